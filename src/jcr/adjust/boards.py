@@ -95,8 +95,8 @@ class BoardShapes:
         columns: slice,
         shared: int,
     ) -> Derivatives:
-        """Two rows a corner, across and above its body; the second is half empty. `columns` are those of the shape,
-        of so many that all observations share."""
+        """Two rows a corner, across and above its body; the second is half empty. `columns` are those of the shape among
+        the `shared` ones."""
         c = len(self.point)
         residual, by = np.zeros((c, 4)), np.zeros((c, 4, shared + 9))
         residual[:, :3] = self.residual(world_from_rig, points_in_world, shape)

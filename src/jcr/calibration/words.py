@@ -85,7 +85,8 @@ def board_in_words(board: BoardFound) -> str:
     stated = "" if board.stated_mm is None else f", {board.stated_mm:g} mm stated"
     return (
         f"board: sides of {board.side_mm:.2f} ± {significant(board.side_std_mm)} mm by the robot{stated}; "
-        f"{board.corners} corners in {board.images} images, {board.rms_px:.2f} px, bent by {significant(board.bend_mm)} mm"
+        f"{board.corners} corners in {board.images} images, {board.rms_px:.2f} px, bent by "
+        f"{significant(board.bend_mm)} mm"
     )
 
 

@@ -36,6 +36,8 @@ LEAST = 0.005
 """And its least size: the robot's own covariance leaves out what is wrong with its lengths all alike."""
 EXACT = 0.015
 """Relative standard deviation of a length that is exact enough to reject a calibration by."""
+WORTH = 10.0
+"""Standard deviations of the robot's scale: a length less exact than that hardly moves it, and is compared alone."""
 Name = LengthName | Literal["robot"]
 
 
@@ -55,13 +57,16 @@ def check_lengths(case: Case) -> Checked:
         return Checked(_from_robot_alone(case, hand_eye), hand_eye)
     robot = Length("robot", 0.0, float(np.sqrt(hand_eye.covariance[6, 6])))
     pair = contradiction([robot, *lengths]) if hand_eye.converged else None
-    used = pair is None and hand_eye.converged and case.adjusted is not None and hand_eye.before is not None
+    is_made_of_images = hand_eye.converged and case.adjusted is not None and hand_eye.before is not None
+    worth = (
+        [one for one in lengths if one.std < WORTH * robot.std] if is_made_of_images and pair is None else []
+    )
     checks = tuple(
         LengthCheck(
             name=one.name,
             robot_longer_percent=100 * float(np.expm1(one.off)),
             std_percent=100 * one.std,
-            used=used,
+            used=one in worth,
         )
         for one in lengths
         if one.name != "robot"
@@ -69,9 +74,7 @@ def check_lengths(case: Case) -> Checked:
     hand_eye = _with(hand_eye, lengths=checks)
     if pair is not None:
         return Checked((_finding(*pair, hand_eye), *_from_robot_alone(case, hand_eye)), hand_eye)
-    if not used:
-        return Checked(_from_robot_alone(case, hand_eye), hand_eye)
-    return _fused(case, hand_eye, lengths)
+    return _fused(case, hand_eye, worth) if worth else Checked(_from_robot_alone(case, hand_eye), hand_eye)
 
 
 def _measured(case: Case) -> tuple[HandEye, list[Length]]:
