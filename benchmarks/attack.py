@@ -116,11 +116,11 @@ def reconstructed(found: FaultyCapture, estimated: bool) -> tuple[Capture, Recon
     intrinsics, x = sfm.placed.scene.cameras[0], sfm.placed.x[0]
     rigs = predict(x, sfm.placed.scale, sfm.placed.z[0], sfm.placed.scene.world_from_rig)
     capture = Capture(
-        Path("."),
-        tuple(f"{k:02d}.png" for k in range(m)),
-        found.base_from_gripper,
-        (INTRINSICS.width, INTRINSICS.height),
-        None if estimated else found.intrinsics,
+        folder=Path("."),
+        images=tuple(f"{k:02d}.png" for k in range(m)),
+        base_from_gripper=found.base_from_gripper,
+        image_size=(INTRINSICS.width, INTRINSICS.height),
+        intrinsics=None if estimated else found.intrinsics,
     )
     return capture, Reconstruction(
         image_index=np.arange(m),

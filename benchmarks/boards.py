@@ -121,7 +121,7 @@ def _calibrated(capture: Capture, how: str, board: str) -> RunResult | RejectedE
     backend, named = {"features": ("colmap", None), "board": ("marker", board), "both": ("colmap", board)}[
         how
     ]
-    options = RunOptions(reconstruct=ReconstructOptions(backend, board=named))
+    options = RunOptions(reconstruct=ReconstructOptions(backend=backend, board=named))
     try:
         with tempfile.TemporaryDirectory() as out:
             return calibrate(capture, out, options)
@@ -243,10 +243,10 @@ def _board_alone(found: FaultyCapture) -> Reconstruction:
             cameras.append(inverse(pose.camera_from_body))
     own = np.isin(tracks.image, rows) & tracks.on_board[tracks.point]
     corners = Tracks(
-        np.searchsorted(rows, tracks.image[own]),
-        tracks.x_px[own],
-        tracks.point[own] - first,
-        body.x_in_body,
+        image=np.searchsorted(rows, tracks.image[own]),
+        x_px=tracks.x_px[own],
+        point=tracks.point[own] - first,
+        points_in_recon=body.x_in_body,
         from_board=True,
     )
     return Reconstruction(

@@ -155,7 +155,13 @@ def _withheld(folder: Path) -> list[Row]:
     if not hand_eye.converged:
         return [Row(folder.name, "–", "", 0, None, message=hand_eye.warnings[0])]
     cameras = [
-        CellCamera(f"fixed{row}", "base", (capture.images[row],), capture.image_size, capture.intrinsics)
+        CellCamera(
+            name=f"fixed{row}",
+            mount="base",
+            images=(capture.images[row],),
+            image_size=capture.image_size,
+            intrinsics=capture.intrinsics,
+        )
         for row in apart
     ]
     found = place_cameras(rest, cameras, reconstruction, hand_eye)

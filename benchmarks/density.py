@@ -56,7 +56,7 @@ def run(out: Path | None = None) -> str:
         )
         capture = read_capture(made)
         sparse, swept = _clouds(
-            capture, ReconstructOptions("colmap"), "dense depth on COLMAP's cameras (ours)"
+            capture, ReconstructOptions(backend="colmap"), "dense depth on COLMAP's cameras (ours)"
         )
         pairs = Path(folder) / "pairs.npz"
         write_pairs(pairs, pairs_of_capture(made, errors=PUBLISHED, seed=SEED)[0])

@@ -60,7 +60,7 @@ def run(long: bool = False) -> str:
             made = simulate(Path(folder) / "capture", options)
             capture = read_capture(made)
             begun = time.perf_counter()
-            found = densify(capture, reconstruct(capture, ReconstructOptions(backend)))
+            found = densify(capture, reconstruct(capture, ReconstructOptions(backend=backend)))
             seconds = time.perf_counter() - begun
             hand_eye = calibrate(capture, found)
             shown = shown_by(made, found)

@@ -151,11 +151,11 @@ def _made(
     problem = bent_problem(arm_named(name), preset, count, seed)
     start = known.start(rng)
     capture = Capture(
-        Path(),
-        tuple(f"{k}.png" for k in range(count)),
-        problem.base_from_gripper,
-        (start.width, start.height),
-        None if known.name.startswith("not") else start,
+        folder=Path(),
+        images=tuple(f"{k}.png" for k in range(count)),
+        base_from_gripper=problem.base_from_gripper,
+        image_size=(start.width, start.height),
+        intrinsics=None if known.name.startswith("not") else start,
         joints=problem.joints if seed % 2 else None,
         robot=name if seed % 2 else None,
     )

@@ -155,7 +155,16 @@ def draw(kind: str, seed: int, folder: Path) -> Drawn:
     for name, image in zip(names, images, strict=True):
         Image.fromarray(image).save(folder / name)
     reported = with_robot_noise(gripper, *ROBOT_NOISE, np.random.default_rng([seed, 6]))
-    return Drawn(Capture(folder, names, reported, (640, 480), intrinsics), x)
+    return Drawn(
+        Capture(
+            folder=folder,
+            images=names,
+            base_from_gripper=reported,
+            image_size=(640, 480),
+            intrinsics=intrinsics,
+        ),
+        x,
+    )
 
 
 def _on_table(

@@ -319,7 +319,7 @@ def true_cloud(truth: Truth, points: int = 200_000, noise: float = 0.0, seed: in
 def calibrated_cloud(truth: Truth) -> PointCloud:
     """The cloud that COLMAP and the calibration of the capture give, labelled by the true masks."""
     capture = read_capture(truth.folder)
-    reconstruction = densify(capture, reconstruct(capture, ReconstructOptions("colmap")))
+    reconstruction = densify(capture, reconstruct(capture, ReconstructOptions(backend="colmap")))
     size = reconstruction.dense.confidence.shape[:0:-1]
     labels = [
         cv2.resize(true_labels(truth, row), size, interpolation=cv2.INTER_NEAREST)

@@ -168,7 +168,7 @@ def _methods(
         )
 
     def by_name(name: str) -> Callable[[Capture], Reconstruction]:
-        return lambda capture: backends.reconstruct(capture, ReconstructOptions(name))
+        return lambda capture: backends.reconstruct(capture, ReconstructOptions(backend=name))
 
     methods = {name: by_name(name) for name in ("colmap", "direct")}
     for level, errors in levels.items():

@@ -44,7 +44,9 @@ def run(long: bool = False) -> str:
     count = MANY_IMAGES if long else IMAGES
     network = random_network(VIT_LARGE)
     colors = np.random.default_rng(0).integers(0, 256, (count, HEIGHT, WIDTH, 3), dtype=np.uint8)
-    images = PreparedImages(colors, image_grid((WIDTH, HEIGHT), WIDTH), None, None)
+    images = PreparedImages(
+        colors=colors, grid=image_grid((WIDTH, HEIGHT), WIDTH), intrinsics_of_capture=None, pinhole=None
+    )
     once = measure(lambda: encode_once(network, images))
     per_pair = measure(lambda: encode_per_pair(network, images))
     difference = np.abs(once.pairs.pts3d_in_other_view - per_pair.pairs.pts3d_in_other_view).max()
@@ -103,4 +105,4 @@ def encode_per_pair(network: Dust3r, images: PreparedImages) -> PairPredictions:
         (torch.cat([v[k].points for v in views]).numpy(), torch.cat([v[k].confidence for v in views]).numpy())
         for k in (0, 1)
     )
-    return PairPredictions(edges, points, conf, points2, conf2)
+    return PairPredictions(edges=edges, pts3d=points, conf=conf, pts3d_in_other_view=points2, conf2=conf2)

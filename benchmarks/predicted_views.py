@@ -73,7 +73,14 @@ def predicted_views(truth: Truth, errors: ViewErrors, seed: int) -> Predicted:
     recon_from_camera = inverse(base_from_camera[0]) @ base_from_camera
     recon_from_camera[:, :3, 3] /= errors.unit
     pinholes = np.tile([pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy], (count, 1))
-    return Predicted(grid, points / np.float32(errors.unit), confidence, pinholes, recon_from_camera, False)
+    return Predicted(
+        grid=grid,
+        x_in_camera=points / np.float32(errors.unit),
+        confidence=confidence,
+        pinholes=pinholes,
+        recon_from_camera=recon_from_camera,
+        is_metric=False,
+    )
 
 
 def auc(

@@ -208,7 +208,7 @@ def _methods(capture: Capture, truth: Truth, pairs: Path) -> list[tuple[str, Cel
         on_colmap = Cell(0), Cell(0, accepted=False)
     cells = [(f"{PAPERS} on {ON_COLMAP}", on_colmap[0]), (f"ours on {ON_COLMAP}", on_colmap[1])]
     options: list[tuple[str, ReconstructOptions]] = [(ON_PREDICTIONS, ReconstructOptions(predictions=pairs))]
-    options += [(name, ReconstructOptions(name)) for name in networks]
+    options += [(name, ReconstructOptions(backend=name)) for name in networks]
     for name, option in options:
         predicted = reconstruct(capture, option)
         # The paper aligns without the robot.

@@ -126,7 +126,7 @@ def _scene(folder: Path, seed: int, images: int) -> Scene:
     capture = replace(
         capture, images=capture.images[:images], base_from_gripper=capture.base_from_gripper[:images]
     )
-    reconstruction = densify(capture, reconstruct(capture, ReconstructOptions("colmap")))
+    reconstruction = densify(capture, reconstruct(capture, ReconstructOptions(backend="colmap")))
     hand_eye = calibrate(capture, reconstruction)
     given = read_labels(capture, reconstruction)
     assert given is not None  # copied above

@@ -52,7 +52,7 @@ with ExitStack() as until_done:
 
     print("move the arm; an image is taken whenever it rests")
     asks = asks_at_rest(lambda: states(host, port))
-    collect(LiveFolder(out), camera, asks, CollectOptions(images), tell, ArmWords("ur"))
+    collect(LiveFolder(out), camera, asks, CollectOptions(images=images), tell, ArmWords("ur"))
 
 capture = jcr.read_capture(out)
 print(f"{len(capture)} images in {out}; next: jcr run {out} out/ur_run")

@@ -66,7 +66,9 @@ def small_capture(folder: Path) -> Capture:
         Image.fromarray(draw.integers(0, 255, (SIZE[1], SIZE[0], 3), dtype=np.uint8)).save(folder / name)
     poses = hand_eye_problem(draw, COUNT).base_from_gripper
     intrinsics = Intrinsics(15.0, 15.0, 7.5, 5.5, *SIZE, (0.01, 0.0, 0.0, 0.0, 0.0))
-    capture = Capture(folder, images, poses, SIZE, intrinsics)
+    capture = Capture(
+        folder=folder, images=images, base_from_gripper=poses, image_size=SIZE, intrinsics=intrinsics
+    )
     capture_json.write(folder, capture)
     return capture
 
@@ -133,11 +135,22 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
 
     folder.mkdir()
     draw = np.random.default_rng(3)
-    pairs = PosePairs(capture.folder, capture.images, capture.base_from_gripper, cameras, True)
+    pairs = PosePairs(
+        source=capture.folder,
+        images=capture.images,
+        base_from_gripper=capture.base_from_gripper,
+        recon_from_camera=cameras,
+        is_metric=True,
+    )
     found = calibration_file(pairs, pairs, calibrate_poses(pairs), {}, "0")
     write_calibration(folder / "calibration.json", found)
     height, width = SIZE[1], SIZE[0]
-    tracks = Tracks(np.zeros(2, int), draw.random((2, 2)), np.arange(2), draw.random((2, 3)))
+    tracks = Tracks(
+        image=np.zeros(2, int),
+        x_px=draw.random((2, 2)),
+        point=np.arange(2),
+        points_in_recon=draw.random((2, 3)),
+    )
     assert capture.intrinsics is not None
     reconstruction = Reconstruction(
         image_index=np.arange(COUNT),
@@ -247,7 +260,13 @@ def sound_run(out: Path) -> Path:
         )
         frames.append({"image": name, "base_from_gripper": pose.tolist()})
     (out / "capture" / "capture.json").write_text(json.dumps({"frames": frames}))
-    pairs = PosePairs(out, names, problem.base_from_gripper, problem.recon_from_camera, False)
+    pairs = PosePairs(
+        source=out,
+        images=names,
+        base_from_gripper=problem.base_from_gripper,
+        recon_from_camera=problem.recon_from_camera,
+        is_metric=False,
+    )
     attempt = Attempt(
         backend="colmap", images_registered=RUN_IMAGES, reconstruct_s=1.0, calibrate_s=0.5, why_not=None
     )

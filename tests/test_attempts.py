@@ -54,7 +54,9 @@ def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
 def reconstruction(backend: str, poses: np.ndarray, observations: int = 0) -> Reconstruction:
     intrinsics = Intrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
     n = observations
-    tracks = Tracks(np.zeros(n, int), np.zeros((n, 2)), np.arange(n), np.zeros((n, 3)))
+    tracks = Tracks(
+        image=np.zeros(n, int), x_px=np.zeros((n, 2)), point=np.arange(n), points_in_recon=np.zeros((n, 3))
+    )
     return Reconstruction(
         image_index=np.arange(len(poses)),
         recon_from_camera=poses,
@@ -79,7 +81,9 @@ def without_surface(capture: Capture, made: Reconstruction, *_: object, **__: ob
 
 def capture_of(problem: HandEyeProblem) -> Capture:
     names = tuple(f"{k:02d}.png" for k in range(len(problem.base_from_gripper)))
-    return Capture(Path(), names, problem.base_from_gripper, (640, 480))
+    return Capture(
+        folder=Path(), images=names, base_from_gripper=problem.base_from_gripper, image_size=(640, 480)
+    )
 
 
 def chosen(problem: HandEyeProblem, poses: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> HandEye:
@@ -416,7 +420,9 @@ def test_a_known_length_ends_on_surfaces_and_nothing_else_needs_depth_before_the
     )
     monkeypatch.setattr(attempts, "densify", deeper)
     names = tuple(f"{k:02d}.png" for k in range(8))
-    capture = Capture(Path(), names, problem.base_from_gripper, (640, 480))
+    capture = Capture(
+        folder=Path(), images=names, base_from_gripper=problem.base_from_gripper, image_size=(640, 480)
+    )
     chosen = []
     choice = attempts.choose(
         capture, ReconstructOptions(), CalibrateOptions(), None, lambda made: chosen.append(made)

@@ -84,12 +84,19 @@ def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():
         image_index=np.arange(12),
         recon_from_camera=problem.recon_from_camera,
         intrinsics=INTRINSICS,
-        tracks=Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3))),
+        tracks=Tracks(
+            image=np.zeros(0, int),
+            x_px=np.zeros((0, 2)),
+            point=np.zeros(0, int),
+            points_in_recon=np.zeros((0, 3)),
+        ),
         backend="given",
     )
     hand_eye = solve_hand_eye(gripper, problem.recon_from_camera)
     assert hand_eye.converged and not hand_eye.inliers[[3, 5, 8]].any()
-    found = left_out_poses(Capture(Path(), names, gripper, (640, 480)), made, hand_eye)
+    found = left_out_poses(
+        Capture(folder=Path(), images=names, base_from_gripper=gripper, image_size=(640, 480)), made, hand_eye
+    )
     assert [(one.kind, one.severity, one.images) for one in found] == [
         (Kind.POSES_SWAPPED, "rejects", ("3.png", "8.png")),
         (Kind.POSE_CONTRADICTS_IMAGE, "warns", ("5.png",)),
@@ -99,7 +106,9 @@ def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():
     of_right = solve_hand_eye(right, problem.recon_from_camera)
     images = replace(of_right.images, inliers=np.arange(12) != 4)
     assert not left_out_poses(
-        Capture(Path(), names, right, (640, 480)), made, replace(of_right, images=images)
+        Capture(folder=Path(), images=names, base_from_gripper=right, image_size=(640, 480)),
+        made,
+        replace(of_right, images=images),
     )
 
 

@@ -106,7 +106,9 @@ def test_pointmaps_in_a_file_leave_the_resident_set(tmp_path: Path) -> None:
 
     shape = (100, 256, 256)
     points, conf = predictor._new_array((*shape, 3), False), predictor._new_array(shape, False)
-    pairs = PairPredictions(np.tile([[0, 1]], (100, 1)), points, conf, points, conf)
+    pairs = PairPredictions(
+        edges=np.tile([[0, 1]], (100, 1)), pts3d=points, conf=conf, pts3d_in_other_view=points, conf2=conf
+    )
     give_back()
     before = resident()
     for row in range(100):

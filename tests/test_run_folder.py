@@ -137,7 +137,9 @@ def test_a_cut_file_is_refused(sound: Path, tmp_path: Path, name: str, length: i
 
 
 def test_a_capture_in_a_folder_whose_name_is_not_utf8_is_refused_before_any_work():
-    capture = Capture(Path("caf\udce9"), ("a.png",), np.eye(4)[None], (640, 480))
+    capture = Capture(
+        folder=Path("caf\udce9"), images=("a.png",), base_from_gripper=np.eye(4)[None], image_size=(640, 480)
+    )
     made_with = MadeWith(reconstruct=ReconstructOptions(), calibrate=CalibrateOptions())
     with pytest.raises(InputError, match="not UTF-8; rename it"):
         state_of(capture, made_with)

@@ -65,7 +65,12 @@ def reconstruction(capture: Capture, x: np.ndarray) -> Reconstruction:
         image_index=np.arange(OLD),
         recon_from_camera=cameras(capture, x)[:OLD],
         intrinsics=intrinsics,
-        tracks=Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3))),
+        tracks=Tracks(
+            image=np.zeros(0, int),
+            x_px=np.zeros((0, 2)),
+            point=np.zeros(0, int),
+            points_in_recon=np.zeros((0, 3)),
+        ),
         backend="colmap",
     )
 

@@ -126,7 +126,12 @@ def faulty_capture(rng: np.random.Generator, images: int = 12, faults: Faults = 
         image.append(np.full(len(seen), k))
         point.append(seen)
         pixels.append(x_px[seen] + NOISE_PX * rng.normal(size=(len(seen), 2)))
-    tracks = Tracks(np.concatenate(image), np.concatenate(pixels), np.concatenate(point), points)
+    tracks = Tracks(
+        image=np.concatenate(image),
+        x_px=np.concatenate(pixels),
+        point=np.concatenate(point),
+        points_in_recon=points,
+    )
     if faults.is_bent:
         x, slipped = _effective(x, images, faults, rng), x
     return FaultyCapture(

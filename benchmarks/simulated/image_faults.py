@@ -117,7 +117,13 @@ def write(drawn: Drawn, folder: Path) -> Path:
     for name, image in zip(drawn.names, drawn.images, strict=True):
         write_bytes(folder / name, encoded(image, JPEG_QUALITY))
     height, width = drawn.images[0].shape[:2]
-    capture = Capture(folder, drawn.names, drawn.base_from_gripper, (width, height), drawn.camera)
+    capture = Capture(
+        folder=folder,
+        images=drawn.names,
+        base_from_gripper=drawn.base_from_gripper,
+        image_size=(width, height),
+        intrinsics=drawn.camera,
+    )
     capture_json.write(folder, capture)
     return folder
 

@@ -34,8 +34,8 @@ def observed(
     recon_from_base = problem.recon_from_camera[0, :3, :3] @ base_from_camera[0, :3, :3].T
     about_camera = (x_in_base - base_from_camera[0, :3, 3]) / problem.scale
     return Tracks(
-        np.concatenate(image),
-        np.concatenate(pixels),
-        np.concatenate(point),
-        about_camera @ recon_from_base.T + problem.recon_from_camera[0, :3, 3],
+        image=np.concatenate(image),
+        x_px=np.concatenate(pixels),
+        point=np.concatenate(point),
+        points_in_recon=about_camera @ recon_from_base.T + problem.recon_from_camera[0, :3, 3],
     )

@@ -14,7 +14,6 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
-from html import escape
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -28,6 +27,7 @@ from jcr.pipeline import RunOptions, calibrate, run
 from jcr.progress import Progress, silent
 from jcr.records import Verdict, verdict_of
 from jcr.records.words import sentence
+from jcr.report.render import render
 from jcr.run_folder import CAPTURE, RunFolder, fingerprint
 
 STATE = "batch.json"
@@ -309,36 +309,16 @@ def _write_summary(out: Path, rows: list[Row]) -> None:
     write_text(out / "summary.html", _page(rows))
 
 
-_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>jcr batch</title>
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<style>:root{{color-scheme:light dark}}body{{font:15px system-ui,sans-serif;margin:1.5em}}
-table{{border-collapse:collapse}}th,td{{padding:.3em .8em;text-align:left;border-bottom:1px solid #8885}}
-td.n,th.n{{text-align:right;font-variant-numeric:tabular-nums}}.bad{{color:#c33}}</style>
-<h1>{accepted} of {n} captures accepted</h1><table><thead><tr><th class="n">#</th><th>capture</th><th>status</th>
-<th class="n">images used</th>
-<th class="n">translation ± mm</th><th class="n">rotation ± °</th><th class="n">scale ± %</th>
-<th class="n">leave-one-out mm</th><th class="n">leave-one-out °</th><th class="n">s</th><th>reason</th></tr></thead>
-<tbody>{rows}</tbody></table></html>
-"""
-
-
 def _page(rows: list[Row]) -> str:
-    lines = []
-    for rank, row in enumerate(rows, start=1):
-        name = Path(row.out).name
-        link = escape(name)
-        if (Path(row.out) / "report.html").is_file():
-            link = f'<a href="{escape(name, quote=True)}/report.html">{link}</a>'
-        numbers = (
-            row.offset_std_mm, row.turn_std_deg, row.scale_std_percent, row.held_out_mm, row.held_out_deg,
-            row.seconds,
-        )  # fmt: skip
-        cells = "".join(
-            f'<td class="n">{"" if number is None else f"{number:.3g}"}</td>' for number in numbers
-        )
-        bad = "" if is_accepted(row) else ' class="bad"'
-        lines.append(
-            f'<tr><td class="n">{rank}</td><td>{link}</td><td{bad}>{row.status}</td>'
-            f'<td class="n">{row.used} of {row.images}</td>{cells}<td>{escape(row.reason)}</td></tr>'
-        )
-    return _PAGE.format(accepted=sum(map(is_accepted, rows)), n=len(rows), rows="\n".join(lines))
+    numbers = ("offset_std_mm", "turn_std_deg", "scale_std_percent", "held_out_mm", "held_out_deg", "seconds")
+    table = [
+        {
+            "row": row,
+            "name": Path(row.out).name,
+            "has_report": (Path(row.out) / "report.html").is_file(),
+            "is_accepted": is_accepted(row),
+            "numbers": [getattr(row, name) for name in numbers],
+        }
+        for row in rows
+    ]
+    return render("batch.html", {"table": table})

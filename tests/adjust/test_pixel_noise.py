@@ -38,7 +38,14 @@ def adjusted(seed: int, stated: str) -> tuple[ImageEvidence, Float[ndarray, "11 
             points_in_world=exact.points_in_recon,
         ),
         Observations.of_one_camera(
-            Tracks(exact.image, x_px, exact.point, exact.points_in_recon, std_px=of[stated]), 12
+            Tracks(
+                image=exact.image,
+                x_px=x_px,
+                point=exact.point,
+                points_in_recon=exact.points_in_recon,
+                std_px=of[stated],
+            ),
+            12,
         ),
         Freedom.of((INTRINSICS,), (prior_of(INTRINSICS, FIXED),), 12),
     )
@@ -82,10 +89,10 @@ def test_what_no_camera_focuses_on_counts_nothing():
 
 def test_stated_sizes_follow_their_observations():
     tracks = Tracks(
-        np.array([0, 1, 1]),
-        np.arange(6.0).reshape(3, 2),
-        np.array([0, 0, 1]),
-        np.zeros((2, 3)),
+        image=np.array([0, 1, 1]),
+        x_px=np.arange(6.0).reshape(3, 2),
+        point=np.array([0, 0, 1]),
+        points_in_recon=np.zeros((2, 3)),
         std_px=np.arange(3.0),
     )
     kept = tracks.only(tracks.image == 1)

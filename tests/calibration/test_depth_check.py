@@ -57,7 +57,14 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, Reconst
     gripper = base_from_camera @ inverse(X)
     gripper[:, :3, 3] += 3e-4 * draw.normal(size=(12, 3))
     images = tuple(f"{k}.png" for k in range(12))
-    capture = Capture(folder, images, gripper, (WIDTH, HEIGHT), INTRINSICS, depths=names)
+    capture = Capture(
+        folder=folder,
+        images=images,
+        base_from_gripper=gripper,
+        image_size=(WIDTH, HEIGHT),
+        intrinsics=INTRINSICS,
+        depths=names,
+    )
     base_from_recon = transform(rotation_exp(np.array([0.3, -2.0, 0.5])), np.array([0.4, 0.2, -0.7]))
     cameras = inverse(base_from_recon) @ base_from_camera
     cameras[:, :3, 3] /= SCALE
@@ -74,7 +81,12 @@ def _reconstruction(cameras: np.ndarray, true: np.ndarray, draw: np.random.Gener
     points = np.stack(
         [apply(cameras[i], d * r) for i, d, r in zip(image, z, rays(INTRINSICS)[v, u], strict=True)]
     )
-    tracks = Tracks(image, np.stack([u, v], 1).astype(float), np.arange(len(image)), points)
+    tracks = Tracks(
+        image=image,
+        x_px=np.stack([u, v], 1).astype(float),
+        point=np.arange(len(image)),
+        points_in_recon=points,
+    )
     nothing = np.zeros(true.shape)
     pointmaps = Pointmaps(
         intrinsics=INTRINSICS,

@@ -145,7 +145,13 @@ def test_a_robot_that_is_found_worse_than_assumed_is_not_promised_away():
     noise = (0.03, np.radians(4.0))
     problem = hand_eye_problem(np.random.default_rng(4), 12, robot_noise=noise)
     names = tuple(f"{k}.png" for k in range(12))
-    pairs = PosePairs(Path("."), names, problem.base_from_gripper, problem.recon_from_camera, False)
+    pairs = PosePairs(
+        source=Path("."),
+        images=names,
+        base_from_gripper=problem.base_from_gripper,
+        recon_from_camera=problem.recon_from_camera,
+        is_metric=False,
+    )
     found = calibrate_poses(pairs)
     assert not found.converged
     promised = calibration_file(pairs, pairs, found, {}, "").next_poses[-1].expected_std

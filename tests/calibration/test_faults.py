@@ -136,7 +136,11 @@ def test_nothing_is_named_where_nothing_is_wrong(estimated: bool):
 def test_joint_offsets_and_link_errors_are_not_named_as_a_bent_robot(arm: RobotName, preset: PresetName):
     problem = bent_problem(arm_named(arm), preset, 12, 2)
     capture = Capture(
-        Path("."), tuple(f"{k}.png" for k in range(12)), problem.base_from_gripper, (640, 480), OBSERVED_BY
+        folder=Path("."),
+        images=tuple(f"{k}.png" for k in range(12)),
+        base_from_gripper=problem.base_from_gripper,
+        image_size=(640, 480),
+        intrinsics=OBSERVED_BY,
     )
     reconstruction = Reconstruction(
         image_index=np.arange(12),

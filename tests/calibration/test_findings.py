@@ -152,7 +152,13 @@ def test_a_fault_that_is_too_much_rejects_and_comes_before_its_consequences(solv
 def test_what_a_cause_explains_is_not_another_fault():
     problem = hand_eye_problem(np.random.default_rng(0), 12, robot_noise=(5e-4, 1e-3))
     names = tuple(f"{k}.png" for k in range(12))
-    pairs = PosePairs(Path("a"), names, problem.base_from_gripper[::-1], problem.recon_from_camera, False)
+    pairs = PosePairs(
+        source=Path("a"),
+        images=names,
+        base_from_gripper=problem.base_from_gripper[::-1],
+        recon_from_camera=problem.recon_from_camera,
+        is_metric=False,
+    )
     content = calibration_file(pairs, pairs, calibrate_poses(pairs), {}, "0")
     assert content.findings[0].kind is Kind.POSE_CONVENTION and Kind.UNCERTAIN in {
         one.kind for one in content.findings
@@ -175,10 +181,20 @@ def test_of_images_that_are_missing_the_motions_are_not_to_blame():
         image_index=np.arange(5),
         recon_from_camera=camera,
         intrinsics=Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480),
-        tracks=Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3))),
+        tracks=Tracks(
+            image=np.zeros(0, int),
+            x_px=np.zeros((0, 2)),
+            point=np.zeros(0, int),
+            points_in_recon=np.zeros((0, 3)),
+        ),
         backend="colmap",
     )
-    capture = Capture(Path(), tuple(f"{k}.png" for k in range(12)), gripper, (640, 480))
+    capture = Capture(
+        folder=Path(),
+        images=tuple(f"{k}.png" for k in range(12)),
+        base_from_gripper=gripper,
+        image_size=(640, 480),
+    )
     found = calibrate(capture, made)
     assert [one.kind for one in found.findings[:2]] == [Kind.FEW_USED, Kind.UNOBSERVABLE]
     assert found.findings[0].mend == "reconstruction" and found.observability.advice == ("",)
@@ -200,7 +216,13 @@ def test_the_parts_of_the_uncertainty_are_the_whole_with_every_fault(solved: Han
 def test_findings_are_in_the_file_and_come_back(tmp_path: Path):
     problem = hand_eye_problem(np.random.default_rng(0), 12, robot_noise=(5e-4, 1e-3))
     names = tuple(f"{k}.png" for k in range(12))
-    pairs = PosePairs(Path("a"), names, problem.base_from_gripper, problem.recon_from_camera, False)
+    pairs = PosePairs(
+        source=Path("a"),
+        images=names,
+        base_from_gripper=problem.base_from_gripper,
+        recon_from_camera=problem.recon_from_camera,
+        is_metric=False,
+    )
     hand_eye = calibrate_poses(pairs).with_findings(*(example(kind) for kind in Kind))
     hand_eye = with_findings(hand_eye, (replace(example(Kind.SLIP), mend="mount", shift=(1e-3,) * 7),))
     content = calibration_file(pairs, pairs, hand_eye, {}, "0")

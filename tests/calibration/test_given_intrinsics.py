@@ -25,7 +25,11 @@ def pictured(
     )
     tracks = observed(problem, rng, 250, 0.5)
     capture = Capture(
-        Path("."), tuple(f"{k}.png" for k in range(images)), problem.base_from_gripper, (640, 480), intrinsics
+        folder=Path("."),
+        images=tuple(f"{k}.png" for k in range(images)),
+        base_from_gripper=problem.base_from_gripper,
+        image_size=(640, 480),
+        intrinsics=intrinsics,
     )
     reconstruction = Reconstruction(
         image_index=np.arange(images),

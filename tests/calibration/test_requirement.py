@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,13 @@ NOISE = (5e-4, np.radians(0.1))
 def pairs(seed: int, count: int) -> tuple[PosePairs, np.ndarray]:
     problem = hand_eye_problem(np.random.default_rng(seed), count, robot_noise=NOISE)
     names = tuple(f"sample {k}" for k in range(count))
-    found = PosePairs(Path("a.yaml"), names, problem.base_from_gripper, problem.recon_from_camera, False)
+    found = PosePairs(
+        source=Path("a.yaml"),
+        images=names,
+        base_from_gripper=problem.base_from_gripper,
+        recon_from_camera=problem.recon_from_camera,
+        is_metric=False,
+    )
     return found, problem.gripper_from_camera
 
 
@@ -81,7 +88,13 @@ def with_poses(problem: HandEyeProblem, poses: np.ndarray, rng: np.random.Genera
     more = scale_translation(recon_from_base @ poses @ problem.gripper_from_camera, 1 / problem.scale)
     gripper = np.concatenate([problem.base_from_gripper, disturbed(poses, NOISE, rng)])
     names = tuple(f"sample {k}" for k in range(len(gripper)))
-    return PosePairs(Path("a.yaml"), names, gripper, np.concatenate([problem.recon_from_camera, more]), False)
+    return PosePairs(
+        source=Path("a.yaml"),
+        images=names,
+        base_from_gripper=gripper,
+        recon_from_camera=np.concatenate([problem.recon_from_camera, more]),
+        is_metric=False,
+    )
 
 
 def test_the_poses_that_are_proposed_reach_what_they_promise():
@@ -123,7 +136,13 @@ def test_a_scale_that_was_known_is_not_promised_again():
     problem = hand_eye_problem(np.random.default_rng(5), 8, robot_noise=NOISE)
     cameras = problem.recon_from_camera.copy()
     cameras[:, :3, 3] *= problem.scale
-    given = PosePairs(Path("a.yaml"), tuple("abcdefgh"), problem.base_from_gripper, cameras, True)
+    given = PosePairs(
+        source=Path("a.yaml"),
+        images=tuple("abcdefgh"),
+        base_from_gripper=problem.base_from_gripper,
+        recon_from_camera=cameras,
+        is_metric=True,
+    )
     known = calibrate_poses(given)
     gripper = given.base_from_gripper
     assumptions = assumed_of_poses(known, gripper)
@@ -181,7 +200,10 @@ def test_one_notion_of_accepted_in_python_notebook_and_compare(
         assert f"gripper_from_camera, {verdict}" in hand_eye.as_html()
         write_calibration(tmp_path / f"{k}.json", page(given, hand_eye)[0])
     # By default it is a wish: it warns, in the notebook too.
-    poor = calibrate_poses(PosePairs(given.source, given.images[:4], *_first(given, 4), False))
+    gripper, camera = _first(given, 4)
+    poor = calibrate_poses(
+        replace(given, images=given.images[:4], base_from_gripper=gripper, recon_from_camera=camera)
+    )
     assert poor.verdict == "accepted with warnings"
     table = poor.as_html()
     assert "accepted with warnings: " in table and "not as exact as needed" in table

@@ -89,8 +89,14 @@ def test_further_cameras_of_a_bag_are_named_by_tf_or_by_name(tmp_path: Path, cap
         cv2.imwrite(str(tmp_path / f"{k}.png"), small)
         write_bytes(tmp_path / name, (capture.folder / name).read_bytes())
     size = (80, 60)
-    top = CellCamera("top", "base", ("8.png",), size)
-    second = CellCamera("second", "gripper", tuple(f"{k}.png" for k in range(4)), size, frame=np.arange(4))
+    top = CellCamera(name="top", mount="base", images=("8.png",), image_size=size)
+    second = CellCamera(
+        name="second",
+        mount="gripper",
+        images=tuple(f"{k}.png" for k in range(4)),
+        image_size=size,
+        frame=np.arange(4),
+    )
     few = replace(
         capture, folder=tmp_path, images=capture.images[:4], base_from_gripper=capture.base_from_gripper[:4]
     )

@@ -159,7 +159,12 @@ def calibrated(tabletop: Path) -> tuple[Capture, Reconstruction, HandEye]:
     poses = scale_translation(recon_from_base @ capture.base_from_gripper[:OLD] @ x, 1 / SCALE)
     intrinsics = capture.intrinsics
     assert intrinsics is not None
-    nothing = Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3)))
+    nothing = Tracks(
+        image=np.zeros(0, int),
+        x_px=np.zeros((0, 2)),
+        point=np.zeros(0, int),
+        points_in_recon=np.zeros((0, 3)),
+    )
     reconstruction = Reconstruction(
         image_index=np.arange(OLD),
         recon_from_camera=poses,
@@ -177,7 +182,13 @@ def calibrated(tabletop: Path) -> tuple[Capture, Reconstruction, HandEye]:
 
 
 def fixed(capture: Capture, *images: str, known: bool = True) -> CellCamera:
-    return CellCamera("overhead", "base", images, capture.image_size, capture.intrinsics if known else None)
+    return CellCamera(
+        name="overhead",
+        mount="base",
+        images=images,
+        image_size=capture.image_size,
+        intrinsics=capture.intrinsics if known else None,
+    )
 
 
 @pytest.mark.slow
@@ -244,11 +255,11 @@ def test_a_second_camera_on_the_gripper_is_placed_by_images_of_two_gripper_poses
 
     def second(*frames: int) -> CameraFound:
         camera = CellCamera(
-            "second",
-            "gripper",
-            (old.images[4], old.images[6])[: len(frames)],
-            old.image_size,
-            old.intrinsics,
+            name="second",
+            mount="gripper",
+            images=(old.images[4], old.images[6])[: len(frames)],
+            image_size=old.image_size,
+            intrinsics=old.intrinsics,
             frame=np.array(frames),
         )
         return place_cameras(old, [camera], reconstruction, hand_eye).cameras[0]
@@ -335,7 +346,12 @@ def test_a_second_camera_that_sees_another_scene_is_calibrated_by_its_own_images
     old, reconstruction, hand_eye = calibrated
     frame = np.array([0, 1, 3, 4, 5, 7, 8])
     second = CellCamera(
-        "second", "gripper", tuple(old.images[k] for k in frame), old.image_size, old.intrinsics, frame=frame
+        name="second",
+        mount="gripper",
+        images=tuple(old.images[k] for k in frame),
+        image_size=old.image_size,
+        intrinsics=old.intrinsics,
+        frame=frame,
     )
     move = transform(rotation_exp(np.array([1.0, 0.2, -0.4])), np.array([0.5, 0.0, 2.0]))
     its_own = scale_translation(move @ reconstruction.recon_from_camera[frame], 2.5)
@@ -404,7 +420,12 @@ def test_a_fixed_camera_that_watches_the_gripper_is_placed_beside_a_wrist_camera
     old, reconstruction, _ = calibrated
     frame = np.array([0, 1, 2, 3, 5, 6, 7, 8])
     front = CellCamera(
-        "front", "base", tuple(old.images[k] for k in frame), old.image_size, old.intrinsics, frame=frame
+        name="front",
+        mount="base",
+        images=tuple(old.images[k] for k in frame),
+        image_size=old.image_size,
+        intrinsics=old.intrinsics,
+        frame=frame,
     )
     base_from_camera = transform(rotation_exp(np.array([-1.9, 0.2, 0.3])), np.array([1.2, 0.1, 0.5]))
     gripper_from_object = transform(rotation_exp(np.array([0.2, 0.5, 1.0])), np.array([0.0, 0.02, 0.15]))

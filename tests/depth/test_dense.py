@@ -99,7 +99,12 @@ def scene() -> Scene:
         image.append(np.full(len(seen), k))
         point.append(seen)
         x_px.append(np.stack([u, v], axis=-1)[seen])
-    tracks = Tracks(np.concatenate(image), np.concatenate(x_px), np.concatenate(point), points)
+    tracks = Tracks(
+        image=np.concatenate(image),
+        x_px=np.concatenate(x_px),
+        point=np.concatenate(point),
+        points_in_recon=points,
+    )
     return Scene(
         np.stack(images), recon_from_camera, np.stack(depths), np.stack(blanks), np.stack(patches), tracks
     )
@@ -277,10 +282,10 @@ def test_the_gauge_changes_nothing_but_the_unit(scene: Scene, dense: Pointmaps) 
     moved = motion @ scene.recon_from_camera
     moved[:, :3, 3] *= scale
     tracks = Tracks(
-        scene.tracks.image,
-        scene.tracks.x_px,
-        scene.tracks.point,
-        scale * apply(motion, scene.tracks.points_in_recon),
+        image=scene.tracks.image,
+        x_px=scene.tracks.x_px,
+        point=scene.tracks.point,
+        points_in_recon=scale * apply(motion, scene.tracks.points_in_recon),
     )
     other = _dense(scene, moved, tracks)
     both = (dense.confidence > 0) & (other.confidence > 0)
@@ -298,7 +303,12 @@ def test_the_stage_estimates_depth_whatever_the_order_of_the_frames(
     names = tuple(f"{k}.png" for k in order)
     for name, image in zip(names, scene.images[order], strict=True):
         (tmp_path / name).write_bytes(encode_png(image))
-    capture = Capture(tmp_path, names, scene.recon_from_camera[order], (PINHOLE.width, PINHOLE.height))
+    capture = Capture(
+        folder=tmp_path,
+        images=names,
+        base_from_gripper=scene.recon_from_camera[order],
+        image_size=(PINHOLE.width, PINHOLE.height),
+    )
     by_name = np.argsort(order)
     sparse = Reconstruction(
         image_index=np.arange(7),
@@ -337,7 +347,7 @@ def test_neighbours_share_points_under_a_useful_angle() -> None:
     recon_from_camera = transform(np.eye(3), centres)
     image = np.concatenate([np.repeat(np.arange(4), 30), np.full(10, 4)])
     point = np.concatenate([np.tile(np.arange(30), 4), np.arange(30, 40)])
-    tracks = Tracks(image, np.zeros((len(image), 2)), point, points)
+    tracks = Tracks(image=image, x_px=np.zeros((len(image), 2)), point=point, points_in_recon=points)
     neighbours = choose_neighbours(tracks, recon_from_camera, 3)
     assert neighbours[0].tolist() == [2, 1, 3]
     assert all(i not in others and len(others) == 3 for i, others in enumerate(neighbours))

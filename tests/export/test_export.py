@@ -309,7 +309,10 @@ def views(tmp_path: Path) -> "PosedImages":
     inside = ((x_px > 0) & (x_px < [319, 239])).all(1)
     assert inside.sum() > 100
     tracks = Tracks(
-        np.repeat(np.arange(3), 60)[inside], x_px[inside], np.tile(np.arange(60), 3)[inside], points
+        image=np.repeat(np.arange(3), 60)[inside],
+        x_px=x_px[inside],
+        point=np.tile(np.arange(60), 3)[inside],
+        points_in_recon=points,
     )
     return PosedImages(
         folder=folder,
@@ -364,7 +367,15 @@ def test_nerfstudio_cameras_see_the_points_where_the_images_do(
     gray = np.full((n, 3), 90, np.uint8)
     zeros = np.zeros(n, int)
     ones = np.ones(n)
-    cloud = PointCloud(views.points_in_base, gray, ones, 0 * ones, zeros, zeros, np.zeros((1, 3)))
+    cloud = PointCloud(
+        points_in_base=views.points_in_base,
+        color=gray,
+        confidence=ones,
+        margin=0 * ones,
+        label=zeros,
+        image=zeros,
+        camera_centers_in_base=np.zeros((1, 3)),
+    )
     write_nerfstudio(out, views, cloud, Provenance("base_link"), undistorted, link=not undistorted)
     content = json.loads((out / "transforms.json").read_text())
     assert content["about"]["frame"] == "base_link" and content["about"]["unit"] == "m"
@@ -402,7 +413,12 @@ def with_others(views: "PosedImages", tmp_path: Path) -> "list[PosedImages]":
         np.repeat(views.base_from_camera[:1] @ second @ second, 2, axis=0),
         (views.base_from_camera[[0, 2]] @ second),
     )
-    nothing = Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3)))
+    nothing = Tracks(
+        image=np.zeros(0, int),
+        x_px=np.zeros((0, 2)),
+        point=np.zeros(0, int),
+        points_in_recon=np.zeros((0, 3)),
+    )
     intrinsics = replace(INTRINSICS, distortion=(0.02, 0.0, 0.0, 0.0, 0.0))
     images = []
     for name in ("fixed", "second"):
@@ -437,7 +453,13 @@ def test_exports_of_several_cameras_come_back(
     else:
         zeros, ones = np.zeros(n, int), np.ones(n)
         cloud = PointCloud(
-            views.points_in_base, np.full((n, 3), 90, np.uint8), ones, ones, zeros, zeros, np.zeros((1, 3))
+            points_in_base=views.points_in_base,
+            color=np.full((n, 3), 90, np.uint8),
+            confidence=ones,
+            margin=ones,
+            label=zeros,
+            image=zeros,
+            camera_centers_in_base=np.zeros((1, 3)),
         )
         write_nerfstudio(out, views, cloud, about, False, link=False, others=with_others)
         names, poses = transforms_json.read_cameras(out / "transforms.json")

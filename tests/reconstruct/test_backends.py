@@ -72,7 +72,7 @@ def test_a_new_back_end_is_one_row(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert with_mine.candidates(with_mine.ReconstructOptions())[0] == "mine"
-    named = with_mine.ReconstructOptions("mine", weights=str(tmp_path))
+    named = with_mine.ReconstructOptions(backend="mine", weights=str(tmp_path))
     assert with_mine.candidates(named) == ("mine",) and with_mine.weights_of(named).path == tmp_path
     assert "mine" in str(with_mine.BackendName) and "mine" not in str(with_mine.PairBackendName)
     with pytest.raises(InputError, match="give --backend mine or mast3r or"):
@@ -94,7 +94,12 @@ def test_a_new_back_end_is_one_row(
 
 
 def test_a_row_is_called_with_the_options_as_it_takes_them(with_mine: ModuleType) -> None:
-    capture = Capture(Path(), ("b.png", "a.png"), np.tile(np.eye(4), (2, 1, 1)), (64, 48))
+    capture = Capture(
+        folder=Path(),
+        images=("b.png", "a.png"),
+        base_from_gripper=np.tile(np.eye(4), (2, 1, 1)),
+        image_size=(64, 48),
+    )
     seen = []
     with_mine._of_capture = lambda found, order: seen.append((found, order.tolist()))
     with_mine.reconstruct(capture, with_mine.ReconstructOptions())
@@ -111,13 +116,15 @@ def test_the_best_whose_weights_are_here_comes_first(
     assert candidates(ReconstructOptions())[0] == "mast3r"
     monkeypatch.setattr(Backend, "is_installed", lambda self: self.name != "mapanything")
     assert candidates(ReconstructOptions()) == ("mast3r", "dust3r", "colmap", "direct")
-    assert candidates(ReconstructOptions("colmap")) == ("colmap",)
+    assert candidates(ReconstructOptions(backend="colmap")) == ("colmap",)
 
 
 def test_without_weights_the_command_that_gets_them_is_said_in_a_line(
     present: set[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    capture = Capture(Path(), ("a.png",), np.eye(4)[None], (64, 48))
+    capture = Capture(
+        folder=Path(), images=("a.png",), base_from_gripper=np.eye(4)[None], image_size=(64, 48)
+    )
     for installed, words in (
         (
             False,
@@ -128,7 +135,7 @@ def test_without_weights_the_command_that_gets_them_is_said_in_a_line(
         monkeypatch.setattr(Backend, "is_installed", lambda self, there=installed: there)
         monkeypatch.setattr(backends, "cached_files", lambda *of: [])
         with pytest.raises(InputError, match=words) as caught:
-            backends.reconstruct(capture, ReconstructOptions("da3"))
+            backends.reconstruct(capture, ReconstructOptions(backend="da3"))
         assert "\n" not in str(caught.value)
 
 
@@ -138,11 +145,11 @@ def test_an_option_of_one_back_end_selects_it(present: set[str]) -> None:
         ReconstructOptions(predictions=Path("pairs.npz")): ("predictions",),
         ReconstructOptions(cameras=Path("sparse")): ("given",),
         ReconstructOptions(board="chessboard:9x6:0.025"): ("colmap", "marker"),
-        ReconstructOptions("marker", board="chessboard:9x6:0.025"): ("marker",),
+        ReconstructOptions(backend="marker", board="chessboard:9x6:0.025"): ("marker",),
         ReconstructOptions(board="chessboard:9x6:0.025", cameras=Path("sparse")): ("given", "marker"),
         ReconstructOptions(weights="folder"): ("dust3r", "colmap"),
         ReconstructOptions(weights="folder", pair_graph="window"): ("dust3r", "colmap"),
-        ReconstructOptions("mast3r", weights="folder"): ("mast3r",),
+        ReconstructOptions(backend="mast3r", weights="folder"): ("mast3r",),
     }.items():
         assert candidates(options) == names
 
@@ -150,10 +157,10 @@ def test_an_option_of_one_back_end_selects_it(present: set[str]) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (ReconstructOptions("colmap", predictions=Path("p.npz")), "--predictions p.npz: .*--backend predictions"),
-        (ReconstructOptions("predictions", weights="p.npz"), "--weights p.npz: .*mast3r or dust3r or da3 or .*mapany"),
-        (ReconstructOptions("direct", board="b"), "--board b: .*give --backend colmap or moge or marker or given"),
-        (ReconstructOptions("mapanything", pair_graph="window"), "--pair-graph window: .*mast3r or dust3r"),
+        (ReconstructOptions(backend="colmap", predictions=Path("p.npz")), "--predictions p.npz: .*predictions"),
+        (ReconstructOptions(backend="predictions", weights="p.npz"), "--weights p.npz: .*mast3r or dust3r or .*mapany"),
+        (ReconstructOptions(backend="direct", board="b"), "--board b: .*colmap or moge or marker or given"),
+        (ReconstructOptions(backend="mapanything", pair_graph="window"), "--pair-graph window: .*mast3r or dust3r"),
         (ReconstructOptions(pair_graph="robot"), r"--pair-graph robot: .*\(colmap, direct\) does not use it"),
         (ReconstructOptions(board="b", predictions=Path("c")), r"--board b: .*\(predictions\) does not use it"),
         (ReconstructOptions(weights="w", predictions=Path("p")), "--weights and --predictions select"),
@@ -172,24 +179,32 @@ def test_what_a_back_end_does_not_use_is_refused_in_a_line(
     ("name", "flag"), [("marker", "--board"), ("predictions", "--predictions"), ("given", "--cameras")]
 )
 def test_a_back_end_without_its_input_shows_which_option_names_it(name: str, flag: str) -> None:
-    capture = Capture(Path(), ("a.png",), np.eye(4)[None], (64, 48))
+    capture = Capture(
+        folder=Path(), images=("a.png",), base_from_gripper=np.eye(4)[None], image_size=(64, 48)
+    )
     with pytest.raises(InputError, match=f"--backend {name}: name the .* with {flag}[ ,]"):
-        backends.reconstruct(capture, ReconstructOptions(name))
+        backends.reconstruct(capture, ReconstructOptions(backend=name))
 
 
 def test_a_second_back_end_is_spared_what_was_meant_for_the_first() -> None:
     options = ReconstructOptions(weights="folder", pair_graph="window", seed=3, memory_gb=4.0)
     assert for_backend(options, "dust3r") == replace(options, backend="dust3r")
-    assert for_backend(options, "colmap") == ReconstructOptions("colmap", seed=3, memory_gb=4.0)
+    assert for_backend(options, "colmap") == ReconstructOptions(backend="colmap", seed=3, memory_gb=4.0)
 
 
 def test_the_captures_own_cameras_are_taken_where_nothing_else_is_asked_for(tmp_path: Path) -> None:
-    capture = Capture(tmp_path, ("a.png",), np.eye(4)[None], (64, 48), cameras=tmp_path / "sparse")
-    for options in (ReconstructOptions(), ReconstructOptions("given"), ReconstructOptions(board="b")):
+    capture = Capture(
+        folder=tmp_path,
+        images=("a.png",),
+        base_from_gripper=np.eye(4)[None],
+        image_size=(64, 48),
+        cameras=tmp_path / "sparse",
+    )
+    for options in (ReconstructOptions(), ReconstructOptions(backend="given"), ReconstructOptions(board="b")):
         assert with_cameras_of(capture, options) == replace(options, cameras=tmp_path / "sparse")
         assert candidates(with_cameras_of(capture, options))[0] == "given"
     for options in (
-        ReconstructOptions("colmap"),
+        ReconstructOptions(backend="colmap"),
         ReconstructOptions(cameras=Path("mine")),
     ):
         assert with_cameras_of(capture, options) == options
@@ -198,7 +213,7 @@ def test_the_captures_own_cameras_are_taken_where_nothing_else_is_asked_for(tmp_
 def test_options_survive_a_run_folder(tmp_path: Path) -> None:
     options = ReconstructOptions(predictions=tmp_path / "p.npz", seed=2)
     state = run_folder.state_of(
-        Capture(tmp_path, (), np.zeros((0, 4, 4)), (64, 48)),
+        Capture(folder=tmp_path, images=(), base_from_gripper=np.zeros((0, 4, 4)), image_size=(64, 48)),
         run_folder.MadeWith(reconstruct=options, calibrate=CalibrateOptions()),
     )
     folder = run_folder.RunFolder(tmp_path)
@@ -207,7 +222,7 @@ def test_options_survive_a_run_folder(tmp_path: Path) -> None:
 
 
 def test_a_changed_file_of_predictions_is_another_input(tmp_path: Path) -> None:
-    capture = Capture(tmp_path, (), np.zeros((0, 4, 4)), (64, 48))
+    capture = Capture(folder=tmp_path, images=(), base_from_gripper=np.zeros((0, 4, 4)), image_size=(64, 48))
     for name in ("predictions", "cameras"):
         path = tmp_path / name
         path.write_text("one")

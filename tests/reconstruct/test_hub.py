@@ -199,10 +199,10 @@ def test_a_run_without_weights_names_the_command_and_asks_no_network(monkeypatch
         monkeypatch.setattr(huggingface_hub, name, fetch)
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", "/nowhere")
     for options, command in (
-        (ReconstructOptions("dust3r"), "jcr models get dust3r downloads"),
-        (ReconstructOptions("da3"), "jcr models get da3 downloads"),
-        (ReconstructOptions("mast3r", weights="owner/name"), "jcr models get owner/name downloads"),
-        (ReconstructOptions("mast3r", weights="owner/name.pth"), "give a file, a folder or a hub id"),
+        (ReconstructOptions(backend="dust3r"), "jcr models get dust3r downloads"),
+        (ReconstructOptions(backend="da3"), "jcr models get da3 downloads"),
+        (ReconstructOptions(backend="mast3r", weights="owner/name"), "jcr models get owner/name downloads"),
+        (ReconstructOptions(backend="mast3r", weights="owner/name.pth"), "give a file, a folder or a hub id"),
     ):
         with pytest.raises(InputError, match=command):
             weights_of(options)

@@ -63,7 +63,12 @@ def test_exact_pointmaps_give_matches_exact_below_a_pixel(table: tuple[ndarray, 
     tracks = tracks_from_pointmaps(recon_from_camera, points, confidence, lambda x_px: 2 * x_px + 3)
     assert_sound(tracks)
     errors = pixel_errors(
-        Tracks(tracks.image, (tracks.x_px - 3) / 2, tracks.point, tracks.points_in_recon),
+        Tracks(
+            image=tracks.image,
+            x_px=(tracks.x_px - 3) / 2,
+            point=tracks.point,
+            points_in_recon=tracks.points_in_recon,
+        ),
         recon_from_camera,
         FOCAL,
         (WIDTH / 2, HEIGHT / 2),
@@ -87,7 +92,11 @@ def test_pairs_at_any_scale_give_the_same_tracks(table: tuple[ndarray, ndarray])
         for side in (0, 1)
     )
     one = np.ones(own.shape[:3], np.float32)
-    tracks = tracks_from_pairs(PairPredictions(edges, own, one, other, one), points, lambda x_px: x_px)
+    tracks = tracks_from_pairs(
+        PairPredictions(edges=edges, pts3d=own, conf=one, pts3d_in_other_view=other, conf2=one),
+        points,
+        lambda x_px: x_px,
+    )
     alone = tracks_from_pointmaps(recon_from_camera, points, np.ones(points.shape[:3]), lambda x_px: x_px)
     # A second order of a pair can only veto.
     assert 0.98 * len(alone.image) < len(tracks.image) <= len(alone.image)

@@ -63,7 +63,13 @@ def capture(tmp_path: Path, truth: dict[str, Any]) -> Capture:
     focal = 5 * truth["gt_focal"]
     intrinsics = Intrinsics(focal, focal, 2.5 * WIDTH + 2, 2.5 * HEIGHT + 2, 5 * WIDTH, 5 * HEIGHT)
     base_from_gripper = truth["gt_poses"] @ inverse(gripper_from_camera)
-    return Capture(tmp_path, names, base_from_gripper, (5 * WIDTH, 5 * HEIGHT), intrinsics)
+    return Capture(
+        folder=tmp_path,
+        images=names,
+        base_from_gripper=base_from_gripper,
+        image_size=(5 * WIDTH, 5 * HEIGHT),
+        intrinsics=intrinsics,
+    )
 
 
 def pair_arrays(truth: dict[str, Any]) -> dict[str, ndarray]:
@@ -146,7 +152,11 @@ def test_pointmaps_in_one_frame_keep_their_poses(
 ) -> None:
     if not known:
         capture = Capture(
-            capture.folder, capture.images, capture.base_from_gripper, capture.image_size, intrinsics=None
+            folder=capture.folder,
+            images=capture.images,
+            base_from_gripper=capture.base_from_gripper,
+            image_size=capture.image_size,
+            intrinsics=None,
         )
     result = reconstructed(capture, pointmap_arrays(truth))
     assert_poses(result, truth["gt_poses"], millimetres=1e-3, degrees=1e-4)
@@ -160,7 +170,13 @@ def test_a_distorted_intrinsics_is_used_with_intrinsics_and_given_up_without(
     capture: Capture, truth: dict[str, Any]
 ) -> None:
     intrinsics = Intrinsics(600.0, 600.0, 320.0, 240.0, 640, 480, (-0.1, 0.02, 0.0, 0.0, 0.0))
-    distorted = Capture(capture.folder, capture.images, capture.base_from_gripper, (640, 480), intrinsics)
+    distorted = Capture(
+        folder=capture.folder,
+        images=capture.images,
+        base_from_gripper=capture.base_from_gripper,
+        image_size=(640, 480),
+        intrinsics=intrinsics,
+    )
     seen = np.array([truth["gt_focal"], truth["gt_focal"], WIDTH / 2, HEIGHT / 2])
     arrays = pointmap_arrays(truth)
     assert reconstructed(distorted, arrays | {"intrinsics": seen}).intrinsics == intrinsics
@@ -222,7 +238,12 @@ def test_a_network_gives_the_same_record(
     result = dust3r.reconstruct_dust3r(capture, options)
     assert result.backend == "dust3r" and "weights X: licence Y" in result.notes
     assert_poses(result, truth["gt_poses"], millimetres=3, degrees=0.3)
-    unknown = Capture(capture.folder, capture.images, capture.base_from_gripper, capture.image_size)
+    unknown = Capture(
+        folder=capture.folder,
+        images=capture.images,
+        base_from_gripper=capture.base_from_gripper,
+        image_size=capture.image_size,
+    )
     found = dust3r.reconstruct_dust3r(unknown, options).intrinsics
     # The principal point stays where the network has it; the focal length is aligned.
     assert found.fx == pytest.approx(5 * truth["gt_focal"], rel=0.01)
@@ -296,7 +317,13 @@ def test_an_any_view_model_is_given_our_intrinsics_and_the_robot_names_what_it_d
 
     rotated = capture.base_from_gripper.copy()
     rotated[1, :3, :3] = Rotation.from_euler("y", 20, degrees=True).as_matrix() @ rotated[1, :3, :3]
-    off = Capture(capture.folder, capture.images, rotated, capture.image_size, capture.intrinsics)
+    off = Capture(
+        folder=capture.folder,
+        images=capture.images,
+        base_from_gripper=rotated,
+        image_size=capture.image_size,
+        intrinsics=capture.intrinsics,
+    )
     found = reconstruct_views_at_once(off, options, predict=partial(mapanything.predict, model))
     named = [note for note in found.warnings if "check its pose" in note]
     assert len(named) == 1 and named[0].startswith("1.png: its angles to the other views differ")
@@ -306,4 +333,4 @@ def test_mapanything_that_is_not_installed_shows_how_to_get_it(capture: Capture)
     if importlib.util.find_spec("mapanything"):
         pytest.skip("the mapanything package is installed here")
     with pytest.raises(InputError, match="pip install git"):
-        backends.reconstruct(capture, ReconstructOptions("mapanything"))
+        backends.reconstruct(capture, ReconstructOptions(backend="mapanything"))

@@ -66,7 +66,13 @@ def test_a_distorted_capture_is_undistorted_and_pixels_find_their_way_back(tmp_p
     v, u = np.mgrid[:480, :640]
     image = sum(np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * 5.0**2)) for x, y in spots)
     Image.fromarray(np.repeat((255 * image).astype(np.uint8)[..., None], 3, 2)).save(tmp_path / "0.png")
-    capture = Capture(tmp_path, ("0.png",), np.eye(4)[None], (640, 480), intrinsics)
+    capture = Capture(
+        folder=tmp_path,
+        images=("0.png",),
+        base_from_gripper=np.eye(4)[None],
+        image_size=(640, 480),
+        intrinsics=intrinsics,
+    )
 
     prepared = prepare_images(capture)
     assert prepared.intrinsics is not None
@@ -83,6 +89,14 @@ def test_a_distorted_capture_is_undistorted_and_pixels_find_their_way_back(tmp_p
 def test_a_folding_distortion_is_dropped_and_said(tmp_path: Path) -> None:
     Image.new("RGB", (640, 480)).save(tmp_path / "0.png")
     intrinsics = Intrinsics(400.0, 400.0, 320.0, 240.0, 640, 480, (-0.9, 0.0, 0.0, 0.0, 0.0))
-    prepared = prepare_images(Capture(tmp_path, ("0.png",), np.eye(4)[None], (640, 480), intrinsics))
+    prepared = prepare_images(
+        Capture(
+            folder=tmp_path,
+            images=("0.png",),
+            base_from_gripper=np.eye(4)[None],
+            image_size=(640, 480),
+            intrinsics=intrinsics,
+        )
+    )
     assert "folds over" in prepared.warnings[0]
     assert prepared.intrinsics_of_capture == Intrinsics(400.0, 400.0, 320.0, 240.0, 640, 480)

@@ -82,7 +82,13 @@ def run(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     reported = truth.base_from_gripper.copy()
     reported[WRONG, :3, 3] += [0.05, 0.0, 0.03]
     intrinsics = truth.intrinsics
-    capture = Capture(folder, tuple(names), reported, (intrinsics.width, intrinsics.height), intrinsics)
+    capture = Capture(
+        folder=folder,
+        images=tuple(names),
+        base_from_gripper=reported,
+        image_size=(intrinsics.width, intrinsics.height),
+        intrinsics=intrinsics,
+    )
     reconstruction, label = _cast(truth, tabletop)
     hand_eye = calibrate(capture, reconstruction)
     content = calibration_file(capture, reconstruction, hand_eye, {"reconstruct": 1.0}, "0.0")
@@ -168,10 +174,10 @@ def _cast(truth: Truth, tabletop: Path) -> tuple[Reconstruction, np.ndarray]:
             ),
         ),
         tracks=Tracks(
-            np.concatenate(image),
-            np.concatenate(seen),
-            np.concatenate(point),
-            apply(inverse(base_from_recon), spots) / scale,
+            image=np.concatenate(image),
+            x_px=np.concatenate(seen),
+            point=np.concatenate(point),
+            points_in_recon=apply(inverse(base_from_recon), spots) / scale,
         ),
         backend="cast",
         notes=("a <note> & more",),
@@ -305,8 +311,21 @@ def test_every_camera_of_the_cell_is_in_the_scene(run: RunResult):
     size, poses = run.capture.image_size, run.capture.base_from_gripper
     mount, base = transform(np.eye(3), np.array([0.0, 0.1, 0.0])), transform(np.eye(3), np.array([1.0, 0, 0]))
     others = (
-        CellCamera("second", "gripper", ("a", "b", "c"), size, frame=np.array([0, 2, UNREGISTERED])),
-        CellCamera("other", "gripper", ("a",), size, arm="right", base_from_gripper=poses[:1]),
+        CellCamera(
+            name="second",
+            mount="gripper",
+            images=("a", "b", "c"),
+            image_size=size,
+            frame=np.array([0, 2, UNREGISTERED]),
+        ),
+        CellCamera(
+            name="other",
+            mount="gripper",
+            images=("a",),
+            image_size=size,
+            arm="right",
+            base_from_gripper=poses[:1],
+        ),
     )
     found = [
         CameraFound(
@@ -366,7 +385,12 @@ def test_sections_without_a_record_are_left_out(run: RunResult):
 
 def test_cameras_alone_are_reported_without_tracks_points_or_map(run: RunResult):
     capture, result = run.capture, run
-    nothing = Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3)))
+    nothing = Tracks(
+        image=np.zeros(0, int),
+        x_px=np.zeros((0, 2)),
+        point=np.zeros(0, int),
+        points_in_recon=np.zeros((0, 3)),
+    )
     reconstruction = replace(result.reconstruction, backend="marker", tracks=nothing)
     hand_eye = calibrate(capture, reconstruction)
     content = calibration_file(capture, reconstruction, hand_eye, {}, "0.0")

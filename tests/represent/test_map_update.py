@@ -97,7 +97,9 @@ def known_reconstruction(
         image.append(np.full(inside.sum(), k))
         point.append(np.flatnonzero(inside))
         x_px.append(pixel[inside])
-    tracks = Tracks(np.concatenate(image), np.concatenate(x_px), np.concatenate(point), x)
+    tracks = Tracks(
+        image=np.concatenate(image), x_px=np.concatenate(x_px), point=np.concatenate(point), points_in_recon=x
+    )
     reconstruction = Reconstruction(
         image_index=np.arange(views),
         recon_from_camera=recon_from_camera,

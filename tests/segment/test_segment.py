@@ -91,13 +91,13 @@ def cloud_of(
     x = apply(base_from_table, x + rng.normal(0, noise, x.shape))
     n = len(x)
     return PointCloud(
-        x,
-        np.zeros((n, 3), np.uint8),
-        np.ones(n),
-        np.zeros(n),
-        np.zeros(n, int),
-        rng.integers(IMAGES, size=n),
-        apply(base_from_table, EYES),
+        points_in_base=x,
+        color=np.zeros((n, 3), np.uint8),
+        confidence=np.ones(n),
+        margin=np.zeros(n),
+        label=np.zeros(n, int),
+        image=rng.integers(IMAGES, size=n),
+        camera_centers_in_base=apply(base_from_table, EYES),
     )
 
 
@@ -299,7 +299,11 @@ PINHOLE = Intrinsics(60.0, 60.0, 19.5, 14.5, 40, 30)
 
 def labelled_capture(folder: Path, rows: tuple[int, ...] = (0, 1)) -> tuple[Capture, Reconstruction]:
     capture = Capture(
-        folder, ("images/a.png", "images/b.png"), np.stack([np.eye(4)] * 2), (80, 60), INTRINSICS
+        folder=folder,
+        images=("images/a.png", "images/b.png"),
+        base_from_gripper=np.stack([np.eye(4)] * 2),
+        image_size=(80, 60),
+        intrinsics=INTRINSICS,
     )
     m = len(rows)
     grid = np.stack(np.meshgrid(np.linspace(-0.2, 0.2, 40), np.linspace(-0.15, 0.15, 30)), -1)
@@ -308,7 +312,12 @@ def labelled_capture(folder: Path, rows: tuple[int, ...] = (0, 1)) -> tuple[Capt
         image_index=np.array(rows),
         recon_from_camera=np.stack([np.eye(4)] * m),
         intrinsics=INTRINSICS,
-        tracks=Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3))),
+        tracks=Tracks(
+            image=np.zeros(0, int),
+            x_px=np.zeros((0, 2)),
+            point=np.zeros(0, int),
+            points_in_recon=np.zeros((0, 3)),
+        ),
         backend="colmap",
         pointmaps=Pointmaps(
             intrinsics=PINHOLE,

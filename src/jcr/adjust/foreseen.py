@@ -122,7 +122,7 @@ def _seen_points(cameras: Poses, intrinsics: Intrinsics, distance_m: float) -> T
     for i, pose in enumerate(cameras):
         mine = image == i
         x_px[mine] = project(intrinsics, apply(inverse(pose), points[point[mine]]))
-    return Tracks(image, x_px, point, points)
+    return Tracks(image=image, x_px=x_px, point=point, points_in_recon=points)
 
 
 def _on_surface(

@@ -112,12 +112,12 @@ def _camera(name: str, camera: dict[str, Any], capture: Capture, where: str) -> 
     intrinsics = read_intrinsics_of_size(camera.get("intrinsics"), sizes[0], where)
     std = read_std(camera.get("intrinsics_std"), intrinsics, where)
     return CellCamera(
-        name,
-        camera["mount"],
-        tuple(images),
-        sizes[0],
-        intrinsics,
-        std,
+        name=name,
+        mount=camera["mount"],
+        images=tuple(images),
+        image_size=sizes[0],
+        intrinsics=intrinsics,
+        intrinsics_std=std,
         frame=frame,
         arm=None if arm is None else str(arm),
         base_from_gripper=poses,

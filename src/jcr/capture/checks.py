@@ -41,7 +41,13 @@ def checked_capture(
     check_metres(base_from_gripper, where)
     size = _common_size(folder, images)
     orientation = _common_orientation(folder, images)
-    return Capture(folder, tuple(images), base_from_gripper, size, orientation=orientation)
+    return Capture(
+        folder=folder,
+        images=tuple(images),
+        base_from_gripper=base_from_gripper,
+        image_size=size,
+        orientation=orientation,
+    )
 
 
 def require_images(folder: Path, images: Sequence[str], where: str) -> None:

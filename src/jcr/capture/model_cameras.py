@@ -104,4 +104,11 @@ def _other(
     (size,) = sizes
     frame = np.array([row_of[camera.moment[k]] for k in in_rig]) if in_rig else None
     mount = "gripper" if in_rig else "base"
-    return CellCamera(name, mount, images, size, camera.intrinsics_of_size(size), frame=frame)
+    return CellCamera(
+        name=name,
+        mount=mount,
+        images=images,
+        image_size=size,
+        intrinsics=camera.intrinsics_of_size(size),
+        frame=frame,
+    )

@@ -98,5 +98,14 @@ def further_cameras(
         (size,) = sizes
         frame = np.searchsorted(rows, found) if camera.mount == "gripper" else None
         intrinsics = camera.intrinsics_of_size(size)
-        out.append(CellCamera(camera.name, camera.mount, tuple(images), size, intrinsics, frame=frame))
+        out.append(
+            CellCamera(
+                name=camera.name,
+                mount=camera.mount,
+                images=tuple(images),
+                image_size=size,
+                intrinsics=intrinsics,
+                frame=frame,
+            )
+        )
     return tuple(out)

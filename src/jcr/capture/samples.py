@@ -68,7 +68,14 @@ def _pairs(
     check_metres(gripper, str(path))
     check_metres(marker, f"{path}: the marker")
     names = tuple(f"sample {k}" for k in range(1, len(gripper) + 1))
-    return PosePairs(path, names, gripper, inverse(marker), True, notes)
+    return PosePairs(
+        source=path,
+        images=names,
+        base_from_gripper=gripper,
+        recon_from_camera=inverse(marker),
+        is_metric=True,
+        notes=notes,
+    )
 
 
 def _row_major(entry: Any, key: str, where: str) -> Float[ndarray, "4 4"]:

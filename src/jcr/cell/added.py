@@ -55,7 +55,9 @@ def camera_of(name: str, files: Sequence[Path], intrinsics: Path | None, taken: 
             content = content["intrinsics"]
         known = read_intrinsics_of_size(content, sizes[0], f"{files[0]}, {intrinsics}")
     images = tuple(str(file.resolve()) for file in files)
-    return CellCamera(name, "base", images, sizes[0], known, folder=Path("/"))
+    return CellCamera(
+        name=name, mount="base", images=images, image_size=sizes[0], intrinsics=known, folder=Path("/")
+    )
 
 
 def keep_camera(run_folder: Path, capture: Capture, camera: CellCamera) -> CellCamera:

@@ -12,7 +12,7 @@ from jcr.reconstruct.backends import BACKENDS, Backend, weights_command
 from jcr.reconstruct.hub import HUB_FILES, HUB_ID, download
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """List the back ends with their licences, and what is installed on this machine; or download weights.
 

@@ -51,7 +51,7 @@ def main(arguments: Arguments) -> int:
     if arguments.out.suffix != ".npz":
         raise InputError(f"{arguments.out}: predictions are written as npz; give a name that ends in .npz")
     capture = read_capture(arguments.capture)
-    asked = ReconstructOptions(arguments.backend, device=arguments.device, weights=arguments.weights)
+    asked = ReconstructOptions(backend=arguments.backend, device=arguments.device, weights=arguments.weights)
     options = Dust3rOptions(weights=weights_of(asked), device=device_of(asked), pairs=arguments.pairs)
     with progress_bars() as progress:
         _, predictions, notes = predict(capture, options, progress)

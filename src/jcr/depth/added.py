@@ -197,4 +197,9 @@ def _with_projections(
         image.append(np.full(inside.sum(), row))
         x_px.append(np.stack([u, v], -1)[inside].astype(float))
         point.append(np.flatnonzero(inside))
-    return Tracks(np.concatenate(image), np.concatenate(x_px), np.concatenate(point), tracks.points_in_recon)
+    return Tracks(
+        image=np.concatenate(image),
+        x_px=np.concatenate(x_px),
+        point=np.concatenate(point),
+        points_in_recon=tracks.points_in_recon,
+    )

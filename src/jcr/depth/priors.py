@@ -46,7 +46,7 @@ _PAIRS = 600
 """Pixels of an image whose brightness is compared with other images'."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Prior:
     """What the planes say of one image, or of all."""
 

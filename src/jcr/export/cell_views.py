@@ -12,7 +12,9 @@ from jcr.export.views import PosedImages
 from jcr.geometry import inverse
 from jcr.records import Capture, CellCamera, Tracks
 
-NOTHING = Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3)))
+NOTHING = Tracks(
+    image=np.zeros(0, int), x_px=np.zeros((0, 2)), point=np.zeros(0, int), points_in_recon=np.zeros((0, 3))
+)
 
 
 def posed_cameras(

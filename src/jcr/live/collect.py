@@ -39,7 +39,7 @@ ENOUGH_IMAGES, MOST_IMAGES = 12, 40
 """Of a capture, and of one that ends when it is accurate enough."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CollectOptions:
     """How images are taken."""
 
@@ -89,14 +89,14 @@ def collect(
     the next pose in the arm's own `words`. live.html in the folder shows how it goes. `typed` are commands, from another
     thread. The finished calibration is returned where the capture ended because it is accurate.
     """
-    taking = _Taking(live, camera, options, tell, words or ArmWords())
+    taking = _Taking(live=live, camera=camera, options=options, tell=tell, words=words or ArmWords())
     if calibration is not None:
         taking.worker = CalibrationWorker(calibration, taking.events.put, options.until_accurate)
     with Window(live, camera.latest):
         return taking.until_the_end(asks, typed)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _Taking:
     """One capture while it is taken."""
 
@@ -271,4 +271,4 @@ class _Taking:
 
 def _as_kept(live: LiveFolder, name: str) -> Still:
     image = read_image(live.folder / name)
-    return Still(image, grid(image), brightness_and_sharpness(image)[1])
+    return Still(image=image, grid=grid(image), sharpness=brightness_and_sharpness(image)[1])

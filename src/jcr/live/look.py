@@ -19,7 +19,7 @@ a shift of one pixel in 640 of a textured tabletop 3."""
 GRID_PX = 160
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Still:
     """An image that was kept, and what later ones are held against."""
 
@@ -57,7 +57,9 @@ def still_image(frames: Iterator[Frame], kept: list[Still], patience_s: float) -
         elif any(np.abs(now - one.grid).mean() < STILL for one in kept):
             reason = "the gripper moved but the image did not change; is the stream frozen, or is it another camera?"
         else:
-            return Still(frame.image, now, sharpness, frame.depth_mm, frame.time_s)
+            return Still(
+                image=frame.image, grid=now, sharpness=sharpness, depth_mm=frame.depth_mm, time_s=frame.time_s
+            )
         if frame.time_s > end:
             return reason
 

@@ -19,7 +19,7 @@ LEAST_ACROSS = 0.25
 ROUNDS = 20
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RotationOfX:
     """gripper_from_camera's rotation, how sure it is, and which pairs say so."""
 
@@ -103,7 +103,13 @@ def _refined(
     sigma = max(1.48 * float(np.median(gap[agreeing])) / np.sqrt(3), np.radians(0.02))
     if np.linalg.eigvalsh(information)[0] < LEAST_ACROSS**2 * 0.1:
         return None
-    return RotationOfX(x, sigma**2 * np.linalg.inv(information), agreeing, gap, sigma)
+    return RotationOfX(
+        rotation=x,
+        covariance=sigma**2 * np.linalg.inv(information),
+        agreeing=agreeing,
+        residual=gap,
+        sigma=sigma,
+    )
 
 
 def _gap(

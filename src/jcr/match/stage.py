@@ -40,7 +40,7 @@ GUESSED_AT_ONCE = 6
 GUESSED_AT_MOST = 30
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Matched:
     """What matching found."""
 
@@ -59,7 +59,7 @@ class Matched:
     """As those of records.Reconstruction."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _Search:
     """What is known while pairs are matched."""
 
@@ -201,7 +201,7 @@ def match_with_robot(
     n = len(base_from_gripper)
     motion = motions(base_from_gripper)
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
-    search = _Search(matcher, motion, View.of(matcher.x_px, intrinsics), known)
+    search = _Search(matcher=matcher, motion=motion, view=View.of(matcher.x_px, intrinsics), known=known)
     everything = all_pairs(n) if n <= matcher.every_pair else near_pairs(motion, NEIGHBOURS)
     at_once = n <= FEW and not matcher.minds_roll
     first = everything if at_once else near_pairs(motion, FIRST_NEIGHBOURS)
@@ -217,7 +217,14 @@ def match_with_robot(
         found = _with_intrinsics(search, intrinsics)
     if found.of_x is None:
         notes = _beside(search, found, names, original)
-        return Matched(search.geometries, None, search.view.intrinsics, None, search.still, notes)
+        return Matched(
+            geometries=search.geometries,
+            gate=None,
+            intrinsics=search.view.intrinsics,
+            upright=None,
+            still=search.still,
+            notes=notes,
+        )
     upright = robot.rolls(robot.base_from_camera_rotations(base_from_gripper, found.of_x))
     search.match(seen_in_common(search.view, found, motion) or everything, upright)
     found = search.gate(found)
@@ -236,7 +243,15 @@ def match_with_robot(
     kept = {key: geometry for key, geometry in search.geometries.items() if key in believed}
     notes = (*_left_out(found), *_beside(search, found, names, original))
     warnings = _wrong_poses(stale, names)
-    return Matched(kept, found, search.view.intrinsics, upright, search.still, notes, warnings)
+    return Matched(
+        geometries=kept,
+        gate=found,
+        intrinsics=search.view.intrinsics,
+        upright=upright,
+        still=search.still,
+        notes=notes,
+        warnings=warnings,
+    )
 
 
 def _without_partners(found: Gate, count: int) -> set[int]:

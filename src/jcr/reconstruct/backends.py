@@ -116,7 +116,7 @@ def _given(capture: Capture, options: "ReconstructOptions", progress: Progress |
     return reconstruct_given(capture, options.cameras, made, progress)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Backend:
     """A row of the table."""
 
@@ -183,9 +183,9 @@ BACKENDS: dict[str, Backend] = {
     row.name: row
     for row in (
         Backend(
-            "mast3r",
-            _dust3r,
-            f"{CC_BY_NC_SA}, and the licences of its training data (its CHECKPOINTS_NOTICE)",
+            name="mast3r",
+            reconstruct=_dust3r,
+            licence=f"{CC_BY_NC_SA}, and the licences of its training data (its CHECKPOINTS_NOTICE)",
             metric=True,
             auto=True,
             tests_camera=False,
@@ -199,9 +199,9 @@ BACKENDS: dict[str, Backend] = {
             commercial=False,
         ),
         Backend(
-            "dust3r",
-            _dust3r,
-            CC_BY_NC_SA,
+            name="dust3r",
+            reconstruct=_dust3r,
+            licence=CC_BY_NC_SA,
             auto=True,
             tests_camera=False,
             options=("weights", "pair_graph"),
@@ -215,18 +215,18 @@ BACKENDS: dict[str, Backend] = {
             commercial=False,
         ),
         Backend(
-            "colmap",
-            _colmap,
-            "BSD-3-Clause; XFeat and LightGlue Apache-2.0, ALIKED BSD-3-Clause",
+            name="colmap",
+            reconstruct=_colmap,
+            licence="BSD-3-Clause; XFeat and LightGlue Apache-2.0, ALIKED BSD-3-Clause",
             auto=True,
             options=("features", "board"),
             selected_by="features",
             accuracy="0.20 mm and 0.036° on the bundled capture (jcr docs results/run)",
         ),
         Backend(
-            "da3",
-            _views_at_once,
-            "Apache-2.0",
+            name="da3",
+            reconstruct=_views_at_once,
+            licence="Apache-2.0",
             auto=True,
             tests_camera=False,
             options=("weights",),
@@ -240,9 +240,9 @@ BACKENDS: dict[str, Backend] = {
             cost=(1.0, 0.15, 5.5, 0.2),
         ),
         Backend(
-            "da3-small",
-            _views_at_once,
-            "Apache-2.0",
+            name="da3-small",
+            reconstruct=_views_at_once,
+            licence="Apache-2.0",
             auto=True,
             tests_camera=False,
             options=("weights",),
@@ -256,9 +256,9 @@ BACKENDS: dict[str, Backend] = {
             cost=(0.35, 0.09, 2.4, 0.05),
         ),
         Backend(
-            "mapanything",
-            _views_at_once,
-            "Apache-2.0",
+            name="mapanything",
+            reconstruct=_views_at_once,
+            licence="Apache-2.0",
             metric=True,
             auto=True,
             tests_camera=False,
@@ -271,18 +271,18 @@ BACKENDS: dict[str, Backend] = {
             cost=(5.0, 0.4, 20.0, 4.0),
         ),
         Backend(
-            "direct",
-            _direct,
-            "Apache-2.0",
+            name="direct",
+            reconstruct=_direct,
+            licence="Apache-2.0",
             auto=True,
             tests_camera=False,
             accuracy="0.10 mm and 0.012° on printed, 0.29 mm and 0.023° on plain simulated tables "
             "(jcr docs plain-tables)",
         ),
         Backend(
-            "moge",
-            _moge,
-            "MIT",
+            name="moge",
+            reconstruct=_moge,
+            licence="MIT",
             metric=True,
             options=("weights", "board"),
             hub_id="Ruicheng/moge-2-vitl",
@@ -294,17 +294,17 @@ BACKENDS: dict[str, Backend] = {
             download_gb=1.3,
         ),
         Backend(
-            "marker",
-            _marker,
-            "Apache-2.0",
+            name="marker",
+            reconstruct=_marker,
+            licence="Apache-2.0",
             metric=True,
             options=("board",),
             accuracy="0.7 mm and 0.20° from the reference of a real capture (jcr docs results/real)",
         ),
         Backend(
-            "predictions",
-            _predictions,
-            "your network's",
+            name="predictions",
+            reconstruct=_predictions,
+            licence="your network's",
             metric=None,
             tests_camera=False,
             options=("predictions",),
@@ -313,9 +313,9 @@ BACKENDS: dict[str, Backend] = {
             accuracy="0.74 mm and 0.047° from simulated predictions (jcr docs results/predictions)",
         ),
         Backend(
-            "given",
-            _given,
-            "your reconstruction's",
+            name="given",
+            reconstruct=_given,
+            licence="your reconstruction's",
             options=("cameras", "board"),
             selected_by="cameras",
         ),
@@ -342,7 +342,7 @@ else:
     PairBackendName = Literal[tuple(row.name for row in BACKENDS.values() if "pair_graph" in row.options)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ReconstructOptions:
     """What turns images into camera poses."""
 

@@ -87,7 +87,12 @@ def _rows(names: Sequence[str]) -> Callable[[str], int | None]:
 def _own_tracks(cameras: Path, names: Sequence[str], size: tuple[int, int]) -> Tracks:
     """The observations that a COLMAP model holds; none for a transforms.json."""
     if not cameras.is_dir():
-        return Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3)))
+        return Tracks(
+            image=np.zeros(0, int),
+            x_px=np.zeros((0, 2)),
+            point=np.zeros(0, int),
+            points_in_recon=np.zeros((0, 3)),
+        )
     model = colmap_model.read_model(cameras)
     id_of = {model.image(image_id).name: image_id for image_id in model.reg_image_ids()}
     return tracks_of(model, [id_of[name] for name in names], size)

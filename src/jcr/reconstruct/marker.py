@@ -241,4 +241,10 @@ def _tracks(sightings: Sequence[Sequence[Sighting]], bodies: dict[int, Float[nda
                 image.append(row)
                 x_px.append(s.x_px[k])
                 point.append(place[s.body, index])
-    return Tracks(np.array(image), np.array(x_px), np.array(point), np.array(points), from_board=True)
+    return Tracks(
+        image=np.array(image),
+        x_px=np.array(x_px),
+        point=np.array(point),
+        points_in_recon=np.array(points),
+        from_board=True,
+    )

@@ -150,7 +150,9 @@ def _images(
             base_from_gripper=capture.base_from_gripper[ordered],
         )
         colors = read_colors(part, grid, intrinsics, pinhole)
-    return PreparedImages(colors, grid, intrinsics, pinhole, warnings)
+    return PreparedImages(
+        colors=colors, grid=grid, intrinsics_of_capture=intrinsics, pinhole=pinhole, warnings=warnings
+    )
 
 
 def _plain_grid(original: tuple[int, int], size: tuple[int, int], source: str) -> ImageGrid:

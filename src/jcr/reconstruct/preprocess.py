@@ -92,7 +92,7 @@ def image_grid(
     return ImageGrid(original_size, resized, corner, (2 * half[0], 2 * half[1]))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PreparedImages:
     """A capture's images as the network reads them."""
 
@@ -134,7 +134,11 @@ def prepare_images(
         pinhole = pinhole_inside(intrinsics, max(intrinsics.width, intrinsics.height))
     grid = grid_of(capture.image_size if pinhole is None else (pinhole.width, pinhole.height))
     return PreparedImages(
-        read_colors(capture, grid, intrinsics, pinhole), grid, intrinsics, pinhole, warnings
+        colors=read_colors(capture, grid, intrinsics, pinhole),
+        grid=grid,
+        intrinsics_of_capture=intrinsics,
+        pinhole=pinhole,
+        warnings=warnings,
     )
 
 

@@ -154,7 +154,7 @@ def read_reconstruction(path: Path) -> Reconstruction:
             recon_from_camera=file["recon_from_camera"],
             intrinsics=about.intrinsics.record(),
             tracks=Tracks(
-                *(file[f"track_{name}"] for name in OF_TRACKS if name != "std_px"),
+                **{name: file[f"track_{name}"] for name in OF_TRACKS if name != "std_px"},
                 from_pointmaps=bool(file["tracks_from_pointmaps"]),
                 from_board=bool(file["tracks_from_board"])
                 if about.format == FORMAT

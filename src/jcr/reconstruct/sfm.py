@@ -195,7 +195,9 @@ def matched_pairs(
     if base_from_gripper is None:
         n = len(matcher.x_px)
         pairs = all_pairs(n)
-        matched = Matched(matcher.geometries(pairs, np.zeros((len(pairs), 2))), None, working)
+        matched = Matched(
+            geometries=matcher.geometries(pairs, np.zeros((len(pairs), 2))), gate=None, intrinsics=working
+        )
     else:
         matched = match_with_robot(
             matcher,

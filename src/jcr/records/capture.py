@@ -54,7 +54,7 @@ Mount = Literal["gripper", "base"]
 """What a camera is bolted to: the gripper of an arm, or the ground that the arm's base stands on."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CellCamera:
     """A further camera of the robot's cell, and its images."""
 
@@ -81,7 +81,7 @@ class CellCamera:
         return self.mount == "base" and self.frame is not None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Capture:
     """Images of one scene and the gripper pose at each, checked on reading."""
 
@@ -139,7 +139,7 @@ class Capture:
         return table(f"capture {self.source or self.folder}", rows, "; ".join(self.notes))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PosePairs:
     """Gripper and camera poses of the same instants, the cameras found by somebody else: no image is needed."""
 

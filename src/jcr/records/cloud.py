@@ -9,7 +9,7 @@ from numpy import ndarray
 from jcr.records.reconstruction import PRIOR
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PointCloud:
     """Confident points in the base frame, with the rays that saw them."""
 

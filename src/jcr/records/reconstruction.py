@@ -39,7 +39,7 @@ class Boards:
     """Where no body was found, the `--board` that the images seem to show; None where they show none."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Tracks:
     """Observations of common 3D points, for bundle adjustment, whatever back end made them."""
 

@@ -18,7 +18,7 @@ GIMBAL_LOCK = np.radians(89.9)
 """Pitch beyond which roll and yaw rotate about nearly the same axis."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Notation:
     """A transform, or a part of it, as numbers with one-sigma uncertainties in the same unit."""
 
@@ -50,12 +50,39 @@ def notations(
     names = ("roll", "pitch", "yaw")
     return [
         Notation(
-            "Translation", "m", ("x", "y", "z"), gripper_from_camera[:3, 3], np.sqrt(np.diag(covariance)[:3])
+            name="Translation",
+            unit="m",
+            components=("x", "y", "z"),
+            value=gripper_from_camera[:3, 3],
+            std=np.sqrt(np.diag(covariance)[:3]),
         ),
-        Notation("Quaternion", "", ("x", "y", "z", "w"), quat_xyzw, std_quat, "x, y, z, w: the scalar last"),
-        Notation("Roll, pitch, yaw", "rad", names, rpy, std_rpy, fixed_axes),
-        Notation("Roll, pitch, yaw", "deg", names, np.degrees(rpy), np.degrees(std_rpy), fixed_axes),
-        Notation("Rotation vector", "rad", ("rx", "ry", "rz"), rotvec, std_rotvec, "axis times angle"),
+        Notation(
+            name="Quaternion",
+            unit="",
+            components=("x", "y", "z", "w"),
+            value=quat_xyzw,
+            std=std_quat,
+            note="x, y, z, w: the scalar last",
+        ),
+        Notation(
+            name="Roll, pitch, yaw", unit="rad", components=names, value=rpy, std=std_rpy, note=fixed_axes
+        ),
+        Notation(
+            name="Roll, pitch, yaw",
+            unit="deg",
+            components=names,
+            value=np.degrees(rpy),
+            std=np.degrees(std_rpy),
+            note=fixed_axes,
+        ),
+        Notation(
+            name="Rotation vector",
+            unit="rad",
+            components=("rx", "ry", "rz"),
+            value=rotvec,
+            std=std_rotvec,
+            note="axis times angle",
+        ),
     ]
 
 

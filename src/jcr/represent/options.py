@@ -20,7 +20,7 @@ class CloudOptions:
     """Seed of that draw."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MapOptions:
     """How the map is trained."""
 

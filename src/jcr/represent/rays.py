@@ -22,7 +22,7 @@ NEAR = 2.0
 """Cells before a surface from which half of the negatives along the rays are drawn."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Rays:
     """The cloud on the training device, one row per point."""
 
@@ -40,7 +40,12 @@ class Rays:
     def __getitem__(self, rows: Tensor | slice) -> "Rays":
         targets = {name: target[rows] for name, target in self.targets.items()}
         return Rays(
-            self.x[rows], self.ahead[rows], self.reach[rows], self.weight[rows], self.measured[rows], targets
+            x=self.x[rows],
+            ahead=self.ahead[rows],
+            reach=self.reach[rows],
+            weight=self.weight[rows],
+            measured=self.measured[rows],
+            targets=targets,
         )
 
 
@@ -173,10 +178,10 @@ def workspace_rays(
     if len(cloud.label_names) > 1:
         tensors["label"] = torch.as_tensor(cloud.label[inside], dtype=torch.int64, device=device)
     return Rays(
-        tensor(x),
-        tensor(toward / distance),
-        tensor(reach[:, None]),
-        tensor(weight / weight.mean()),
-        tensor(measured),
-        tensors,
+        x=tensor(x),
+        ahead=tensor(toward / distance),
+        reach=tensor(reach[:, None]),
+        weight=tensor(weight / weight.mean()),
+        measured=tensor(measured),
+        targets=tensors,
     )

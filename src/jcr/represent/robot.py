@@ -23,7 +23,7 @@ VOXELS, CANDIDATES = 100_000, 1000
 JointValues = Float[ndarray, "*batch dof"] | Mapping[str, Float[ndarray, "*batch"] | float]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RobotJoint:
     """How a link hangs on another."""
 
@@ -41,7 +41,7 @@ class RobotJoint:
     """Of a joint that mimics another: value = multiplier · other + offset."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RobotSpheres:
     """Spheres fixed to links, and the joints, parents before children."""
 
@@ -61,12 +61,12 @@ class RobotSpheres:
             raise InputError(f"links {sorted(unknown)}: the robot has only {', '.join(self.links)}")
         kept = ~np.isin(self.link, [self.links.index(name) for name in names])
         return RobotSpheres(
-            self.links,
-            self.joint_names,
-            self.joints,
-            self.link[kept],
-            self.centers_in_link[kept],
-            self.radii[kept],
+            links=self.links,
+            joint_names=self.joint_names,
+            joints=self.joints,
+            link=self.link[kept],
+            centers_in_link=self.centers_in_link[kept],
+            radii=self.radii[kept],
         )
 
     def centers(self, joint_values: JointValues) -> Float[ndarray, "*batch s 3"]:
@@ -160,12 +160,12 @@ def _load(path: Path, changed_ns: int, excess: float) -> RobotSpheres:
     if not radii:
         raise InputError(f"{path}: no link has a <collision> shape, so nothing can collide")
     return RobotSpheres(
-        links,
-        tuple(robot.actuated_joint_names),
-        joints,
-        np.concatenate(link),
-        np.concatenate(centers),
-        np.concatenate(radii),
+        links=links,
+        joint_names=tuple(robot.actuated_joint_names),
+        joints=joints,
+        link=np.concatenate(link),
+        centers_in_link=np.concatenate(centers),
+        radii=np.concatenate(radii),
     )
 
 
@@ -190,14 +190,14 @@ def _joints(robot: Any, links: tuple[str, ...], path: Path) -> tuple[RobotJoint,
             axis = np.array([1.0, 0.0, 0.0] if joint.axis is None else joint.axis, float)
             joints.append(
                 RobotJoint(
-                    links.index(joint.parent),
-                    links.index(joint.child),
-                    np.eye(4) if joint.origin is None else np.asarray(joint.origin, float),
-                    axis / np.linalg.norm(axis),
-                    joint.type,
-                    None if joint.type == "fixed" else columns[leader],
-                    multiplier,
-                    offset,
+                    parent=links.index(joint.parent),
+                    child=links.index(joint.child),
+                    parent_from_joint=np.eye(4) if joint.origin is None else np.asarray(joint.origin, float),
+                    axis=axis / np.linalg.norm(axis),
+                    kind=joint.type,
+                    column=None if joint.type == "fixed" else columns[leader],
+                    multiplier=multiplier,
+                    offset=offset,
                 )
             )
             reached.add(joint.child)

@@ -50,7 +50,9 @@ def add_cameras(
         for k, view in enumerate(render(scene, camera, places, options.texture, with_truth=False)):
             write_image(out / images[k], view.image, options, [15, k, *name.encode()])
         size, stated = (camera.width, camera.height), stated_intrinsics(camera, options, rng)
-        cameras.append(CellCamera(name, mount, images, size, stated, **of_mount))
+        cameras.append(
+            CellCamera(name=name, mount=mount, images=images, image_size=size, intrinsics=stated, **of_mount)
+        )
 
     for k in range(options.fixed_cameras):
         camera, azimuth = pinhole(rng), rng.uniform(-2.6, 2.6)

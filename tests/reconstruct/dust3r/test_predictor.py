@@ -43,7 +43,7 @@ def loaded() -> "LoadedNetwork":
 def images() -> PreparedImages:
     grid = dataclasses.replace(image_grid((640, 480)), size=(64, 48))
     colors = np.random.default_rng(0).integers(0, 256, (4, 48, 64, 3), dtype=np.uint8)
-    return PreparedImages(colors, grid, None, None)
+    return PreparedImages(colors=colors, grid=grid, intrinsics_of_capture=None, pinhole=None)
 
 
 def options(folder: Path, **changes: object) -> PairOptions:
@@ -277,7 +277,13 @@ def chain_over_a_table(base_from_camera: np.ndarray, noise: float) -> PairPredic
             points = (rays * depth[..., None]) @ relative[:3, :3].T + relative[:3, 3]
             out.append(scale * (points + noise * rng.normal(size=points.shape)))
     one = np.ones((len(edges), height, width), np.float32)
-    return PairPredictions(edges, np.array(own, np.float32), one, np.array(other, np.float32), one)
+    return PairPredictions(
+        edges=edges,
+        pts3d=np.array(own, np.float32),
+        conf=one,
+        pts3d_in_other_view=np.array(other, np.float32),
+        conf2=one,
+    )
 
 
 def test_robot_poses_leave_out_exactly_the_pairs_without_a_common_view() -> None:

@@ -269,12 +269,12 @@ def test_a_hub_id_comes_from_the_cache(
     (repository / "snapshots").mkdir()
     write_folder(repository / "snapshots" / ("0" * 40), linear, LINEAR_CONFIG)
     assert row.has_weights()
-    weights = weights_of(ReconstructOptions("dust3r"))
+    weights = weights_of(ReconstructOptions(backend="dust3r"))
     assert weights.name == row.hub_id and weights.licence.startswith("CC BY-NC-SA 4.0")
     assert_same_output(linear, load_weights(weights).network)
     # The pinned one is preferred.
     write_folder(repository / "snapshots" / row.revision, linear, LINEAR_CONFIG)
-    assert weights_of(ReconstructOptions("dust3r")).path.name == row.revision
+    assert weights_of(ReconstructOptions(backend="dust3r")).path.name == row.revision
 
 
 def test_jcr_predict_writes_pairs_from_a_checkpoint_and_a_bad_one_is_exit_2(

@@ -88,7 +88,13 @@ def test_motions_without_rotation_leave_the_translation_open_and_the_scale_known
             np.float32
         )
         first_view[e] = (truth.depth[n][..., None] * _ray(predictions)).astype(np.float32)
-    still = PairPredictions(predictions.edges, first_view, predictions.conf, second_view, predictions.conf2)
+    still = PairPredictions(
+        edges=predictions.edges,
+        pts3d=first_view,
+        conf=predictions.conf,
+        pts3d_in_other_view=second_view,
+        conf2=predictions.conf2,
+    )
     found, cameras = tied(still, poses)
     sigma = np.sqrt(np.linalg.inv(cameras.normal).diagonal()[:3])
     assert sigma.max() > 1.0

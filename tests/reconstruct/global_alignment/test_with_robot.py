@@ -66,8 +66,15 @@ def case(
     names = tuple(f"{k:02d}.png" for k in range(count))
     colors = np.zeros((count, SIZE[1], SIZE[0], 3), np.uint8)
     return Case(
-        Capture(Path(), names, poses, SIZE, truth.intrinsics),
-        PreparedImages(colors, ImageGrid(SIZE, SIZE, (0, 0), SIZE), truth.intrinsics, truth.intrinsics),
+        Capture(
+            folder=Path(), images=names, base_from_gripper=poses, image_size=SIZE, intrinsics=truth.intrinsics
+        ),
+        PreparedImages(
+            colors=colors,
+            grid=ImageGrid(SIZE, SIZE, (0, 0), SIZE),
+            intrinsics_of_capture=truth.intrinsics,
+            pinhole=truth.intrinsics,
+        ),
         replace(predictions, images=names, intrinsics=truth.intrinsics),
         truth.base_from_camera,
         gripper_from_camera,

@@ -76,7 +76,13 @@ def capture(folder: Path) -> Capture:
     rng = np.random.default_rng(5)
     noise = rng.normal(0, 1, (COUNT, 6)) * ([2e-4] * 3 + [4e-4] * 3)
     gripper = retract(base_from_camera() @ inverse(X), noise)
-    return Capture(folder, tuple(f"{k}.png" for k in range(COUNT)), gripper, (400, 300), INTRINSICS)
+    return Capture(
+        folder=folder,
+        images=tuple(f"{k}.png" for k in range(COUNT)),
+        base_from_gripper=gripper,
+        image_size=(400, 300),
+        intrinsics=INTRINSICS,
+    )
 
 
 class Fake:
@@ -105,7 +111,14 @@ class Fake:
         recon[:, :3, 3] *= 2
         pinholes = np.tile([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy], (COUNT, 1))
         points = (2 * depth[..., None] * ray).astype(np.float32)
-        return Predicted(grid, points, np.ones(depth.shape, np.float32), pinholes, recon, False)
+        return Predicted(
+            grid=grid,
+            x_in_camera=points,
+            confidence=np.ones(depth.shape, np.float32),
+            pinholes=pinholes,
+            recon_from_camera=recon,
+            is_metric=False,
+        )
 
 
 def options(**changes):
@@ -238,7 +251,9 @@ def test_single_views_take_their_cameras_and_fit_their_depth(capture: Capture) -
         image_index=np.arange(COUNT),
         recon_from_camera=recon_from_camera,
         intrinsics=INTRINSICS,
-        tracks=Tracks(image, np.array(seen)[image, point], point, unit * in_recon),
+        tracks=Tracks(
+            image=image, x_px=np.array(seen)[image, point], point=point, points_in_recon=unit * in_recon
+        ),
         backend="colmap",
     )
     made = SingleViewsOptions(

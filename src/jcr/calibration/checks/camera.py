@@ -105,7 +105,7 @@ def with_contradiction(
     return (*(one for one in faults if one.kind is not Kind.INTRINSICS), *(named or [whole]))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Hypothesis:
     kind: str
     free: Float[ndarray, "e p"]
@@ -200,7 +200,7 @@ def camera_faults(imaged: Imaged) -> tuple[Finding, ...]:
 
 def _freed_before(free: Combinations) -> _Hypothesis:
     """A focal length of each image that is free as the user asked."""
-    return _Hypothesis("scatter", free, np.zeros((len(free), 0)))
+    return _Hypothesis(kind="scatter", free=free, beside=np.zeros((len(free), 0)))
 
 
 def _of_fewer_points(case: Case) -> Case:
@@ -327,22 +327,22 @@ def _hypotheses(state: _State) -> list[_Hypothesis]:
     steps = np.arange(LEAST_PART, m - LEAST_PART + 1)
     common, nothing = equations.common_focal(), np.zeros((equations.columns, 0))
     found = [
-        _Hypothesis("distance", equations.focal_of_images(far[:, None]), common),
-        _Hypothesis("scatter", equations.focal_of_images(differences(m)), common),
-        _Hypothesis("shear", equations.shear_of_images(np.ones((m, 1))), common),
-        _Hypothesis("shear of each", equations.shear_of_images(np.eye(m)), common),
+        _Hypothesis(kind="distance", free=equations.focal_of_images(far[:, None]), beside=common),
+        _Hypothesis(kind="scatter", free=equations.focal_of_images(differences(m)), beside=common),
+        _Hypothesis(kind="shear", free=equations.shear_of_images(np.ones((m, 1))), beside=common),
+        _Hypothesis(kind="shear of each", free=equations.shear_of_images(np.eye(m)), beside=common),
     ]
     for k in steps:
         after = (np.arange(m) >= k) - (m - k) / m
         free = equations.focal_of_images(after[:, None])
-        found.append(_Hypothesis("zoom", free, common, len(steps), int(k) - 1))
+        found.append(_Hypothesis(kind="zoom", free=free, beside=common, places=len(steps), after=int(k) - 1))
     of_centre = np.concatenate([common, equations.of_camera(("cx", "cy"))], axis=1)
-    found.append(_Hypothesis("sag", equations.offset_by_gravity(), of_centre))
+    found.append(_Hypothesis(kind="sag", free=equations.offset_by_gravity(), beside=of_centre))
     if len(state.adjusted.given.evidence.scene.cameras) == 1:  # all images share the glass
-        found.append(_Hypothesis("prism", equations.prism(), of_centre))
+        found.append(_Hypothesis(kind="prism", free=equations.prism(), beside=of_centre))
     # Intrinsics that are wrong in all images include the focal length that shows nothing in the others.
     kind = "intrinsics" if state.imaged.is_given else "aspect"
-    found.append(_Hypothesis(kind, equations.of_camera(_freed(kind, equations)), nothing))
+    found.append(_Hypothesis(kind=kind, free=equations.of_camera(_freed(kind, equations)), beside=nothing))
     return found
 
 

@@ -150,9 +150,13 @@ class _Predictor:
         in_memory, needed = self._plan(estimate, len(edges))
         shapes = ((height, width, 3), (height, width)) * 2
         arrays = [_new_array((len(edges), *shape), in_memory) for shape in shapes]
+        pts3d, conf, pts3d_in_other_view, conf2 = arrays
         predictions = PairPredictions(
-            edges,
-            *arrays,
+            edges=edges,
+            pts3d=pts3d,
+            conf=conf,
+            pts3d_in_other_view=pts3d_in_other_view,
+            conf2=conf2,
             images=self.names,
             colors=self.images.colors,
             intrinsics=self.images.intrinsics,

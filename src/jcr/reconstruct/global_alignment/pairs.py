@@ -20,7 +20,7 @@ ARRAYS = {"edges": 2, "pts3d": 4, "conf": 3, "pts3d_in_other_view": 4, "conf2": 
 """Keys every file has, and their dimensions; the names are those of DUSt3R's own output."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PairPredictions:
     """Pointmaps of ordered image pairs, each pair in its first image's camera frame, at a scale of its own.
 

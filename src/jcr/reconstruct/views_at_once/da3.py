@@ -91,11 +91,11 @@ def predict(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) -> Pre
     camera_from_recon = rigid(output(answer, "extrinsics", (count, 3, 4), "Depth Anything 3"))
     return checked(
         Predicted(
-            grid,
-            depth[..., None] * rays_of(pinholes, height, width),
-            output(answer, "depth_conf", (count, height, width), "Depth Anything 3"),
-            pinholes,
-            inverse(camera_from_recon),
+            grid=grid,
+            x_in_camera=depth[..., None] * rays_of(pinholes, height, width),
+            confidence=output(answer, "depth_conf", (count, height, width), "Depth Anything 3"),
+            pinholes=pinholes,
+            recon_from_camera=inverse(camera_from_recon),
             is_metric=False,
         ),
         "Depth Anything 3",

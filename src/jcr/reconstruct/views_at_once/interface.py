@@ -34,7 +34,7 @@ class Views:
         return self.colors.shape[2], self.colors.shape[1]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Predicted:
     """The output of a model for the views."""
 
@@ -118,10 +118,10 @@ def checked(predicted: Predicted, model: str) -> Predicted:
             f"{model} gave no usable depth or camera; its weights may be damaged, get them again"
         )
     return Predicted(
-        predicted.grid,
-        np.where(there[..., None], predicted.x_in_camera, 0).astype(np.float32),
-        np.where(there, confidence, 0).astype(np.float32),
-        predicted.pinholes,
-        poses,
-        predicted.is_metric,
+        grid=predicted.grid,
+        x_in_camera=np.where(there[..., None], predicted.x_in_camera, 0).astype(np.float32),
+        confidence=np.where(there, confidence, 0).astype(np.float32),
+        pinholes=predicted.pinholes,
+        recon_from_camera=poses,
+        is_metric=predicted.is_metric,
     )

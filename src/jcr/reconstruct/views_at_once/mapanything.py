@@ -79,4 +79,14 @@ def predict(model: Model, views: Views, device: str = "cpu") -> Predicted:
             confidence[k] *= output(answer, "mask", (height, width), "MapAnything") > 0.5
         own = output(answer, "intrinsics", (3, 3), "MapAnything")
         pinholes[k] = own[0, 0], own[1, 1], own[0, 2], own[1, 2]
-    return checked(Predicted(grid, points, confidence, pinholes, poses, is_metric=True), "MapAnything")
+    return checked(
+        Predicted(
+            grid=grid,
+            x_in_camera=points,
+            confidence=confidence,
+            pinholes=pinholes,
+            recon_from_camera=poses,
+            is_metric=True,
+        ),
+        "MapAnything",
+    )

@@ -55,7 +55,14 @@ def predict(network: nn.Module, views: Views) -> Predicted:
         masks.append(output(answer, "mask", (height, width), "MoGe-2"))
         matrix = output(answer, "intrinsics", (3, 3), "MoGe-2") * [[width], [height], [1]]
         pinholes.append(pinhole_of_edges(matrix))
-    made = Predicted(grid, np.stack(points), np.stack(masks), np.stack(pinholes), None, is_metric=True)
+    made = Predicted(
+        grid=grid,
+        x_in_camera=np.stack(points),
+        confidence=np.stack(masks),
+        pinholes=np.stack(pinholes),
+        recon_from_camera=None,
+        is_metric=True,
+    )
     return checked(made, "MoGe-2")
 
 

@@ -169,7 +169,7 @@ def adjust_matches(tracks: Tracks, geometry: Geometry, fixed: bool) -> _Adjusted
     good = error < LARGEST_PX * max(float(np.median(error)), 0.1)
     good &= (np.bincount(seen.point[good], minlength=len(points)) >= 2)[seen.point]
     kept, point = np.unique(seen.point[good], return_inverse=True)
-    inliers = Tracks(seen.image[good], seen.x_px[good], point, points[kept])
+    inliers = Tracks(image=seen.image[good], x_px=seen.x_px[good], point=point, points_in_recon=points[kept])
     return _Adjusted(shown, inliers, float(np.median(error[good])) if good.any() else np.inf)
 
 
