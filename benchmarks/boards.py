@@ -26,7 +26,7 @@ from jcr.reconstruct.marker import pose_of_body
 from jcr.records import Capture, HandEye, Intrinsics, Kind, Reconstruction, Tracks
 from jcr.results import RunOptions, RunResult
 
-DRAWS, LONG_DRAWS = 6, 40
+DRAWS, LONG_DRAWS = 2, 40
 POSE_SCALES = (1.0, 1.01, 1.02, 1.05)
 BENDS_M = (0.0, 2e-3)
 IMAGES = (8, 15)

@@ -128,7 +128,7 @@ BENCHES = {
             "src/jcr/reconstruct/board_corners.py",
             "benchmarks/simulated",
         ),
-        long="40 draws of every simulated row instead of 6",
+        long="40 draws of every simulated row instead of 2",
     ),
     "seen": Bench(
         "Points that the camera sees",
