@@ -180,6 +180,8 @@ def test_a_board_named_in_the_wrong_size_is_rejected(tmp_path, capsys):
         "calibrate",
         str(tmp_path / "capture"),
         str(tmp_path / "out"),
+        "--backend",
+        "marker",
         "--board",
         "chessboard:8x5:0.028",
     ]
