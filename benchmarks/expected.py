@@ -44,7 +44,7 @@ class Row:
     expected: tuple[float, float, float] | None
     """Of a seen point (mm), the camera (mm) and its rotation (degrees), 95 % of errors; None: nothing."""
     live: tuple[float, float, float]
-    """The same as the live page has it, of a usual robot and usual images."""
+    """The same by the poses alone, of a usual robot and usual images."""
     reported: tuple[float, float, float]
 
     @property
@@ -54,7 +54,7 @@ class Row:
 
     @property
     def live_ratios(self) -> tuple[float, ...]:
-        """The same of the live page."""
+        """The same by the poses alone."""
         return tuple(np.divide(self.live, self.reported))
 
 
@@ -72,12 +72,12 @@ def page(real: Sequence[Row], made: Sequence[Row]) -> str:
         *(_claim(name, rows) for name, rows in (("real captures", real), ("simulated ones", made)) if rows),
         "",
         "Expected by `jcr check` over what the calibration reports, 95 % of errors: a point seen at the centre "
-        "of the image and the distance of the scene, the camera on the gripper, its rotation. Live: the same of the "
-        "live page, which knows neither robot nor images and takes both for usual. A simulated capture has observations "
+        "of the image and the distance of the scene, the camera on the gripper, its rotation. Poses alone: the same by "
+        "`--poses-only`, which takes robot and images for usual. A simulated capture has observations "
         f"instead of images; of more than {QUICK} images, {QUICK} are looked at.",
         "",
         "| capture | | images | seen point: expected mm | reported | ratio | camera: expected mm | reported | ratio | "
-        "rotation: expected ° | reported | ratio | live, seen point: ratio |",
+        "rotation: expected ° | reported | ratio | poses alone, seen point: ratio |",
         "|---" * 13 + "|",
         *map(_line, [*real, *made]),
     ]

@@ -53,6 +53,12 @@ FEATURES = (
 DEPTH = ("src/jcr/depth", "src/jcr/reconstruct/pointmaps.py")
 MAP = ("src/jcr/represent", "src/jcr/mapping.py")
 READING = ("src/jcr/capture",)
+LIVE = (
+    "src/jcr/reconstruct/growing.py",
+    "src/jcr/live/calibration.py",
+    "src/jcr/live/calibration_left_out.py",
+    "src/jcr/live/next_pose.py",
+)
 WHOLE = (*SOLVER, *FEATURES, *DEPTH, *MAP, *READING, "src/jcr/pipeline.py", "src/jcr/report")
 
 
@@ -113,6 +119,23 @@ BENCHES = {
             "benchmarks/board_intrinsics.py",
         ),
     ),
+    "boards": Bench(
+        "A board beside features",
+        ROBOTS,
+        "features alone, a board alone and both in one adjustment: captures in DIR that --boards names, and simulated",
+        of_captures=True,
+        of_boards=True,
+        measures=(
+            *SOLVER,
+            *FEATURES,
+            *READING,
+            "src/jcr/reconstruct/marker.py",
+            "src/jcr/reconstruct/board.py",
+            "src/jcr/reconstruct/board_corners.py",
+            "benchmarks/simulated",
+        ),
+        long="40 draws of every simulated row instead of 2",
+    ),
     "seen": Bench(
         "Points that the camera sees",
         HONEST,
@@ -123,7 +146,7 @@ BENCHES = {
     "expected": Bench(
         "Expected before the run",
         HONEST,
-        "what jcr check and the live page expect, against what the calibration reports: captures in DIR, and simulated",
+        "what jcr check expects, against what the calibration reports: captures in DIR, and simulated",
         of_captures=True,
         measures=(
             *SOLVER,
@@ -306,8 +329,16 @@ BENCHES = {
         "Calibrated while capturing",
         HONEST,
         "images until 2 mm and 0.3° are claimed and confirmed, at proposed poses, varied ones, random ones and a grid",
-        measures=(*SOLVER, *FEATURES, "src/jcr/reconstruct/growing.py", "src/jcr/live", "src/jcr/simulate"),
-        long="ten scenes instead of one, and up to 40 images instead of 24",
+        measures=(*SOLVER, *FEATURES, *LIVE, "src/jcr/simulate"),
+        long="ten scenes instead of two, and up to 40 images instead of 24",
+    ),
+    "live_real": Bench(
+        "Fed image by image",
+        HONEST,
+        "captures in DIR fed image by image, against the same captures calibrated at once; seconds after each image",
+        True,
+        of_captures=True,
+        measures=(*SOLVER, *FEATURES, *LIVE),
     ),
     "batch": Bench(
         "Many captures",

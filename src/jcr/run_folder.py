@@ -51,6 +51,8 @@ MOVING = "moving"
 """Images of a fixed camera without what stands still; a carried thing is reconstructed from them."""
 CAPTURE = "capture"
 """Images and poses that were read from another format than capture.json."""
+LIVE = "result"
+"""In the folder of a capture that was calibrated while it was taken: the run folder of all its images."""
 STATE = "run.json"
 """The capture, the options of its calibration, and what reconstruction.npz was made from."""
 RECONSTRUCTION, CALIBRATION, LOG = "reconstruction.npz", "calibration.json", "log.txt"
@@ -199,6 +201,19 @@ class RunFolder:
         found = self.reconstruction()  # with its depth in one file: from now on in two
         self.keep_reconstruction(found, state.model_copy(update={"attempts": earlier.attempts}))
         return found, earlier
+
+    def reuse_live(self, capture: Capture, state: State) -> tuple[Reconstruction, State] | None:
+        """The same of the calibration that `jcr capture` left in the capture's own folder; it is then kept here too."""
+        live = RunFolder(capture.folder / LIVE)
+        if live.path.resolve() == self.path.resolve():
+            return None
+        try:
+            found = live.reuse_reconstruction(capture, state)
+        except InputError:
+            return None  # Damaged; it is made again.
+        if found is not None:
+            self.keep_reconstruction(found[0], state.model_copy(update={"attempts": found[1].attempts}))
+        return found
 
     def keep_capture(self, capture: Capture) -> Capture:
         """The capture as later commands will find it: where it lies, or copied if it is of another format."""

@@ -151,9 +151,11 @@ def reported(result: RunResult, folder: RunFolder, options: RunOptions, progress
 def _reused(
     capture: Capture, folder: RunFolder, options: RunOptions, state: State, progress: Progress
 ) -> tuple[Tried, tuple[Attempt, ...]] | None:
-    """What an earlier run chose from the same input, calibrated, and how it was chosen; None where it is to be made."""
+    """What an earlier run, or `jcr capture`, chose from the same input, calibrated, and how it was chosen; None where it
+    is to be made."""
     start = time.perf_counter()
-    if (reused := folder.reuse_reconstruction(capture, state)) is None:
+    reused = folder.reuse_reconstruction(capture, state) or folder.reuse_live(capture, state)
+    if reused is None:
         return None
     reconstruction, earlier = reused
     read_s = time.perf_counter() - start

@@ -82,6 +82,12 @@ EXAMPLES: dict[Kind, dict] = {
     Kind.LENGTHS: {"value": 0.02, "std": 0.002, "p": 1e-9, "details": AT | {"frame": "base"}},
     Kind.IMAGES_ROTATED: {"value": 6.0, "details": {"rotated": "rotated by 90°"}},
     Kind.BOARD_IN_VIEW: {"details": {"board": "chessboard:9x6:SIDE"}},
+    Kind.SCALES: {"value": 0.03, "std": 0.005, "details": {"one": "board", "other": "known length"}},
+    Kind.BOARD_SIDE: {"value": 0.0254, "std": 5e-5, "details": {"board": "chessboard:9x6:SIDE"}},
+    Kind.BOARD_MOVED: {"images": ("03.png",), "details": {"board": "chessboard:9x6:0.025"}},
+    Kind.BOARD_NOT_FOUND: {
+        "details": {"board": "chessboard:9x6:0.025", "proposed": "aruco:SIDE:DICT_4X4_50"}
+    },
     Kind.OWN_REJECTED: {"details": {"camera": "wrist"}},
     Kind.FEW_POINTS_SHARED: {"value": 3.0, "images": ("a.png",)},
     Kind.FEW_LOCALISED: {"value": 2.0, "details": {"needed": 3.0}},

@@ -1,10 +1,11 @@
-"""The ROS 2 package: its core with an arm and a camera that are played, its node with stand-ins for rclpy."""
+"""The ROS 2 package: its core with a simulated arm and camera, its node with stand-ins for rclpy."""
 
 import json
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -18,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 import jcr
 from jcr.capture.images import read_image
+from jcr.live.collect import CollectOptions
 from jcr.live.rest import State
 from places import ROOT
 from waiting import until
@@ -76,43 +78,49 @@ def filmed(tabletop: Path) -> Iterator[Callable[[Session, Played], None]]:
 
 
 @pytest.mark.slow
-def test_samples_are_taken_by_service_and_at_rest_and_the_next_pose_is_proposed(
+def test_images_are_taken_by_service_and_at_rest_each_with_its_state_and_a_change_is_undone(
     tmp_path: Path, tabletop: Path, filmed: Callable[[Session, Played], None]
 ):
-    played, said, proposed = Played(tabletop), [], []
-    session = Session(
-        Settings(tmp_path / "c", images=4),
-        played.gripper,
-        said.append,
-        lambda pose, answer: proposed.append(pose),
-    )
-    session.camera_info(camera_info())
-    filmed(session, played)
-    session.start()
-    for k in range(3):  # the arm rests: nobody asks
-        played.at = k
-        until(lambda k=k: len(proposed) == k + 1)
-    assert proposed[0] is None and np.linalg.det(proposed[2][:3, :3]) == pytest.approx(1)
-    assert session.take() == (False, "the gripper is where images/002.png was taken; move to another pose")
-    session.stop()
+    played, events, states = Played(tabletop), [], []
 
-    by_hand = Session(
-        Settings(tmp_path / "c", images=4, at_rest=False), played.gripper, said.append, lambda *_: None
-    )
+    def session(**settings: Any) -> Session:
+        collect = CollectOptions(images=6)
+        given = Settings(folder=tmp_path / "c", collect=collect, **settings)
+        return Session(given, played.gripper, events.append, states.append, lambda mount: None)
+
+    at_rest = session()
+    at_rest.camera_info(camera_info())
+    filmed(at_rest, played)
+    assert at_rest.start().startswith("http://127.0.0.1:")
+    for k in range(5):  # The arm rests: no service is called.
+        played.at = k
+        until(lambda k=k: states and len(states[-1]["images"]) == k + 1)
+    assert {"translation_95_mm", "rotation_95_deg", "findings", "verdict", "event"} <= states[-1].keys()
+    assert states[-1]["translation_95_mm"] > 0 and states[0]["translation_95_mm"] is None
+    assert np.linalg.det(np.array(states[-1]["next_base_from_gripper"])[:3, :3]) == pytest.approx(1)
+    assert at_rest.take() == (False, "the gripper is where images/004.png was taken; move to another pose")
+    assert at_rest.undo()[0] is True
+    until(lambda: len(states[-1]["images"]) == 4)
+    at_rest.stop()
+    assert at_rest.undo() == (False, "nothing to undo")
+
+    by_hand = session(at_rest=False)
     filmed(by_hand, played)
     by_hand.start()
-    played.at = 3
-    assert by_hand.take() == (True, "kept images/003.png")
-    until(lambda: any("enough images" in text for text in said))
-    assert by_hand.take()[0] is False
+    with pytest.raises(jcr.InputError, match="already started"):
+        by_hand.start()
+    with pytest.raises(jcr.InputError, match="another jcr is writing"):
+        session().start()
+    assert by_hand.take() == (True, "kept images/004.png")
     by_hand.stop()
     capture = jcr.read_capture(tmp_path / "c")
-    assert len(capture) == 4 and capture.intrinsics is not None and capture.intrinsics.fx == 600
-    assert np.allclose(capture.base_from_gripper, played.poses[:4])
+    assert len(capture) == 5 and capture.intrinsics is not None and capture.intrinsics.fx == 600
+    assert np.allclose(capture.base_from_gripper, played.poses[:5])
 
 
-def test_a_intrinsics_that_is_not_known_and_a_gripper_that_is_not_in_tf_are_said(tmp_path: Path):
-    session = Session(Settings(tmp_path / "c"), lambda: None, lambda text: None, lambda *_: None)
+def test_intrinsics_that_are_not_known_and_a_gripper_that_is_not_in_tf_are_named(tmp_path: Path):
+    nothing: Any = lambda *_: None  # noqa: E731
+    session = Session(Settings(folder=tmp_path / "c"), lambda: None, nothing, nothing, nothing)
     with pytest.raises(jcr.InputError, match="camera_info"):
         info = camera_info()
         info.distortion_model, info.d = "thin_prism", [0.1] * 12
@@ -139,7 +147,6 @@ class FakeNode:
     def __init__(self, name: str) -> None:
         self.subscriptions_made: dict[str, Callable[[Any], None]] = {}
         self.services: dict[str, Callable[[Any, Any], Any]] = {}
-        self.published: list[Any] = []
 
     def declare_parameter(self, name: str, default: Any) -> Any:
         return SimpleNamespace(value=self.parameters.get(name, default))
@@ -154,7 +161,8 @@ class FakeNode:
         del self.subscriptions_made[subscription]
 
     def create_publisher(self, kind: Any, topic: str, qos: Any) -> Any:
-        return SimpleNamespace(publish=self.published.append)
+        messages: list[Any] = []
+        return SimpleNamespace(publish=messages.append, messages=messages)
 
     def create_service(self, kind: Any, name: str, answer: Callable[[Any, Any], Any], **_: Any) -> None:
         self.services[name] = answer
@@ -196,9 +204,7 @@ def node_module(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
         Buffer=lambda: SimpleNamespace(lookup_transform=None),
         StaticTransformBroadcaster=lambda node: SimpleNamespace(sendTransform=sent.append, sent=sent),
     )
-    from jcr_ros import node
-
-    return node
+    return import_module("jcr_ros.node")
 
 
 def stamped(pose: ndarray, time_s: float) -> Any:
@@ -211,13 +217,18 @@ def stamped(pose: ndarray, time_s: float) -> Any:
 
 
 @pytest.mark.slow
-def test_the_node_takes_samples_solves_and_publishes_the_transform(
-    tmp_path: Path, tabletop: Path, node_module: ModuleType, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("require_mm", [5.0, 1e-3])
+def test_the_node_broadcasts_the_transform_where_it_is_accepted_alone(
+    tmp_path: Path,
+    tabletop: Path,
+    node_module: ModuleType,
+    monkeypatch: pytest.MonkeyPatch,
+    require_mm: float,
 ):
     played = Played(tabletop)
-    monkeypatch.setattr(
-        FakeNode, "parameters", {"folder": str(tmp_path / "c"), "images": 6, "depth_topic": "/depth"}
-    )
+    parameters = {"folder": str(tmp_path / "c"), "images": 6, "depth_topic": "/depth"}
+    parameters |= {"require_mm": require_mm, "require_deg": 1.0}
+    monkeypatch.setattr(FakeNode, "parameters", parameters)
     node = node_module.Calibrator()
     node.buffer.lookup_transform = lambda base, gripper, at: stamped(played.poses[played.at], played.time_s)
     node.subscriptions_made["/camera/color/camera_info"](camera_info())
@@ -239,14 +250,24 @@ def test_the_node_takes_samples_solves_and_publishes_the_transform(
     finally:
         over.set()
         film.join()
-    answer = node.services["~/solve"](None, Message())
+    answer = node.services["~/finish"](None, Message())
+    states = [json.loads(one.data) for one in node.status.messages]
+    assert states[-1]["done"] and len(states[-1]["images"]) == 6
+    next_pose = node.next_pose.messages[-1]
+    assert next_pose.header.frame_id == "base_link"
+    position = np.array(states[-1]["next_base_from_gripper"])[:3, 3]
+    place = next_pose.pose.position
+    assert np.allclose([place.x, place.y, place.z], position)
+    assert read_depth(tmp_path / "c") == 500
+    if require_mm < 1:
+        assert not answer.success and node.broadcaster.sent == []
+        return
     assert answer.success, answer.message
     (sent,) = node.broadcaster.sent
     assert (sent.header.frame_id, sent.child_frame_id) == ("tool0", "camera_color_optical_frame")
     truth = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
     place = sent.transform.translation
     assert np.linalg.norm(np.array([place.x, place.y, place.z]) - truth[:3, 3]) < 5e-3
-    assert read_depth(tmp_path / "c") == 500
 
 
 def read_depth(folder: Path) -> int:

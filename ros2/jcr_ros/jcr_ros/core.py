@@ -1,4 +1,4 @@
-"""What the node does, without ROS: images and gripper poses come in, samples, advice and a calibration go out.
+"""What the node does, without ROS: images and gripper poses come in, states of the calibration and its transform go out.
 
 The node (node.py) translates topics, tf and services to the calls below and holds no logic of its own.
 """
@@ -7,6 +7,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
-import jcr
+from jcr.calibration.options import CalibrateOptions
 from jcr.capture.camera_info import intrinsics_of_ros
 from jcr.capture.camera_json import intrinsics_as_json
 from jcr.capture.ros_image import image_of
@@ -23,24 +24,32 @@ from jcr.export.ros import CameraMount, camera_mount
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.live.arm_words import ArmWords
 from jcr.live.asks import Answer, Ask
+from jcr.live.calibration import LiveCalibration
+from jcr.live.calibration_words import progress_answer
 from jcr.live.camera import TIMEOUT_S, Camera, Frame
-from jcr.live.collect import CollectOptions, collect
+from jcr.live.collect import CollectOptions, LiveCapture
+from jcr.live.commands import Command
 from jcr.live.folder import LiveFolder
+from jcr.live.page_server import PageServer
 from jcr.live.rest import State, asks_at_rest
+from jcr.results import RunResult
+from jcr.run_folder import locked
 
 POLL_S = 0.02
 ANSWER_S = 30.0
+FINISH_S = 300.0
+"""For the calibration of all images."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Settings:
-    """What the node's parameters say."""
+    """The node's parameters."""
 
     folder: Path
     """Of the capture; the result lies in its folder `result`."""
-    images: int = 12
+    collect: CollectOptions = CollectOptions()
     at_rest: bool = True
-    """Take a sample whenever the arm comes to rest in a new place; else by service alone."""
+    """Take an image whenever the arm comes to rest in a new place; else by service alone."""
     robot: str = ""
     """Name of the arm, for joint angles of the next pose; empty: unknown."""
     parent: str = "tool0"
@@ -85,19 +94,25 @@ class Pushed:
 
 @dataclass
 class Session:
-    """One capture at the robot, from the first sample to the calibration."""
+    """One capture at the robot, from the first image to the calibration."""
 
     settings: Settings
     gripper: Callable[[], State | None]
     """base_from_gripper now; None while tf does not know it."""
-    say: Callable[[str], None]
-    """Hears each answer in words."""
-    propose: Callable[[ndarray | None, Answer], None]
-    """Hears each answer, and the next base_from_gripper (4,4) where one is proposed."""
+    show: Callable[[str], None]
+    """Gets each event in words."""
+    publish: Callable[[Answer], None]
+    """Gets the state of the calibration at each event: the fields of the line protocol's answer, and `event`."""
+    broadcast: Callable[[CameraMount], None]
+    """Gets the camera's frame under the gripper, of an accepted calibration alone."""
     frames: Pushed = field(default_factory=Pushed)
-    lens: dict[str, Any] | None = None
+    intrinsics: dict[str, Any] | None = None
+    capture: LiveCapture | None = None
+    outcome: tuple[bool, str] = (False, "not started")
+    """Whether the calibration of all images is accepted, and a line on it."""
     _asked: "queue.Queue[Ask | None]" = field(default_factory=queue.Queue)
     _thread: threading.Thread | None = None
+    _is_stopped: bool = False
 
     def image(self, message: Any, time_s: float, depth_mm: ndarray | None = None) -> None:
         """A sensor_msgs/Image or CompressedImage."""
@@ -113,83 +128,116 @@ class Session:
     def camera_info(self, message: Any) -> None:
         """A sensor_msgs/CameraInfo; refused in words where jcr does not know its intrinsics."""
         size = (message.width, message.height)
-        lens = intrinsics_of_ros(
+        found = intrinsics_of_ros(
             list(message.k), message.distortion_model, list(message.d), size, size, "camera_info"
         )
-        if lens is not None:
-            self.lens = intrinsics_as_json(lens)
+        if found is not None:
+            self.intrinsics = intrinsics_as_json(found)
 
-    def start(self) -> None:
-        """Begin to take samples, in a thread of its own."""
-        name = self.settings.robot
-        live = LiveFolder(self.settings.folder, self.lens, name or None)
-        words = ArmWords(arm=arm_named(name) if name in ROBOT_NAMES else None)
-        options = CollectOptions(images=self.settings.images)
-
-        def work() -> None:
-            try:
-                collect(
-                    live, Camera(self.frames, self.frames.latest), self._asks(), options, self._tell, words
-                )
-                self.say("enough images: call ~/solve")
-            except InputError as error:
-                self.say(f"error: {error}")
-
-        self._thread = threading.Thread(target=work, daemon=True)
+    def start(self) -> str:
+        """Begin to take images, in a thread of its own; the address of the live page."""
+        if self._thread is not None and self._thread.is_alive():
+            raise InputError("already started: call ~/finish")
+        opened, name = ExitStack(), self.settings.robot
+        with opened:
+            opened.enter_context(locked(self.settings.folder))
+            live = LiveFolder(self.settings.folder, self.intrinsics, name or None)
+            options = self.settings.collect
+            asked = CalibrateOptions(require=options.require)
+            calibration = LiveCalibration(live, options=asked, reach=options.reach_m)
+            opened.callback(calibration.close)
+            camera = Camera(self.frames, self.frames.latest)
+            words = ArmWords(arm=arm_named(name) if name in ROBOT_NAMES else None)
+            self.capture = LiveCapture(calibration, camera, options, self._tell, words, self._state_now)
+            page = opened.enter_context(PageServer(self.capture))
+            # The thread closes what is open, from here on.
+            self._thread = threading.Thread(
+                target=self._work, args=(self.capture, opened.pop_all()), daemon=True
+            )
         self._thread.start()
+        return page.address
+
+    def _work(self, capture: LiveCapture, opened: ExitStack) -> None:
+        with opened:
+            try:
+                capture.run(self._asks())
+                if not self._is_stopped:
+                    self._conclude(capture.finish())
+            except InputError as error:
+                self.outcome = False, str(error)
+            self.show(self.outcome[1])
+
+    def _conclude(self, result: RunResult | None) -> None:
+        """State what came of all images, and broadcast the transform where it is accepted."""
+        if result is None:
+            self.outcome = False, self.capture.shown.event if self.capture is not None else "no images"
+            return
+        hand_eye, settings = result.hand_eye, self.settings
+        reason = None if result.converged else "; ".join(hand_eye.warnings)
+        mount = camera_mount(
+            hand_eye.gripper_from_camera,
+            hand_eye.covariance,
+            settings.parent,
+            settings.child,
+            settings.base,
+            reason,
+        )
+        std = np.sqrt(np.diag(hand_eye.covariance))
+        offset = " ".join(f"{1e3 * value:.1f}" for value in hand_eye.gripper_from_camera[:3, 3])
+        line = (
+            f"camera at {offset} mm on {settings.parent}, sigma {1e3 * std[:3].max():.2g} mm and "
+            f"{np.degrees(std[3:6].max()):.2g} deg; {hand_eye.verdict}"
+        )
+        self.outcome = result.converged, line if reason is None else f"{line}: {reason}"
+        if result.converged:
+            self.broadcast(mount)
 
     def take(self) -> tuple[bool, str]:
-        """A sample here and now; whether it was kept, and why not."""
-        state = self.gripper()
-        if state is None:
-            return False, "tf does not know the gripper in the base: check base_frame and gripper_frame"
+        """Take an image here and now; whether it was kept, and why not."""
+        try:
+            state = self._state_now()
+        except InputError as error:
+            return False, str(error)
         if self._thread is None or not self._thread.is_alive():
-            return False, "not started, or there are enough images: call ~/solve"
+            return False, "not started, or finished: call ~/start"
         answered: queue.Queue[Answer] = queue.Queue()
-        self._asked.put(Ask(state.base_from_gripper, answered.put, self._now, state.joints))
+        current = lambda: self._state_now().base_from_gripper  # noqa: E731
+        self._asked.put(
+            Ask(state.base_from_gripper, answer=answered.put, current=current, joints=state.joints)
+        )
         try:
             answer = answered.get(timeout=ANSWER_S)
         except queue.Empty:
             return False, "no answer: do images arrive?"
-        if answer["accepted"]:
-            return True, f"kept {answer['image']}"
-        return False, str(answer["reason"])
+        return (True, f"kept {answer['image']}") if answer["accepted"] else (False, str(answer["reason"]))
+
+    def undo(self) -> tuple[bool, str]:
+        """Take back the last change; whether there was one."""
+        if self.capture is None or not self.capture.live.can_undo:
+            return False, "nothing to undo"
+        self.capture.press(Command("undo"))
+        return True, "the last change is taken back"
+
+    def finish(self) -> tuple[bool, str]:
+        """Calibrate all images; whether the calibration is accepted, and a line on it."""
+        if self.capture is not None and self._thread is not None:
+            self.capture.press(Command("finish"))
+            self._thread.join(FINISH_S)
+        return self.outcome
 
     def stop(self) -> None:
-        """Take no more samples; those taken are kept."""
+        """Take no more images; those taken are kept."""
+        self._is_stopped = True
         self._asked.put(None)
         self.frames.close()
         if self._thread is not None:
             self._thread.join(ANSWER_S)
 
-    def solve(self) -> tuple[CameraMount, bool, str]:
-        """The camera's frame under the gripper, whether it is accepted, and a line for people.
-
-        Raises InputError and NotTrustedError as jcr.calibrate does.
-        """
-        result = jcr.calibrate(jcr.read_capture(self.settings.folder), self.settings.folder / "result")
-        hand_eye = result.hand_eye
-        mount = camera_mount(
-            hand_eye.gripper_from_camera,
-            hand_eye.covariance,
-            self.settings.parent,
-            self.settings.child,
-            self.settings.base,
-            None if result.converged else "; ".join(hand_eye.warnings),
-        )
-        std = np.sqrt(np.diag(hand_eye.covariance))
-        offset = " ".join(f"{1e3 * value:.1f}" for value in hand_eye.gripper_from_camera[:3, 3])
-        line = (
-            f"camera at {offset} mm on {self.settings.parent}, sigma {1e3 * std[:3].max():.2g} mm and "
-            f"{np.degrees(std[3:6].max()):.2g} deg; {hand_eye.verdict}"
-        )
-        return mount, result.converged, line
-
-    def _now(self) -> ndarray:
+    def _state_now(self) -> State:
         state = self.gripper()
         if state is None:
-            raise InputError("tf no longer knows the gripper in the base")
-        return state.base_from_gripper
+            raise InputError("tf does not know the gripper in the base: check base_frame and gripper_frame")
+        return state
 
     def _states(self) -> Iterator[State]:
         while True:
@@ -206,18 +254,21 @@ class Session:
             yield ask
 
     def _watch(self) -> None:
-        """Ask at rest, one at a time: the next is thought of when the last is answered."""
+        """Ask at rest, one at a time, the next when the last is answered."""
         for ask in asks_at_rest(self._states):
             done = threading.Event()
 
-            def heard(answer: Answer, ask: Ask = ask, done: threading.Event = done) -> None:
+            def answered(answer: Answer, ask: Ask = ask, done: threading.Event = done) -> None:
                 ask.answer(answer)
                 done.set()
 
-            self._asked.put(Ask(ask.base_from_gripper, heard, ask.current, ask.joints))
+            self._asked.put(
+                Ask(ask.base_from_gripper, answer=answered, current=ask.current, joints=ask.joints)
+            )
             done.wait()
 
     def _tell(self, answer: Answer, lines: list[str]) -> None:
-        self.say("\n".join(lines))
-        proposed = answer.get("next_base_from_gripper")
-        self.propose(None if proposed is None else np.array(proposed), answer)
+        self.show("\n".join(lines))
+        assert self.capture is not None
+        shown = self.capture.shown
+        self.publish(progress_answer(shown.progress) | {"event": lines[0], "done": shown.is_over} | answer)

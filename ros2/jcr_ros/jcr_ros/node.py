@@ -1,5 +1,8 @@
-"""The ROS 2 node: tf, images and camera_info in, samples by service or at rest, the static transform out."""
+"""The ROS 2 node: tf, images and camera_info in; the state of the calibration, next pose and static transform out."""
 
+import json
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +21,16 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from tf2_ros import Buffer, StaticTransformBroadcaster, TransformException, TransformListener
 
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError
+from jcr.export.ros import CameraMount
 from jcr.geometry import transform
+from jcr.live.collect import CollectOptions
 from jcr.live.rest import State
 from jcr_ros.core import Session, Settings
 
 
 class Calibrator(Node):
-    """Takes samples and solves; see README.md for topics, services and parameters."""
+    """Takes images and calibrates; see README.md for topics, services and parameters."""
 
     def __init__(self) -> None:
         super().__init__("jcr")
@@ -33,7 +38,7 @@ class Calibrator(Node):
         self.gripper = self._parameter("gripper_frame", "tool0")
         settings = Settings(
             folder=Path(self._parameter("folder", "jcr_capture")).expanduser(),
-            images=self._parameter("images", 12),
+            collect=self._collect_options(),
             at_rest=self._parameter("at_rest", True),
             robot=self._parameter("robot", ""),
             parent=self.gripper,
@@ -43,7 +48,7 @@ class Calibrator(Node):
         self.buffer = Buffer()
         self.listener = TransformListener(self.buffer, self)
         self.broadcaster = StaticTransformBroadcaster(self)
-        self.session = Session(settings, self._gripper_now, self._say, self._propose)
+        self.session = Session(settings, self._gripper_now, self._show, self._publish, self._broadcast)
         group = ReentrantCallbackGroup()
         image = self._parameter("image_topic", "/camera/color/image_raw")
         kind = CompressedImage if image.endswith("compressed") else Image
@@ -56,16 +61,36 @@ class Calibrator(Node):
         self.depth_mm: ndarray | None = None
         self.status = self.create_publisher(String, "~/status", 10)
         self.next_pose = self.create_publisher(PoseStamped, "~/next_pose", 1)
-        for name, answer in (("start", self._start), ("take_sample", self._take), ("solve", self._solve)):
-            self.create_service(Trigger, f"~/{name}", answer, callback_group=group)
-        self._say("call ~/start when image and camera_info arrive")
+        services = {
+            "start": self._start,
+            "take": self.session.take,
+            "undo": self.session.undo,
+            "finish": self.session.finish,
+        }
+        for name, action in services.items():
+            self.create_service(Trigger, f"~/{name}", partial(_answered, action), callback_group=group)
+        self._show("call ~/start when image and camera_info arrive")
 
     def _parameter(self, name: str, default: Any) -> Any:
         return self.declare_parameter(name, default).value
 
-    def _say(self, text: str) -> None:
+    def _collect_options(self) -> CollectOptions:
+        """Of numbers, 0 stands for the default."""
+        require = self._parameter("require_mm", 0.0), self._parameter("require_deg", 0.0)
+        return CollectOptions(
+            images=self._parameter("images", 0) or None,
+            require=require if all(require) else None,
+            until_accurate=self._parameter("until_accurate", False),
+        )
+
+    def _show(self, text: str) -> None:
         self.get_logger().info(text)
-        self.status.publish(String(data=text))
+
+    def _publish(self, answer: dict[str, Any]) -> None:
+        """The state as JSON, and the next pose."""
+        self.status.publish(String(data=json.dumps(answer)))
+        if answer.get("next_base_from_gripper") is not None:
+            self._propose(np.array(answer["next_base_from_gripper"]))
 
     def _image(self, message: Any) -> None:
         stamp = message.header.stamp
@@ -86,7 +111,7 @@ class Calibrator(Node):
         try:
             self.session.camera_info(message)
         except InputError as error:
-            self._say(f"error: {error}")
+            self._show(f"error: {error}")
         self.destroy_subscription(self.info)
 
     def _gripper_now(self) -> State | None:
@@ -98,51 +123,38 @@ class Calibrator(Node):
         rotation = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
         return State(stamp.sec + 1e-9 * stamp.nanosec, transform(rotation, np.array([t.x, t.y, t.z])))
 
-    def _propose(self, base_from_gripper: ndarray | None, answer: dict[str, Any]) -> None:
-        if base_from_gripper is None:
-            return
+    def _propose(self, base_from_gripper: ndarray) -> None:
         message = PoseStamped()
         message.header.frame_id = self.base
         message.header.stamp = self.get_clock().now().to_msg()
-        position, rotation = message.pose.position, message.pose.orientation
-        position.x, position.y, position.z = base_from_gripper[:3, 3].tolist()
-        rotation.x, rotation.y, rotation.z, rotation.w = (
-            Rotation.from_matrix(base_from_gripper[:3, :3]).as_quat().tolist()
-        )
+        _fill(message.pose.position, message.pose.orientation, base_from_gripper)
         self.next_pose.publish(message)
 
-    def _start(self, request: Any, response: Any) -> Any:
-        try:
-            self.session.start()
-        except InputError as error:
-            response.success, response.message = False, str(error)
-            return response
-        response.success = True
-        response.message = f"move the arm; {self.session.settings.folder}/live.html shows how it goes"
-        return response
-
-    def _take(self, request: Any, response: Any) -> Any:
-        response.success, response.message = self.session.take()
-        return response
-
-    def _solve(self, request: Any, response: Any) -> Any:
-        self.session.stop()
-        try:
-            mount, response.success, response.message = self.session.solve()
-        except (InputError, NotTrustedError) as error:
-            response.success, response.message = False, str(error)
-            return response
+    def _broadcast(self, mount: CameraMount) -> None:
+        """The accepted transform, on /tf_static."""
         message = TransformStamped()
         message.header.frame_id, message.child_frame_id = mount.parent, mount.child
         message.header.stamp = self.get_clock().now().to_msg()
-        place, turn = message.transform.translation, message.transform.rotation
-        place.x, place.y, place.z = mount.parent_from_child[:3, 3].tolist()
-        turn.x, turn.y, turn.z, turn.w = (
-            Rotation.from_matrix(mount.parent_from_child[:3, :3]).as_quat().tolist()
-        )
+        _fill(message.transform.translation, message.transform.rotation, mount.parent_from_child)
         self.broadcaster.sendTransform(message)
-        self._say(response.message)
-        return response
+
+    def _start(self) -> tuple[bool, str]:
+        try:
+            return True, f"move the arm; {self.session.start()} shows the capture"
+        except InputError as error:
+            return False, str(error)
+
+
+def _answered(action: Callable[[], tuple[bool, str]], request: Any, response: Any) -> Any:
+    response.success, response.message = action()
+    return response
+
+
+def _fill(translation: Any, rotation: Any, a_from_b: ndarray) -> None:
+    """Write a transform (4,4) into the two parts of a message."""
+    translation.x, translation.y, translation.z = a_from_b[:3, 3].tolist()
+    quat_xyzw = Rotation.from_matrix(a_from_b[:3, :3]).as_quat().tolist()
+    rotation.x, rotation.y, rotation.z, rotation.w = quat_xyzw
 
 
 def main() -> None:

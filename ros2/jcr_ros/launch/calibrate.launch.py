@@ -23,12 +23,18 @@ TEXT = {
 def generate_launch_description() -> LaunchDescription:
     arguments = [DeclareLaunchArgument(name, default_value=value) for name, value in TEXT.items()]
     arguments += [
-        DeclareLaunchArgument("images", default_value="12"),
+        DeclareLaunchArgument("images", default_value="0"),
+        DeclareLaunchArgument("require_mm", default_value="0.0"),
+        DeclareLaunchArgument("require_deg", default_value="0.0"),
+        DeclareLaunchArgument("until_accurate", default_value="false"),
         DeclareLaunchArgument("at_rest", default_value="true"),
         DeclareLaunchArgument("rviz", default_value="true"),
     ]
     parameters = {name: ParameterValue(LaunchConfiguration(name), value_type=str) for name in TEXT}
     parameters["images"] = ParameterValue(LaunchConfiguration("images"), value_type=int)
+    for name in ("require_mm", "require_deg"):
+        parameters[name] = ParameterValue(LaunchConfiguration(name), value_type=float)
+    parameters["until_accurate"] = ParameterValue(LaunchConfiguration("until_accurate"), value_type=bool)
     parameters["at_rest"] = ParameterValue(LaunchConfiguration("at_rest"), value_type=bool)
     view = PathJoinSubstitution([FindPackageShare("jcr_ros"), "rviz", "calibrate.rviz"])
     return LaunchDescription(

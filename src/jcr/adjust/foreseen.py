@@ -60,7 +60,7 @@ class ForeseenCamera:
         return ForeseenCamera(
             intrinsics=images.scene.cameras[0],
             prior=problem.freedom.intrinsics[0],
-            information_per_px2=float(images.weight.sum()) / len(problem.seen.rows),
+            information_per_px2=float(images.weight.sum()) / len(problem.observations.rig),
             model_error=float(left[0]) if len(left) else 0.0,
         )
 

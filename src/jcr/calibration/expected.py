@@ -1,4 +1,4 @@
-"""How exact a calibration will be, before it is made: one expectation for `jcr check`, live page and proposed poses.
+"""How exact a calibration will be, before it is made: one expectation for `jcr check` and proposed poses.
 
 It is the covariance that the calibration itself would report, by its own equations (adjust/foreseen.py where there are
 images, handeye/fit.py where camera poses are given): of the gripper poses, of what is known of the intrinsics before,

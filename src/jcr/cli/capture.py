@@ -1,7 +1,6 @@
 """`jcr capture`: takes a capture live, image by image, with advice on the next pose."""
 
 import os
-import queue
 import sys
 import threading
 from dataclasses import dataclass, field
@@ -11,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from jcr.capture.options import ConventionName, UnitsName
-from jcr.cli.output import Output, warn
-from jcr.errors import InputError, RejectedError
+from jcr.cli.output import Output
+from jcr.errors import InputError
 from jcr.handeye.arms import CHOICES, ROBOT_NAMES, RobotName
 from jcr.live.camera import CameraOptions
-from jcr.live.collect import CollectOptions
+from jcr.live.collect import LEAST_IMAGES, CollectOptions
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,12 +22,10 @@ if TYPE_CHECKING:
     from jcr.live.arm_words import ArmWords
     from jcr.live.asks import Answer, Ask
     from jcr.live.calibration import LiveCalibration
-    from jcr.live.calibration_keys import Typed
+    from jcr.live.collect import LiveCapture
     from jcr.live.folder import LiveFolder
+    from jcr.live.rest import States
     from jcr.results import RunResult
-
-LEAST_IMAGES = 3
-"""Of a calibration."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +34,8 @@ class Arguments:
 
     An image is taken when the arm rests, and kept if it is sharp and nothing moves. The calibration is made meanwhile:
     after each image it is printed how exact it is, what is wrong, and the pose that helps most. OUT/result is the
-    calibration of all images. After Ctrl-C the same command resumes. Typed on the terminal, retake, remove and finish
-    take an image again, take one out, and end.
+    calibration of all images. After Ctrl-C the same command resumes. The live page, whose address is printed, has
+    buttons to take, retake and remove images, to undo that, and to finish; the same words can be typed.
 
     examples:
       jcr capture captures/table --camera 0 --poses ur:192.168.0.2 --robot ur5e
@@ -70,6 +67,8 @@ class Arguments:
     """With tcp: the token that the client must send first; better set as JCR_TOKEN, which other users cannot see."""
     timeout: Annotated[float, tyro.conf.arg(metavar="S")] = 600.0
     """With tcp: stop after this many seconds without a pose."""
+    page_port: Annotated[int, tyro.conf.arg(metavar="PORT")] = 0
+    """Port of the live page, on this machine alone; 0: any free one."""
     intrinsics_from: Path | None = None
     """JSON file with the camera's "intrinsics" (a capture.json or calibration.json); unset: those stored in the camera
     (RealSense), otherwise estimated."""
@@ -79,16 +78,16 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Collect until there are enough images, or the calibration is as accurate as required."""
-    from jcr.live.collect import collect
+    from jcr.live.collect import LiveCapture
     from jcr.live.devices import opened
     from jcr.live.folder import LiveFolder
+    from jcr.live.page_server import PageServer
     from jcr.run_folder import locked
 
     options = arguments.collect
     if options.until_accurate and options.require is None:
         raise InputError("--until-accurate: needs --require MM DEG, the accuracy that is meant")
     answers: list[Answer] = []
-    typed: queue.SimpleQueue[Typed] = queue.SimpleQueue()
 
     def tell(answer: "Answer", lines: list[str]) -> None:
         answers.append(answer)
@@ -97,15 +96,14 @@ def main(arguments: Arguments) -> int:
     given = _intrinsics(arguments.intrinsics_from)
     with locked(arguments.out), opened(arguments.camera, arguments.optics) as camera:
         live = LiveFolder(arguments.out, given or camera.intrinsics, arguments.robot)
-        _print(
-            f"{len(live.names)} images in {arguments.out}; watch {arguments.out / 'live.html'} in a browser"
-        )
-        calibration = _calibration(live, options)
-        asks = _asks(arguments, _lines(arguments, typed))
+        calibration, states = _calibration(live, options), _states(arguments)
+        gripper = None if states is None else lambda: next(states())
+        capture = LiveCapture(calibration, camera, options, tell, _words(arguments, live), gripper)
         try:
-            result = collect(live, camera, asks, options, tell, _words(arguments, live), calibration, typed)
-            if result is None and len(live.names) >= LEAST_IMAGES:
-                result = _finished(calibration)
+            with PageServer(capture, arguments.page_port) as page:
+                _print(f"{len(live.names)} images in {arguments.out}; open {page.address} in a browser")
+                capture.run(_asks(arguments, states, _lines(arguments, capture)))
+                result = capture.finish()
         finally:
             calibration.close()
     is_proven = calibration.progress.is_accurate
@@ -117,15 +115,6 @@ def _calibration(live: "LiveFolder", options: CollectOptions) -> "LiveCalibratio
     from jcr.live.calibration import LiveCalibration
 
     return LiveCalibration(live, options=CalibrateOptions(require=options.require), reach=options.reach_m)
-
-
-def _finished(calibration: "LiveCalibration") -> "RunResult | None":
-    """The calibration of all images; None, and a line that says why, where there is none."""
-    try:
-        return calibration.finish()
-    except RejectedError as error:
-        warn(f"no calibration: {error}")
-        return None
 
 
 def _report(
@@ -154,11 +143,11 @@ def _report(
     return 3 if arguments.collect.until_accurate and not (is_accurate and is_proven) else 0
 
 
-def _lines(arguments: Arguments, typed: "queue.SimpleQueue[Typed]") -> "Iterator[str]":
+def _lines(arguments: Arguments, capture: "LiveCapture") -> "Iterator[str]":
     """What is typed, without commands; where poses come from elsewhere, a thread of its own reads these."""
-    from jcr.live.calibration_keys import HELP, without_commands
+    from jcr.live.commands import HELP, without_commands
 
-    lines = without_commands(sys.stdin, typed.put)
+    lines = without_commands(sys.stdin, capture.press)
     if sys.stdin.isatty():
         _print(HELP)
     if arguments.poses != "typed":
@@ -171,30 +160,37 @@ def _print(text: str) -> None:
     sys.stderr.flush()
 
 
-def _asks(arguments: Arguments, lines: "Iterator[str]") -> "Iterator[Ask]":
+def _states(arguments: Arguments) -> "States | None":
+    """The states of an arm that is watched; None of poses that are typed or sent."""
     from jcr.live import franka, ur, xarm
+
+    kind, _, address = arguments.poses.partition(":")
+    if kind not in _SPOKEN or not address:
+        return None
+    if kind == "ur":
+        host, port = _address(address, 30003, "--poses ur:")
+        return lambda: ur.states(host, port)
+    module = franka if kind == "franka" else xarm
+    return lambda: module.states(address)
+
+
+def _asks(arguments: Arguments, states: "States | None", lines: "Iterator[str]") -> "Iterator[Ask]":
     from jcr.live.line_server import Listen, bound, served_poses
     from jcr.live.rest import asks_at_rest
     from jcr.live.typed import typed_poses
 
-    kind, _, address = arguments.poses.partition(":")
-    if kind == "typed" and not address:
+    if states is not None:
+        _print(f"move the arm; an image is taken whenever it rests ({arguments.poses.partition(':')[2]})")
+        yield from asks_at_rest(states)
+    elif arguments.poses == "typed":
         yield from typed_poses(lines, _print, arguments.pose_convention, arguments.pose_units)
-    elif kind == "tcp" and not address:
+    elif arguments.poses == "tcp":
         host, port = _address(arguments.listen, 7464, "--listen ")
         token = arguments.token or os.environ.get("JCR_TOKEN")
         listen = Listen(host, port, token, arguments.timeout)
         with bound(listen) as server:
             _print("waiting for poses on {}:{}".format(*server.getsockname()[:2]))
             yield from served_poses(server, listen)
-    elif kind in _SPOKEN and address:
-        _print(f"move the arm; an image is taken whenever it rests ({address})")
-        if kind == "ur":
-            host, port = _address(address, 30003, "--poses ur:")
-            yield from asks_at_rest(lambda: ur.states(host, port))
-        else:
-            module = franka if kind == "franka" else xarm
-            yield from asks_at_rest(lambda: module.states(address))
     else:
         raise InputError(f"--poses {arguments.poses}: give ur:HOST, franka:HOST, xarm:HOST, typed or tcp")
 

@@ -16,17 +16,19 @@ from jcr.geometry import rotation_exp, transform
 Answer = dict[str, Any]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Ask:
     """The gripper rests here: take an image."""
 
-    base_from_gripper: Float[ndarray, "4 4"]
+    base_from_gripper: Float[ndarray, "4 4"] = field(kw_only=False)
     answer: Callable[[Answer], None] = field(default=lambda answer: None)
-    """Gets what came of it, for whoever asked and can listen."""
+    """Is called with the answer, once."""
     current: Callable[[], Float[ndarray, "4 4"]] | None = None
-    """Reads the pose once more after the image; None where whoever asked vouches for it."""
+    """Reads the pose once more after the image; None where the source has no other than this one."""
     joints: Float[ndarray, " dof"] | None = None
-    """Joint angles (rad) at rest, where the arm tells them."""
+    """Joint angles (rad) at rest; None where the arm does not send them."""
+    waits: bool = False
+    """Whether the answer is the calibration with the image, seconds later."""
 
 
 def pose_of_numbers(numbers: list[float], where: str) -> Float[ndarray, "4 4"]:

@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8, UInt16
+from jaxtyping import Float, Float32, UInt8, UInt16
 from numpy import ndarray
 
 from jcr.calibration.case import Case, some_of_many
 from jcr.calibration.checks.left_out import SAME
 from jcr.calibration.checks.views import STILL as MOVED
-from jcr.calibration.expected import FEWEST, Ahead, Assumptions, assumed, assumed_of, typical_camera
+from jcr.calibration.expected import FEWEST, assumed_of
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised
-from jcr.calibration.robot_errors import RobotErrors, errors_of, robot_errors
+from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import checked
 from jcr.capture.camera_json import intrinsics_as_json
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
@@ -25,34 +25,25 @@ from jcr.files import read_bytes, write_text
 from jcr.geometry import apply, largest_motion
 from jcr.handeye.arms import arm_named
 from jcr.least_squares import one_blas_thread
-from jcr.live.arm_words import ArmWords
-from jcr.live.arm_words import Path as ArmPath
 from jcr.live.calibration_left_out import left_out
 from jcr.live.calibration_progress import LeftOut, Progress, Reached
-from jcr.live.coverage import reachable
 from jcr.live.folder import LiveFolder
 from jcr.live.look import STILL, grid
+from jcr.live.next_pose import Reach, before_calibration, proposed
 from jcr.options import checked_options
 from jcr.reconstruct.growing import Growing
-from jcr.records import Capture, Finding, HandEye, Intrinsics, Kind, NextPose, strongest_first
+from jcr.records import Capture, Finding, HandEye, Intrinsics, Kind, strongest_first
 
 if TYPE_CHECKING:
     from jcr.results import RunResult
 
 HISTORY = "live/history.json"
 """In the folder of the capture: how exact the calibration was after each image."""
-RESULT = "result"
-"""In the folder of the capture: the run folder of the calibration of all images."""
 OBSERVATIONS = 300, 8000
 """An image and in all, that take part while images are taken; what more of them add, the calibration at the end has."""
 FEW = 5
 """Images from which on there is a calibration, or a finding that says what is missing."""
 MOST_POINTS = 3000
-PROPOSALS = 12
-"""Poses that are compared; the first that the arm reaches and whose image is likely to register is proposed."""
-ALIKE, ELSEWHERE_M = np.radians(25.0), 0.06
-"""Largest angle between the lines of sight of a proposed image and the nearest that registered, and least distance (m)
-of its camera from where an image did not register."""
 
 
 class LiveCalibration:
@@ -77,11 +68,11 @@ class LiveCalibration:
         if not isinstance(folder, LiveFolder):
             given = None if intrinsics is None else intrinsics_as_json(intrinsics)
             folder = LiveFolder(Path(folder), given, robot)
-        self.live, self._reach = folder, reach
+        self.live = folder
         self._options = checked_options(options, CalibrateOptions)
         check_options(self._options)
         name = self._options.robot or folder.rest.get("robot")
-        self._arm = None if name is None else arm_named(name)
+        self._reach = Reach(None if name is None else arm_named(name), reach)
         self._map: Growing | None = None
         self._mapped: list[str] = []
         self._of_image: dict[str, tuple[Finding, ...]] = {}
@@ -131,8 +122,12 @@ class LiveCalibration:
         refused = self.fault(image, base_from_gripper, without=old)
         if refused is not None:
             return self._refusing(refused)
-        self.live.add(image, base_from_gripper, joints, depth_mm, time_s)
-        self.live.remove(old)
+        self.live.add(image, base_from_gripper, joints, depth_mm, time_s, replaces=old)
+        return self.update()
+
+    def undo(self) -> Progress:
+        """Take back the last `add`, `remove` or `replace` since the capture was begun or resumed."""
+        self.live.undo()
         return self.update()
 
     def finish(self, out: str | Path | None = None) -> "RunResult":
@@ -142,9 +137,10 @@ class LiveCalibration:
         """
         from jcr.pipeline import calibrate
         from jcr.results import RunOptions
+        from jcr.run_folder import LIVE
 
         options = RunOptions(calibrate=self._options)
-        return calibrate(self.live.folder, out or self.live.folder / RESULT, options)
+        return calibrate(self.live.folder, out or self.live.folder / LIVE, options)
 
     def fault(
         self,
@@ -158,16 +154,16 @@ class LiveCalibration:
             sizes = {"size": "{}x{}".format(*size), "before": "{}x{}".format(*self.live.size)}
             return Finding(kind=Kind.SIZE_DIFFERS, severity="rejects", mend="images", details=sizes)
         coarse = grid(image)
-        for name, pose in self.live.places():
-            metres, radians = largest_motion(np.stack([pose, base_from_gripper]))
-            if name == without or (metres < MOVED[0] and radians < MOVED[1]):
+        for one in self.live.images:
+            metres, radians = largest_motion(np.stack([one.base_from_gripper, base_from_gripper]))
+            if one.name == without or (metres < MOVED[0] and radians < MOVED[1]):
                 continue
-            if np.abs(self._grid(name) - coarse).mean() < STILL:
+            if np.abs(self._grid(one.name) - coarse).mean() < STILL:
                 return Finding(
                     kind=Kind.FRAME_REPEATED,
                     severity="rejects",
                     mend="images",
-                    images=(name,),
+                    images=(one.name,),
                     value=metres,
                     details={"rotation": radians},
                 )
@@ -176,9 +172,15 @@ class LiveCalibration:
     @one_blas_thread
     def update(self) -> Progress:
         """Bring the calibration up to what the folder holds: images that were added there, or removed."""
-        capture = self.live.capture() if self.live.names else None
+        capture = self.live.capture()
         names, before = [] if capture is None else list(capture.images), len(self._mapped)
         for name in [name for name in self._mapped if name not in names]:
+            self._forget(name)
+        # An image that is back is not the last one: those after it are mapped after it again.
+        same = next(
+            (k for k, pair in enumerate(zip(self._mapped, names, strict=False)) if len(set(pair)) > 1), None
+        )
+        for name in [] if same is None else self._mapped[same:]:
             self._forget(name)
         new = [name for name in names if name not in self._mapped]
         if capture is not None:
@@ -188,9 +190,10 @@ class LiveCalibration:
         return self.progress
 
     def close(self) -> None:
-        """Remove the working files; what lies in the folder of the capture stays."""
+        """Remove the working files, and the files of images that were taken out of the capture."""
         if self._map is not None:
             self._map.close()
+        self.live.close()
 
     def _refusing(self, refused: Finding) -> Progress:
         self.progress = replace(self.progress, added=None, refused=refused)
@@ -215,7 +218,8 @@ class LiveCalibration:
             image = read_image(capture.folder / name)
             self._of_image[name] = self._looked_at(name, image)
             if self._map is None or self._map.is_to_be_mapped_again:
-                self.close()
+                if self._map is not None:
+                    self._map.close()
                 # What is there already is mapped at once, as after an interruption.
                 self._map = Growing(capture)
                 self._of_image |= {
@@ -250,7 +254,7 @@ class LiveCalibration:
         state = Progress(images=names, added=added, registered=registered, history=self._history)
         if capture is None or made is None or len(registered) < FEWEST:
             state = replace(state, findings=strongest_first([*of_images, *_too_few(len(names))]))
-            return replace(state, **self._before_calibration(capture))
+            return replace(state, **before_calibration(capture, self._reach))
         tracks = some_of_many(made.tracks, min(OBSERVATIONS[0] * len(registered), OBSERVATIONS[1]))
         made = replace(made, tracks=tracks)
         robot = robot_errors(capture, self._options).of(made.image_index)
@@ -258,7 +262,7 @@ class LiveCalibration:
             case = checked(capture, made, self._options, robot)
         except RejectedError:
             state = replace(state, findings=strongest_first([*of_images, *_too_few(len(names))]))
-            return replace(state, **self._before_calibration(capture))
+            return replace(state, **before_calibration(capture, self._reach))
         assumptions = assumed_of(case)
         hand_eye = advised(
             case.hand_eye, case.base_from_gripper, self._options, robot, assumptions, case.scene_in_base
@@ -276,7 +280,7 @@ class LiveCalibration:
             history=self._history,
             left_out=proof,
             points_in_base=_points(case, hand_eye),
-            **self._proposed(case, hand_eye, robot, assumptions),
+            **proposed(case, hand_eye, robot, assumptions, self._reach),
         )
 
     def _not_registered(self, names: tuple[str, ...]) -> list[Finding]:
@@ -308,50 +312,6 @@ class LiveCalibration:
         )
         self._history = (*(one for one in self._history if one.images < images), reached)
         write_text(self.live.folder / HISTORY, json.dumps([asdict(one) for one in self._history]) + "\n")
-
-    def _before_calibration(self, capture: Capture | None) -> dict[str, Any]:
-        """The next pose by a usual robot and usual images, as fields of Progress."""
-        if capture is None or len(capture) < 2:
-            return {}
-        poses = capture.base_from_gripper
-        camera = typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
-        ahead = Ahead.of(assumed(poses, camera), poses, errors_of(poses), 1, self._reach)
-        pose = ahead.next_pose(1, ahead.expected(1))
-        return {"next_pose": pose, "next_like": capture.images[pose.like]}
-
-    def _proposed(
-        self, case: Case, hand_eye: HandEye, robot: RobotErrors, assumptions: Assumptions
-    ) -> dict[str, Any]:
-        """The next pose, within the reach and the arm's limits where they are known, as fields of Progress."""
-        used = case.used
-        poses, names = case.base_from_gripper[used], [case.names[row] for row in used]
-        pose: NextPose = hand_eye.next_poses[0]
-        joints = None
-        if not hand_eye.is_sound:
-            return self._before_calibration(case.capture)
-        is_bounded = self._reach is not None or self._arm is not None
-        registers = self._registers(case, pose.base_from_gripper[None])[0]
-        if is_bounded or not registers:
-            ahead = Ahead.of(assumptions, poses, robot.of(used), PROPOSALS, self._reach)
-            likely = self._registers(case, ahead.added)
-            ahead = replace(ahead, added=ahead.added[likely if likely.any() else slice(None)])
-            angles = case.capture.joints
-            of_used = None if angles is None else angles[case.reconstruction.image_index[used]]
-            row, joints = reachable(ahead.added, ArmPath(poses, of_used), ArmWords(arm=self._arm))
-            ahead = replace(ahead, added=ahead.added[row : row + 1])
-            pose = ahead.next_pose(1, ahead.expected(1))
-        return {"next_pose": pose, "next_joints": joints, "next_like": names[pose.like]}
-
-    def _registers(self, case: Case, added: Float[ndarray, "c 4 4"]) -> Bool[ndarray, " c"]:
-        """Which gripper poses are likely to give an image that registers: one that looks along nearly the same line as
-        an image that registered, and not from where one did not."""
-        x, capture = case.hand_eye.gripper_from_camera, case.capture
-        there = np.isin(np.arange(len(capture)), case.reconstruction.image_index)
-        camera, known = added @ x, capture.base_from_gripper[there] @ x
-        angle = np.arccos(np.clip(camera[:, :3, 2] @ known[:, :3, 2].T, -1, 1)).min(1)
-        failed = capture.base_from_gripper[~there] @ x
-        away = np.linalg.norm(camera[:, None, :3, 3] - failed[:, :3, 3], axis=2).min(1, initial=np.inf)
-        return (angle < ALIKE) & (away > ELSEWHERE_M)
 
 
 def _first(capture: Capture, count: int) -> Capture:

@@ -5,9 +5,9 @@ import numpy as np
 from jcr.live.arm_words import ArmWords, pose_lines
 from jcr.live.asks import Answer
 from jcr.live.calibration_progress import Progress, Reached
-from jcr.records import Kind
+from jcr.records import Finding, Kind
 from jcr.records.findings import without_consequences
-from jcr.records.words import sentence
+from jcr.records.words import remedy, sentence, text
 from jcr.rounding import significant
 
 EARLIER = 5
@@ -16,6 +16,8 @@ EARLIER = 5
 
 def progress_lines(state: Progress, require: tuple[float, float] | None, words: ArmWords) -> list[str]:
     """How exact the calibration is beside what is required, how it came to that, what is wrong, and the next pose."""
+    if state.hand_eye is None and len(state.images) <= 1:
+        return ["rotate the wrist by 20° or more, and move, between images"]
     lines = [f"{_registered(state)}: {_accuracy(state, require)}"]
     if len(earlier := state.history[-EARLIER - 1 : -1]) and state.now is not None:
         course = " → ".join(significant(one.translation_mm) for one in (*earlier, state.now))
@@ -27,18 +29,38 @@ def progress_lines(state: Progress, require: tuple[float, float] | None, words: 
             f"  {proof.images} images that take no part are off by {significant(proof.translation_mm)} mm and "
             f"{significant(proof.rotation_deg)}° (rms), {verdict}"
         )
-    lines += [
-        f"  {sentence(one)}"
+    lines += [f"  {sentence(one)}" for one in faults(state)]
+    if state.next_pose is not None:
+        lines.append(f"next: {next_sentence(state)}")
+        lines += [f"  {line}" for line in next_lines(state, words)]
+    return lines
+
+
+def faults(state: Progress) -> list[Finding]:
+    """What is found against the images and the calibration, that of the last image first; not that more images help."""
+    found = [
+        one
         for one in without_consequences(state.findings)
-        if one.severity != "informs" and one.kind is not Kind.NOT_EXACT_ENOUGH
+        if one.severity != "informs" and one.kind not in (Kind.NOT_EXACT_ENOUGH, Kind.FEW_IMAGES)
     ]
-    if (pose := state.next_pose) is not None:
-        moved, rotated = 1e3 * pose.moved_m, np.degrees(pose.rotation_rad)
-        then = (
-            f"then {significant(pose.within_95_mm)} mm and {significant(pose.rotation_95_deg)}° are expected"
-        )
-        lines.append(f"next: {moved:.0f} mm and {rotated:.0f}° from {state.next_like}; {then}")
-        lines += [f"  {line}" for line in pose_lines(pose.base_from_gripper, words, state.next_joints)]
+    return sorted(found, key=lambda one: one.images != (state.added,))
+
+
+def next_sentence(state: Progress) -> str:
+    """Where the next pose is, and what is expected of the calibration with it."""
+    pose = state.next_pose
+    assert pose is not None
+    moved, rotated = 1e3 * pose.moved_m, np.degrees(pose.rotation_rad)
+    then = f"then {significant(pose.within_95_mm)} mm and {significant(pose.rotation_95_deg)}° are expected"
+    return f"{moved:.0f} mm and {rotated:.0f}° from {state.next_like}; {then}"
+
+
+def next_lines(state: Progress, words: ArmWords) -> list[str]:
+    """The next pose in the words of the arm."""
+    assert state.next_pose is not None
+    lines = pose_lines(state.next_pose.base_from_gripper, words, state.next_joints)
+    if words.arm is not None and state.next_joints is None:
+        lines.append(f"a {words.arm.name} cannot reach this pose within its joint limits: go near it")
     return lines
 
 
@@ -73,7 +95,8 @@ def progress_answer(state: Progress) -> Answer:
                 "kind": one.kind.value,
                 "severity": one.severity,
                 "images": list(one.images),
-                "text": sentence(one),
+                "text": text(one),
+                "remedy": remedy(one),
             }
             for one in state.findings
         ],

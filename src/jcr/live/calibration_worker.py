@@ -1,6 +1,5 @@
 """A calibration that is made in a thread of its own, so that neither the camera nor the source of poses waits for it."""
 
-import queue
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -34,7 +33,6 @@ class CalibrationWorker:
     def __init__(self, calibration: "LiveCalibration", heard: "Heard", until_accurate: bool = False) -> None:
         """`until_accurate`: as soon as the calibration is as accurate as required, it is finished, too."""
         self._calibration, self._heard, self._until_accurate = calibration, heard, until_accurate
-        self._removed: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._changed = threading.Event()
         self._ended = self._abandoned = False
         self._calibrated: tuple[str, ...] = ()
@@ -46,12 +44,7 @@ class CalibrationWorker:
         self._thread.start()
 
     def changed(self) -> None:
-        """An image was added to the capture."""
-        self._changed.set()
-
-    def remove(self, name: str) -> None:
-        """Take an image out of the capture, before the next calibration."""
-        self._removed.put(name)
+        """Images were added to the capture, or taken out of it."""
         self._changed.set()
 
     def finish(self) -> None:
@@ -76,18 +69,19 @@ class CalibrationWorker:
                 return
             ends = self._ended
             self._changed.clear()
-            self._remove_all()
             try:
                 self._calibrate()
             except (InputError, RejectedError) as error:
                 self._heard(Failed(str(error)))
+            except OSError as error:
+                self._heard(Failed(f"{error.filename or self._calibration.live.folder}: {error.strerror}"))
             except Exception as error:
                 self._heard(error)
             if ends:
                 return
 
     def _calibrate(self) -> None:
-        names = tuple(name for name, _ in self._calibration.live.places())
+        names = tuple(self._calibration.live.names)
         if names == self._calibrated:
             return
         progress = self._calibration.update()
@@ -95,9 +89,3 @@ class CalibrationWorker:
         self._heard(progress)
         if self._until_accurate and progress.is_accurate:
             self._heard(self._calibration.finish())
-
-    def _remove_all(self) -> None:
-        live = self._calibration.live
-        while not self._removed.empty():
-            if (name := self._removed.get()) in live.names:
-                live.remove(name)

@@ -1,33 +1,29 @@
-"""Taking a capture: requests for images, what a person types and what the calibration comes to, one after the other.
+"""Taking a capture: requests for images, commands of a person and states of the calibration, one after the other.
 
-The source of poses and the calibration have threads of their own; what they come to is put into one queue, and all that
-changes the capture's images happens here, but for their removal, which the calibration's thread does between two of its
-states.
+The source of poses, the calibration, the terminal and the live page have threads of their own; what they come to is put
+into one queue, and all that changes the capture's images happens here.
 """
 
 import queue
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
 
-from jcr.capture.images import brightness_and_sharpness, read_image
-from jcr.errors import InputError
+from jcr.capture.images import read_image
+from jcr.errors import InputError, RejectedError
 from jcr.live.arm_words import ArmWords
 from jcr.live.asks import Answer, Ask
-from jcr.live.calibration_keys import Typed
 from jcr.live.calibration_progress import Progress
 from jcr.live.calibration_words import progress_answer, progress_lines
 from jcr.live.calibration_worker import CalibrationWorker, Failed
-from jcr.live.camera import Camera
-from jcr.live.coverage import as_answer, coverage, in_words
-from jcr.live.folder import LiveFolder
-from jcr.live.look import Still, grid, still_image
-from jcr.live.page import ENOUGH, Window, write_page
-from jcr.live.rest import REST, farther
+from jcr.live.camera import Camera, Frame
+from jcr.live.commands import Command
+from jcr.live.look import Look, frame_at_rest
+from jcr.live.rest import REST, State, farther
 
 if TYPE_CHECKING:
     from jcr.live.calibration import LiveCalibration
@@ -37,6 +33,8 @@ SAME_PLACE = (0.005, np.radians(1.0))
 """m, rad: a second image from within this adds nothing."""
 ENOUGH_IMAGES, MOST_IMAGES = 12, 40
 """Of a capture, and of one that ends when it is accurate enough."""
+LEAST_IMAGES = 3
+"""Of a calibration."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,206 +67,276 @@ class CollectOptions:
         return None if self.reach is None else np.array(self.reach).reshape(2, 3)
 
 
-_Event = Ask | Typed | Progress | Failed | Exception | None
-"""None: nobody asks any more."""
+@dataclass(frozen=True, kw_only=True)
+class Shown:
+    """A capture at one moment, as the live page shows it."""
 
-
-def collect(
-    live: LiveFolder,
-    camera: Camera,
-    asks: Iterator[Ask],
-    options: CollectOptions,
-    tell: Callable[[Answer, list[str]], None],
-    words: ArmWords | None = None,
-    calibration: "LiveCalibration | None" = None,
-    typed: "queue.SimpleQueue[Typed] | None" = None,
-) -> "RunResult | None":
-    """Take images into the folder until there are enough, nobody asks any more, or the video ends.
-
-    `tell` gets each answer, and each state of the `calibration` where there is one, with the lines that a person reads,
-    the next pose in the arm's own `words`. live.html in the folder shows how it goes. `typed` are commands, from another
-    thread. The finished calibration is returned where the capture ended because it is accurate.
-    """
-    taking = _Taking(live=live, camera=camera, options=options, tell=tell, words=words or ArmWords())
-    if calibration is not None:
-        taking.worker = CalibrationWorker(calibration, taking.events.put, options.until_accurate)
-    with Window(live, camera.latest):
-        return taking.until_the_end(asks, typed)
-
-
-@dataclass(kw_only=True)
-class _Taking:
-    """One capture while it is taken."""
-
-    live: LiveFolder
-    camera: Camera
-    options: CollectOptions
-    tell: Callable[[Answer, list[str]], None]
-    words: ArmWords
-    worker: CalibrationWorker | None = None
-    events: "queue.SimpleQueue[_Event | RunResult]" = field(default_factory=queue.SimpleQueue)
-    answered: threading.Event = field(default_factory=threading.Event)
-    is_over: bool = False
+    version: int = 0
+    """Grows with every change."""
+    event: str = ""
+    """What happened last, in words; empty of what the rest shows."""
+    is_refusal: bool = False
+    """Whether that is why an image was not kept."""
+    images: tuple[str, ...] = ()
     replaces: str | None = None
-    """The image that the next one is taken in place of."""
-    is_other: bool = False
-    """Whether images were removed since it was last asked what the capture covers."""
-    done: "RunResult | None" = None
+    """The image that the next one replaces."""
+    progress: Progress = Progress(images=())
+    """Of the last calibration, which may be of fewer images."""
+    is_over: bool = False
+    result: "RunResult | None" = None
+    """The calibration of all images, at the end."""
 
-    def __post_init__(self) -> None:
-        self.kept = {name: _as_kept(self.live, name) for name in self.live.names}
-        self.found = coverage(self.live, self.options.reach_m, self.words)
-        self.frames = iter(self.camera.frames)
-        self._show(f"{len(self.kept)} images of {self.options.most}")
 
-    def until_the_end(
-        self, asks: Iterator[Ask], typed: "queue.SimpleQueue[Typed] | None"
-    ) -> "RunResult | None":
-        """Handle what comes until the capture ends."""
-        if self.worker is not None:
-            self.worker.start()
-        self.is_over = len(self.kept) >= self.options.most
+_Event = Ask | Command | Progress | Failed | Exception | None
+"""None: no more requests come."""
+
+
+class LiveCapture:
+    """One capture while it is taken; `run` takes images until it ends, `finish` calibrates all of them.
+
+    `tell` gets each answer, and each state of the calibration, with the lines that a person reads, the next pose in the
+    arm's own `words`. `gripper` reads where the gripper is now (InputError where it cannot), for an image on command;
+    None where poses are typed or sent.
+    """
+
+    def __init__(
+        self,
+        calibration: "LiveCalibration",
+        camera: Camera,
+        options: CollectOptions,
+        tell: Callable[[Answer, list[str]], None],
+        words: ArmWords | None = None,
+        gripper: Callable[[], State] | None = None,
+    ) -> None:
+        self.calibration, self.live, self.camera = calibration, calibration.live, camera
+        self.options, self.words = options, words or ArmWords()
+        self.shown = Shown(images=tuple(self.live.names))
+        self._tell, self._gripper = tell, gripper
+        self._events: queue.SimpleQueue[_Event | RunResult] = queue.SimpleQueue()
+        self._worker = CalibrationWorker(calibration, self._events.put, options.until_accurate)
+        self._frames = iter(camera.frames)
+        self._looks = {name: Look.of(read_image(self.live.folder / name)) for name in self.live.names}
+        self._waiting: list[tuple[str, Ask]] = []
+        """Images whose requests are answered with the calibration."""
+        self._answered = threading.Event()
+
+    def press(self, command: Command) -> None:
+        """Obey a command after all that came before it; from any thread."""
+        self._events.put(command)
+
+    def run(self, asks: Iterator[Ask]) -> None:
+        """Take images until there are enough, no more requests come, the video ends, or the calibration is accurate."""
+        self._worker.start()
+        self._show("", is_over=len(self.live.names) >= self.options.most)
         threading.Thread(target=self._listen, args=(asks,), daemon=True).start()
-        if typed is not None:
-            threading.Thread(target=self._forward, args=(typed,), daemon=True).start()
         try:
-            while not self.is_over:
-                self._handle(self.events.get())
+            while not self.shown.is_over:
+                self._handle(self._events.get())
+            self._stop(self._worker.finish)
+            while not self._events.empty():
+                event = self._events.get()
+                if isinstance(event, Ask):
+                    event.answer({"accepted": False, "reason": "the capture has ended", "done": True})
+                elif event is not None and not isinstance(event, Command):
+                    self._handle(event)
         except BaseException:
-            self._end(abandon=True)
+            self._stop(self._worker.abandon)
             raise
-        self._end(abandon=False)
-        while not self.events.empty():
-            event = self.events.get()
-            if not isinstance(event, Ask | Typed):
-                self._handle(event)
-        return self.done
+        finally:
+            self._answer_waiting()
 
-    def _end(self, abandon: bool) -> None:
-        self.is_over = True
-        self.answered.set()
-        if self.worker is not None:
-            (self.worker.abandon if abandon else self.worker.finish)()
+    def finish(self) -> "RunResult | None":
+        """The calibration of all images; None, with a line that says why, where there is none."""
+        if self.shown.result is None and len(self.live.names) >= LEAST_IMAGES:
+            self._show(f"calibrating all {len(self.live.names)} images", is_over=True)
+            try:
+                self._show("", result=self.calibration.finish())
+            except RejectedError as error:
+                self._refuse(f"no calibration: {error}")
+        return self.shown.result
+
+    def _stop(self, worker_stops: Callable[[], None]) -> None:
+        self._show(self.shown.event, is_over=True)
+        self._answered.set()
+        worker_stops()
 
     def _listen(self, asks: Iterator[Ask]) -> None:
-        """One request after the other, each when the one before it was answered."""
+        """One request after the other, each when the one before it was handled."""
         try:
-            while not self.is_over and (ask := next(asks, None)) is not None:
-                self.events.put(ask)
-                self.answered.wait()
-                self.answered.clear()
+            while not self.shown.is_over and (ask := next(asks, None)) is not None:
+                self._events.put(ask)
+                self._answered.wait()
+                self._answered.clear()
         except Exception as error:
-            self.events.put(error)
-        self.events.put(None)
-
-    def _forward(self, typed: "queue.SimpleQueue[Typed]") -> None:
-        while not self.is_over:
-            self.events.put(typed.get())
+            self._events.put(error)
+        self._events.put(None)
 
     def _handle(self, event: "_Event | RunResult") -> None:
         if event is None:
-            self.is_over = True
+            self._show(self.shown.event, is_over=True)
         elif isinstance(event, Ask):
             self._take(event)
-            self.answered.set()
-        elif isinstance(event, Typed):
+            self._answered.set()
+        elif isinstance(event, Command):
             self._obey(event)
         elif isinstance(event, Progress):
-            self._tell_progress(event)
+            self._report(event)
         elif isinstance(event, Failed):
-            self.tell({"calibration": None, "reason": event.reason}, [f"no calibration: {event.reason}"])
+            self._refuse(f"no calibration: {event.reason}")
+            self._answer_waiting(of_all=True)
         elif isinstance(event, Exception):
             raise event
         else:
             self._end_if_accurate(event)
 
     def _take(self, ask: Ask) -> None:
+        """Take an image, keep it, and answer, at once or with the calibration."""
         try:
-            taken = self._image(ask)
+            frame = self._frame(ask)
+            name = frame if isinstance(frame, InputError) else self._keep(ask, frame)
         except StopIteration:
-            answer: Answer = {"accepted": False, "reason": "the video has ended"}
-            self.is_over = True
-            ask.answer(answer | {"done": True})
-            self.tell(answer, ["the video has ended"])
+            name = InputError("the video has ended")
+            self._show("", is_over=True)
+        if isinstance(name, InputError):
+            answer: Answer = {"accepted": False, "reason": str(name), "done": self.shown.is_over}
+            ask.answer(answer)
+            self._show(f"refused: {name}", is_refusal=True)
+            self._tell(answer, [f"refused: {name}"])
             return
-        name = taken if isinstance(taken, InputError | str) else self._keep(ask, taken)
-        if isinstance(name, InputError) or isinstance(taken, str):
-            answer = {"accepted": False, "reason": str(name)}
-            lines, headline = [f"refused: {name}"], f"Refused: {name}"
+        self._show(f"kept {name}", is_over=len(self.live.names) >= self.options.most)
+        self._tell(_kept(name, self.shown.is_over), [f"kept {name}"])
+        if ask.waits:
+            self._waiting.append((name, ask))
         else:
-            self.is_over = len(self.kept) >= self.options.most
-            answer = {"accepted": True, "image": name, "done": self.is_over} | as_answer(self.found)
-            headline = f"{len(self.kept)} images of {self.options.most}"
-            lines = [f"kept {name}", *in_words(self.found)]
-        self._show(headline)
-        ask.answer(answer)
-        self.tell(answer, lines)
+            ask.answer(_kept(name, self.shown.is_over))
 
-    def _image(self, ask: Ask) -> Still | str:
-        """An image at rest, or why none is kept."""
-        for name, pose in self.live.places():
-            is_there = name in self.kept and name != self.replaces
-            if is_there and not farther(pose, ask.base_from_gripper, SAME_PLACE):
-                return f"the gripper is where {name} was taken; move to another pose"
-        others = [one for name, one in self.kept.items() if name != self.replaces]
-        taken = still_image(self.frames, others, self.options.patience)
+    def _frame(self, ask: Ask) -> Frame | InputError:
+        """A frame at rest, or why none is kept."""
+        others = [one for one in self.live.images if one.name != self.shown.replaces]
+        for one in others:
+            if not farther(one.base_from_gripper, ask.base_from_gripper, SAME_PLACE):
+                return InputError(f"the gripper is where {one.name} was taken; move to another pose")
+        found = frame_at_rest(self._frames, [self._looks[one.name] for one in others], self.options.patience)
+        if isinstance(found, str):
+            return InputError(found)
         if ask.current is not None and farther(ask.base_from_gripper, ask.current(), REST):
-            return "the arm moved while the image was taken; let it rest"
-        return taken
+            return InputError("the arm moved while the image was taken; let it rest")
+        return found
 
-    def _keep(self, ask: Ask, taken: Still) -> str | InputError:
-        """Keep an image, in place of another where one is retaken; an InputError of one that does not fit the others."""
+    def _keep(self, ask: Ask, frame: Frame) -> str | InputError:
+        """The name of a frame that is kept; the InputError of one that does not fit the others or cannot be written."""
         try:
-            name = self.live.add(taken.image, ask.base_from_gripper, ask.joints, taken.depth_mm, taken.time_s)
+            name = self.live.add(
+                frame.image,
+                ask.base_from_gripper,
+                ask.joints,
+                frame.depth_mm,
+                frame.time_s,
+                replaces=self.shown.replaces,
+            )
         except InputError as error:
             return error
-        self.kept[name] = taken
-        if self.replaces is not None:
-            self._remove(self.replaces)
-            self.replaces = None
-        elif self.worker is not None:
-            self.worker.changed()
-        self.found = coverage(
-            self.live, self.options.reach_m, self.words, None if self.is_other else self.found
-        )
-        self.is_other = False
+        except OSError as error:
+            return InputError(
+                f"the image cannot be written ({error.strerror}); free the disk and take it again"
+            )
+        self._looks[name] = Look.of(frame.image)
+        self._show("", replaces=None)
+        self._worker.changed()
         return name
 
-    def _remove(self, name: str) -> None:
-        self.kept.pop(name, None)
-        self.is_other = True
-        if self.worker is None:
-            self.live.remove(name)
+    def _obey(self, command: Command) -> None:
+        names = self.live.names
+        number = len(names) if command.number is None else command.number
+        if command.action == "finish":
+            self._show("", is_over=True)
+        elif command.action == "take":
+            self._take_now()
+        elif command.action == "undo":
+            self._undo()
+        elif not 1 <= number <= len(names):
+            self._refuse(f"refused: there is no image {number}")
+        elif command.action == "retake":
+            self._retake(names[number - 1])
         else:
-            self.worker.remove(name)
+            self.live.remove(names[number - 1])
+            self._changed(f"removed {names[number - 1]}")
 
-    def _obey(self, typed: Typed) -> None:
-        names = list(self.kept)
-        row = len(names) if typed.number is None else typed.number
-        if typed.action == "finish":
-            self.is_over = True
-        elif not 1 <= row <= len(names):
-            self.tell({"accepted": False, "reason": "no such image"}, [f"refused: there is no image {row}"])
-        elif typed.action == "retake":
-            self.replaces = names[row - 1]
-            self.tell({"retake": self.replaces}, [f"the next image replaces {self.replaces}"])
+    def _take_now(self) -> None:
+        if self._gripper is None:
+            self._refuse("refused: give the pose at which the gripper rests; the image is taken then")
+            return
+        try:
+            state = self._gripper()
+            read = self._gripper
+            self._take(
+                Ask(state.base_from_gripper, current=lambda: read().base_from_gripper, joints=state.joints)
+            )
+        except InputError as error:
+            self._refuse(f"refused: {error}")
+
+    def _retake(self, name: str) -> None:
+        """The next image replaces one: now, where the gripper is still there."""
+        event = f"the next image replaces {name}"
+        self._show(event, replaces=name)
+        self._tell({"retake": name}, [event])
+        there = next(one.base_from_gripper for one in self.live.images if one.name == name)
+        if self._gripper is not None and not farther(there, self._gripper().base_from_gripper, SAME_PLACE):
+            self._take_now()
+
+    def _undo(self) -> None:
+        if self.shown.replaces is not None:
+            self._show("no image is replaced", replaces=None)
+        elif self.live.undo():
+            self._changed(f"undone: {len(self.live.names)} images")
         else:
-            self._remove(names[row - 1])
-            self.tell({"removed": names[row - 1]}, [f"removed {names[row - 1]}"])
+            self._refuse("refused: nothing to undo")
 
-    def _tell_progress(self, state: Progress) -> None:
+    def _changed(self, event: str) -> None:
+        """Calibrate the images that are there now."""
+        self._show(event, replaces=None)
+        self._worker.changed()
+        self._tell({"images": self.live.names}, [event])
+
+    def _refuse(self, why: str) -> None:
+        self._show(why, is_refusal=True)
+        self._tell({"accepted": False, "reason": why.removeprefix("refused: ")}, [why])
+
+    def _report(self, state: Progress) -> None:
+        shown = self.shown
+        is_done = not shown.is_refusal and state.images == shown.images
+        self._show("" if is_done else shown.event, is_refusal=shown.is_refusal, progress=state)
         lines = progress_lines(state, self.options.require, self.words)
-        self.tell({"calibration": progress_answer(state)}, lines)
+        self._tell({"calibration": progress_answer(state)}, lines)
+        # Whether an accurate calibration ends the capture is known when it is finished.
+        if not (self.options.until_accurate and state.is_accurate):
+            self._answer_waiting()
 
     def _end_if_accurate(self, result: "RunResult") -> None:
         required = result.hand_eye.requirement
         if result.converged and required is not None and required.met:
-            self.done, self.is_over = result, True
+            self._show("", is_over=True, result=result)
+        self._answer_waiting()
 
-    def _show(self, headline: str) -> None:
-        write_page(self.live, self.found, headline, self.options.require or ENOUGH)
+    def _answer_waiting(self, of_all: bool = False) -> None:
+        """Answer the requests whose images the calibration has, or all of them."""
+        state, waiting = self.shown.progress, self._waiting
+        is_due = [of_all or self.shown.is_over or name in state.images for name, _ in waiting]
+        self._waiting = [one for one, due in zip(waiting, is_due, strict=True) if not due]
+        for (name, ask), due in zip(waiting, is_due, strict=True):
+            if due:
+                ask.answer(progress_answer(state) | _kept(name, self.shown.is_over))
+
+    def _show(self, event: str, *, is_refusal: bool = False, **changes: object) -> None:
+        self.shown = replace(
+            self.shown,
+            version=self.shown.version + 1,
+            event=event,
+            is_refusal=is_refusal,
+            images=tuple(self.live.names),
+            **changes,  # pyright: ignore[reportArgumentType]
+        )
 
 
-def _as_kept(live: LiveFolder, name: str) -> Still:
-    image = read_image(live.folder / name)
-    return Still(image=image, grid=grid(image), sharpness=brightness_and_sharpness(image)[1])
+def _kept(name: str, is_over: bool) -> Answer:
+    return {"accepted": True, "image": name, "done": is_over}

@@ -1,12 +1,11 @@
-"""The capture folder while it grows: whole after every image, so that stopping loses nothing."""
+"""The capture folder while it grows: whole after every change, so that stopping loses nothing."""
 
 import json
 import re
-import threading
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 from numpy import ndarray
@@ -17,55 +16,89 @@ from jcr.capture.checks import read_rigid
 from jcr.capture.images import encode_png, read_image
 from jcr.capture.plain_files import contained, read_json
 from jcr.errors import InputError
-from jcr.files import write_bytes, write_text
+from jcr.files import remove_unfinished, write_bytes, write_text
 from jcr.handeye.arms import ROBOT_NAMES
 from jcr.records import Capture
 
-THUMBNAIL_PX = 240
+IMAGES = "images"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TakenImage:
+    """An image of the capture, and what was recorded with it."""
+
+    name: str
+    """Its file, in the folder."""
+    base_from_gripper: Float[ndarray, "4 4"]
+    joints: Float[ndarray, " dof"] | None
+    """rad; None where they are not known."""
+    depth: str | None
+    """The file of a depth camera's image."""
+    time_s: float | None
+    """On the camera's clock."""
 
 
 class LiveFolder:
-    """A capture folder that images are added to; what it holds already is kept."""
+    """A capture folder whose images are added, replaced and removed; what it holds already is kept.
+
+    Changes are made by one thread; others may read at any time. The files of removed images stay until `close`, so that
+    a change can be undone.
+    """
 
     def __init__(self, folder: Path, intrinsics: dict[str, Any] | None = None, robot: str | None = None):
-        """Raises InputError when `folder` holds a capture.json that cannot be resumed."""
+        """`intrinsics` as capture.json has them. Raises InputError when `folder` cannot be resumed."""
         self.folder = folder
-        self._lock = threading.Lock()
-        self.names: list[str] = []
-        self.poses: list[Float[ndarray, "4 4"]] = []
-        self.joints: list[Float[ndarray, " dof"] | None] = []
-        self.depths: list[str | None] = []
-        self.times_s: list[float | None] = []
+        self.images: tuple[TakenImage, ...] = ()
         self.intrinsics = intrinsics
         self.size: tuple[int, int] | None = None
         self.rest: dict[str, Any] = {"source": {"program": "jcr capture"}}
+        self._earlier: list[tuple[TakenImage, ...]] = []
+        """The images before each change of this session."""
         if folder.exists() and not folder.is_dir():
             raise InputError(f"{folder}: is a file; name a folder for the capture")
         if (folder / FILE).exists():
             self._resume(read_json(folder / FILE))
+        remove_unfinished(folder / IMAGES)
         if robot is not None:
             self.rest["robot"] = robot
-        self._stamped_before = tuple(self.names)
+        self._before_session = frozenset(self.names)
+        self._ever: dict[str, TakenImage] = {one.name: one for one in self.images}
+        self._next_number = self._first_free_number()
 
     def _resume(self, content: Any) -> None:
         file = self.folder / FILE
         if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
             raise InputError(f'{file}: has no list "frames"; name a new folder for the capture')
+        images = []
         for row, frame in enumerate(content["frames"]):
             if not isinstance(frame, dict) or not isinstance(frame.get("image"), str):
                 raise InputError(f"{file}: frame {row} names no image; name a new folder for the capture")
             where = f"{file}: frame {row}"
             height, width = read_image(contained(self.folder, frame["image"], where)).shape[:2]
             self.size = (width, height)
-            self.names.append(frame["image"])
-            self.poses.append(read_rigid(frame.get("base_from_gripper"), where))
-            angles, depth = frame.get("joints"), frame.get("depth")
-            self.joints.append(None if angles is None else read_joints(angles, f"{where}: joints"))
-            self.depths.append(depth if isinstance(depth, str) else None)
-            time_s = frame.get("time_s")
-            self.times_s.append(float(time_s) if isinstance(time_s, int | float) else None)
+            angles, depth, time_s = (frame.get(key) for key in ("joints", "depth", "time_s"))
+            images.append(
+                TakenImage(
+                    name=frame["image"],
+                    base_from_gripper=read_rigid(frame.get("base_from_gripper"), where),
+                    joints=None if angles is None else read_joints(angles, f"{where}: joints"),
+                    depth=depth if isinstance(depth, str) else None,
+                    time_s=float(time_s) if isinstance(time_s, int | float) else None,
+                )
+            )
+        self.images = tuple(images)
         self.intrinsics = self.intrinsics or content.get("intrinsics")
         self.rest = {key: content[key] for key in content if key not in ("frames", "intrinsics")}
+
+    @property
+    def names(self) -> list[str]:
+        """Of the images, in the order in which they were taken."""
+        return [one.name for one in self.images]
+
+    @property
+    def poses(self) -> list[Float[ndarray, "4 4"]]:
+        """base_from_gripper of each image."""
+        return [one.base_from_gripper for one in self.images]
 
     def add(
         self,
@@ -74,11 +107,13 @@ class LiveFolder:
         joints: Float[ndarray, " dof"] | None = None,
         depth_mm: UInt16[ndarray, "h w"] | None = None,
         time_s: float | None = None,
+        replaces: str | None = None,
     ) -> str:
         """Keep an image (RGB) and its pose, and return the image's name; capture.json is whole again after.
 
-        `joints` (rad) are kept when all images have them. Raises InputError where the image's size is not that of the
-        others.
+        `replaces` is an image that is taken out for it. `joints` (rad) are kept when all images have them. Raises
+        InputError where the image's size is not that of the others, and OSError where it cannot be written: the capture
+        is then what it was.
         """
         size = (image.shape[1], image.shape[0])
         if self.size not in (None, size):
@@ -88,99 +123,116 @@ class LiveFolder:
             )
         if self.intrinsics is not None:
             read_intrinsics(self.intrinsics, size, self.folder / FILE)
-        name = f"images/{self._next_number():03d}.png"
-        write_bytes(self.folder / name, encode_png(image))
-        depth = None
-        if depth_mm is not None:
-            depth = f"depth/{Path(name).stem}.png"
-            write_bytes(self.folder / depth, encode_png(depth_mm))
-        height = round(THUMBNAIL_PX * size[1] / size[0])
-        bgr = np.ascontiguousarray(image[..., ::-1])
-        small = cv2.resize(bgr, (THUMBNAIL_PX, height), interpolation=cv2.INTER_AREA)
-        write_bytes(self.folder / self.thumbnail(name), cv2.imencode(".jpg", small)[1].tobytes())
-        with self._lock:
-            self.size = size
-            self.names.append(name)
-            self.poses.append(base_from_gripper)
-            self.joints.append(joints)
-            self.depths.append(depth)
-            self.times_s.append(time_s)
-            self._write()
-        return name
+        stem = f"{self._next_number:03d}"
+        new = TakenImage(
+            name=f"{IMAGES}/{stem}.png",
+            base_from_gripper=base_from_gripper,
+            joints=joints,
+            depth=None if depth_mm is None else f"depth/{stem}.png",
+            time_s=time_s,
+        )
+        try:
+            write_bytes(self.folder / new.name, encode_png(image))
+            if new.depth is not None and depth_mm is not None:
+                write_bytes(self.folder / new.depth, encode_png(depth_mm))
+            self._change((*(one for one in self.images if one.name != replaces), new))
+        except OSError:
+            self._delete(new)
+            raise
+        self.size = size
+        self._ever[new.name] = new
+        self._next_number += 1
+        return new.name
 
     def remove(self, name: str) -> None:
-        """Take an image out of the capture; capture.json is whole before its files are deleted."""
-        with self._lock:
-            row = self.names.index(name)
-            files = [name, self.thumbnail(name), *filter(None, [self.depths[row]])]
-            for of_images in (self.names, self.poses, self.joints, self.depths, self.times_s):
-                del of_images[row]
-            self._stamped_before = tuple(one for one in self._stamped_before if one != name)
-            self._write()
-        for file in files:
-            contained(self.folder, file, str(self.folder)).unlink(missing_ok=True)
+        """Take an image out of the capture."""
+        self._change(tuple(one for one in self.images if one.name != name))
 
-    def places(self) -> list[tuple[str, Float[ndarray, "4 4"]]]:
-        """The images and their gripper poses, while another thread may add to them."""
-        with self._lock:
-            return list(zip(self.names, self.poses, strict=True))
+    @property
+    def can_undo(self) -> bool:
+        """Whether this session changed anything that is not undone."""
+        return len(self._earlier) > 0
+
+    def undo(self) -> bool:
+        """Take back the last change of this session; whether there was one."""
+        if not self._earlier:
+            return False
+        self._write(self._earlier[-1])
+        self.images = self._earlier.pop()
+        return True
+
+    def close(self) -> None:
+        """Delete the files of images that this session took out of the capture: no change can be undone after."""
+        for name in self._ever.keys() - set(self.names):
+            self._delete(self._ever.pop(name))
+        self._earlier.clear()
+
+    def _change(self, images: tuple[TakenImage, ...]) -> None:
+        self._write(images)
+        self._earlier.append(self.images)
+        self.images = images
+
+    def _delete(self, one: TakenImage) -> None:
+        for file in filter(None, (one.name, one.depth)):
+            contained(self.folder, file, str(self.folder)).unlink(missing_ok=True)
 
     def seconds_back(self, name: str) -> float | None:
         """By how much an image was stamped before the one taken before it; None where it was not, or has no stamp.
 
         Another run of the program, which took the images that were there before, may have had another clock.
         """
-        with self._lock:
-            row = self.names.index(name) if name in self.names else 0
-            if row == 0 or (self.names[row - 1] in self._stamped_before) != (name in self._stamped_before):
-                return None
-            now, before = self.times_s[row], self.times_s[row - 1]
-        return before - now if now is not None and before is not None and now <= before else None
+        images = self.images
+        row = next((row for row, one in enumerate(images) if one.name == name), 0)
+        before, now = images[row - 1 : row + 1] if row else (None, None)
+        if before is None or now is None:
+            return None
+        if (before.name in self._before_session) != (name in self._before_session):
+            return None
+        if now.time_s is None or before.time_s is None or now.time_s > before.time_s:
+            return None
+        return before.time_s - now.time_s
 
-    def capture(self) -> Capture:
-        """The images so far as a capture, of one image too; they were checked when they were taken."""
-        with self._lock:
-            return self._capture()
-
-    def _capture(self) -> Capture:
-        assert self.size is not None
+    def capture(self) -> Capture | None:
+        """The images so far as a capture, of one image too; None of none. They were checked when they were taken."""
+        images = self.images
+        if not images or self.size is None:
+            return None
         intrinsics = read_intrinsics(self.intrinsics, self.size, self.folder / FILE)
         return Capture(
             folder=self.folder,
-            images=tuple(self.names),
-            base_from_gripper=np.stack(self.poses),
+            images=tuple(one.name for one in images),
+            base_from_gripper=np.stack([one.base_from_gripper for one in images]),
             image_size=self.size,
             intrinsics=intrinsics,
             intrinsics_std=read_std(self.rest.get("intrinsics_std"), intrinsics, self.folder / FILE),
-            joints=self.all_joints(),
+            joints=_all_joints(images),
             robot=name if (name := self.rest.get("robot")) in ROBOT_NAMES else None,
-            depths=tuple(self.depths) if any(self.depths) else None,
+            depths=tuple(one.depth for one in images) if any(one.depth for one in images) else None,
         )
 
-    def all_joints(self) -> Float[ndarray, "n dof"] | None:
-        """Joint angles (rad) of all images, or None where one lacks them."""
-        known = [angles for angles in self.joints if angles is not None]
-        return np.stack(known) if known and len(known) == len(self.joints) else None
-
-    def _write(self) -> None:
+    def _write(self, images: tuple[TakenImage, ...]) -> None:
+        joints = _all_joints(images)
         frames: list[dict[str, Any]] = []
-        for row, (name, pose) in enumerate(zip(self.names, self.poses, strict=True)):
-            frame: dict[str, Any] = {"image": name, "base_from_gripper": pose.tolist()}
-            if all(angles is not None for angles in self.joints):
-                frame["joints"] = np.asarray(self.joints[row]).tolist()
-            if self.depths[row] is not None:
-                frame["depth"] = self.depths[row]
-            if self.times_s[row] is not None:
-                frame["time_s"] = self.times_s[row]
+        for row, one in enumerate(images):
+            frame: dict[str, Any] = {"image": one.name, "base_from_gripper": one.base_from_gripper.tolist()}
+            if joints is not None:
+                frame["joints"] = joints[row].tolist()
+            if one.depth is not None:
+                frame["depth"] = one.depth
+            if one.time_s is not None:
+                frame["time_s"] = one.time_s
             frames.append(frame)
         content = {"frames": frames, "intrinsics": self.intrinsics, **self.rest}
         write_text(self.folder / FILE, json.dumps(content, indent=1) + "\n")
 
-    @staticmethod
-    def thumbnail(name: str) -> str:
-        """Where the small copy of an image lies, in the folder."""
-        return f"thumbnails/{Path(name).stem}.jpg"
-
-    def _next_number(self) -> int:
-        numbers = [int(match[1]) for name in self.names if (match := re.match(r"images/(\d+)\.", name))]
+    def _first_free_number(self) -> int:
+        """Above all images that are there, those of an interrupted session that no capture.json names included."""
+        names = [*self.names, *(f"{IMAGES}/{file.name}" for file in (self.folder / IMAGES).glob("*.png"))]
+        numbers = [int(match[1]) for name in names if (match := re.match(r"images/(\d+)\.", name))]
         return max(numbers, default=-1) + 1
+
+
+def _all_joints(images: tuple[TakenImage, ...]) -> Float[ndarray, "n dof"] | None:
+    """Joint angles (rad) of all images, or None where one lacks them."""
+    known = [one.joints for one in images if one.joints is not None]
+    return np.stack(known) if known and len(known) == len(images) else None

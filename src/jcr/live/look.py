@@ -1,11 +1,11 @@
 """Whether what the camera shows can be kept: at rest, sharp, exposed, and not what it showed before."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8, UInt16
+from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
 from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault
@@ -19,20 +19,21 @@ a shift of one pixel in 640 of a textured tabletop 3."""
 GRID_PX = 160
 
 
-@dataclass(frozen=True, kw_only=True)
-class Still:
-    """An image that was kept, and what later ones are held against."""
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What later images are compared with of an image that was kept."""
 
-    image: UInt8[ndarray, "h w 3"]
     grid: Float32[ndarray, "gh gw"]
     sharpness: float
-    depth_mm: UInt16[ndarray, "h w"] | None = None
-    time_s: float | None = None
-    """On the camera's clock."""
+
+    @staticmethod
+    def of(image: UInt8[ndarray, "h w 3"]) -> "Look":
+        """Of an RGB image."""
+        return Look(grid(image), brightness_and_sharpness(image)[1])
 
 
-def still_image(frames: Iterator[Frame], kept: list[Still], patience_s: float) -> Still | str:
-    """The first image at rest that can be kept, or after `patience_s` the reason why none could.
+def frame_at_rest(frames: Iterator[Frame], kept: Sequence[Look], patience_s: float) -> Frame | str:
+    """The first frame at rest that can be kept, or after `patience_s` the reason why none could.
 
     Those `kept` were taken from elsewhere, so this one must differ. Raises StopIteration at the end of a video
     file.
@@ -42,26 +43,38 @@ def still_image(frames: Iterator[Frame], kept: list[Still], patience_s: float) -
     reason = "no second image came"
     while True:
         frame = next(frames)
+        if frame.time_s < earlier.time_s:
+            # The clock was set back: time is counted from here.
+            earlier, end = frame, frame.time_s + patience_s
         if frame.time_s - earlier.time_s < REST_S:
             continue
-        before, now = grid(earlier.image), grid(frame.image)
-        earlier = frame
-        grey, sharpness = brightness_and_sharpness(frame.image)
-        usual = float(np.median([one.sharpness for one in kept])) if kept else 0.0
-        if np.abs(now - before).mean() > STILL:
-            reason = "the image is not still; wait until the arm and everything in view is at rest"
-        elif (fault := exposure_fault(grey)) is not None:
-            reason = f"the image is {fault}; change light or exposure"
-        elif sharpness < BLURRED * usual:
-            reason = f"the image is blurred ({100 * sharpness / usual:.0f} % of the usual sharpness)"
-        elif any(np.abs(now - one.grid).mean() < STILL for one in kept):
-            reason = "the gripper moved but the image did not change; is the stream frozen, or is it another camera?"
-        else:
-            return Still(
-                image=frame.image, grid=now, sharpness=sharpness, depth_mm=frame.depth_mm, time_s=frame.time_s
-            )
+        fault = _fault(earlier, frame, kept)
+        if fault is None:
+            return frame
+        reason, earlier = fault, frame
         if frame.time_s > end:
             return reason
+
+
+def _fault(earlier: Frame, frame: Frame, kept: Sequence[Look]) -> str | None:
+    """Why a frame cannot be kept; None of one that can be."""
+    if earlier.image.shape != frame.image.shape:
+        return "the size of the camera's images changes; fix it with --camera-size"
+    before, now = grid(earlier.image), grid(frame.image)
+    grey, sharpness = brightness_and_sharpness(frame.image)
+    usual = float(np.median([one.sharpness for one in kept])) if kept else 0.0
+    if np.abs(now - before).mean() > STILL:
+        return "the image is not still; wait until the arm and everything in view is at rest"
+    if (fault := exposure_fault(grey)) is not None:
+        return f"the image is {fault}; change light or exposure"
+    if sharpness < BLURRED * usual:
+        return f"the image is blurred ({100 * sharpness / usual:.0f} % of the usual sharpness)"
+    # Images of another size are refused where they are kept.
+    if any(np.abs(now - one.grid).mean() < STILL for one in kept if one.grid.shape == now.shape):
+        return (
+            "the gripper moved but the image did not change; is the stream frozen, or is it another camera?"
+        )
+    return None
 
 
 def grid(image: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "gh gw"]:

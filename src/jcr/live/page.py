@@ -1,167 +1,255 @@
-"""live.html: the camera's image now, what the images show so far, and the next pose; it renews itself."""
+"""What the live page shows of a capture: one record, drawn by the templates and the figures of the report."""
 
 import json
-import threading
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
-import cv2
 import numpy as np
-from jaxtyping import UInt8
-from numpy import ndarray
 
-from jcr.calibration.expected import FEWEST
 from jcr.calibration.requirement import GRASPING
-from jcr.files import write_bytes, write_text
-from jcr.live.camera import Frame
-from jcr.live.coverage import Coverage, in_words, next_lines
-from jcr.live.figures import chart_figure, pose_figure
+from jcr.live.arm_words import ArmWords
+from jcr.live.calibration_progress import Progress
+from jcr.live.calibration_words import faults, next_lines, next_sentence
+from jcr.live.collect import LiveCapture, Shown
 from jcr.live.folder import LiveFolder
-from jcr.report.render import render
+from jcr.records import Finding, Intrinsics
+from jcr.records.words import reached_in_words, sentence
+from jcr.report.figures import course_figure
+from jcr.report.raster import TRACK_COLOR
+from jcr.report.render import Section, render
+from jcr.report.scene3d import TRACK_SIZE, PointLayer, scene_data, scene_view
 from jcr.report.svg import Figure
 from jcr.report.verdict import Tile
 from jcr.rounding import significant
 
 PACKAGE = "jcr.live"
-NOW_PX = 640
-FEW_FEATURES = 150
-"""SIFT features in an image of NOW_PX below which registration is at risk."""
-LOOK_S = 1.0
-ENOUGH = GRASPING
-"""mm, degrees: what the chart marks where nothing was required."""
-LABEL = "95 % of the errors expected of a seen point, as a multiple of what is wanted, by number of images"
+PARTS = ("head", "next", "course", "images")
+"""Templates of what changes with the capture, each in an element of this name."""
+ANY_CAMERA = Intrinsics(600.0, 600.0, 320.0, 240.0, 640, 480)
+"""Drawn where no intrinsics are known."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageCard:
+    """An image as the page lists it."""
+
+    number: int
+    name: str
+    fault: str
+    """What is found against it; empty where nothing is."""
+    state: str
+    """registered, not registered, new (no calibration with it yet)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PageState:
-    """All that the page shows of a capture; the templates draw nothing else."""
+    """All that changes on the page, but for the 3D view; the templates draw nothing else."""
 
-    folder: str
     kind: str
-    """good, bad, or empty: the colour of the headline."""
+    """good, fair, bad, or empty: the colour of the headline."""
     headline: str
-    covered: str
-    """A sentence on what the images cover."""
+    lines: Sequence[str]
+    """What is to be known of it, and what is wrong."""
+    replaces: int | None
+    """The number of the image that the next one replaces."""
+    is_over: bool
+    can_undo: bool
     tiles: Sequence[Tile]
     next_pose: str
-    """Where it is, as a sentence; empty where none is proposed yet."""
-    next_pose_lines: Sequence[str]
+    """Where it is and what is expected of it; empty where none is proposed."""
+    next_lines: Sequence[str]
     """As the arm writes it."""
-    scene: Figure | None
-    chart: Figure | None
-    legend: Sequence[tuple[str, str]]
-    """The curves of the chart, and their last values."""
-    images: Sequence[tuple[int, str, str]]
-    """Number, name and thumbnail, the newest first."""
+    courses: Sequence[Figure]
+    images: Sequence[ImageCard]
+    """The newest first."""
 
 
-def write_page(
-    live: LiveFolder, found: Coverage, headline: str, wanted: tuple[float, float] = ENOUGH
-) -> None:
-    """Write live.html, and live/state.js by which an open page learns of it."""
-    content = {"state": page_state(live, found, headline, wanted)}
-    write_text(live.folder / "live.html", render("live.html", content, PACKAGE))
-    body = json.dumps(render("state.html", content, PACKAGE))
-    write_text(live.folder / "live" / "state.js", f"show({body});\n")
+def whole_page(capture: LiveCapture) -> str:
+    """The page as a browser loads it; it then asks for its parts."""
+    content = {"folder": str(capture.live.folder), "scene": _scene_section(capture)}
+    return render("live.html", content, PACKAGE)
 
 
-def page_state(live: LiveFolder, found: Coverage, headline: str, wanted: tuple[float, float]) -> PageState:
-    """What the page shows after an image: what is covered, and mm and degrees expected beside those wanted."""
-    pose, like = found.next_pose, 0 if found.next_pose is None else found.next_pose.like
-    reached = np.array([one.reached("seen") for one in found.expected]).reshape(-1, 2).T
-    curves = dict(zip(("translation", "rotation"), reached, strict=True))
-    shares = {name: values / want for (name, values), want in zip(curves.items(), wanted, strict=True)}
-    next_gripper = None if pose is None else pose.base_from_gripper
-    units = dict(zip(curves, ("mm", "°"), strict=True))
+def page_parts(capture: LiveCapture) -> dict[str, Any]:
+    """What the page asks for when the capture has changed: the parts, as HTML, and what the 3D view draws."""
+    shown = capture.shown
+    state = page_state(shown, capture.live, capture.options.require or GRASPING, capture.words)
+    parts = {name: render(f"{name}.html", {"state": state}, PACKAGE) for name in PARTS}
+    return {
+        "version": shown.version,
+        "is_over": shown.is_over,
+        "images": len(shown.images),
+        "parts": parts,
+        "scene": json.dumps(_scene(capture)),
+    }
+
+
+def page_state(shown: Shown, live: LiveFolder, required: tuple[float, float], words: ArmWords) -> PageState:
+    """What the page shows at one moment; `required` are mm and degrees."""
+    progress, images = shown.progress, _cards(shown)
+    kind, headline, lines = _verdict(shown, required)
+    pose = progress.next_pose if not shown.is_over else None
     return PageState(
-        folder=str(live.folder),
-        kind=_kind(headline, found, wanted),
+        kind=kind,
         headline=headline,
-        covered=in_words(found)[0],
-        tiles=_tiles(found, wanted),
-        next_pose=""
-        if pose is None
-        else f"{1e3 * pose.moved_m:.0f} mm and {np.degrees(pose.rotation_rad):.0f}° from {found.like}.",
-        next_pose_lines=[] if pose is None else next_lines(found),
-        scene=pose_figure(live.poses, next_gripper, like) if live.poses else None,
-        chart=chart_figure(LABEL, shares, FEWEST) if found.expected else None,
-        legend=[(name, f"{significant(float(v[-1]))} {units[name]}") for name, v in curves.items() if len(v)],
-        images=[(k, name, live.thumbnail(name)) for k, name in reversed(list(enumerate(live.names, 1)))],
+        lines=lines,
+        replaces=None if shown.replaces is None else live.names.index(shown.replaces) + 1,
+        is_over=shown.is_over,
+        can_undo=live.can_undo or shown.replaces is not None,
+        tiles=_tiles(shown, required),
+        next_pose="" if pose is None else next_sentence(progress),
+        next_lines=[] if pose is None else next_lines(progress, words),
+        courses=_courses(progress, required),
+        images=images[::-1],
     )
 
 
-def _kind(headline: str, found: Coverage, wanted: tuple[float, float]) -> str:
-    if headline.startswith("Refused"):
-        return "bad"
-    if (now := found.now) is None or found.unseen:
-        return ""
-    mm, deg = now.reached("seen")
-    return "good" if mm <= wanted[0] and deg <= wanted[1] else ""
-
-
-def _tiles(found: Coverage, wanted: tuple[float, float]) -> list[Tile]:
-    tiles: list[Tile] = [("images", str(found.images), "", False)]
-    if (now := found.now) is None:
-        return tiles
-    mm, deg = now.reached("seen")
-    far, std = significant(1e-3 * now.seen.distance_mm), now.std
-    translation = " ".join(significant(1e3 * value) for value in std[:3])
+def _cards(shown: Shown) -> list[ImageCard]:
+    progress = shown.progress
+    against = {name: sentence(one) for one in progress.findings[::-1] for name in _of_one(one)}
     return [
-        *tiles,
-        (f"a point seen at {far} m, 95 %", f"{significant(mm)} mm", f"wanted {wanted[0]:g} mm", False),
-        ("directions there, 95 %", f"{significant(deg)}°", f"wanted {wanted[1]:g}°", False),
-        ("the camera itself, 1 σ", f"{translation} mm", f"scale {significant(100 * std[6])} %", False),
+        ImageCard(
+            number=number,
+            name=name,
+            fault=against.get(name, ""),
+            state="registered"
+            if name in progress.registered
+            else "not registered"
+            if name in progress.images
+            else "new",
+        )
+        for number, name in enumerate(shown.images, 1)
     ]
 
 
-class Window:
-    """Writes what the camera sees into the folder, once a second, with the features on it."""
+def _of_one(finding: Finding) -> tuple[str, ...]:
+    return finding.images if len(finding.images) == 1 and finding.severity != "informs" else ()
 
-    def __init__(self, live: LiveFolder, latest: Callable[[], Frame | None]) -> None:
-        self._live, self._latest = live, latest
-        self._stop = threading.Event()
-        self._shown: float | None = None
-        self._thread = threading.Thread(target=self._watch, daemon=True)
 
-    def __enter__(self) -> "Window":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._stop.set()
-        self._thread.join(10 * LOOK_S)
-        self.look()
-
-    def look(self) -> None:
-        """Write the newest image, if it is new."""
-        frame = self._latest()
-        if frame is None or frame.time_s == self._shown:
-            return
-        self._shown = frame.time_s
-        image, count = with_features(frame.image)
-        write_bytes(
-            self._live.folder / "live" / "now.jpg", cv2.imencode(".jpg", image[..., ::-1])[1].tobytes()
+def _verdict(shown: Shown, required: tuple[float, float]) -> tuple[str, str, list[str]]:
+    """The kind, the headline and the lines below it."""
+    progress, wrong = shown.progress, faults(shown.progress)
+    lines = [_capitalised(sentence(one)) for one in wrong]
+    if shown.result is not None:
+        verdict = shown.result.verdict
+        kind = {"accepted": "good", "rejected": "bad"}.get(verdict, "fair")
+        found = shown.result.hand_eye.requirement
+        reached = [] if found is None else [_capitalised(reached_in_words(found))]
+        where = f"The calibration of all {len(shown.images)} images is in {shown.result.out}; its report.html shows it."
+        return kind, _capitalised(verdict), [*reached, where]
+    if shown.is_refusal:
+        return "bad", _capitalised(shown.event), lines
+    if shown.event:
+        return "", _capitalised(shown.event), lines
+    if not shown.images:
+        first = "Move the arm so that the camera sees textured things at different heights, and let it rest."
+        return "", "No image yet", [first]
+    if wrong:
+        is_bad = any(one.severity == "rejects" for one in wrong)
+        return "bad" if is_bad else "fair", lines[0], lines[1:]
+    if progress.now is None:
+        return (
+            "",
+            f"{len(shown.images)} images",
+            ["From the third image that registers on there is a calibration."],
         )
-        words = f"{count} features" + (
-            f": few; put textured things into view (fewer than {FEW_FEATURES} may not register)"
-            if count < FEW_FEATURES
-            else ""
+    return _accuracy(progress, required)
+
+
+def _accuracy(progress: Progress, required: tuple[float, float]) -> tuple[str, str, list[str]]:
+    """Of a calibration against which nothing is found."""
+    assert progress.now is not None
+    if progress.is_accurate and progress.left_out is not None:
+        proof = f"{progress.left_out.images} images that take no part confirm it."
+        return "good", "As accurate as required", [f"{proof} Finish, or go on."]
+    mm, deg = progress.now.translation_mm, progress.now.rotation_deg
+    if mm > required[0] or deg > required[1]:
+        return "", "Not accurate enough yet: go on to the next pose", []
+    if progress.left_out is None:
+        return "", "Accurate by its own claim: more images are needed to confirm it", []
+    return "fair", "Accurate by its own claim, which the images do not confirm", []
+
+
+def _capitalised(words: str) -> str:
+    return words[:1].upper() + words[1:]
+
+
+def _tiles(shown: Shown, required: tuple[float, float]) -> list[Tile]:
+    progress = shown.progress
+    if not shown.images:
+        return []
+    tiles: list[Tile] = [
+        (name, f"± {significant(value)}{unit}", f"required {limit:g}{unit}", True)
+        for name, value, limit, unit in zip(
+            ("Point seen, 95 %", "Direction, 95 %"), _reached(shown), required, (" mm", "°"), strict=False
         )
-        seen = {"words": words, "few": count < FEW_FEATURES, "time": time.strftime("%H:%M:%S")}
-        write_text(self._live.folder / "live" / "now.js", f"now({json.dumps(seen)});\n")
+    ]
+    count = f"{len(progress.registered)} of {len(shown.images)}"
+    tiles.append(("Images registered", count, "", False))
+    if (proof := progress.left_out) is not None:
+        off = f"{significant(proof.translation_mm)} mm · {significant(proof.rotation_deg)}°"
+        expected = f"expected {significant(proof.expected_mm)} mm · {significant(proof.expected_deg)}°"
+        tiles.append((f"{proof.images} images left out, rms", off, expected, False))
+    return tiles
 
-    def _watch(self) -> None:
-        while not self._stop.wait(LOOK_S):
-            self.look()
+
+def _reached(shown: Shown) -> tuple[float, ...]:
+    """How exact the calibration is (mm, degrees), at the end that of all images; empty where there is none."""
+    found = None if shown.result is None else shown.result.hand_eye.requirement
+    if found is not None:
+        return found.reached_mm, found.reached_deg
+    now = shown.progress.now
+    return () if now is None else (now.translation_mm, now.rotation_deg)
 
 
-def with_features(image: UInt8[ndarray, "h w 3"]) -> tuple[UInt8[ndarray, "h2 w2 3"], int]:
-    """The image NOW_PX wide with a ring at each SIFT feature, and how many there are."""
-    height = max(1, round(NOW_PX * image.shape[0] / image.shape[1]))
-    small = cv2.resize(np.ascontiguousarray(image), (NOW_PX, height), interpolation=cv2.INTER_AREA)
-    found = cv2.SIFT.create(2000).detect(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), None)
-    for feature in found:
-        center = round(feature.pt[0]), round(feature.pt[1])
-        cv2.circle(small, center, 3, (60, 235, 120), 1, cv2.LINE_AA)
-    return small, len(found)
+def _courses(progress: Progress, required: tuple[float, float]) -> list[Figure]:
+    """How exact the calibration was, image by image."""
+    if len(history := progress.history) < 2:
+        return []
+    count = [one.images for one in history]
+    curves = [
+        ("Point seen (mm)", [one.translation_mm for one in history], required[0], " mm"),
+        ("Direction (°)", [one.rotation_deg for one in history], required[1], "°"),
+    ]
+    return [course_figure(title, count, values, goal, unit) for title, values, goal, unit in curves]
+
+
+def _scene_section(capture: LiveCapture) -> Section:
+    checks = [
+        ("cameras", "cameras", True),
+        ("grippers", "grippers", True),
+        ("grid", "base and grid", True),
+        ("next", "next pose (green)", True),
+        ("tracks", "points seen (red)", True),
+    ]
+    return Section(
+        "view", {"layers": [], "checks": checks, "through": [], "labels": [], "data": _scene(capture)}
+    )
+
+
+def _scene(capture: LiveCapture) -> dict[str, Any]:
+    """Points seen, images and the next pose; cameras where a calibration places them."""
+    shown, live = capture.shown, capture.live
+    progress, found = shown.progress, shown.progress.hand_eye
+    x = np.eye(4) if found is None else found.gripper_from_camera
+    faults = {one.name: one.fault for one in _cards(shown)}
+    views = [
+        scene_view(
+            Path(one.name).name,
+            faults.get(one.name, "") or one.name,
+            not faults.get(one.name),
+            one.base_from_gripper,
+            one.base_from_gripper @ x if found is not None and one.name in progress.registered else None,
+        )
+        for one in live.images
+    ]
+    points = np.zeros((0, 3)) if progress.points_in_base is None else progress.points_in_base
+    layer = PointLayer(
+        "points seen", points, np.tile(np.array(TRACK_COLOR, np.uint8), (len(points), 1)), TRACK_SIZE
+    )
+    next_poses = [] if progress.next_pose is None or shown.is_over else [progress.next_pose.base_from_gripper]
+    intrinsics = (found.intrinsics if found is not None else None) or ANY_CAMERA
+    shown_in_base = np.array([np.zeros(3), *(pose[:3, 3] for pose in (*live.poses, *next_poses))])
+    return scene_data([layer], views, next_poses, x, intrinsics, shown_in_base)

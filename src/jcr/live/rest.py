@@ -28,11 +28,11 @@ class State:
     """On the controller's clock."""
     base_from_gripper: Float[ndarray, "4 4"]
     joints: Float[ndarray, " dof"] | None = None
-    """rad; None where the source does not tell them."""
+    """rad; None where the source does not send them."""
 
 
 States = Callable[[], Iterator[State]]
-"""Begins to listen: what the arm tells from then on, without end. Closing the iterator hangs up."""
+"""Begins to listen: what the arm sends from then on, without end. Closing the iterator hangs up."""
 
 
 def asks_at_rest(states: States) -> Iterator[Ask]:
@@ -48,8 +48,8 @@ def asks_at_rest(states: States) -> Iterator[Ask]:
 
     while True:
         state = _at_rest(states, last, limit)
-        # The connection is closed meanwhile: states that wait would tell where the arm has been.
-        yield Ask(state.base_from_gripper, heard, current, state.joints)
+        # The connection is closed meanwhile: states that wait would be those of where the arm has been.
+        yield Ask(state.base_from_gripper, answer=heard, current=current, joints=state.joints)
         last = state.base_from_gripper
 
 
@@ -57,6 +57,8 @@ def _at_rest(states: States, last: Float[ndarray, "4 4"] | None, limit: tuple[fl
     """Where the arm rests, once it is farther than `limit` from `last`."""
     recent: deque[State] = deque()
     for state in states():
+        if recent and state.time_s < recent[-1].time_s:
+            recent.clear()  # The controller's clock was set back.
         while recent and farther(recent[0].base_from_gripper, state.base_from_gripper, REST):
             recent.popleft()
         recent.append(state)

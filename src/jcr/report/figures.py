@@ -1,6 +1,6 @@
 """The report's figures: cameras and grippers, a grid over the frame, a histogram, a slice of the map."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -29,6 +29,8 @@ from jcr.report.svg import (
 
 CAMERA_LENGTH = 0.07
 """Of a drawn pyramid, as a share of the figure's contents."""
+COURSE_HEIGHT = 240.0
+"""px."""
 
 
 def camera_figure(
@@ -122,6 +124,41 @@ def bars_figure(
         more = " and more" if share == 1 else ""
         shapes.append(text(share * WIDTH, HEIGHT - 32, f"{share * float(edge[-1]):.2g}{more}", kind))
     return Figure(title, [*shapes, text(WIDTH / 2, HEIGHT - 14, unit, "small middle")])
+
+
+def course_figure(title: str, count: Sequence[int], value: Sequence[float], goal: float, unit: str) -> Figure:
+    """A value by number of images, on a logarithmic axis, and the value that is required; `unit` follows the numbers."""
+    left, top, right, bottom = 46.0, 30.0, 12.0, 40.0
+    low, high = 0.8 * min(*value, goal), 1.25 * max(*value, goal)
+    wide, tall = WIDTH - left - right, COURSE_HEIGHT - top - bottom
+    first, last = count[0], max(count[-1], count[0] + 1)
+
+    def at(images: int, y: float) -> tuple[float, float]:
+        down = float(np.log(high / y) / np.log(high / low))
+        return left + wide * (images - first) / (last - first), top + tall * down
+
+    reached = at(first, goal)[1]
+    shapes = [
+        text(12.0, 18.0, title, "title"),
+        rectangle((left, reached, wide, top + tall - reached), class_="reached"),
+        line([(left, reached), (left + wide, reached)], "goal"),
+        text(left + wide - 4, reached - 5, f"required: {goal:g}{unit}", "small end"),
+    ]
+    marks = [step * 10.0**power for power in range(-6, 6) for step in (1, 2, 5)]
+    for mark in (mark for mark in marks if low <= mark <= high):
+        y = at(first, mark)[1]
+        shapes += [line([(left - 4, y), (left, y)], "frame"), text(left - 7, y + 4, f"{mark:g}", "small end")]
+    shapes.append(rectangle((left, top, wide, tall), class_="frame"))
+    for images in range(first, last + 1, max(1, (last - first) // 8)):
+        shapes.append(text(at(images, goal)[0], top + tall + 16, str(images), "small middle"))
+    points_px = [at(images, y) for images, y in zip(count, value, strict=True)]
+    shapes.append(line(points_px, "course"))
+    for (x, y), images, number in zip(points_px, count, value, strict=True):
+        title_of = Shape("title", {}, f"{images} images: {number:.3g}{unit}")
+        dot = {"class": "course-point", "cx": f"{x:.1f}", "cy": f"{y:.1f}", "r": 4}
+        shapes.append(Shape("circle", dot, children=(title_of,)))
+    shapes.append(text(left + wide / 2, COURSE_HEIGHT - 8, "images", "small middle"))
+    return Figure(title, shapes, COURSE_HEIGHT)
 
 
 def slice_figure(title: str, cut: Slice, marked: float, mark: str) -> Figure:

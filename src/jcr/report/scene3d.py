@@ -1,7 +1,7 @@
 """The 3D view: what templates/scene3d.js draws, packed small enough to live in the page."""
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -12,7 +12,7 @@ from numpy import ndarray
 from jcr.cell.cameras_json import CameraPlaced
 from jcr.cell.poses import base_from_camera as poses_of
 from jcr.geometry import apply_similarity, inverse
-from jcr.records import CellCamera
+from jcr.records import CellCamera, Intrinsics
 from jcr.report.images import image_numbers, shown_names
 from jcr.report.map_samples import SurfacePoints, point_size
 from jcr.report.raster import TRACK_COLOR, label_colors
@@ -42,21 +42,11 @@ def scene_section(
     """Cameras, grippers and points in the base frame, to be rotated by hand."""
     layers = [*_map_layers(result, surface), *_measured_layer(result)]
     views = _views(result, base_from_camera)
-    others, bases = _others(result, base_from_camera), _bases(result)
-    data = {
-        **_packed_layers([*layers, _tracks(result)], base_from_camera[:, :3, 3]),
-        "views": views,
-        "others": others,
-        "bases": bases,
-        "next": [
-            {
-                "gripper": pose.base_from_gripper[:3],
-                "camera": _rows(np.array(pose.base_from_gripper) @ result.hand_eye.gripper_from_camera),
-            }
-            for pose in result.calibration.next_poses
-        ],
-        "intrinsics": asdict(result.intrinsics),
-    }
+    next_poses = [np.array(pose.base_from_gripper) for pose in result.calibration.next_poses]
+    others = _others(result, base_from_camera)
+    x, centers = result.hand_eye.gripper_from_camera, base_from_camera[:, :3, 3]
+    data = scene_data([*layers, _tracks(result)], views, next_poses, x, result.intrinsics, centers)
+    data |= {"others": others, "bases": _bases(result)}
     checks = [("cameras", "cameras", True), *([("others", "other cameras", True)] * bool(others))]
     checks += [("grippers", "grippers", True), ("grid", "base and grid", True)]
     if result.calibration.next_poses:
@@ -70,6 +60,46 @@ def scene_section(
         "data": data,
     }
     return Section("view", content)
+
+
+def scene_data(
+    layers: Sequence[PointLayer],
+    views: Sequence[Mapping[str, Any]],
+    next_poses: Sequence[Float[ndarray, "4 4"]],
+    gripper_from_camera: Float[ndarray, "4 4"],
+    intrinsics: Intrinsics,
+    shown_in_base: Float[ndarray, "m 3"],
+) -> dict[str, Any]:
+    """What scene3d.js draws: points, the images (`scene_view`), and gripper poses to add; `shown_in_base` are further
+    points that the box of coordinates holds."""
+    return {
+        **_packed_layers(layers, shown_in_base),
+        "views": views,
+        "others": [],
+        "bases": [],
+        "next": [
+            {"gripper": _rows(pose), "camera": _rows(pose @ gripper_from_camera)} for pose in next_poses
+        ],
+        "intrinsics": asdict(intrinsics),
+    }
+
+
+def scene_view(
+    name: str,
+    caption: str,
+    used: bool,
+    base_from_gripper: Float[ndarray, "4 4"],
+    base_from_camera: Float[ndarray, "4 4"] | None,
+) -> dict[str, Any]:
+    """An image: its name and numbers, and where its gripper and its camera (None: not known) were."""
+    camera = None if base_from_camera is None else _rows(base_from_camera)
+    return {
+        "name": name,
+        "used": used,
+        "caption": caption,
+        "gripper": _rows(base_from_gripper),
+        "camera": camera,
+    }
 
 
 def _rows(a_from_b: Float[ndarray, "4 4"]) -> list[list[float]]:
@@ -139,13 +169,13 @@ def _views(result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]) -> list
     row_of = {int(row): k for k, row in enumerate(result.image_index)}
     images = result.calibration.images
     return [
-        {
-            "name": name,
-            "used": image.used,
-            "caption": image_numbers(image) if image.used else f"rejected: {image.reason}",
-            "gripper": _rows(result.capture.base_from_gripper[i]),
-            "camera": _rows(base_from_camera[row_of[i]]) if i in row_of else None,
-        }
+        scene_view(
+            name,
+            image_numbers(image) if image.used else f"rejected: {image.reason}",
+            image.used,
+            result.capture.base_from_gripper[i],
+            base_from_camera[row_of[i]] if i in row_of else None,
+        )
         for i, (image, name) in enumerate(zip(images, shown_names(images), strict=True))
     ]
 

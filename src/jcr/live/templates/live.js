@@ -1,28 +1,65 @@
-// Loaded from disk, where a page may not fetch: a script that calls a function is what a file can send.
-let shown = null, heard = Date.now();
-function show(body) {
-  if (body === shown) return;
-  if (shown !== null) document.getElementById("body").innerHTML = body;
-  shown = body;
-}
-function now(seen) {
-  const words = document.getElementById("words");
-  const text = seen.time + ": " + seen.words;
-  if (words.textContent !== text) {
-    heard = Date.now();
-    document.getElementById("now").src = "live/now.jpg?" + encodeURIComponent(seen.time);
+"use strict";
+(() => {
+  const element = (id) => document.getElementById(id);
+  let version = -1;
+  // A part is replaced where it has changed, so that the reader's selection and the images stay.
+  const parts = {};
+  async function ask() {
+    try {
+      const found = await (await fetch(`state?version=${version}`)).json();
+      element("away").hidden = true;
+      if (found.version === version) return;
+      version = found.version;
+      for (const [name, html] of Object.entries(found.parts)) {
+        if (parts[name] !== html) element(name).innerHTML = parts[name] = html;
+      }
+      const main = document.querySelector("main");
+      main.toggleAttribute("data-over", found.is_over);
+      main.toggleAttribute("data-images", found.images > 0);
+      const holder = element("scene-data");
+      if (holder.textContent !== found.scene) {
+        holder.textContent = found.scene;
+        holder.dispatchEvent(new Event("change"));
+      }
+    } catch {
+      element("away").hidden = false;
+    }
   }
-  words.textContent = text;
-  words.style.color = seen.few ? "var(--warn)" : "";
-  const silent = (Date.now() - heard) / 1000;
-  document.getElementById("stale").textContent =
-    silent > 10 ? "No new image for " + silent.toFixed(0) + " s: jcr capture has ended or waits for its camera." : "";
-}
-function load(file) {
-  const script = document.createElement("script");
-  script.src = file + "?" + Date.now();
-  script.onload = script.onerror = () => script.remove();
-  document.head.append(script);
-}
-setInterval(() => { load("live/now.js"); load("live/state.js"); }, 1000);
-load("live/now.js");
+  async function look() {
+    if (document.hidden) return;
+    try {
+      const answer = await fetch("now.jpg");
+      if (answer.status !== 200) return;
+      const url = URL.createObjectURL(await answer.blob());
+      const image = element("now");
+      URL.revokeObjectURL(image.src);
+      image.src = url;
+      image.hidden = false;
+      element("features").textContent = answer.headers.get("X-Features");
+    } catch { /* The state says that nobody answers. */ }
+  }
+  document.addEventListener("click", async (event) => {
+    const button = event.target.closest("[data-press]");
+    if (!button || (button.dataset.ask && !confirm(button.dataset.ask))) return;
+    const number = button.dataset.number ? Number(button.dataset.number) : null;
+    button.disabled = true;
+    try {
+      await fetch("press", {
+        method: "POST",
+        headers: { "Content-Type": "application/json" },
+        body: JSON.stringify({ action: button.dataset.press, number }),
+      });
+    } finally {
+      button.disabled = false;
+      setTimeout(ask, 100);
+    }
+  });
+  async function repeat(action, every) {
+    for (;;) {
+      await action();
+      await new Promise((resolve) => setTimeout(resolve, every));
+    }
+  }
+  repeat(ask, 700);
+  repeat(look, 1000);
+})();

@@ -4,7 +4,6 @@
 (() => {
   const holder = document.getElementById("scene-data");
   if (!holder) return;
-  const scene = JSON.parse(holder.textContent);
   const canvas = document.getElementById("scene");
   const context = canvas.getContext("2d");
   const tooltip = document.getElementById("scene-tip");
@@ -13,22 +12,27 @@
   const lookThrough = document.getElementById("scene-through");
 
   const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
-  const layers = scene.layers.map((layer) => {
-    const steps = new Uint16Array(bytes(layer.xyz).buffer);
-    const xyz = new Float32Array(steps.length);
-    for (let i = 0; i < steps.length; i++) {
-      const [low, high] = [scene.box[0][i % 3], scene.box[1][i % 3]];
-      xyz[i] = low + (steps[i] / 65535) * (high - low);
-    }
-    return { xyz, rgb: bytes(layer.rgb), size: layer.size };
-  });
+  let scene, layers;
+  function read() {
+    scene = JSON.parse(holder.textContent);
+    layers = scene.layers.map((layer) => {
+      const steps = new Uint16Array(bytes(layer.xyz).buffer);
+      const xyz = new Float32Array(steps.length);
+      for (let i = 0; i < steps.length; i++) {
+        const [low, high] = [scene.box[0][i % 3], scene.box[1][i % 3]];
+        xyz[i] = low + (steps[i] / 65535) * (high - low);
+      }
+      return { xyz, rgb: bytes(layer.rgb), size: layer.size };
+    });
+  }
+  read();
   const column = (matrix, k) => matrix.map((row) => row[k]);
   const add = (a, b, factor = 1) => a.map((x, k) => x + factor * b[k]);
   const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
   const apply = (matrix, x) => matrix.map((row) => dot(row, x) + row[3]);
 
   // What is looked at: an orbit about `target`, or (through >= 0) out of one of the cameras.
-  const state = { yaw: 0, pitch: 0, distance: 1, target: [0, 0, 0], through: -1 };
+  const state = { yaw: 0, pitch: 0, distance: 1, target: [0, 0, 0], through: -1, moved: false };
   const shown = () => ({
     // The last choice is to show none; the last layer, the tracks, has a box of its own.
     layer: Number(document.querySelector('input[name="scene-layer"]:checked')?.value ?? layers.length - 1),
@@ -302,6 +306,7 @@
   }
 
   function turn(dx, dy) {
+    state.moved = true;
     if (state.through >= 0) fit();
     state.yaw -= dx * 0.008;
     state.pitch = Math.max(-1.55, Math.min(1.57, state.pitch + dy * 0.008));
@@ -309,6 +314,7 @@
   }
 
   function move(dx, dy) {
+    state.moved = true;
     const view = eye();
     const metres = (state.distance * ratio) / view.fx;
     state.target = add(add(state.target, view.axes[0], -dx * metres), view.axes[1], -dy * metres);
@@ -316,6 +322,7 @@
   }
 
   function zoom(factor) {
+    state.moved = true;
     state.distance = Math.max(0.05, Math.min(20, state.distance * factor));
     redraw();
   }
@@ -404,6 +411,8 @@
     }));
   lookThrough.addEventListener("change", () => (lookThrough.value === "-1" ? fit() : setThrough(Number(lookThrough.value))));
   document.getElementById("scene-controls").addEventListener("input", redraw);
+  // The live page puts new content there.
+  holder.addEventListener("change", () => { read(); if (state.moved) redraw(); else fit(); });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
 
   new ResizeObserver(() => {

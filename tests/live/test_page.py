@@ -1,0 +1,134 @@
+"""The live page: what it shows in each state, and that no other site reads or commands it."""
+
+import http.client
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import jcr
+from jcr.capture.images import read_image
+from jcr.live.collect import LiveCapture
+from jcr.live.commands import Command
+from jcr.live.page_server import PageServer
+from scripted_capture import Scripted, a_capture, still_frames
+
+
+@pytest.fixture
+def capture(tmp_path: Path, tabletop: Path) -> tuple[LiveCapture, Scripted]:
+    image = read_image(tabletop / "images" / "00.jpg")
+    return a_capture(tmp_path / "<c>", still_frames(lambda: image), accurate_from=5)
+
+
+def add(capture: LiveCapture, scripted: Scripted, tabletop: Path, count: int) -> None:
+    """Images, and the state of the calibration with them."""
+    poses = jcr.read_capture(tabletop).base_from_gripper
+    for k in range(len(capture.live.names), count):
+        capture.live.add(read_image(tabletop / "images" / f"{k:02d}.jpg"), poses[k])
+    capture._report(scripted.update())
+
+
+@contextmanager
+def asked(page: PageServer, method: str, path: str, body: str = "", **headers: str) -> Iterator[Any]:
+    connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=10)
+    names = {name.replace("_", "-"): value for name, value in headers.items()}
+    connection.request(method, path, body or None, {"Host": f"127.0.0.1:{page.port}"} | names)
+    yield connection.getresponse()
+    connection.close()
+
+
+def parts(page: PageServer, version: int = -1) -> dict[str, Any]:
+    with asked(page, "GET", f"/{page.key}/state?version={version}") as answer:
+        return json.loads(answer.read())
+
+
+def test_the_page_shows_each_state(capture: tuple[LiveCapture, Scripted], tabletop: Path):
+    live, scripted = capture
+    with PageServer(live) as page:
+        with asked(page, "GET", f"/{page.key}/") as answer:
+            whole = answer.read().decode()
+        assert "&lt;c&gt;" in whole and "<c>" not in whole and "http" not in whole.replace("http-equiv", "")
+        nothing = parts(page)
+        assert "No image yet" in nothing["parts"]["head"] and not nothing["images"]
+        assert "None yet" in nothing["parts"]["images"]
+        assert parts(page, nothing["version"]) == {"version": nothing["version"]}
+
+        add(live, scripted, tabletop, 3)
+        three = parts(page)
+        assert three["version"] > nothing["version"]
+        assert "± 3.3 mm" in three["parts"]["head"] and "required 2 mm" in three["parts"]["head"]
+        scene = json.loads(three["scene"])
+        assert len(scene["views"]) == 3 and scene["views"][0]["camera"] is not None
+        with asked(page, "GET", f"/{page.key}/image/images/000.png") as answer:
+            assert answer.status == 200 and answer.read()[:2] == b"\xff\xd8"
+
+        add(live, scripted, tabletop, 4)
+        assert parts(page)["parts"]["course"].count("<circle") == 4
+        scripted.contradicted = "images/003.png"
+        add(live, scripted, tabletop, 4)
+        wrong = parts(page)["parts"]
+        assert "verdict fair" in wrong["head"] and "The gripper pose of images/003.png" in wrong["head"]
+        assert wrong["images"].count('class="rejected"') == 1
+
+        scripted.contradicted = None
+        add(live, scripted, tabletop, 5)
+        assert "verdict good" in parts(page)["parts"]["head"]
+        live.finish()
+        done = parts(page)["parts"]
+        assert "<h2>Accepted</h2>" in done["head"] and "data-press" not in done["head"] + done["images"]
+        assert (
+            "± 1.0 mm" in done["head"]
+            and str(live.live.folder / "result").replace("<c>", "&lt;c&gt;") in done["head"]
+        )
+
+
+def test_only_the_page_itself_commands(capture: tuple[LiveCapture, Scripted], tabletop: Path):
+    live, scripted = capture
+    add(live, scripted, tabletop, 2)
+    pressed: list[Command] = []
+    live.press = pressed.append
+    with PageServer(live) as page:
+        press, body = f"/{page.key}/press", json.dumps({"action": "remove", "number": 1})
+        own = {"Origin": f"http://127.0.0.1:{page.port}", "Content_Type": "application/json"}
+
+        def status(method: str = "POST", path: str = press, text: str = body, **headers: str) -> int:
+            with asked(page, method, path, text, **(own | headers)) as answer:
+                return answer.status
+
+        assert status(Origin="http://evil.example") == status(Origin="null") == 403
+        assert status(Host="evil.example") == status("GET", f"/{page.key}/", "", Host="evil.example") == 403
+        assert status(Content_Type="text/plain") == 403
+        assert status(path="/press") == status(path="/guess/press") == status("GET", "/", "") == 404
+        assert status("GET", f"/{page.key}/image/../capture.json", "") == 404
+        for text in ("{", "[]", '{"action": "rm"}', '{"action": "remove", "number": "1"}', "x" * 2000):
+            assert status(text=text) == 400
+        with asked(page, "POST", press, body, Content_Type="application/json") as answer:
+            assert answer.status == 403
+        assert pressed == []
+        assert status() == 204 and pressed == [Command("remove", 1)]
+        with asked(page, "GET", f"/{page.key}/") as answer:
+            assert "frame-ancestors 'none'" in answer.headers["Content-Security-Policy"]
+    other = PageServer(live)
+    assert other.key != page.key and len(other.key) >= 22
+    with pytest.raises(jcr.InputError, match="--page-port"), other:
+        PageServer(live, other.port)
+
+
+def test_the_camera_now_is_shown_with_its_features(capture: tuple[LiveCapture, Scripted], tabletop: Path):
+    live, _ = capture
+    frame = next(iter(live.camera.frames))
+    with PageServer(live) as page:
+        with asked(page, "GET", f"/{page.key}/now.jpg") as answer:
+            assert answer.status == 204
+        object.__setattr__(live.camera, "latest", lambda: frame)
+        with asked(page, "GET", f"/{page.key}/now.jpg") as answer:
+            count = int(answer.headers["X-Features"].split()[0])
+            assert count > 150 and answer.read()[:2] == b"\xff\xd8"
+        blank = type(frame)(np.full_like(frame.image, 128), 1.0)
+        object.__setattr__(live.camera, "latest", lambda: blank)
+        with asked(page, "GET", f"/{page.key}/now.jpg") as answer:
+            assert "Few" in answer.headers["X-Features"]

@@ -1,0 +1,125 @@
+"""A capture whose calibration is scripted: what `LiveCapture` does with its states, without reconstructing anything."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy import ndarray
+
+import jcr
+from jcr.geometry import rotation_exp, transform
+from jcr.live.asks import Answer, Ask
+from jcr.live.calibration_progress import LeftOut, Progress, Reached
+from jcr.live.camera import Camera, Frame
+from jcr.live.collect import CollectOptions, LiveCapture
+from jcr.live.folder import LiveFolder
+from jcr.live.rest import State
+from jcr.records import Finding, HandEye, Kind, Plan, Requirement
+
+REQUIRED = (2.0, 0.3)
+PROOF = LeftOut(images=9, translation_mm=1.0, rotation_deg=0.1, expected_mm=1.0, expected_deg=0.1, agree=True)
+
+
+def a_hand_eye(met: bool) -> HandEye:
+    """An accepted calibration that meets what is required, or does not."""
+    rng = np.random.default_rng(0)
+    poses = transform(rotation_exp(0.5 * rng.normal(size=(10, 3))), 0.2 * rng.normal(size=(10, 3)))
+    found = jcr.solve_hand_eye(poses, poses @ transform(np.eye(3), np.array([0.05, 0.0, 0.1])))
+    required = Requirement(
+        translation_mm=REQUIRED[0],
+        rotation_deg=REQUIRED[1],
+        asked=True,
+        distance_mm=500.0,
+        reached_mm=1.0 if met else 3.0,
+        reached_deg=0.1,
+    )
+    return replace(found, plan=Plan(requirement=required))
+
+
+@dataclass
+class Scripted:
+    """A calibration that is accurate from a number of images on; `contradicted` is an image with a wrong pose."""
+
+    live: LiveFolder
+    accurate_from: int = 100
+    contradicted: str | None = None
+    fault: Exception | None = None
+    """Raised by the next update."""
+    finished: int = 0
+    progress: Progress = field(default_factory=lambda: Progress(images=()))
+
+    def update(self) -> Progress:
+        if self.fault is not None:
+            fault, self.fault = self.fault, None
+            raise fault
+        images = tuple(self.live.names)
+        history = tuple(
+            Reached(images=k, translation_mm=10.0 / k, rotation_deg=1.0 / k, accepted=True)
+            for k in range(3, len(images) + 1)
+        )
+        findings = ()
+        if self.contradicted in images:
+            findings = (
+                Finding(
+                    kind=Kind.POSE_CONTRADICTS_IMAGE,
+                    severity="warns",
+                    mend="poses",
+                    images=(str(self.contradicted),),
+                    value=0.03,
+                    details={"rotation": 0.1},
+                ),
+            )
+        self.progress = Progress(
+            images=images,
+            added=images[-1] if images else None,
+            registered=images,
+            findings=findings,
+            hand_eye=a_hand_eye(len(images) >= self.accurate_from) if history else None,
+            history=history,
+            left_out=PROOF if len(images) >= self.accurate_from else None,
+            points_in_base=np.random.default_rng(0).normal(size=(50, 3)),
+        )
+        return self.progress
+
+    def finish(self) -> Any:
+        self.finished += 1
+        requirement = a_hand_eye(True).requirement
+        hand_eye = SimpleNamespace(requirement=requirement, findings=())
+        return SimpleNamespace(
+            converged=True, hand_eye=hand_eye, verdict="accepted", out=self.live.folder / "result"
+        )
+
+    def close(self) -> None:
+        self.live.close()
+
+
+def a_capture(
+    folder: Path,
+    frames: Iterator[Frame],
+    tell: Callable[[Answer, list[str]], None] = lambda answer, lines: None,
+    gripper: Callable[[], State] | None = None,
+    accurate_from: int = 100,
+    **options: Any,
+) -> tuple[LiveCapture, Scripted]:
+    """A capture into a folder by these frames."""
+    scripted: Any = Scripted(LiveFolder(folder), accurate_from)
+    camera = Camera(frames, lambda: None)
+    options = {"require": REQUIRED} | options
+    return LiveCapture(scripted, camera, CollectOptions(**options), tell, gripper=gripper), scripted
+
+
+def still_frames(image: Callable[[], ndarray]) -> Iterator[Frame]:
+    """What `image` gives, four times a second."""
+    step = 0
+    while True:
+        yield Frame(image(), 0.25 * step)
+        step += 1
+
+
+def asked(poses: list[ndarray], answers: list[Answer], waits: bool = False) -> Iterator[Ask]:
+    """A request at each pose."""
+    for pose in poses:
+        yield Ask(pose, answer=answers.append, waits=waits)
