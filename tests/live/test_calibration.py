@@ -80,13 +80,15 @@ def test_a_requirement_that_holds_is_proven_by_images_that_take_no_part(grown):
 def test_the_end_is_the_batch_calibration_without_finding_features_again(
     grown, done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    from jcr.match import sift
+    from jcr.match import sift_features
 
     folder = shutil.copytree(grown[0], tmp_path / "capture")
     found: list[str] = []
     for name in ("detect", "matches"):
-        real = getattr(sift, name)
-        monkeypatch.setattr(sift, name, lambda *a, name=name, real=real: (found.append(name), real(*a))[1])
+        real = getattr(sift_features, name)
+        monkeypatch.setattr(
+            sift_features, name, lambda *a, name=name, real=real: (found.append(name), real(*a))[1]
+        )
     kept = {file.name: file.stat().st_mtime_ns for file in (folder / "live" / "features").iterdir()}
     with closing(LiveCalibration(folder)) as live:
         result = live.finish()

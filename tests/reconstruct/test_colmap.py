@@ -18,7 +18,7 @@ from jcr.depth.densify import densify, undistorted
 from jcr.depth.options import DepthOptions
 from jcr.errors import RejectedError
 from jcr.geometry import apply_similarity, fit_similarity, inverse, rotation_between_deg
-from jcr.match.sift import SiftFeatures
+from jcr.match.sift_features import SiftFeatures
 from jcr.progress import silent
 from jcr.reconstruct.colmap import reconstruct
 from jcr.reconstruct.colmap_options import ColmapOptions

@@ -12,12 +12,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pycolmap
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.files import read_bytes, written_whole
 from jcr.match.gate import Key
 from jcr.match.matchers import Features, Matcher
+from jcr.match.sift import Sift
 from jcr.match.verify import Geometries
 from jcr.records import Capture
 
@@ -27,8 +28,6 @@ FORMAT = "jcr.features/2"
 """To be changed with whatever changes the features, the matches or the geometries of a pair."""
 _MATRICES = ("E", "F", "H")
 
-Sift = tuple[Float[ndarray, "k 2"], Float32[ndarray, "k 128"]]
-"""Keypoints (px; pixel centres are whole numbers) and their unit descriptors."""
 MatchedPair = tuple[Int[ndarray, "m 2"], pycolmap.TwoViewGeometry | None]
 """Rows of all keypoints that match, right or wrong, and the geometry of most; None where too few agree on one."""
 

@@ -28,7 +28,8 @@ from jcr.match.guided import guided
 from jcr.match.kept import KeepingMatcher, KeptFeatures
 from jcr.match.matchers import Matcher
 from jcr.match.pairs import all_pairs
-from jcr.match.sift import BYTES_OF_FEATURES, SiftFeatures, grey_of
+from jcr.match.sift import BYTES_OF_FEATURES, grey_of
+from jcr.match.sift_features import SiftFeatures
 from jcr.match.stage import Matched, match_with_robot
 from jcr.match.verify import View, read_geometries, write_geometries, write_keypoints
 from jcr.memory import GB, give_back, resident
