@@ -17,18 +17,23 @@ env: .venv/ready
 demo: .venv/ready
 	$(BIN)/python examples/demo.py $(BACKEND)
 
+# Files in the order of tests/conftest.py, slow ones first.
+TWO_WORKERS := -n 2 --dist loadfile --no-loadscope-reorder
+# Where bytecode is not kept, each of the many processes that tests start compiles all of jcr: a second, half of a start.
+test test-fast test-lowest: export PYTHONDONTWRITEBYTECODE :=
+
 test: .venv/ready
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(TWO_WORKERS)
 
 test-fast: .venv/ready
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(TWO_WORKERS) -m "not slow"
 
 # The core with the lowest versions of its packages, and without torch. Left out: OpenCV before 4.14 finds a few of the
 # corners of a board that was drawn over, and says that this is too little; and with OpenCV 4.10 one real board comes out
 # 0.22° from its reference, where the test asks for 0.2°; with OpenCV 4.8 a ChArUco board comes out 1.08 mm and 0.21° off,
 # where it asks for 1 mm and 0.2°.
 test-lowest: .venv-lowest/ready
-	OMP_NUM_THREADS=1 .venv-lowest/bin/python -m pytest -n 2 --dist loadfile -o addopts='--import-mode=importlib -ra' \
+	OMP_NUM_THREADS=1 .venv-lowest/bin/python -m pytest $(TWO_WORKERS) -o addopts='--import-mode=importlib -ra' \
 		--deselect tests/reconstruct/test_marker.py::test_lines_that_a_detector_drew_over_a_board_are_no_hindrance \
 		--deselect tests/reconstruct/test_marker.py::test_real_boards_reproduce_their_references \
 		--deselect "tests/reconstruct/test_marker.py::test_calibrates_from_every_kind_of_board[charuco:7x6:0.030:0.022:DICT_4X4_50]" \

@@ -139,7 +139,9 @@ def _rows(folder: Path, board: str | None) -> list[Row]:
     how = "images alone" if board is None else f"`{board}`"
     known = read_hand_eye(folder / "reference.json")
     reference = known.gripper_from_camera
-    options = RunOptions(reconstruct=ReconstructOptions(board=board))
+    options = RunOptions(
+        reconstruct=ReconstructOptions(backend="auto" if board is None else "marker", board=board)
+    )
     begun = time.perf_counter()
     try:
         with tempfile.TemporaryDirectory() as out:

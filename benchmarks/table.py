@@ -119,6 +119,23 @@ BENCHES = {
             "benchmarks/board_intrinsics.py",
         ),
     ),
+    "boards": Bench(
+        "A board beside features",
+        ROBOTS,
+        "features alone, a board alone and both in one adjustment: captures in DIR that --boards names, and simulated",
+        of_captures=True,
+        of_boards=True,
+        measures=(
+            *SOLVER,
+            *FEATURES,
+            *READING,
+            "src/jcr/reconstruct/marker.py",
+            "src/jcr/reconstruct/board.py",
+            "src/jcr/reconstruct/board_corners.py",
+            "benchmarks/simulated",
+        ),
+        long="40 draws of every simulated row instead of 2",
+    ),
     "seen": Bench(
         "Points that the camera sees",
         HONEST,

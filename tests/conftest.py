@@ -53,10 +53,18 @@ SLOW_FIXTURES = {"done", "opengl", "real_captures", "tiny_sam", "garbage_weights
 """They run the command line, draw, reconstruct from images, or load a network."""
 
 
+FIRST = "faults/test_faults.py", "calibration/test_faults.py"
+"""Files that the two workers begin with: one makes the run of `done`, the other takes longer and does without it."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark slow tests by their fixtures, and put files with slow tests first: short ones are left for the end."""
     for item in items:
         if item.get_closest_marker("gl") or SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
+    rank = {ROOT / "tests" / name: k for k, name in enumerate(FIRST)}
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: rank.get(item.path, len(rank) + (item.path not in slow)))
 
 
 @pytest.hookimpl(wrapper=True)

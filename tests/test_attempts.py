@@ -286,8 +286,11 @@ def test_what_plenty_of_features_reject_colours_do_not_accept(
     shuffled = good[np.random.default_rng(4).permutation(8)]
     answers = {"sift": shuffled, "xfeat": shuffled, "da3": good, "direct": good}
     kept, tried = auto_result(problem, answers, monkeypatch, observations=80)
-    assert tried == ["colmap", "colmap"] and kept.backend == "colmap"
+    assert tried == ["colmap"] and kept.backend == "colmap"
     assert kept.notes[0].startswith("da3 was not tried: it is for scenes without features")
+    assert kept.notes[1].endswith("and they register 8 of 8 images"), "other features would show the same"
+    _, tried = auto_result(problem, answers | {"sift": shuffled[:6]}, monkeypatch, observations=80)
+    assert tried == ["colmap", "colmap"], "of images that SIFT left out, learned features may register more"
     _, tried = auto_result(problem, answers, monkeypatch, observations=79)
     assert tried == ["colmap", "colmap", "da3"]
     # A scene full of features that agree on nothing is none without features; one of too few of them is.

@@ -65,3 +65,11 @@ def test_a_plain_background_is_rejected(real_captures: Path):
     capture = jcr.read_capture(real_captures / "franka_plain_background")
     with pytest.raises(jcr.RejectedError, match=r"0 of 8 images \(too little texture"):
         reconstruct(capture)
+
+
+@pytest.mark.slow
+def test_another_first_pair_is_tried_where_the_first_bends_unknown_intrinsics(real_captures: Path):
+    """Of one model alone three images of this capture register."""
+    capture = jcr.read_capture(real_captures / "elephant_floor")
+    assert capture.intrinsics is None
+    assert len(reconstruct(capture).image_index) == len(capture)

@@ -178,6 +178,20 @@ def is_textured(tried: Tried, images: int) -> bool:
     return len(tried.made.tracks.image) >= TEXTURED * images
 
 
+NEARLY_ALL = 0.9
+"""Share of the capture's images."""
+
+
+def is_well_seen(tried: Tried, images: int) -> bool:
+    """Whether SIFT found features in plenty and registered nearly all of that number of images, so that a rejection is
+    not for lack of either: other features show the same scene to the same robot, for three times the seconds."""
+    return (
+        is_textured(tried, images)
+        and tried.made is not None
+        and len(tried.made.image_index) >= NEARLY_ALL * images
+    )
+
+
 def choose(
     capture: Capture,
     options: ReconstructOptions,
@@ -190,10 +204,11 @@ def choose(
 
     `auto` runs the best back end whose weights are on this machine, and the next attempt of `backends.tries` as long
     as one `needs_another`; where SIFT finds features in plenty, none that does not test the camera as these do, for
-    what they reject it would accept unseen. Of two results an accepted one is kept, else the one with the smaller
-    leave-one-out error. `chosen` gets the reconstruction as soon as it is sure that the run keeps it. `depth_options`
-    are for a known length. Raises InputError as the back end does, and where gripper poses and joint angles contradict
-    each other; NothingFoundError where no back end gave anything.
+    what they reject it would accept unseen, and where these register nearly all images no other features. Of two
+    results an accepted one is kept, else the one with the smaller leave-one-out error. `chosen` gets the
+    reconstruction as soon as it is sure that the run keeps it. `depth_options` are for a known length. Raises
+    InputError as the back end does, and where gripper poses and joint angles contradict each other; NothingFoundError
+    where no back end gave anything.
     """
     robot_errors(capture, calibrate_options)  # refuses before the images cost time
     depth_options = depth_options or DepthOptions()
@@ -209,16 +224,23 @@ def choose(
     of_images = _of_images(capture, kept)
     # A camera at rest shows every back end the same one view.
     untried = [] if any(one.severity == "rejects" for one in of_images) else others
-    textured = is_textured(kept, len(capture))
+    textured, seen = is_textured(kept, len(capture)), is_well_seen(kept, len(capture))
     for one in untried:
         if not needs_another(kept):
             kept = _alone(kept)
             break
+        if seen and one.backend == "colmap":
+            kept = kept.noted(
+                f"no features but SIFT's were tried: there are plenty, and they register "
+                f"{len(kept.reconstruction.image_index)} of {len(capture)} images"
+            )
+            continue
         if textured and not BACKENDS[one.backend].tests_camera:
             kept = _not_overruled(kept, one.backend)
             break
         tried = _tried(capture, one, calibrate_options, depth_options, progress)
         textured = textured or is_textured(tried, len(capture))
+        seen = seen or is_well_seen(tried, len(capture))
         kept = _better(kept, tried)
     kept = kept.require_found(of_images)
     chosen(kept.reconstruction)

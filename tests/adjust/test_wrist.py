@@ -85,7 +85,7 @@ def test_noise_of_the_images_is_found_from_short_tracks_too(views: int):
 @pytest.mark.slow
 def test_robot_noise_is_found_and_the_ellipsoid_covers():
     noise = (5e-4, np.radians(0.1))
-    runs, inside, estimates = 60, 0, []
+    runs, inside, estimates = 30, 0, []
     for seed in range(runs):
         rng = np.random.default_rng([4, seed])
         problem = hand_eye_problem(rng, 10, robot_noise=noise)

@@ -61,13 +61,12 @@ def said(hand_eye: HandEye) -> str:
 @pytest.mark.parametrize("images", [3, 5, 10])
 @pytest.mark.parametrize("motion", [{}, {"pattern": "translation", "deviation": np.radians(6.0)}])
 def test_a_true_intrinsics_is_never_named(images: int, motion: dict) -> None:
-    for seed in range(6):
+    for seed in range(2):
         assert said(calibrated(seed, images, INTRINSICS, **motion)[1]) == ""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("factor", [0.8, 0.95, 1.05, 1.2])
-@pytest.mark.parametrize("images", [5, 10])
+@pytest.mark.parametrize(("factor", "images"), [(0.8, 5), (0.95, 10), (1.05, 10), (1.2, 5)])
 def test_a_wrong_focal_length_is_named_with_the_right_one(factor: float, images: int) -> None:
     problem, hand_eye = calibrated(0, images, scaled(factor))
     found = re.match(
@@ -85,10 +84,9 @@ def test_a_wrong_focal_length_is_named_with_the_right_one(factor: float, images:
     assert (np.abs(off) < 3 * np.sqrt(np.diag(hand_eye.covariance))).all()
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_what_a_wrong_focal_length_does_is_in_the_covariance(seed: int) -> None:
+def test_what_a_wrong_focal_length_does_is_in_the_covariance() -> None:
     # Given a good robot, the fit alone would be sure of a wrong answer.
-    problem, hand_eye = calibrated(seed, 10, scaled(1.03), CalibrateOptions(robot_noise=(0.5, 0.1)))
+    problem, hand_eye = calibrated(0, 10, scaled(1.03), CalibrateOptions(robot_noise=(0.5, 0.1)))
     off = error(problem, hand_eye.gripper_from_camera, hand_eye.scale)
     std = np.sqrt(np.diag(hand_eye.covariance))
     assert "focal length" in said(hand_eye)
@@ -96,10 +94,9 @@ def test_what_a_wrong_focal_length_does_is_in_the_covariance(seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("factor", [1.03, 0.95, 1.2])
-def test_more_views_are_not_promised_to_make_up_for_a_wrong_intrinsics(factor: float) -> None:
+def test_more_views_are_not_promised_to_make_up_for_a_wrong_intrinsics() -> None:
     offset, promised, reported = [], [], []
-    for intrinsics in (INTRINSICS, scaled(factor)):
+    for intrinsics in (INTRINSICS, scaled(1.03), scaled(1.2)):
         _, capture, reconstruction = pictured(0, 5, intrinsics)
         hand_eye = calibrate(capture, reconstruction)
         content = calibration_file(capture, reconstruction, hand_eye, {}, "")
@@ -107,7 +104,8 @@ def test_more_views_are_not_promised_to_make_up_for_a_wrong_intrinsics(factor: f
         promised.append(np.linalg.norm(content.next_poses[-1].expected_std[:3]))
         reported.append(np.sqrt(np.trace(hand_eye.covariance[:3, :3])))
     assert promised[0] < 0.7 * reported[0]
-    assert np.linalg.norm(offset[1] - offset[0]) < promised[1] < reported[1]
+    for k in (1, 2):
+        assert np.linalg.norm(offset[k] - offset[0]) < promised[k] < reported[k]
 
 
 @pytest.mark.slow

@@ -1,8 +1,6 @@
 """Recordings of robots: ROS 1, sqlite3 and MCAP bags give the frames at which the arm stood still."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +13,7 @@ import capture_writers as writers
 import jcr
 from benchmarks.simulated.problem import hand_eye_problem
 from benchmarks.simulated.ros_bag import nearest_view, write_bag
+from in_process import run_jcr
 from jcr.capture.best_frames import best_frames
 from jcr.capture.depth_images import read_depth
 from jcr.capture.images import encode_png
@@ -374,9 +373,8 @@ def test_colours_of_raw_images(encoding: str):
 
 @pytest.mark.slow
 def test_the_command_line_judges_a_bag(mcap: Path):
-    command = [sys.executable, "-m", "jcr", "check", str(mcap), "--poses-only", "--json"]
-    command += ["--base-frame", "base_link", "--gripper-frame", "tool0", "--frames", "8"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    frames = ["--base-frame", "base_link", "--gripper-frame", "tool0", "--frames", "8"]
+    done = run_jcr("check", mcap, "--poses-only", "--json", *frames)
     assert done.returncode == 0, done.stderr
     assert len(json.loads(done.stdout)["images"]) == 8
 

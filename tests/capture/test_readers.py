@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +11,7 @@ import pytest
 import capture_writers as writers
 import jcr
 from benchmarks.simulated.problem import HandEyeProblem, hand_eye_problem
+from in_process import run_jcr
 from jcr.capture import capture_json
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import read_npy, read_yaml
@@ -392,11 +391,6 @@ def test_what_is_no_capture_is_named_what_would_be_one(tmp_path: Path):
     with pytest.raises(jcr.InputError, match="give its format with --format") as caught:
         jcr.read_capture(tmp_path / "notes.md")
     assert all(name in str(caught.value) for name in FORMATS)
-
-
-def run_jcr(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "jcr", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The command line through a subprocess, on the bundled capture and on faults."""
+"""The command line on the bundled capture and on faults."""
 
 import html
 import json
@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import jcr
+from in_process import run_jcr
 from jcr.cli import COMMANDS, dispatch
 from jcr.cli.arguments import groups
 from jcr.cli.help import COMMON, MANY
@@ -21,11 +22,6 @@ from jcr.represent.cloud_ply import read_cloud
 from jcr.represent.options import MapOptions
 
 pytestmark = pytest.mark.slow
-
-
-def run_jcr(*arguments: object, **options) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "jcr", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300, **options)
 
 
 def test_the_bundled_capture_is_calibrated_to_a_fraction_of_a_millimetre(done: Path, tabletop: Path):
@@ -81,11 +77,15 @@ def test_an_added_image_extends_the_map_and_stays(done: Path, tabletop: Path, tm
 
 
 def test_the_same_command_again_resumes_and_gives_the_same_bits(done: Path, tabletop: Path):
-    before = json.loads((done / "calibration.json").read_text())
+    before, files = (
+        json.loads((done / "calibration.json").read_text()),
+        {path.name for path in done.iterdir()},
+    )
     stamp = (done / "reconstruction.npz").stat().st_mtime_ns
     again = run_jcr("calibrate", tabletop, done, "--quiet", "--json")
     after = json.loads(again.stdout)
     assert (done / "reconstruction.npz").stat().st_mtime_ns == stamp
+    assert {path.name for path in done.iterdir()} == files
     assert after["gripper_from_camera"] == before["gripper_from_camera"]
     assert after["scale"] == before["scale"]
 
@@ -177,6 +177,7 @@ def test_check_finds_the_bundled_capture_good_and_a_planted_mistake_bad(tabletop
     shutil.copytree(tabletop, tmp_path / "bad")
     file = tmp_path / "bad" / "capture.json"
     content = json.loads(file.read_text())
+    content["frames"] = content["frames"][:6]
     for frame in content["frames"]:
         frame["base_from_gripper"] = np.linalg.inv(frame["base_from_gripper"]).tolist()
     file.write_text(json.dumps(content))
@@ -253,7 +254,9 @@ def test_wrong_arguments_are_one_line_and_exit_2(tmp_path: Path, arguments: list
 
 def test_wrong_arguments_are_named_in_full_on_an_ascii_terminal_too(tmp_path: Path):
     environment = os.environ | {"PYTHONIOENCODING": "ascii"}
-    finished = run_jcr("run", "a", "b", "--backend", "magic", cwd=tmp_path, env=environment)
+    command = [sys.executable, "-m", "jcr", "run", "a", "b", "--backend", "magic"]
+    finished = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert finished.returncode == 2 and finished.stdout == ""
     assert "magic" in finished.stderr and "--backend" in finished.stderr and finished.stderr.count("\n") == 1
 
 

@@ -1,8 +1,6 @@
 """A printed board is what the marker back end looks for, at the size that its name says."""
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -11,6 +9,7 @@ import pytest
 from numpy import ndarray
 
 import jcr
+from in_process import run_jcr
 from jcr.export.board_sheet import board_sheet
 from jcr.reconstruct.board import boards
 
@@ -73,7 +72,6 @@ def test_what_cannot_be_printed_is_one_line(spec: str, words: str):
 
 @pytest.mark.slow
 def test_the_command_writes_the_file_and_names_the_option(tmp_path: Path):
-    command = [sys.executable, "-m", "jcr", "board", tmp_path / "b.pdf"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    done = run_jcr("board", tmp_path / "b.pdf")
     assert done.returncode == 0 and "--board charuco:8x5:0.030:0.022:DICT_4X4_50" in done.stdout
     assert (tmp_path / "b.pdf").read_bytes().startswith(b"%PDF")

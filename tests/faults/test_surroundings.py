@@ -44,13 +44,15 @@ def private(out: Path) -> bool:
 
 
 CASES = {
-    "no HOME": Surroundings(without=("HOME", "XDG_CACHE_HOME", "USER", "LOGNAME")),
-    "locale C": Surroundings(environment={"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}),
-    "umask 077": Surroundings(shell='umask 077; "$@"', check=private),
-    "paths with spaces and quotes": Surroundings(folder=ODD),
+    "no HOME in locale C": Surroundings(
+        without=("HOME", "XDG_CACHE_HOME", "USER", "LOGNAME"),
+        environment={"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+    ),
+    "paths with spaces and quotes, umask 077 and closed stdin": Surroundings(
+        shell='umask 077; "$@" <&-', folder=ODD, check=private
+    ),
     "closed stdout": Surroundings(shell='"$@" >&-'),
     "closed stderr": Surroundings(shell='"$@" 2>&-'),
-    "closed stdin": Surroundings(shell='"$@" <&-'),
     "full stdout": Surroundings(2, "No space left", shell='"$@" >/dev/full'),
     "output that nobody may write": Surroundings(2, "cannot be written", folder="/proc/1/jcr"),
 }

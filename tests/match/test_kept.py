@@ -35,7 +35,7 @@ class Points:
         ]
         self.matched: list[tuple[int, int]] = []
 
-    def matches(self, pairs, rolls: ndarray) -> list[ndarray]:
+    def matches(self, pairs, rolls: ndarray, coarse: bool = False) -> list[ndarray]:
         self.matched += pairs
         return [np.repeat(np.arange(120)[:, None], 2, 1) for _ in pairs]
 

@@ -144,7 +144,9 @@ def test_an_option_of_one_back_end_selects_it(present: set[str]) -> None:
     for options, names in {
         ReconstructOptions(predictions=Path("pairs.npz")): ("predictions",),
         ReconstructOptions(cameras=Path("sparse")): ("given",),
-        ReconstructOptions(board="chessboard:9x6:0.025"): ("marker",),
+        ReconstructOptions(board="chessboard:9x6:0.025"): ("colmap", "marker"),
+        ReconstructOptions(backend="marker", board="chessboard:9x6:0.025"): ("marker",),
+        ReconstructOptions(board="chessboard:9x6:0.025", cameras=Path("sparse")): ("given", "marker"),
         ReconstructOptions(weights="folder"): ("dust3r", "colmap"),
         ReconstructOptions(weights="folder", pair_graph="window"): ("dust3r", "colmap"),
         ReconstructOptions(backend="mast3r", weights="folder"): ("mast3r",),
@@ -157,10 +159,10 @@ def test_an_option_of_one_back_end_selects_it(present: set[str]) -> None:
     [
         (ReconstructOptions(backend="colmap", predictions=Path("p.npz")), "--predictions p.npz: .*predictions"),
         (ReconstructOptions(backend="predictions", weights="p.npz"), "--weights p.npz: .*mast3r or dust3r or .*mapany"),
-        (ReconstructOptions(backend="given", board="b"), "--board b: .*give --backend marker"),
+        (ReconstructOptions(backend="direct", board="b"), "--board b: .*colmap or moge or marker or given"),
         (ReconstructOptions(backend="mapanything", pair_graph="window"), "--pair-graph window: .*mast3r or dust3r"),
         (ReconstructOptions(pair_graph="robot"), r"--pair-graph robot: .*\(colmap, direct\) does not use it"),
-        (ReconstructOptions(board="b", cameras=Path("c")), r"--board and --cameras select .*\(marker, given\)"),
+        (ReconstructOptions(board="b", predictions=Path("c")), r"--board b: .*\(predictions\) does not use it"),
         (ReconstructOptions(weights="w", predictions=Path("p")), "--weights and --predictions select"),
         (ReconstructOptions(predictions=Path("p"), pair_graph="robot"), "--pair-graph robot: "),
     ],
@@ -198,12 +200,11 @@ def test_the_captures_own_cameras_are_taken_where_nothing_else_is_asked_for(tmp_
         image_size=(64, 48),
         cameras=tmp_path / "sparse",
     )
-    for options in (ReconstructOptions(), ReconstructOptions(backend="given")):
+    for options in (ReconstructOptions(), ReconstructOptions(backend="given"), ReconstructOptions(board="b")):
         assert with_cameras_of(capture, options) == replace(options, cameras=tmp_path / "sparse")
-        assert candidates(with_cameras_of(capture, options)) == ("given",)
+        assert candidates(with_cameras_of(capture, options))[0] == "given"
     for options in (
         ReconstructOptions(backend="colmap"),
-        ReconstructOptions(board="chessboard:9x6:0.025"),
         ReconstructOptions(cameras=Path("mine")),
     ):
         assert with_cameras_of(capture, options) == options

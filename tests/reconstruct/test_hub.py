@@ -115,6 +115,10 @@ def tree(hub: Hub) -> list[dict[str, object]]:
     ]
 
 
+AT_ONCE = "import time; time.sleep = lambda seconds: None\nfrom jcr.cli import main; main()"
+"""`jcr` whose retries of a download do not wait for each other."""
+
+
 def get(hub: Hub, home: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     environment = {
         name: value
@@ -122,7 +126,7 @@ def get(hub: Hub, home: Path, *arguments: str) -> subprocess.CompletedProcess[st
         if not name.lower().endswith("_proxy") and name[:3] != "HF_"
     }
     return subprocess.run(
-        [sys.executable, "-m", "jcr", "models", "get", *arguments],
+        [sys.executable, "-c", AT_ONCE, "models", "get", *arguments],
         capture_output=True,
         text=True,
         stdin=subprocess.DEVNULL,

@@ -13,21 +13,19 @@ pytestmark = pytest.mark.slow
 
 
 def test_priors_make_surfaces_and_nothing_free() -> None:
-    import torch
-
     from jcr.represent.build import build_scene
+    from jcr.represent.carve import carve
     from jcr.represent.options import MapOptions
-    from jcr.represent.seen import CROSSED, HIT, carve
+    from jcr.represent.seen import CROSSED, HIT
 
     whole = analytic_scene.cloud(20_000)
     left = whole.points_in_base[:, 0] < 0
     reason = np.where(left, PRIOR, MATCHED).astype(np.uint8)
-    box = torch.tensor([[-0.3, -0.3, -0.05], [0.3, 0.3, 0.45]])
+    box = np.array([[-0.3, -0.3, -0.05], [0.3, 0.3, 0.45]])
 
     def seen(rows: np.ndarray, reasons: np.ndarray) -> np.ndarray:
-        x, image = torch.tensor(whole.points_in_base[rows]).float(), torch.tensor(whole.image[rows])
-        centers = torch.tensor(whole.camera_centers_in_base).float()
-        return carve(x, image, centers, box, 0.01, torch.tensor(reasons[rows] != PRIOR)).state.numpy()
+        ends = whole.points_in_base[rows], whole.image[rows], whole.camera_centers_in_base
+        return carve(*ends, box, 0.01, reasons[rows] != PRIOR).state.numpy()
 
     every = np.ones(len(left), bool)
     mixed, measured_alone = seen(every, reason), seen(~left, reason)

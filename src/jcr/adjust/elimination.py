@@ -27,6 +27,14 @@ class Derivatives:
     residual: Float[ndarray, "k 2"]
 
 
+def in_order(order: Int[ndarray, " k"], *parts: Derivatives) -> Derivatives:
+    """Rows of several parts, one after the other, in another order."""
+    names = ("shared", "own", "by_point", "residual")
+    return Derivatives(
+        **{name: np.concatenate([getattr(part, name) for part in parts])[order] for name in names}
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Group:
     """Points that are eliminated together, for they are seen by few images of many."""

@@ -25,8 +25,9 @@ from jcr.records import Intrinsics, RobotNoise, Tracks
 
 COLUMNS = 9
 """Across the width of an image, of the grid whose rays end in points of the scene."""
-MOST_POINTS = 1000
-"""Of a scene; of many images every few rays end in one."""
+MOST_POINTS = 400
+"""Of a scene; of many images every few rays end in one. With 1000, what is expected differs by 0.1 %, after eleven more
+poses by 5 %, and takes twice as long."""
 RELIEF = 0.1
 """Of the working distance, to either side of the surface: what stands on a table."""
 TYPICAL_INFORMATION, TYPICAL_MODEL_ERROR = 5000.0, 1.2e-4
@@ -59,7 +60,7 @@ class ForeseenCamera:
         return ForeseenCamera(
             intrinsics=images.scene.cameras[0],
             prior=problem.freedom.intrinsics[0],
-            information_per_px2=float(images.weight.sum()) / len(problem.seen.rows),
+            information_per_px2=float(images.weight.sum()) / len(problem.observations.rig),
             model_error=float(left[0]) if len(left) else 0.0,
         )
 

@@ -16,7 +16,15 @@ from numpy import ndarray
 from jcr.adjust.elimination import Normal, with_fixed_points, without_points
 from jcr.adjust.model_error import size_of
 from jcr.adjust.pixel_noise import PixelNoise, common_share, left_of_points, pixel_noise, variance_ratios
-from jcr.adjust.projection import ImageProblem, View, by_points, derivatives, view_of
+from jcr.adjust.projection import (
+    ImageProblem,
+    View,
+    by_points,
+    derivatives,
+    shape_information,
+    shape_residuals,
+    view_of,
+)
 from jcr.adjust.scene import (
     Freedom,
     Observations,
@@ -98,8 +106,11 @@ def adjust_images(scene: Scene, observations: Observations, freedom: Freedom) ->
             break
     unit = float(np.median(np.abs(depth / view.depth)))
     back = inverse(scale_translation(scene.world_from_rig[0], unit))
+    steps = scene.camera_steps.copy()
+    steps[problem.freedom.board_columns][:1] += np.log(unit)
     scene = replace(
         scene,
+        camera_steps=steps,
         world_from_rig=start[0] @ back @ scale_translation(scene.world_from_rig, unit),
         rig_from_camera=scale_translation(scene.rig_from_camera, unit),
         points_in_world=apply(start[0] @ back, unit * scene.points_in_world),
@@ -118,13 +129,13 @@ def posed(
 
 
 def noise_of(scene: Scene, view: View, problem: ImageProblem, before: PixelNoise | None = None) -> PixelNoise:
-    """Of the observations at a scene; several cameras are distinguished where an estimate was made before, and so
+    """Of the observations at a scene; their groups are distinguished where an estimate was made before, and so
     are observations by what their matches state."""
     layout, residual_px, depth = problem.layout, view.residual_px, view.depth
-    if before is None or (len(scene.cameras) == 1 and not layout.states_variances):
-        return pixel_noise(layout, residual_px, depth, np.ones(len(scene.cameras)))
-    by = by_points(scene, view, problem)
-    left = left_of_points(layout, before, residual_px, depth, by, problem.seen.starts)
+    if before is None or (layout.groups == 1 and not layout.states_variances):
+        return pixel_noise(layout, residual_px, depth, np.ones(layout.groups))
+    by, known = by_points(scene, view, problem), shape_information(scene, problem)
+    left = left_of_points(layout, before, residual_px, depth, by, problem.seen.starts, known)
     ratio = variance_ratios(layout, before, residual_px, depth, left)
     return pixel_noise(layout, residual_px, depth, ratio, common_share(layout, residual_px, left, ratio))
 
@@ -222,6 +233,7 @@ def cost(
     """In squared standard deviations, with these weights of the observations, and of what is `known` of the rigs."""
     total = float(weight @ (view.residual_px**2).sum(1))
     total += float(((scene.camera_steps / problem.freedom.std) ** 2).sum())
+    total += float((shape_residuals(scene, problem) ** 2).sum())
     for one in known:
         steps = one.steps(scene)
         total += float(steps @ one.information @ steps + 2 * one.gradient @ steps)
@@ -249,7 +261,7 @@ def _normal_equations(
     """The normal equations in the order of Freedom's columns, without the points."""
     freedom, first, cameras = problem.freedom, problem.freedom.first_rig, len(problem.freedom.std)
     weighted = derivatives(scene, view, problem, weight)
-    hessian, right = with_fixed_points(weighted, problem.seen)
+    hessian, right = with_fixed_points(weighted, problem.rows_seen)
     hessian[range(cameras), range(cameras)] += freedom.std**-2.0
     right[:cameras] -= scene.camera_steps / freedom.std**2
     for one in known:
@@ -257,7 +269,7 @@ def _normal_equations(
         hessian[of_rigs, of_rigs] += one.information
         right[of_rigs] -= one.information @ one.steps(scene) + one.gradient
     hessian[np.diag_indices(len(right))] *= 1 + damping
-    return without_points(hessian, right, weighted, problem.seen, damping)
+    return without_points(hessian, right, weighted, problem.rows_seen, damping)
 
 
 def _after_step(scene: Scene, problem: ImageProblem, normal: Normal) -> Scene:

@@ -40,8 +40,9 @@ LEAST_LEFT = 0.1
 class PixelNoise:
     """Errors of image observations."""
 
-    sigma_px: Float[ndarray, " c"]
-    """Of one coordinate, by camera."""
+    sigma_px: Float[ndarray, " g"]
+    """Of one coordinate, by group of observations: the features of each camera, then the corners of boards, which are
+    found in another way."""
     inflation: float = 1.0
     """Of the variance of what many observations show together, because neighbours share errors; one for all cameras, for
     where points follow the few observations of one its own residuals do not show it."""
@@ -54,7 +55,7 @@ class PixelNoise:
 
     def variance_px2(self, layout: "Layout") -> Float[ndarray, " k"]:
         """Of one coordinate of each observation."""
-        return self.sigma_px[layout.camera] ** 2 * layout.relative_variance(self.common)
+        return self.sigma_px[layout.group] ** 2 * layout.relative_variance(self.common)
 
     def weights(
         self, residual_px: Float[ndarray, "k 2"], depth: Float[ndarray, " k"], layout: "Layout"
@@ -74,6 +75,9 @@ class Layout:
 
     camera: Int[ndarray, " k"]
     """Of each observation."""
+    group: Int[ndarray, " k"]
+    """Of each observation, as PixelNoise counts them."""
+    groups: int
     point: Int[ndarray, " k"]
     cell: Int[ndarray, " k"]
     """The images of a fixed camera show the same features with the same errors: their cells are one."""
@@ -81,7 +85,7 @@ class Layout:
     """As matching states it, over the median observation's."""
     median_square: Float[ndarray, " p"]
     """Median of a point's sum of squared residuals where an image coordinate's variance is 1: of the 2n errors of n
-    views its position takes up 3."""
+    views its position takes up 3, but for a corner of a board, whose place is known."""
 
     @staticmethod
     def of(observations: Observations, widths: Int[ndarray, " c"]) -> "Layout":
@@ -90,10 +94,17 @@ class Layout:
         column, row = (CELLS * observations.x_px / widths[camera, None]).astype(int).T
         keys = np.stack([observations.rig[observations.image], camera, row, column])
         _, cell = np.unique(keys, axis=1, return_inverse=True)
-        freedom = np.maximum(2 * np.bincount(observations.point) - 3, 1)
+        seen = np.bincount(observations.point)
+        corner = np.zeros(len(seen), bool)
+        if observations.boards is not None:
+            corner = observations.boards.is_corner(len(seen))
+        freedom = np.maximum(2 * seen - 3 * ~corner, 1)
+        cameras = len(widths)
         stated = (observations.std_px / np.median(observations.std_px)) ** 2 if len(camera) else np.ones(0)
         return Layout(
             camera=camera,
+            group=np.where(corner[observations.point], cameras, camera),
+            groups=cameras + bool(corner.any()),
             point=observations.point,
             cell=cell.ravel(),
             stated_variance=stated,
@@ -118,17 +129,17 @@ def pixel_noise(
     layout: Layout,
     residual_px: Float[ndarray, "k 2"],
     depth: Float[ndarray, " k"],
-    ratio: Float[ndarray, " c"],
+    ratio: Float[ndarray, " g"],
     common: float = 1.0,
 ) -> PixelNoise:
     """From the median point none of whose observations is far off, and from cells of the images.
 
-    `ratio` is that of the variances of each camera's observations to those of the first. Were errors independent, the
+    `ratio` is that of the variances of each group's observations to those of the first. Were errors independent, the
     squared sum over a cell of what each observation pulls would be, on average, the sum of the squares; what it is times
     that is what the errors that neighbours share cost of the images' information (the variance inflation of cluster
     sampling; Liang and Zeger, Biometrika 73, 1986).
     """
-    relative = (residual_px**2).sum(1) / (ratio[layout.camera] * layout.relative_variance(common))
+    relative = (residual_px**2).sum(1) / (ratio[layout.group] * layout.relative_variance(common))
     far = relative > FAR_OFF**2 * np.median(relative)
     squares = np.bincount(layout.point, relative) / layout.median_square
     clean = np.bincount(layout.point, far) == 0
@@ -147,14 +158,17 @@ def left_of_points(
     depth: Float[ndarray, " k"],
     by_point: Float[ndarray, "k 2 3"],
     starts: Int[ndarray, " p"],
+    known: Float[ndarray, "p 3 3"] | None = None,
 ) -> Float[ndarray, " k"]:
     """Share of each observation's variance that its residual has after the points took their part (their leverage).
 
-    `by_point` are derivatives by the points, `starts` each point's first observation.
+    `by_point` are derivatives by the points, `starts` each point's first observation, `known` the information that each
+    point has beside its observations.
     """
     weight = replace(before, inflation=1.0).weights(residual_px, depth, layout)
     j = np.sqrt(weight)[:, None, None] * by_point
-    inverse = np.linalg.inv(point_blocks(j, starts))[layout.point]
+    blocks = point_blocks(j, starts)
+    inverse = np.linalg.inv(blocks if known is None else blocks + known)[layout.point]
     return 1 - np.minimum(np.einsum("kai,kij,kaj->k", j, inverse, j) / 2, 1.0)
 
 
@@ -164,10 +178,10 @@ def variance_ratios(
     residual_px: Float[ndarray, "k 2"],
     depth: Float[ndarray, " k"],
     left: Float[ndarray, " k"],
-) -> Float[ndarray, " c"]:
-    """Variances of each camera's observations over those of the first.
+) -> Float[ndarray, " g"]:
+    """Variances of each group's observations over those of the first.
 
-    From their sums of squares over what is left of them, for a camera whose residuals are small because points follow
+    From their sums of squares over what is left of them, for a group whose residuals are small because points follow
     it is not the better one.
     """
     count = len(before.sigma_px)
@@ -177,7 +191,7 @@ def variance_ratios(
     tame = replace(before, inflation=1.0).weights(residual_px, depth, layout) * before.variance_px2(layout)
     square = (residual_px**2).sum(1) / layout.relative_variance(before.common)
     for c in range(count):
-        rows = layout.camera == c
+        rows = layout.group == c
         if rows.any():
             ratio[c] = (tame[rows] @ square[rows]) / max(2 * float(tame[rows] @ left[rows]), 1e-12)
     return np.clip(ratio / max(ratio[0], 1e-12), *RATIOS)
@@ -187,7 +201,7 @@ def common_share(
     layout: Layout,
     residual_px: Float[ndarray, "k 2"],
     left: Float[ndarray, " k"],
-    ratio: Float[ndarray, " c"],
+    ratio: Float[ndarray, " g"],
 ) -> float:
     """The share of variance that all observations have alike under which the residuals are likeliest.
 
@@ -196,7 +210,7 @@ def common_share(
     if not layout.states_variances:
         return 1.0
     shown = left > LEAST_LEFT
-    square = (residual_px[shown] ** 2).sum(1) / (ratio[layout.camera] * left)[shown]
+    square = (residual_px[shown] ** 2).sum(1) / (ratio[layout.group] * left)[shown]
 
     def cost(common: float) -> float:
         relative = layout.relative_variance(common)[shown]

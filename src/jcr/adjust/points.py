@@ -62,9 +62,8 @@ def _of_points(
     """How points move with the columns of the images' evidence, and their covariance where these stand still."""
     images = adjusted.given.evidence
     problem = images.problem
-    observations = problem.observations
-    rows = np.flatnonzero(np.isin(observations.point, some))
-    point = np.searchsorted(some, observations.point[rows])
+    rows = np.flatnonzero(np.isin(problem.rows_point, some))
+    point = np.searchsorted(some, problem.rows_point[rows])
     by = derivatives(images.scene, images.view, problem, images.weight)
     by_point = by.by_point[rows]
     starts = np.flatnonzero(np.diff(point, prepend=-1))
@@ -72,8 +71,7 @@ def _of_points(
     first = problem.freedom.first_rig
     columns = np.zeros((len(rows), 2, len(images.gradient)))
     columns[:, :, :first] = by.shared[rows]
-    rig = observations.rig[observations.image[rows]]
-    own = first + 6 * rig[:, None] + np.arange(6)
+    own = first + 6 * problem.rows_rig[rows][:, None] + np.arange(6)
     columns[np.arange(len(rows))[:, None, None], np.arange(2)[:, None], own[:, None]] = by.own[rows]
     coupling = np.add.reduceat(np.swapaxes(by_point, 1, 2) @ columns, starts)
     return -np.linalg.solve(blocks, coupling), np.linalg.inv(blocks)

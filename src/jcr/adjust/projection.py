@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.adjust.elimination import Derivatives, Sightings
+from jcr.adjust.elimination import Derivatives, Sightings, in_order
 from jcr.adjust.model_error import TYPICAL, displacements
 from jcr.adjust.pixel_noise import Layout
 from jcr.adjust.scene import OF_IMAGE, PRISM, Freedom, Nuisances, Observations, RigInformation, Scene
@@ -25,7 +25,10 @@ CENTRE = slice(2, 4)
 
 @dataclass(frozen=True, kw_only=True)
 class ImageProblem:
-    """What stays fixed; observations sorted by point, then by rig."""
+    """What stays fixed; observations sorted by point, then by rig.
+
+    The rows of the equations are the observations and, where there are boards, what these show of their own corners.
+    """
 
     observations: Observations
     points: Int[ndarray, " p"]
@@ -38,6 +41,14 @@ class ImageProblem:
     layout: Layout
     displacements: Float[ndarray, "k 2 e"]
     """Of each observation by what its camera's model leaves (px); no column where intrinsics are exact."""
+    rows_order: Int[ndarray, " r"]
+    """That sorts the rows of the equations by point: observations first, then two a corner."""
+    rows_point: Int[ndarray, " r"]
+    """Of each row, sorted."""
+    rows_rig: Int[ndarray, " r"]
+    """Of each row, sorted."""
+    rows_seen: Sightings
+    """By rigs, of the sorted rows."""
 
     @staticmethod
     def of(
@@ -57,16 +68,32 @@ class ImageProblem:
             point=point,
             std_px=observations.std_px[order],
         )
+        boards = None if observations.boards is None else observations.boards.of_points(kept)
+        used = replace(used, boards=boards)
         layout = Layout.of(used, np.array([camera.width for camera in freedom.start]))
+        rig, rigs = used.rig[used.image], len(scene.world_from_rig)
+        rows = np.stack([point, rig])
+        if boards is not None:
+            rows = np.concatenate([rows, np.repeat([boards.point, boards.rig], 2, axis=1)], axis=1)
+        rows_order = np.lexsort(rows[::-1])
+        rows_point, rows_rig = rows[:, rows_order]
         by = displacements(freedom.start, freedom.intrinsics, used.x_px, layout.camera)
         return ImageProblem(
             observations=used,
             points=kept,
-            freedom=replace(freedom, model_error_std=np.full(by.shape[2], TYPICAL)),
+            freedom=replace(
+                freedom,
+                model_error_std=np.full(by.shape[2], TYPICAL),
+                board_std=np.zeros(0) if boards is None else boards.shape_std,
+            ),
             prior=prior,
-            seen=Sightings.of(point, used.rig[used.image], len(scene.world_from_rig)),
+            seen=(seen := Sightings.of(point, rig, rigs)),
             layout=layout,
             displacements=by,
+            rows_order=rows_order,
+            rows_point=rows_point,
+            rows_rig=rows_rig,
+            rows_seen=seen if boards is None else Sightings.of(rows_point, rows_rig, rigs),
         )
 
     @cached_property
@@ -171,7 +198,7 @@ def view_of(scene: Scene, problem: ImageProblem) -> View:
 
 
 def derivatives(scene: Scene, view: View, problem: ImageProblem, weight: Float[ndarray, " k"]) -> Derivatives:
-    """Derivatives of all observations by everything, and their residuals, times the roots of their weights."""
+    """Derivatives of all rows of the equations by everything, and their residuals, times the roots of their weights."""
     freedom, root = problem.freedom, np.sqrt(weight)[:, None, None]
     by_rig = root * _by_rig(scene, view, problem)
     shared = np.zeros((len(weight), 2, freedom.first_rig))
@@ -188,7 +215,36 @@ def derivatives(scene: Scene, view: View, problem: ImageProblem, weight: Float[n
         by_world[rows] = here
         own[rows, :, :3] = -here
         own[rows, :, 3:] = _crossed(here, (view.from_rig[rows] @ rotation.T)[:, None])
-    return Derivatives(shared=shared, own=own, by_point=by_world, residual=view.residual_px * root[..., 0])
+    of_images = Derivatives(
+        shared=shared, own=own, by_point=by_world, residual=view.residual_px * root[..., 0]
+    )
+    if problem.observations.boards is None:
+        return of_images
+    of_boards = problem.observations.boards.derivatives(
+        scene.world_from_rig,
+        scene.points_in_world,
+        scene.camera_steps[freedom.board_columns],
+        freedom.board_columns,
+        freedom.first_rig,
+    )
+    return in_order(problem.rows_order, of_images, of_boards)
+
+
+def shape_residuals(scene: Scene, problem: ImageProblem) -> Float[ndarray, "c 3"]:
+    """By how much corners are off the shape of their boards, in standard deviations."""
+    boards = problem.observations.boards
+    if boards is None:
+        return np.zeros((0, 3))
+    shape = scene.camera_steps[problem.freedom.board_columns]
+    return boards.residual(scene.world_from_rig, scene.points_in_world, shape)
+
+
+def shape_information(scene: Scene, problem: ImageProblem) -> Float[ndarray, "p 3 3"] | None:
+    """What boards show of each point; None without boards."""
+    if (boards := problem.observations.boards) is None:
+        return None
+    shape = scene.camera_steps[problem.freedom.board_columns]
+    return boards.point_information(scene.world_from_rig, shape, len(problem.points))
 
 
 def by_points(scene: Scene, view: View, problem: ImageProblem) -> Float[ndarray, "k 2 3"]:

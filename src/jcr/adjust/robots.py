@@ -184,6 +184,17 @@ class RigsGivenCameras:
 
 
 @dataclass(frozen=True, kw_only=True)
+class KnownLength:
+    """A length that is known beside the robot's positions: a normal prior of the scale."""
+
+    log_scale: float
+    """What the logarithm of the metres per unit of the world is by it; of boards, of the metres per metre as stated."""
+    std: float
+    of_boards: bool = False
+    """The size of the boards in the world is an unknown too, and its logarithm is added to that of the scale."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Given:
     """What the mixed model of a scene is made of."""
 
@@ -191,6 +202,7 @@ class Given:
     arms: tuple[ArmPoses, ...]
     noise: tuple[float, float] | None
     """m, rad: of the gripper poses, at least."""
+    lengths: tuple[KnownLength, ...] = ()
 
     @cached_property
     def by_arm(self) -> Int[ndarray, " s"]:
@@ -254,17 +266,44 @@ def equations_of(placed: Placed, given: Given) -> tuple[Equations, Region]:
     of_free = images.information[np.ix_(free, free)] - coupling.T @ rigs.follow
     region = Region.of_unknowns(np.delete(poses.jacobian, SCALE, axis=1), robots + len(free))
     by_free = -pose_by_pose(poses.by_rig, rigs.follow)
+    information, gradient = _of_lengths(placed, given)
     equations = Equations(
         residual=poses.residual - pose_by_pose(poses.by_rig, rigs.step[:, None])[:, 0],
         jacobian=np.concatenate([poses.jacobian, by_free], axis=1),
-        prior_information=np.asarray(block_diag(weak_prior(len(given.arms)), (of_free + of_free.T) / 2)),
-        prior_gradient=np.r_[np.zeros(robots), images.gradient[free] - coupling.T @ rigs.step],
+        prior_information=np.asarray(block_diag(weak_prior(len(given.arms)), (of_free + of_free.T) / 2))
+        + information,
+        prior_gradient=np.r_[np.zeros(robots), images.gradient[free] - coupling.T @ rigs.step] + gradient,
         known=(known + known.T) / 2,
         systematic=region.left(np.asarray(block_diag(*(arm.systematic for arm in given.arms)))),
         given=given.noise,
         bent=_bent(given.arms, region),
     )
     return equations, region
+
+
+def size_of_boards(placed: Placed, given: Given) -> tuple[float, Float[ndarray, " p"]]:
+    """Logarithm of the metres, by the scale, that a metre of the boards is as stated; and its derivative by the unknowns
+    of the mixed model."""
+    problem = given.evidence.problem
+    boards, column = problem.observations.boards, problem.freedom.board_columns.start
+    assert boards is not None
+    by_unknown = np.zeros(given.arm_unknowns + len(given.free))
+    by_unknown[SCALE] = by_unknown[given.arm_unknowns + int(np.searchsorted(given.free, column))] = 1.0
+    return float(np.log(placed.scale * boards.unit) + placed.scene.camera_steps[column]), by_unknown
+
+
+def _of_lengths(placed: Placed, given: Given) -> tuple[Float[ndarray, "p p"], Float[ndarray, " p"]]:
+    """Information and gradient of the lengths that are known."""
+    unknowns = given.arm_unknowns + len(given.free)
+    information, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+    for length in given.lengths:
+        log_scale, by_unknown = float(np.log(placed.scale)), np.zeros(unknowns)
+        by_unknown[SCALE] = 1.0
+        if length.of_boards:
+            log_scale, by_unknown = size_of_boards(placed, given)
+        information += np.outer(by_unknown, by_unknown) / length.std**2
+        gradient += by_unknown * (log_scale - length.log_scale) / length.std**2
+    return information, gradient
 
 
 def _bent(arms: Sequence[ArmPoses], region: Region) -> Float[ndarray, "s s"] | None:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from jcr.adjust.boards import BoardShapes
 from jcr.adjust.intrinsics_prior import IntrinsicsPrior
 from jcr.camera import parameters, with_parameters
 from jcr.geometry import retract, skew, step_between
@@ -32,10 +33,13 @@ class Observations:
     point: Int[ndarray, " k"]
     std_px: Float[ndarray, " k"]
     """Of one coordinate, as matching states it, up to a factor; all 1 where it states nothing."""
+    boards: BoardShapes | None = None
+    """What is known of the shape of boards and tags whose corners are among the points; each is a rig that no arm
+    moves."""
 
     @staticmethod
-    def of_one_camera(tracks: Tracks, images: int) -> "Observations":
-        """Of the images of one camera, a rig an image."""
+    def of_one_camera(tracks: Tracks, images: int, boards: BoardShapes | None = None) -> "Observations":
+        """Of the images of one camera, a rig an image; `boards` are the rigs after them."""
         each = np.arange(images)
         return Observations(
             rig=each,
@@ -44,6 +48,7 @@ class Observations:
             x_px=tracks.x_px,
             point=tracks.point,
             std_px=np.ones(len(tracks.image)) if tracks.std_px is None else tracks.std_px,
+            boards=boards,
         )
 
 
@@ -88,7 +93,7 @@ class Freedom:
     """What may move beside rigs and points: the cameras' parameters, and where cameras are mounted on their rig.
 
     The columns of all equations are, in this order: the intrinsics of each camera, nuisances, what the cameras' models
-    leave (model_error.py), mounts (six each, rig axes), rigs (six each, world axes).
+    leave (model_error.py), the shape of boards (boards.py), mounts (six each, rig axes), rigs (six each, world axes).
     """
 
     intrinsics: tuple[IntrinsicsPrior, ...]
@@ -100,6 +105,8 @@ class Freedom:
     """Of each camera, where its prior has its middle."""
     model_error_std: Float[ndarray, " e"] = field(default_factory=lambda: np.zeros(0))
     """Of each displacement, in widths of the image."""
+    board_std: Float[ndarray, " s"] = field(default_factory=lambda: np.zeros(0))
+    """Of what is free of the shape of boards: first the logarithm of their size."""
 
     @staticmethod
     def of(
@@ -120,7 +127,12 @@ class Freedom:
     def std(self) -> Float[ndarray, " l"]:
         """Of all camera columns."""
         return np.concatenate(
-            [*(prior.std for prior in self.intrinsics), self.nuisance.std, self.model_error_std]
+            [
+                *(prior.std for prior in self.intrinsics),
+                self.nuisance.std,
+                self.model_error_std,
+                self.board_std,
+            ]
         )
 
     @property
@@ -142,9 +154,15 @@ class Freedom:
         return slice(begin, begin + len(self.model_error_std))
 
     @property
+    def board_columns(self) -> slice:
+        """After what the models leave."""
+        begin = self.model_error_columns.stop
+        return slice(begin, begin + len(self.board_std))
+
+    @property
     def mount_columns(self) -> list[slice | None]:
         """Of each camera; None where it does not move."""
-        begin, out = self.model_error_columns.stop, list[slice | None]()
+        begin, out = self.board_columns.stop, list[slice | None]()
         for free in self.mounts:
             out.append(slice(begin, begin + 6) if free else None)
             begin += 6 * int(free)
@@ -153,7 +171,7 @@ class Freedom:
     @property
     def first_rig(self) -> int:
         """Column; six for each rig follow."""
-        return self.model_error_columns.stop + 6 * int(self.mounts.sum())
+        return self.board_columns.stop + 6 * int(self.mounts.sum())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,8 +183,8 @@ class Scene:
     cameras: tuple[Intrinsics, ...]
     points_in_world: Float[ndarray, "p 3"]
     camera_steps: Float[ndarray, " l"] = field(default_factory=lambda: np.zeros(0))
-    """Of the intrinsics from where they start, along the directions of their priors, of the nuisances, and of what the
-    models leave; empty: all are where they start."""
+    """Of the intrinsics from where they start, along the directions of their priors, of the nuisances, of what the
+    models leave, and of the shape of boards; empty: all are where they start."""
 
     def nuisances(self, freedom: Freedom) -> Float[ndarray, " r"]:
         """How the images differ from their camera's model, in the order of NuisancePrior's rows."""
@@ -192,6 +210,7 @@ def with_freedom(scene: Scene, before: Freedom, freedom: Freedom) -> Scene:
     left = scene.camera_steps[before.model_error_columns]
     if len(left) == len(freedom.model_error_std):
         along[freedom.model_error_columns] = left
+    along[freedom.board_columns] = scene.camera_steps[before.board_columns]
     nothing = np.zeros(freedom.first_rig + 6 * len(scene.world_from_rig))
     return stepped(replace(scene, camera_steps=along), freedom, nothing)
 
@@ -225,6 +244,7 @@ def similarities(scene: Scene, freedom: Freedom) -> Float[ndarray, "d 7"]:
     first = freedom.first_rig
     out = np.zeros((first + 6 * len(scene.world_from_rig), 7))
     out[first:] = similarities_of_rigs(scene.world_from_rig)
+    out[freedom.board_columns, 0][:1] = 1.0  # the logarithm of their size
     for c, columns in enumerate(freedom.mount_columns):
         if columns is not None:
             out[columns.start : columns.start + 3, 0] = scene.rig_from_camera[c, :3, 3]

@@ -198,7 +198,7 @@ def _with_all_free(
         beyond_prior(adjusted, prior, camera) / units,
         steps[columns.stop : freedom.nuisance_columns.start],
         scene.nuisances(freedom)[rows],
-        steps[freedom.model_error_columns],
+        steps[freedom.model_error_columns.start : freedom.board_columns.stop],
     ]
     return evidence(replace(scene, camera_steps=wider_steps), replace(problem, freedom=all_free), found.noise)
 

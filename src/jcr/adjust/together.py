@@ -27,7 +27,16 @@ from jcr.adjust.images import (
 )
 from jcr.adjust.pixel_noise import PixelNoise
 from jcr.adjust.projection import ImageProblem, view_of
-from jcr.adjust.robots import Adjusted, ArmPoses, Given, Placed, after_step, equations_of, reported_poses
+from jcr.adjust.robots import (
+    Adjusted,
+    ArmPoses,
+    Given,
+    KnownLength,
+    Placed,
+    after_step,
+    equations_of,
+    reported_poses,
+)
 from jcr.adjust.scene import (
     Freedom,
     Observations,
@@ -89,6 +98,12 @@ def adjust(
     pixels = noise_of(scene, view_of(scene, problem), problem)
     scene, *_ = minimised(scene, problem, pixels, [_rig_information(placed, arms, np.diag(white))])
     return _settled(replace(placed, scene=scene), problem, pixels, tuple(arms), noise)
+
+
+def with_lengths(adjusted: Adjusted, lengths: Sequence[KnownLength]) -> Adjusted:
+    """An adjustment beside which these lengths are known; the images' evidence stays what it is."""
+    given = replace(adjusted.given, lengths=tuple(lengths))
+    return _averaged(given, adjusted.most_likely, adjusted.log_sizes)
 
 
 def _begun(near: Adjusted, problem: ImageProblem) -> tuple[Placed, ImageProblem, PixelNoise]:

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.adjust.boards import shapes_of
 from jcr.adjust.intrinsics_prior import FIXED, IntrinsicsPrior, prior_of
 from jcr.adjust.robots import Adjusted, ArmPoses
 from jcr.adjust.scene import Freedom, Observations, Scene
@@ -53,6 +54,9 @@ def adjust_wrist(
     x, scale, z = start
     each, systematic = np.arange(len(base_from_gripper)), options.systematic
     prior = prior_of(intrinsics, FIXED) if prior is None else prior
+    points_in_world = scale * tracks.points_in_recon.astype(float)
+    twice = np.bincount(tracks.point, minlength=len(points_in_world)) >= 2
+    boards, world_from_board = shapes_of(tracks.boards, points_in_world, twice, len(each))
     freedom = Freedom.of((intrinsics,), (prior,), len(each))
     if options.combinations is not None:
         freedom = freed(freedom, options.combinations, each)
@@ -66,12 +70,12 @@ def adjust_wrist(
     )
     return adjust(
         Scene(
-            world_from_rig=scale_translation(recon_from_camera, scale),
+            world_from_rig=np.concatenate([scale_translation(recon_from_camera, scale), world_from_board]),
             rig_from_camera=np.eye(4)[None],
             cameras=(intrinsics,),
-            points_in_world=scale * tracks.points_in_recon.astype(float),
+            points_in_world=points_in_world,
         ),
-        Observations.of_one_camera(tracks, len(each)),
+        Observations.of_one_camera(tracks, len(each), boards),
         freedom,
         [arm],
         noise,

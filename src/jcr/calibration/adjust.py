@@ -180,8 +180,8 @@ def refined_by(case: Case, found: Adjusted) -> HandEye:
 
 def _adjusted_poses(found: Adjusted) -> Float[ndarray, "u 4 4"]:
     """base_from_gripper where images and robot together put it."""
-    placed = found.placed
-    return predict(placed.x[0], placed.scale, placed.z[0], placed.scene.world_from_rig)
+    placed, rigs = found.placed, found.given.arms[0].rigs
+    return predict(placed.x[0], placed.scale, placed.z[0], placed.scene.world_from_rig[rigs])
 
 
 def _leave_one_out(found: Adjusted) -> LeaveOneOut | None:
@@ -194,9 +194,10 @@ def _leave_one_out(found: Adjusted) -> LeaveOneOut | None:
     # The images as they would be with every gripper, and the rig on it, by as much beside its place.
     placed, evidence = found.most_likely, found.given.evidence
     x, z = placed.x[0], placed.z[0]
-    gripper = predict(x, placed.scale, z, placed.scene.world_from_rig)
+    own, rigs = found.given.arms[0].rigs, placed.scene.world_from_rig.copy()
+    gripper = predict(x, placed.scale, z, rigs[own])
     in_metres = inverse(z) @ retract(gripper, -left_out) @ x
-    rigs = scale_translation(in_metres, 1 / placed.scale)
+    rigs[own] = scale_translation(in_metres, 1 / placed.scale)
     moved = view_of(replace(evidence.scene, world_from_rig=rigs), evidence.problem)
     return LeaveOneOut(
         1e3 * float(metres),

@@ -19,6 +19,7 @@ from jcr.intrinsics_json import IntrinsicsAndStd, IntrinsicsJson, Positive
 from jcr.records import (
     AngleRatio,
     Attempt,
+    BoardFound,
     Capture,
     DepthCheck,
     Finding,
@@ -26,6 +27,7 @@ from jcr.records import (
     ImageVerdict,
     Kind,
     LeaveOneOut,
+    LengthCheck,
     Mount,
     NextPose,
     PaperResiduals,
@@ -155,6 +157,10 @@ class CalibrationFile(Part):
     robot_errors: RobotErrors | None = None
     angle_ratio: AngleRatio | None = None
     depth_check: DepthCheck | None = None
+    lengths: list[LengthCheck] = []
+    """Every length that was compared with the robot's positions."""
+    board: BoardFound | None = None
+    """Null where no board took part beside features, and in files of earlier versions."""
     requirement: Requirement | None = None
     """None of files of earlier versions, and where nothing was found."""
     attempts: list[Attempt] = []
@@ -262,6 +268,8 @@ def calibration_file(
         "robot_errors": RobotErrors.of(hand_eye.robot),
         "angle_ratio": hand_eye.robot.angle_ratio,
         "depth_check": hand_eye.scale_evidence.depth,
+        "lengths": list(hand_eye.scale_evidence.lengths),
+        "board": hand_eye.scale_evidence.board,
         "requirement": hand_eye.requirement,
         "attempts": list(attempts),
         "with_given_intrinsics": hand_eye.with_given_intrinsics,

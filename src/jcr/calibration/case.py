@@ -143,12 +143,13 @@ def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
 
 
 def some_of_many(tracks: Tracks, most: int) -> Tracks:
-    """All observations, or where there are more than `most` those of a random choice of the points."""
+    """All observations, or where there are more than `most` those of a random choice of the points and of all corners
+    of boards."""
     if len(tracks.image) <= most:
         return tracks
     count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
     order = np.random.default_rng(0).permutation(len(count))
-    chosen = np.zeros(len(count), bool)
+    chosen = tracks.on_board
     chosen[order[np.cumsum(count[order]) <= most]] = True
     return of_points(tracks, chosen)
 

@@ -32,6 +32,9 @@ def fitted(
         )
     gripper = capture.base_from_gripper[reconstruction.image_index]
     cues, contradiction = _measured(capture, reconstruction, options), None
+    if cues is not None and cues.offset is None and _shows_scale(gripper, reconstruction, options, robot):
+        # The length is compared with the robot's beside other lengths (checks/lengths.py).
+        cues = None
     if cues is None and (metric_std := reconstruction.metric_std) is not None:
         free = _solved(gripper, reconstruction, options, robot, None)
         contradiction = scale_contradiction(free, metric_std)
@@ -46,6 +49,16 @@ def fitted(
         cues=cues,
         hand_eye=hand_eye.with_findings(*_present(contradiction)),
     )
+
+
+def _shows_scale(
+    gripper: Float[ndarray, "m 4 4"],
+    reconstruction: Reconstruction,
+    options: CalibrateOptions,
+    robot: RobotErrors,
+) -> bool:
+    """Whether the motions determine the scale, and images can be adjusted with it."""
+    return options.bundle_adjustment and _solved(gripper, reconstruction, options, robot, None).converged
 
 
 def _present(finding: Finding | None) -> tuple[Finding, ...]:

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from jcr.calibration.calibration_json import CalibrationFile, GivenIntrinsicsKept
 from jcr.calibration.uncertainty_json import SeenAndCorners, UncertaintyBudget
-from jcr.records import Attempt, DepthCheck, LeaveOneOut, is_explained, verdict_of
+from jcr.records import Attempt, BoardFound, DepthCheck, LeaveOneOut, is_explained, verdict_of
 from jcr.records.words import network_scale, reached_in_words, sentence
 from jcr.rounding import significant
 
@@ -71,11 +71,23 @@ def found(content: CalibrationFile) -> list[str]:
         lines.append(f"  {network_scale(content.scale_check.off_percent, content.scale_check.std_percent)}")
     if content.depth_check is not None:
         lines.append(depth_in_words(content.depth_check))
+    if content.board is not None:
+        lines.append(board_in_words(content.board))
     if (held_out := content.held_out) is not None:
         lines.append(
             f"leave-one-out error: {leave_one_out_text(held_out)}{pixels(held_out)} ({held_out.how})"
         )
     return lines
+
+
+def board_in_words(board: BoardFound) -> str:
+    """What a board beside features came to."""
+    stated = "" if board.stated_mm is None else f", {board.stated_mm:g} mm stated"
+    return (
+        f"board: sides of {board.side_mm:.2f} ± {significant(board.side_std_mm)} mm by the robot{stated}; "
+        f"{board.corners} corners in {board.images} images, {board.rms_px:.2f} px, bent by "
+        f"{significant(board.bend_mm)} mm"
+    )
 
 
 def seen_in_words(seen: SeenAndCorners) -> str:

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import project, undistortion
@@ -72,36 +72,41 @@ def extend(
         changing=True,
         memory_gb=memory_gb,
     )
-    assert found.reason is not None and found.depth_std is not None
-    points, confidence = found.points_in_recon[-new:], found.confidence[-new:]
-    for name, of_image in zip(added.images, confidence, strict=True):
+    for name, of_image in zip(added.images, found.confidence[-new:], strict=True):
         if (of_image > 0).mean() < LEAST_SHARE:
             raise InputError(
                 f"{added.folder / name}: no depth can be found in it; its pose may be wrong, or it shows nothing "
                 "that other images show"
             )
-    # In the unit of the back end's own confidence, so that one threshold serves both.
-    known = dense.confidence[dense.confidence > 0]
+    pointmaps = _joined(dense, found, colors, new)
+    _forget_contradicted(pointmaps.points_in_recon, pointmaps.confidence, recon_from_camera, old, pinhole)
+    return replace(
+        reconstruction,
+        image_index=np.concatenate([reconstruction.image_index, capture_size + np.arange(new)]),
+        recon_from_camera=recon_from_camera,
+        pointmaps=pointmaps,
+    )
+
+
+def _joined(dense: Pointmaps, found: Pointmaps, colors: UInt8[ndarray, "m h w 3"], new: int) -> Pointmaps:
+    """The pointmaps of a reconstruction, and those found of its last images, `new` in number; `colors` are of all.
+
+    The confidence is in the unit of the back end's own, so that one threshold serves both.
+    """
+    assert found.reason is not None and found.depth_std is not None
+    confidence, known = found.confidence[-new:], dense.confidence[dense.confidence > 0]
     if len(known):
         confidence = confidence * (np.median(known) / np.median(confidence[confidence > 0]))
     reason, std = dense.reason, dense.depth_std
     if reason is None:
         reason = np.where(dense.confidence > 0, MATCHED, NO_DEPTH).astype(np.uint8)
-    points = np.concatenate([dense.points_in_recon, points])
-    confidence = np.concatenate([dense.confidence, confidence])
-    _forget_contradicted(points, confidence, recon_from_camera, old, pinhole)
-    return replace(
-        reconstruction,
-        image_index=np.concatenate([reconstruction.image_index, capture_size + np.arange(new)]),
-        recon_from_camera=recon_from_camera,
-        pointmaps=Pointmaps(
-            intrinsics=pinhole,
-            points_in_recon=points,
-            confidence=confidence,
-            colors=colors,
-            reason=np.concatenate([reason, found.reason[-new:]]),
-            depth_std=None if std is None else np.concatenate([std, found.depth_std[-new:]]),
-        ),
+    return Pointmaps(
+        intrinsics=dense.intrinsics,
+        points_in_recon=np.concatenate([dense.points_in_recon, found.points_in_recon[-new:]]),
+        confidence=np.concatenate([dense.confidence, confidence]),
+        colors=colors,
+        reason=np.concatenate([reason, found.reason[-new:]]),
+        depth_std=None if std is None else np.concatenate([std, found.depth_std[-new:]]),
     )
 
 

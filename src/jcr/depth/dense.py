@@ -63,15 +63,21 @@ def dense_pointmaps(
         report=progress(0.7, 0.3),
     )
     depth = 1 / found.inverse_depth.astype(np.float64)
-    points = np.empty((*depth.shape, 3))
-    direction = rays(pinhole)
-    for k, pose in enumerate(recon_from_camera):
-        points[k] = (depth[k, ..., None] * direction) @ pose[:3, :3].T + pose[:3, 3]
     return Pointmaps(
         intrinsics=pinhole,
-        points_in_recon=points,
+        points_in_recon=_points(depth, recon_from_camera, pinhole),
         confidence=found.confidence.astype(np.float64),
         colors=colors,
         reason=found.reason,
         depth_std=(found.std * depth).astype(np.float32),
     )
+
+
+def _points(
+    depth: Float[ndarray, "m h w"], recon_from_camera: Float[ndarray, "m 4 4"], pinhole: Intrinsics
+) -> Float[ndarray, "m h w 3"]:
+    """The points of every pixel in the recon frame."""
+    points, direction = np.empty((*depth.shape, 3)), rays(pinhole)
+    for k, pose in enumerate(recon_from_camera):
+        points[k] = (depth[k, ..., None] * direction) @ pose[:3, :3].T + pose[:3, 3]
+    return points

@@ -88,9 +88,7 @@ def fused_depth(
 
         support = _support(inverse_depth, matched, recon_from_camera, pinhole)
         even = evened(colors, inverse_depth, matched, views, pinhole)
-        even = [cv2.GaussianBlur(image, (0, 0), 1.0) for image in even]
-        depths = np.where(matched, inverse_depth, 0)[..., None]
-        surfaces = padded(np.concatenate([depths, even], -1))
+        surfaces = _surfaces(np.where(matched, inverse_depth, 0), even)
         report(0.4)
 
         def prior(i: int) -> Prior:
@@ -142,6 +140,14 @@ def _stacked(priors: Sequence[Prior]) -> Prior:
     return Prior(**{one.name: np.stack([getattr(p, one.name) for p in priors]) for one in fields(Prior)})
 
 
+def _surfaces(
+    inverse_depth: Float[ndarray, "m h w"], even: Float[ndarray, "m h w 3"]
+) -> Float[ndarray, "m h _ 4"]:
+    """Inverse depths and colours, these a little smooth, as `colours_agree` takes them."""
+    smooth = [cv2.GaussianBlur(image, (0, 0), 1.0) for image in even]
+    return padded(np.concatenate([inverse_depth[..., None], smooth], -1))
+
+
 def _with_planes(
     matching: FusedDepth,
     planes: Prior,
@@ -184,10 +190,10 @@ def _support(
     pinhole: Intrinsics,
 ) -> Float[ndarray, "4"]:
     """The plane of most matched points, in the recon frame."""
-    direction = rays(pinhole)
-    x_in_recon = [
-        apply(pose, (direction / depth[..., None].astype(float))[there][::10])
-        for pose, depth, there in zip(recon_from_camera, inverse_depth, matched, strict=True)
-    ]
+    direction = rays(pinhole).reshape(-1, 3)
+    x_in_recon = []
+    for pose, per_depth, there in zip(recon_from_camera, inverse_depth, matched, strict=True):
+        some = np.flatnonzero(there)[::10]
+        x_in_recon.append(apply(pose, direction[some] / per_depth.ravel()[some, None].astype(float)))
     tolerance = 0.004 / float(np.median(inverse_depth[matched]))
     return support_plane(np.concatenate(x_in_recon), tolerance)

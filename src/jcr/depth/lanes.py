@@ -9,6 +9,7 @@ from functools import partialmethod
 from typing import Any
 
 from llvmlite import ir
+from numba.core import cgutils
 
 FLOAT, INT, LONG = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 
@@ -31,9 +32,9 @@ class Lanes:
         return cls(builder, builder.insert_element(empty, number, INT(0))).at([0] * count)
 
     @classmethod
-    def read(cls, builder: Any, start: Any, place: Any, count: int) -> "Lanes":
-        """`count` consecutive floats from a place on."""
-        there = builder.bitcast(builder.gep(start, [place]), ir.VectorType(FLOAT, count).as_pointer())
+    def read(cls, builder: Any, start: Any, place: Any, count: int, kind: Any = FLOAT) -> "Lanes":
+        """`count` consecutive numbers from a place on."""
+        there = builder.bitcast(builder.gep(start, [place]), ir.VectorType(kind, count).as_pointer())
         return cls(builder, builder.load(there, align=4))
 
     def gathered(self, start: Any, used: int) -> "Lanes":
@@ -86,24 +87,31 @@ class Lanes:
         """The numbers of int32 as float32."""
         return Lanes(self.builder, self.builder.sitofp(self.value, ir.VectorType(FLOAT, self.count)))
 
-    def as_pairs(self) -> "tuple[Lanes, Lanes]":
-        """The two floats that lie in the 64 bits of every lane."""
-        floats = Lanes(self.builder, self.builder.bitcast(self.value, ir.VectorType(FLOAT, 2 * self.count)))
-        return floats.at(range(0, 2 * self.count, 2)), floats.at(range(1, 2 * self.count, 2))
+    def as_pairs(self, kind: Any = FLOAT) -> "tuple[Lanes, Lanes]":
+        """The two numbers that lie in the 64 bits of every lane."""
+        pairs = Lanes(self.builder, self.builder.bitcast(self.value, ir.VectorType(kind, 2 * self.count)))
+        return pairs.at(range(0, 2 * self.count, 2)), pairs.at(range(1, 2 * self.count, 2))
+
+    def inverted(self) -> "Lanes":
+        """One over the numbers."""
+        return self._same(1.0) / self
+
+    def root(self) -> "Lanes":
+        """The square roots."""
+        kind = ir.FunctionType(self.value.type, [self.value.type])
+        root = cgutils.get_or_insert_function(self.builder.module, kind, f"llvm.sqrt.v{self.count}f32")
+        return Lanes(self.builder, self.builder.call(root, [self.value]))
 
     def at(self, lanes: Any) -> "Lanes":
         """The numbers of some lanes, in a given order."""
         chosen = Lanes.constant(self.builder, lanes, INT).value
         return Lanes(self.builder, self.builder.shuffle_vector(self.value, self.value, chosen))
 
-    def sum(self) -> Any:
-        """The scalar sum, by halves: lane k is added to lane k + n/2, then k to k + n/4, and so on."""
-        lanes = self
-        while (n := lanes.count) > 1:
-            lanes = lanes.at(range(n // 2)) + lanes.at(range(n // 2, n))
-        return self.builder.extract_element(lanes.value, INT(0))
+    def write(self, start: Any, place: Any) -> None:
+        """Store the lanes as consecutive floats from a place on."""
+        there = self.builder.bitcast(self.builder.gep(start, [place]), self.value.type.as_pointer())
+        self.builder.store(self.value, there, align=4)
 
     def add_to(self, start: Any, place: Any) -> None:
         """Add the lanes to consecutive floats from a place on."""
-        there = self.builder.bitcast(self.builder.gep(start, [place]), self.value.type.as_pointer())
-        self.builder.store((self + Lanes.read(self.builder, start, place, self.count)).value, there, align=4)
+        (self + Lanes.read(self.builder, start, place, self.count)).write(start, place)

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from queue import SimpleQueue
 
 import cv2
 import numpy as np
@@ -10,8 +11,8 @@ from jaxtyping import Float, Int, UInt8, UInt16, UInt64
 from numpy import ndarray
 
 from jcr.camera import rays, resized
-from jcr.depth.patch_match import PAD, random_planes, scores, spread_planes
-from jcr.depth.window import ALIKE, quads, windows
+from jcr.depth.patch_match import UNKNOWN, best_neighbours, peaks, random_planes, spread_planes
+from jcr.depth.window import PAD, blocks_of, continued, floats_of_windows, quads, windows
 from jcr.geometry import inverse
 from jcr.records import Intrinsics
 
@@ -19,10 +20,9 @@ COMPARED = 5
 """Neighbours that an image is matched with, the first that are given."""
 ASKED = 3
 """Of them, those that a pixel is matched with at full resolution: the ones it correlated best with at half."""
-_COARSE = (0.2, 0.1, 0.05, 0.025)
-_FINE = (0.01, 0.003)
-"""Per pass at half and at full resolution: relative change of inverse depth that is tried."""
-_COARSE_TRIES, _FINE_TRIES = 3, 2
+_COARSE = ((0.2, 2), (0.1, 2), (0.05, 2), (0.025, 2))
+_FINE = ((0.01, 2), (0.003, 1))
+"""Per pass at half and at full resolution: relative change of inverse depth that is tried, and how often."""
 _PEAK = 0.003
 """Relative change of inverse depth, to either side, by which the peak is found in the end."""
 LEAST = 0.25
@@ -82,19 +82,24 @@ class _Level:
         return cls(pinhole, np.stack(fitting), np.stack(greys), np.stack(packed))
 
     def views(
-        self, i: int, others: Int[ndarray, " n"], recon_from_camera: Float[ndarray, "m 4 4"]
+        self,
+        i: int,
+        others: Int[ndarray, " n"],
+        recon_from_camera: Float[ndarray, "m 4 4"],
+        space: Float[ndarray, " _"],
     ) -> tuple[ndarray, ndarray, ndarray, tuple[np.float32, ...]]:
-        """`packed`, `motions`, `windows` and k of image i, as the loops take them."""
+        """`packed`, `motions`, `windows` (written to `space`) and k of image i, as the loops take them."""
         near = relative(i, others, recon_from_camera, self.pinhole)
         motions = np.concatenate([near.a.reshape(-1, 9), near.b], 1)
         k = tuple(grid(self.pinhole))  # of numbers, that the loops keep in registers
-        return self.packed[others], motions, windows(self.colors[i], self.greys[i], ALIKE), k
+        return self.packed[others], motions, windows(continued(self.colors[i], self.greys[i]), space), k
 
     def enlarged(self, map_of_half: ndarray) -> ndarray:
         """A map of the level below, each number for the pixels that it covers here."""
         h, w = self.pinhole.height, self.pinhole.width
-        row, column = (np.arange(n) * half // n for n, half in zip((h, w), map_of_half.shape, strict=False))
-        return map_of_half[row[:, None], column]
+        row = np.minimum(np.arange(h) // 2, map_of_half.shape[1] - 1)
+        column = np.minimum(np.arange(blocks_of(w)) // 2, map_of_half.shape[2] - 1)
+        return np.ascontiguousarray(map_of_half[:, row[:, None], column])
 
 
 def match_depth(
@@ -114,6 +119,9 @@ def match_depth(
     half = _Level.of(colors, resized(pinhole, pinhole.width // 2, pinhole.height // 2))
     full = _Level.of(colors, pinhole)
     h, w = half.greys.shape[1:]
+    spaces = SimpleQueue[ndarray]()
+    for _ in range(threads):
+        spaces.put(np.empty(floats_of_windows(*full.greys.shape[1:]), np.float32))
 
     def one(i: int) -> tuple[Float[ndarray, "h w"], Float[ndarray, "h w"]]:
         others, seed = neighbours[i][:COMPARED], 100 * i
@@ -121,24 +129,23 @@ def match_depth(
         reach = np.einsum("di,hwi->dhw", family, rays(half.pinhole))
         span = max(float(reach.min()), LEAST * float(reach.max())), float(reach.max())
 
-        views = half.views(i, others, recon_from_camera)
-        found = random_planes(family, span, views[-1], h, w, i)
-        everyone = np.tile(np.arange(len(others), dtype=np.uint8), (h, w, 1))
-        found[..., 3] = scores(found, everyone, *views)
-        for n, size in enumerate(_COARSE):
-            spread_planes(found, everyone, *views, (*span, size, _COARSE_TRIES), seed + n)
-        each = [
-            scores(found, np.ascontiguousarray(everyone[..., n : n + 1]), *views) for n in range(len(others))
-        ]
-        asked = np.argsort(-np.stack(each, -1), axis=-1, kind="stable")[..., :ASKED].astype(np.uint8)
+        space = spaces.get()
+        views = half.views(i, others, recon_from_camera, space)
+        found = random_planes(family, span, views[-1], h, blocks_of(w), i)
+        asked = np.empty((len(others), *found.shape[1:]), np.uint8)
+        asked[:] = np.arange(len(others))[:, None, None]
+        for n, (size, tries) in enumerate(_COARSE):
+            spread_planes(found, asked, *views, (*span, size, tries, n == 0), seed + n)
+        asked = best_neighbours(found, asked, *views, ASKED)
         found, asked = full.enlarged(found), full.enlarged(asked)
 
-        views = full.views(i, others, recon_from_camera)
-        found[..., 3] = scores(found, asked, *views)
-        for n, size in enumerate(_FINE):
-            spread_planes(found, asked, *views, (*span, size, _FINE_TRIES), seed + n)
-        peak = _inverse_depth_of_peak(found, asked, views, rays(pinhole))
-        return np.maximum(peak, np.float32(0.5 * span[0])), found[..., 3]
+        views = full.views(i, others, recon_from_camera, space)
+        found[3] = UNKNOWN
+        for n, (size, tries) in enumerate(_FINE):
+            spread_planes(found, asked, *views, (*span, size, tries, n == 0), seed + n)
+        depth = peaks(found, asked, *views, np.float32(_PEAK))
+        spaces.put(space)
+        return np.maximum(depth, np.float32(0.5 * span[0]))[:, : pinhole.width], found[3, :, : pinhole.width]
 
     depths, correlations = [], []
     with ThreadPoolExecutor(threads) as pool:
@@ -147,22 +154,3 @@ def match_depth(
             correlations.append(score)
             report((n + 1) / len(colors))
     return np.stack(depths), np.stack(correlations)
-
-
-def _inverse_depth_of_peak(
-    found: Float[ndarray, "h w 4"],
-    asked: UInt8[ndarray, "h w a"],
-    views: tuple,
-    direction: Float[ndarray, "h w 3"],
-) -> Float[ndarray, "h w"]:
-    """Inverse depth at the peak of the parabola through each plane's score and those `_PEAK` (relative) off."""
-    inverse_depth = np.einsum("hwi,hwi->hw", found[..., :3], direction.astype(np.float32))
-    step, beside = _PEAK * inverse_depth, []
-    for side in (-step, step):
-        plane = found.copy()
-        plane[..., 2] += side
-        beside.append(scores(plane, asked, *views))
-    low, high = beside
-    curvature = low - 2 * found[..., 3] + high
-    shift = np.where(curvature < -1e-6, (low - high) / np.minimum(2 * curvature, -1e-6), 0)
-    return inverse_depth + np.clip(shift, -1, 1) * step

@@ -2,12 +2,15 @@
 
 Bleyer, Rhemann and Rother, "PatchMatch stereo", BMVC 2011, for several views as in Schönberger et al., ECCV 2016. A
 plane p of camera coordinates holds p·x = 1, so that p·ray is the inverse depth of a pixel whose ray has z = 1, and the
-homography to a neighbour is K (R + t pᵀ) K⁻¹.
+homography to a neighbour is K (R + t pᵀ) K⁻¹. Planes are passed on from row to row, for 16 pixels of a row at once.
 
-What the loops share: `found` (h,w,4) is each pixel's plane and its score, `windows` what `window.windows` makes of the
-image, `packed` (n,y,x) what `window.quads` makes of its neighbours, continued by `PAD` pixels, `motions` (n,12) the rows
-of K R and K t to each, and k is fx, fy, cx, cy. They are plain arguments: an array that is taken out of a
-tuple is counted by numba, which takes longer than a window.
+What the loops share: `found` (4,h,w) is each pixel's plane and its score, `asked` (a,h,w) the neighbours that it is
+matched with, both with whole blocks of `window.LANES` columns; `windows` what `window.windows` makes of the image,
+`packed` (n,y,x) what `window.quads` makes of its neighbours, continued by `PAD` pixels, `motions` (n,12) the rows of K R
+and K t to each, and k is fx, fy, cx, cy. For one block: `near` (a,12,lanes) and `starts` (a,lanes) are what
+`window.correlate` takes of the neighbours asked, `each` (a,lanes) the correlations with them, and `tried` (7,lanes) has
+a plane in rows 0 to 2, what `correlate` takes of it in rows 3 to 5, and its score. All are plain arguments: an array
+that is taken out of a tuple is counted by numba, which takes longer than a window.
 """
 
 from typing import no_type_check
@@ -15,14 +18,18 @@ from typing import no_type_check
 import numpy as np
 
 from jcr.compiled import compiled, inlined, random_state, uniform
-from jcr.depth.window import NOISE, REACH, STRIDE, window_sums
+from jcr.depth.window import LANES, STRIDE, correlate
 
 MOST_SLANTED = 0.12
 """Cosine between a plane's normal and the ray, below which a surface shows too few pixels to be matched."""
-PAD = 12
-"""Pixels by which images are continued, so that windows at their borders need no question."""
 BEST = 2
 """Neighbours whose correlations count at a pixel; the worse ones are taken to be occluded."""
+UNKNOWN = -2.0
+"""Score of a plane that has not been compared."""
+_PASSED = 3
+"""Planes that a pixel is passed from the row before: its own column's, and the best of those to either side."""
+_BESIDE = 3
+"""Columns to either side; the best plane of them is passed."""
 
 
 @inlined
@@ -33,72 +40,116 @@ def _ray(v, u, k):
 
 @inlined
 @no_type_check
-def _column(motions, n, row, p):
-    """A row of K (R + t pᵀ)."""
-    t = motions[n, 9 + row]
-    return (
-        motions[n, 3 * row] + t * p[0],
-        motions[n, 3 * row + 1] + t * p[1],
-        motions[n, 3 * row + 2] + t * p[2],
-    )
+def _look(v, u, asked, packed, motions, k, near, starts):
+    """Write `near`, columns of K R from tap to tap in a row and a column, K R·ray and K t; and `starts`."""
+    su, sv = np.float32(STRIDE) / k[0], np.float32(STRIDE) / k[1]
+    size = packed.shape[1] * packed.shape[2]
+    for slot in range(asked.shape[0]):
+        for lane in range(LANES):
+            rx, ry = _ray(v, u + lane, k)
+            n = asked[slot, v, u + lane]
+            starts[slot, lane] = n * size
+            for row in range(3):
+                a, b, c = motions[n, 3 * row], motions[n, 3 * row + 1], motions[n, 3 * row + 2]
+                near[slot, row, lane] = a * su
+                near[slot, 3 + row, lane] = b * sv
+                near[slot, 6 + row, lane] = a * rx + b * ry + c
+                near[slot, 9 + row, lane] = motions[n, 9 + row]
 
 
 @inlined
 @no_type_check
-def _correlation(pixel, p, n, packed, motions, windows, k):
-    """Correlation of the window at a pixel (v, u) on plane p with the n-th neighbour; -1 where that is not seen."""
-    v, u = pixel
-    rx, ry = _ray(v, u, k)
-    # Columns of K (R + t pᵀ): along the ray's x, y and 1.
-    x0, x1, x2 = _column(motions, n, 0, p)
-    y0, y1, y2 = _column(motions, n, 1, p)
-    z0, z1, z2 = _column(motions, n, 2, p)
-    x, y, z = x0 * rx + x1 * ry + x2, y0 * rx + y1 * ry + y2, z0 * rx + z1 * ry + z2
-    if z <= 0:
-        return np.float32(-1)
-    iz = np.float32(1) / z
-    cu, cv = x * iz, y * iz
-    # The window is small: its homography is taken as affine about the centre, which spares the divisions.
-    sx, sy = np.float32(STRIDE) / k[0] * iz, np.float32(STRIDE) / k[1] * iz
-    uu, vu = (x0 - cu * z0) * sx, (y0 - cv * z0) * sx
-    uv, vv = (x1 - cu * z1) * sy, (y1 - cv * z1) * sy
-    ru, rv = np.float32(REACH) * (abs(uu) + abs(uv)), np.float32(REACH) * (abs(vu) + abs(vv))
-    right, bottom = np.float32(packed.shape[2] - 2 * PAD - 1), np.float32(packed.shape[1] - 2 * PAD - 1)
-    pad, most = np.float32(PAD), np.float32(PAD - 2)
-    if not (cu >= 0 and cv >= 0 and cu <= right and cv <= bottom and ru <= most and rv <= most):
-        return np.float32(-1)
-    mean, square, product = window_sums(packed, n, windows, pixel, cu + pad, cv + pad, uu, vu, uv, vv)
-    variance = max(square - mean * mean, np.float32(0))
-    return product / np.sqrt(variance + np.float32(NOISE * NOISE))
+def _score(v, u, tried, packed, windows, k, near, starts, each):
+    """Write the score of the planes tried: the mean of the best correlations with the neighbours asked."""
+    su, sv = np.float32(STRIDE) / k[0], np.float32(STRIDE) / k[1]
+    for lane in range(LANES):
+        rx, ry = _ray(v, u + lane, k)
+        tried[3, lane], tried[4, lane] = tried[0, lane] * su, tried[1, lane] * sv
+        tried[5, lane] = tried[0, lane] * rx + tried[1, lane] * ry + tried[2, lane]
+    slots = len(each)
+    for slot in range(slots):
+        correlate(each, slot, packed, starts, near, windows, (v, u // LANES), tried)
+    for lane in range(LANES):
+        first, second = each[0, lane], np.float32(-1)
+        for slot in range(1, slots):
+            one = each[slot, lane]
+            first, second = max(first, one), max(second, min(first, one))
+        tried[6, lane] = first if slots < BEST else np.float32(0.5) * (first + second)
 
 
 @inlined
 @no_type_check
-def _score(pixel, p, packed, motions, windows, k, asked):
-    """Mean of the best correlations of the window at a pixel on plane p with the neighbours `asked` (h,w,a) there.
-
-    No neighbour is left out where it could change nothing: the branch, which chance would take, takes longer.
-    """
-    v, u = pixel
-    first = np.float32(-1)
-    second = np.float32(-1)
-    for n in range(asked.shape[2]):
-        score = _correlation(pixel, p, asked[v, u, n], packed, motions, windows, k)
-        first, second = max(first, score), max(second, min(first, score))
-    if asked.shape[2] < BEST:
-        return first
-    return np.float32(0.5) * (first + second)
-
-
-@inlined
-@no_type_check
-def _faces(p, rx, ry):
+def _faces(p0, p1, p2, inverse_depth, rx, ry):
     """Whether the surface on the plane is seen from before, not too slanted."""
-    inverse_depth = p[0] * rx + p[1] * ry + p[2]
     if inverse_depth <= 0:
         return False
-    normal, ray = p[0] * p[0] + p[1] * p[1] + p[2] * p[2], rx * rx + ry * ry + np.float32(1)
+    normal, ray = p0 * p0 + p1 * p1 + p2 * p2, rx * rx + ry * ry + np.float32(1)
     return inverse_depth > np.float32(MOST_SLANTED) * np.sqrt(normal * ray)
+
+
+@inlined
+@no_type_check
+def _keep_better(found, v, u, k, tried):
+    """Take the planes tried where they score better and face the camera."""
+    for lane in range(LANES):
+        rx, ry = _ray(v, u + lane, k)
+        p0, p1, p2 = tried[0, lane], tried[1, lane], tried[2, lane]
+        if tried[6, lane] > found[3, v, u + lane] and _faces(p0, p1, p2, tried[5, lane], rx, ry):
+            found[0, v, u + lane], found[1, v, u + lane], found[2, v, u + lane] = p0, p1, p2
+            found[3, v, u + lane] = tried[6, lane]
+
+
+@inlined
+@no_type_check
+def _try_own(found, v, u, tried):
+    """Write the planes of the pixels themselves."""
+    for lane in range(LANES):
+        for c in range(3):
+            tried[c, lane] = found[c, v, u + lane]
+
+
+@inlined
+@no_type_check
+def _try_passed(found, before, u, side, tried):
+    """Write the planes of the pixels in the row before, or of the best of three to one `side` of them (-1 or 1)."""
+    last = found.shape[2] - 1
+    for lane in range(LANES):
+        best = min(max(u + lane + side, 0), last)
+        if side != 0:
+            for far in range(2, _BESIDE + 1):
+                column = min(max(u + lane + side * far, 0), last)
+                if found[3, before, column] > found[3, before, best]:
+                    best = column
+        for c in range(3):
+            tried[c, lane] = found[c, before, best]
+
+
+@inlined
+@no_type_check
+def _try_changed(found, v, u, k, search, halvings, state, tried):
+    """Write planes like those of the pixels by chance."""
+    lowest, highest, size = search[:3]
+    scale = size * 0.5**halvings
+    for lane in range(LANES):
+        rx, ry = _ray(v, u + lane, k)
+        p0, p1, p2 = found[0, v, u + lane], found[1, v, u + lane], found[2, v, u + lane]
+        inverse_depth = p0 * rx + p1 * ry + p2
+        changed = inverse_depth * (1 + scale * (2 * uniform(state) - 1))
+        changed = min(max(changed, lowest), highest)
+        tilt = min(8 * scale, 0.5) * inverse_depth
+        q0 = p0 + tilt * (2 * uniform(state) - 1)
+        q1 = p1 + tilt * (2 * uniform(state) - 1)
+        tried[0, lane], tried[1, lane], tried[2, lane] = q0, q1, changed - q0 * rx - q1 * ry
+
+
+@inlined
+@no_type_check
+def _try_beside(found, v, u, k, step, tried):
+    """Write the planes of the pixels with another inverse depth, by a relative step."""
+    _try_own(found, v, u, tried)
+    for lane in range(LANES):
+        rx, ry = _ray(v, u + lane, k)
+        tried[2, lane] += step * (tried[0, lane] * rx + tried[1, lane] * ry + tried[2, lane])
 
 
 @compiled
@@ -106,18 +157,19 @@ def _faces(p, rx, ry):
 def random_planes(family, span, k, h, w, seed):
     """A plane for each pixel: half of them parallel to the family's between its two, half with any normal.
 
-    The inverse depth of these lies in the span. The scores are left at 0.
+    The inverse depth of these lies in the span.
     """
     state = random_state(seed)
     lowest, highest = span
-    found = np.zeros((h, w, 4), np.float32)
+    found = np.empty((4, h, w), np.float32)
+    found[3] = UNKNOWN
     for v in range(h):
         for u in range(w):
             rx, ry = _ray(v, u, k)
             t = uniform(state)
             for c in range(3):
-                found[v, u, c] = (1 - t) * family[0, c] + t * family[1, c]
-            own = found[v, u, 0] * rx + found[v, u, 1] * ry + found[v, u, 2]
+                found[c, v, u] = (1 - t) * family[0, c] + t * family[1, c]
+            own = found[0, v, u] * rx + found[1, v, u] * ry + found[2, v, u]
             if uniform(state) < 0.5 or own <= lowest:
                 inverse_depth = lowest + (highest - lowest) * uniform(state)
                 n0, n1, n2 = 2 * uniform(state) - 1, 2 * uniform(state) - 1, 1.0
@@ -125,21 +177,8 @@ def random_planes(family, span, k, h, w, seed):
                 if facing < 0.3:
                     n0, n1, facing = 0.0, 0.0, 1.0
                 scale = inverse_depth / facing
-                found[v, u, 0], found[v, u, 1], found[v, u, 2] = n0 * scale, n1 * scale, n2 * scale
+                found[0, v, u], found[1, v, u], found[2, v, u] = n0 * scale, n1 * scale, n2 * scale
     return found
-
-
-@compiled
-@no_type_check
-def scores(found, asked, packed, motions, windows, k):
-    """The score (h,w) of every pixel's plane."""
-    h, w = asked.shape[:2]
-    out = np.empty((h, w), np.float32)
-    for v in range(h):
-        for u in range(w):
-            p = found[v, u, 0], found[v, u, 1], found[v, u, 2]
-            out[v, u] = _score((v, u), p, packed, motions, windows, k, asked)
-    return out
 
 
 @compiled
@@ -148,48 +187,75 @@ def spread_planes(found, asked, packed, motions, windows, k, search, seed):
     """One pass over the image: each pixel takes its neighbours' planes, or a changed one, where that scores better.
 
     Passes alternate in direction (Bleyer et al. 2011, section 3.2), with the lowest bit of the seed. `search` is the
-    span of inverse depths, the relative change of it that is tried, and of the normal, and how often it is: the change
-    halves from try to try.
+    span of inverse depths, the relative change of it that is tried, and of the normal, how often it is: the change
+    halves from try to try; and whether the planes have no score yet.
     """
     state = random_state(seed)
-    h, w = asked.shape[:2]
-    tries = search[3]
+    slots, h, w = asked.shape
+    near, starts = np.empty((slots, 12, LANES), np.float32), np.empty((slots, LANES), np.int32)
+    each, tried = np.empty((slots, LANES), np.float32), np.empty((7, LANES), np.float32)
+    tries, fresh = search[3:]
     backward = seed % 2 == 1
-    towards = 1 if backward else -1
     for row in range(h):
-        v = h - 1 - row if backward else row
-        for column in range(w):
-            u = w - 1 - column if backward else column
-            rx, ry = _ray(v, u, k)
-            here = found[v, u, 0], found[v, u, 1], found[v, u, 2], found[v, u, 3]
-            for option in range(2 + tries):
-                if option < 2:
-                    y, x = (v, u + towards) if option == 0 else (v + towards, u)
-                    if y < 0 or x < 0 or y >= h or x >= w:
-                        continue
-                    q = found[y, x, 0], found[y, x, 1], found[y, x, 2]
-                    if q[0] == here[0] and q[1] == here[1] and q[2] == here[2]:
-                        continue
+        v, before = (h - 1 - row, h - row) if backward else (row, row - 1)
+        for u in range(0, w, LANES):
+            _look(v, u, asked, packed, motions, k, near, starts)
+            for option in range(-1 if fresh else 0, _PASSED + tries):
+                if option < 0:
+                    _try_own(found, v, u, tried)
+                elif option >= _PASSED:
+                    _try_changed(found, v, u, k, search, option - _PASSED, state, tried)
+                elif row > 0:
+                    _try_passed(found, before, u, option - 1, tried)
                 else:
-                    q = _changed(here, rx, ry, search, option - 2, state)
-                if not _faces(q, rx, ry):
                     continue
-                new = _score((v, u), q, packed, motions, windows, k, asked)
-                if new > here[3]:
-                    here = q[0], q[1], q[2], new
-            found[v, u, 0], found[v, u, 1], found[v, u, 2], found[v, u, 3] = here
+                _score(v, u, tried, packed, windows, k, near, starts, each)
+                _keep_better(found, v, u, k, tried)
 
 
-@inlined
+@compiled
 @no_type_check
-def _changed(p, rx, ry, search, halvings, state):
-    """A plane like p by chance."""
-    lowest, highest, size, _ = search
-    inverse_depth = p[0] * rx + p[1] * ry + p[2]
-    scale = size * 0.5**halvings
-    moved = inverse_depth * (1 + scale * (2 * uniform(state) - 1))
-    moved = min(max(moved, lowest), highest)
-    tilt = min(8 * scale, 0.5) * inverse_depth
-    q0 = p[0] + tilt * (2 * uniform(state) - 1)
-    q1 = p[1] + tilt * (2 * uniform(state) - 1)
-    return np.float32(q0), np.float32(q1), np.float32(moved - q0 * rx - q1 * ry)
+def best_neighbours(found, asked, packed, motions, windows, k, count):
+    """Of the neighbours asked, the `count` (count,h,w) with which each pixel's plane correlates best, the best first."""
+    slots, h, w = asked.shape
+    near, starts = np.empty((slots, 12, LANES), np.float32), np.empty((slots, LANES), np.int32)
+    each, tried = np.empty((slots, LANES), np.float32), np.empty((7, LANES), np.float32)
+    best = np.empty((min(count, slots), h, w), np.uint8)
+    for v in range(h):
+        for u in range(0, w, LANES):
+            _look(v, u, asked, packed, motions, k, near, starts)
+            _try_own(found, v, u, tried)
+            _score(v, u, tried, packed, windows, k, near, starts, each)
+            for lane in range(LANES):
+                for rank in range(len(best)):
+                    first = 0
+                    for slot in range(1, slots):
+                        if each[slot, lane] > each[first, lane]:
+                            first = slot
+                    best[rank, v, u + lane] = asked[first, v, u + lane]
+                    each[first, lane] = UNKNOWN
+    return best
+
+
+@compiled
+@no_type_check
+def peaks(found, asked, packed, motions, windows, k, step):
+    """Inverse depth (h,w) at the peak of the parabola through each plane's score and those a relative step off."""
+    slots, h, w = asked.shape
+    near, starts = np.empty((slots, 12, LANES), np.float32), np.empty((slots, LANES), np.int32)
+    each, tried = np.empty((slots, LANES), np.float32), np.empty((7, LANES), np.float32)
+    beside, out = np.empty((2, LANES), np.float32), np.empty((h, w), np.float32)
+    for v in range(h):
+        for u in range(0, w, LANES):
+            _look(v, u, asked, packed, motions, k, near, starts)
+            for side in range(2):
+                _try_beside(found, v, u, k, np.float32(2 * side - 1) * step, tried)
+                _score(v, u, tried, packed, windows, k, near, starts, each)
+                for lane in range(LANES):
+                    beside[side, lane] = tried[6, lane]
+            for lane in range(LANES):
+                low, high = beside[0, lane], beside[1, lane]
+                curvature = min(low - 2 * found[3, v, u + lane] + high, np.float32(-1e-6))
+                shift = min(max((low - high) / (2 * curvature), np.float32(-1)), np.float32(1))
+                out[v, u + lane] = tried[5, lane] / (1 + step) * (1 + shift * step)
+    return out

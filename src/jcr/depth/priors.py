@@ -151,21 +151,16 @@ def planar_prior(
     `colours_agree` takes them.
     """
     label, count = colour_regions(np.ascontiguousarray(surfaces[i, :, : pinhole.width, 1:]))
-    in_camera = recon_from_camera[:3, :3].T @ support[:3]
-    offset = float(support[:3] @ recon_from_camera[:3, 3] + support[3])
-    plane = -in_camera / offset if offset else np.zeros(3)
+    plane = _plane_in_camera(support, recon_from_camera)
     planes, on_support, inliers, fixed, rest, middle, shape = region_planes(
         label, count, inverse_depth, matched, plane, grid(pinhole).astype(float), ON_PLANE, i
     )
-    pixel = np.stack(np.meshgrid(np.arange(label.shape[1]), np.arange(label.shape[0])), -1)
-    du, dv = np.moveaxis(pixel - middle[label], -1, 0)
-    xx, xy, yy = np.moveaxis(shape[label], -1, 0)
+    away = _deviations(label, middle, shape)
     # Patches of shade and print on the support plane that carry no plane of their own.
     lonely = _beside_support(label, on_support & (inliers > 0)) & (inliers == 0) & (fixed < FEWEST)
     lonely &= np.bincount(label.ravel(), minlength=count) < PATCH * label.size
     planes[lonely] = plane
     predicted = np.einsum("hwi,hwi->hw", planes[label], rays(pinhole)).astype(np.float32)
-    away = np.sqrt(np.maximum(xx * du**2 + 2 * xy * du * dv + yy * dv**2, 0))
     carried = (inliers > 0) & (inliers >= CARRIED * fixed)
     near = on_support[label] | lonely[label] | (away < FARTHEST)
     asked = (carried | lonely)[label] & (predicted > 0) & near
@@ -199,6 +194,24 @@ def planar_prior(
             np.float32
         ),
     )
+
+
+def _plane_in_camera(
+    plane: Float[ndarray, "4"], recon_from_camera: Float[ndarray, "4 4"]
+) -> Float[ndarray, "3"]:
+    """A plane (n, d) of the recon frame as p with p·x = 1 in a camera's; 0 where it runs through the camera."""
+    offset = float(plane[:3] @ recon_from_camera[:3, 3] + plane[3])
+    return -recon_from_camera[:3, :3].T @ plane[:3] / offset if offset else np.zeros(3)
+
+
+def _deviations(
+    label: Int[ndarray, "h w"], middle: Float[ndarray, "r 2"], shape: Float[ndarray, "r 3"]
+) -> Float[ndarray, "h w"]:
+    """Standard deviations of the pixels that carry its region's plane by which each pixel is away from their mean."""
+    pixel = np.stack(np.meshgrid(np.arange(label.shape[1]), np.arange(label.shape[0])), -1)
+    du, dv = np.moveaxis(pixel - middle[label], -1, 0)
+    xx, xy, yy = np.moveaxis(shape[label], -1, 0)
+    return np.sqrt(np.maximum(xx * du**2 + 2 * xy * du * dv + yy * dv**2, 0))
 
 
 def _beside_support(label: Int[ndarray, "h w"], on_support: Bool[ndarray, " r"]) -> Bool[ndarray, " r"]:

@@ -33,26 +33,29 @@ def focal_by_robot(
     width, height = size
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
     known = [item for item in geometries if angle[item[0]] > math.radians(8)]
+    of_gripper = np.array([angle[key] for key, _ in known])
     best, support = None, LEAST_SUPPORT
     for factor in LADDER:
         focal = float(factor * max(size))
         intrinsics = Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
-        agreeing = 0.0
-        for key, geometry in known:
-            gap = min((abs(a - angle[key]) for a in _angles(x_px, intrinsics, key, geometry)), default=np.inf)
-            agreeing += math.exp(-0.5 * (gap / TOLERANCE) ** 2)
+        readings = [_rotations(x_px, intrinsics, key, geometry) for key, geometry in known]
+        of_pair = np.repeat(np.arange(len(known)), np.array([len(one) for one in readings], int))
+        rotations = np.array([rotation for one in readings for rotation in one]).reshape(-1, 3, 3)
+        gap = np.full(len(known), np.inf)
+        np.minimum.at(gap, of_pair, np.abs(rotation_angle(rotations) - of_gripper[of_pair]))
+        agreeing = float(np.exp(-0.5 * (gap / TOLERANCE) ** 2).sum())
         if agreeing > support:
             best, support = intrinsics, agreeing
     return best
 
 
-def _angles(
+def _rotations(
     x_px: list[Float[ndarray, "_ 2"]],
     intrinsics: Intrinsics,
     key: Key,
     geometry: pycolmap.TwoViewGeometry,
-) -> list[float]:
-    """Angles of rotation that a geometry may mean."""
+) -> list[Float[ndarray, "3 3"]]:
+    """Rotations that a geometry may mean."""
     rows = np.asarray(geometry.inlier_matches, dtype=int)[:MATCHES]
     essential, homography = matrices(geometry, intrinsics)
     view = View.of([x_px[key[0]][rows[:, 0]], x_px[key[1]][rows[:, 1]]], intrinsics)
@@ -63,4 +66,4 @@ def _angles(
         found += [rotations[k] for k in range(count) if np.mean(rays @ normals[k][:, 0] > 0) > 0.9]
     elif essential is not None:
         found.append(cv2.recoverPose(essential, view.rays[0], view.rays[1], np.eye(3), distanceThresh=1e6)[1])
-    return [float(rotation_angle(rotation)) for rotation in found]
+    return found

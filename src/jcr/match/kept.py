@@ -112,8 +112,10 @@ class KeepingMatcher(Matcher):
         super().__init__(features, np.ones(2), camera, known, seed)
         self._kept, self._depends = kept, _camera_text(camera, known, seed)
 
-    def geometries(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> Geometries:
-        """Verified two-view geometries of pairs; the rotations of the images (rad) change nothing."""
+    def geometries(
+        self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], coarse: bool = False
+    ) -> Geometries:
+        """Verified two-view geometries of pairs; neither the rotations of the images (rad) nor `coarse` change them."""
         there = {key: self._kept.pair(key, self._depends) for key in pairs}
         new = [k for k, key in enumerate(pairs) if there[key] is None]
         found = super().geometries([pairs[k] for k in new], rolls[new])

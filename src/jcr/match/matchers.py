@@ -32,8 +32,11 @@ class Features(Protocol):
         """Captures of up to this many images have all pairs matched; of more, pairs grow in proportion to the images."""
         ...
 
-    def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
-        """Rows of the keypoints that match, of each pair, its images rotated (rad) before."""
+    def matches(
+        self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], coarse: bool = False
+    ) -> list[Int[ndarray, "_ 2"]]:
+        """Rows of the keypoints that match, of each pair, its images rotated (rad) before; `coarse`: where matching is
+        slow, of the best keypoints alone."""
         ...
 
     def descriptors(self, row: int, roll: float) -> tuple[int, Float[ndarray, "k d"]]:
@@ -57,9 +60,11 @@ class Matcher:
         self.x_px = self._at_work()
         """Keypoints at the working size; more come with every angle by which an image is rotated."""
 
-    def geometries(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> Geometries:
-        """Verified two-view geometries of pairs, their images rotated (rad) before."""
-        self.raw |= dict(zip(pairs, self._features.matches(pairs, rolls), strict=True))
+    def geometries(
+        self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], coarse: bool = False
+    ) -> Geometries:
+        """Verified two-view geometries of pairs, their images rotated (rad) before; `coarse` as of the features."""
+        self.raw |= dict(zip(pairs, self._features.matches(pairs, rolls, coarse), strict=True))
         self.x_px = self._at_work()
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             found = pool.map(lambda key: self.verified(key, self.raw[key]), pairs)

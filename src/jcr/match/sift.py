@@ -58,8 +58,9 @@ def matches(
         return np.zeros(0, int), np.zeros(0, int)
     cosine = first @ second.T
     row, best = np.arange(len(first)), cosine.argmax(1)
-    mutual = cosine.argmax(0)[best] == row
-    nearest = _distance(cosine[row, best])
+    largest = cosine[row, best]
+    mutual = largest == cosine.max(0)[best]  # argmax along columns takes 2.4 times as long
+    nearest = _distance(largest)
     cosine[row, best] = -1.0
     kept = np.flatnonzero(mutual & (nearest < FARTHEST) & (nearest < RATIO * _distance(cosine.max(1))))
     return kept, best[kept]
@@ -111,8 +112,11 @@ class SiftFeatures:
             kept.keep_features(row, self._size, found)
         return found
 
-    def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
-        """Rows of the keypoints that match, of each pair; the rotations of the images (rad) change nothing."""
+    def matches(
+        self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], coarse: bool = False
+    ) -> list[Int[ndarray, "_ 2"]]:
+        """Rows of the keypoints that match, of each pair; neither the rotations of the images (rad) nor `coarse` change
+        them."""
 
         def of_pair(key: Key) -> Int[ndarray, "_ 2"]:
             return np.stack(matches(self._descriptors[key[0]], self._descriptors[key[1]]), 1)

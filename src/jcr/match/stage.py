@@ -38,6 +38,8 @@ STILL = (5e-3, math.radians(1))
 GUESSED_AT_ONCE = 6
 """Pairs whose rotations by 90° are guessed before the robot is asked again."""
 GUESSED_AT_MOST = 30
+ENOUGH = 150
+"""Matches of a pair by its best keypoints, with which it needs no others."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,32 +74,52 @@ class _Search:
     pairs: dict[Key, Pair] = field(default_factory=dict)
     still: Bool[ndarray, "r c"] | None = None
     """Parts of the image that do not move."""
-    tried: set[tuple[int, int, int, int]] = field(default_factory=set)
-    """Pairs, and the angles (degrees) by which their images were rotated."""
+    rotations: dict[Key, tuple[float, float]] = field(default_factory=dict)
+    """Angles (rad) by which the images of each pair were rotated."""
+    tried: set[tuple[int, int, int, int, bool]] = field(default_factory=set)
+    """Pairs, the angles (degrees) by which their images were rotated, and whether of the best keypoints alone."""
 
     @property
     def systematic(self) -> float:
         return robot.SYSTEMATIC if self.known else robot.SYSTEMATIC_OF_GUESS
 
     def match(
-        self, pairs: Iterable[Key], rolls: Float[ndarray, " n"] | None = None, guess: float = 0.0
+        self,
+        pairs: Iterable[Key],
+        rolls: Float[ndarray, " n"] | None = None,
+        guess: float = 0.0,
+        coarse: bool = True,
     ) -> None:
-        """Match pairs with images rotated by `rolls`, or the second of each by a guess; the better of two is kept."""
-        todo, rotations = [], []
-        for i, j in pairs:
-            rotation = (0.0, guess) if rolls is None else (float(rolls[i]), float(rolls[j]))
-            if not self.matcher.minds_roll:
-                rotation = (0.0, 0.0)
-            rotation = robot.by_quarters(rotation[0]), robot.by_quarters(rotation[1])
-            how = (i, j, round(math.degrees(rotation[0])), round(math.degrees(rotation[1])))
-            if how in self.tried:
-                continue
-            self.tried.add(how)
-            todo.append((i, j))
-            rotations.append(rotation)
+        """Match pairs with images rotated by `rolls`, or the second of each by a guess; the better of two is kept.
+
+        `coarse` as of the matcher.
+        """
+        self._match_rotated(
+            {(i, j): (0.0, guess) if rolls is None else (rolls[i], rolls[j]) for i, j in pairs}, coarse
+        )
+
+    def match_in_full(self, pairs: Iterable[Key], rolls: Float[ndarray, " n"] | None = None) -> None:
+        """Those of pairs that few of the best keypoints match once more, with all; their images rotated by `rolls`, or
+        as they matched."""
+        few = [key for key in pairs if key not in self.pairs or len(self.pairs[key].rows) < ENOUGH]
+        self._match_rotated(
+            {(i, j): self.rotations[i, j] if rolls is None else (rolls[i], rolls[j]) for i, j in few}, False
+        )
+
+    def _match_rotated(self, rotations: dict[Key, tuple[float, float]], coarse: bool) -> None:
+        """Match pairs, the images of each rotated by two angles (rad)."""
+        if not self.matcher.minds_roll:
+            rotations, coarse = dict.fromkeys(rotations, (0.0, 0.0)), False
+        todo = {}
+        for key, both in rotations.items():
+            both = robot.by_quarters(both[0]), robot.by_quarters(both[1])
+            how = (*key, round(math.degrees(both[0])), round(math.degrees(both[1])), coarse)
+            if how not in self.tried:
+                self.tried.add(how)
+                todo[key] = both
         if not todo:
             return
-        found = self.matcher.geometries(todo, np.array(rotations))
+        found = self.matcher.geometries(list(todo), np.array(list(todo.values())), coarse)
         if self.matcher.minds_roll:  # an image that is rotated brings keypoints of its own
             self.view = View.of(self.matcher.x_px, self.view.intrinsics)
         for key, geometry in found.items():
@@ -106,7 +128,7 @@ class _Search:
                 continue
             pair = pair_of(self.view, *key, clean)
             if key not in self.geometries or self._better(pair, self.pairs[key]):
-                self.geometries[key], self.pairs[key] = clean, pair
+                self.geometries[key], self.pairs[key], self.rotations[key] = clean, pair, todo[key]
 
     def hide_still_parts(self) -> None:
         """Take out what does not move in the image while the gripper does; pairs are verified again without it."""
@@ -216,6 +238,7 @@ def match_with_robot(
         search.match(everything)
         found = _with_intrinsics(search, intrinsics)
     if found.of_x is None:
+        search.match_in_full(list(search.geometries))
         notes = _beside(search, found, names, original)
         return Matched(
             geometries=search.geometries,
@@ -226,12 +249,10 @@ def match_with_robot(
             notes=notes,
         )
     upright = robot.rolls(robot.base_from_camera_rotations(base_from_gripper, found.of_x))
-    search.match(seen_in_common(search.view, found, motion) or everything, upright)
-    found = search.gate(found)
+    found = _upright(search, seen_in_common(search.view, found, motion) or everything, upright, found)
     report(0.8)
     lonely = _without_partners(found, n)
-    search.match([key for key in everything if lonely & set(key)], upright)
-    found = search.gate(found)
+    found = _upright(search, [key for key in everything if lonely & set(key)], upright, found)
     found = search.second_motions_confirmed(found)
     stale = _contradicted_by_all(found, motion)
     believed = {pair.key for pair in (*found.confirmed, *found.undecided)}
@@ -252,6 +273,13 @@ def match_with_robot(
         notes=notes,
         warnings=warnings,
     )
+
+
+def _upright(search: _Search, pairs: Sequence[Key], upright: Float[ndarray, " n"], found: Gate) -> Gate:
+    """The gate after pairs that should see the same were matched, their images rotated upright."""
+    search.match(pairs, upright)
+    search.match_in_full(pairs, upright)
+    return search.gate(found)
 
 
 def _without_partners(found: Gate, count: int) -> set[int]:

@@ -14,7 +14,7 @@ from jcr.errors import InputError
 from jcr.extras import extra, install, is_installed
 from jcr.progress import Progress
 from jcr.reconstruct.hub import HUB_FILES, HUB_ID, Weights, cached_files
-from jcr.records import CameraEvidence, Capture, Reconstruction
+from jcr.records import Boards, CameraEvidence, Capture, Reconstruction
 
 CC_BY_NC_SA = "CC BY-NC-SA 4.0, non-commercial use only (https://creativecommons.org/licenses/by-nc-sa/4.0/)"
 INSTALL_DA3 = "pip install omegaconf addict einops && pip install --no-deps depth-anything-3"
@@ -219,7 +219,7 @@ BACKENDS: dict[str, Backend] = {
             reconstruct=_colmap,
             licence="BSD-3-Clause; XFeat and LightGlue Apache-2.0, ALIKED BSD-3-Clause",
             auto=True,
-            options=("features",),
+            options=("features", "board"),
             selected_by="features",
             accuracy="0.20 mm and 0.036° on the bundled capture (jcr docs results/run)",
         ),
@@ -284,7 +284,7 @@ BACKENDS: dict[str, Backend] = {
             reconstruct=_moge,
             licence="MIT",
             metric=True,
-            options=("weights",),
+            options=("weights", "board"),
             hub_id="Ruicheng/moge-2-vitl",
             revision="39c4d5e957afe587e04eec59dc2bcc3be5ecd968",
             package="moge",
@@ -299,7 +299,6 @@ BACKENDS: dict[str, Backend] = {
             licence="Apache-2.0",
             metric=True,
             options=("board",),
-            selected_by="board",
             accuracy="0.7 mm and 0.20° from the reference of a real capture (jcr docs results/real)",
         ),
         Backend(
@@ -317,7 +316,7 @@ BACKENDS: dict[str, Backend] = {
             name="given",
             reconstruct=_given,
             licence="your reconstruction's",
-            options=("cameras",),
+            options=("cameras", "board"),
             selected_by="cameras",
         ),
     )
@@ -330,6 +329,8 @@ and better than direct alignment on plain tables (jcr docs results/models, with 
 Direct alignment needs no weights: COLMAP matches what is printed on things, it the colours of plain ones.
 """
 
+MARKER = "marker"
+"""The back end that uses the board and nothing else."""
 PATHS = ("predictions", "cameras")
 """Options that name files."""
 
@@ -350,8 +351,9 @@ class ReconstructOptions:
     (jcr models), in this order, and the next only if the result is rejected."""
     _: KW_ONLY
     board: Annotated[str | None, tyro.conf.arg(metavar="KIND:SIZE")] = None
-    """The board or tags to look for, in metres; selects the back end marker: charuco:7x5:0.030:0.022:DICT_4X4_50,
-    chessboard:9x6:0.025 (inner corners), circles:4x11:0.020, aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
+    """The board or tags in view, in metres (SIDE where the side is unknown), used beside the features, or alone where
+    these fail (--backend marker: only alone): charuco:7x5:0.030:0.022:DICT_4X4_50, chessboard:9x6:0.025 (inner corners),
+    circles:4x11:0.020, aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
     features: Literal["auto", "sift", "xfeat", "aliked"] = "auto"
     """Features that are matched between images; selects the back end colmap. SIFT, or learned features for little
     texture (extra match); auto tries sift, then, if the result is rejected and it is installed, xfeat."""
@@ -410,7 +412,12 @@ def reconstruct(
         images=tuple(capture.images[k] for k in order),
         base_from_gripper=capture.base_from_gripper[order],
     )
-    return _of_capture(row.reconstruct(by_name, replace(options, backend=row.name), progress), order)
+    made = row.reconstruct(by_name, replace(options, backend=row.name), progress)
+    if options.board is not None and row.name != MARKER:
+        from jcr.reconstruct.board_corners import with_boards
+
+        made = with_boards(by_name, made, options.board, progress)
+    return _of_capture(made, order)
 
 
 def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Reconstruction:
@@ -429,17 +436,24 @@ def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Re
         image_index=image_index[rows],
         recon_from_camera=reconstruction.recon_from_camera[rows],
         pointmaps=None if reconstruction.pointmaps is None else reconstruction.pointmaps.of_rows(rows),
-        tracks=replace(tracks, image=row_of[tracks.image]),
+        tracks=replace(tracks, image=row_of[tracks.image], boards=_in_order(tracks.boards, row_of)),
         evidence=evidence,
     )
+
+
+def _in_order(boards: Boards | None, row_of: Int[ndarray, " m"]) -> Boards | None:
+    if boards is None:
+        return None
+    return replace(boards, elsewhere=tuple(sorted(row_of[list(boards.elsewhere)].tolist())))
 
 
 def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
     """What `auto` stands for here, the best first, or the one back end that was asked for.
 
-    An option that only one back end uses selects that one. A network whose weights were named is followed by the
-    best back end that needs none. Raises InputError for a back end that is not there, for options that select
-    different ones, and for an option that none of the answer uses.
+    An option that only one back end uses selects that one. A network whose weights were named is followed by the best
+    back end that needs none, and one that uses a board beside its features by the board alone. Raises InputError for
+    a back end that is not there, for options that select different ones, and for an option that none of the answer
+    uses.
     """
     given = _given_options(options)
     selecting = [row for row in BACKENDS.values() if row.selected_by in given]
@@ -456,12 +470,16 @@ def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
         )
     else:
         allowed = [row for row in BACKENDS.values() if row.auto]
+        beside = "board" in given
         if not selecting:
-            names = tuple(row.name for row in allowed if row.is_installed() and row.has_weights())
+            allowed = [row for row in allowed if row.is_installed() and row.has_weights()]
+            names = tuple(row.name for row in allowed if not beside or "board" in row.options)
         elif selecting[0].hub_id:
             names = (selecting[0].name, next(row.name for row in allowed if not row.hub_id))
         else:
             names = (selecting[0].name,)
+        if beside and "board" in BACKENDS[names[0]].options:
+            names = (*names, MARKER)
     for name, value in given.items():
         if not any(name in BACKENDS[chosen].options for chosen in names):
             users = [row.name for row in BACKENDS.values() if name in row.options]

@@ -26,6 +26,12 @@ INK = 120
 """Difference of a pixel's strongest and weakest channel, of 255, beyond which it is no part of a grey board."""
 LARGEST = 1.0
 """m. A square or tag of more was meant in millimetres."""
+PRINTED = 0.002
+"""Relative one-sigma error of a printed board's size."""
+SIDE, MARKER = "SIDE", "MARKER"
+"""In place of lengths that are unknown: the side is then the unit."""
+RATIOS = (0.75, 0.7, 0.8, 0.6, 0.5)
+"""Of marker to square of a ChArUco board, those that are usual."""
 
 
 @dataclass(frozen=True)
@@ -52,10 +58,13 @@ class Board:
 def boards(spec: str) -> list[Board]:
     """The readings of a board's name, the literal one first.
 
-    A ChArUco board has others: printed by OpenCV before 4.6, or with its sides swapped. Raises InputError on a
-    name that means none, with the forms it may have.
+    A ChArUco board has others: printed by OpenCV before 4.6, with its sides swapped, or with a marker of unknown size.
+    With SIDE in place of the length of a side, and MARKER in place of that of a marker, the unit is the side. Raises
+    InputError on a name that means none, with the forms it may have.
     """
     kind, *parts = spec.split(":")
+    if MARKER in parts:
+        return [one for ratio in RATIOS for one in boards(spec.replace(MARKER, f"{ratio:g}"))]
     try:
         if kind == "charuco" and len(parts) == 4:
             return _charuco(spec, _count(parts[0]), _length(parts[1]), _length(parts[2]), _tags(parts[3]))
@@ -72,6 +81,17 @@ def boards(spec: str) -> list[Board]:
     raise InputError(f"--board {spec}: no such board; write it as {'; '.join(KINDS)}")
 
 
+def is_of_unknown_size(spec: str) -> bool:
+    """Whether a board's name leaves its side open."""
+    return SIDE in spec.split(":")
+
+
+def side_of(spec: str) -> float:
+    """The side of a square, or of a tag, that a board's name states (m); 1 where it is the unit."""
+    kind, *parts = spec.split(":")
+    return _length(parts[0] if kind in ("aruco", "apriltag") else parts[1])
+
+
 def _count(text: str) -> tuple[int, int]:
     across, by, down = text.partition("x")
     if not (by and across.isdigit() and down.isdigit() and int(across) > 1 and int(down) > 1):
@@ -80,6 +100,8 @@ def _count(text: str) -> tuple[int, int]:
 
 
 def _length(text: str) -> float:
+    if text == SIDE:
+        return 1.0
     try:
         length = float(text)
     except ValueError:

@@ -9,15 +9,13 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from jcr.capture.images import read_image
-from jcr.reconstruct.board import boards
+from jcr.reconstruct.board import RATIOS, boards
 from jcr.records import Capture, Finding, Kind
 
 LOOKED_AT = 3
 """Images; a board that helps is in most of them."""
 FAMILIES = ("4X4", "5X5", "6X6", "7X7", "APRILTAG_36h11", "APRILTAG_25h9")
 SIZES = (50, 100, 250, 1000)
-RATIOS = (0.75, 0.7, 0.8, 0.6, 0.5)
-"""Of marker to square of a ChArUco board."""
 FEWEST = 2
 """Images in which the same tags are found, or the same chessboard: one may be a trick of the texture."""
 SMALLEST = 4

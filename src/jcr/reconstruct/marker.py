@@ -18,11 +18,9 @@ from jcr.geometry import apply, inverse, retract, rotation_between_deg, rotation
 from jcr.least_squares import minimise
 from jcr.memory import plan
 from jcr.progress import Progress, silent
-from jcr.reconstruct.board import Board, Sighting, boards, most_seen
+from jcr.reconstruct.board import PRINTED, Board, Sighting, boards, is_of_unknown_size, most_seen
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
-PRINTED = 0.002
-"""Relative one-sigma error of a printed board's size."""
 FEWEST_POINTS = 4
 WORST_PX = 3.0
 """A board whose points miss by more (rms) is bent, or no such board."""
@@ -43,7 +41,7 @@ class Pose:
 def reconstruct_marker(
     capture: Capture, look_for: str, progress: Progress | None = None, *, memory_gb: float = 8.0
 ) -> Reconstruction:
-    """Cameras in metres; the recon frame is the board's, or that of the tag seen most often.
+    """Cameras in metres, or in sides of unknown length; the recon frame is the board's, or that of the tag seen most.
 
     `look_for` names the board as `board.KINDS` has it. Unknown intrinsics are calibrated from the board. Raises
     InputError for a board that is none, and NotTrustedError when fewer than three images show it.
@@ -62,7 +60,7 @@ def reconstruct_marker(
     if (fold_px := fold_distance_px(intrinsics)) is not None:
         seen = [_within(sightings, intrinsics, fold_px) for sightings in seen]
         notes.append(f"the distortion folds over at {fold_px:.0f} px from the centre: nothing beyond is used")
-    poses = [{s.body: pose for s in sightings if (pose := _pose(s, intrinsics))} for sightings in seen]
+    poses = [{s.body: pose for s in sightings if (pose := pose_of_body(s, intrinsics))} for sightings in seen]
     recon_from_camera, recon_from_body = locate_cameras_and_bodies(poses)
     rows = np.array(sorted(recon_from_camera), dtype=int)
     if len(rows) < 3:
@@ -83,8 +81,8 @@ def reconstruct_marker(
         intrinsics=intrinsics,
         tracks=tracks,
         backend="marker",
-        is_metric=True,
-        metric_std=PRINTED,
+        is_metric=not is_of_unknown_size(look_for),
+        metric_std=None if is_of_unknown_size(look_for) else PRINTED,
         notes=tuple(notes),
     )
 
@@ -128,7 +126,7 @@ def _within(sightings: Sequence[Sighting], intrinsics: Intrinsics, fold_px: floa
     return [s for s in sightings if np.linalg.norm(s.x_px - centre, axis=1).max() < limit_px]
 
 
-def _pose(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:
+def pose_of_body(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:
     """The body's pose, unless its points lie on a line, miss, or leave open which way it is tilted."""
     x, x_px = sighting.x_in_body, sighting.x_px
     seen, camera = x_px, (intrinsics.matrix, np.array(intrinsics.distortion))

@@ -113,11 +113,14 @@ def retriangulated(
     recon_from_camera: dict[int, Float[ndarray, "4 4"]],
     adjust: Callable[[pycolmap.Reconstruction], None],
 ) -> pycolmap.Reconstruction:
-    """A model of these cameras, its points triangulated from all verified matches, adjusted, and once more so."""
+    """A model of these cameras, its points triangulated from all verified matches, adjusted, and triangulated again."""
     with tempfile.TemporaryDirectory(prefix="jcr-placed-") as folder:
         poses = recon_from_camera
-        model = pycolmap.Reconstruction()
+        model = None
         for _ in range(2):
+            if model is not None:
+                adjust(model)
+                poses = dict(zip(sorted(poses), poses_of(model, sorted(poses)), strict=True))
             model = pycolmap.Reconstruction()
             model.add_camera_with_trivial_rig(camera)
             with closing(pycolmap.Database.open(database)) as db:
@@ -133,9 +136,7 @@ def retriangulated(
             model = pycolmap.triangulate_points(
                 model, database, folder, Path(folder), refine_intrinsics=False, options=options
             )
-            adjust(model)
-            rows = sorted(poses)
-            poses = dict(zip(rows, poses_of(model, rows), strict=True))
+        assert model is not None
         return model
 
 

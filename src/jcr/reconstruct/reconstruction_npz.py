@@ -15,7 +15,7 @@ from jcr.errors import InputError
 from jcr.files import require_file, written_whole
 from jcr.geometry import require_rigid
 from jcr.intrinsics_json import IntrinsicsJson, Positive
-from jcr.records import CameraEvidence, Pointmaps, Reconstruction, Tracks
+from jcr.records import Boards, Body, CameraEvidence, Pointmaps, Reconstruction, Tracks
 
 FORMAT = "jcr.reconstruction/7"
 """Changes with what the file holds."""
@@ -23,6 +23,19 @@ WITH_DEPTH = "jcr.reconstruction/5"
 """Read as well: it holds estimated depth as pointmaps without confidence, and no standard deviations of observations."""
 OF_TRACKS = ("image", "x_px", "point", "points_in_recon", "std_px")
 OF_POINTMAPS = ("points_in_recon", "confidence", "colors", "reason", "depth_std")
+
+
+class BoardsJson(BaseModel):
+    """What is no array of records.Boards."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    spec: str
+    side: Positive
+    size_std: Positive | None
+    numbers: list[int]
+    """Of the bodies."""
+    elsewhere: list[int]
+    proposed: str | None
 
 
 class About(BaseModel):
@@ -37,6 +50,7 @@ class About(BaseModel):
     warnings: list[str]
     intrinsics: IntrinsicsJson
     pointmap_intrinsics: IntrinsicsJson | None = None
+    boards: BoardsJson | None = None
 
 
 def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
@@ -51,6 +65,7 @@ def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
         "warnings": list(reconstruction.warnings),
         "intrinsics": asdict(reconstruction.intrinsics),
         "pointmap_intrinsics": None if pointmaps is None else asdict(pointmaps.intrinsics),
+        "boards": None if tracks.boards is None else _about_boards(tracks.boards),
     }
     arrays = {
         "image_index": reconstruction.image_index,
@@ -59,6 +74,12 @@ def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
         "tracks_from_board": np.array(tracks.from_board),
     }
     arrays |= {f"track_{name}": array for name in OF_TRACKS if (array := getattr(tracks, name)) is not None}
+    if tracks.boards is not None and (bodies := tracks.boards.bodies):
+        arrays |= {
+            "board_body": np.repeat(np.arange(len(bodies)), [len(body.point) for body in bodies]),
+            "board_point": np.concatenate([body.point for body in bodies]),
+            "board_x_in_body": np.concatenate([body.x_in_body for body in bodies]),
+        }
     if evidence is not None:
         arrays |= {
             "evidence_recon_from_camera": evidence.recon_from_camera,
@@ -139,6 +160,7 @@ def read_reconstruction(path: Path) -> Reconstruction:
                 if about.format == FORMAT
                 else about.backend == "marker",
                 std_px=file.get("track_std_px"),
+                boards=None if about.boards is None else _boards(file, about.boards),
             ),
             backend=about.backend,
             pointmaps=_pointmaps(file, about),
@@ -150,6 +172,35 @@ def read_reconstruction(path: Path) -> Reconstruction:
         )
         _check(found)
     return found
+
+
+def _about_boards(boards: Boards) -> dict[str, Any]:
+    return {
+        "spec": boards.spec,
+        "side": boards.side,
+        "size_std": boards.size_std,
+        "numbers": [body.number for body in boards.bodies],
+        "elsewhere": list(boards.elsewhere),
+        "proposed": boards.proposed,
+    }
+
+
+def _boards(file: Mapping[str, np.ndarray], about: BoardsJson) -> Boards:
+    """KeyError or ValueError where its arrays are not whole."""
+    bodies = []
+    for k, number in enumerate(about.numbers):
+        own = file["board_body"] == k
+        point, x_in_body = file["board_point"][own], file["board_x_in_body"][own]
+        check_arrays({"board_point": (point, (len(point),)), "board_x_in_body": (x_in_body, (len(point), 3))})
+        bodies.append(Body(number, point, x_in_body))
+    return Boards(
+        spec=about.spec,
+        side=about.side,
+        size_std=about.size_std,
+        bodies=tuple(bodies),
+        elsewhere=tuple(about.elsewhere),
+        proposed=about.proposed,
+    )
 
 
 def _pointmaps(file: Mapping[str, np.ndarray], about: About) -> Pointmaps | None:
@@ -197,6 +248,8 @@ def _check(found: Reconstruction) -> None:
         ("image_index", found.image_index, np.inf),
         ("track_image", tracks.image, m),
         ("track_point", tracks.point, p),
+        *(("board_point", body.point, p) for body in (tracks.boards.bodies if tracks.boards else ())),
+        ("board elsewhere", np.array(tracks.boards.elsewhere if tracks.boards else (), int), m),
     ):
         if index.dtype.kind not in "iu" or (index < 0).any() or (index >= end).any():
             raise ValueError(f"{name} counts rows that are not there")

@@ -44,6 +44,7 @@ from jcr.reconstruct.placed import (
     retriangulated,
     shared_points,
 )
+from jcr.reconstruct.primed import primed
 from jcr.records import Intrinsics, Reconstruction, Tracks
 
 _MIN_REGISTERED = 3
@@ -56,6 +57,10 @@ _MANY, _GROWN = 40, 1.3
 _ENOUGH = 1e-6
 """Relative change of a cost that ends an adjustment: with COLMAP's 0 it takes three times as long, and cameras come out
 1e-5 of their distance elsewhere."""
+_ROUGHLY = 1e-3
+"""The same of an adjustment that others follow."""
+_MOST_OBSERVATIONS = 60_000
+"""Of a map; the robot limits what more could add, and the calibration adjusts no more (calibration/case.py)."""
 _FEW_FEATURES = 1000
 """Per image; textured tabletops give 1500 to 5000, a chessboard before a plain background 400."""
 
@@ -87,12 +92,24 @@ def structure_from_motion(
         matched = matched_pairs(
             database, matcher, base_from_gripper, all_intrinsics[0], cameras, known, names, report
         )
-        model = map_incrementally(database, len(images), cameras, known, seed, report)
+        model = None
+        if known and matched.gate is not None and base_from_gripper is not None and len(images) > _MANY:
+            model = primed(
+                database,
+                cameras[0],
+                matched.gate,
+                matched.geometries,
+                base_from_gripper,
+                lambda made: adjust_robustly(made, True, _ROUGHLY),
+            )
+        if model is None or model.num_reg_images() < len(images):
+            model = map_incrementally(database, len(images), cameras, known, seed, report, model)
         if model is not None and base_from_gripper is not None and model.num_reg_images() < len(images):
             model, matched = _placed(database, model, matcher, matched, base_from_gripper, names)
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise _not_registered(database, len(images), model)
-        adjust_robustly(model, fix_intrinsics=known)
+        _thin(model, seed)
+        adjust_robustly(model, known, _ROUGHLY)
         std_px = _align_observations(
             model, images, all_intrinsics[0] if known else intrinsics_of(model.camera(1), all_intrinsics[0])
         )
@@ -223,10 +240,12 @@ def map_incrementally(
     known: bool,
     seed: int,
     report: Progress,
+    begun: pycolmap.Reconstruction | None = None,
 ) -> pycolmap.Reconstruction | None:
     """The model with most images over all starting cameras; with relaxed demands if that is below three.
 
-    The share of images in the model is reported; it falls back where another start is tried.
+    A model that is `begun` is resumed with the images that it lacks. The share of images in the model is reported; it
+    falls back where another start is tried.
     """
     pipeline = pipeline_options(known, seed)
     if n_images > _MANY:
@@ -239,7 +258,7 @@ def map_incrementally(
         for camera in cameras:
             with closing(pycolmap.Database.open(database)) as db:
                 db.update_camera(camera)
-            models = _models(database, n_images, pipeline, report)
+            models = _models(database, n_images, pipeline, report, begun)
             for model in models.values():
                 if model.num_reg_images() > registered:
                     best, registered = model, model.num_reg_images()
@@ -359,10 +378,18 @@ def pipeline_options(known: bool, seed: int) -> pycolmap.IncrementalPipelineOpti
 
 
 def _models(
-    database: Path, n_images: int, pipeline: pycolmap.IncrementalPipelineOptions, report: Progress
+    database: Path,
+    n_images: int,
+    pipeline: pycolmap.IncrementalPipelineOptions,
+    report: Progress,
+    begun: pycolmap.Reconstruction | None,
 ) -> dict[int, pycolmap.Reconstruction]:
-    """COLMAP's models from one start, the share of images registered so far reported."""
-    registered = 0
+    """COLMAP's models from one start, or from a model; the share of images registered so far reported."""
+    registered, folder = 0, database.parent
+    if begun is not None:
+        registered, folder = begun.num_reg_images(), database.parent / "begun"
+        folder.mkdir(exist_ok=True)
+        begun.write(folder)
 
     def add(count: int) -> None:
         nonlocal registered
@@ -375,15 +402,17 @@ def _models(
         database.parent,
         database.parent,
         pipeline,
+        "" if begun is None else folder,
         initial_image_pair_callback=lambda: add(2),
         next_image_callback=lambda: add(1),
     )
 
 
-def adjust_robustly(model: pycolmap.Reconstruction, fix_intrinsics: bool) -> None:
+def adjust_robustly(model: pycolmap.Reconstruction, fix_intrinsics: bool, enough: float = _ENOUGH) -> None:
     """One more bundle adjustment under a Cauchy loss, for COLMAP's least squares lets mismatches pull.
 
-    It halves the error of the camera centres (0.20 to 0.11 mm rms over 12 simulated views).
+    It halves the error of the camera centres (0.20 to 0.11 mm rms over 12 simulated views). A relative change of the
+    cost of less than `enough` ends it.
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
@@ -391,13 +420,24 @@ def adjust_robustly(model: pycolmap.Reconstruction, fix_intrinsics: bool) -> Non
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = 0.5
     options.ceres.solver_options.num_threads = 1
-    options.ceres.solver_options.function_tolerance = _ENOUGH
+    options.ceres.solver_options.function_tolerance = enough
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     # pycolmap.bundle_adjustment() does the same, but enables the log again.
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+
+
+def _thin(model: pycolmap.Reconstruction, seed: int) -> None:
+    """Leave a random choice of the points of a model with more observations than add something."""
+    points = sorted(model.point3D_ids())
+    if model.compute_num_observations() <= _MOST_OBSERVATIONS:
+        return
+    order = np.random.default_rng(seed).permutation(points)
+    count = np.cumsum([model.point3D(int(point)).track.length() for point in order])
+    for point in order[count > _MOST_OBSERVATIONS]:
+        model.delete_point3D(int(point))
 
 
 def _align_observations(

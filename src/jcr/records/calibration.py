@@ -1,6 +1,7 @@
 """Where the camera sits on the gripper, how well that is known, and what was found on the way."""
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -360,6 +361,46 @@ class RobotExamined:
     angle_ratio: AngleRatio | None = None
 
 
+LengthName = Literal["board", "known length", "depth camera", "network"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LengthCheck:
+    """A length beside the robot's positions, compared with them."""
+
+    name: LengthName
+    robot_longer_percent: float
+    """By how much it is longer by the robot's positions than as stated (negative: shorter)."""
+    std_percent: float
+    """One sigma of its own, the robot's not counted."""
+    used: bool
+    """Whether it is part of the scale; not where two lengths contradict each other."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoardFound:
+    """A board, or the tags of one `--board`, in the adjusted images."""
+
+    spec: str
+    bodies: int
+    """1 for a board."""
+    images: int
+    corners: int
+    side_mm: float
+    """Of a square or tag by the robot's positions alone."""
+    side_std_mm: float
+    stated_mm: float | None
+    """None: unknown."""
+    rms_px: float
+    """Of the corners' reprojection errors, per axis."""
+    bend_mm: float
+    """Between the lowest and the highest corner beside the plane; the largest of all bodies."""
+    centres_in_base: tuple[tuple[float, float, float], ...]
+    """Of the bodies (m)."""
+    tilts_deg: tuple[float, ...]
+    """Of the bodies, from the horizontal of the base."""
+
+
 @dataclass(frozen=True)
 class ScaleEvidence:
     """Measures of the scale beside the robot's positions."""
@@ -368,6 +409,10 @@ class ScaleEvidence:
     """None where the reconstruction's unit is not meant to be the metre."""
     depth: DepthCheck | None = None
     """None without depth images, or where too few features have a depth."""
+    lengths: tuple[LengthCheck, ...] = ()
+    """Every length that was compared with the robot's."""
+    board: BoardFound | None = None
+    """None where no board took part beside features."""
 
 
 @dataclass(frozen=True)

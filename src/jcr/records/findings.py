@@ -50,6 +50,10 @@ class Kind(StrEnum):
     TOOL_SAGS = "tool sags"
     ANGLE_RATIO = "camera and gripper angles differ"
     BOARD_SIZE = "board size contradicts the robot"
+    SCALES = "lengths contradict each other"
+    BOARD_SIDE = "side of a board"
+    BOARD_MOVED = "board at several places"
+    BOARD_NOT_FOUND = "board not found"
     NETWORK_SCALE = "a network's metre contradicts the robot"
     SCALE_ASSUMED = "scale assumed"
     SCALE_FROM_ROBOT = "scale from the robot alone"
@@ -171,6 +175,7 @@ LASTING = (
     | BENT
     | {
         Kind.BOARD_SIZE,
+        Kind.SCALES,
         Kind.SLIP,
         Kind.DRIFT,
         Kind.DELAY,

@@ -2,10 +2,41 @@
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.records.capture import Intrinsics
+
+
+@dataclass(frozen=True)
+class Body:
+    """A board, or a single tag, among the points of tracks: rigid, and unrelated to other bodies."""
+
+    number: int
+    """Of the tag; 0 for a board."""
+    point: Int[ndarray, " c"]
+    """Rows of `Tracks.points_in_recon`, its corners."""
+    x_in_body: Float[ndarray, "c 3"]
+    """Corners as printed, z = 0; in metres, or in sides where the side is unknown."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Boards:
+    """The boards or tags of one `--board`."""
+
+    spec: str
+    """As `--board` names them."""
+    side: float
+    """Of a square or a tag, in the unit of `Body.x_in_body`: metres, or 1 where it is unknown."""
+    size_std: float | None
+    """Relative standard deviation of the stated size, common to all bodies; None: the size is unknown."""
+    bodies: tuple[Body, ...]
+    """Empty where no two images show one."""
+    elsewhere: tuple[int, ...] = ()
+    """Rows of the reconstruction whose images show a body at another place than most do: their corners are left out."""
+    proposed: str | None = None
+    """Where no body was found, the `--board` that the images seem to show; None where they show none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +56,16 @@ class Tracks:
     """All on a board or tags: the scene rises above them."""
     std_px: Float[ndarray, " k"] | None = None
     """Of one coordinate of each observation, as its match states it, up to a factor; None: all are alike."""
+    boards: Boards | None = None
+    """Boards or tags whose corners are among the points; None: no shape of any point is known."""
+
+    @property
+    def on_board(self) -> Bool[ndarray, " p"]:
+        """Which points are corners of `boards`."""
+        out = np.zeros(len(self.points_in_recon), bool)
+        for body in () if self.boards is None else self.boards.bodies:
+            out[body.point] = True
+        return out
 
     def only(self, rows: Bool[ndarray, " k"] | Int[ndarray, " n"]) -> "Tracks":
         """These observations; points keep their rows."""

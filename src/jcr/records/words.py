@@ -19,6 +19,14 @@ SURE = 4.0
 CALIBRATE_INTRINSICS = (
     "calibrate the intrinsics again at this resolution, or give no intrinsics (null) to have them estimated"
 )
+LENGTHS = {
+    "robot": "the robot's positions",
+    "board": "the size of the board",
+    "known length": "the known length",
+    "depth camera": "the depth camera",
+    "network": "the network's metre",
+}
+"""Names of what a scale is known from."""
 AT_REST = "take the images at rest"
 NEARER = "take two or more images 20 % nearer to or farther from the point you look at"
 PAIRS = (
@@ -430,6 +438,43 @@ def _board_size(finding: Finding) -> str:
     )
 
 
+def _scales(finding: Finding) -> str:
+    off, std = _value_and_std(finding)
+    names = (LENGTHS[str(finding.details[name])] for name in ("one", "other"))
+    return f"{' and '.join(names)} contradict each other by {100 * abs(off):.1f} ± {100 * std:.1f} %"
+
+
+def _board_side(finding: Finding) -> str:
+    side, std = (1e3 * value for value in _value_and_std(finding))
+    return f"by the robot's positions the sides of {finding.details['board']} are {side:.2f} ± {significant(std)} mm"
+
+
+def _to_board_side(finding: Finding) -> str:
+    side, std = (1e3 * value for value in _value_and_std(finding))
+    printed = round(2 * side) / 2  # boards are printed in halves of a millimetre
+    if abs(side - printed) < 2 * std:
+        return "measure one, and give it in --board: the scale is then known twice"
+    longer = "long" if side > printed else "short"
+    return (
+        f"if they measure {printed:g} mm, give {1e-3 * printed:g} in --board: the positions are "
+        f"{100 * abs(side / printed - 1):.1f} % too {longer}"
+    )
+
+
+def _board_not_found(finding: Finding) -> str:
+    proposed = finding.details.get("proposed")
+    shown = f", but they seem to show {proposed}" if proposed else ""
+    return _said("no two images show {board}: features alone are used", finding) + shown
+
+
+def _board_moved(finding: Finding) -> str:
+    names = joined(finding.images[:3]) + (
+        f" and {len(finding.images) - 3} more" if len(finding.images) > 3 else ""
+    )
+    where = "is at another place than in the other images: it was moved, or there are two"
+    return f"in {names} {finding.details['board']} {where}"
+
+
 def _to_size(finding: Finding) -> str:
     measure = "measure its squares, and check that the gripper poses are in metres"
     return "" if finding.details.get("marker") else measure
@@ -529,6 +574,10 @@ _TEXT: dict[Kind, Words] = {
     Kind.TOOL_SAGS: _sags,
     Kind.ANGLE_RATIO: _angles_differ,
     Kind.BOARD_SIZE: _board_size,
+    Kind.SCALES: _scales,
+    Kind.BOARD_SIDE: _board_side,
+    Kind.BOARD_MOVED: _board_moved,
+    Kind.BOARD_NOT_FOUND: _board_not_found,
     Kind.NETWORK_SCALE: lambda f: network_scale(*(100 * x for x in _value_and_std(f))),
     Kind.SCALE_ASSUMED: "the scale is unobservable from these motions: it is taken as 1, from the marker's size",
     Kind.SCALE_FROM_ROBOT: (
@@ -616,6 +665,10 @@ _REMEDY: dict[Kind, Words] = {
     Kind.BASE_LEANS: "bolt the stand to the floor, or brace it",
     Kind.TOOL_SAGS: "stiffen its mount, and check the zero of the wrist's joints, which looks like it",
     Kind.BOARD_SIZE: _to_size,
+    Kind.SCALES: "measure both again",
+    Kind.BOARD_SIDE: _to_board_side,
+    Kind.BOARD_MOVED: "its corners there are left out; keep one board of a kind, and keep it still",
+    Kind.BOARD_NOT_FOUND: "check its kind and its numbers of squares or corners (jcr docs markers)",
     Kind.NETWORK_SCALE: "check the unit of the gripper poses",
     Kind.SCALE_FROM_ROBOT: "the size of a board or --known-length would show it",
     Kind.IMAGES_ROTATED: (

@@ -11,6 +11,7 @@ from jcr.calibration.calibration_json import CalibrationFile
 from jcr.calibration.words import attempt_in_words, budget_in_words
 from jcr.extras import is_installed
 from jcr.records import COEFFICIENTS
+from jcr.records.words import LENGTHS
 from jcr.report.render import Section
 from jcr.rounding import significant
 
@@ -29,6 +30,8 @@ def details_section(
         "Time": _times(calibration),
         "Intrinsics": _intrinsics(calibration),
         "Uncertainty, 1 σ per axis": {} if budget is None else budget_in_words(budget),
+        "Board": _board(calibration),
+        "Lengths": _lengths(calibration),
         "Depth camera": _depth_camera(calibration),
         "Robot": _robot(calibration),
         "Map": map_history or {},
@@ -73,6 +76,36 @@ def _depth_camera(calibration: CalibrationFile) -> dict[str, str]:
         "scale error, compared with the robot": f"{check.off_percent:+.2f} ± {check.std_percent:.2g} %",
         **{f"noise at {z:.2f} m, 1 σ": f"{value} mm" for z, value in noise_mm.items()},
         "looked at": f"{check.features} features of {check.images} images",
+    }
+
+
+def _board(calibration: CalibrationFile) -> dict[str, str]:
+    """Where boards or tags beside the features were found, how large, and how bent."""
+    if (board := calibration.board) is None:
+        return {}
+    stated = "" if board.stated_mm is None else f" ({board.stated_mm:g} mm stated)"
+    places = {
+        f"place of {board.spec}" + (f", {k}" if board.bodies > 1 else ""): (
+            f"({', '.join(f'{x:.3f}' for x in centre)}) m in the base, {tilt:.1f}° from horizontal"
+        )
+        for k, (centre, tilt) in enumerate(zip(board.centres_in_base, board.tilts_deg, strict=True), start=1)
+    }
+    return {
+        **places,
+        "side by the robot's positions": f"{board.side_mm:.2f} ± {significant(board.side_std_mm)} mm{stated}",
+        "corners": f"{board.corners} in {board.images} images, {board.rms_px:.2f} px rms per axis",
+        "bend": f"{board.bend_mm:.2f} mm between lowest and highest corner",
+    }
+
+
+def _lengths(calibration: CalibrationFile) -> dict[str, str]:
+    """By how much each length that is known beside the robot's positions differs from these."""
+    return {
+        LENGTHS[one.name]: (
+            f"{one.robot_longer_percent:+.2f} ± {significant(one.std_percent)} % longer by the robot's positions, "
+            f"{'part of the scale' if one.used else 'not used'}"
+        )
+        for one in calibration.lengths
     }
 
 

@@ -11,18 +11,18 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy import ndarray
-from torch import Tensor
 
 from jcr.errors import InputError
 from jcr.progress import Progress, silent
 from jcr.records import PointCloud
+from jcr.represent.carve import carve
 from jcr.represent.clear import with_clear_cells
 from jcr.represent.fields import Field, Fields, FieldShape, Lattice
 from jcr.represent.options import MapOptions
-from jcr.represent.rays import NEAR, workspace_box, workspace_rays
+from jcr.represent.rays import NEAR, Rays, workspace_box, workspace_rays
 from jcr.represent.scene import SceneMap
-from jcr.represent.seen import HIT, SeenGrid, carve, dilate, halve, without_doubts
-from jcr.represent.train import RECIPES, train
+from jcr.represent.seen import HIT, SeenGrid, dilate, halve, without_doubts
+from jcr.represent.train import RECIPES, Recipe, train
 
 
 def build_scene(
@@ -39,36 +39,58 @@ def build_scene(
     options = options or MapOptions()
     recipe = RECIPES[options.preset]
     torch.manual_seed(options.map_seed)
-
-    def tensor(array: ndarray) -> Tensor:
-        return torch.as_tensor(array, dtype=torch.float32, device=device)
-
     for numbers in (cloud.points_in_base, cloud.camera_centers_in_base, cloud.confidence, cloud.margin):
         if not np.isfinite(numbers).all():
             raise InputError(
                 "the cloud holds numbers that are not finite; remove those points and map the rest"
             )
+    box, cell = _workspace(cloud, options)
+    rays = workspace_rays(cloud, values or {}, box, cell, device)
+    report = progress or silent
+
+    def fit(field: Field) -> int:
+        stage = f"map: {', '.join(field.heads)}"
+        return train(field, rays, seen, recipe, options.map_seed, options.max_seconds, partial(report, stage))
+
+    with threads_of_one_core(torch.device(device)) as pool:
+        start = time.perf_counter()
+        report("what was seen", 0.0)
+        # Rays that end beyond the workspace cross it all the same.
+        ends = cloud.points_in_base, cloud.image, cloud.camera_centers_in_base
+        seen = carve(*ends, box, cell / 2, cloud.cleared, device)
+        carved = time.perf_counter()
+        lattices = feature_lattices(seen) if recipe.grids else []
+        shapes = _field_shapes(rays, len(cloud.label_names), recipe, options.joint)
+        fields = Fields(shapes, seen.box, lattices).to(device)
+        steps = list(pool.map(fit, fields.of))
+        history = {
+            "preset": options.preset,
+            "steps": " + ".join(map(str, steps)),
+            "carving_s": f"{carved - start:.3f}",
+            "training_s": f"{time.perf_counter() - carved:.3f}",
+        }
+        scene = SceneMap(fields, without_doubts(seen), cloud.label_names, history)
+        scene.seen = with_clear_cells(scene.seen, fields.field_of("occupancy"))
+    return scene
+
+
+def _workspace(cloud: PointCloud, options: MapOptions) -> tuple[Float[ndarray, "2 3"], float]:
+    """The box of the map, whole cells along every axis, and the side of a cell (m)."""
     box = workspace_box(cloud, options.workspace)
     cell = max(options.cell, float(np.prod(box[1] - box[0]) / options.max_cells) ** (1 / 3))
     box[1] = box[0] + np.ceil((box[1] - box[0]) / cell - 1e-6) * cell
-    rays = workspace_rays(cloud, values or {}, box, cell, device)
+    return box, cell
 
-    start = time.perf_counter()
-    if progress:
-        progress("what was seen", 0.0)
-    # Rays that end beyond the workspace cross it all the same.
-    image = torch.as_tensor(cloud.image, device=device)
-    centers = tensor(cloud.camera_centers_in_base)
-    measured = torch.as_tensor(cloud.cleared, device=device)
-    seen = carve(tensor(cloud.points_in_base), image, centers, tensor(box), cell / 2, measured)
-    carved = time.perf_counter()
-    lattices = feature_lattices(seen) if recipe.grids else []
-    outputs = {name: target.shape[-1] for name, target in rays.targets.items() if name != "label"}
-    heads = {"occupancy": 1} | outputs
+
+def _field_shapes(rays: Rays, labels: int, recipe: Recipe, joint: bool) -> list[FieldShape]:
+    """The networks to train: one for all properties where they are `joint`, else occupancy and all others apart."""
+    heads = {"occupancy": 1} | {
+        name: target.shape[-1] for name, target in rays.targets.items() if name != "label"
+    }
     if "label" in rays.targets:
-        heads["label"] = len(cloud.label_names)
-    groups = [heads] if options.joint else [{"occupancy": heads.pop("occupancy")}, heads]
-    shapes = [
+        heads["label"] = labels
+    groups = [heads] if joint else [{"occupancy": heads.pop("occupancy")}, heads]
+    return [
         FieldShape(
             group,
             recipe.hidden,
@@ -77,24 +99,6 @@ def build_scene(
         )
         for group in groups
     ]
-    fields = Fields(shapes, seen.box, lattices).to(device)
-
-    def fit(field: Field) -> int:
-        stage = f"map: {', '.join(field.heads)}"
-        report = partial(progress or silent, stage)
-        return train(field, rays, seen, recipe, options.map_seed, options.max_seconds, report)
-
-    with threads_of_one_core(torch.device(device)) as pool:
-        steps = list(pool.map(fit, fields.of))
-    history = {
-        "preset": options.preset,
-        "steps": " + ".join(map(str, steps)),
-        "carving_s": f"{carved - start:.3f}",
-        "training_s": f"{time.perf_counter() - carved:.3f}",
-    }
-    scene = SceneMap(fields, without_doubts(seen), cloud.label_names, history)
-    scene.seen = with_clear_cells(scene.seen, fields.field_of("occupancy"))
-    return scene
 
 
 def feature_lattices(seen: SeenGrid) -> list[Lattice]:

@@ -14,7 +14,7 @@ from jcr.represent.rays import Rays, Samples, draw_samples, on_surface
 from jcr.represent.seen import SeenGrid
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Recipe:
     """What a preset is made of."""
 
@@ -31,20 +31,38 @@ class Recipe:
     """Learning rates of Adam."""
     look: int
     """Steps between looks at the validation rays."""
+    falls: int
+    """Falls of the learning rate at which the training ends."""
 
 
 RECIPES = {
     "default": Recipe(
-        32, 0, ((0, 4), (1, 2)), ((0, 4), (2, 4)), rays=True, layer_rate=3e-2, grid_rate=0.3, look=10
+        hidden=32,
+        frequencies=0,
+        grids=((0, 4), (1, 2)),
+        surface_grids=((0, 4), (2, 4)),
+        rays=True,
+        layer_rate=3e-2,
+        grid_rate=0.3,
+        look=6,
+        falls=2,
     ),
-    "paper": Recipe(256, 10, (), (), rays=False, layer_rate=5e-3, grid_rate=0.0, look=100),
+    "paper": Recipe(
+        hidden=256,
+        frequencies=10,
+        grids=(),
+        surface_grids=(),
+        rays=False,
+        layer_rate=5e-3,
+        grid_rate=0.0,
+        look=100,
+        falls=3,
+    ),
 }
 BATCH = 6144
 """Rays a step."""
 GAIN = 0.03
 """Share by which the loss must fall from look to look, or the learning rate falls."""
-FALLS = 3
-"""Falls of the learning rate at which the training ends."""
 
 
 def train(
@@ -76,7 +94,7 @@ def train(
     leave_one_out, rays = rays[: len(rays.x) // 50], rays[len(rays.x) // 50 :]
     test = draw(leave_one_out)
     best, falls, step = float("inf"), 0, 0
-    while falls < FALLS and time.perf_counter() - start < max_seconds:
+    while falls < recipe.falls and time.perf_counter() - start < max_seconds:
         first = step * BATCH % max(len(rays.x) - BATCH, 1)
         samples = draw(rays[first : first + BATCH])
         with torch.autocast(device.type, torch.bfloat16, enabled=half_precision):
@@ -93,7 +111,7 @@ def train(
                 for optimizer in optimizers:
                     optimizer.rate *= 0.3
             best = min(best, now)
-            report(falls / FALLS)
+            report(falls / recipe.falls)
     return step
 
 

@@ -71,7 +71,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def capture(folder: Path) -> Capture:
     rng = np.random.default_rng(5)
     noise = rng.normal(0, 1, (COUNT, 6)) * ([2e-4] * 3 + [4e-4] * 3)
@@ -136,12 +136,19 @@ def options(**changes):
     return replace(made, **changes)
 
 
-def test_matches_by_colour_put_predicted_cameras_right_and_show_how_surely(capture: Capture) -> None:
-    from jcr.calibration.stage import calibrate
+@pytest.fixture(scope="module")
+def found(capture: Capture) -> Reconstruction:
+    """By one pass of the model."""
     from jcr.reconstruct.views_at_once.views_at_once import reconstruct_views_at_once
 
-    predict = Fake()
-    found = reconstruct_views_at_once(capture, options(), predict=predict)
+    return reconstruct_views_at_once(capture, options(), predict=Fake())
+
+
+def test_matches_by_colour_put_predicted_cameras_right_and_show_how_surely(
+    capture: Capture, found: Reconstruction
+) -> None:
+    from jcr.calibration.stage import calibrate
+
     assert found.evidence is not None and "refined" in found.notes[1]
     truth = base_from_camera()
     base, scale = fit_similarity(truth[:, :3, 3], found.recon_from_camera[:, :3, 3])
@@ -189,23 +196,22 @@ def test_an_unknown_focal_length_is_adjusted(capture: Capture) -> None:
 
 @pytest.mark.parametrize("better", [True, False])
 def test_a_second_pass_is_shown_the_robots_cameras_and_stands_where_it_is_better(
-    capture: Capture, better: bool
+    capture: Capture, found: Reconstruction, better: bool
 ) -> None:
     from jcr.reconstruct.views_at_once.views_at_once import reconstruct_views_at_once
 
-    predict = Fake(bend=0.02, better_again=better)
-    found = reconstruct_views_at_once(capture, options(takes_poses=True), predict=predict)
+    predict = Fake(better_again=better)
+    twice = reconstruct_views_at_once(capture, options(takes_poses=True), predict=predict)
     assert predict.shown[0] is None and len(predict.shown) == 2
     between = inverse(predict.shown[1][0]) @ predict.shown[1]
     true = inverse(base_from_camera()[0]) @ base_from_camera()
     assert np.abs(between - true).max() < 5e-3
-    note = next(note for note in found.notes if note.startswith("second pass"))
+    note = next(note for note in twice.notes if note.startswith("second pass"))
     if not better:
         assert note.endswith("not kept")
-    once = reconstruct_views_at_once(capture, options(), predict=Fake(bend=0.02))
-    assert found.evidence is not None and once.evidence is not None
+    assert found.evidence is not None and twice.evidence is not None
     # Its cameras are the robot's: those of the images alone stay.
-    np.testing.assert_array_equal(found.evidence.recon_from_camera, once.evidence.recon_from_camera)
+    np.testing.assert_array_equal(twice.evidence.recon_from_camera, found.evidence.recon_from_camera)
 
 
 def test_a_view_that_the_robot_contradicts_is_named(capture: Capture) -> None:

@@ -257,11 +257,12 @@ def _finding(after: _State, before: _State, alone: Tested) -> Finding:
 
 
 def of_some(tracks: Tracks, most: int, seed: int = 0) -> Tracks:
-    """A random choice of the points that most images see, with no more than `most` observations."""
+    """A random choice of the points that most images see, with no more than `most` observations, and all corners of
+    boards."""
     count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
     order = np.random.default_rng(seed).permutation(len(count))
     enough = order[np.argsort(count[order] < WELL_SEEN, kind="stable")]
-    chosen = np.zeros(len(count), bool)
+    chosen = tracks.on_board
     shown = enough[count[enough] >= 2][:MOST_POINTS]
     chosen[shown[np.cumsum(count[shown]) <= most]] = True
     return of_points(tracks, chosen)

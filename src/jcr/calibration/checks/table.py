@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from jcr.calibration.case import Case, Checked
 from jcr.calibration.checks.bent import check_bent
+from jcr.calibration.checks.boards import check_boards
 from jcr.calibration.checks.camera import check_camera
 from jcr.calibration.checks.capture import (
     check_arm,
@@ -19,8 +20,8 @@ from jcr.calibration.checks.capture import (
     check_reconstruction,
     check_registered,
 )
+from jcr.calibration.checks.lengths import check_lengths
 from jcr.calibration.checks.robot import check_robot
-from jcr.calibration.checks.scale import check_depth_camera, check_network_scale, check_scale_source
 from jcr.calibration.checks.sequence import MIN_IMAGES, check_sequence
 from jcr.records import BENT, CAMERA, Kind
 
@@ -55,6 +56,8 @@ CHECKS = (
         check_bent,
         lambda case: case.shows_camera and case.adjusted is not None and not _has(case, CAMERA),
     ),
+    Check(check_boards, lambda case: case.reconstruction.tracks.boards is not None),
+    Check(check_lengths),
     Check(check_robot, _is_observable),
     Check(check_arm),
     Check(
@@ -62,12 +65,5 @@ CHECKS = (
         lambda case: _is_observable(case) and len(case.names) >= MIN_IMAGES and not _has(case, CAMERA | BENT),
     ),
     Check(check_images),
-    # A unit with a stated standard deviation was used for the scale, and is no check of it.
-    Check(
-        check_network_scale,
-        lambda case: case.reconstruction.is_metric and case.reconstruction.metric_std is None,
-    ),
-    Check(check_depth_camera, lambda case: case.hand_eye.converged),
-    Check(check_scale_source),
     Check(check_reconstruction),
 )

@@ -1,0 +1,62 @@
+"""Simulated captures with a printed sheet on the table, flat or bent, without images."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from benchmarks.simulated.faults import INTRINSICS, FaultyCapture
+from jcr.camera import project
+from jcr.geometry import apply, inverse, rotation_exp, transform
+from jcr.records import Boards, Body
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sheet:
+    """A chessboard that lies among the other things, and what its user states of it."""
+
+    corners: tuple[int, int] = (9, 6)
+    side_m: float = 0.025
+    stated_m: float | None = 0.025
+    """None: unknown."""
+    bend_m: float = 0.0
+    """By how much its short edges are above its middle."""
+    size_error: float = 0.0
+    """Relative, of the printed size over `side_m`."""
+    noise_px: float = 0.1
+    """One sigma of a coordinate of a corner."""
+
+
+def with_sheet(found: FaultyCapture, rng: np.random.Generator, sheet: Sheet) -> FaultyCapture:
+    """The same capture with the corners of a sheet among its points, in the images that show all of it."""
+    grid = np.stack(np.meshgrid(*map(np.arange, sheet.corners)), axis=-1).reshape(-1, 2).astype(float)
+    grid = np.column_stack([grid - grid.mean(0), np.zeros(len(grid))])
+    printed = sheet.side_m * (1 + sheet.size_error) * grid
+    printed[:, 2] = sheet.bend_m * (grid[:, 0] / grid[:, 0].max()) ** 2
+    base_from_sheet = transform(
+        rotation_exp(np.array([0.0, 0.0, rng.uniform(0, np.pi)])), np.array([0.5, 0.0, 0.005])
+    )
+    x_in_base = apply(base_from_sheet, printed)
+    tracks = found.tracks
+    first, image, x_px = len(tracks.points_in_recon), [tracks.image], [tracks.x_px]
+    for k, camera in enumerate(found.base_from_camera):
+        seen = project(found.intrinsics, apply(inverse(camera), x_in_base))
+        if ((seen > 0) & (seen < [INTRINSICS.width, INTRINSICS.height])).all():
+            image.append(np.full(len(grid), k))
+            x_px.append(seen + sheet.noise_px * rng.normal(size=seen.shape))
+    row = first + np.arange(len(grid))
+    unit = 1.0 if sheet.stated_m is None else sheet.stated_m
+    boards = Boards(
+        spec=f"chessboard:{sheet.corners[0]}x{sheet.corners[1]}:{'SIDE' if sheet.stated_m is None else unit}",
+        side=unit,
+        size_std=None if sheet.stated_m is None else 0.002,
+        bodies=(Body(0, row, unit * grid),),
+    )
+    with_corners = replace(
+        tracks,
+        image=np.concatenate(image),
+        x_px=np.concatenate(x_px),
+        point=np.concatenate([tracks.point, *[row] * (len(image) - 1)]),
+        points_in_recon=np.concatenate([tracks.points_in_recon, x_in_base]),
+        boards=boards,
+    )
+    return replace(found, tracks=with_corners)

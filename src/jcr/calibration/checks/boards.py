@@ -1,0 +1,71 @@
+"""Boards and tags beside features: where they were found, how large and how bent they are."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.adjust.robots import Adjusted, size_of_boards
+from jcr.calibration.case import Case, Checked
+from jcr.geometry import apply
+from jcr.records import BoardFound, Boards, Finding, Kind
+
+
+def check_boards(case: Case) -> Checked:
+    """What became of the boards that were to be looked for, and what size the robot makes of them."""
+    boards = case.reconstruction.tracks.boards
+    assert boards is not None
+    findings = list[Finding]()
+    if not boards.bodies:
+        details = {"board": boards.spec} | ({"proposed": boards.proposed} if boards.proposed else {})
+        findings.append(
+            Finding(kind=Kind.BOARD_NOT_FOUND, severity="warns", mend="reconstruction", details=details)
+        )
+    if boards.elsewhere:
+        elsewhere = [case.names[row] for row in boards.elsewhere]
+        findings.append(Finding.of(Kind.BOARD_MOVED, "warns", "images", *elsewhere, board=boards.spec))
+    hand_eye = case.hand_eye
+    if case.adjusted is None or case.adjusted.given.evidence.problem.observations.boards is None:
+        return Checked(tuple(findings))
+    found = board_found(case.adjusted, boards)
+    if boards.size_std is None and hand_eye.before is not None:
+        side = 1e-3 * found.side_mm, 1e-3 * found.side_std_mm
+        findings.append(Finding.of(Kind.BOARD_SIDE, "informs", value=side[0], std=side[1], board=boards.spec))
+    evidence = replace(hand_eye.scale_evidence, board=found)
+    return Checked(tuple(findings), replace(hand_eye, scale_evidence=evidence))
+
+
+def board_found(adjusted: Adjusted, boards: Boards) -> BoardFound:
+    """The boards as an adjustment has them."""
+    evidence, placed = adjusted.given.evidence, adjusted.placed
+    problem, scene = evidence.problem, placed.scene
+    shapes = problem.observations.boards
+    assert shapes is not None
+    size, by_unknown = size_of_boards(placed, adjusted.given)
+    side_mm = 1e3 * boards.side * float(np.exp(size))
+    std = float(np.sqrt(by_unknown @ adjusted.covariance @ by_unknown))
+    of_corners = np.isin(problem.observations.point, shapes.point)
+    shape = scene.camera_steps[problem.freedom.board_columns]
+    height_mm = 1e3 * placed.scale * np.exp(shape[0]) * shapes.bend(shape)
+    numbers = np.unique(shapes.body)
+    rigs = scene.world_from_rig[shapes.first_rig + numbers]
+    normals = rigs[:, :3, 2] @ placed.z[0][:3, :3].T
+    points = apply(placed.z[0], placed.scale * scene.points_in_world[shapes.point])
+    return BoardFound(
+        spec=boards.spec,
+        bodies=len(numbers),
+        images=len(np.unique(problem.observations.image[of_corners])),
+        corners=len(shapes.point),
+        side_mm=side_mm,
+        side_std_mm=side_mm * std,
+        stated_mm=None if boards.size_std is None else 1e3 * boards.side,
+        rms_px=float(np.sqrt((evidence.view.residual_px[of_corners] ** 2).mean())),
+        bend_mm=max(float(np.ptp(height_mm[shapes.body == k])) for k in numbers),
+        centres_in_base=tuple(_xyz(points[shapes.body == k].mean(0)) for k in numbers),
+        tilts_deg=tuple(np.degrees(np.arccos(np.abs(normals[:, 2]).clip(0, 1))).tolist()),
+    )
+
+
+def _xyz(x: Float[ndarray, "3"]) -> tuple[float, float, float]:
+    return float(x[0]), float(x[1]), float(x[2])

@@ -1,0 +1,202 @@
+"""Lengths beside the robot's positions: boards, a known length, a depth camera, a network that predicts metres.
+
+Each is compared with the robot's positions and with each other. Where none contradicts another the scale is their
+weighted mean: they are priors in the mixed model, which weighs the robot's positions as their errors deserve. Where two
+contradict each other, the scale stays the robot's, and a finding names the two.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.adjust.robots import Adjusted, KnownLength, size_of_boards
+from jcr.adjust.together import with_lengths
+from jcr.calibration.adjust import refined_by
+from jcr.calibration.case import Case, Checked
+from jcr.calibration.checks.depth_camera import depth_check
+from jcr.calibration.cues import CONTRADICTED, length_cue
+from jcr.handeye.equation import SCALE
+from jcr.handeye.solve import judged
+from jcr.records import Finding, HandEye, Kind, LengthCheck, LengthName, ScaleCheck, ScaleEvidence
+
+DEPTH_STD, NETWORK_STD = 0.02, 0.05
+"""Relative, of the metre of depth cameras, which are off by a few percent, and of networks, at times by ten."""
+ROBOT_STD = 0.002
+"""Relative: by how much a robot's positions may be too long all alike, which no pose shows and its covariance leaves
+out. To pull the scale towards a board where that is why they differ bends the transform: by 1.1 mm where positions are
+1 % too long."""
+SIGMAS = 3.5
+"""Standard deviations of a difference from which two lengths contradict each other."""
+LEAST = 0.005
+"""And its least size: the robot's own covariance leaves out what is wrong with its lengths all alike."""
+EXACT = 0.015
+"""Relative standard deviation of a length that is exact enough to reject a calibration by."""
+WORTH = 10.0
+"""Standard deviations of the robot's scale: a length less exact than that hardly moves it, and is compared alone."""
+Name = LengthName | Literal["robot"]
+
+
+@dataclass(frozen=True)
+class Length:
+    """Logarithm of how much longer it is by the robot's positions than as stated, and one sigma of its own."""
+
+    name: Name
+    off: float
+    std: float
+
+
+def check_lengths(case: Case) -> Checked:
+    """The scale with every length that is known, or which two of them contradict each other."""
+    hand_eye, lengths = _measured(case)
+    if not lengths:
+        return Checked(_from_robot_alone(case, hand_eye), hand_eye)
+    robot = Length("robot", 0.0, float(np.sqrt(hand_eye.covariance[6, 6])))
+    pair = contradiction([robot, *lengths]) if hand_eye.converged else None
+    is_made_of_images = hand_eye.converged and case.adjusted is not None and hand_eye.before is not None
+    worth = (
+        [one for one in lengths if one.std < WORTH * robot.std] if is_made_of_images and pair is None else []
+    )
+    checks = tuple(
+        LengthCheck(
+            name=one.name,
+            robot_longer_percent=100 * float(np.expm1(one.off)),
+            std_percent=100 * one.std,
+            used=one in worth,
+        )
+        for one in lengths
+        if one.name != "robot"
+    )
+    hand_eye = _with(hand_eye, lengths=checks)
+    if pair is not None:
+        return Checked((_finding(*pair, hand_eye), *_from_robot_alone(case, hand_eye)), hand_eye)
+    return _fused(case, hand_eye, worth) if worth else Checked(_from_robot_alone(case, hand_eye), hand_eye)
+
+
+def _measured(case: Case) -> tuple[HandEye, list[Length]]:
+    """The lengths that a case has, and the calibration with what was measured of them."""
+    hand_eye, found = case.hand_eye, list[Length]()
+    boards, adjusted = case.reconstruction.tracks.boards, case.adjusted
+    if adjusted is not None and boards is not None and hand_eye.before is not None:
+        found.extend(_of_boards(adjusted, boards.size_std))
+    if case.options.known_length is not None and case.cues is None:
+        image, *ends, length_mm = case.options.known_length
+        ends_px = np.array(ends).reshape(2, 2)
+        scale, std = length_cue(case.capture, case.reconstruction, image, ends_px, length_mm / 1e3)
+        found.append(Length("known length", float(np.log(hand_eye.scale / scale)), std))
+    if hand_eye.converged and (depth := depth_check(case.capture, case.reconstruction, hand_eye)) is not None:
+        off_std = np.hypot(
+            DEPTH_STD, np.sqrt(max((depth.std_percent / 100) ** 2 - hand_eye.covariance[6, 6], 0.0))
+        )
+        found.append(Length("depth camera", -float(np.log1p(depth.off_percent / 100)), float(off_std)))
+        hand_eye = _with(hand_eye, depth=depth)
+    # A unit with a stated standard deviation was used for the scale, and is no check of it.
+    if case.reconstruction.is_metric and case.reconstruction.metric_std is None:
+        # A network's length of 1 is `scale` metres by the robot.
+        found.append(Length("network", float(np.log(hand_eye.scale)), NETWORK_STD))
+        hand_eye = _with(hand_eye, network=_network_check(hand_eye))
+    return hand_eye, found
+
+
+def _of_boards(adjusted: Adjusted, size_std: float | None) -> Iterator[Length]:
+    """The size of the boards, where it is known and they were adjusted."""
+    if size_std is None or adjusted.given.evidence.problem.observations.boards is None:
+        return
+    off, by_unknown = size_of_boards(adjusted.placed, adjusted.given)
+    together = float(by_unknown @ adjusted.covariance @ by_unknown)
+    of_images = max(together - float(adjusted.covariance[SCALE, SCALE].item()), 0.0)
+    yield Length("board", off, float(np.hypot(np.sqrt(of_images), size_std)))
+
+
+def _network_check(hand_eye: HandEye) -> ScaleCheck:
+    std_percent = 100 * float(np.sqrt(hand_eye.covariance[6, 6])) / hand_eye.scale
+    return ScaleCheck(100 * (1 / hand_eye.scale - 1), std_percent)
+
+
+def _with(hand_eye: HandEye, **measured: object) -> HandEye:
+    evidence: ScaleEvidence = replace(hand_eye.scale_evidence, **measured)
+    return replace(hand_eye, scale_evidence=evidence)
+
+
+def contradiction(lengths: list[Length]) -> tuple[Length, Length] | None:
+    """The two that contradict each other most surely; None where none do."""
+
+    def sigmas(pair: tuple[Length, Length]) -> float:
+        return abs(pair[0].off - pair[1].off) / float(np.hypot(pair[0].std, pair[1].std))
+
+    worst = max(combinations(lengths, 2), key=sigmas)
+    return worst if sigmas(worst) > SIGMAS and abs(worst[0].off - worst[1].off) > LEAST else None
+
+
+def _finding(one: Length, other: Length, hand_eye: HandEye) -> Finding:
+    """That two lengths contradict each other; the robot is the first where it is one of them."""
+    off, std = other.off - one.off, float(np.hypot(one.std, other.std))
+    if one.name == "robot" and other.name == "network":
+        check = _network_check(hand_eye)
+        value, of_robot = check.off_percent / 100, check.std_percent / 100
+        return Finding.of(Kind.NETWORK_SCALE, "warns", "poses", value=value, std=of_robot)
+    exact = max(one.std, other.std) < EXACT and abs(off) >= CONTRADICTED[1]
+    kind = Kind.BOARD_SIZE if (one.name, other.name) == ("robot", "board") else Kind.SCALES
+    found = Finding.of(
+        kind,
+        "rejects" if exact and one.name == "robot" else "warns",
+        "poses",
+        value=float(np.expm1(off)),
+        std=std,
+        one=one.name,
+        other=other.name,
+    )
+    of_robot = one.name == "robot" and other.std < EXACT
+    return replace(found, shift=tuple(_shift(off, hand_eye).tolist())) if of_robot else found
+
+
+def _shift(off: float, hand_eye: HandEye) -> Float[ndarray, "7"]:
+    """How far a calibration would move if the robot's positions were too long: all that is in its metre is shorter."""
+    return -off * np.r_[hand_eye.gripper_from_camera[:3, 3], np.zeros(3), 1.0]
+
+
+def _from_robot_alone(case: Case, hand_eye: HandEye) -> tuple[Finding, ...]:
+    """That the scale comes from the robot's positions alone, where nothing was compared with it but a network."""
+    compared = any(one.name != "network" for one in hand_eye.scale_evidence.lengths)
+    if compared or case.cues is not None or case.reconstruction.metric_std is not None:
+        return ()
+    return (Finding.of(Kind.SCALE_FROM_ROBOT, "informs"),)
+
+
+def _fused(case: Case, hand_eye: HandEye, lengths: list[Length]) -> Checked:
+    """The calibration with the lengths as priors of its scale."""
+    assert case.adjusted is not None
+    placed, boards = case.adjusted.most_likely, case.reconstruction.tracks.boards
+    known = [
+        KnownLength(log_scale=0.0, std=float(np.hypot(boards.size_std, ROBOT_STD)), of_boards=True)
+        if one.name == "board" and boards is not None and boards.size_std is not None
+        else KnownLength(
+            log_scale=float(np.log(placed.scale)) - one.off, std=float(np.hypot(one.std, ROBOT_STD))
+        )
+        for one in lengths
+    ]
+    adjusted = with_lengths(case.adjusted, known)
+    refined = refined_by(case, adjusted)
+    estimate = refined.estimate
+    # What the best of the lengths differs by, beyond what both may be off by, may be the robot's.
+    best = min(lengths, key=lambda one: one.std)
+    beyond = best.off**2 - best.std**2 - float(hand_eye.covariance[6, 6])
+    if best.std < EXACT and beyond > 0:
+        shift = _shift(float(np.sqrt(beyond)), hand_eye)
+        estimate = estimate.with_fault(np.outer(shift, shift))
+    for one in hand_eye.findings:
+        if one.shift is not None:
+            of_camera = one.intrinsics_shift
+            shifts = None if of_camera is None else (np.array(one.shift), np.array(of_camera))
+            estimate = estimate.with_fault(one.covariance, shifts)
+    evidence, longer = hand_eye.scale_evidence, estimate.scale / hand_eye.scale
+    if evidence.depth is not None:
+        # What is measured with depth images is in the metre that the map has.
+        percent = 100 * ((1 + evidence.depth.off_percent / 100) / longer - 1)
+        evidence = replace(evidence, depth=replace(evidence.depth, off_percent=percent))
+    refined = replace(refined, estimate=estimate, findings=hand_eye.findings, scale_evidence=evidence)
+    return Checked(_from_robot_alone(case, refined), judged(refined), adjusted)

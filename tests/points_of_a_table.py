@@ -1,0 +1,68 @@
+"""Features of images along a table, as a perfect matcher has them, and what the search of pairs makes of them."""
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from jcr.camera import project
+from jcr.geometry import Transforms, apply, inverse, rotation_exp, transform
+from jcr.match.gate import Key
+from jcr.match.matchers import Matcher
+from jcr.match.stage import Matched, match_with_robot
+from jcr.reconstruct.sfm import camera_of
+from jcr.records import Intrinsics
+
+INTRINSICS = Intrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
+IMAGES, STEP_M, HEIGHT_M = 30, 0.1, 0.5
+GRIPPER_FROM_CAMERA = transform(rotation_exp(np.array([0.1, -0.2, 0.4])), np.array([0.03, -0.05, 0.04]))
+
+
+class PointsOfATable:
+    """Features that match without error, of points along a table; a camera sees a fifth of its length."""
+
+    every_pair = 12
+
+    def __init__(self, minds_roll: bool) -> None:
+        rng = np.random.default_rng(0)
+        self.minds_roll = minds_roll
+        points = rng.uniform([-0.3, -0.3, -0.06], [3.2, 0.3, 0.06], (3600, 3))
+        down = transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+        self.base_from_camera = np.stack(
+            [
+                transform(np.eye(3), np.array([STEP_M * k, 0.0, HEIGHT_M]))
+                @ down
+                @ transform(rotation_exp(rng.normal(scale=0.15, size=3)), np.zeros(3))
+                for k in range(IMAGES)
+            ]
+        )
+        self.ids: list[ndarray] = []
+        self.x_px: list[Float[ndarray, "_ 2"]] = []
+        for pose in self.base_from_camera:
+            x_px = project(INTRINSICS, apply(inverse(pose), points))
+            seen = np.flatnonzero(((x_px > 0) & (x_px < [639, 479])).all(1))
+            self.ids.append(seen)
+            self.x_px.append(x_px[seen] + rng.normal(scale=0.3, size=(len(seen), 2)))
+        self.asked: dict[bool, list[Key]] = {True: [], False: []}
+
+        self.base_from_gripper: Transforms = self.base_from_camera @ inverse(GRIPPER_FROM_CAMERA)
+
+    def common(self, key: Key, coarse: bool = False) -> Int[ndarray, "m 2"]:
+        """Rows of the points that two images see; coarse: of every third."""
+        first, second = (self.ids[k] for k in key)
+        both, i, j = np.intersect1d(first, second, return_indices=True)
+        some = both % 3 == 0 if coarse else np.full(len(both), True)
+        return np.stack([i, j], 1)[some]
+
+    def matches(self, pairs: list[Key], rolls: ndarray, coarse: bool = False) -> list[ndarray]:
+        self.asked[coarse] += pairs
+        return [self.common(key, coarse) for key in pairs]
+
+    def descriptors(self, row: int, roll: float) -> tuple[int, ndarray]:
+        raise NotImplementedError
+
+
+def matched_pairs_of(features: PointsOfATable, base_from_gripper: Transforms) -> Matched:
+    """The pairs of all images, by these gripper poses."""
+    matcher = Matcher(features, np.ones(2), camera_of(INTRINSICS, True), True, 0)
+    names = [f"{k}.png" for k in range(IMAGES)]
+    return match_with_robot(matcher, base_from_gripper, INTRINSICS, True, names, (640, 480))
