@@ -85,7 +85,9 @@ EXAMPLES: dict[Kind, dict] = {
     Kind.SCALES: {"value": 0.03, "std": 0.005, "details": {"one": "board", "other": "known length"}},
     Kind.BOARD_SIDE: {"value": 0.0254, "std": 5e-5, "details": {"board": "chessboard:9x6:SIDE"}},
     Kind.BOARD_MOVED: {"images": ("03.png",), "details": {"board": "chessboard:9x6:0.025"}},
-    Kind.BOARD_NOT_FOUND: {"details": {"board": "chessboard:9x6:0.025", "proposed": "aruco:SIDE:DICT_4X4_50"}},
+    Kind.BOARD_NOT_FOUND: {
+        "details": {"board": "chessboard:9x6:0.025", "proposed": "aruco:SIDE:DICT_4X4_50"}
+    },
     Kind.OWN_REJECTED: {"details": {"camera": "wrist"}},
     Kind.FEW_POINTS_SHARED: {"value": 3.0, "images": ("a.png",)},
     Kind.FEW_LOCALISED: {"value": 2.0, "details": {"needed": 3.0}},

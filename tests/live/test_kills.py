@@ -80,7 +80,7 @@ def test_a_killed_capture_loses_nothing_and_ends_at_the_same_numbers(
         process.kill()
         process.join(300)
         if process.exitcode == 0:
-            # The adjustment sums in another order where pairs were found in another one.
+            # From the same images, to the rounding of sums.
             assert np.allclose(result(folder), expected, rtol=1e-6, atol=1e-12)
             ends, folder = ends + 1, tmp_path / f"{ends + 1}"
             continue
