@@ -1,5 +1,7 @@
 """Features of images along a table, as a perfect matcher has them, and what the search of pairs makes of them."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
@@ -53,7 +55,7 @@ class PointsOfATable:
         some = both % 3 == 0 if coarse else np.full(len(both), True)
         return np.stack([i, j], 1)[some]
 
-    def matches(self, pairs: list[Key], rolls: ndarray, coarse: bool = False) -> list[ndarray]:
+    def matches(self, pairs: Sequence[Key], rolls: ndarray, coarse: bool = False) -> list[ndarray]:
         self.asked[coarse] += pairs
         return [self.common(key, coarse) for key in pairs]
 

@@ -16,6 +16,8 @@ from jcr.adjust.scene import Freedom, Observations, Scene, similarities, stepped
 from jcr.adjust.wrist import adjust_wrist
 from jcr.geometry import inverse, step_between
 
+pytestmark = pytest.mark.slow
+
 
 def adjusted(seed: int, sheet: Sheet, images: int = 8) -> Adjusted:
     rng = np.random.default_rng(seed)

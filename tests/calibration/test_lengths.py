@@ -14,6 +14,8 @@ from jcr.geometry import step_between
 from jcr.records import Finding, HandEye, Kind
 from jcr.records.words import sentence
 
+pytestmark = pytest.mark.slow
+
 
 def calibrated(sheet: Sheet | None, pose_scale: float = 1.0, seed: int = 0) -> tuple[HandEye, np.ndarray]:
     """12 images, and the true transform."""

@@ -29,9 +29,9 @@ from jcr.records import Capture
 
 MINE = """
         Backend(
-            "mine",
-            lambda capture, options, progress: (options.backend, len(capture)),
-            "MIT",
+            name="mine",
+            reconstruct=lambda capture, options, progress: (options.backend, len(capture)),
+            licence="MIT",
             metric=True,
             auto=True,
             options=("weights",),

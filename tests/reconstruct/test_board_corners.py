@@ -17,6 +17,8 @@ from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_recons
 from jcr.records import Capture, Kind, Reconstruction
 from jcr.records.words import sentence
 
+pytestmark = pytest.mark.slow
+
 SPEC = "chessboard:9x6:0.025"
 GRID = np.column_stack(
     [0.025 * np.stack(np.meshgrid(np.arange(9.0), np.arange(6.0)), -1).reshape(-1, 2), np.zeros(54)]

@@ -115,7 +115,7 @@ def _open_closed_streams() -> None:
 def dispatch(arguments: Sequence[str]) -> int:
     """The exit status of one command line."""
     if not arguments or arguments[0] in ("-h", "--help"):
-        sys.stdout.write(_OVERVIEW.format(commands="\n\n".join(map(_listed, GROUPS))))
+        sys.stdout.write(_OVERVIEW.format(commands="\n\n".join(_listed(group) for group in GROUPS)))
         return 0
     name, rest = arguments[0], arguments[1:]
     if name == "--version":
