@@ -80,7 +80,8 @@ def test_a_killed_capture_loses_nothing_and_ends_at_the_same_numbers(
         process.kill()
         process.join(300)
         if process.exitcode == 0:
-            assert np.array_equal(result(folder), expected)
+            # From the same images, to the rounding of sums.
+            assert np.allclose(result(folder), expected, rtol=1e-6, atol=1e-12)
             ends, folder = ends + 1, tmp_path / f"{ends + 1}"
             continue
         assert process.exitcode == -9
