@@ -104,7 +104,7 @@ def photographed(sheet: np.ndarray, base_from_camera: np.ndarray, seed: int) -> 
 
 @cache
 def photographs(sheet: Callable[[], np.ndarray]) -> tuple[HandEyeProblem, list[np.ndarray]]:
-    """Eight views and their images, of which each is drawn once for all tests."""
+    """Eight views and their images; each image is drawn once for all tests."""
     problem = hand_eye_problem(np.random.default_rng(3), 8)
     base_from_camera = problem.base_from_gripper @ problem.gripper_from_camera
     return problem, [photographed(sheet(), pose, k) for k, pose in enumerate(base_from_camera)]
