@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8, UInt16
 from numpy import ndarray
 
-from jcr.calibration.case import Case, some_of_many
+from jcr.calibration.case import Case, of_points
 from jcr.calibration.checks.left_out import SAME
 from jcr.calibration.checks.views import STILL as MOVED
 from jcr.calibration.expected import FEWEST, assumed_of
@@ -32,7 +32,7 @@ from jcr.live.look import STILL, grid
 from jcr.live.next_pose import Reach, before_calibration, proposed
 from jcr.options import checked_options
 from jcr.reconstruct.growing import Growing
-from jcr.records import Capture, Finding, HandEye, Intrinsics, Kind, strongest_first
+from jcr.records import Capture, Finding, HandEye, Intrinsics, Kind, Tracks, strongest_first
 
 if TYPE_CHECKING:
     from jcr.results import RunResult
@@ -255,7 +255,7 @@ class LiveCalibration:
         if capture is None or made is None or len(registered) < FEWEST:
             state = replace(state, findings=strongest_first([*of_images, *_too_few(len(names))]))
             return replace(state, **before_calibration(capture, self._reach))
-        tracks = some_of_many(made.tracks, min(OBSERVATIONS[0] * len(registered), OBSERVATIONS[1]))
+        tracks = _longest(made.tracks, min(OBSERVATIONS[0] * len(registered), OBSERVATIONS[1]))
         made = replace(made, tracks=tracks)
         robot = robot_errors(capture, self._options).of(made.image_index)
         try:
@@ -318,6 +318,21 @@ def _first(capture: Capture, count: int) -> Capture:
     return replace(
         capture, images=capture.images[:count], base_from_gripper=capture.base_from_gripper[:count]
     )
+
+
+def _longest(tracks: Tracks, most: int) -> Tracks:
+    """The points that most images see, until there are `most` observations.
+
+    Among points of as many images the fraction of a pixel decides: as good as chance, and the same choice of points
+    however the map was grown.
+    """
+    count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
+    fraction = np.ones(len(count))
+    np.minimum.at(fraction, tracks.point, tracks.x_px[:, 0] % 1.0)
+    order = np.lexsort([fraction, -count])
+    chosen = tracks.on_board
+    chosen[order[np.cumsum(count[order]) <= most]] = True
+    return of_points(tracks, chosen)
 
 
 def _too_few(images: int) -> list[Finding]:

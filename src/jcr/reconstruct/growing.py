@@ -49,8 +49,10 @@ FEW = 5
 """Images up to which all are mapped again with each: the first pair may have been an unlucky one."""
 AGAIN = 1.3
 """Growth of the number of images after which all are mapped again where images stay out of the map."""
+ADJUSTED_TOGETHER = 16
+"""Images up to which all cameras and points are adjusted with each, and not only those near the new image."""
 ADJUSTED_AGAIN = 1.5
-"""Growth of the number of images after which all cameras and points are adjusted, not only those near the new image."""
+"""Growth of the number of images after which all are adjusted beyond that."""
 LEAST_INLIERS = 15
 """Points by which an image is registered."""
 LEAST_AGAINST = 3
@@ -260,6 +262,7 @@ class Growing:
                 row + 1,
             )
         mapper.end_reconstruction(False)
-        if len(self._rows) >= ADJUSTED_AGAIN * self._adjusted_of:
+        count = len(self._rows)
+        if count <= ADJUSTED_TOGETHER or count >= ADJUSTED_AGAIN * self._adjusted_of:
             adjust_robustly(self._model, fix_intrinsics=self._known)
-            self._adjusted_of = len(self._rows)
+            self._adjusted_of = count
