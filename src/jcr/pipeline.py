@@ -173,7 +173,7 @@ def add_camera(
 ) -> RunResult:
     """Locate a fixed camera from its images of the scene of the run folder `out`.
 
-    `images` are one file or more (`pictures`, their name in 0.1.0, is removed in 0.2.0). `intrinsics` is a JSON file in
+    `images` are one file or more (`pictures`, their name in 0.1.0, is removed in 0.3.0). `intrinsics` is a JSON file in
     the form of capture.json; None: they are estimated. The camera becomes part of the run, of cameras.json and of the
     report. Raises InputError if the images are not from one camera or do not fit the intrinsics, and RejectedError,
     writing nothing, if they do not determine the camera's pose or the run is rejected.

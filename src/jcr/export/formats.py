@@ -48,7 +48,7 @@ def export_run(
     """Export the run folder `out` in a format of `jcr export` and return the path of the new file or folder.
 
     `options` are those of the command line; `named` are single ones of them, as 0.1.0 took them, and are removed in
-    0.2.0. Raises InputError as the command does, and RejectedError if the calibration is rejected; with `force` it is
+    0.3.0. Raises InputError as the command does, and RejectedError if the calibration is rejected; with `force` it is
     exported, and the file contains the reason.
     """
     if named:
