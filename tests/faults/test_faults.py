@@ -553,7 +553,7 @@ def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(
 
 
 ARRAYS = {
-    "jcr.reconstruction/7": {
+    "jcr.reconstruction/8": {
         "about", "image_index", "recon_from_camera", "track_image", "track_point", "track_points_in_recon",
         "track_std_px", "track_x_px", "tracks_from_board", "tracks_from_pointmaps",
     },
@@ -570,7 +570,8 @@ def test_a_reconstruction_of_another_version_is_distinguished(
     about = json.loads(str(arrays["about"]))
     assert ARRAYS[about["format"]] == set(arrays)
     assert set(about) == {
-        "format", "backend", "is_metric", "metric_std", "notes", "warnings", "intrinsics", "pointmap_intrinsics"
+        "format", "backend", "is_metric", "metric_std", "notes", "warnings", "intrinsics", "pointmap_intrinsics",
+        "boards",
     }  # fmt: skip
     with np.load(done / "depth.npz") as file:
         assert ARRAYS[json.loads(str(file["about"]))["format"]] == set(file)
@@ -581,7 +582,7 @@ def test_a_reconstruction_of_another_version_is_distinguished(
     np.savez(out / "reconstruction.npz", **arrays | {"about": np.array(old)})
     assert dispatch(["map", str(out), "--quiet"]) == 2
     said = capsys.readouterr().err
-    assert "'jcr.reconstruction/1', not 'jcr.reconstruction/7'; delete it and run again" in said
+    assert "'jcr.reconstruction/1', not 'jcr.reconstruction/8'; delete it and run again" in said
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from jcr.geometry import require_rigid
 from jcr.intrinsics_json import IntrinsicsJson, Positive
 from jcr.records import Boards, Body, CameraEvidence, Pointmaps, Reconstruction, Tracks
 
-FORMAT = "jcr.reconstruction/7"
+FORMAT = "jcr.reconstruction/8"
 """Changes with what the file holds."""
 WITH_DEPTH = "jcr.reconstruction/5"
 """Read as well: it holds estimated depth as pointmaps without confidence, and no standard deviations of observations."""
