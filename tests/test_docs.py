@@ -209,8 +209,8 @@ def test_architecture_names_what_there_is():
 
 
 def test_image_shows_what_there_is():
-    drawn = (ROOT / "docs" / "explanation" / "rooms.svg").read_text()
-    assert drawn == runpy.run_path(str(ROOT / "docs" / "explanation" / "rooms.py"))["picture"]()
+    drawn = (ROOT / "docs" / "explanation" / "packages.svg").read_text()
+    assert drawn == runpy.run_path(str(ROOT / "docs" / "explanation" / "packages.py"))["drawing"]()
     names = re.findall(r'<text class="name"[^>]*>([^<]*)<', drawn)
     shown = {
         name if name.endswith(("/", ".py")) else f"{name}.py"

@@ -119,7 +119,7 @@ def verify(
 ) -> Verification:
     """Hold the calibration in the run folder `out` against the few images of `new`, a capture or its path.
 
-    Raises InputError for a run that holds no accepted calibration, or images of another camera; NotTrustedError
+    Raises InputError for a run that holds no accepted calibration, or images of another camera; RejectedError
     when the images share too few features with the old scene, or too few of another, to tell.
     """
     report, options = progress or silent, checked_options(options, VerifyOptions)
@@ -219,7 +219,7 @@ def verify_camera(
     """Hold the place of a fixed camera of the run folder `out` against new images of the same scene by it.
 
     Both places are found together, so that what the wrist camera's calibration leaves open moves them alike. Raises
-    InputError where the run has placed no fixed camera of that name, or the images cannot be its; NotTrustedError
+    InputError where the run has placed no fixed camera of that name, or the images cannot be its; RejectedError
     where they share too few features with the scene.
     """
     from jcr.cell.stage import place_cameras  # pycolmap, which help need not wait for

@@ -119,7 +119,7 @@ FILMED = """
     from jcr.live.devices import opened
     with opened("realsense:" + sys.argv[1]) as camera:
         frames = list(camera.frames)
-    rays = [rs.rs2_deproject_pixel_to_point(record_realsense.lens(rs), x, 1.0) for x in json.loads(sys.argv[2])]
+    rays = [rs.rs2_deproject_pixel_to_point(record_realsense.intrinsics(rs), x, 1.0) for x in json.loads(sys.argv[2])]
     depth = np.unique(frames[0].depth_mm).tolist()
     print(json.dumps([len(frames), frames[0].image.shape, depth, camera.intrinsics, rays]))
 """

@@ -21,7 +21,7 @@ def fitted(
 ) -> Case:
     """The case of a capture and its reconstruction, fitted to camera poses.
 
-    `robot` is of the registered images' poses. Raises NotTrustedError with fewer than two registered images.
+    `robot` is of the registered images' poses. Raises RejectedError with fewer than two registered images.
     """
     registered = len(reconstruction.image_index)
     if registered < 2:

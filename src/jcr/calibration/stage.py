@@ -27,7 +27,7 @@ def calibrate(
     Camera poses that come with their covariance are weighed with it, and that is all. Else bundle adjustment
     follows on correspondences found in the images; on those between pointmaps, whose errors neighbours share,
     its result stands only where its leave-one-out error is smaller. Raises InputError for options that cannot be, and
-    NotTrustedError with fewer than two registered images.
+    RejectedError with fewer than two registered images.
     """
     check_options(options := options or CalibrateOptions())
     robot = robot_errors(capture, options).of(reconstruction.image_index)

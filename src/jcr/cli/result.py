@@ -23,7 +23,7 @@ def show_calibration(result: "RunResult | SavedRun | PosesResult", output: Outpu
 def show(result: "RunResult | SavedRun | PosesResult", output: Output, after: str = "") -> int:
     """Print what follows the calibration: further cameras, the verdict and `after` it; doubts and notes on stderr.
 
-    Returns exit status 0, or raises NotTrustedError where it is rejected.
+    Returns exit status 0, or raises RejectedError where it is rejected.
     """
     from jcr.calibration.words import verdict_in_words
     from jcr.cell.cameras_json import in_words

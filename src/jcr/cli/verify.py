@@ -65,7 +65,7 @@ def main(arguments: Arguments) -> int:
 
 
 def _print_found(found: "Verification", output: Output) -> int:
-    """Print it; NotTrustedError where something has moved."""
+    """Print it; RejectedError where something has moved."""
     from jcr.errors import RejectedError
 
     output.result(_as_text(found), _as_json(found))

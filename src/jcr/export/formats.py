@@ -65,7 +65,7 @@ def written(
     """Write a run folder in a format, and return what was exported, the row of the table and the path.
 
     Raises InputError for a format that does not exist, options that it cannot serve, and a run that lacks what it
-    needs; NotTrustedError for a calibration that is rejected, unless `options` force it.
+    needs; RejectedError for a calibration that is rejected, unless `options` force it.
     """
     row = next((row for row in FORMATS if row.name == format), None)
     if row is None:

@@ -390,7 +390,7 @@ def reconstruct(
 ) -> Reconstruction:
     """The capture reconstructed by the back end that `options` names.
 
-    Raises InputError for a back end that is not there, NotTrustedError when it finds too little.
+    Raises InputError for a back end that is not there, RejectedError when it finds too little.
     """
     options = options or ReconstructOptions()
     row = BACKENDS[candidates(options)[0]]

@@ -25,7 +25,7 @@ def reconstruct(
 ) -> Reconstruction:
     """Camera poses and tracks of a capture, up to one similarity.
 
-    Known intrinsics are held, unknown ones are estimated. Raises NotTrustedError when fewer than three images
+    Known intrinsics are held, unknown ones are estimated. Raises RejectedError when fewer than three images
     register: how many did, the likely reason, and what to do instead.
     """
     from jcr.match.kept import KeptFeatures

@@ -35,7 +35,7 @@ def reconstruct_given(
 ) -> Reconstruction:
     """The capture's images that the model at `cameras` knows, with its poses fixed.
 
-    Raises InputError when the model knows fewer than three, NotTrustedError when nothing can be triangulated.
+    Raises InputError when the model knows fewer than three, RejectedError when nothing can be triangulated.
     """
     report = progress or silent
     reader = colmap_model if cameras.is_dir() else transforms_json

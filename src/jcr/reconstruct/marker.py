@@ -44,7 +44,7 @@ def reconstruct_marker(
     """Cameras in metres, or in sides of unknown length; the recon frame is the board's, or that of the tag seen most.
 
     `look_for` names the board as `board.KINDS` has it. Unknown intrinsics are calibrated from the board. Raises
-    InputError for a board that is none, and NotTrustedError when fewer than three images show it.
+    InputError for a board that is none, and RejectedError when fewer than three images show it.
     """
     report = progress or silent
     readings = boards(look_for)

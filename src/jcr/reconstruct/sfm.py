@@ -81,8 +81,8 @@ def structure_from_motion(
     With gripper poses the robot checks the matches (`match.stage`); `names` are those of the images, for notes. SIFT
     features and pairs that are `kept` are not found again.
 
-    A `known` intrinsics are the only ones of `lenses`, do not fold over, and are held; unknown ones are starting
-    points, tried in turn, for a focal length and two radial coefficients. Raises NotTrustedError when fewer
+    A `known` intrinsics are the only ones of `all_intrinsics`, do not fold over, and are held; unknown ones are starting
+    points, tried in turn, for a focal length and two radial coefficients. Raises RejectedError when fewer
     than three images register.
     """
     seed = options.seed

@@ -73,7 +73,7 @@ def reconstruct_direct(
 
     Known intrinsics stay, else a focal length is estimated. The unit is the robot's metre only roughly, the frame
     is the first camera's; `evidence` has the covariance. Raises InputError with fewer than three images, and
-    NotTrustedError where another place of the camera fits as well, or too few pixels are explained.
+    RejectedError where another place of the camera fits as well, or too few pixels are explained.
     """
     if len(capture) < 3:
         raise InputError(f"direct alignment needs 3 images or more, there are {len(capture)}; take more")
@@ -139,7 +139,7 @@ def images_that_fit(
     """The images that show what the others do, and their cameras on the robot's poses, which the rest do not bend.
 
     Each image shows a share of the other images' points in their colour. One whose share is far below the others' even
-    when its camera is free is not where the robot reports it, or not of this scene. Raises NotTrustedError where fewer
+    when its camera is free is not where the robot reports it, or not of this scene. Raises RejectedError where fewer
     than three are left.
     """
     rows = np.arange(level.count)

@@ -43,7 +43,7 @@ def search(
     intrinsics_known: bool,
     report: Progress,
 ) -> Found:
-    """The hand-eye transform under which colours agree best; NotTrustedError where a different one is as good."""
+    """The hand-eye transform under which colours agree best; RejectedError where a different one is as good."""
     if not len(strongest(levels[COARSEST.height], COARSEST.per_image)[0]):
         raise RejectedError(
             "direct alignment: the images show one colour and no edges", "put different objects in view"

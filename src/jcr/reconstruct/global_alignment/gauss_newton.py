@@ -190,7 +190,7 @@ def gauss_newton(
     """Iterate until no unknown moves by more than `tolerance` (rad, or relative).
 
     The weights, and the spread of the pairs' errors, are measured again in each iteration, and depths and pairs' errors
-    eliminated: neither is a problem for least_squares.py. Raises NotTrustedError where the pointmaps do not determine
+    eliminated: neither is a problem for least_squares.py. Raises RejectedError where the pointmaps do not determine
     the unknowns.
     """
     for iteration in range(1, ITERATIONS + 1):
@@ -226,7 +226,7 @@ class _Linearised:
 def _linearised(
     images: list[ImageObservations], state: State, layout: Layout, pair_spread: Float[ndarray, "6"]
 ) -> tuple[list[Noise], list[_Linearised]]:
-    """Noise of every image's pointmaps, and the equations weighted by it; NotTrustedError where they are singular."""
+    """Noise of every image's pointmaps, and the equations weighted by it; RejectedError where they are singular."""
     misfit = [residuals(o, state, log_depth) for o, log_depth in zip(images, state.log_depth, strict=True)]
     noise = measure_noise(images, misfit)
     observer_axes = adjoint(inverse(state.recon_from_camera))
@@ -245,7 +245,7 @@ def _linearised(
 
 
 def _step(linearised: list[_Linearised], layout: Layout, cameras: Cameras) -> Float[ndarray, " p"]:
-    """The step of all unknowns that are not eliminated; the cameras take theirs. NotTrustedError where it is none."""
+    """The step of all unknowns that are not eliminated; the cameras take theirs. RejectedError where it is none."""
     hessian, gradient = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
     for image in linearised:
         hessian += image.selection.T @ (image.selection.T @ image.reduced.hessian).T

@@ -1,4 +1,4 @@
-"""Draws tabletop.png, the picture of the README: `python docs/picture.py RUN`, where RUN is a run of examples/tabletop.
+"""Draws tabletop.png of the manual: `python docs/tabletop.py RUN`, where RUN is a run of examples/tabletop.
 
 Left a photo; right the map in the base frame, sampled where predicted occupancy is high, in
 predicted colours, with the camera on the gripper at that photo and its other places.

@@ -1,6 +1,6 @@
-"""Draws rooms.svg, the picture of architecture.md: `python docs/explanation/rooms.py` writes it beside this file.
+"""Draws packages.svg, the drawing of architecture.md: `python docs/explanation/packages.py` writes it beside this file.
 
-The colours follow the reader's light or dark mode; the ground is opaque, so that the picture can be read on any page.
+The colours follow the reader's light or dark mode; the ground is opaque, so that the drawing can be read on any page.
 """
 
 from html import escape
@@ -168,7 +168,7 @@ def flow(tops: dict[str, float]) -> list[str]:
     return drawn
 
 
-def picture() -> str:
+def drawing() -> str:
     """The whole SVG."""
     drawn, tops, top = [], {}, float(TOP)
     for rooms in ROWS:
@@ -195,4 +195,4 @@ def picture() -> str:
 
 
 if __name__ == "__main__":
-    Path(__file__).with_name("rooms.svg").write_text(picture())
+    Path(__file__).with_name("packages.svg").write_text(drawing())
