@@ -10,14 +10,14 @@ The command line does the same: `jcr capture captures/table --camera 0 --poses u
 import shutil
 import sys
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import jcr
 from jcr.capture.images import read_image
 from jcr.live.arm_words import ArmWords
 from jcr.live.camera import Camera, Frame, Recorded
-from jcr.live.collect import CollectOptions, collect
+from jcr.live.collect import CollectOptions, LiveCapture
 from jcr.live.devices import opened
 from jcr.live.folder import LiveFolder
 from jcr.live.rest import asks_at_rest
@@ -44,15 +44,16 @@ with ExitStack() as until_done:
         out, host, port, images = Path("out/ur_robot"), "127.0.0.1", arm.port, 5
         seen = Recorded(simulated_camera(table, arm))
         camera = Camera(seen, seen.latest)
-        shutil.rmtree(out, ignore_errors=True)  # a real one is gone on with
+        shutil.rmtree(out, ignore_errors=True)  # a real one is resumed
 
     def tell(answer, lines):
-        """Which image was kept or why not, what the motions do not show yet, and the pose to add next."""
+        """Which image was kept or why not, how exact the calibration is now, and the pose to add next."""
         print("\n".join(lines))
 
     print("move the arm; an image is taken whenever it rests")
     asks = asks_at_rest(lambda: states(host, port))
-    collect(LiveFolder(out), camera, asks, CollectOptions(images=images), tell, ArmWords("ur"))
+    calibration = until_done.enter_context(closing(jcr.LiveCalibration(LiveFolder(out))))
+    LiveCapture(calibration, camera, CollectOptions(images=images), tell, ArmWords("ur")).run(asks)
 
 capture = jcr.read_capture(out)
 print(f"{len(capture)} images in {out}; next: jcr run {out} out/ur_run")
