@@ -216,8 +216,8 @@ def match_with_robot(
 ) -> Matched:
     """The pairs of images that match and that the robot does not contradict.
 
-    `original` is the size of the images as they were taken, for notes. `lens` is at the working size, and a first guess
-    unless `known`. Where X's rotation cannot be found from the pairs, the robot poses are not used: they may be of
+    `original` is the size of the images as they were taken, for notes. `intrinsics` are at the working size, and a first
+    guess unless `known`. Where X's rotation cannot be found from the pairs, the robot poses are not used: they may be of
     another convention, or too few pairs match.
     """
     n = len(base_from_gripper)
@@ -238,16 +238,7 @@ def match_with_robot(
         search.match(everything)
         found = _with_intrinsics(search, intrinsics)
     if found.of_x is None:
-        search.match_in_full(list(search.geometries))
-        notes = _beside(search, found, names, original)
-        return Matched(
-            geometries=search.geometries,
-            gate=None,
-            intrinsics=search.view.intrinsics,
-            upright=None,
-            still=search.still,
-            notes=notes,
-        )
+        return _without_robot(search, found, names, original)
     upright = robot.rolls(robot.base_from_camera_rotations(base_from_gripper, found.of_x))
     found = _upright(search, seen_in_common(search.view, found, motion) or everything, upright, found)
     report(0.8)
@@ -255,11 +246,7 @@ def match_with_robot(
     found = _upright(search, [key for key in everything if lonely & set(key)], upright, found)
     found = search.second_motions_confirmed(found)
     stale = _contradicted_by_all(found, motion)
-    believed = {pair.key for pair in (*found.confirmed, *found.undecided)}
-    believed |= {pair.key for pair in found.contradicted if stale & set(pair.key)}
-    if known:
-        # Of a pair whose rotation is not measured, only what the known rotation explains would be right.
-        believed -= {pair.key for pair in found.undecided}
+    believed = _believed(found, stale, known)
     report(1.0)
     kept = {key: geometry for key, geometry in search.geometries.items() if key in believed}
     notes = (*_left_out(found), *_beside(search, found, names, original))
@@ -273,6 +260,27 @@ def match_with_robot(
         notes=notes,
         warnings=warnings,
     )
+
+
+def _without_robot(search: _Search, found: Gate, names: Sequence[str], original: tuple[int, int]) -> Matched:
+    """All pairs that match, matched in full, where the robot poses are not used."""
+    search.match_in_full(list(search.geometries))
+    return Matched(
+        geometries=search.geometries,
+        gate=None,
+        intrinsics=search.view.intrinsics,
+        upright=None,
+        still=search.still,
+        notes=_beside(search, found, names, original),
+    )
+
+
+def _believed(found: Gate, stale: set[int], known: bool) -> set[Key]:
+    """The pairs that the robot does not contradict, and those of images whose own pose is contradicted by all."""
+    believed = {pair.key for pair in found.confirmed}
+    believed |= {pair.key for pair in found.contradicted if stale & set(pair.key)}
+    # Of a pair whose rotation is not measured, only what the known rotation explains would be right.
+    return believed if known else believed | {pair.key for pair in found.undecided}
 
 
 def _upright(search: _Search, pairs: Sequence[Key], upright: Float[ndarray, " n"], found: Gate) -> Gate:

@@ -93,20 +93,9 @@ def structure_from_motion(
         matched = matched_pairs(
             database, matcher, base_from_gripper, all_intrinsics[0], cameras, known, names, report
         )
-        model = None
-        if known and matched.gate is not None and base_from_gripper is not None and len(images) > _MANY:
-            model = primed(
-                database,
-                cameras[0],
-                matched.gate,
-                matched.geometries,
-                base_from_gripper,
-                lambda made: adjust_robustly(made, True, _ROUGHLY),
-            )
-        if model is None or model.num_reg_images() < len(images):
-            model = map_incrementally(database, len(images), cameras, known, seed, report, model)
-        if model is not None and base_from_gripper is not None and model.num_reg_images() < len(images):
-            model, matched = _placed(database, model, matcher, matched, base_from_gripper, names)
+        model, matched = _map_of_pairs(
+            database, matcher, matched, cameras, base_from_gripper, names, known, seed, report
+        )
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise _not_registered(database, len(images), model)
         _thin(model, seed)
@@ -136,6 +125,36 @@ def structure_from_motion(
         notes=tuple(notes),
         warnings=matched.warnings,
     )
+
+
+def _map_of_pairs(
+    database: Path,
+    matcher: Matcher,
+    matched: Matched,
+    cameras: list[pycolmap.Camera],
+    base_from_gripper: Float[ndarray, "n 4 4"] | None,
+    names: Sequence[str],
+    known: bool,
+    seed: int,
+    report: Progress,
+) -> tuple[pycolmap.Reconstruction | None, Matched]:
+    """The map of the matched pairs, of many images from the robot's poses, and the pairs with those added that place
+    images which COLMAP's mapper left out."""
+    count, model = len(matcher.x_px), None
+    if known and matched.gate is not None and base_from_gripper is not None and count > _MANY:
+        model = primed(
+            database,
+            cameras[0],
+            matched.gate,
+            matched.geometries,
+            base_from_gripper,
+            lambda made: adjust_robustly(made, True, _ROUGHLY),
+        )
+    if model is None or model.num_reg_images() < count:
+        model = map_incrementally(database, count, cameras, known, seed, report, model)
+    if model is not None and base_from_gripper is not None and model.num_reg_images() < count:
+        return _placed(database, model, matcher, matched, base_from_gripper, names)
+    return model, matched
 
 
 def enter(
