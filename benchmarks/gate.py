@@ -17,7 +17,7 @@ from jcr.calibration.stage import calibrate
 from jcr.errors import RejectedError
 from jcr.geometry import Transforms, inverse, rotation_exp, transform
 from jcr.match.matchers import FeatureName
-from jcr.reconstruct.colmap import reconstruct
+from jcr.reconstruct.colmap import reconstruct_colmap
 from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.records import Capture, Intrinsics
 from jcr.simulate.poses import gripper_poses, random_hand_eye
@@ -121,7 +121,7 @@ def judged(kind: str, drawn: Drawn, features: FeatureName, gate: bool) -> Verdic
     begun = time.perf_counter()
     options = ColmapOptions(features=features, robot_checks=gate)
     try:
-        made = reconstruct(drawn.capture, options)
+        made = reconstruct_colmap(drawn.capture, options)
         hand_eye = calibrate(drawn.capture, made)
     except RejectedError:
         return Verdict(kind, features, gate, 0, False, False, None, time.perf_counter() - begun)

@@ -22,7 +22,7 @@ from jcr.errors import RejectedError
 from jcr.files import write_bytes
 from jcr.geometry import transform
 from jcr.handeye.solve import solve_hand_eye
-from jcr.reconstruct.colmap import reconstruct
+from jcr.reconstruct.colmap import reconstruct_colmap
 from jcr.records import HandEye
 from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.render import render
@@ -171,7 +171,7 @@ def _verdict(trial: Trial) -> Verdict:
         # The last one: what happens midway has happened.
         image = cv2.resize(read_image(_images(made)[-1]), IMAGE_SIZE, interpolation=cv2.INTER_AREA)
         try:
-            reconstruction = reconstruct(capture)
+            reconstruction = reconstruct_colmap(capture)
             found = calibrate(capture, reconstruction)
         except RejectedError as refusal:
             return Verdict(trial, np.asarray(image, np.uint8), reason=_short(str(refusal)))

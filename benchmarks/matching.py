@@ -16,7 +16,7 @@ from jcr.errors import InputError, RejectedError
 from jcr.geometry import rotation_between_deg, rotation_log
 from jcr.match.matchers import FeatureName
 from jcr.reconstruct import marker
-from jcr.reconstruct.colmap import reconstruct
+from jcr.reconstruct.colmap import reconstruct_colmap
 from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.records import HandEye
 
@@ -144,7 +144,7 @@ def row_of(folder: Path, features: FeatureName, gate: bool, reference: Reference
     begun = time.perf_counter()
     made = None
     try:
-        made = reconstruct(capture, ColmapOptions(features=features, robot_checks=gate))
+        made = reconstruct_colmap(capture, ColmapOptions(features=features, robot_checks=gate))
         hand_eye = calibrate(capture, made)
     except RejectedError as refusal:
         count = 0 if made is None else len(made.image_index)

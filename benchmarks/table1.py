@@ -17,7 +17,7 @@ from jcr.errors import RejectedError
 from jcr.geometry import Transforms, fit_similarity, rotation_between_deg, rotation_log, scale_translation
 from jcr.handeye.residuals import paper_residuals
 from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, candidates, reconstruct
-from jcr.reconstruct.colmap import reconstruct as reconstruct_with_colmap
+from jcr.reconstruct.colmap import reconstruct_colmap
 from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.reconstruct.global_alignment.pairs import PairPredictions, write_pairs
 from jcr.records import Capture, Reconstruction
@@ -202,7 +202,7 @@ def _methods(capture: Capture, truth: Truth, pairs: Path) -> list[tuple[str, Cel
     """Every method on one set of images; networks where their weights are."""
     networks = [name for name in candidates(ReconstructOptions()) if BACKENDS[name].hub_id]
     try:
-        sparse = reconstruct_with_colmap(capture, ColmapOptions())
+        sparse = reconstruct_colmap(capture, ColmapOptions())
         on_colmap = _papers(capture, truth, sparse), _ours(capture, truth, sparse)
     except RejectedError:
         on_colmap = Cell(0), Cell(0, accepted=False)

@@ -9,7 +9,7 @@ import pytest
 import jcr
 from jcr.calibration.stage import calibrate
 from jcr.geometry import apply_similarity, fit_similarity, rotation_between_deg
-from jcr.reconstruct.colmap import reconstruct
+from jcr.reconstruct.colmap import reconstruct_colmap
 from jcr.records import Kind
 
 
@@ -23,7 +23,7 @@ def test_within_reach_of_the_marker_reference(
 ):
     """And the cameras follow the gripper."""
     capture = jcr.read_capture(real_captures / name)
-    found = reconstruct(capture)
+    found = reconstruct_colmap(capture)
     solved = calibrate(capture, found)
     reference = np.array(
         json.loads((real_captures / name / "reference.json").read_text())["gripper_from_camera"]
@@ -46,7 +46,7 @@ def test_within_reach_of_the_marker_reference(
 def test_nominal_intrinsics_are_contradicted_by_their_images(real_captures: Path):
     """The reference of this capture was made with them, and belongs to them."""
     capture = jcr.read_capture(real_captures / "franka_tabletop")
-    solved = calibrate(capture, reconstruct(capture))
+    solved = calibrate(capture, reconstruct_colmap(capture))
     assert solved.converged and any(one.kind is Kind.INTRINSICS for one in solved.findings)
     found, given = solved.intrinsics, solved.with_given_intrinsics
     assert found is not None and found.fx == pytest.approx(found.fy, rel=2e-3)
@@ -64,7 +64,7 @@ def test_nominal_intrinsics_are_contradicted_by_their_images(real_captures: Path
 def test_a_plain_background_is_rejected(real_captures: Path):
     capture = jcr.read_capture(real_captures / "franka_plain_background")
     with pytest.raises(jcr.RejectedError, match=r"0 of 8 images \(too little texture"):
-        reconstruct(capture)
+        reconstruct_colmap(capture)
 
 
 @pytest.mark.slow
@@ -72,4 +72,4 @@ def test_another_first_pair_is_tried_where_the_first_bends_unknown_intrinsics(re
     """Of one model alone three images of this capture register."""
     capture = jcr.read_capture(real_captures / "elephant_floor")
     assert capture.intrinsics is None
-    assert len(reconstruct(capture).image_index) == len(capture)
+    assert len(reconstruct_colmap(capture).image_index) == len(capture)

@@ -40,7 +40,7 @@ from jcr.handeye.residuals import angle_ratio
 from jcr.handeye.solve import SCALE_STD, solve_hand_eye
 from jcr.progress import Progress
 from jcr.reconstruct.board_in_view import proposed
-from jcr.reconstruct.colmap import reconstruct
+from jcr.reconstruct.colmap import reconstruct_colmap
 from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.records import (
     Capture,
@@ -293,7 +293,7 @@ def _compare_registered(
     if size_px is not None:
         options = replace(options, working_size_px=size_px)
     try:
-        found = reconstruct(capture, options, progress)
+        found = reconstruct_colmap(capture, options, progress)
     except RejectedError as error:
         board = None
         if size_px is None:

@@ -17,7 +17,7 @@ from jcr.capture.images import read_image
 from jcr.geometry import inverse, rotation_exp, step_between, transform
 from jcr.live.calibration import LiveCalibration
 from jcr.live.calibration_progress import Progress
-from jcr.reconstruct.colmap import reconstruct
+from jcr.reconstruct.colmap import reconstruct_colmap
 from jcr.records import Kind
 
 REQUIRED = (2.0, 0.3)
@@ -106,7 +106,7 @@ def test_the_end_is_the_batch_calibration_without_finding_features_again(
     # A batch reads what is kept, and writes nothing there; what is damaged is found again.
     assert kept == {file.name: file.stat().st_mtime_ns for file in (folder / "live" / "features").iterdir()}
     next((folder / "live" / "features").glob("image-*")).write_bytes(b"damaged")
-    again = reconstruct(jcr.read_capture(folder))
+    again = reconstruct_colmap(jcr.read_capture(folder))
     assert np.array_equal(again.recon_from_camera, result.reconstruction.recon_from_camera)
     assert found == ["detect"]
 

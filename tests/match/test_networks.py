@@ -76,12 +76,12 @@ def test_a_chessboard_before_a_plain_background(real_captures: Path):
     """SIFT registers none of its images; what says which way round the board is, is the robot."""
     from jcr.calibration.stage import calibrate
     from jcr.geometry import rotation_between_deg
-    from jcr.reconstruct.colmap import reconstruct
+    from jcr.reconstruct.colmap import reconstruct_colmap
     from jcr.reconstruct.colmap_options import ColmapOptions
 
     assert LIGHTERGLUE.found()
     capture = read_capture(real_captures / "franka_plain_background")
-    made = reconstruct(capture, ColmapOptions(features="xfeat"))
+    made = reconstruct_colmap(capture, ColmapOptions(features="xfeat"))
     assert len(made.image_index) == 8
     hand_eye = calibrate(capture, made)
     reference = np.array(json.loads((capture.folder / "reference.json").read_text())["gripper_from_camera"])

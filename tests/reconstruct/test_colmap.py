@@ -20,7 +20,7 @@ from jcr.errors import RejectedError
 from jcr.geometry import apply_similarity, fit_similarity, inverse, rotation_between_deg
 from jcr.match.sift_features import SiftFeatures
 from jcr.progress import silent
-from jcr.reconstruct.colmap import reconstruct
+from jcr.reconstruct.colmap import reconstruct_colmap
 from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.records import Capture, Reconstruction
 
@@ -35,12 +35,12 @@ def capture(tabletop: Path) -> Capture:
 @pytest.fixture(scope="module")
 def found(capture: Capture) -> Reconstruction:
     first = _first(capture, 7)
-    return densify(first, reconstruct(first), DepthOptions(pointmap_size_px=240))
+    return densify(first, reconstruct_colmap(first), DepthOptions(pointmap_size_px=240))
 
 
 @pytest.fixture(scope="module")
 def four(capture: Capture) -> Reconstruction:
-    return reconstruct(_first(capture, 4))
+    return reconstruct_colmap(_first(capture, 4))
 
 
 def _first(capture: Capture, count: int) -> Capture:
@@ -123,7 +123,7 @@ def test_same_pixels_same_result(capture: Capture, four: Reconstruction, tmp_pat
             on_its_side = upright.convert("RGB").transpose(Image.Transpose.ROTATE_90)
             on_its_side.save(tmp_path / names[-1], exif=exif)
     shares = []
-    again = reconstruct(
+    again = reconstruct_colmap(
         replace(rotated, folder=tmp_path, images=tuple(names)),
         progress=lambda stage, share: shares.append(share) if stage == "mapping" else None,
     )
@@ -138,7 +138,7 @@ def test_same_pixels_same_result(capture: Capture, four: Reconstruction, tmp_pat
 def test_distortion_that_folds_over_is_not_used(capture: Capture, four: Reconstruction) -> None:
     assert capture.intrinsics is not None
     folding = replace(capture.intrinsics, distortion=(0.01, 0.7, 0.0, 0.0, -9.0))
-    result = reconstruct(replace(_first(capture, 4), intrinsics=folding))
+    result = reconstruct_colmap(replace(_first(capture, 4), intrinsics=folding))
     (warning,) = result.warnings
     assert "folds over at" in warning and "not used" in warning and not result.notes
     assert result.intrinsics == capture.intrinsics
@@ -147,7 +147,7 @@ def test_distortion_that_folds_over_is_not_used(capture: Capture, four: Reconstr
 
 def test_unknown_intrinsics_is_found(capture: Capture) -> None:
     assert capture.intrinsics is not None
-    result = reconstruct(replace(_first(capture, 5), intrinsics=None))
+    result = reconstruct_colmap(replace(_first(capture, 5), intrinsics=None))
     assert result.intrinsics.fx == pytest.approx(capture.intrinsics.fx, rel=0.01)
     corner = np.array([[0.4, 0.3, 1.0]])
     np.testing.assert_allclose(
@@ -157,7 +157,7 @@ def test_unknown_intrinsics_is_found(capture: Capture) -> None:
 
 
 def test_tracks_are_in_pixels_of_the_original(capture: Capture) -> None:
-    result = reconstruct(_first(capture, 4), ColmapOptions(working_size_px=480))
+    result = reconstruct_colmap(_first(capture, 4), ColmapOptions(working_size_px=480))
     assert result.intrinsics == capture.intrinsics
     error = _reprojection_errors(result)
     assert np.abs(np.median(error, axis=0)).max() < 0.1
@@ -171,7 +171,7 @@ def test_image_that_shows_something_else_is_named(capture: Capture, tmp_path: Pa
     noise = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
     Image.fromarray(noise).save(tmp_path / "elsewhere.png")
     images = (*(Path(name).name for name in three.images[:2]), "elsewhere.png", Path(three.images[2]).name)
-    result = reconstruct(replace(three, folder=tmp_path, images=images))
+    result = reconstruct_colmap(replace(three, folder=tmp_path, images=images))
     assert result.image_index.tolist() == [0, 1, 3]
     assert result.notes == ("3 of 4 images registered; not elsewhere.png",)
     assert result.tracks.image.max() == 2
@@ -184,7 +184,7 @@ def test_images_without_texture_are_refused_in_one_line(capture: Capture, tmp_pa
         shade = np.linspace(90, 150 + k, 640)[None, :, None] * np.ones((480, 1, 3))
         Image.fromarray(shade.astype(np.uint8)).save(tmp_path / name)
     with pytest.raises(RejectedError) as refusal:
-        reconstruct(replace(bare, folder=tmp_path))
+        reconstruct_colmap(replace(bare, folder=tmp_path))
     message = str(refusal.value)
     assert "\n" not in message
     assert "0 of 4 images" in message and "0 features" in message and "textured objects" in message

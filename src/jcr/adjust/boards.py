@@ -149,7 +149,7 @@ def shapes_of(
 
     Corners that are not `seen` take no part, nor do bodies with fewer than four that are; None where there is none.
     """
-    placed = list(_placed(boards, points_in_world, seen))
+    placed = list(_seen_corners(boards, points_in_world, seen))
     if boards is None or not placed:
         return None, np.zeros((0, 4, 4))
     sizes = np.array([size for _, _, _, size in placed])
@@ -177,7 +177,7 @@ def shapes_of(
     return shapes, np.stack([pose for _, _, pose, _ in placed])
 
 
-def _placed(
+def _seen_corners(
     boards: Boards | None, points_in_world: Float[ndarray, "p 3"], seen: Bool[ndarray, " p"]
 ) -> Iterator[tuple[Int[ndarray, " c"], Float[ndarray, "c 3"], Float[ndarray, "4 4"], float]]:
     """Rows and places of the seen corners of each body, its pose, and its size in the world over the stated one."""

@@ -204,11 +204,11 @@ class LiveCapture:
             self._tell(answer, [f"refused: {name}"])
             return
         self._show(f"kept {name}", is_over=len(self.live.names) >= self.options.most)
-        self._tell(_kept(name, self.shown.is_over), [f"kept {name}"])
+        self._tell(_accepted(name, self.shown.is_over), [f"kept {name}"])
         if ask.waits:
             self._waiting.append((name, ask))
         else:
-            ask.answer(_kept(name, self.shown.is_over))
+            ask.answer(_accepted(name, self.shown.is_over))
 
     def _frame(self, ask: Ask) -> Frame | InputError:
         """A frame at rest, or why none is kept."""
@@ -325,7 +325,7 @@ class LiveCapture:
         self._waiting = [one for one, due in zip(waiting, is_due, strict=True) if not due]
         for (name, ask), due in zip(waiting, is_due, strict=True):
             if due:
-                ask.answer(progress_answer(state) | _kept(name, self.shown.is_over))
+                ask.answer(progress_answer(state) | _accepted(name, self.shown.is_over))
 
     def _show(self, event: str, *, is_refusal: bool = False, **changes: object) -> None:
         self.shown = replace(
@@ -338,5 +338,5 @@ class LiveCapture:
         )
 
 
-def _kept(name: str, is_over: bool) -> Answer:
+def _accepted(name: str, is_over: bool) -> Answer:
     return {"accepted": True, "image": name, "done": is_over}

@@ -72,10 +72,10 @@ def rotation_of_x(
             best, best_score = few[int(score.argmax())], float(score.max())
     if best is None:
         return None
-    return _refined(best, gripper, camera, tolerance, weight)
+    return _least_squares_rotation(best, gripper, camera, tolerance, weight)
 
 
-def _refined(
+def _least_squares_rotation(
     x: Float[ndarray, "3 3"],
     gripper: Float[ndarray, "p 3 3"],
     camera: Float[ndarray, "p 3 3"],

@@ -64,7 +64,7 @@ def readings(
         starts += _of_homography(j_from_i_homography, ray_i)
     found: list[Reading] = []
     for rotation, direction in starts:
-        reading = _refined(rotation, direction, ray_i, ray_j, focal_px)
+        reading = _least_squares_motion(rotation, direction, ray_i, ray_j, focal_px)
         if reading is None or reading.sigma_px > LARGEST_SIGMA_PX:
             continue
         if all(np.linalg.norm(other.rotation - reading.rotation) > 0.02 for other in found):
@@ -93,7 +93,7 @@ def _by_step(
     ray_j: Float[ndarray, "m 2"],
     focal_px: float,
 ) -> Float[ndarray, "m 5"]:
-    """Derivatives of `sampson_px` by the step of `_moved`."""
+    """Derivatives of `sampson_px` by the step of `_retracted`."""
     of_direction, h_i, h_j = skew(direction), _homogeneous(ray_i), _homogeneous(ray_j)
     essential = of_direction @ rotation
     by_step = np.concatenate(
@@ -137,7 +137,7 @@ def _of_homography(
     ]
 
 
-def _refined(
+def _least_squares_motion(
     rotation: Float[ndarray, "3 3"],
     direction: Float[ndarray, "3"],
     ray_i: Float[ndarray, "m 2"],
@@ -156,7 +156,7 @@ def _refined(
         information = jacobian.T @ (weight[:, None] * jacobian)
         gradient = jacobian.T @ (weight * residual)
         step = -np.linalg.solve(information + damping * np.diag(np.diag(information) + 1e-9), gradient)
-        moved = _moved(rotation, direction, step)
+        moved = _retracted(rotation, direction, step)
         tried = sampson_px(*moved, ray_i, ray_j, focal_px)
         cost, before = (np.log1p((of / (2 * sigma)) ** 2).sum() for of in (tried, residual))
         if cost > before:
@@ -171,7 +171,7 @@ def _refined(
     return Reading(rotation, direction, covariance, sigma)
 
 
-def _moved(
+def _retracted(
     rotation: Float[ndarray, "3 3"], direction: Float[ndarray, "3"], step: Float[ndarray, "5"]
 ) -> tuple[Float[ndarray, "3 3"], Float[ndarray, "3"]]:
     one, other = _sideways(direction)

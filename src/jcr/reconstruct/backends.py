@@ -22,14 +22,14 @@ INSTALL_DA3 = "pip install omegaconf addict einops && pip install --no-deps dept
 
 
 def _colmap(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.colmap import reconstruct
+    from jcr.reconstruct.colmap import reconstruct_colmap
     from jcr.reconstruct.colmap_options import ColmapOptions
 
     features = "sift" if options.features == "auto" else options.features
     if features != "sift":
         extra("torch", "match", f"--features {features}")
     made = ColmapOptions(seed=options.seed, features=features, memory_gb=options.memory_gb)
-    return reconstruct(capture, made, progress)
+    return reconstruct_colmap(capture, made, progress)
 
 
 def _direct(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:

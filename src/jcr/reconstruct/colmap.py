@@ -20,7 +20,7 @@ _START_FOCALS = (0.8, 0.5, 1.2)
 cameras (true values 0.5 to 0.7); from 0.8 all three converge."""
 
 
-def reconstruct(
+def reconstruct_colmap(
     capture: Capture, options: ColmapOptions | None = None, progress: Progress | None = None
 ) -> Reconstruction:
     """Camera poses and tracks of a capture, up to one similarity.

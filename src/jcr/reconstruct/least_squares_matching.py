@@ -138,7 +138,7 @@ def _scales(
 ) -> Float[ndarray, " k"]:
     """Pixels² of each observation that a unit of area of its plane covers, times the square of the normal's length."""
     camera_from_recon = inverse(recon_from_camera)[image]
-    x_in_camera = _moved(camera_from_recon, x_in_recon)
+    x_in_camera = _x_in_b(camera_from_recon, x_in_recon)
     by_recon = by_point(intrinsics, x_in_camera) @ camera_from_recon[:, :3, :3]
     # The area's factor along a normal n is det [J; nᵀ], and n is as long for all observations of a point.
     return np.abs(np.linalg.det(np.concatenate([by_recon, facing[:, None]], axis=1)))
@@ -168,7 +168,7 @@ def _warps(
         rays = unproject(intrinsics, x_px[of_reference] + offset)
         ray = np.einsum("kij,kj->ki", recon_from_reference[:, :3, :3], rays)
         on_plane = centre + (height / (ray * facing).sum(1))[:, None] * ray
-        return project(intrinsics, _moved(camera_from_recon, on_plane))
+        return project(intrinsics, _x_in_b(camera_from_recon, on_plane))
 
     with np.errstate(all="ignore"):
         middle, right, left, below, above = at(0, 0), at(1, 0), at(-1, 0), at(0, 1), at(0, -1)
@@ -180,7 +180,7 @@ def _warps(
     return np.where(tame, affine, 0.0), np.where(tame, bend, 0.0) / _BEND_AT_PX**2
 
 
-def _moved(b_from_a: Float[ndarray, "k 4 4"], x_in_a: Float[ndarray, "k 3"]) -> Float[ndarray, "k 3"]:
+def _x_in_b(b_from_a: Float[ndarray, "k 4 4"], x_in_a: Float[ndarray, "k 3"]) -> Float[ndarray, "k 3"]:
     return np.einsum("kij,kj->ki", b_from_a[:, :3, :3], x_in_a) + b_from_a[:, :3, 3]
 
 

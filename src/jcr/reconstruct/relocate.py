@@ -103,7 +103,7 @@ def _located(
         return 0 if inliers is None else len(inliers)
     start = inverse(transform(rotation_exp(rotation[:, 0]), shift[:, 0]))
     agree = np.asarray(inliers, int)[:, 0]
-    return _refined(points[agree], spread[agree], rays[agree], start, focal_px)
+    return _least_squares_pose(points[agree], spread[agree], rays[agree], start, focal_px)
 
 
 def triangulated(
@@ -143,7 +143,7 @@ def triangulated(
     return point, np.linalg.inv(normal), (count >= 2) & (2 * angle > MIN_PARALLAX)
 
 
-def _refined(
+def _least_squares_pose(
     points: Float[ndarray, "k 3"],
     spread: Float[ndarray, "k 3 3"],
     rays: Float[ndarray, "k 2"],

@@ -153,7 +153,7 @@ def _map_of_pairs(
     if model is None or model.num_reg_images() < count:
         model = map_incrementally(database, count, cameras, known, seed, report, model)
     if model is not None and base_from_gripper is not None and model.num_reg_images() < count:
-        return _placed(database, model, matcher, matched, base_from_gripper, names)
+        return _with_predicted_images(database, model, matcher, matched, base_from_gripper, names)
     return model, matched
 
 
@@ -289,7 +289,7 @@ def map_incrementally(
     return best
 
 
-def _placed(
+def _with_predicted_images(
     database: Path,
     model: pycolmap.Reconstruction,
     matcher: Matcher,
