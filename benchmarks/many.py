@@ -14,7 +14,7 @@ from benchmarks.matching import off
 from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
-from jcr.reconstruct.colmap import reconstruct
+from jcr.reconstruct.colmap import reconstruct_colmap
 from jcr.simulate.capture import SimulateOptions, simulate
 
 SIZES, LONG_SIZES = (8, 16, 32), (8, 16, 32, 50, 64, 128, 200)
@@ -66,7 +66,7 @@ def one(folder: str, count: int) -> None:
         capture, images=capture.images[:count], base_from_gripper=capture.base_from_gripper[:count]
     )
     begun = time.perf_counter()
-    made = reconstruct(capture)
+    made = reconstruct_colmap(capture)
     mapped = time.perf_counter()
     hand_eye = calibrate(capture, made)
     done = time.perf_counter()
