@@ -1,5 +1,6 @@
 """The map stage: a calibrated reconstruction to the labelled cloud, the map, and what stands on the table."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -46,15 +47,6 @@ def require_dense(options: DepthOptions) -> None:
         raise InputError("--no-dense: the map needs dense depth; leave it out, or add --no-map")
 
 
-def why_no_map() -> str | None:
-    """What to install before a map can be made; None where nothing is missing."""
-    try:
-        require_packages("the map", ", then `jcr map`")
-    except InputError as error:
-        return f"no map was made: {error}"
-    return None
-
-
 def make_map(result: RunResult, added: Capture, options: RunOptions, progress: Progress) -> Mapped:
     """The map of a calibrated run and of images that were added to it later.
 
@@ -68,9 +60,10 @@ def make_map(result: RunResult, added: Capture, options: RunOptions, progress: P
     reconstruction, remarks = with_measured_depth(result.capture, result.reconstruction, result.hand_eye)
     cloud, support, notes = _cloud(replace(result, reconstruction=reconstruction), options, progress)
     give_back()
-    scene = build_scene(cloud, options.map, progress, device=device)
-    sizes = None if support is None else measured(cloud, result.calibration, support)
-    return Mapped(cloud, scene, sizes, (*remarks, *notes))
+    with ThreadPoolExecutor(1) as beside:
+        sizes = None if support is None else beside.submit(measured, cloud, result.calibration, support)
+        scene = build_scene(cloud, options.map, progress, device=device)
+        return Mapped(cloud, scene, sizes and sizes.result(), (*remarks, *notes))
 
 
 def measured(cloud: PointCloud, calibration: CalibrationFile, support: Support | None = None) -> Measured:

@@ -6,6 +6,7 @@ capture -> reconstruct -> calibrate -> densify -> map -> report
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ from jcr.capture.added import read_added, with_images
 from jcr.capture.read import read_capture
 from jcr.cell.added import camera_of, keep_camera, read_added_cameras
 from jcr.errors import InputError, RejectedError
+from jcr.extras import is_installed
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import BackendName
@@ -52,12 +54,15 @@ def run(
     check_options(options.calibrate)
     capture = _capture_of(capture, Path(out))
     options, missing = _possible(options.for_capture(capture, backend), capture)
-    with locked(Path(out)) as folder:
+    with locked(Path(out)) as folder, ThreadPoolExecutor(1) as beside:
+        # Torch takes more than a second to import, and COLMAP leaves a core idle.
+        importing = None if options.map is None else beside.submit(_why_no_map)
         capture = folder.keep_capture(capture)
         added = None if options.map is None else read_added(folder.path, capture)
         result = stages.calibrated(capture, folder, options, progress or silent)
+        missing = missing if importing is None else importing.result()
         if missing is not None:
-            result = result.noted(missing)
+            options, added, result = replace(options, map=None), None, result.noted(missing)
         if calibrated is not None:
             calibrated(result)
         result = _after_calibration(result, added, folder, options, progress or silent)
@@ -77,16 +82,30 @@ def finished(capture: Capture, out: str | Path, options: RunOptions) -> SavedRun
 
 
 def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, str | None]:
-    """The options without the map where none can be made, and what is missing for it if that can be installed."""
-    if (
-        options.map is None or capture.mount == "base"
-    ):  # what that sees moves with the gripper, not with the base
+    """The options without the map where none can be made, and what to install for it if that is missing."""
+    # What a camera on the base sees moves with the gripper, not with the base.
+    if options.map is None or capture.mount == "base":
         return replace(options, map=None), None
-    from jcr.mapping import require_dense, why_no_map
+    from jcr.mapping import require_dense
+    from jcr.represent.map_file import PACKAGES
 
     require_dense(options.depth)
-    missing = why_no_map()
-    return (options if missing is None else replace(options, map=None)), missing
+    if all(map(is_installed, PACKAGES)):
+        return options, None
+    return replace(options, map=None), _why_no_map()
+
+
+def _why_no_map() -> str | None:
+    """What to install before a map can be made; None where all that makes one is imported."""
+    from jcr.represent.map_file import require_packages
+
+    try:
+        require_packages("the map", ", then `jcr map`")
+    except InputError as error:
+        return f"no map was made: {error}"
+    import jcr.represent.build  # noqa: F401
+
+    return None
 
 
 def calibrate(

@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from jcr.represent.scene import SceneMap
 
 FILE = "map.safetensors"
+PACKAGES = "torch", "safetensors", "skimage"
+"""That training, reading and meshing a map need."""
 
 
 def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
@@ -49,6 +51,6 @@ def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
 
 
 def require_packages(what: str, otherwise: str = "") -> None:
-    """InputError where a package is not installed that training, reading and meshing a map need."""
-    for package in ("torch", "safetensors", "skimage"):
+    """InputError where one of `PACKAGES` is not installed."""
+    for package in PACKAGES:
         extra(package, "map", what, otherwise)
