@@ -166,10 +166,10 @@ def test_benches_run_as_a_package_of_their_own():
 
 def test_a_bench_refuses_what_it_does_not_use(capsys: pytest.CaptureFixture[str]):
     for given, said in {
-        ("pairs", "captures"): "takes no folder of captures",
+        ("map", "captures"): "takes no folder of captures",
         ("cameras", "captures", "--boards", "a=charuco"): "takes no --boards",
-        ("bag", "--runs", "runs"): "keeps no run folders",
-        ("bag", "--long"): "has no --long",
+        ("map", "--runs", "runs"): "keeps no run folders",
+        ("map", "--long"): "has no --long",
         ("all", "--long", "--out", "pages"): "of one bench at a time",
     }.items():
         assert call(lambda: import_module("benchmarks.__main__"), "python -m benchmarks", given) == 2
