@@ -105,7 +105,7 @@ def predict(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) -> Pre
 def grid_of(size: tuple[int, int], long_edge: int = LONG_EDGE) -> ImageGrid:
     """Nothing is cropped: the long edge becomes `long_edge`, then each edge the nearest multiple of the patch."""
     width, height = (_multiple(round(edge * long_edge / max(size))) for edge in size)
-    return ImageGrid(size, (width, height), (0, 0), (width, height))
+    return ImageGrid.uncropped(size, (width, height))
 
 
 def resized(image: UInt8[ndarray, "h w 3"], grid: ImageGrid, long_edge: int) -> UInt8[ndarray, "h2 w2 3"]:
