@@ -116,7 +116,6 @@ BENCHES = {
             "src/jcr/reconstruct/board.py",
             "src/jcr/reconstruct/board_in_view.py",
             "benchmarks/corners.py",
-            "benchmarks/board_intrinsics.py",
         ),
     ),
     "boards": Bench(
