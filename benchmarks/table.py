@@ -223,6 +223,13 @@ BENCHES = {
         measures=(*SOLVER, *FEATURES, *DEPTH, "src/jcr/segment", "src/jcr/simulate"),
         long="five scenes instead of three",
     ),
+    "density": Bench(
+        "How much a cloud covers",
+        MAPPED,
+        "how much of a plain table and its objects a cloud covers, beside COLMAP's points",
+        draws=True,
+        measures=(*FEATURES, *DEPTH, "src/jcr/simulate"),
+    ),
     "depth": Bench(
         "Dense depth",
         MAPPED,

@@ -210,13 +210,9 @@ def _joined(
             if overlap or (
                 floats
                 and count[small] < 0.25 * count[large]
-                and _distance(x_in_support[rows[small], :2], x_in_support[rows[large], :2])
+                and KDTree(x_in_support[rows[large], :2]).query(x_in_support[rows[small], :2])[0].min()
                 < 2.5 * options.object_gap
             ):
                 joined[small] = joined[large]
                 break
     return joined[part]
-
-
-def _distance(a: Float[ndarray, "n 2"], b: Float[ndarray, "k 2"]) -> float:
-    return float(KDTree(b).query(a)[0].min())

@@ -51,6 +51,11 @@ class PairPredictions:
         return len(self.images) or int(self.edges.max()) + 1
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Of the images, for messages: their numbers where they have none."""
+        return self.images or tuple(f"#{k}" for k in range(self.image_count))
+
+    @property
     def pointmaps(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
         """Points and confidences of the first views, and of the second ones."""
         return self.pts3d, self.conf, self.pts3d_in_other_view, self.conf2
