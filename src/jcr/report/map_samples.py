@@ -50,7 +50,7 @@ class Slice:
     unknown: Bool[ndarray, "h w"]
 
 
-def sample_surface(scene: "SceneMap", count: int, seed: int = 0) -> SurfacePoints:
+def sample_surface(scene: "SceneMap", count: int) -> SurfacePoints:
     """At most `count` points of occupancy over one half, spread evenly over where known free space ends."""
     low, high = scene.box
     pitch = max(scene.cell, float(np.prod(high - low) / MAX_CELLS) ** (1 / 3))
@@ -62,7 +62,7 @@ def sample_surface(scene: "SceneMap", count: int, seed: int = 0) -> SurfacePoint
     free = (~sample.unknown & (sample.occupancy < 0.5)).reshape(shape)
     border = ((free & binary_dilation(~free)) | (~free & binary_dilation(free))).ravel()
 
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
 
     def solid_points(cells: Float[ndarray, "k 3"], side: float, each: int) -> Float[ndarray, "m 3"]:
         """A solid point of each cell of that side in which `each` draws find one."""
