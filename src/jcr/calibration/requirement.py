@@ -7,12 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.expected import (
-    Ahead,
-    Assumptions,
-    typical_noise,
-    worse_of,
-)
+from jcr.calibration.expected import Ahead, Assumptions, typical_noise, worse_of
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import RobotErrors
 from jcr.calibration.seen import Scene, in_use, within_95

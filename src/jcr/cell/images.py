@@ -117,11 +117,7 @@ def cell_images(
 
 
 def _freedom(
-    capture: Capture,
-    hand_eye: HandEye,
-    members: Sequence[Member],
-    cameras: Sequence[Intrinsics],
-    images: int,
+    capture: Capture, hand_eye: HandEye, members: Sequence[Member], cameras: Sequence[Intrinsics], images: int
 ) -> Freedom:
     """Intrinsics free about what was given or found of each camera; a mount only beside another camera on its rig.
 

@@ -168,13 +168,7 @@ class _Matched:
         )
 
 
-def _located(
-    known: Known,
-    seen: _Matched,
-    intrinsics: Intrinsics,
-    is_given: bool,
-    seed: int,
-) -> Shared | int:
+def _located(known: Known, seen: _Matched, intrinsics: Intrinsics, is_given: bool, seed: int) -> Shared | int:
     """As `localised`, of what was matched."""
     feature, row, count = seen.feature, seen.row, len(seen.x_px)
     rays = unproject(known.intrinsics, seen.row_x_px)[:, :2]

@@ -199,10 +199,7 @@ _UNSEEN = {
         "translation along {axis}: all rotations are about it (planar or SCARA motion)",
         f"{_TILT}, or give the camera's known height along it",
     ),
-    "one axis, translation": (
-        "translation along {axis}: all rotations are about it (one fixed axis)",
-        _TILT,
-    ),
+    "one axis, translation": ("translation along {axis}: all rotations are about it (one fixed axis)", _TILT),
     "one axis, scale": (
         "scale: the camera moves on circles about one axis only",
         "move the gripper sideways and in height as well",
