@@ -368,8 +368,6 @@ def _one_part(finding: Finding) -> str:
 def _delayed(finding: Finding) -> str:
     value, error = _value_and_std(finding)
     how = f"{abs(value):.3f} ± {significant(error)} of the time from one image to the next"
-    if finding.details["unit"] == "s":
-        how = f"{1e3 * abs(value):.0f} ± {significant(1e3 * error)} ms"
     late = "late" if value > 0 else "early"
     return f"the gripper poses look as if read {how} too {late} ({_said('{chance}', finding)})"
 
