@@ -51,7 +51,8 @@ def adjusted(case: Case) -> Case:
     if not case.hand_eye.converged:
         return case
     refined = judged(refined_by(case, found))
-    if case.tracks.from_pointmaps and not _is_nearer(refined.leave_one_out, case.hand_eye.leave_one_out):
+    nearer, than = refined.leave_one_out, case.hand_eye.leave_one_out
+    if case.tracks.from_pointmaps and (nearer is None or than is None or nearer.length_m >= than.length_m):
         return case
     return replace(case, hand_eye=refined)
 
@@ -143,11 +144,6 @@ def _considered(case: Case) -> Case:
     return replace(case, hand_eye=judged(considered))
 
 
-def _is_nearer(one: LeaveOneOut | None, other: LeaveOneOut | None) -> bool:
-    """Whether the leave-one-out error is smaller; not, where there are too few images."""
-    return one is not None and other is not None and one.length_m < other.length_m
-
-
 def refined_by(case: Case, found: Adjusted) -> HandEye:
     """The calibration of a case as an adjustment has it; not judged yet."""
     before, used = case.hand_eye.before or case.hand_eye, case.used
@@ -156,7 +152,8 @@ def refined_by(case: Case, found: Adjusted) -> HandEye:
     gripper, camera = case.base_from_gripper, case.recon_from_camera
     # Rejected poses are measured against where their cameras show them.
     predicted = estimate.base_from_recon @ scale_translation(camera, estimate.scale) @ inverse(x)
-    predicted[used] = _adjusted_poses(found)
+    placed, rigs = found.placed, found.given.arms[0].rigs
+    predicted[used] = predict(placed.x[0], placed.scale, placed.z[0], placed.scene.world_from_rig[rigs])
     metres, radians = np.linalg.norm(step_between(gripper, predicted).reshape(-1, 2, 3), axis=2).T
     reprojection = np.full(len(gripper), np.nan)
     evidence = found.given.evidence
@@ -176,12 +173,6 @@ def refined_by(case: Case, found: Adjusted) -> HandEye:
         leave_one_out=_leave_one_out(found),
         before=before,
     )
-
-
-def _adjusted_poses(found: Adjusted) -> Float[ndarray, "u 4 4"]:
-    """base_from_gripper where images and robot together put it."""
-    placed, rigs = found.placed, found.given.arms[0].rigs
-    return predict(placed.x[0], placed.scale, placed.z[0], placed.scene.world_from_rig[rigs])
 
 
 def _leave_one_out(found: Adjusted) -> LeaveOneOut | None:

@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError, model_validator
 from jcr.arrays_json import Covariance7, Matrix, Numbers7, Part, Spread
 from jcr.calibration.findings_json import FindingJson, derived, findings_of_words, require_one_verdict
 from jcr.calibration.requirement import not_exact_enough
-from jcr.calibration.uncertainty_json import SeenJson, Uncertainty, mm_and_deg
+from jcr.calibration.uncertainty_json import Uncertainty, mm_and_deg
 from jcr.capture.plain_files import first_fault, read_json, shown
 from jcr.errors import InputError
 from jcr.files import write_text
@@ -29,14 +29,13 @@ from jcr.records import (
     LeaveOneOut,
     LengthCheck,
     Mount,
-    NextPose,
     PaperResiduals,
     PosePairs,
     Reconstruction,
     Requirement,
     RobotExamined,
-    RobotNoise,
     ScaleCheck,
+    Seen,
     Verdict,
     strongest_first,
     without_consequences,
@@ -44,6 +43,11 @@ from jcr.records import (
 from jcr.records.words import doubt_of, remedy, sentence, text
 
 FORMAT = "jcr.calibration/1"
+OF_HAND_EYE = (
+    *("gripper_from_camera", "base_from_recon", "scale", "residuals", "observability", "requirement"),
+    "with_given_intrinsics",
+)
+"""Fields of the file that a HandEye has by the same names."""
 
 
 class Observed(Part):
@@ -56,11 +60,6 @@ class Noise(Part):
     translation_mm: float
     rotation_deg: float
     estimated: bool
-
-    @classmethod
-    def of(cls, noise: RobotNoise) -> "Noise":
-        """The random part."""
-        return cls(**mm_and_deg(noise.translation, noise.rotation), estimated=noise.estimated)
 
 
 class JointOffset(Part):
@@ -105,7 +104,7 @@ class GivenIntrinsicsKept(Part):
     covariance: Covariance7
     """In the order of `uncertainty`."""
     intrinsics: IntrinsicsJson
-    seen: SeenJson
+    seen: Seen
     differs_mm: Spread
     """From where the estimated intrinsics and their transform place a point at the centre of the image."""
 
@@ -120,12 +119,6 @@ class Proposal(Part):
     within_95_mm: Spread | None = None
     """Of a point seen as in `uncertainty.seen`; null in files of earlier versions."""
     rotation_95_deg: Spread | None = None
-
-    @classmethod
-    def of(cls, pose: NextPose, like: str) -> "Proposal":
-        """That of a calibration, near the image `like`."""
-        given = {name: value for name, value in vars(pose).items() if name in cls.model_fields}
-        return cls.model_validate(given | {"like": like})
 
 
 class CalibrationFile(Part):
@@ -248,31 +241,27 @@ def calibration_file(
 ) -> CalibrationFile:
     """The file of a calibration of `capture`; poses that were given are capture and reconstruction in one."""
     names = [capture.images[row] for row in reconstruction.image_index[hand_eye.inliers]]
+    proposals = [vars(pose) | {"like": names[pose.like]} for pose in hand_eye.next_poses]
+    noise, measured = hand_eye.robot_noise, hand_eye.scale_evidence
     content = {
         "mount": "gripper",
-        "gripper_from_camera": hand_eye.gripper_from_camera,
-        "base_from_recon": hand_eye.base_from_recon,
-        "scale": hand_eye.scale,
+        **{name: getattr(hand_eye, name) for name in OF_HAND_EYE},
         "backend": reconstruction.backend,
         "images": image_verdicts(capture, reconstruction, hand_eye),
-        "residuals": hand_eye.residuals,
         "uncertainty": Uncertainty.of(hand_eye.estimate, hand_eye.in_use),
         "held_out": hand_eye.leave_one_out,
-        "observability": hand_eye.observability,
-        "robot_noise": Noise.of(hand_eye.robot_noise),
+        "robot_noise": mm_and_deg(noise.translation, noise.rotation) | {"estimated": noise.estimated},
         "intrinsics": IntrinsicsAndStd.of(hand_eye.intrinsics, hand_eye.estimate.intrinsics_std),
         "timings_s": timings_s,
         "version": version,
-        "next_poses": [Proposal.of(pose, names[pose.like]) for pose in hand_eye.next_poses],
-        "scale_check": hand_eye.scale_evidence.network,
+        "next_poses": [{name: pose[name] for name in Proposal.model_fields} for pose in proposals],
+        "scale_check": measured.network,
         "robot_errors": RobotErrors.of(hand_eye.robot),
         "angle_ratio": hand_eye.robot.angle_ratio,
-        "depth_check": hand_eye.scale_evidence.depth,
-        "lengths": list(hand_eye.scale_evidence.lengths),
-        "board": hand_eye.scale_evidence.board,
-        "requirement": hand_eye.requirement,
+        "depth_check": measured.depth,
+        "lengths": list(measured.lengths),
+        "board": measured.board,
         "attempts": list(attempts),
-        "with_given_intrinsics": hand_eye.with_given_intrinsics,
     }
     if isinstance(capture, Capture) and capture.mount == "base":
         # Of a fixed camera the transform is another one, and there is no name for it with the given intrinsics.
@@ -378,11 +367,8 @@ def validated(content: dict[str, object], file: Path) -> CalibrationFile:
         found = CalibrationFile.model_validate_json(json.dumps(content), strict=True)
     except ValidationError as error:
         raise InputError(f"{file}: {first_fault(error)}; run the calibration again") from None
-    return _of_earlier_version(found) if found.verdict is None else found
-
-
-def _of_earlier_version(found: CalibrationFile) -> CalibrationFile:
-    """With its warnings as findings; only their words are known."""
+    if found.verdict is not None:
+        return found
     findings = findings_of_words(found.warnings, found.converged)
     if found.converged and found.requirement is not None:
         short = not_exact_enough(found.requirement, found.mostly_systematic)
