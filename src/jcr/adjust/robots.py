@@ -78,7 +78,7 @@ class Adjusted:
 
     placed: Placed
     covariance: Float[ndarray, "p p"]
-    """Of steps as `moved` takes them."""
+    """Of steps as `after_step` takes them."""
     budget: Budget
     """Of the first arm's X and scale, by what they come from."""
     most_likely: Placed
@@ -147,10 +147,6 @@ class Adjusted:
         columns = freedom.intrinsics_columns[c]
         return slice(first + columns.start, first + columns.stop), freedom.intrinsics[c].directions
 
-    def moved(self, step: Float[ndarray, " p"]) -> Placed:
-        """Everything after a step: X, log scale, base of the first arm; X and base of others; then the `free` ones."""
-        return after_step(self.placed, step, self.given)
-
     def transform(self, of: Callable[[Placed], Transform]) -> tuple[Transform, Float[ndarray, "6 6"]]:
         """A transform that follows from where everything is, and the covariance of its step."""
         found, j = of(self.placed), self.derivative(of)
@@ -164,11 +160,9 @@ class Adjusted:
         cameras = self.first_camera_column
         size[cameras:] = np.minimum(1e-2 * std[cameras:], 1e-2) + 1e-9
         j = np.empty((6, len(size)))
-        for k, small in enumerate(size):
-            step = np.zeros(len(size))
-            step[k] = small
-            ahead, behind = of(self.moved(step)), of(self.moved(-step))
-            j[:, k] = (step_between(found, ahead) - step_between(found, behind)) / (2 * small)
+        for k, step in enumerate(np.diag(size)):
+            ahead, behind = (of(after_step(self.placed, way * step, self.given)) for way in (1, -1))
+            j[:, k] = (step_between(found, ahead) - step_between(found, behind)) / (2 * size[k])
         return j
 
 
@@ -316,7 +310,8 @@ def _bent(arms: Sequence[ArmPoses], region: Region) -> Float[ndarray, "s s"] | N
 
 
 def after_step(placed: Placed, step: Float[ndarray, " p"], given: Given) -> Placed:
-    """Everything after a step of the unknowns of the mixed model."""
+    """Everything after a step of the unknowns of the mixed model: X, log scale, base of the first arm; X and base of
+    others; then the `free` ones."""
     own = np.stack([step[columns_of_arm(arm)] for arm in range(len(placed.x))])
     of_images = np.zeros(len(given.evidence.gradient))
     of_images[given.free] = step[given.arm_unknowns :]

@@ -142,6 +142,7 @@ def alternatives(
     coupling = hessian[np.ix_(kept, rest)]
     by_column = over(cholesky(hessian[np.ix_(kept, kept)]), coupling)
     start = given.evidence.scene.cameras[camera]
+    now, rig = adjusted.placed.scene, problem.observations.rig[mine]
     return Alternatives(
         hessian=hessian[np.ix_(rest, rest)] - coupling.T @ by_column,
         right=right[rest] - by_column.T @ right[kept],
@@ -152,14 +153,10 @@ def alternatives(
         names=parameter_names(start),
         units=units_of(start),
         distance=_distances(wider, mine),
-        down_in_camera=_down(adjusted, camera, mine),
+        down_in_camera=-(adjusted.placed.z[0] @ now.world_from_rig[rig] @ now.rig_from_camera[camera])[
+            :, 2, :3
+        ],
     )
-
-
-def _down(adjusted: Adjusted, camera: int, images: Int[ndarray, " m"]) -> Float[ndarray, "m 3"]:
-    """Of each image, the direction against the base's z axis in its camera."""
-    scene, rig = adjusted.placed.scene, adjusted.given.evidence.problem.observations.rig[images]
-    return -(adjusted.placed.z[0] @ scene.world_from_rig[rig] @ scene.rig_from_camera[camera])[:, 2, :3]
 
 
 def nuisances_of(images: Int[ndarray, " m"], count: int) -> Int[ndarray, " r"]:
@@ -187,7 +184,7 @@ def _with_all_free(
     left = freedom.model_error_std
     all_free = replace(
         freedom,
-        intrinsics=_with_one(freedom.intrinsics, camera, wider),
+        intrinsics=with_intrinsics(freedom, wider, camera).intrinsics,
         nuisance=NuisancePrior(np.eye(len(freedom.nuisance.directions))[:, rows], _weak_nuisances(m)),
         model_error_std=left if model_error_std is None else np.full_like(left, model_error_std),
     )
@@ -201,12 +198,6 @@ def _with_all_free(
         steps[freedom.model_error_columns.start : freedom.board_columns.stop],
     ]
     return evidence(replace(scene, camera_steps=wider_steps), replace(problem, freedom=all_free), found.noise)
-
-
-def _with_one(
-    priors: tuple[IntrinsicsPrior, ...], camera: int, prior: IntrinsicsPrior
-) -> tuple[IntrinsicsPrior, ...]:
-    return (*priors[:camera], prior, *priors[camera + 1 :])
 
 
 def _place_by_kept(
@@ -260,7 +251,8 @@ def freed_intrinsics(
 
 def with_intrinsics(freedom: Freedom, prior: IntrinsicsPrior, camera: int = 0) -> Freedom:
     """The freedom with another prior of a camera's intrinsics."""
-    return replace(freedom, intrinsics=_with_one(freedom.intrinsics, camera, prior))
+    priors = freedom.intrinsics
+    return replace(freedom, intrinsics=(*priors[:camera], prior, *priors[camera + 1 :]))
 
 
 def beyond_prior(adjusted: Adjusted, prior: IntrinsicsPrior, camera: int = 0) -> Float[ndarray, " q"]:
@@ -334,11 +326,8 @@ def spanned(combinations: Float[ndarray, "e p"]) -> Float[ndarray, "e r"]:
     return u[:, size > 1e-9 * size.max(initial=1e-300)]
 
 
-def tested(
-    equations: Alternatives, free: Float[ndarray, "e p"], beside: Float[ndarray, "e q"] | None = None
-) -> Tested:
+def tested(equations: Alternatives, free: Float[ndarray, "e p"], beside: Float[ndarray, "e q"]) -> Tested:
     """The test of freeing the combinations `free`, with those of `beside` free under both hypotheses."""
-    beside = np.zeros((equations.columns, 0)) if beside is None else beside
     q, both = beside.shape[1], np.concatenate([beside, free], axis=1)
     fewer, more = spanned(beside), spanned(both)
     without, gain_without, _ = _step(equations, fewer)
@@ -365,9 +354,8 @@ def _step(
 def _dispersion(images: ImageEvidence) -> float:
     """Of the weighted residuals, and no less than that of their sums over cells of the images (cluster sampling;
     Liang and Zeger, Biometrika 73, 1986)."""
-    problem, view = images.problem, images.view
-    weight = images.weight
-    pull = weight[:, None] * view.residual_px
+    problem, weight = images.problem, images.weight
+    pull = weight[:, None] * images.view.residual_px
     taken = 3 * len(problem.points) + 6 * len(problem.seen.rows)
     share = max(1 - taken / (2 * len(weight)), 0.1)
     scale = 2 * weight.sum() * share

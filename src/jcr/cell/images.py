@@ -125,16 +125,12 @@ def _freedom(
     """
     contradicted = any(one.kind is Kind.INTRINSICS and one.shift is None for one in hand_eye.findings)
     own = prior_about(cameras[0], capture.intrinsics is not None and not contradicted, capture.intrinsics_std)
-    priors = [
-        own,
-        *(
-            prior_about(start, member.camera.intrinsics is not None, member.camera.intrinsics_std)
-            for start, member in zip(cameras[1:], members, strict=True)
-        ),
-    ]
-    return Freedom.of(
-        cameras, priors, images, [False, *(member.rig_from_camera is not None for member in members)]
-    )
+    priors, mounts = [own], [False]
+    for start, member in zip(cameras[1:], members, strict=True):
+        known = member.camera.intrinsics is not None
+        priors.append(prior_about(start, known, member.camera.intrinsics_std))
+        mounts.append(member.rig_from_camera is not None)
+    return Freedom.of(cameras, priors, images, mounts)
 
 
 def _as_given(reconstruction: Reconstruction, hand_eye: HandEye, known: Known) -> RigInformation:

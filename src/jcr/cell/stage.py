@@ -59,8 +59,13 @@ def place_cameras(
     if not others:
         return CellFound((), (), None)
     if not hand_eye.is_sound:
-        seen = map(CameraViews.nothing_of, others)
-        refused = [one.refused(Kind.OWN_REJECTED, camera=capture.camera_name) for one in seen]
+        why = (Finding.of(Kind.OWN_REJECTED, "rejects", camera=capture.camera_name),)
+        refused = [
+            CameraFound.not_placed(
+                one, why, [0] * len(one.images), ["the camera was not placed"] * len(one.images)
+            )
+            for one in others
+        ]
         return CellFound(tuple(refused), (), None)
     used = np.flatnonzero(hand_eye.inliers)
     rows = reconstruction.image_index[used]

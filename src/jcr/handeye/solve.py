@@ -17,7 +17,7 @@ from jcr.handeye.observability import observability
 from jcr.handeye.residuals import paper_residuals
 from jcr.handeye.robots import Arm, Joints
 from jcr.handeye.robust import robust_fit
-from jcr.handeye.systematic import systematic_errors
+from jcr.handeye.systematic import arm_errors, posed, smooth_errors
 from jcr.least_squares import one_blas_thread
 from jcr.records import (
     Estimate,
@@ -94,7 +94,8 @@ def solve_hand_eye(  # noqa: PLR0913 (published; each is a fact about the captur
             f"camera_covariance: shape {camera_covariance.shape}; {n} poses need {(6 * n, 6 * n)}"
         )
     if systematic is None:
-        systematic = systematic_errors(gripper, *_checked_arm(robot, joints, n))
+        arm, angles = _checked_arm(robot, joints, n)
+        systematic = smooth_errors(gripper) if arm is None else arm_errors(*posed(arm, angles, gripper))
     fitted = _fit_distinct(gripper, camera, robot_noise, cues, camera_covariance, systematic)
     return judged(_with_residuals(gripper, camera, *fitted, cues))
 
@@ -180,10 +181,7 @@ def _of_agreement(hand_eye: HandEye) -> Iterator[Finding]:
     """Too few images, or none, that fit their gripper poses."""
     used, n = float(hand_eye.inliers.sum()), len(hand_eye.inliers)
     if used < max(3, MIN_SHARE_USED * n) and n > 2:
-        details = {"images": float(n)}
-        yield Finding(
-            kind=Kind.FEW_AGREE, severity="rejects", mend="reconstruction", value=used, details=details
-        )
+        yield Finding.of(Kind.FEW_AGREE, "rejects", "reconstruction", value=used, images=float(n))
     metres, radians = hand_eye.robot_noise.together
     if metres > MAX_NOISE[0] or radians > MAX_NOISE[1]:
         kind = Kind.POSES_CONTRADICT_IMAGES
@@ -200,8 +198,8 @@ def _of_uncertainty(hand_eye: HandEye) -> Iterator[Finding]:
     parts = {"translation": std[:3].max(), "rotation": std[3:6].max(), "scale": std[6]}
     for (part, value), limit in zip(parts.items(), MAX_STD, strict=True):
         if value > limit:
-            details = {"part": part} | ({"noise_unknown": 1.0} if unknown else {})
-            yield Finding.of(Kind.UNCERTAIN, "rejects", "images", value=float(value), **details)
+            of_noise = {"noise_unknown": 1.0} if unknown else {}
+            yield Finding.of(Kind.UNCERTAIN, "rejects", "images", value=float(value), part=part, **of_noise)
 
 
 def _of_residuals(hand_eye: HandEye) -> Iterator[Finding]:
@@ -212,7 +210,7 @@ def _of_residuals(hand_eye: HandEye) -> Iterator[Finding]:
         metres > SURPRISE * noise.given[0] or radians > SURPRISE * noise.given[1]
     ):
         details = {"rotation": radians, "given": noise.given[0], "given_rotation": noise.given[1]}
-        yield Finding.of(Kind.NOISE_ABOVE_GIVEN, "warns", value=metres, **details)
+        yield Finding.of(Kind.NOISE_ABOVE_GIVEN, "warns", "none", value=metres, **details)
     if (leave_one_out := hand_eye.leave_one_out) is not None:
         leave_one_out_m, typical = 1e-3 * leave_one_out.translation_mm, float(np.sqrt(3)) * noise.together[0]
         if leave_one_out_m > max(3 * typical, WELL_ABOVE):
