@@ -142,10 +142,7 @@ def no_reconstruction(error: RejectedError) -> tuple[Finding, ...]:
     """The failure of every back end as findings."""
     details = {"text": error.what, "remedy": "; ".join(error.remedies)}
     failed = Finding(kind=Kind.NO_RECONSTRUCTION, severity="rejects", mend="reconstruction", details=details)
-    more = (
-        Finding(kind=Kind.RECONSTRUCTION, severity="warns", details={"text": text}) for text in error.also
-    )
-    return (failed, *more)
+    return (failed, *(Finding.of(Kind.RECONSTRUCTION, "warns", text=text) for text in error.also))
 
 
 CAMERA = frozenset(

@@ -29,7 +29,7 @@ from jcr.adjust.score_test import (
     tested,
 )
 from jcr.calibration.adjust import adjust_case, focal_of_each
-from jcr.calibration.case import Case, Checked, of_points
+from jcr.calibration.case import Case, Checked
 from jcr.calibration.checks.given_intrinsics import intrinsics_contradiction
 from jcr.calibration.checks.imaged import Imaged, of_case
 from jcr.camera import parameter_names, parameters
@@ -186,9 +186,9 @@ def _of_fewer_points(case: Case) -> Case:
     few = len(np.unique(tracks.point)) <= MOST_POINTS and len(tracks.image) <= most
     if len(case.used) < MIN_IMAGES or few:
         return case
-    fewer = case.with_tracks(of_some(tracks, most))
-    varies = case.options.focus == "varies"
-    return replace(fewer, adjusted=adjust_case(fewer, combinations=focal_of_each(case) if varies else None))
+    fewer = replace(case, chosen_tracks=of_some(tracks, most))
+    free = focal_of_each(case) if case.options.focus == "varies" else None
+    return replace(fewer, adjusted=adjust_case(fewer, combinations=free))
 
 
 def _with(state: _State, best: _Hypothesis) -> _State | None:
@@ -239,7 +239,7 @@ def of_some(tracks: Tracks, most: int) -> Tracks:
     chosen = tracks.on_board
     shown = enough[count[enough] >= 2][:MOST_POINTS]
     chosen[shown[np.cumsum(count[shown]) <= most]] = True
-    return of_points(tracks, chosen)
+    return tracks.only(chosen[tracks.point])
 
 
 def _all(state: _State) -> Float[ndarray, "e r"]:
