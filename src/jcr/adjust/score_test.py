@@ -10,6 +10,7 @@ free (`freed`) is what they come to.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -29,6 +30,10 @@ from jcr.records import Intrinsics
 WEAK = {"fx": 0.3, "fy": 0.3, "cx": 0.2, "cy": 0.2}
 """Standard deviations that only keep finite what the images cannot see: focal lengths relative, centre per width."""
 WEAK_DISTORTION, WEAK_SHEAR, WEAK_FOCAL, WEAK_OFFSET, WEAK_PRISM = 1.0, 0.3, 0.05, 0.1, 0.3
+
+
+OfImage = Literal["focal", "shear", "x", "y"]
+"""What NuisancePrior has of each image, in its order."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,30 +72,10 @@ class Alternatives:
         """Combinations: these parameters of the camera."""
         return np.eye(self.columns)[:, [self.names.index(name) for name in names]]
 
-    def common_focal(self) -> Float[ndarray, "e 1"]:
-        """Combination: both focal lengths by one factor."""
-        return self.of_camera(("fx", "fy")).sum(1, keepdims=True)
-
-    def focal_of_images(self, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
-        """Combinations: the logarithm of each image's focal length moves by its share."""
-        return self._of_images(0, shares)
-
-    def shear_of_images(self, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
-        """Combinations: x of each image moves by its share of the focal length over its height."""
-        return self._of_images(1, shares)
-
-    def offset_by_gravity(self) -> Float[ndarray, "e 2"]:
-        """Combinations: the offset of each image in x by gravity along x, in y by gravity along y."""
-        x, y = self.down_in_camera[:, :2].T
-        return np.concatenate([self._of_images(2, x[:, None]), self._of_images(3, y[:, None])], axis=1)
-
-    def prism(self) -> Float[ndarray, "e 4"]:
-        """Combinations: the coefficients of a thin prism."""
-        return np.eye(self.columns)[:, -PRISM:]
-
-    def _of_images(self, block: int, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
+    def of_images(self, nuisance: OfImage, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
+        """Combinations: this nuisance of each image moves by its share."""
         out = np.zeros((self.columns, shares.shape[1]))
-        first = len(self.names) + block * self.images
+        first = len(self.names) + get_args(OfImage).index(nuisance) * self.images
         out[first : first + self.images] = shares
         return out
 

@@ -280,28 +280,28 @@ def failed_file(
     attempts: Sequence[Attempt] = (),
 ) -> CalibrationFile:
     """The file of a capture whose images gave no camera poses at all; `findings` are the reasons, strongest first."""
-    return CalibrationFile(
-        mount=capture.mount,
-        gripper_from_camera=None,
-        scale=None,
-        base_from_recon=None,
-        backend=backend,
-        images=[ImageVerdict(image=name, used=False, reason="not registered") for name in capture.images],
-        residuals=None,
-        uncertainty=None,
-        held_out=None,
-        observability=Observed(
-            observable=False,
-            unobservable=["everything: no camera poses"],
-            advice=[remedy(findings[0]) or text(findings[0])],
-        ),
-        robot_noise=None,
-        intrinsics=IntrinsicsAndStd.of(capture.intrinsics),
-        **_derived(findings, ()),
-        timings_s=timings_s,
-        version=version,
-        attempts=list(attempts),
+    nothing = (
+        "gripper_from_camera",
+        "base_from_recon",
+        "scale",
+        "residuals",
+        "uncertainty",
+        "held_out",
+        "robot_noise",
     )
+    advice = remedy(findings[0]) or text(findings[0])
+    unseen = {"observable": False, "unobservable": ["everything: no camera poses"], "advice": [advice]}
+    content = dict.fromkeys(nothing) | {
+        "mount": capture.mount,
+        "backend": backend,
+        "images": [ImageVerdict(image=name, used=False, reason="not registered") for name in capture.images],
+        "observability": unseen,
+        "intrinsics": IntrinsicsAndStd.of(capture.intrinsics),
+        "timings_s": timings_s,
+        "version": version,
+        "attempts": list(attempts),
+    }
+    return CalibrationFile.model_validate(content | _derived(findings, ()))
 
 
 def image_verdicts(

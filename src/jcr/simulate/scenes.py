@@ -83,7 +83,7 @@ def make_scene(name: SceneName, seed: int, table: TableName | None = None) -> Sc
     layout, looks, lamp = (np.random.default_rng([seed, stream]) for stream in (1, 2, 3))
     recipe = RECIPES[name]
     center = np.array([layout.uniform(0.46, 0.52), layout.uniform(-0.03, 0.03), layout.uniform(-0.05, 0.08)])
-    things = [CATALOGUE[thing](looks) for thing in recipe.objects]
+    things = [TableObject(thing, CATALOGUE[thing](looks)) for thing in recipe.objects]
     top = _table_top(looks, table or recipe.table, recipe.plain_table)
     body = Part(box(_TABLE_SIZE, ("+x", "-x", "+y", "-y", "-z")), (0.45, 0.42, 0.38))
     parts = tuple(replace(part, mesh=part.mesh.moved((0.0, 0.0, -_TABLE_SIZE[2]))) for part in (top, body))

@@ -17,7 +17,7 @@ from numpy import ndarray
 
 from jcr.adjust.model_error import TYPICAL
 from jcr.adjust.robots import Adjusted
-from jcr.adjust.scene import OF_IMAGE
+from jcr.adjust.scene import OF_IMAGE, PRISM
 from jcr.adjust.score_test import (
     Alternatives,
     Tested,
@@ -299,21 +299,26 @@ def _hypotheses(state: _State) -> list[_Hypothesis]:
     far = np.log(equations.distance)
     far = far - far.mean()
     steps = np.arange(LEAST_PART, m - LEAST_PART + 1)
-    common, nothing = equations.common_focal(), np.zeros((equations.columns, 0))
+    common, nothing = (
+        equations.of_camera(("fx", "fy")).sum(1, keepdims=True),
+        np.zeros((equations.columns, 0)),
+    )
+    x, y = equations.down_in_camera[:, :2].T
+    sag = [equations.of_images("x", x[:, None]), equations.of_images("y", y[:, None])]
     found = [
-        _Hypothesis(Kind.FOCUS_BY_DISTANCE, equations.focal_of_images(far[:, None]), common),
-        _Hypothesis(Kind.FOCUS_BY_IMAGE, equations.focal_of_images(differences(m)), common),
-        _Hypothesis(Kind.ROLLING_SHUTTER, equations.shear_of_images(np.ones((m, 1))), common),
-        _Hypothesis(Kind.ROLLING_SHUTTER_BY_IMAGE, equations.shear_of_images(np.eye(m)), common),
+        _Hypothesis(Kind.FOCUS_BY_DISTANCE, equations.of_images("focal", far[:, None]), common),
+        _Hypothesis(Kind.FOCUS_BY_IMAGE, equations.of_images("focal", differences(m)), common),
+        _Hypothesis(Kind.ROLLING_SHUTTER, equations.of_images("shear", np.ones((m, 1))), common),
+        _Hypothesis(Kind.ROLLING_SHUTTER_BY_IMAGE, equations.of_images("shear", np.eye(m)), common),
     ]
     for k in steps:
         after = (np.arange(m) >= k) - (m - k) / m
-        free = equations.focal_of_images(after[:, None])
+        free = equations.of_images("focal", after[:, None])
         found.append(_Hypothesis(Kind.ZOOM, free, common, len(steps), int(k) - 1))
     of_centre = np.concatenate([common, equations.of_camera(("cx", "cy"))], axis=1)
-    found.append(_Hypothesis(Kind.CENTRE_SAGS, equations.offset_by_gravity(), of_centre))
+    found.append(_Hypothesis(Kind.CENTRE_SAGS, np.concatenate(sag, axis=1), of_centre))
     if len(state.adjusted.given.evidence.scene.cameras) == 1:  # all images share the glass
-        found.append(_Hypothesis(Kind.THIN_PRISM, equations.prism(), of_centre))
+        found.append(_Hypothesis(Kind.THIN_PRISM, np.eye(equations.columns)[:, -PRISM:], of_centre))
     # Intrinsics that are wrong in all images include the focal length that shows nothing in the others.
     found.append(_Hypothesis(Kind.INTRINSICS, equations.of_camera(_freed(state)), nothing))
     return found
