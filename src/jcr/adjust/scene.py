@@ -138,7 +138,7 @@ class Freedom:
     @property
     def nuisance_columns(self) -> slice:
         """After the intrinsics."""
-        begin = sum(len(prior.std) for prior in self.intrinsics)
+        begin = self.intrinsics_columns[-1].stop
         return slice(begin, begin + len(self.nuisance.std))
 
     @property

@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError, model_validator
 from jcr.arrays_json import Covariance7, Matrix, Numbers7, Part, Spread
 from jcr.calibration.findings_json import FindingJson, derived, findings_of_words, require_one_verdict
 from jcr.calibration.requirement import not_exact_enough
-from jcr.calibration.uncertainty_json import Uncertainty, mm_and_deg
+from jcr.calibration.uncertainty_json import SeenJson, Uncertainty, mm_and_deg
 from jcr.capture.plain_files import first_fault, read_json, shown
 from jcr.errors import InputError
 from jcr.files import write_text
@@ -35,7 +35,6 @@ from jcr.records import (
     Requirement,
     RobotExamined,
     ScaleCheck,
-    Seen,
     Verdict,
     strongest_first,
     without_consequences,
@@ -104,7 +103,7 @@ class GivenIntrinsicsKept(Part):
     covariance: Covariance7
     """In the order of `uncertainty`."""
     intrinsics: IntrinsicsJson
-    seen: Seen
+    seen: SeenJson
     differs_mm: Spread
     """From where the estimated intrinsics and their transform place a point at the centre of the image."""
 

@@ -147,4 +147,9 @@ def some_of_many(tracks: Tracks, most: int) -> Tracks:
     order = np.random.default_rng(0).permutation(len(count))
     chosen = tracks.on_board
     chosen[order[np.cumsum(count[order]) <= most]] = True
+    return of_points(tracks, chosen)
+
+
+def of_points(tracks: Tracks, chosen: Bool[ndarray, " p"]) -> Tracks:
+    """The observations of some of the points, which keep their rows."""
     return tracks.only(chosen[tracks.point])

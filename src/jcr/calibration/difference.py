@@ -1,6 +1,6 @@
 """How far apart two calibrations are, whether what both report explains it, and which of its causes would."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -24,12 +24,12 @@ class Difference:
     translation_m: Float[ndarray, "3"]
     rotation_vector: Float[ndarray, "3"]
     """rad: R_other = exp(r)·R."""
-    sigmas: Float[ndarray, "6"] | None = None
+    sigmas: Float[ndarray, "6"] | None
     """Size on each axis in standard deviations of the difference; None where neither states any."""
-    chi2: float | None = None
+    chi2: float | None
     """Squared Mahalanobis distance, of 6 degrees of freedom where errors of the two are independent."""
-    p_value: float | None = None
-    explained_by: dict[str, float] = field(default_factory=dict)
+    p_value: float | None
+    explained_by: dict[str, float]
     """Shares of it, by cause, largest first; their sum is 1. Empty where there is no difference."""
 
 
@@ -57,7 +57,14 @@ def difference(ours: Known, other: Known) -> Difference:
         for name, part in (known.parts | {OTHER: rest}).items():
             parts[name] = parts.get(name, np.zeros((6, 6))) + part
     if not np.diag(together).all():  # neither states any, or both are said to be exact
-        return Difference(translation_m=step[:3], rotation_vector=step[3:])
+        return Difference(
+            translation_m=step[:3],
+            rotation_vector=step[3:],
+            sigmas=None,
+            chi2=None,
+            p_value=None,
+            explained_by={},
+        )
     std = np.sqrt(np.diag(together))
     weighed = np.linalg.solve(together / np.outer(std, std), step / std) / std
     squared = float(step @ weighed)

@@ -66,11 +66,20 @@ class UncertaintyBudget(Part):
         return self.robot_systematic.translation_mm**2 >= squares
 
 
+def _sizes(found: Seen) -> Seen:
+    if min(size for size in vars(found).values() if isinstance(size, float)) < 0:
+        raise ValueError("a size below 0")
+    return found
+
+
+SeenJson = Annotated[Seen, AfterValidator(_sizes)]
+
+
 @dataclass(frozen=True, kw_only=True)
 class SeenAndCorners(Seen):
     """At the centre of the image, and at its worst corner."""
 
-    corners: Seen
+    corners: SeenJson
 
 
 class Joint(Part):
@@ -106,7 +115,7 @@ class Uncertainty(Part):
     worst: str
     """The least certain direction of the translation in words, and its size."""
     budget: UncertaintyBudget | None = None
-    seen: SeenAndCorners | None = None
+    seen: Annotated[SeenAndCorners, AfterValidator(_sizes)] | None = None
     """Null in files of earlier versions."""
     scene_95_mm: Spread | None = None
     """95 % of the errors of points of the reconstruction in the base frame are smaller, at the median point."""

@@ -29,7 +29,7 @@ from jcr.adjust.score_test import (
     tested,
 )
 from jcr.calibration.adjust import adjust_case, focal_of_each
-from jcr.calibration.case import Case, Checked
+from jcr.calibration.case import Case, Checked, of_points
 from jcr.calibration.checks.given_intrinsics import intrinsics_contradiction
 from jcr.calibration.checks.imaged import Imaged, of_case
 from jcr.camera import parameter_names, parameters
@@ -239,7 +239,7 @@ def of_some(tracks: Tracks, most: int) -> Tracks:
     chosen = tracks.on_board
     shown = enough[count[enough] >= 2][:MOST_POINTS]
     chosen[shown[np.cumsum(count[shown]) <= most]] = True
-    return tracks.only(chosen[tracks.point])
+    return of_points(tracks, chosen)
 
 
 def _all(state: _State) -> Float[ndarray, "e r"]:
