@@ -37,7 +37,7 @@ from jcr.handeye.equation import (
 )
 from jcr.handeye.mixed_model import Equations, left_out, solve
 from jcr.handeye.systematic import Region
-from jcr.records import Budget, ModelError
+from jcr.records import Budget, ModelError, RobotNoise
 
 TINY_STEP = 1e-6
 """m, rad, or standard deviations of what is small: for derivatives by differences."""
@@ -90,20 +90,9 @@ class Adjusted:
     given: "Given"
 
     @property
-    def noise(self) -> tuple[float, float]:
-        """m, rad per axis: the robots' random errors."""
-        sigma_t, sigma_r = np.sqrt(self.equations.variances(self.log_sizes)[:2]).tolist()
-        return sigma_t, sigma_r
-
-    @property
-    def systematic(self) -> float:
-        """rad: size of the robots' systematic errors."""
-        return float(np.sqrt(self.equations.variances(self.log_sizes)[2]))
-
-    @property
-    def systematic_left(self) -> tuple[float, float]:
-        """m, rad per axis: what of these is left in the poses."""
-        return self.equations.systematic_left(self.log_sizes)
+    def noise(self) -> RobotNoise:
+        """Errors of the gripper poses, the same of all arms."""
+        return self.equations.noise(self.log_sizes)
 
     @property
     def first_camera_column(self) -> int:
@@ -112,7 +101,8 @@ class Adjusted:
 
     def leave_one_out(self) -> Float[ndarray, "m 6"]:
         """Steps from the reported to the adjusted gripper poses (m, rad), each by an adjustment without that pose."""
-        return left_out(solve(self.equations, self.log_sizes), self.noise)[0]
+        random = self.noise.translation, self.noise.rotation
+        return left_out(solve(self.equations, self.log_sizes), random)[0]
 
     def intrinsics_covariance(self, c: int) -> Float[ndarray, "q q"]:
         """Of the parameters of a camera, in the order of camera.parameters."""

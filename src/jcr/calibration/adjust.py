@@ -19,7 +19,6 @@ from jcr.calibration.case import Case
 from jcr.calibration.consider import with_intrinsics_considered
 from jcr.geometry import inverse, retract, scale_translation, step_between
 from jcr.handeye.equation import predict
-from jcr.handeye.fit import exceeds
 from jcr.handeye.residuals import paper_residuals
 from jcr.handeye.solve import judged
 from jcr.records import (
@@ -29,7 +28,6 @@ from jcr.records import (
     LeaveOneOut,
     PaperResiduals,
     RobotExamined,
-    RobotNoise,
     Tracks,
 )
 
@@ -113,19 +111,6 @@ def estimate_in(found: Adjusted, scale: float, base_from_recon: Float[ndarray, "
     )
 
 
-def robot_noise_of(found: Adjusted) -> RobotNoise:
-    """The errors of the gripper poses, as an adjustment found them."""
-    given = found.given.noise
-    return RobotNoise(
-        translation=found.noise[0],
-        rotation=found.noise[1],
-        estimated=exceeds(found.noise, given),
-        given=given,
-        systematic=found.systematic,
-        systematic_left=found.systematic_left,
-    )
-
-
 def _considered(case: Case) -> Case:
     """The case with what errors of its given intrinsics do to a fit to poses, which cannot estimate them."""
     made_with_them = case.reconstruction.evidence is None and not case.tracks.from_pointmaps
@@ -169,7 +154,7 @@ def refined_by(case: Case, found: Adjusted) -> HandEye:
             reprojection_px=reprojection,
         ),
         residuals=PaperResiduals(*paper_residuals(gripper, camera, x, estimate.scale, before.inliers)),
-        robot=RobotExamined(robot_noise_of(found)),
+        robot=RobotExamined(found.noise),
         leave_one_out=_leave_one_out(found),
         before=before,
     )
