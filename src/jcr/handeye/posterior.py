@@ -47,7 +47,7 @@ def posterior(
 ) -> Posterior:
     """The unknowns averaged over the sizes about their mode; `region` adds what other poses of it would change."""
     found = over_sizes(equations, log_sizes, information)
-    return _averaged(equations, log_sizes, found, lambda *at: _elsewhere(equations, *at, region))
+    return _averaged(equations, log_sizes, found, lambda one, at: _elsewhere(equations, one, at, region))
 
 
 def expected_posterior(equations: Equations, noise: RobotNoise, region: Region | None) -> Posterior:

@@ -148,7 +148,7 @@ def _quantities(finding: Finding) -> dict[str, Any]:
 
 
 class _Way(float):
-    """A number of which a template names the sign: {way:long|short}."""
+    """A number whose sign a template names: {way:long|short}."""
 
     def __format__(self, words: str) -> str:
         return words.split("|")[self <= 0]
