@@ -97,7 +97,7 @@ class Ahead:
         reach: Float[ndarray, "2 3"] | None = None,
         seed: int = 0,
     ) -> "Ahead":
-        """The `count` poses that help most; `robot` is of the others, `reach` as `candidates` takes it, drawn by `seed`."""
+        """The `count` that help most; `robot` is of the others, `reach` as `candidates` takes it, drawn with `seed`."""
         x, noise = assumptions.gripper_from_camera, assumptions.noise
         of_random, distance = (noise.translation, noise.rotation), assumptions.distance_m
         possible = candidates(base_from_gripper, x, reach, np.random.default_rng(seed))
