@@ -87,7 +87,7 @@ EXAMPLES: dict[Kind, dict] = {
         "details": SIZE | {"longer": "after", "count": 5.0},
     },
     Kind.DRIFT: {"value": 0.01, "p": 1e-9, "details": SIZE},
-    Kind.DELAY: {"value": 0.01, "std": 0.001, "p": 1e-9, "details": {"unit": "s"}},
+    Kind.DELAY: {"value": 0.41, "std": 0.03, "p": 1e-9, "details": {"unit": "interval"}},
     Kind.WRONG_MOUNT: {"details": {"camera": "overhead"}},
     Kind.SYSTEMATIC_ERRORS: {"value": 0.01, "p": 1e-9, "details": SIZE},
     Kind.JOINT_OFFSETS: {"joints": (2,), "p": 1e-9, "details": {"joint_2": 0.01, "joint_2_std": 0.001}},

@@ -53,10 +53,10 @@ def test_objects_stand_on_the_table_and_apart(name):
 
 @pytest.mark.parametrize("make", CATALOGUE.values(), ids=CATALOGUE)
 def test_surfaces_close_and_face_outwards(make):
-    thing = make(np.random.default_rng(0))
-    corners = np.concatenate([part.mesh.vertices for part in thing.parts])
+    parts = make(np.random.default_rng(0))
+    corners = np.concatenate([part.mesh.vertices for part in parts])
     x = np.random.default_rng(1).uniform(corners.min(0) - 0.01, corners.max(0) + 0.01, (1000, 3))
-    rotations = sum(winding_number(part.mesh, x) for part in thing.parts)
+    rotations = sum(winding_number(part.mesh, x) for part in parts)
     # The open ends of a mug's handle and an apple's stalk leak a little, and little else than beside them.
     assert (np.abs(rotations - rotations.round()) > 0.05).mean() < 0.02
     assert rotations.round().min() == 0 and rotations.round().max() >= 1
