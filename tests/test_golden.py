@@ -93,7 +93,7 @@ def test_a_map_is_built_on_it(
     from jcr.represent.options import MapOptions
 
     out = golden(name)
-    result = jcr.build_map(out, map=MapOptions(max_seconds=5.0))
+    result = jcr.build_map(out, map=MapOptions(max_seconds=1.0))
     assert result.cloud is not None and len(result.cloud.points_in_base) > 500
     assert (result.reconstruction.dense.confidence.shape[2] == 40) == (name == "run")
     assert RunFolder(out).has_map() and RunFolder(out).calibration().converged

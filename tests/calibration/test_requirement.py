@@ -99,7 +99,7 @@ def with_poses(problem: HandEyeProblem, poses: np.ndarray, rng: np.random.Genera
 
 def test_the_poses_that_are_proposed_reach_what_they_promise():
     ratios = []
-    for seed in range(12, 20):
+    for seed in range(12, 17):
         rng = np.random.default_rng(seed)
         problem = hand_eye_problem(rng, 12, robot_noise=NOISE)
         now = calibrate_poses(with_poses(problem, np.zeros((0, 4, 4)), rng)).requirement

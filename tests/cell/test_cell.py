@@ -2,7 +2,6 @@
 
 import json
 import os
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -37,8 +36,6 @@ from jcr.errors import RejectedError
 from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.progress import silent
 from jcr.reconstruct.backends import ReconstructOptions
-from jcr.reconstruct.relocate import Features
-from jcr.reconstruct.relocate import features as sift_features
 from jcr.records import Capture, CellCamera, Finding, HandEye, Intrinsics, Reconstruction, Tracks
 from jcr.records import Kind as FindingKind
 
@@ -150,22 +147,6 @@ def test_images_alone_leave_one_similarity_open():
     assert np.allclose(along, fixed * np.eye(7), rtol=1e-6, atol=1e-6 * fixed)
     values = np.linalg.eigvalsh(found.information - fixed * unseen @ unseen.T)
     assert (np.abs(values) > 1e-8 * values[-1]).sum() == len(values) - 7
-
-
-@pytest.fixture(scope="module", autouse=True)
-def features_found_once() -> Iterator[None]:
-    """Features of an image are found once for all tests of this file."""
-    found: dict[tuple[bytes, Intrinsics], Features] = {}
-
-    def features(image: np.ndarray, intrinsics: Intrinsics) -> Features:
-        key = image.tobytes(), intrinsics
-        if key not in found:
-            found[key] = sift_features(image, intrinsics)
-        return found[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(localise, "features", features)
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -616,17 +616,17 @@ def test_poses_that_read_well_and_mean_nothing_are_rejected(
     assert not found.converged and found.warnings
 
 
-def test_a_full_disk_leaves_the_earlier_results(tmp_path: Path, done: Path, capsys):
+def test_a_full_disk_leaves_the_earlier_results(tmp_path: Path, small_done: Path, capsys):
     disk = tmp_path / "disk"
     disk.mkdir()
-    size = sum(path.stat().st_size for path in done.iterdir())
+    size = sum(path.stat().st_size for path in small_done.iterdir())
     mount = ["mount", "-t", "tmpfs", "-o", f"size={size + (2 << 20)}", "tmpfs", str(disk)]
     try:
         subprocess.run(mount, check=True, capture_output=True)
     except (OSError, subprocess.CalledProcessError):
         pytest.skip("a small file system to fill cannot be mounted here")
     try:
-        shutil.copytree(done, disk, dirs_exist_ok=True)
+        shutil.copytree(small_done, disk, dirs_exist_ok=True)
         (disk / "filler").write_bytes(b"x" * (1 << 20))
         before = state(disk)
         assert dispatch(["map", str(disk), "--max-seconds", "1", "--quiet"]) == 2
