@@ -65,6 +65,7 @@ def test_what_an_earlier_version_wrote_is_read(golden: Callable[[str], Path], na
         assert dense.confidence.shape == (5, 30, 40) and dense.confidence.any() and not dense.is_predicted
 
 
+@pytest.mark.slow
 def test_the_same_calibration_comes_of_it(
     golden: Callable[[str], Path], nothing_is_reconstructed: None
 ) -> None:

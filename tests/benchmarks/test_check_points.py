@@ -50,6 +50,7 @@ def test_a_sheet_that_bends_is_not_flat_and_scatters_no_more():
     assert bent.scatter == pytest.approx(flat.scatter, rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_scatter_is_predicted_from_what_a_calibration_states():
     ratios = []
     for seed in range(3):
