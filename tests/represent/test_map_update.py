@@ -161,7 +161,7 @@ def mapped(truth: Truth, capture: Capture, reconstruction: Reconstruction, hand_
 
     box = tuple(truth.workspace_in_base.ravel().tolist())
     cloud = point_cloud(capture, reconstruction, hand_eye, options=CloudOptions(confidence_percentile=0.0))
-    return build_scene(cloud, MapOptions(workspace=box, cell=0.02))
+    return build_scene(cloud, MapOptions(workspace=box))
 
 
 def within(truth: Truth, name: str, count: int = 4000) -> np.ndarray:
