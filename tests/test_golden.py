@@ -65,7 +65,6 @@ def test_what_an_earlier_version_wrote_is_read(golden: Callable[[str], Path], na
         assert dense.confidence.shape == (5, 30, 40) and dense.confidence.any() and not dense.is_predicted
 
 
-@pytest.mark.slow
 def test_the_same_calibration_comes_of_it(
     golden: Callable[[str], Path], nothing_is_reconstructed: None
 ) -> None:
@@ -94,7 +93,7 @@ def test_a_map_is_built_on_it(
     from jcr.represent.options import MapOptions
 
     out = golden(name)
-    result = jcr.build_map(out, map=MapOptions(max_seconds=1.0))
+    result = jcr.build_map(out, map=MapOptions(max_seconds=5.0))
     assert result.cloud is not None and len(result.cloud.points_in_base) > 500
     assert (result.reconstruction.dense.confidence.shape[2] == 40) == (name == "run")
     assert RunFolder(out).has_map() and RunFolder(out).calibration().converged
