@@ -54,9 +54,11 @@ class Run:
         self.wait_for_lock()
         assert self.process.pid is not None
         os.kill(self.process.pid, signal.SIGSTOP)
-        assert dispatch(["run", str(self.capture), str(self.out), "--quiet"]) == 2
+        try:
+            assert dispatch(["run", str(self.capture), str(self.out), "--quiet"]) == 2
+        finally:
+            os.kill(self.process.pid, signal.SIGCONT)
         assert "another jcr is writing there; wait for it" in capsys.readouterr().err
-        os.kill(self.process.pid, signal.SIGCONT)
 
     def wait_for_lock(self) -> None:
         while self.process.is_alive() and not is_locked(self.out / ".lock"):
