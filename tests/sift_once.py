@@ -20,7 +20,7 @@ def once(function: Callable[..., Arrays], most: int) -> Callable[..., Arrays]:
     lock = threading.Lock()
 
     def recalled(*arrays: np.ndarray) -> Arrays:
-        key = tuple((array.shape, hashlib.sha1(np.ascontiguousarray(array)).digest()) for array in arrays)
+        key = tuple((array.shape, hashlib.sha1(array.tobytes()).digest()) for array in arrays)
         with lock:
             answer = known.get(key)
         if answer is None:
