@@ -599,6 +599,7 @@ def in_degrees(pose: np.ndarray) -> np.ndarray:
     return transform(rotation_exp(np.degrees(rotation_log(pose[:3, :3]))), pose[:3, 3])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [
