@@ -1,9 +1,12 @@
 """`benchmarks boards DIR`: features alone, a board alone, and both in one adjustment: real captures, and simulated."""
 
+import json
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -42,8 +45,8 @@ class Outcome:
     deg: float
     sigmas: float
     """Largest error on an axis of X in stated standard deviations."""
-    scale_sigmas: float
     named: bool
+    """A finding states that board and robot contradict each other."""
     accepted: bool
 
 
@@ -64,9 +67,10 @@ class Row:
     seconds: float | None = None
 
 
-def run(captures: Path, boards: Sequence[str] = (), long: bool = False) -> str:
+def run(captures: Path, boards: Sequence[str] = (), runs: Path | None = None, long: bool = False) -> str:
     """Markdown: the captures below `captures` that `boards` names as CAPTURE=BOARD, and the simulated table.
 
+    Simulated draws are kept in the folder `runs` as they are made, and those that are there are used.
     Raises InputError where a capture that is named is not there.
     """
     named = {name: board for name, _, board in (text.partition("=") for text in boards)}
@@ -75,12 +79,7 @@ def run(captures: Path, boards: Sequence[str] = (), long: bool = False) -> str:
         raise InputError(f"--boards {', '.join(sorted(unknown))}: no such capture in {captures}")
     rows = [row for name, board in named.items() for row in _rows(read_capture(folders[name]), board)]
     draws = LONG_DRAWS if long else DRAWS
-    table = {
-        (images, bend, scale): [_simulated(images, bend, scale, seed) for seed in range(draws)]
-        for images in IMAGES
-        for bend in BENDS_M
-        for scale in POSE_SCALES
-    }
+    table = _table(draws, None if runs is None else runs / "draws.jsonl")
     return "\n".join([_claim(table), "", *_real_table(rows), "", *_simulated_table(table, draws), ""])
 
 
@@ -212,19 +211,44 @@ def _real_line(row: Row) -> str:
 # Simulated captures.
 
 
+def _table(draws: int, file: Path | None) -> "Table":
+    """That many draws of every row, the first of all rows before the second of any; a line of `file` each."""
+    rows = list(product(IMAGES, BENDS_M, POSE_SCALES))
+    made = dict[tuple[float, ...], dict[str, Outcome]]()
+    if file is not None and file.is_file():
+        for line in map(json.loads, file.read_text().splitlines()):
+            made[tuple(line["draw"])] = {how: Outcome(**one) for how, one in line["outcomes"].items()}
+    for seed, row in product(range(draws), rows):
+        if (*row, seed) in made:
+            continue
+        made[(*row, seed)] = outcomes = _simulated(*row, seed)
+        if file is not None:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            line = {"draw": (*row, seed), "outcomes": {how: asdict(one) for how, one in outcomes.items()}}
+            with file.open("a") as kept:
+                kept.write(json.dumps(line) + "\n")
+    return {row: [made[(*row, seed)] for seed in range(draws)] for row in rows}
+
+
 def _simulated(images: int, bend_m: float, pose_scale: float, seed: int) -> dict[str, Outcome]:
     """One draw, calibrated in each way."""
-    rng = np.random.default_rng([seed, images])
-    bare = faulty_capture(rng, images, Faults(pose_scale=pose_scale))
+    bare, capture, reconstruction, features = _without_sheet(images, pose_scale, seed)
+    rng = np.random.default_rng([seed, images, 1])
     sheet = Sheet(bend_m=bend_m, size_error=float(rng.normal(scale=PRINTED)))
     found = with_sheet(bare, rng, sheet)
+    ways = {"board": _board_alone(found), "both": replace(reconstruction, tracks=found.tracks)}
+    outcomes = {how: _outcome(found, calibrate_stage(capture, one)) for how, one in ways.items()}
+    return {"features": features, **outcomes}
+
+
+@lru_cache(maxsize=len(IMAGES) * len(POSE_SCALES))
+def _without_sheet(
+    images: int, pose_scale: float, seed: int
+) -> tuple[FaultyCapture, Capture, Reconstruction, Outcome]:
+    """What sheets of every shape are put into, and what its features alone come to."""
+    bare = faulty_capture(np.random.default_rng([seed, images]), images, Faults(pose_scale=pose_scale))
     capture, reconstruction = reconstructed(bare, estimated=False)
-    ways = {
-        "features": reconstruction,
-        "board": _board_alone(found),
-        "both": replace(reconstruction, tracks=found.tracks),
-    }
-    return {how: _outcome(found, calibrate_stage(capture, one), pose_scale) for how, one in ways.items()}
+    return bare, capture, reconstruction, _outcome(bare, calibrate_stage(capture, reconstruction))
 
 
 def _board_alone(found: FaultyCapture) -> Reconstruction:
@@ -260,7 +284,7 @@ def _board_alone(found: FaultyCapture) -> Reconstruction:
     )
 
 
-def _outcome(found: FaultyCapture, hand_eye: HandEye, pose_scale: float) -> Outcome:
+def _outcome(found: FaultyCapture, hand_eye: HandEye) -> Outcome:
     step = step_between(hand_eye.gripper_from_camera, found.gripper_from_camera)
     std = np.sqrt(np.diag(hand_eye.covariance))
     metres, radians = np.linalg.norm(step.reshape(2, 3), axis=1)
@@ -268,9 +292,8 @@ def _outcome(found: FaultyCapture, hand_eye: HandEye, pose_scale: float) -> Outc
         1e3 * float(metres),
         float(np.degrees(radians)),
         float(np.abs(step / std[:6]).max()),
-        abs(float(np.log(hand_eye.scale))) / float(std[6]),
         any(one.kind in NAMED for one in hand_eye.findings),
-        hand_eye.converged,
+        bool(hand_eye.converged),
     )
 
 

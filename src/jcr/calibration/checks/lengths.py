@@ -1,8 +1,9 @@
 """Lengths beside the robot's positions: boards, a known length, a depth camera, a network that predicts metres.
 
-Each is compared with the robot's positions and with each other. Where none contradicts another the scale is their
-weighted mean: they are priors in the mixed model, which weighs the robot's positions as their errors deserve. Where two
-contradict each other, the scale stays the robot's, and a finding names the two.
+Each is compared with the robot's positions and with each other. Where none contradicts another the scale is the weighted
+mean of the robot's and of those that agree with it: they are priors in the mixed model, which weighs the robot's
+positions as their errors deserve. Where two contradict each other, the scale stays the robot's, and a finding names the
+two.
 """
 
 from collections.abc import Iterator
@@ -32,6 +33,10 @@ out. To pull the scale towards a board where that is why they differ bends the t
 1 % too long."""
 SIGMAS = 3.5
 """Standard deviations of a difference from which two lengths contradict each other."""
+AGREES = 2.0
+"""Standard deviations of a difference up to which a length is weighed with the robot's. Between these and SIGMAS neither
+is likely: of positions that are 1 % too long, weighing takes X from 1.0 mm off to 1.4 (docs/results/boards.md), since
+the poses give way by rotating and shifting X, where the whole answer is but too large."""
 LEAST = 0.005
 """And its least size: the robot's own covariance leaves out what is wrong with its lengths all alike."""
 EXACT = 0.015
@@ -58,15 +63,13 @@ def check_lengths(case: Case) -> Checked:
     robot = Length("robot", 0.0, float(np.sqrt(hand_eye.covariance[6, 6])))
     pair = contradiction([robot, *lengths]) if hand_eye.converged else None
     is_made_of_images = hand_eye.converged and case.adjusted is not None and hand_eye.before is not None
-    worth = (
-        [one for one in lengths if one.std < WORTH * robot.std] if is_made_of_images and pair is None else []
-    )
+    weighed = [one for one in lengths if is_made_of_images and pair is None and is_weighed(one, robot)]
     checks = tuple(
         LengthCheck(
             name=one.name,
             robot_longer_percent=100 * float(np.expm1(one.off)),
             std_percent=100 * one.std,
-            used=one in worth,
+            used=one in weighed,
         )
         for one in lengths
         if one.name != "robot"
@@ -74,7 +77,12 @@ def check_lengths(case: Case) -> Checked:
     hand_eye = _with(hand_eye, lengths=checks)
     if pair is not None:
         return Checked((_finding(*pair, hand_eye), *_from_robot_alone(case, hand_eye)), hand_eye)
-    return _fused(case, hand_eye, worth) if worth else Checked(_from_robot_alone(case, hand_eye), hand_eye)
+    fault = _fault(hand_eye, lengths)
+    if weighed:
+        return _fused(case, hand_eye, weighed, fault)
+    if hand_eye.converged and fault.any():
+        hand_eye = judged(replace(hand_eye, estimate=hand_eye.estimate.with_fault(fault)))
+    return Checked(_from_robot_alone(case, hand_eye), hand_eye)
 
 
 def _measured(case: Case) -> tuple[HandEye, list[Length]]:
@@ -132,6 +140,11 @@ def contradiction(lengths: list[Length]) -> tuple[Length, Length] | None:
     return worst if sigmas(worst) > SIGMAS and abs(worst[0].off - worst[1].off) > LEAST else None
 
 
+def is_weighed(one: Length, robot: Length) -> bool:
+    """Whether a length is exact enough to move the scale, and agrees with the robot's."""
+    return one.std < WORTH * robot.std and abs(one.off) < AGREES * float(np.hypot(one.std, robot.std))
+
+
 def _finding(one: Length, other: Length, hand_eye: HandEye) -> Finding:
     """That two lengths contradict each other; the robot is the first where it is one of them."""
     off, std = other.off - one.off, float(np.hypot(one.std, other.std))
@@ -167,7 +180,17 @@ def _from_robot_alone(case: Case, hand_eye: HandEye) -> tuple[Finding, ...]:
     return (Finding.of(Kind.SCALE_FROM_ROBOT, "informs"),)
 
 
-def _fused(case: Case, hand_eye: HandEye, lengths: list[Length]) -> Checked:
+def _fault(hand_eye: HandEye, lengths: list[Length]) -> Float[ndarray, "7 7"]:
+    """Covariance of what the most exact of the lengths differs by beyond what both may be off by: the robot may be."""
+    best = min(lengths, key=lambda one: one.std)
+    beyond = best.off**2 - best.std**2 - float(hand_eye.covariance[6, 6])
+    if best.std >= EXACT or beyond <= 0:
+        return np.zeros((7, 7))
+    shift = _shift(float(np.sqrt(beyond)), hand_eye)
+    return np.outer(shift, shift)
+
+
+def _fused(case: Case, hand_eye: HandEye, lengths: list[Length], fault: Float[ndarray, "7 7"]) -> Checked:
     """The calibration with the lengths as priors of its scale."""
     assert case.adjusted is not None
     placed, boards = case.adjusted.most_likely, case.reconstruction.tracks.boards
@@ -181,13 +204,7 @@ def _fused(case: Case, hand_eye: HandEye, lengths: list[Length]) -> Checked:
     ]
     adjusted = with_lengths(case.adjusted, known)
     refined = refined_by(case, adjusted)
-    estimate = refined.estimate
-    # What the best of the lengths differs by, beyond what both may be off by, may be the robot's.
-    best = min(lengths, key=lambda one: one.std)
-    beyond = best.off**2 - best.std**2 - float(hand_eye.covariance[6, 6])
-    if best.std < EXACT and beyond > 0:
-        shift = _shift(float(np.sqrt(beyond)), hand_eye)
-        estimate = estimate.with_fault(np.outer(shift, shift))
+    estimate = refined.estimate.with_fault(fault)
     for one in hand_eye.findings:
         if one.shift is not None:
             of_camera = one.intrinsics_shift
