@@ -33,7 +33,9 @@ DRAWS, LONG_DRAWS = 2, 40
 POSE_SCALES = (1.0, 1.01, 1.02, 1.05)
 BENDS_M = (0.0, 2e-3)
 IMAGES = (8, 15)
-HOWS = ("features", "board", "both")
+USUAL = {"features": "colmap", "board": "marker", "both": "colmap"}
+"""What each is calibrated from, and the back end that it usually comes to."""
+HOWS = tuple(USUAL)
 NAMED = frozenset({Kind.BOARD_SIZE, Kind.SCALES})
 
 
@@ -89,22 +91,24 @@ def run(captures: Path, boards: Sequence[str] = (), runs: Path | None = None, lo
 def _rows(capture: Capture, board: str) -> Iterator[Row]:
     reference = capture.folder / "reference.json"
     x = read_hand_eye(reference).gripper_from_camera if reference.is_file() else None
-    shown = _calibrated(capture, "both", board)
+    timed = dict[str, tuple[RunResult | RejectedError, float]]()
     for how in HOWS:
         begun = time.perf_counter()
         result = _calibrated(capture, how, board)
-        seconds = time.perf_counter() - begun
+        timed[how] = result, time.perf_counter() - begun
+    shown, _ = timed["both"]
+    for how, (result, seconds) in timed.items():
         if isinstance(result, RejectedError):
             yield Row(capture.folder.name, how, f"none: {result.what}", seconds=seconds)
             continue
-        found = result.hand_eye
+        found, backend = result.hand_eye, result.calibration.backend
         std = np.sqrt(np.diag(found.covariance))
         halves = (None, None)
         if not isinstance(shown, RejectedError):
             halves = _left_out(capture, how, board, shown.reconstruction)
         yield Row(
             capture.folder.name,
-            how,
+            how if backend == USUAL[how] else f"{how} ({backend})",
             result.calibration.verdict or "",
             None if x is None else 1e3 * float(np.linalg.norm(found.gripper_from_camera[:3, 3] - x[:3, 3])),
             None if x is None else float(rotation_between_deg(found.gripper_from_camera[:3, :3], x[:3, :3])),
@@ -117,10 +121,12 @@ def _rows(capture: Capture, board: str) -> Iterator[Row]:
 
 
 def _calibrated(capture: Capture, how: str, board: str) -> RunResult | RejectedError:
-    backend, named = {"features": ("colmap", None), "board": ("marker", board), "both": ("colmap", board)}[
-        how
-    ]
-    options = RunOptions(reconstruct=ReconstructOptions(backend=backend, board=named))
+    """As a user would: with and without --board, and with --backend marker."""
+    options = RunOptions(
+        reconstruct=ReconstructOptions(
+            backend="marker" if how == "board" else "auto", board=None if how == "features" else board
+        )
+    )
     try:
         with tempfile.TemporaryDirectory() as out:
             return calibrate(capture, out, options)
@@ -139,7 +145,8 @@ def _left_out(
     intrinsics = half.hand_eye.intrinsics or half.reconstruction.intrinsics
     cameras = capture.base_from_gripper[shown.image_index] @ half.hand_eye.gripper_from_camera
     odd = ~even[shown.image_index]
-    tracks, corners = shown.tracks, shown.tracks.on_board
+    tracks = shown.tracks
+    corners = tracks.on_board | tracks.from_board
     own = tracks.only(odd[tracks.image])
     features, on_board = (own.only(corners[own.point] == kind) for kind in (False, True))
     return _reprojection_px(features, cameras, intrinsics), _reprojection_px(on_board, cameras, intrinsics)

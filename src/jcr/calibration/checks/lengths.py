@@ -33,12 +33,12 @@ out. To pull the scale towards a board where that is why they differ bends the t
 1 % too long."""
 SIGMAS = 3.5
 """Standard deviations of a difference from which two lengths contradict each other."""
+LEAST = 0.005
+"""And its least size: the robot's own covariance leaves out what is wrong with its lengths all alike."""
 AGREES = 2.0
 """Standard deviations of a difference up to which a length is weighed with the robot's. Between these and SIGMAS neither
 is likely: of positions that are 1 % too long, weighing takes X from 1.0 mm off to 1.4 (docs/results/boards.md), since
 the poses give way by rotating and shifting X, where the whole answer is but too large."""
-LEAST = 0.005
-"""And its least size: the robot's own covariance leaves out what is wrong with its lengths all alike."""
 EXACT = 0.015
 """Relative standard deviation of a length that is exact enough to reject a calibration by."""
 WORTH = 10.0
@@ -54,6 +54,10 @@ class Length:
     off: float
     std: float
 
+    def agrees_with(self, other: "Length") -> bool:
+        """Whether the two differ by no more than they usually do."""
+        return abs(self.off - other.off) < AGREES * float(np.hypot(self.std, other.std))
+
 
 def check_lengths(case: Case) -> Checked:
     """The scale with every length that is known, or which two of them contradict each other."""
@@ -63,7 +67,11 @@ def check_lengths(case: Case) -> Checked:
     robot = Length("robot", 0.0, float(np.sqrt(hand_eye.covariance[6, 6])))
     pair = contradiction([robot, *lengths]) if hand_eye.converged else None
     is_made_of_images = hand_eye.converged and case.adjusted is not None and hand_eye.before is not None
-    weighed = [one for one in lengths if is_made_of_images and pair is None and is_weighed(one, robot)]
+    weighed = [
+        one
+        for one in lengths
+        if is_made_of_images and pair is None and one.std < WORTH * robot.std and one.agrees_with(robot)
+    ]
     checks = tuple(
         LengthCheck(
             name=one.name,
@@ -76,7 +84,9 @@ def check_lengths(case: Case) -> Checked:
     )
     hand_eye = _with(hand_eye, lengths=checks)
     if pair is not None:
-        return Checked((_finding(*pair, hand_eye), *_from_robot_alone(case, hand_eye)), hand_eye)
+        others = [one for one in (robot, *lengths) if one not in pair]
+        found = finding_of(*pair, others, hand_eye)
+        return Checked((found, *_from_robot_alone(case, hand_eye)), hand_eye)
     fault = _fault(hand_eye, lengths)
     if weighed:
         return _fused(case, hand_eye, weighed, fault)
@@ -140,31 +150,37 @@ def contradiction(lengths: list[Length]) -> tuple[Length, Length] | None:
     return worst if sigmas(worst) > SIGMAS and abs(worst[0].off - worst[1].off) > LEAST else None
 
 
-def is_weighed(one: Length, robot: Length) -> bool:
-    """Whether a length is exact enough to move the scale, and agrees with the robot's."""
-    return one.std < WORTH * robot.std and abs(one.off) < AGREES * float(np.hypot(one.std, robot.std))
+def finding_of(one: Length, other: Length, others: list[Length], hand_eye: HandEye) -> Finding:
+    """That two lengths contradict each other; the robot is the first where it is one of them.
 
-
-def _finding(one: Length, other: Length, hand_eye: HandEye) -> Finding:
-    """That two lengths contradict each other; the robot is the first where it is one of them."""
+    Where an exact one of the `others` agrees with one of the two alone, the remaining one is wrong.
+    """
     off, std = other.off - one.off, float(np.hypot(one.std, other.std))
     if one.name == "robot" and other.name == "network":
         check = _network_check(hand_eye)
         value, of_robot = check.off_percent / 100, check.std_percent / 100
         return Finding.of(Kind.NETWORK_SCALE, "warns", "poses", value=value, std=of_robot)
+    agreeing = [
+        (third.name, right.name)
+        for third in others
+        for right, wrong in ((one, other), (other, one))
+        if third.std < EXACT and third.agrees_with(right) and not third.agrees_with(wrong)
+    ]
+    is_robot_doubted = one.name == "robot" and not any(right == "robot" for _, right in agreeing)
     exact = max(one.std, other.std) < EXACT and abs(off) >= CONTRADICTED[1]
-    kind = Kind.BOARD_SIZE if (one.name, other.name) == ("robot", "board") else Kind.SCALES
     found = Finding.of(
-        kind,
-        "rejects" if exact and one.name == "robot" else "warns",
+        Kind.BOARD_SIZE if (one.name, other.name) == ("robot", "board") else Kind.SCALES,
+        "rejects" if exact and is_robot_doubted else "warns",
         "poses",
         value=float(np.expm1(off)),
         std=std,
         one=one.name,
         other=other.name,
+        **(dict(zip(("third", "agrees_with"), agreeing[0], strict=True)) if agreeing else {}),
     )
-    of_robot = one.name == "robot" and other.std < EXACT
-    return replace(found, shift=tuple(_shift(off, hand_eye).tolist())) if of_robot else found
+    if not is_robot_doubted or other.std >= EXACT:
+        return found
+    return replace(found, shift=tuple(_shift(off, hand_eye).tolist()))
 
 
 def _shift(off: float, hand_eye: HandEye) -> Float[ndarray, "7"]:
