@@ -137,10 +137,11 @@ def _calibrated(capture: Capture, how: str, board: str) -> RunResult | RejectedE
 def _left_out(
     capture: Capture, how: str, board: str, shown: Reconstruction
 ) -> tuple[float | None, float | None]:
-    """Median reprojection error of features and of corners in the odd images, by a calibration of the even ones."""
+    """Median reprojection error of features and of corners in the odd images, by a calibration of the even ones; None
+    where that is rejected."""
     even = np.arange(len(capture)) % 2 == 0
     half = _calibrated(_of(capture, even), how, board)
-    if isinstance(half, RejectedError):
+    if isinstance(half, RejectedError) or not half.converged:
         return None, None
     intrinsics = half.hand_eye.intrinsics or half.reconstruction.intrinsics
     cameras = capture.base_from_gripper[shown.image_index] @ half.hand_eye.gripper_from_camera
@@ -183,11 +184,13 @@ def _reprojection_px(
 
 def _real_table(rows: Sequence[Row]) -> list[str]:
     return [
-        "Distance of `gripper_from_camera` from the reference stored with the capture. That is a board's: Park's method "
+        "As a user calls it: without and with `--board`, and with `--backend marker`. Distance of `gripper_from_camera` "
+        "from the reference stored with the capture. That is a board's: Park's method "
         "on the poses of a flat board with the stored intrinsics, so that what bends the board, or is wrong with those "
         "intrinsics, is in the reference and not an error of ours. σ: the largest stated one of an axis. Left out: the "
         "calibration of the even images, and the odd images' points triangulated where robot and X put the cameras; "
-        "median reprojection error of features and of corners. Seconds include the matching and two cores' other load.",
+        "median reprojection error of features and of corners; empty where the even images alone are rejected. Seconds "
+        "include the matching.",
         "",
         "| capture | from | verdict | off: mm | ° | ±σ: mm | ° | scale: ±% | left out, features: px | corners: px | s |",
         "|---" * 11 + "|",
@@ -305,18 +308,20 @@ def _outcome(found: FaultyCapture, hand_eye: HandEye) -> Outcome:
 
 
 def _claim(table: "Table") -> str:
-    nearest = [
-        _median(draws, "both") <= min(_median(draws, how) for how in ("features", "board"))
-        for (_, _, scale), draws in table.items()
-        if scale == 1.0
-    ]
+    behind = {
+        row: _median(draws, "both") - min(_median(draws, how) for how in ("features", "board"))
+        for row, draws in table.items()
+    }
+    right = [mm for (_, _, scale), mm in behind.items() if scale == 1.0]
+    beyond = [one["both"].sigmas > 3 for draws in table.values() for one in draws if one["both"].accepted]
     long = [one["both"].named for (_, _, scale), draws in table.items() for one in draws if scale >= 1.02]
     clean = [one["both"] for (_, _, scale), draws in table.items() for one in draws if scale == 1.0]
     return (
-        f"> Simulated robots whose lengths are right: both are nearest in {sum(nearest)} of {len(nearest)} rows, "
-        f"{sum(one.sigmas > 3 for one in clean)} of {len(clean)} results are beyond 3 σ and "
-        f"{sum(one.named for one in clean)} are falsely said to contradict the board. Positions 2 and 5 % too long are "
-        f"named in {sum(long)} of {len(long)} draws."
+        f"> Simulated: both are nearest in {sum(mm <= 0 for mm in right)} of {len(right)} rows of robots whose lengths are "
+        f"right and in {sum(mm <= 0 for mm in behind.values())} of all {len(behind)}, elsewhere at most "
+        f"{max(behind.values()):.2f} mm farther than the nearest. {sum(beyond)} of {len(beyond)} accepted results are "
+        f"beyond 3 σ, {sum(one.named for one in clean)} of {len(clean)} are falsely said to contradict the board, and "
+        f"positions 2 and 5 % too long are named in {sum(long)} of {len(long)} draws."
     )
 
 
