@@ -317,8 +317,8 @@ def _claim(table: "Table") -> str:
     long = [one["both"].named for (_, _, scale), draws in table.items() for one in draws if scale >= 1.02]
     clean = [one["both"] for (_, _, scale), draws in table.items() for one in draws if scale == 1.0]
     return (
-        f"> Simulated: both are nearest in {sum(mm <= 0 for mm in right)} of {len(right)} rows of robots whose lengths are "
-        f"right and in {sum(mm <= 0 for mm in behind.values())} of all {len(behind)}, elsewhere at most "
+        f"> Simulated: both are nearest in {sum(mm <= 0 for mm in right)} of {len(right)} rows of robots whose lengths "
+        f"are right and in {sum(mm <= 0 for mm in behind.values())} of all {len(behind)}, elsewhere at most "
         f"{max(behind.values()):.2f} mm farther than the nearest. {sum(beyond)} of {len(beyond)} accepted results are "
         f"beyond 3 σ, {sum(one.named for one in clean)} of {len(clean)} are falsely said to contradict the board, and "
         f"positions 2 and 5 % too long are named in {sum(long)} of {len(long)} draws."
@@ -336,8 +336,9 @@ def _simulated_table(table: Table, draws: int) -> list[str]:
     lines = [
         f"Simulated, the truth known, {draws} draws a row: 500 features seen with 0.4 px of noise, a chessboard of 9x6 "
         "corners and 25 mm seen with 0.1 px, printed to 0.2 %, flat or with its edges 2 mm up; robot pose noise 0.3 mm "
-        "and 0.06° per axis. *too long*: all positions of the robot. *off*: median distance from the true transform; of "
-        "positions that are too long the robot's own metre is, and so is its transform. *> 3 σ*: accepted results with "
+        "and 0.06° per axis. *too long*: all positions of the robot. *off*: median distance from the true transform. "
+        "Where a contradiction is named, the transform stays in the robot's metre, as that of features alone is, 2 or 5 % "
+        "longer than the true one; which of the two is nearer is then chance. *> 3 σ*: accepted results with "
         "an axis of X more than three stated σ off. *named*: a finding says that board and robot contradict each other.",
         "",
         "| images | sheet | too long | features: mm | ° | > 3 σ | board: mm | ° | > 3 σ | both: mm | ° | > 3 σ | "
