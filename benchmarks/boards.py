@@ -337,8 +337,8 @@ def _simulated_table(table: Table, draws: int) -> list[str]:
         f"Simulated, the truth known, {draws} draws a row: 500 features seen with 0.4 px of noise, a chessboard of 9x6 "
         "corners and 25 mm seen with 0.1 px, printed to 0.2 %, flat or with its edges 2 mm up; robot pose noise 0.3 mm "
         "and 0.06° per axis. *too long*: all positions of the robot. *off*: median distance from the true transform. "
-        "Where a contradiction is named, the transform stays in the robot's metre, as that of features alone is, 2 or 5 % "
-        "longer than the true one; which of the two is nearer is then chance. *> 3 σ*: accepted results with "
+        "Where a contradiction is named, the transform stays in the robot's metre, as that of features alone is: 2 or 5 "
+        "% longer than the true one, and which of the two is nearer is chance. *> 3 σ*: accepted results with "
         "an axis of X more than three stated σ off. *named*: a finding says that board and robot contradict each other.",
         "",
         "| images | sheet | too long | features: mm | ° | > 3 σ | board: mm | ° | > 3 σ | both: mm | ° | > 3 σ | "
