@@ -29,8 +29,7 @@ DEPTH_STD, NETWORK_STD = 0.02, 0.05
 """Relative, of the metre of depth cameras, which are off by a few percent, and of networks, at times by ten."""
 ROBOT_STD = 0.002
 """Relative: by how much a robot's positions may be too long all alike, which no pose shows and its covariance leaves
-out. To pull the scale towards a board where that is why they differ bends the transform: by 1.1 mm where positions are
-1 % too long."""
+out."""
 SIGMAS = 3.5
 """Standard deviations of a difference from which two lengths contradict each other."""
 LEAST = 0.005
