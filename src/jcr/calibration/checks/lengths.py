@@ -36,8 +36,8 @@ LEAST = 0.005
 """And its least size: the robot's own covariance leaves out what is wrong with its lengths all alike."""
 AGREES = 2.0
 """Standard deviations of a difference up to which a length is weighed with the robot's. Between these and SIGMAS neither
-is likely: of positions that are 1 % too long, weighing takes X from 1.0 mm off to 1.4 (docs/results/boards.md), since
-the poses give way by rotating and shifting X, where the whole answer is but too large."""
+is likely, and of positions that are 1 % too long weighing takes the transform from 1.0 mm off to 1.4: the poses give way
+by rotating and shifting it, where the whole answer is but too large."""
 EXACT = 0.015
 """Relative standard deviation of a length that is exact enough to reject a calibration by."""
 WORTH = 10.0
