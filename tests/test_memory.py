@@ -36,9 +36,10 @@ SIDE = 320
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ten images of noise, whose pairs make 0.57 GB of pointmaps, and weights beside them."""
+    import torch
     from safetensors.torch import save_file
 
-    from benchmarks.pairs import random_network
+    from jcr.reconstruct.dust3r.network import Dust3r
 
     folder = tmp_path_factory.mktemp("capture")
     rng = np.random.default_rng(0)
@@ -49,10 +50,8 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pose[:3, :3] = Rotation.from_rotvec(rng.normal(size=3)).as_matrix()
         frames.append({"image": f"{k}.png", "base_from_gripper": pose.tolist()})
     (folder / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": None}))
-    network = random_network(TINY)
-    save_file(
-        {key: value.contiguous() for key, value in network.state_dict().items()}, folder / "model.safetensors"
-    )
+    torch.manual_seed(0)
+    save_file(Dust3r(**TINY).state_dict(), folder / "model.safetensors")
     (folder / "config.json").write_text(json.dumps(TINY))
     return folder
 
