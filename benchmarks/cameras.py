@@ -215,7 +215,7 @@ def _against_robot(answer: Adjusted, rig: int, gripper: Float[ndarray, "4 4"]) -
     j = answer.derivative(placed) - answer.derivative(carried)
     moves = np.eye(6)
     moves[:3, 3:] = -skew(gripper[:3, :3] @ answer.placed.x[0][:3, 3])
-    sizes = np.hypot(answer.noise, answer.systematic_left)
+    sizes = answer.noise.together
     robot = moves @ np.diag(np.repeat(sizes, 3) ** 2) @ moves.T
     error = step_between(placed(answer.placed), carried(answer.placed))
     return Draw(error, j @ answer.covariance @ j.T + robot)

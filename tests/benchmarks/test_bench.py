@@ -169,6 +169,7 @@ def test_a_bench_takes_what_its_row_of_the_table_shows(name: str):
     assert set(signature(run_one).parameters) == {option for option, is_asked in asks.items() if is_asked}
 
 
+@pytest.mark.slow
 def test_the_bench_of_robots_tells_what_each_way_of_knowing_them_is_worth():
     from benchmarks.robots import KNOWN, PEER, measure, page
 
