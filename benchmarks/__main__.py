@@ -51,7 +51,7 @@ class Arguments:
     """CAPTURE=BOARD, as jcr run --board has it. For real: of those that show one. For matching: to make references. For
     check_points: of those that state a side; others are looked for."""
     runs: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """For check_points: keep the run folders here, and use those that are."""
+    """For check_points: keep the run folders here, and use those that are. For boards: the simulated draws."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Also write NAME.md in this folder (NAME_long.md with --long), and the images of those benches that draw some."""
     long: bool = False

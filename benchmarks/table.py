@@ -124,6 +124,7 @@ BENCHES = {
         "features alone, a board alone and both in one adjustment: captures in DIR that --boards names, and simulated",
         of_captures=True,
         of_boards=True,
+        keeps_runs=True,
         measures=(
             *SOLVER,
             *FEATURES,
@@ -131,7 +132,8 @@ BENCHES = {
             "src/jcr/reconstruct/marker.py",
             "src/jcr/reconstruct/board.py",
             "src/jcr/reconstruct/board_corners.py",
-            "benchmarks/simulated",
+            "benchmarks/simulated/boards.py",
+            "benchmarks/simulated/faults.py",
         ),
         long="40 draws of every simulated row instead of 2",
     ),

@@ -394,16 +394,16 @@ def test_input_that_calibration_cannot_use_is_no_reason_for_another_back_end(
 
     monkeypatch.setattr(attempts, "reconstruct", door)
     monkeypatch.setattr(attempts, "densify", without_surface)
-    lost = CalibrateOptions(known_length=("nowhere.png", 0.0, 0.0, 9.0, 9.0, 50.0))
-    with pytest.raises(InputError, match="nowhere.png"):
+    lost = CalibrateOptions(known_length=(capture.images[0], 0.0, 0.0, 9.0, 9.0, 50.0))
+    with pytest.raises(InputError, match="no surface was found"):
         calibrate(capture, tmp_path / "auto", RunOptions(calibrate=lost))
     assert made == ["colmap"]
     # Where there is no choice, the reconstruction is kept before it is calibrated: corrected options find it there.
-    with pytest.raises(InputError, match="nowhere.png"):
+    with pytest.raises(InputError, match="no surface was found"):
         calibrate(capture, tmp_path / "colmap", RunOptions(calibrate=lost), backend="colmap")
     kept = RunFolder(tmp_path / "colmap").reconstruction()
     assert kept.backend == "colmap" and kept.pointmaps is not None
-    with pytest.raises(InputError, match="nowhere.png"):
+    with pytest.raises(InputError, match="no surface was found"):
         calibrate(capture, tmp_path / "colmap", RunOptions(calibrate=lost), backend="colmap")
     assert made == ["colmap", "colmap"]
 

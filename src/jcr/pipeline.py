@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from jcr import __version__, stages
 from jcr.calibration.calibration_json import calibration_file
+from jcr.calibration.cues import check_known_length
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.poses import calibrate_poses as calibrate_poses_stage
 from jcr.calibration.poses import is_one
@@ -23,7 +24,7 @@ from jcr.errors import InputError, RejectedError
 from jcr.extras import is_installed
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
-from jcr.reconstruct.backends import BackendName
+from jcr.reconstruct.backends import BackendName, check_board
 from jcr.records import Capture, PosePairs
 from jcr.represent.options import CloudOptions, MapOptions
 from jcr.results import PosesResult, RunOptions, RunResult, SavedRun, load_run
@@ -52,7 +53,9 @@ def run(
     """
     options = checked_options(options, RunOptions)
     check_options(options.calibrate)
+    check_board(options.reconstruct)
     capture = _capture_of(capture, Path(out))
+    check_known_length(capture, options.calibrate.known_length)
     options, missing = _possible(options.for_capture(capture, backend), capture)
     with locked(Path(out)) as folder, ThreadPoolExecutor(1) as beside:
         # Torch takes more than a second to import, and COLMAP leaves a core idle.

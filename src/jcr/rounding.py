@@ -12,6 +12,12 @@ def decimals_of(std: float) -> int:
     return int(np.clip(np.floor(1 - np.log10(std)), 0, MOST_DECIMALS))
 
 
+def with_std(value: float, std: float) -> str:
+    """The number and its standard deviation with as many decimals as that leaves: 25.40 ± 0.05."""
+    decimals = decimals_of(std)
+    return f"{value:.{decimals}f} ± {std:.{decimals}f}"
+
+
 def significant(value: float, digits: int = 2) -> str:
     """The number with this many significant digits, never in powers of ten; at most six decimals."""
     if not np.isfinite(value):

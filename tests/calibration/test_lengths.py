@@ -8,23 +8,37 @@ import pytest
 from benchmarks.attack import reconstructed
 from benchmarks.simulated.boards import Sheet, with_sheet
 from benchmarks.simulated.faults import Faults, faulty_capture
-from jcr.calibration.checks.lengths import Length, contradiction
+from jcr.calibration import fit
+from jcr.calibration.checks import lengths
+from jcr.calibration.checks.lengths import Length, contradiction, finding_of
+from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.geometry import step_between
-from jcr.records import Finding, HandEye, Kind
+from jcr.records import DepthCheck, Finding, HandEye, Kind
 from jcr.records.words import sentence
 
 pytestmark = pytest.mark.slow
 
 
-def calibrated(sheet: Sheet | None, pose_scale: float = 1.0, seed: int = 0) -> tuple[HandEye, np.ndarray]:
+def calibrated(
+    sheet: Sheet | None,
+    pose_scale: float = 1.0,
+    seed: int = 0,
+    options: CalibrateOptions | None = None,
+) -> tuple[HandEye, np.ndarray]:
     """12 images, and the true transform."""
     rng = np.random.default_rng([seed, 12])
     bare = faulty_capture(rng, 12, Faults(pose_scale=pose_scale))
     found = bare if sheet is None else with_sheet(bare, rng, sheet)
     capture, reconstruction = reconstructed(bare, estimated=False)
-    hand_eye = calibrate(capture, replace(reconstruction, tracks=found.tracks))
+    hand_eye = calibrate(capture, replace(reconstruction, tracks=found.tracks), options)
     return hand_eye, found.gripper_from_camera
+
+
+def of_pixels(monkeypatch: pytest.MonkeyPatch, metres_per_unit: float) -> None:
+    """A known length makes the simulated reconstruction, which is in metres, so much larger."""
+    for module in (fit, lengths):
+        monkeypatch.setattr(module, "length_cue", lambda *_: (metres_per_unit, 0.01))
 
 
 def of_kind(hand_eye: HandEye, kind: Kind) -> Finding:
@@ -77,9 +91,88 @@ def test_the_side_of_a_board_of_unknown_size_is_stated_by_the_robot():
     assert hand_eye.converged and hand_eye.scale_evidence.lengths == ()
 
 
+def test_a_board_that_neither_agrees_with_the_robot_nor_surely_contradicts_it_is_not_weighed():
+    """Weighed, it bends the transform; what it differs by may be the robot's and is counted."""
+    hand_eye, x = calibrated(Sheet(), pose_scale=1.006)
+    alone, _ = calibrated(Sheet(stated_m=None), pose_scale=1.006)
+    (board,) = hand_eye.scale_evidence.lengths
+    assert not board.used and 0.4 < board.robot_longer_percent < 1.0
+    assert not any(one.kind is Kind.BOARD_SIZE for one in hand_eye.findings)
+    assert np.allclose(hand_eye.gripper_from_camera, alone.gripper_from_camera, rtol=0, atol=1e-9)
+    assert hand_eye.covariance[6, 6] > 2 * alone.covariance[6, 6]
+    error = np.r_[step_between(hand_eye.gripper_from_camera, x), -np.log(hand_eye.scale)]
+    assert (np.abs(error) < 3 * np.sqrt(np.diag(hand_eye.covariance))).all()
+
+
+def test_a_known_length_that_contradicts_the_robot_rejects_unless_a_board_agrees_with_the_robot(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    options = CalibrateOptions(known_length=("00.png", 1.0, 2.0, 300.0, 200.0, 100.0))
+    of_pixels(monkeypatch, 1.05)
+    alone, _ = calibrated(None, options=options)
+    named = of_kind(alone, Kind.SCALES)
+    assert (named.severity, named.details) == ("rejects", {"one": "robot", "other": "known length"})
+    (line,) = alone.warnings
+    assert "the robot's positions and the known length contradict each other by 4." in line
+    assert line.endswith(" ± 1.0 %; measure both again")
+    both, _ = calibrated(Sheet(), options=options)
+    named = of_kind(both, Kind.SCALES)
+    assert both.converged and named.severity == "warns" and named.shift is None
+    assert sentence(named) == (
+        "the size of the board and the known length contradict each other by 4.8 ± 1.0 %; check the known length: the "
+        "size of the board and the robot's positions agree"
+    )
+    assert [one.name for one in both.scale_evidence.lengths] == ["board", "known length"]
+
+
+def test_a_known_length_that_agrees_is_compared_beside_features(monkeypatch: pytest.MonkeyPatch):
+    options = CalibrateOptions(known_length=("00.png", 1.0, 2.0, 300.0, 200.0, 100.0))
+    of_pixels(monkeypatch, 1.005)
+    hand_eye, _ = calibrated(None, options=options)
+    (known,) = hand_eye.scale_evidence.lengths
+    assert known.name == "known length" and known.robot_longer_percent == pytest.approx(-0.5, abs=0.5)
+    assert hand_eye.converged and not hand_eye.warnings
+    assert not any(one.kind is Kind.SCALE_FROM_ROBOT for one in hand_eye.findings)
+
+
+def test_a_depth_camera_that_contradicts_robot_and_board_is_named_with_the_percent(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    measured = DepthCheck(
+        off_percent=9.0,
+        std_percent=0.3,
+        noise_m=1e-3,
+        noise_per_m=1e-3,
+        distances_m=(0.4, 0.7),
+        images=12,
+        features=900,
+    )
+    monkeypatch.setattr(lengths, "depth_check", lambda *_: measured)
+    hand_eye, _ = calibrated(Sheet())
+    named = of_kind(hand_eye, Kind.SCALES)
+    assert named.details["other"] == "depth camera" and named.severity == "warns" and hand_eye.converged
+    assert "the depth camera contradict each other by 8.3 ± 2.0 %" in sentence(named)
+
+
 def test_of_several_lengths_the_two_that_contradict_each_other_most_surely_are_named():
     robot, board = Length("robot", 0.0, 0.001), Length("board", 0.001, 0.002)
     depth, network = Length("depth camera", -0.15, 0.02), Length("network", 0.1, 0.05)
     assert contradiction([robot, board]) is None
     assert contradiction([robot, board, network]) is None
     assert contradiction([robot, board, depth, network]) == (board, depth)
+
+
+def test_the_one_of_three_lengths_that_is_wrong_is_named_and_a_robot_that_is_right_is_not_rejected():
+    hand_eye, _ = calibrated(None)
+    robot, known = Length("robot", 0.0, 0.002), Length("known length", 0.003, 0.01)
+    board = Length("board", -0.167, 0.002)
+    wrong_board = finding_of(robot, board, [known], hand_eye)
+    assert (wrong_board.kind, wrong_board.severity, wrong_board.shift) == (Kind.BOARD_SIZE, "warns", None)
+    assert "check the size of the board: the robot's positions and the known length agree" in sentence(
+        wrong_board
+    )
+    wrong_robot = finding_of(robot, board, [replace(known, off=-0.16)], hand_eye)
+    assert wrong_robot.severity == "rejects" and wrong_robot.shift is not None
+    assert "check the robot's positions: the size of the board and the known length agree" in sentence(
+        wrong_robot
+    )

@@ -142,6 +142,18 @@ class BoardShapes:
         return np.exp(-shape[0]) * (ahead[:, None] @ pose[:, :3, :3])[:, 0]
 
 
+@dataclass(frozen=True)
+class _SeenBody:
+    """The corners of a body that take part, and about where it is in the world."""
+
+    point: Int[ndarray, " c"]
+    """Row of the scene's points."""
+    x_in_body: Float[ndarray, "c 3"]
+    world_from_body: Float[ndarray, "4 4"]
+    size: float
+    """In the world over the stated one."""
+
+
 def shapes_of(
     boards: Boards | None, points_in_world: Float[ndarray, "p 3"], seen: Bool[ndarray, " p"], first_rig: int
 ) -> tuple[BoardShapes | None, Float[ndarray, "b 4 4"]]:
@@ -149,46 +161,43 @@ def shapes_of(
 
     Corners that are not `seen` take no part, nor do bodies with fewer than four that are; None where there is none.
     """
-    placed = list(_seen_corners(boards, points_in_world, seen))
-    if boards is None or not placed:
+    bodies = [] if boards is None else list(_seen_bodies(boards, points_in_world, seen))
+    if not bodies:
         return None, np.zeros((0, 4, 4))
-    sizes = np.array([size for _, _, _, size in placed])
-    corners = np.array([len(point) for point, *_ in placed])
-    unit = float(np.average(sizes, weights=corners))
-    columns, std = [np.zeros((corners.sum(), 3, 1))], [SIZE_STD]
-    ends = np.cumsum(corners)
-    for (_, x, _, _), end in zip(placed, ends, strict=True):
-        ways, of_ways = _deformations(unit * x)
-        block = np.zeros((corners.sum(), 3, len(of_ways)))
-        block[end - len(x) : end] = ways
-        columns.append(block)
-        std.extend(of_ways)
-    point = np.concatenate([point for point, *_ in placed])
+    corners = [len(body.point) for body in bodies]
+    unit = float(np.average([body.size for body in bodies], weights=corners))
+    ways, std = zip(*(_deformations(unit * body.x_in_body) for body in bodies), strict=True)
+    each = np.split(np.arange(sum(corners)), np.cumsum(corners)[:-1])
+    by_shape, column = np.zeros((sum(corners), 3, 1 + sum(map(len, std)))), 1
+    for rows, own in zip(each, ways, strict=True):
+        by_shape[rows, :, column : column + own.shape[2]] = own
+        column += own.shape[2]
+    point = np.concatenate([body.point for body in bodies])
     order = np.argsort(point)
     shapes = BoardShapes(
         point=point[order],
-        body=np.repeat(np.arange(len(placed)), corners)[order],
+        body=np.repeat(np.arange(len(bodies)), corners)[order],
         first_rig=first_rig,
-        x_in_body=unit * np.concatenate([x for _, x, _, _ in placed])[order],
-        by_shape=np.concatenate(columns, axis=2)[order],
-        shape_std=np.array(std),
+        x_in_body=unit * np.concatenate([body.x_in_body for body in bodies])[order],
+        by_shape=by_shape[order],
+        shape_std=np.concatenate([[SIZE_STD], *std]),
         unit=unit,
     )
-    return shapes, np.stack([pose for _, _, pose, _ in placed])
+    return shapes, np.stack([body.world_from_body for body in bodies])
 
 
-def _seen_corners(
-    boards: Boards | None, points_in_world: Float[ndarray, "p 3"], seen: Bool[ndarray, " p"]
-) -> Iterator[tuple[Int[ndarray, " c"], Float[ndarray, "c 3"], Float[ndarray, "4 4"], float]]:
-    """Rows and places of the seen corners of each body, its pose, and its size in the world over the stated one."""
-    for body in () if boards is None else boards.bodies:
+def _seen_bodies(
+    boards: Boards, points_in_world: Float[ndarray, "p 3"], seen: Bool[ndarray, " p"]
+) -> Iterator[_SeenBody]:
+    """The bodies whose seen corners determine where they are."""
+    for body in boards.bodies:
         rows = np.flatnonzero(seen[body.point])
-        x = body.x_in_body[rows]
+        x, there = body.x_in_body[rows], points_in_world[body.point[rows]]
         if len(rows) < FEWEST_CORNERS or np.linalg.matrix_rank(x - x.mean(0), tol=0.1 * np.ptp(x)) < 2:
             continue
-        pose, size = fit_similarity(points_in_world[body.point[rows]], x)
-        if np.abs(apply(pose, size * x) - points_in_world[body.point[rows]]).max() < size * np.ptp(x):
-            yield body.point[rows], x, pose, size
+        pose, size = fit_similarity(there, x)
+        if np.abs(apply(pose, size * x) - there).max() < size * np.ptp(x):
+            yield _SeenBody(body.point[rows], x, pose, size)
 
 
 def _deformations(x: Float[ndarray, "c 3"]) -> tuple[Float[ndarray, "c 3 w"], Sequence[float]]:

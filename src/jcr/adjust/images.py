@@ -186,9 +186,13 @@ def linearised(
     information = normal.hessian
     information[np.diag_indices(len(information))] += FAINT
     if problem.prior is None:
-        # A unit of the world that is that of its rigs' places, all alike: what λ is counted in.
-        of_rigs = information.diagonal()[problem.freedom.first_rig :]
-        information += information_along(similarities(scene, problem.freedom), float(of_rigs.mean()))
+        # A unit of the world that is that of its rigs' places, all alike: what λ is counted in. Boards take no part: λ
+        # would then be of their size too, and no longer that of the cameras and points.
+        boards, first = problem.observations.boards, problem.freedom.first_rig
+        rigs = slice(first, None if boards is None else first + 6 * boards.first_rig)
+        by_similarity = np.zeros((len(information), 7))
+        by_similarity[rigs] = similarities(scene, problem.freedom)[rigs]
+        information += information_along(by_similarity, float(information.diagonal()[rigs].mean()))
     found = ImageEvidence(
         scene=scene, problem=problem, information=information, gradient=-normal.right, noise=noise, view=view
     )

@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.calibration.options import LengthInImage
 from jcr.camera import project, unproject
 from jcr.errors import InputError
 from jcr.geometry import rotation_angle
@@ -36,6 +37,23 @@ def height_cue(base_from_gripper: Poses, height: float) -> tuple[Float[ndarray, 
             "known; leave the option out"
         )
     return axis_in_gripper, height, HEIGHT_STD
+
+
+def check_known_length(capture: Capture, known_length: LengthInImage | None) -> None:
+    """Raise InputError, before any work, if the image of a known length, or a pixel of it, is not in the capture."""
+    if known_length is None:
+        return
+    image, *ends, _ = known_length
+    if image not in capture.images:
+        names = ", ".join(capture.images[:3]) + ", …" * (len(capture) > 3)
+        raise InputError(f"--known-length: the capture has no image {image}; it has {names}")
+    width, height = capture.image_size
+    for x, y in (ends[:2], ends[2:]):
+        if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+            raise InputError(
+                f"--known-length: pixel ({x:g}, {y:g}) is outside {image}, which has {width}x{height} pixels; "
+                "give x and y from its upper left corner"
+            )
 
 
 def length_cue(

@@ -9,6 +9,9 @@ import tyro
 from jcr.errors import InputError
 from jcr.records import Where
 
+LengthInImage = tuple[str, float, float, float, float, float]
+"""An image, x and y of two pixels of it, and how far apart what they show is (mm)."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateOptions:
@@ -30,9 +33,7 @@ class CalibrateOptions:
     the capture, if any."""
     known_height: Annotated[float | None, tyro.conf.arg(metavar="MM")] = None
     """Planar or SCARA arms: the camera's height above the gripper's origin along its rotation axis."""
-    known_length: Annotated[
-        tuple[str, float, float, float, float, float] | None, tyro.conf.arg(metavar="IMAGE X1 Y1 X2 Y2 MM")
-    ] = None
+    known_length: Annotated[LengthInImage | None, tyro.conf.arg(metavar="IMAGE X1 Y1 X2 Y2 MM")] = None
     """A known length, for a scale that the motion does not determine: two pixels of one image, and their distance."""
     focus: Literal["fixed", "varies"] = "fixed"
     """varies: estimate a focal length for each image, for a camera whose focus changed during the capture."""
@@ -58,5 +59,12 @@ def check_options(options: CalibrateOptions) -> None:
         raise InputError(f"--scale {options.scale:g}: give a positive number, metres per unit")
     if options.known_height is not None and not isfinite(options.known_height):
         raise InputError(f"--known-height {options.known_height:g}: give millimetres")
+    if options.known_length is not None:
+        image, *ends, length_mm = options.known_length
+        given = f"--known-length {image} {' '.join(f'{x:g}' for x in (*ends, length_mm))}"
+        if not (0 < length_mm < inf and all(map(isfinite, ends))):
+            raise InputError(f"{given}: give two pixels and a positive length in millimetres")
+        if ends[:2] == ends[2:]:
+            raise InputError(f"{given}: both ends are one pixel; give two")
     if options.robot is not None:
         arm_named(options.robot)

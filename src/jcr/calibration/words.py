@@ -9,7 +9,7 @@ from jcr.calibration.calibration_json import CalibrationFile, GivenIntrinsicsKep
 from jcr.calibration.uncertainty_json import SeenAndCorners, UncertaintyBudget
 from jcr.records import Attempt, BoardFound, DepthCheck, LeaveOneOut, is_explained, verdict_of
 from jcr.records.words import network_scale, reached_in_words, sentence
-from jcr.rounding import significant
+from jcr.rounding import significant, with_std
 
 NOTHING = 0.02
 """Of the largest part of a budget: its square is nothing beside that of the whole."""
@@ -84,7 +84,7 @@ def board_in_words(board: BoardFound) -> str:
     """What a board beside features came to."""
     stated = "" if board.stated_mm is None else f", {board.stated_mm:g} mm stated"
     return (
-        f"board: sides of {board.side_mm:.2f} ± {significant(board.side_std_mm)} mm by the robot{stated}; "
+        f"board: sides of {with_std(board.side_mm, board.side_std_mm)} mm by the robot{stated}; "
         f"{board.corners} corners in {board.images} images, {board.rms_px:.2f} px, bent by "
         f"{significant(board.bend_mm)} mm"
     )

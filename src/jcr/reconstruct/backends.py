@@ -385,6 +385,14 @@ class ReconstructOptions:
         return {name: str(x) if isinstance(x, Path) else x for name, x in values.items()}
 
 
+def check_board(options: ReconstructOptions) -> None:
+    """Raise InputError, before any work, for a --board that names none."""
+    if options.board is not None:
+        from jcr.reconstruct.board import boards
+
+        boards(options.board)
+
+
 def reconstruct(
     capture: Capture, options: ReconstructOptions | None = None, progress: Progress | None = None
 ) -> Reconstruction:

@@ -399,6 +399,9 @@ class BoardFound:
     """Of the bodies (m)."""
     tilts_deg: tuple[float, ...]
     """Of the bodies, from the horizontal of the base."""
+    shape_mm: tuple[tuple[float, float, float], ...] = ()
+    """Of the body that bends most, each corner's x and y on it and its height above its plane, by the robot's positions;
+    empty in files of earlier versions."""
 
 
 @dataclass(frozen=True)

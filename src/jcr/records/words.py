@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from jcr.records.findings import Finding, Kind
 from jcr.records.requirement import Requirement
-from jcr.rounding import significant
+from jcr.rounding import significant, with_std
 
 SHORT = "not as exact as needed"
 SURE = 4.0
@@ -404,6 +404,20 @@ def _scales(finding: Finding) -> str:
     return f"{' and '.join(names)} contradict each other by {100 * abs(off):.1f} ± {100 * std:.1f} %"
 
 
+def _to_lengths(finding: Finding) -> str:
+    named = finding.details
+    if "third" not in named:
+        return "measure both again"
+    wrong = named["one"] if named["agrees_with"] == named["other"] else named["other"]
+    right, third = (LENGTHS[str(named[name])] for name in ("agrees_with", "third"))
+    return f"check {LENGTHS[str(wrong)]}: {right} and {third} agree"
+
+
+def _board_side(finding: Finding) -> str:
+    side, std = (1e3 * value for value in _value_and_std(finding))
+    return f"by the robot's positions the sides of {finding.details['board']} are {with_std(side, std)} mm"
+
+
 def _to_board_side(finding: Finding) -> str:
     side, std = (1e3 * value for value in _value_and_std(finding))
     printed = round(2 * side) / 2  # boards are printed in halves of a millimetre
@@ -431,6 +445,8 @@ def _board_moved(finding: Finding) -> str:
 
 
 def _to_size(finding: Finding) -> str:
+    if "third" in finding.details:
+        return _to_lengths(finding)
     measure = "measure its squares, and check that the gripper poses are in metres"
     return "" if finding.details.get("marker") else measure
 
@@ -551,7 +567,7 @@ _TEXT: dict[Kind, Words] = {
     Kind.ANGLE_RATIO: _angles_differ,
     Kind.BOARD_SIZE: _board_size,
     Kind.SCALES: _scales,
-    Kind.BOARD_SIDE: "by the robot's positions the sides of {board} are {mm:.2f} ± {std_mm} mm",
+    Kind.BOARD_SIDE: _board_side,
     Kind.BOARD_MOVED: _board_moved,
     Kind.BOARD_NOT_FOUND: _board_not_found,
     Kind.NETWORK_SCALE: lambda f: network_scale(*(100 * x for x in _value_and_std(f))),
@@ -641,7 +657,7 @@ _REMEDY: dict[Kind, Words] = {
     Kind.BASE_LEANS: "bolt the stand to the floor, or brace it",
     Kind.TOOL_SAGS: "stiffen its mount, and check the zero of the wrist's joints, which looks like it",
     Kind.BOARD_SIZE: _to_size,
-    Kind.SCALES: "measure both again",
+    Kind.SCALES: _to_lengths,
     Kind.BOARD_SIDE: _to_board_side,
     Kind.BOARD_MOVED: "its corners there are left out; keep one board of a kind, and keep it still",
     Kind.BOARD_NOT_FOUND: "check its kind and its numbers of squares or corners (jcr docs markers)",

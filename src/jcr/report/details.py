@@ -30,7 +30,6 @@ def details_section(
         "Time": _times(calibration),
         "Intrinsics": _intrinsics(calibration),
         "Uncertainty, 1 σ per axis": {} if budget is None else budget_in_words(budget),
-        "Board": _board(calibration),
         "Lengths": _lengths(calibration),
         "Depth camera": _depth_camera(calibration),
         "Robot": _robot(calibration),
@@ -76,25 +75,6 @@ def _depth_camera(calibration: CalibrationFile) -> dict[str, str]:
         "scale error, compared with the robot": f"{check.off_percent:+.2f} ± {check.std_percent:.2g} %",
         **{f"noise at {z:.2f} m, 1 σ": f"{value} mm" for z, value in noise_mm.items()},
         "looked at": f"{check.features} features of {check.images} images",
-    }
-
-
-def _board(calibration: CalibrationFile) -> dict[str, str]:
-    """Where boards or tags beside the features were found, how large, and how bent."""
-    if (board := calibration.board) is None:
-        return {}
-    stated = "" if board.stated_mm is None else f" ({board.stated_mm:g} mm stated)"
-    places = {
-        f"place of {board.spec}" + (f", {k}" if board.bodies > 1 else ""): (
-            f"({', '.join(f'{x:.3f}' for x in centre)}) m in the base, {tilt:.1f}° from horizontal"
-        )
-        for k, (centre, tilt) in enumerate(zip(board.centres_in_base, board.tilts_deg, strict=True), start=1)
-    }
-    return {
-        **places,
-        "side by the robot's positions": f"{board.side_mm:.2f} ± {significant(board.side_std_mm)} mm{stated}",
-        "corners": f"{board.corners} in {board.images} images, {board.rms_px:.2f} px rms per axis",
-        "bend": f"{board.bend_mm:.2f} mm between lowest and highest corner",
     }
 
 

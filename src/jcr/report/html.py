@@ -13,6 +13,7 @@ from jcr.capture.table import TABLES
 from jcr.errors import printable
 from jcr.geometry import scale_translation
 from jcr.records import Capture, HandEye, Intrinsics
+from jcr.report.board import board_section
 from jcr.report.cell_cameras import cameras_section
 from jcr.report.details import Options, details_section
 from jcr.report.features import features_section
@@ -47,6 +48,7 @@ LINKS = {
     "view": "3D",
     "images": "Images",
     "features": "Features",
+    "board": "Board",
     "residuals": "Residuals",
     "uncertainty": "Uncertainty",
     "before-after": "Before and after",
@@ -85,6 +87,7 @@ def report_html(result: RunResult, options: Options | None = None) -> str:
         scene_section(result, base_from_camera, surface),
         images_section(result),
         features_section(result),
+        board_section(result),
         residuals_section(result),
         motion_section(result),
         _before_after(

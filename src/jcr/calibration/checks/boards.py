@@ -47,8 +47,11 @@ def board_found(adjusted: Adjusted, boards: Boards) -> BoardFound:
     std = float(np.sqrt(by_unknown @ adjusted.covariance @ by_unknown))
     of_corners = np.isin(problem.observations.point, shapes.point)
     shape = scene.camera_steps[problem.freedom.board_columns]
-    height_mm = 1e3 * placed.scale * np.exp(shape[0]) * shapes.bend(shape)
+    bent = np.column_stack([shapes.x_in_body[:, :2], shapes.bend(shape)])
+    bent_mm = 1e3 * placed.scale * np.exp(shape[0]) * bent
     numbers = np.unique(shapes.body)
+    bends_mm = [float(np.ptp(bent_mm[shapes.body == k, 2])) for k in numbers]
+    most = shapes.body == numbers[int(np.argmax(bends_mm))]
     rigs = scene.world_from_rig[shapes.first_rig + numbers]
     normals = rigs[:, :3, 2] @ placed.z[0][:3, :3].T
     points = apply(placed.z[0], placed.scale * scene.points_in_world[shapes.point])
@@ -61,9 +64,10 @@ def board_found(adjusted: Adjusted, boards: Boards) -> BoardFound:
         side_std_mm=side_mm * std,
         stated_mm=None if boards.size_std is None else 1e3 * boards.side,
         rms_px=float(np.sqrt((evidence.view.residual_px[of_corners] ** 2).mean())),
-        bend_mm=max(float(np.ptp(height_mm[shapes.body == k])) for k in numbers),
+        bend_mm=max(bends_mm),
         centres_in_base=tuple(_xyz(points[shapes.body == k].mean(0)) for k in numbers),
         tilts_deg=tuple(np.degrees(np.arccos(np.abs(normals[:, 2]).clip(0, 1))).tolist()),
+        shape_mm=tuple(_xyz(one) for one in bent_mm[most].round(3)),
     )
 
 

@@ -1,8 +1,9 @@
 """Lengths beside the robot's positions: boards, a known length, a depth camera, a network that predicts metres.
 
-Each is compared with the robot's positions and with each other. Where none contradicts another the scale is their
-weighted mean: they are priors in the mixed model, which weighs the robot's positions as their errors deserve. Where two
-contradict each other, the scale stays the robot's, and a finding names the two.
+Each is compared with the robot's positions and with each other. Where none contradicts another the scale is the weighted
+mean of the robot's and of those that agree with it: they are priors in the mixed model, which weighs the robot's
+positions as their errors deserve. Where two contradict each other, the scale stays the robot's, and a finding names the
+two.
 """
 
 from collections.abc import Iterator
@@ -28,12 +29,15 @@ DEPTH_STD, NETWORK_STD = 0.02, 0.05
 """Relative, of the metre of depth cameras, which are off by a few percent, and of networks, at times by ten."""
 ROBOT_STD = 0.002
 """Relative: by how much a robot's positions may be too long all alike, which no pose shows and its covariance leaves
-out. To pull the scale towards a board where that is why they differ bends the transform: by 1.1 mm where positions are
-1 % too long."""
+out."""
 SIGMAS = 3.5
 """Standard deviations of a difference from which two lengths contradict each other."""
 LEAST = 0.005
 """And its least size: the robot's own covariance leaves out what is wrong with its lengths all alike."""
+AGREES = 2.0
+"""Standard deviations of a difference up to which a length is weighed with the robot's. Between these and SIGMAS neither
+is likely, and of positions that are 1 % too long weighing takes the transform from 1.0 mm off to 1.4: the poses give way
+by rotating and shifting it, where the whole answer is but too large."""
 EXACT = 0.015
 """Relative standard deviation of a length that is exact enough to reject a calibration by."""
 WORTH = 10.0
@@ -49,6 +53,10 @@ class Length:
     off: float
     std: float
 
+    def agrees_with(self, other: "Length") -> bool:
+        """Whether the two differ by no more than they usually do."""
+        return abs(self.off - other.off) < AGREES * float(np.hypot(self.std, other.std))
+
 
 def check_lengths(case: Case) -> Checked:
     """The scale with every length that is known, or which two of them contradict each other."""
@@ -58,23 +66,32 @@ def check_lengths(case: Case) -> Checked:
     robot = Length("robot", 0.0, float(np.sqrt(hand_eye.covariance[6, 6])))
     pair = contradiction([robot, *lengths]) if hand_eye.converged else None
     is_made_of_images = hand_eye.converged and case.adjusted is not None and hand_eye.before is not None
-    worth = (
-        [one for one in lengths if one.std < WORTH * robot.std] if is_made_of_images and pair is None else []
-    )
+    weighed = [
+        one
+        for one in lengths
+        if is_made_of_images and pair is None and one.std < WORTH * robot.std and one.agrees_with(robot)
+    ]
     checks = tuple(
         LengthCheck(
             name=one.name,
             robot_longer_percent=100 * float(np.expm1(one.off)),
             std_percent=100 * one.std,
-            used=one in worth,
+            used=one in weighed,
         )
         for one in lengths
         if one.name != "robot"
     )
     hand_eye = _with(hand_eye, lengths=checks)
     if pair is not None:
-        return Checked((_finding(*pair, hand_eye), *_from_robot_alone(case, hand_eye)), hand_eye)
-    return _fused(case, hand_eye, worth) if worth else Checked(_from_robot_alone(case, hand_eye), hand_eye)
+        others = [one for one in (robot, *lengths) if one not in pair]
+        found = finding_of(*pair, others, hand_eye)
+        return Checked((found, *_from_robot_alone(case, hand_eye)), hand_eye)
+    fault = _fault(hand_eye, lengths)
+    if weighed:
+        return _fused(case, hand_eye, weighed, fault)
+    if hand_eye.converged and fault.any():
+        hand_eye = judged(replace(hand_eye, estimate=hand_eye.estimate.with_fault(fault)))
+    return Checked(_from_robot_alone(case, hand_eye), hand_eye)
 
 
 def _measured(case: Case) -> tuple[HandEye, list[Length]]:
@@ -132,26 +149,37 @@ def contradiction(lengths: list[Length]) -> tuple[Length, Length] | None:
     return worst if sigmas(worst) > SIGMAS and abs(worst[0].off - worst[1].off) > LEAST else None
 
 
-def _finding(one: Length, other: Length, hand_eye: HandEye) -> Finding:
-    """That two lengths contradict each other; the robot is the first where it is one of them."""
+def finding_of(one: Length, other: Length, others: list[Length], hand_eye: HandEye) -> Finding:
+    """That two lengths contradict each other; the robot is the first where it is one of them.
+
+    Where an exact one of the `others` agrees with one of the two alone, the remaining one is wrong.
+    """
     off, std = other.off - one.off, float(np.hypot(one.std, other.std))
     if one.name == "robot" and other.name == "network":
         check = _network_check(hand_eye)
         value, of_robot = check.off_percent / 100, check.std_percent / 100
         return Finding.of(Kind.NETWORK_SCALE, "warns", "poses", value=value, std=of_robot)
+    agreeing = [
+        (third.name, right.name)
+        for third in others
+        for right, wrong in ((one, other), (other, one))
+        if third.std < EXACT and third.agrees_with(right) and not third.agrees_with(wrong)
+    ]
+    is_robot_doubted = one.name == "robot" and not any(right == "robot" for _, right in agreeing)
     exact = max(one.std, other.std) < EXACT and abs(off) >= CONTRADICTED[1]
-    kind = Kind.BOARD_SIZE if (one.name, other.name) == ("robot", "board") else Kind.SCALES
     found = Finding.of(
-        kind,
-        "rejects" if exact and one.name == "robot" else "warns",
+        Kind.BOARD_SIZE if (one.name, other.name) == ("robot", "board") else Kind.SCALES,
+        "rejects" if exact and is_robot_doubted else "warns",
         "poses",
         value=float(np.expm1(off)),
         std=std,
         one=one.name,
         other=other.name,
+        **(dict(zip(("third", "agrees_with"), agreeing[0], strict=True)) if agreeing else {}),
     )
-    of_robot = one.name == "robot" and other.std < EXACT
-    return replace(found, shift=tuple(_shift(off, hand_eye).tolist())) if of_robot else found
+    if not is_robot_doubted or other.std >= EXACT:
+        return found
+    return replace(found, shift=tuple(_shift(off, hand_eye).tolist()))
 
 
 def _shift(off: float, hand_eye: HandEye) -> Float[ndarray, "7"]:
@@ -167,7 +195,17 @@ def _from_robot_alone(case: Case, hand_eye: HandEye) -> tuple[Finding, ...]:
     return (Finding.of(Kind.SCALE_FROM_ROBOT, "informs"),)
 
 
-def _fused(case: Case, hand_eye: HandEye, lengths: list[Length]) -> Checked:
+def _fault(hand_eye: HandEye, lengths: list[Length]) -> Float[ndarray, "7 7"]:
+    """Covariance of what the most exact of the lengths differs by beyond what both may be off by: the robot may be."""
+    best = min(lengths, key=lambda one: one.std)
+    beyond = best.off**2 - best.std**2 - float(hand_eye.covariance[6, 6])
+    if best.std >= EXACT or beyond <= 0:
+        return np.zeros((7, 7))
+    shift = _shift(float(np.sqrt(beyond)), hand_eye)
+    return np.outer(shift, shift)
+
+
+def _fused(case: Case, hand_eye: HandEye, lengths: list[Length], fault: Float[ndarray, "7 7"]) -> Checked:
     """The calibration with the lengths as priors of its scale."""
     assert case.adjusted is not None
     placed, boards = case.adjusted.most_likely, case.reconstruction.tracks.boards
@@ -181,13 +219,7 @@ def _fused(case: Case, hand_eye: HandEye, lengths: list[Length]) -> Checked:
     ]
     adjusted = with_lengths(case.adjusted, known)
     refined = refined_by(case, adjusted)
-    estimate = refined.estimate
-    # What the best of the lengths differs by, beyond what both may be off by, may be the robot's.
-    best = min(lengths, key=lambda one: one.std)
-    beyond = best.off**2 - best.std**2 - float(hand_eye.covariance[6, 6])
-    if best.std < EXACT and beyond > 0:
-        shift = _shift(float(np.sqrt(beyond)), hand_eye)
-        estimate = estimate.with_fault(np.outer(shift, shift))
+    estimate = refined.estimate.with_fault(fault)
     for one in hand_eye.findings:
         if one.shift is not None:
             of_camera = one.intrinsics_shift
