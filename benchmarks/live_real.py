@@ -81,7 +81,8 @@ def page(rows: Sequence[Row], simulated: Sequence[float]) -> str:
         "Images are reconstructed in the order of their names, which a live capture gives in the order of taking. Where "
         "the names of a capture are in another order (10.png comes before 2.png), `other order` is how far apart the "
         "calibrations at once in these two orders are: matches are sought from the earlier image to the later, "
-        "RANSAC draws and COLMAP begins elsewhere, and many images have other pairs. No σ holds that.",
+        "RANSAC draws and COLMAP begins elsewhere, and many images have other pairs. The reported σ does not "
+        "include it.",
         "",
         f"| capture | images | verdict live | at once | apart, σ | other order, σ | image {AT}, s | last, s | "
         "slowest, s | end, s | at once, s |",
