@@ -170,7 +170,7 @@ def test_the_buttons_take_retake_remove_undo_and_finish_on_a_phone(
         until(lambda: bool(browser.js(f"Boolean({condition})")))
 
     def press(selector: str, images: int) -> None:
-        """Click on a button that is enabled, and wait until the page lists so many images."""
+        """Click on a button that is enabled, and wait until the page lists that number of images."""
         shows(f"document.querySelector('{selector}:not(:disabled)')")
         browser.js(f"document.querySelector('{selector}:not(:disabled)').click()")
         shows(f"document.querySelectorAll('#images figure').length === {images}")
