@@ -121,7 +121,7 @@ def page(runs: Sequence[Run]) -> str:
     lines = [
         "> "
         + "; ".join(f"{name} {_images(some)}" for name, some in of_way.items() if some)
-        + " images, median",
+        + " images, median and range",
         f"> {sum(one.is_true for one in claimed)} of {len(claimed)} claims of {goal} true",
         "",
         "A rendered camera on an arm with errors (typical ones: 0.1° a joint, 0.3 mm a link) goes to poses until the "
@@ -129,6 +129,12 @@ def page(runs: Sequence[Run]) -> str:
         f"part confirm it, which takes 8 images at least. Every way begins with {FIRST} varied poses. Errors are "
         "against the effective transform about the poses of the capture: between workspaces of one arm it differs by "
         "up to 2.5 mm.",
+        "",
+        "| poses | captures | images | claims mm | ° | error mm | ° | claims true |",
+        "|---" * 8 + "|",
+        *(_way_line(name, some) for name, some in of_way.items() if some),
+        "",
+        "Each cell is the median, and the range in brackets.",
         "",
         "| scene, arm | poses | images | claims mm | ° | error mm | ° | claim | last image, s of processor |",
         "|---" * 9 + "|",
@@ -138,9 +144,25 @@ def page(runs: Sequence[Run]) -> str:
 
 
 def _images(runs: Sequence[Run]) -> str:
+    """Median and range; a capture that ended without a claim needs more than it had."""
+    ended = max(one.images for one in runs)
     counts = [one.images if one.claimed else np.inf for one in runs]
-    median = float(np.median(counts))
-    return f"more than {max(one.images for one in runs)}" if np.isinf(median) else f"{median:.0f}"
+    words = [
+        f"more than {ended}" if np.isinf(value) else f"{value:g}"
+        for value in (np.median(counts), min(counts), max(counts))
+    ]
+    return f"{words[0]} ({words[1]} to {words[2]})"
+
+
+def _way_line(name: str, runs: Sequence[Run]) -> str:
+    columns = ((one.claimed_mm, one.claimed_deg, one.error_mm, one.error_deg) for one in runs)
+    spread = [
+        f"{np.median(values):.2g} ({min(values):.2g} to {max(values):.2g})"
+        for values in zip(*columns, strict=True)
+    ]
+    claimed = [one for one in runs if one.claimed]
+    is_true = f"{sum(one.is_true for one in claimed)} of {len(claimed)}"
+    return "| " + " | ".join([name, str(len(runs)), _images(runs), *spread, is_true]) + " |"
 
 
 def _line(one: Run) -> str:

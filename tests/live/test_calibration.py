@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -158,7 +159,10 @@ def test_each_fault_is_named_at_the_image_where_it_happens(resumed: LiveCalibrat
     strange = resumed.add(noise, pose, time_s=10.0)
     assert against(strange)[Kind.NOT_REGISTERED].value == 0
     wrong = pose @ transform(rotation_exp(np.radians([3.0, 8.0, 0.0])), np.array([0.03, 0.0, 0.02]))
+    begun = time.process_time()
     contradicted = resumed.add(image, wrong, time_s=9.0)
+    # 3 s are asked of image 12 at 640x480 (docs/results/live_real.md); others use this machine, and shapes are checked.
+    assert len(contradicted.images) == 13 and time.process_time() - begun < 6
     assert contradicted.added in contradicted.registered
     found = against(contradicted)
     assert found[Kind.POSE_CONTRADICTS_IMAGE].details["rotation"] == pytest.approx(np.radians(8.5), rel=0.1)

@@ -1,5 +1,6 @@
 """A capture that is calibrated while it is taken, killed at any moment: nothing is lost, and the end is the same."""
 
+import itertools
 import json
 import multiprocessing
 import os
@@ -21,9 +22,7 @@ from jcr.run_folder import LIVE
 pytestmark = pytest.mark.slow
 
 KILLS = int(os.environ.get("JCR_TEST_KILLS", "2"))
-IMAGES = 6
-LONGEST_S = 4.0
-"""Processor time of a process before it is killed, at most."""
+IMAGES = 5
 PROCESSES = multiprocessing.get_context("forkserver")
 PROCESSES.set_forkserver_preload(
     ["jcr.pipeline", "jcr.live.calibration", "jcr.reconstruct.growing", "jcr.report.html"]
@@ -44,10 +43,17 @@ def take(tabletop: Path, folder: Path) -> None:
     live.close()
 
 
-def started(tabletop: Path, folder: Path) -> BaseProcess:
+def ended(tabletop: Path, folder: Path, most_s: float = np.inf) -> tuple[int | None, float]:
+    """The exit code of a process that takes the capture, and its processor time; killed when it has taken `most_s`."""
     process = PROCESSES.Process(target=take, args=(tabletop, folder))
     process.start()
-    return process
+    taken_s = 0.0
+    while process.is_alive() and taken_s < most_s:
+        time.sleep(0.005)
+        taken_s = max(taken_s, cpu_s(process))
+    process.kill()
+    process.join(300)
+    return process.exitcode, taken_s
 
 
 def cpu_s(process: BaseProcess) -> float:
@@ -55,7 +61,7 @@ def cpu_s(process: BaseProcess) -> float:
     try:
         fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
-        return np.inf
+        return 0.0
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
@@ -67,30 +73,26 @@ def result(folder: Path) -> np.ndarray:
 def test_a_killed_capture_loses_nothing_and_ends_at_the_same_numbers(
     tabletop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """JCR_TEST_KILLS=30 for thirty."""
-    undisturbed = started(tabletop, tmp_path / "undisturbed")
-    undisturbed.join(300)
+    """JCR_TEST_KILLS=30 for thirty; their moments are spread over the whole capture, a random one in each part."""
+    code, whole_s = ended(tabletop, tmp_path / "undisturbed")
+    assert code == 0
     expected = result(tmp_path / "undisturbed")
-    draw, killed, ends, left = random.Random(0), 0, 0, []
-    folder = tmp_path / "0"
-    while killed < KILLS or ends == 0:
-        process, most = started(tabletop, folder), draw.uniform(0, LONGEST_S) if killed < KILLS else np.inf
-        while process.is_alive() and cpu_s(process) < most:
-            time.sleep(0.005)
-        process.kill()
-        process.join(300)
-        if process.exitcode == 0:
-            # From the same images, to the rounding of sums.
-            assert np.allclose(result(folder), expected, rtol=1e-6, atol=1e-12)
-            ends, folder = ends + 1, tmp_path / f"{ends + 1}"
+    draw, folders, left = random.Random(0), (tmp_path / f"{k}" for k in itertools.count()), []
+    while len(left) < KILLS:
+        folder = next(folders)
+        code, taken_s = ended(tabletop, folder, whole_s * (len(left) + draw.random()) / KILLS)
+        if code == 0:
+            whole_s = taken_s  # Shorter than the first, which may have compiled.
             continue
-        assert process.exitcode == -9
-        killed += 1
+        assert code == -9
         # Every image whose calibration stood is there, and all that capture.json names can be read.
         names = LiveFolder(folder).names
         assert names == [f"images/00{row}.png" for row in range(len(names))]
         assert not any((folder / f"kept-{row}").exists() for row in range(len(names), IMAGES))
         left.append(len(names))
+        assert ended(tabletop, folder)[0] == 0
+        # From the same images, to the rounding of sums.
+        assert np.allclose(result(folder), expected, rtol=1e-6, atol=1e-12)
     if KILLS > 10:
         with capsys.disabled():
-            sys.stdout.write(f"{killed} kills, {ends} ends at the same numbers; images then: {left}\n")
+            sys.stdout.write(f"the images at each kill: {left}; all ended at the same numbers\n")

@@ -2,6 +2,8 @@
 
 import http.client
 import json
+import queue
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,11 +13,17 @@ import numpy as np
 import pytest
 
 import jcr
+from chromium import Chromium
 from jcr.capture.images import read_image
+from jcr.live.arm_words import ArmWords
+from jcr.live.asks import Ask
+from jcr.live.calibration_words import progress_lines
 from jcr.live.collect import LiveCapture
 from jcr.live.commands import Command
 from jcr.live.page_server import PageServer
+from jcr.live.rest import State
 from scripted_capture import Scripted, a_capture, still_frames
+from waiting import until
 
 
 @pytest.fixture
@@ -73,6 +81,11 @@ def test_the_page_shows_each_state(capture: tuple[LiveCapture, Scripted], tablet
         wrong = parts(page)["parts"]
         assert "verdict fair" in wrong["head"] and "The gripper pose of images/003.png" in wrong["head"]
         assert wrong["images"].count('class="rejected"') == 1
+        assert "Retake or remove image 4." in wrong["head"]
+        assert any(
+            "(retake 4, or remove 4)" in line
+            for line in progress_lines(live.shown.progress, None, ArmWords())
+        )
 
         scripted.contradicted = None
         add(live, scripted, tabletop, 5)
@@ -132,3 +145,66 @@ def test_the_camera_now_is_shown_with_its_features(capture: tuple[LiveCapture, S
         object.__setattr__(live.camera, "latest", lambda: blank)
         with asked(page, "GET", f"/{page.key}/now.jpg") as answer:
             assert "Few" in answer.headers["X-Features"]
+
+
+@pytest.fixture
+def browser(tmp_path: Path) -> Iterator[Chromium]:
+    opened = Chromium(tmp_path / "profile", "--disable-gpu")
+    yield opened
+    opened.close()
+
+
+@pytest.mark.slow
+def test_the_buttons_take_retake_remove_undo_and_finish_on_a_phone(
+    browser: Chromium, tmp_path: Path, tabletop: Path
+):
+    poses, at = jcr.read_capture(tabletop).base_from_gripper, [0]
+    live, scripted = a_capture(
+        tmp_path / ("a-long-name-of-a-folder-without-any-space" * 3),
+        still_frames(lambda: read_image(tabletop / "images" / f"{at[0]:02d}.jpg")),
+        gripper=lambda: State(0.0, poses[at[0]]),
+        accurate_from=3,
+    )
+
+    def shows(condition: str) -> None:
+        until(lambda: bool(browser.js(f"Boolean({condition})")))
+
+    def press(selector: str, images: int) -> None:
+        """Click on a button that is enabled, and wait until the page lists that number of images."""
+        shows(f"document.querySelector('{selector}:not(:disabled)')")
+        browser.js(f"document.querySelector('{selector}:not(:disabled)').click()")
+        shows(f"document.querySelectorAll('#images figure').length === {images}")
+
+    asks: queue.SimpleQueue[Ask] = queue.SimpleQueue()
+    taking = threading.Thread(target=live.run, args=(iter(asks.get, None),), daemon=True)
+    with PageServer(live) as page:
+        taking.start()
+        browser.open(page.address, 390, 844, phone=True)
+        browser.js("window.confirm = question => { window.asked = question; return true; }")
+        shows("document.querySelector('[data-press=take]')")
+        disabled = "[...document.querySelectorAll('.commands :disabled')].map(b => b.dataset.press).join()"
+        assert browser.js(disabled) == "retake,remove,undo,finish"
+        press("[data-press=take]", 1)
+        press("[data-press=take]", 1)
+        shows("document.querySelector('.verdict.bad')")
+        assert "where images/000.png was taken" in browser.js("document.querySelector('.verdict').innerText")
+        for at[0] in (1, 2):
+            press("[data-press=take]", at[0] + 1)
+        press(".commands [data-press=retake]", 3)
+        until(lambda: live.live.names == [f"images/00{k}.png" for k in (0, 1, 3)])
+        press('#images [data-press=remove][data-number="1"]', 2)
+        assert live.live.names == ["images/001.png", "images/003.png"]
+        press("[data-press=undo]", 3)
+        shows("document.querySelector('.verdict.good')")
+        # Nothing is wider than the window.
+        assert browser.js("document.documentElement.scrollWidth <= innerWidth")
+        press(".commands [data-press=remove]", 2)
+        assert live.live.names == ["images/000.png", "images/001.png"]
+        press("[data-press=finish]", 2)
+        taking.join(60)
+        assert live.shown.is_over and browser.js("asked") == "End the capture with 2 images?"
+        live._show("", result=scripted.finish())
+        shows("document.querySelector('.verdict h2')?.innerText === 'Accepted'")
+        assert browser.js("document.querySelector('[data-press]')") is None
+        assert browser.js("document.documentElement.scrollWidth <= innerWidth")
+    assert not [event for event in browser.events if event["method"] == "Runtime.exceptionThrown"]

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture.images import ROTATED, how_stored, read_image
+from jcr.capture.images import ROTATED, HowStored, read_image, read_stored
 from jcr.capture.options import MAX_FRAMES, MIN_FRAMES
 from jcr.capture.plain_files import LONGEST, contained
 from jcr.capture.robot_poses import likely_unit
@@ -39,14 +39,14 @@ def checked_capture(
         require_frames(0, where)
     require_images(folder, images, where)
     check_metres(base_from_gripper, where)
-    size = _common_size(folder, images)
-    orientation = _common_orientation(folder, images)
+    size, stored = _decoded(folder, images)
     return Capture(
         folder=folder,
         images=tuple(images),
         base_from_gripper=base_from_gripper,
         image_size=size,
-        orientation=orientation,
+        orientation=_common_orientation(folder, images, stored),
+        bits=tuple(sorted({one.bits for one in stored})),
     )
 
 
@@ -154,11 +154,13 @@ def check_metres(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None
         )
 
 
-def _common_size(folder: Path, images: Sequence[str]) -> tuple[int, int]:
-    """Decode every image once: a truncated one is found now, not after minutes of matching."""
-    sizes, digests = {}, {}
+def _decoded(folder: Path, images: Sequence[str]) -> tuple[tuple[int, int], list[HowStored]]:
+    """The common size (px) of all images and how each is stored; every image is decoded once: a truncated one is found
+    now, not after minutes of matching."""
+    sizes, digests, how_stored = {}, {}, []
     for name in images:
-        pixels = read_image(folder / name)
+        pixels, stored = read_stored(folder / name)
+        how_stored.append(stored)
         sizes[name] = (pixels.shape[1], pixels.shape[0])
         same = digests.setdefault(hashlib.sha256(pixels.tobytes()).digest(), name)
         if same != name:
@@ -172,7 +174,7 @@ def _common_size(folder: Path, images: Sequence[str]) -> tuple[int, int]:
                 f"{folder / name}: {size[0]}x{size[1]} pixels, but {images[0]} has {first[0]}x{first[1]}; "
                 "all images must come from one camera at one resolution"
             )
-    return first
+    return first, how_stored
 
 
 def image_sizes(folder: Path, images: Sequence[str]) -> list[tuple[int, int]]:
@@ -180,11 +182,11 @@ def image_sizes(folder: Path, images: Sequence[str]) -> list[tuple[int, int]]:
     return [read_image(folder / name).shape[1::-1] for name in images]
 
 
-def _common_orientation(folder: Path, images: Sequence[str]) -> int:
+def _common_orientation(folder: Path, images: Sequence[str], stored: Sequence[HowStored]) -> int:
     """The EXIF orientation of all images; InputError where they differ, as a camera's axes cannot."""
-    first = how_stored(folder / images[0]).orientation
-    for name in images[1:]:
-        if (other := how_stored(folder / name).orientation) != first:
+    first = stored[0].orientation
+    for name, how in zip(images, stored, strict=True):
+        if (other := how.orientation) != first:
             raise InputError(
                 f"{folder / name}: EXIF orientation {other}, but {images[0]} has {first}: rotated to be shown, their "
                 "cameras' axes differ; remove the tag from all images (exiftool -Orientation= FILES)"
@@ -211,7 +213,6 @@ def how_rotated(capture: Capture) -> Finding | None:
 
 def how_scaled(capture: Capture) -> str | None:
     """What was done to images of 16 bits that use fewer."""
-    bits = {how_stored(capture.folder / name).bits for name in capture.images}
-    if max(bits) == 8:
+    if max(capture.bits) == 8:
         return None
-    return f"images of 16 bits, {' or '.join(map(str, sorted(bits)))} of them used: read by the upper eight of those"
+    return f"images of 16 bits, {' or '.join(map(str, capture.bits))} of them used: read by the upper eight of those"

@@ -51,8 +51,23 @@ DARK, BRIGHT = 12, 243
 """Mean grey levels of 255 beyond which an image shows nothing."""
 
 
+@dataclass(frozen=True)
+class HowStored:
+    """How a file stores its pixels."""
+
+    orientation: int
+    """EXIF: 1 as the sensor has it; others are rotated, or mirrored, to be shown."""
+    bits: int
+    """Used of each colour."""
+
+
 def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
     """RGB (h,w,3) uint8, rotated upright by its EXIF tag; InputError when the file is no readable image."""
+    return read_stored(path)[0]
+
+
+def read_stored(path: Path) -> tuple[UInt8[ndarray, "h w 3"], HowStored]:
+    """An image as `read_image` has it, and how its file stores it, decoded once."""
     require_file(path)
     try:
         with warnings.catch_warnings():
@@ -65,12 +80,14 @@ def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
                 if opened.format != "MPO" and count > 1:
                     raise InputError(f"{path}: holds {count} images; save one as PNG or JPEG")
                 opened.load()
+                orientation, bits = opened.getexif().get(ORIENTATION, 1), 8
                 if (deep := _sixteen_bit(path, opened)) is not None:
-                    eight = np.minimum(deep >> (_bits(deep) - 8), 255)
+                    bits = _bits(deep)
+                    eight = np.minimum(deep >> (bits - 8), 255)
                     shown = Image.fromarray(eight.astype(np.uint8))
-                    shown.getexif()[ORIENTATION] = opened.getexif().get(ORIENTATION, 1)
+                    shown.getexif()[ORIENTATION] = orientation
                     opened = shown
-                return np.asarray(ImageOps.exif_transpose(opened).convert("RGB"))
+                pixels = np.asarray(ImageOps.exif_transpose(opened).convert("RGB"))
     except FileNotFoundError:
         raise InputError(f"{path}: no such image; correct its name in the capture or add the file") from None
     except InputError:
@@ -79,6 +96,8 @@ def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
         raise InputError(f"{path}: over {MAX_PIXELS // 1_000_000} million pixels; shrink the image") from None
     except Exception as error:  # decoders raise whatever a damaged file makes them
         raise InputError(f"{path}: not a readable image ({error}); save it again as PNG or JPEG") from None
+    known = orientation if isinstance(orientation, int) and orientation in ROTATED else 1
+    return pixels, HowStored(known, bits)
 
 
 def _sixteen_bit(path: Path, opened: Image.Image) -> UInt16[ndarray, "h w *rgb"] | None:
@@ -118,27 +137,6 @@ def _bits(deep: UInt16[ndarray, "h w *rgb"]) -> int:
     rank = -2 - deep.size // DEFECTIVE
     largest = int(np.partition(deep, rank, axis=None)[rank])
     return next(bits for bits in (8, 10, 12, 14, 16) if largest < 1 << bits)
-
-
-@dataclass(frozen=True)
-class HowStored:
-    """How a file stores its pixels."""
-
-    orientation: int
-    """EXIF: 1 as the sensor has it; others are rotated, or mirrored, to be shown."""
-    bits: int
-    """Used of each colour."""
-
-
-def how_stored(path: Path) -> HowStored:
-    """Of an image that `read_image` reads."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with Image.open(path) as opened:
-            orientation = opened.getexif().get(ORIENTATION, 1)
-            deep = _sixteen_bit(path, opened)
-    known = orientation if isinstance(orientation, int) and orientation in ROTATED else 1
-    return HowStored(known, 8 if deep is None else _bits(deep))
 
 
 def _refuse_size(path: Path, size: tuple[int, int]) -> None:

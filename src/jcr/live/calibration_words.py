@@ -1,5 +1,7 @@
 """The state of a growing calibration as lines that a person reads at the arm, and as an answer for a program."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from jcr.live.arm_words import ArmWords, pose_lines
@@ -29,7 +31,10 @@ def progress_lines(state: Progress, require: tuple[float, float] | None, words: 
             f"  {proof.images} images that take no part are off by {significant(proof.translation_mm)} mm and "
             f"{significant(proof.rotation_deg)}° (rms), {verdict}"
         )
-    lines += [f"  {sentence(one)}" for one in faults(state)]
+    for one in faults(state):
+        number = number_of(one, state.images)
+        commands = "" if number is None else f" (retake {number}, or remove {number})"
+        lines.append(f"  {sentence(one)}{commands}")
     if state.next_pose is not None:
         lines.append(f"next: {next_sentence(state)}")
         lines += [f"  {line}" for line in next_lines(state, words)]
@@ -44,6 +49,13 @@ def faults(state: Progress) -> list[Finding]:
         if one.severity != "informs" and one.kind not in (Kind.NOT_EXACT_ENOUGH, Kind.FEW_IMAGES)
     ]
     return sorted(found, key=lambda one: one.images != (state.added,))
+
+
+def number_of(finding: Finding, images: Sequence[str]) -> int | None:
+    """The number by which commands name the one image that a finding is against; None of any other finding."""
+    if len(finding.images) != 1 or finding.images[0] not in images:
+        return None
+    return images.index(finding.images[0]) + 1
 
 
 def next_sentence(state: Progress) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from jcr.calibration.requirement import GRASPING
 from jcr.live.arm_words import ArmWords
 from jcr.live.calibration_progress import Progress
-from jcr.live.calibration_words import faults, next_lines, next_sentence
+from jcr.live.calibration_words import faults, next_lines, next_sentence, number_of
 from jcr.live.collect import LiveCapture, Shown
 from jcr.live.folder import LiveFolder
 from jcr.records import Finding, Intrinsics
@@ -148,7 +148,9 @@ def _verdict(shown: Shown, required: tuple[float, float]) -> tuple[str, str, lis
         return "", "No image yet", [first]
     if wrong:
         is_bad = any(one.severity == "rejects" for one in wrong)
-        return "bad" if is_bad else "fair", lines[0], lines[1:]
+        number = number_of(wrong[0], shown.images)
+        commands = [] if number is None else [f"Retake or remove image {number}."]
+        return "bad" if is_bad else "fair", lines[0], [*commands, *lines[1:]]
     if progress.now is None:
         return (
             "",
