@@ -56,8 +56,6 @@ class Arguments:
     """Also write NAME.md in this folder (NAME_long.md with --long), and the images of those benches that draw some."""
     long: bool = False
     """Measure more than all has time for: more draws, images or methods."""
-    resume: bool = False
-    """For all: leave out the benches whose page is newer than the program's source files."""
     write: bool = False
     """For stale: write into each page whether it is older than the code that it measures."""
     output: Output = field(default_factory=Output)
@@ -118,10 +116,10 @@ def _all(arguments: Arguments) -> int:
 
     def report(outcome: Outcome) -> None:
         if not arguments.output.quiet:
-            sys.stderr.write(f"{outcome.name}: {outcome.trouble or 'done'}, {outcome.seconds or 0.0:.0f} s\n")
+            sys.stderr.write(f"{outcome.name}: {outcome.trouble or 'done'}, {outcome.seconds:.0f} s\n")
 
     begun = time.perf_counter()
-    outcomes = run(names, arguments.out, given, arguments.resume, report)
+    outcomes = run(names, arguments.out, given, report)
     command = " ".join(
         ["python -m benchmarks all", *(["CAPTURES"] if arguments.captures else []), "--out DIR"]
     )

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from benchmarks.page import mm_deg, table
 from benchmarks.simulated.problem import HandEyeProblem, disturbed, error
 from benchmarks.synthetic_pairs import PairErrors, PairTruth, synthetic_pairs
 from jcr.geometry import (
@@ -93,41 +94,37 @@ def camera_errors(
 
 
 def _cost() -> str:
-    rows = [
-        "| input | method | alignment | whole command | peak memory beside the input | error |",
-        "|---|---|---|---|---|---|",
-    ]
+    rows = []
     with tempfile.TemporaryDirectory() as folder:
         predictions, truth = synthetic_pairs(complete_pairs(10), MIDDLE)
         pairs = Path(folder) / "pairs.npz"
         write_pairs(pairs, predictions)
         fast, row = _command(pairs, "fast", 300, predictions, truth)
-        rows.append(f"| {_size(MIDDLE)}, 10 images | fast {row}")
+        rows.append([f"{_size(MIDDLE)}, 10 images", "fast", *row])
         adam, row = _command(pairs, "adam", 300, predictions, truth)
-        rows.append(f"| {_size(MIDDLE)}, 10 images | adam, 300 steps {row}")
+        rows.append([f"{_size(MIDDLE)}, 10 images", "adam, 300 steps", *row])
         predictions, truth = synthetic_pairs(complete_pairs(10), LARGE)
         write_pairs(pairs, predictions)
         large, row = _command(pairs, "fast", 300, predictions, truth)
-        rows.append(f"| {_size(LARGE)}, 10 images | fast {row}")
+        rows.append([f"{_size(LARGE)}, 10 images", "fast", *row])
         begin, _ = _command(pairs, "adam", 0, predictions, truth)
         few, row = _command(pairs, "adam", FEW_STEPS, predictions, truth)
-        rows.append(f"| {_size(LARGE)}, 10 images | adam, {FEW_STEPS} steps {row}")
+        rows.append([f"{_size(LARGE)}, 10 images", f"adam, {FEW_STEPS} steps", *row])
     full = begin + (few - begin) * 300 / FEW_STEPS
-    rows.insert(
-        0,
-        f"> Global alignment of 90 pairs at {_size(LARGE)} takes {large:.1f} s on the processor; 300 steps of Adam "
-        f"would take {full / large:.0f} times as long.\n",
+    return "\n".join(
+        [
+            f"> Global alignment of 90 pairs at {_size(LARGE)} takes {large:.1f} s on the processor; 300 steps of Adam "
+            f"would take {full / large:.0f} times as long.\n",
+            *table("input | method | alignment | whole command | peak memory beside the input | error", rows),
+            f"\nadam takes {adam / fast:.0f} times as long as fast at {_size(MIDDLE)}, and at {_size(LARGE)} "
+            f"{full / large:.0f} times ({full:.0f} s, 300 steps extrapolated from {FEW_STEPS}).",
+        ]
     )
-    rows.append(
-        f"\nadam takes {adam / fast:.0f} times as long as fast at {_size(MIDDLE)}, and at {_size(LARGE)} "
-        f"{full / large:.0f} times ({full:.0f} s, 300 steps extrapolated from {FEW_STEPS})."
-    )
-    return "\n".join(rows)
 
 
 def _command(
     pairs: Path, method: str, steps: int, predictions: PairPredictions, truth: PairTruth
-) -> tuple[float, str]:
+) -> tuple[float, list[str]]:
     """Seconds of the alignment, and the rest of a table row, of `jcr align` in a process of its own."""
     result = pairs.with_name("aligned.npz")
     arguments = [
@@ -148,11 +145,10 @@ def _command(
     whole = time.perf_counter() - begin
     seconds = json.loads(done.stdout)["seconds"]
     peak_gb = int(done.stderr.split("VmHWM:")[1].split()[0]) * 1024 / 1e9
-    shown = (predictions.pts3d, predictions.conf, predictions.pts3d_in_other_view, predictions.conf2)
-    input_gb = sum(array.nbytes for array in shown) / 1e9
+    input_gb = sum(array.nbytes for array in predictions.pointmaps) / 1e9
     with np.load(result) as file:
         mm, deg = camera_errors(truth.base_from_camera, file["poses"])
-    row = f"| {seconds:.2f} s | {whole:.1f} s | {peak_gb - input_gb:.2f} GB | {mm:.2f} mm, {deg:.3f}° |"
+    row = [f"{seconds:.2f} s", f"{whole:.1f} s", f"{peak_gb - input_gb:.2f} GB", f"{mm:.2f} mm, {deg:.3f}°"]
     return seconds, row
 
 
@@ -162,8 +158,8 @@ def _score(predictions: PairPredictions, truth: PairTruth, method: str) -> Score
     return Score(*camera_errors(truth.base_from_camera, found.recon_from_camera), found.seconds)
 
 
-def _mean_row(name: str, scores: dict[str, list[Score]]) -> str:
-    cells = []
+def _mean_row(name: str, scores: dict[str, list[Score]]) -> list[str]:
+    cells = [name]
     for method in ("fast", "adam"):
         mm = [score.mm for score in scores[method]]
         deg = [score.deg for score in scores[method]]
@@ -171,49 +167,32 @@ def _mean_row(name: str, scores: dict[str, list[Score]]) -> str:
         cells.append(
             f"{np.mean(mm):.2f} mm ({max(mm):.2f}), {np.mean(deg):.3f}° ({max(deg):.3f}), {seconds:.2f} s"
         )
-    return f"| {name} | {cells[0]} | {cells[1]} |"
+    return cells
 
 
 def _images(draws: int) -> str:
-    rows = [
-        f"Mean over {draws} draws (worst in brackets), {_size(SMALL)}:\n",
-        "| images | fast | adam |",
-        "|---|---|---|",
-    ]
-    for images in (6, 10, 15):
-        scores: dict[str, list[Score]] = {"fast": [], "adam": []}
-        for seed in range(draws):
-            predictions, truth = synthetic_pairs(complete_pairs(images), SMALL, seed=seed)
-            for method, list_of in scores.items():
-                list_of.append(_score(predictions, truth, method))
-        rows.append(_mean_row(str(images), scores))
-    return "\n".join(rows)
+    rows = [_mean_row(str(images), _scores(images, draws)) for images in (6, 10, 15)]
+    about = f"Mean over {draws} draws (worst in brackets), {_size(SMALL)}:\n"
+    return "\n".join([about, *table("images | fast | adam", rows)])
 
 
 def _kinds(draws: int) -> str:
-    rows = [
-        f"Mean over {draws} draws (worst in brackets), 8 images, {_size(SMALL)}:\n",
-        "| errors of the predictions | fast | adam |",
-        "|---|---|---|",
-    ]
-    for name, errors in ERRORS.items():
-        scores: dict[str, list[Score]] = {"fast": [], "adam": []}
-        for seed in range(draws):
-            predictions, truth = synthetic_pairs(complete_pairs(8), SMALL, errors, seed)
-            for method, list_of in scores.items():
-                list_of.append(_score(predictions, truth, method))
-        rows.append(_mean_row(name, scores))
-    return "\n".join(rows)
+    rows = [_mean_row(name, _scores(8, draws, errors)) for name, errors in ERRORS.items()]
+    about = f"Mean over {draws} draws (worst in brackets), 8 images, {_size(SMALL)}:\n"
+    return "\n".join([about, *table("errors of the predictions | fast | adam", rows)])
+
+
+def _scores(images: int, draws: int, errors: PairErrors | None = None) -> dict[str, list[Score]]:
+    scores: dict[str, list[Score]] = {"fast": [], "adam": []}
+    for seed in range(draws):
+        predictions, truth = synthetic_pairs(complete_pairs(images), SMALL, errors, seed)
+        for method, list_of in scores.items():
+            list_of.append(_score(predictions, truth, method))
+    return scores
 
 
 def _hand_eye(draws: int) -> str:
-    rows = [
-        f"With the robot's poses, mean camera errors and median calibration errors over {draws} draws, "
-        f"{_size(SMALL)}. The robot pose noise is not given but estimated. `jcr` keeps the alignment that promises the "
-        "smaller error; error / sigma is the true error of the calibration over the reported one, 1 where honest.\n",
-        "| robot pose noise | images | cameras aligned freely | as kept (kinematic) | calibration | error / sigma |",
-        "|---|---|---|---|---|---|",
-    ]
+    rows = []
     for noise in ((0.0, 0.0), (5e-4, float(np.radians(0.1)))):
         for images in (3, 4, 5, 10):
             trials = [_hand_eye_trial(images, seed, noise) for seed in range(draws)]
@@ -221,10 +200,22 @@ def _hand_eye(draws: int) -> str:
             *_, mm, deg, percent, _ = np.median(trials, axis=0)
             sigmas = np.sqrt(np.mean([trial[-1] for trial in trials]) / 7)
             rows.append(
-                f"| {1e3 * noise[0]:g} mm, {np.degrees(noise[1]):g}° | {images} | {free:.2f} mm | {kept:.2f} mm "
-                f"({100 * kinematic:.0f} %) | {mm:.2f} mm, {deg:.3f}°, {percent:.3f} % | {sigmas:.1f} |"
+                [
+                    f"{1e3 * noise[0]:g} mm, {np.degrees(noise[1]):g}°",
+                    images,
+                    f"{free:.2f} mm",
+                    f"{kept:.2f} mm ({100 * kinematic:.0f} %)",
+                    f"{mm:.2f} mm, {deg:.3f}°, {percent:.3f} %",
+                    f"{sigmas:.1f}",
+                ]
             )
-    return "\n".join(rows)
+    about = (
+        f"With the robot's poses, mean camera errors and median calibration errors over {draws} draws, "
+        f"{_size(SMALL)}. The robot pose noise is not given but estimated. `jcr` keeps the alignment that promises the "
+        "smaller error; error / sigma is the true error of the calibration over the reported one, 1 where honest.\n"
+    )
+    head = "robot pose noise | images | cameras aligned freely | as kept (kinematic) | calibration | error / sigma"
+    return "\n".join([about, *table(head, rows)])
 
 
 def _hand_eye_trial(images: int, seed: int, noise: tuple[float, float]) -> Float[ndarray, "7"]:
@@ -248,8 +239,7 @@ def _hand_eye_trial(images: int, seed: int, noise: tuple[float, float]) -> Float
             camera_errors(truth.base_from_camera, evidence.recon_from_camera)[0],
             camera_errors(truth.base_from_camera, aligned.alignment.recon_from_camera)[0],
             aligned.alignment.method == "kinematic",
-            1e3 * np.linalg.norm(off[:3]),
-            np.degrees(np.linalg.norm(off[3:6])),
+            *mm_deg(off),
             100 * abs(off[6]),
             off @ np.linalg.solve(found.covariance, off),
         ]

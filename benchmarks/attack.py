@@ -5,11 +5,13 @@ from motion of these observations with the intrinsics that the user believes, th
 """
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.page import mm_deg, table
 from benchmarks.simulated.faults import INTRINSICS, Faults, FaultyCapture, faulty_capture
 from jcr.adjust.intrinsics_prior import ESTIMATED, FIXED, prior_of
 from jcr.adjust.wrist import adjust_wrist
@@ -152,10 +154,7 @@ def outcome(found: FaultyCapture, hand_eye: HandEye) -> Outcome:
         for x in (found.gripper_from_camera, found.gripper_from_camera_after)
     ]
     step = max(steps, key=lambda one: float(np.abs(one / std).max()))
-    metres, radians = np.linalg.norm(step.reshape(2, 3), axis=1)
-    return Outcome(
-        hand_eye.converged, said, 1e3 * metres, float(np.degrees(radians)), float(np.abs(step / std).max())
-    )
+    return Outcome(hand_eye.converged, said, *mm_deg(step), float(np.abs(step / std).max()))
 
 
 def run(long: bool = False) -> str:
@@ -193,18 +192,10 @@ def page(rows: dict[Case, list[Outcome]], clean: list[Outcome]) -> str:
         "how many of the draws say so. *sound*: rejected, or within 3 reported standard deviations on every axis; "
         "against the camera's place before and after a slip, whichever is farther.",
         "",
-        "| what is wrong | draws | reported | as | accepted | off, median: mm | ° | σ, median | sound |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for case, row in rows.items():
-        message = Counter(name for one in row for name in one.said).most_common(3)
-        lines.append(
-            f"| {case.what} | {len(row)} | {_share(bool(one.said) for one in row)} | "
-            f"{', '.join(f'{name} {count}' for name, count in message)} | {_share(one.accepted for one in row)} | "
-            f"{np.median([one.mm for one in row]):.1f} | {np.median([one.deg for one in row]):.2f} | "
-            f"{np.median([one.sigmas for one in row]):.1f} | {_share(one.is_sound for one in row)} |"
-        )
-    lines += [
+        *table(
+            "what is wrong | draws | reported | as | accepted | off, median: mm | ° | σ, median | sound",
+            (_cells(case, row) for case, row in rows.items()),
+        ),
         "",
         f"Nothing wrong: {len(clean)} captures of 8, 12 and 20 images, robots of 0.1 to 0.45 mm, intrinsics given "
         f"and estimated in turn: {len(alarms)} reported as faulty ({falsely}), "
@@ -217,6 +208,22 @@ def page(rows: dict[Case, list[Outcome]], clean: list[Outcome]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _share(fixed) -> str:
-    values = list(fixed)
+def _cells(case: Case, row: list[Outcome]) -> list[str]:
+    message = Counter(name for one in row for name in one.said).most_common(3)
+    mm, deg, sigmas = np.median([(one.mm, one.deg, one.sigmas) for one in row], axis=0)
+    return [
+        case.what,
+        str(len(row)),
+        _share(bool(one.said) for one in row),
+        ", ".join(f"{name} {count}" for name, count in message),
+        _share(one.accepted for one in row),
+        f"{mm:.1f}",
+        f"{deg:.2f}",
+        f"{sigmas:.1f}",
+        _share(one.is_sound for one in row),
+    ]
+
+
+def _share(flags: Iterable[bool]) -> str:
+    values = list(flags)
     return f"{sum(values)} of {len(values)}"

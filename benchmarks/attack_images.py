@@ -18,6 +18,7 @@ from numpy import ndarray
 from scipy.special import chdtrc
 
 import jcr
+from benchmarks.page import mm_deg, table
 from benchmarks.simulated import image_faults as make
 from benchmarks.simulated.image_faults import IMAGES, Drawn, Fault
 from benchmarks.simulated.rendered import Rendered, rendered
@@ -197,15 +198,15 @@ def _judged(capture: Drawn, result: RunResult) -> Outcome:
     step, sigmas, joint_p = max(
         (_off(hand_eye, x) for x in capture.gripper_from_camera), key=lambda one: one[1]
     )
-    metres, radians = np.linalg.norm(step.reshape(2, 3), axis=1)
+    mm, deg = mm_deg(step)
     used = result.reconstruction.image_index[hand_eye.inliers].tolist()
     said = _said(result.calibration.findings)
     return Outcome(
         accepted=hand_eye.converged,
         kinds=frozenset(finding.kind for finding in said),
         left_out=frozenset(range(len(capture.images))) - set(used),
-        mm=1e3 * float(metres),
-        deg=float(np.degrees(radians)),
+        mm=mm,
+        deg=deg,
         sigmas=sigmas,
         joint_p=joint_p,
         backend=result.reconstruction.backend,
@@ -253,10 +254,11 @@ def page(rows: dict[Case, list[Outcome]], clean: Sequence[Outcome]) -> str:
         "before and after, whichever is farther. *warned*: accepted with a warning, and farther off. **silent**: "
         "accepted without one, and farther off: what must not happen. *tried*: back ends, of SIFT, XFeat and direct.",
         "",
-        "| what is wrong | draws | named | as | rejected | within 3 σ | warned | silent | off, median: mm | ° | σ "
-        "| tried |",
-        "|---" * 12 + "|",
-        *(_row(case, row) for case, row in rows.items()),
+        *table(
+            "what is wrong | draws | named | as | rejected | within 3 σ | warned | silent | off, median: mm | ° | σ "
+            "| tried",
+            (_cells(case, row) for case, row in rows.items()),
+        ),
         "",
         f"Nothing wrong: {len(clean)} captures, random errors of the poses 0.5, 1 and 2 times those above, "
         f"intrinsics given and not in turn: {len(alarms)} called faulty ({falsely}), "
@@ -269,7 +271,7 @@ def page(rows: dict[Case, list[Outcome]], clean: Sequence[Outcome]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _row(case: Case, row: Sequence[Outcome]) -> str:
+def _cells(case: Case, row: Sequence[Outcome]) -> list[object]:
     kinds = Counter(str(kind) for one in row for kind in one.kinds).most_common(3)
     named = sum(one.is_named(case) for one in row) if case.named_by or case.fault.wrong else "–"
     silent = sum(one.is_silent for one in row)
@@ -278,9 +280,15 @@ def _row(case: Case, row: Sequence[Outcome]) -> str:
     if kept:
         mm, deg, sigmas = np.median([(one.mm, one.deg, one.sigmas) for one in kept], axis=0)
         medians = [f"{mm:.1f}", f"{deg:.2f}", f"{sigmas:.1f}"]
-    return (
-        f"| {case.what} | {len(row)} | {named} | {', '.join(f'{name} {count}' for name, count in kinds)} | "
-        f"{sum(not one.accepted for one in row)} | {sum(one.is_within for one in row)} | "
-        f"{sum(one.accepted and not one.is_within and not one.is_silent for one in row)} | "
-        f"{f'**{silent}**' if silent else 0} | {' | '.join(medians)} | {max(one.tried for one in row)} |"
-    )
+    return [
+        case.what,
+        len(row),
+        named,
+        ", ".join(f"{name} {count}" for name, count in kinds),
+        sum(not one.accepted for one in row),
+        sum(one.is_within for one in row),
+        sum(one.accepted and not one.is_within and not one.is_silent for one in row),
+        f"**{silent}**" if silent else 0,
+        *medians,
+        max(one.tried for one in row),
+    ]

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
+from benchmarks import page
 from benchmarks.attack import reconstructed
 from benchmarks.simulated.boards import Sheet, with_sheet
 from benchmarks.simulated.faults import Faults, FaultyCapture, faulty_capture
@@ -183,30 +184,27 @@ def _real_table(rows: Sequence[Row]) -> list[str]:
         "calibration of the even images, and the odd images' points triangulated where robot and X put the cameras; "
         "median reprojection error of features and of corners. Seconds include the matching and two cores' other load.",
         "",
-        "| capture | from | verdict | off: mm | ° | ±σ: mm | ° | scale: ±% | left out, features: px | corners: px | s |",
-        "|---" * 11 + "|",
-        *map(_real_line, rows),
+        *page.table(
+            "capture | from | verdict | off: mm | ° | ±σ: mm | ° | scale: ±% | left out, features: px | corners: px | s",
+            map(_cells, rows),
+        ),
     ]
 
 
-def _real_line(row: Row) -> str:
-    def shown(value: float | None, digits: int) -> str:
-        return "" if value is None else f"{value:.{digits}f}"
-
-    cells = (
+def _cells(row: Row) -> list[str]:
+    return [
         row.capture,
         row.how,
         row.message,
-        shown(row.off_mm, 2),
-        shown(row.off_deg, 3),
-        shown(row.std_mm, 2),
-        shown(row.std_deg, 3),
-        shown(row.scale_percent, 3),
-        shown(row.feature_px, 2),
-        shown(row.corner_px, 2),
-        shown(row.seconds, 1),
-    )
-    return "| " + " | ".join(cells) + " |"
+        page.number(row.off_mm, 2),
+        page.number(row.off_deg, 3),
+        page.number(row.std_mm, 2),
+        page.number(row.std_deg, 3),
+        page.number(row.scale_percent, 3),
+        page.number(row.feature_px, 2),
+        page.number(row.corner_px, 2),
+        page.number(row.seconds, 1),
+    ]
 
 
 # Simulated captures.

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from benchmarks.figure import blank, png
+from benchmarks.page import mm_deg, table
 from benchmarks.peers import OPENCV_METHODS, andreff_with_scale, grid_search, opencv
 from benchmarks.simulated.observations import INTRINSICS, observed
 from benchmarks.simulated.problem import HandEyeProblem, error, hand_eye_problem
@@ -176,16 +177,11 @@ def _accuracy(distances: Distances, trials: int, image: str) -> list[str]:
         f"![errors by noise, images and wrong poses]({image})",
     ]
     for noise in NOISES:
-        lines += [
-            "",
-            f"Robot noise {1e3 * noise[0]:.1f} mm, {np.degrees(noise[1]):.1f}° per axis",
-            "",
-            "| method | " + " | ".join(f"{count} images" for count in COUNTS) + " |",
-            "|---" * (len(COUNTS) + 1) + "|",
-        ]
-        for name in _solvers():
-            cells = [_cell(distances[name, noise, count]) for count in COUNTS]
-            lines.append(f"| {name} | " + " | ".join(cells) + " |")
+        lines += ["", f"Robot noise {1e3 * noise[0]:.1f} mm, {np.degrees(noise[1]):.1f}° per axis", ""]
+        lines += table(
+            " | ".join(["method", *(f"{count} images" for count in COUNTS)]),
+            ([name, *(_cell(distances[name, noise, count]) for count in COUNTS)] for name in _solvers()),
+        )
     return lines
 
 
@@ -200,24 +196,20 @@ def _distances(problem: HandEyeProblem, solver: Solver, seed: int) -> tuple[floa
     except cv2.error:  # with wrong poses among them some of OpenCV's methods give up
         return np.inf, np.inf, np.inf
     off = error(problem, x, abs(scale))
-    return (
-        1e3 * float(np.linalg.norm(off[:3])),
-        float(np.degrees(np.linalg.norm(off[3:6]))),
-        100 * abs(off[6]),
-    )
+    return *mm_deg(off), 100 * abs(off[6])
 
 
 def _outliers(spoilt: Spoilt, named: dict[int, int], trials: int) -> list[str]:
-    lines = [
+    rows = [[name, *(_cell(spoilt[name, wrong]) for wrong in WRONG)] for name in _solvers()]
+    named_in = [f"{named[wrong]} of {trials}" for wrong in WRONG]
+    return [
         f"{MANY} images, some of them with another image's gripper pose, robot pose noise 0.5 mm, 0.1°: median error",
         "",
-        "| method | " + " | ".join(f"{wrong} wrong" for wrong in WRONG) + " |",
-        "|---" * (len(WRONG) + 1) + "|",
+        *table(
+            " | ".join(["method", *(f"{wrong} wrong" for wrong in WRONG)]),
+            [*rows, ["*captures in which jcr identifies the wrong ones, and no others*", *named_in]],
+        ),
     ]
-    for name in _solvers():
-        lines.append(f"| {name} | " + " | ".join(_cell(spoilt[name, wrong]) for wrong in WRONG) + " |")
-    counts = " | ".join(f"{named[wrong]} of {trials}" for wrong in WRONG)
-    return [*lines, f"| *captures in which jcr identifies the wrong ones, and no others* | {counts} |"]
 
 
 def _figure(distances: Distances, spoilt: Spoilt) -> bytes:
@@ -275,12 +267,14 @@ def _time() -> list[str]:
             for name in OPENCV_METHODS
         ),
     ]  # fmt: skip
-    lines = ["", "Time, median", "", "| what | images | ms |", "|---|---|---|"]
-    for name, images, work, repeats in rows:
-        taken = []
-        for _ in range(repeats):
-            begun = time.perf_counter()
-            work()
-            taken.append(1e3 * (time.perf_counter() - begun))
-        lines.append(f"| {name} | {images} | {np.median(taken):.1f} |")
-    return lines
+    timed = ((name, images, f"{_median_ms(work, repeats):.1f}") for name, images, work, repeats in rows)
+    return ["", "Time, median", "", *table("what | images | ms", timed)]
+
+
+def _median_ms(work: Callable[[], object], repeats: int) -> float:
+    taken = []
+    for _ in range(repeats):
+        begun = time.perf_counter()
+        work()
+        taken.append(1e3 * (time.perf_counter() - begun))
+    return float(np.median(taken))

@@ -10,8 +10,9 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.stats import chi2
 
+from benchmarks.page import folders_with, mm_deg, table
 from benchmarks.simulated.arm_errors import PresetName
-from benchmarks.simulated.cell import CellProblem, Kind, cell_problem
+from benchmarks.simulated.cell import BOX, CellProblem, Kind, cell_problem
 from jcr.adjust.intrinsics_prior import prior_of
 from jcr.adjust.robots import Adjusted, Placed
 from jcr.adjust.scene import Freedom, Scene
@@ -20,7 +21,7 @@ from jcr.calibration.stage import calibrate
 from jcr.camera import parameters, with_parameters
 from jcr.capture.read import read_capture
 from jcr.cell.stage import place_cameras
-from jcr.errors import InputError, RejectedError
+from jcr.errors import RejectedError
 from jcr.geometry import inverse, scale_translation, skew, step_between
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.records import Capture, CellCamera
@@ -30,6 +31,7 @@ DRAWS, MANY_DRAWS = 10, 40
 COUNT = 10
 """Poses of each arm."""
 PRESET_NAMES: tuple[PresetName, ...] = ("white", "typical")
+BOX_MM = "x".join(f"{1e3 * side:.0f}" for side in BOX)
 WITHHELD = 4
 """Every this many of a real capture's images are declared images of fixed cameras, one each."""
 Of = Callable[[Placed], Float[ndarray, "4 4"]]
@@ -84,9 +86,7 @@ def run(captures: Path, long: bool = False) -> str:
 
     Raises InputError where there is no capture.
     """
-    folders = sorted(path.parent for path in captures.glob("*/capture.json"))
-    if not folders:
-        raise InputError(f"{captures}: no folder below it holds a capture.json")
+    folders = folders_with(captures, "capture.json")
     draws = MANY_DRAWS if long else DRAWS
     drawn: dict[tuple[Kind, PresetName], dict[str, list[Draw]]] = {
         (kind, preset): _drawn(kind, preset, draws) for kind in get_args(Kind) for preset in PRESET_NAMES
@@ -215,7 +215,7 @@ def _against_robot(answer: Adjusted, rig: int, gripper: Float[ndarray, "4 4"]) -
     j = answer.derivative(placed) - answer.derivative(carried)
     moves = np.eye(6)
     moves[:3, 3:] = -skew(gripper[:3, :3] @ answer.placed.x[0][:3, 3])
-    sizes = np.hypot(answer.noise, answer.systematic_left)
+    sizes = answer.noise.together
     robot = moves @ np.diag(np.repeat(sizes, 3) ** 2) @ moves.T
     error = step_between(placed(answer.placed), carried(answer.placed))
     return Draw(error, j @ answer.covariance @ j.T + robot)
@@ -233,7 +233,7 @@ def _page(
         f"of 99 %, {beyond:.1f} % are beyond 3 σ on an axis.",
     ]
     if placed:
-        errors = np.array([_size(row.draw) for row in placed if row.draw is not None])
+        errors = np.array([mm_deg(row.draw.error) for row in placed if row.draw is not None])
         named = sorted({row.capture for row in placed})
         median = np.median(errors, axis=0)
         lines.append(
@@ -246,64 +246,59 @@ def _page(
         "",
         "Simulated: arms of UR5e kinematics, white: random errors of 0.5 mm and 0.1°; typical: joint offsets of 0.1° "
         "and link errors of 0.3 mm, the truth then the effective transform. Points of a table (of a box of "
-        f"{_box()} mm in the gripper), 0.5 px of noise; intrinsics off by what is usual of given ones (0.5 % of focal "
+        f"{BOX_MM} mm in the gripper), 0.5 px of noise; intrinsics off by what is usual of given ones (0.5 % of focal "
         "length, 0.5 % of the width). No images: what bundle adjustment and the robots make of them. σ also counts "
         "what features of real images leave wrong in the intrinsics, and systematic errors of any arm: why squared "
         "distance / 6 is below 1 here is in docs/how-to/cameras.md.",
         "",
-        "| cell | errors | transform | median error | 95 % of errors below | σ per axis | inside 95 % | 99 % | > 3 σ | "
-        "squared distance / 6 |",
-        "|---" * 10 + "|",
-    ]
-    for (kind, preset), names in drawn.items():
-        for name, draws in names.items():
-            sizes = np.array([_size(draw) for draw in draws])
-            low, high = np.median(sizes, axis=0), np.quantile(sizes, 0.95, axis=0)
-            std = np.median([_std(draw) for draw in draws], axis=0)
-            inside = [f"{100 * _inside(draws, share):.0f} %" for share in (0.95, 0.99)]
-            lines.append(
-                f"| {WORDS[kind]} | {preset} | {name} | {low[0]:.2f} mm {low[1]:.3f}° | "
-                f"{high[0]:.2f} mm {high[1]:.3f}° | {std[0]:.2f} mm {std[1]:.3f}° | {' | '.join(inside)} | "
-                f"{100 * np.mean([draw.sigmas > 3 for draw in draws]):.0f} % | "
-                f"{np.mean([draw.squared for draw in draws]) / 6:.2f} |"
-            )
-    lines += [
+        *table(
+            "cell | errors | transform | median error | 95 % of errors below | σ per axis | inside 95 % | 99 % | > 3 σ "
+            "| squared distance / 6",
+            (_simulated(*cell, *named) for cell, names in drawn.items() for named in names.items()),
+        ),
         "",
         f"Real: every {WITHHELD}th image of a capture is declared the image of a fixed camera of its own, its gripper "
         "pose withheld; base_from_camera then against the pose that the robot reported there, times the X of the other "
         "images. In σ: largest on an axis, of the camera's place, X and the robot's pose together.",
         "",
-        "| capture | image | intrinsics | points | off: mm | ° | in σ | ±σ: mm | ° | at the scene: mm |",
-        "|---" * 10 + "|",
+        *table(
+            "capture | image | intrinsics | points | off: mm | ° | in σ | ±σ: mm | ° | at the scene: mm",
+            map(_real, real),
+        ),
     ]
-    for row in real:
-        if row.draw is None:
-            lines.append(
-                f"| {row.capture} | {row.image} | {row.intrinsics} | {row.points} | – | – | – | – | – | – |"
-            )
-            continue
-        mm, deg = _size(row.draw)
-        lines.append(
-            f"| {row.capture} | {row.image} | {row.intrinsics} | {row.points} | {mm:.2f} | {deg:.3f} | "
-            f"{row.draw.sigmas:.1f} | {row.std_mm:.2f} | {row.std_deg:.3f} | {row.scene_mm:.1f} |"
-        )
     lines += ["", *(f"- {row.capture}, {row.image}: {row.message}" for row in real if row.message)]
     return "\n".join(lines).rstrip() + "\n"
 
 
-def _box() -> str:
-    from benchmarks.simulated.cell import BOX
+def _simulated(kind: Kind, preset: PresetName, name: str, draws: list[Draw]) -> list[str]:
+    sizes = np.array([mm_deg(draw.error) for draw in draws])
+    spread = (
+        np.median(sizes, axis=0),
+        np.quantile(sizes, 0.95, axis=0),
+        np.median([*map(_std, draws)], axis=0),
+    )
+    return [
+        WORDS[kind],
+        preset,
+        name,
+        *(f"{mm:.2f} mm {deg:.3f}°" for mm, deg in spread),
+        *(f"{100 * _inside(draws, share):.0f} %" for share in (0.95, 0.99)),
+        f"{100 * np.mean([draw.sigmas > 3 for draw in draws]):.0f} %",
+        f"{np.mean([draw.squared for draw in draws]) / 6:.2f}",
+    ]
 
-    return "x".join(f"{1e3 * side:.0f}" for side in BOX)
+
+def _real(row: Row) -> list[str]:
+    cells = [row.capture, row.image, row.intrinsics, str(row.points)]
+    if row.draw is None:
+        return cells + ["–"] * 6
+    mm, deg = mm_deg(row.draw.error)
+    cells += [f"{mm:.2f}", f"{deg:.3f}", f"{row.draw.sigmas:.1f}"]
+    return [*cells, f"{row.std_mm:.2f}", f"{row.std_deg:.3f}", f"{row.scene_mm:.1f}"]
 
 
 def _inside(draws: Sequence[Draw], share: float) -> float:
     return float(np.mean([draw.squared < chi2.ppf(share, 6) for draw in draws]))
-
-
-def _size(draw: Draw) -> tuple[float, float]:
-    """mm and degrees of the error."""
-    return 1e3 * float(np.linalg.norm(draw.error[:3])), float(np.degrees(np.linalg.norm(draw.error[3:])))
 
 
 def _std(draw: Draw) -> tuple[float, float]:

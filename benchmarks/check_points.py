@@ -10,15 +10,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from benchmarks.board_intrinsics import (
-    FEATURES,
-    FLAT,
-    HALVES,
-    SHAPE_FREE,
-    Fit,
-    intrinsics_of_board,
-    intrinsics_of_features,
-)
 from benchmarks.corners import (
     FEWEST_IMAGES,
     Corners,
@@ -31,6 +22,7 @@ from benchmarks.corners import (
     pixels_of,
     triangulated,
 )
+from benchmarks.page import boards_of, folders_with, number, table
 from jcr.calibration.seen import joint_covariance
 from jcr.camera import parameters, with_parameters
 from jcr.capture.images import read_image
@@ -67,8 +59,6 @@ class Row:
     found: Measured
     predicted: Parts
     """Each number of `found` in the draws."""
-    intrinsics: tuple[Fit, ...]
-    """From features, and from the board."""
 
 
 def run(captures: Path, boards: Sequence[str] = (), runs: Path | None = None) -> str:
@@ -78,10 +68,8 @@ def run(captures: Path, boards: Sequence[str] = (), runs: Path | None = None) ->
     captures it is looked for. Run folders are kept in `runs` and used again. Raises InputError where no capture shows a
     board, or one is named of a capture that is not there.
     """
-    folders = sorted(path.parent for path in captures.glob("*/capture.json"))
-    named = {name: board for name, _, board in (text.partition("=") for text in boards)}
-    if unknown := named.keys() - {folder.name for folder in folders}:
-        raise InputError(f"--boards {', '.join(sorted(unknown))}: no such capture in {captures}")
+    folders = folders_with(captures, "capture.json")
+    named = boards_of(boards, folders, captures)
     rows, absent = [], []
     for folder in folders:
         try:
@@ -92,9 +80,7 @@ def run(captures: Path, boards: Sequence[str] = (), runs: Path | None = None) ->
             absent.append(f"{folder.name}: {refusal}")
     if not rows:
         raise InputError(f"{captures}: no capture below it shows a board that {FEWEST_IMAGES} images share")
-    return "\n".join(
-        [_claim(rows), "", *_corner_table(rows), "", *_intrinsics_table(rows), "", *_list(absent)]
-    )
+    return "\n".join([_claim(rows), "", *_corner_table(rows), "", *_list(absent)])
 
 
 def _row(capture: Capture, named: str | None, runs: Path | None) -> Row:
@@ -115,7 +101,6 @@ def _row(capture: Capture, named: str | None, runs: Path | None) -> Row:
         side=side,
         found=measure(camera, corners),
         predicted=predicted(camera, result.hand_eye, corners, noise_px),
-        intrinsics=intrinsics_of_features(result) + intrinsics_of_board(corners, camera.intrinsics),
     )
 
 
@@ -233,20 +218,21 @@ def _corner_table(rows: Sequence[Row]) -> list[str]:
         "corners, ± predicted. Flat: rms distance of the triangulated corners from their plane, and from a surface of "
         "second order.",
         "",
-        "| capture | images | corners | side: stated mm | triangulated | flat: mm | bend removed | single: mm | across "
-        "| along | predicted | across | along | ratio | halves: mm | predicted |",
-        "|---" * 16 + "|",
-        *map(_corner_line, rows),
+        *table(
+            "capture | images | corners | side: stated mm | triangulated | flat: mm | bend removed | single: mm "
+            "| across | along | predicted | across | along | ratio | halves: mm | predicted",
+            map(_cells, rows),
+        ),
     ]
 
 
-def _corner_line(row: Row) -> str:
+def _cells(row: Row) -> list[str]:
     found, draws = row.found, row.predicted
 
     def mm(value: float, digits: int = 2) -> str:
-        return "" if np.isnan(value) else f"{1e3 * value:.{digits}f}"
+        return number(1e3 * value, digits)
 
-    cells = (
+    return [
         row.capture,
         row.images,
         str(row.corners),
@@ -259,58 +245,7 @@ def _corner_line(row: Row) -> str:
         f"{found.scatter / _rms(draws['scatter']):.1f}",
         mm(found.halves),
         mm(_rms(draws["halves"])),
-    )
-    return "| " + " | ".join(cells) + " |"
-
-
-def _intrinsics_table(rows: Sequence[Row]) -> list[str]:
-    lines = [_intrinsics_line(row.capture, one) for row in rows for one in row.intrinsics]
-    return [
-        "Intrinsics of the same images, ± one σ: from features, as the calibration has them, and from the board's "
-        "corners alone (OpenCV, a free pose an image), flat and with the shape of the sheet free; each from every other "
-        "image, too. σ of the board are of white pixel noise. rms: of the corners, poses free; by features: with the "
-        "calibration's intrinsics instead of the board's own. Without σ: given, and not estimated.",
-        "",
-        "| capture | from | images | fx | fy | cx | cy | k1 | rms px | by features |",
-        "|---" * 10 + "|",
-        *lines,
-        "",
-        "How far they are from each other, rms over the captures that have both:",
-        "",
-        "| | captures | f: % | cx, cy: px | k1 | in σ of both |",
-        "|---" * 6 + "|",
-        *_difference_lines(rows),
     ]
-
-
-def _intrinsics_line(capture: str, one: Fit) -> str:
-    digits = (1, 1, 1, 1, 3)
-    values = [
-        f"{one.parameters[k]:.{digits[k]}f}" + ("" if one.std is None else f" ± {one.std[k]:.{digits[k]}f}")
-        for k in range(5)
-    ]
-    rms = ["" if px is None else f"{px:.2f}" for px in (one.rms_px, one.rms_px_of_features)]
-    return "| " + " | ".join([capture, one.how, str(one.images), *values, *rms]) + " |"
-
-
-def _difference_lines(rows: Sequence[Row]) -> Iterator[str]:
-    pairs = [(FEATURES, FLAT), (FEATURES, SHAPE_FREE), (FLAT, SHAPE_FREE)]
-    pairs += [(f"{kind}, {HALVES[0]}", f"{kind}, {HALVES[1]}") for kind in (FEATURES, FLAT, SHAPE_FREE)]
-    by_name = [{one.how: one for one in row.intrinsics if one.std is not None} for row in rows]
-    for pair in pairs:
-        both = [tuple(fits[how] for how in pair) for fits in by_name if fits.keys() >= set(pair)]
-        if both:
-            off, std = np.array([_difference(a, b) for a, b in both]).transpose(1, 0, 2)
-            percent = 100 * _rms(off[:, :2].ravel())
-            centre, k1, sigmas = (_rms(x.ravel()) for x in (off[:, 2:4], off[:, 4], off / std))
-            yield f"| {pair[0]}; {pair[1]} | {len(both)} | {percent:.2f} | {centre:.1f} | {k1:.3f} | {sigmas:.1f} |"
-
-
-def _difference(a: Fit, b: Fit) -> tuple[Float[ndarray, " 5"], Float[ndarray, " 5"]]:
-    """Of fx and fy (relative), cx, cy and k1, and the standard deviation of both together."""
-    assert a.std is not None and b.std is not None
-    unit = np.array([b.parameters[0], b.parameters[1], 1.0, 1.0, 1.0])
-    return (a.parameters[:5] - b.parameters[:5]) / unit, np.hypot(a.std[:5], b.std[:5]) / unit
 
 
 def _list(lines: Sequence[str]) -> list[str]:

@@ -11,6 +11,7 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 
 from benchmarks.figure import blank, png
+from benchmarks.page import table
 from benchmarks.simulated.surface import truth_points
 from benchmarks.synthetic_pairs import pairs_of_capture
 from benchmarks.table1 import PUBLISHED, WEBCAM
@@ -69,11 +70,11 @@ def run(out: Path | None = None) -> str:
     covered = {cloud.name: _covered(cloud, surface[drawn], labels[drawn]) for cloud in clouds}
     if out is not None:
         write_bytes(out / "density.png", _figure(image, clouds))
-    table, things = covered[sparse.name]
+    on_table, things = covered[sparse.name]
     best_table, best_things = covered[predicted.name]
     swept_table, swept_things = covered[swept.name]
     lines = [
-        f"> On a plain table COLMAP's points cover {table:.0f} % of the table and {things:.0f} % of the objects; our "
+        f"> On a plain table COLMAP's points cover {on_table:.0f} % of the table and {things:.0f} % of the objects; our "
         f"dense depth on its cameras {swept_table:.0f} % and {swept_things:.0f} %, simulated predictions of a network "
         f"{best_table:.0f} % and {best_things:.0f} %.",
         "",
@@ -84,11 +85,12 @@ def run(out: Path | None = None) -> str:
         "",
         "![the clouds from above](density.png)",
         "",
-        "| cloud | points | table covered, % | objects covered, % |",
-        "|---|---|---|---|",
-        *(
-            f"| {cloud.name} | {len(cloud.x_in_base):,} | {covered[cloud.name][0]:.1f} | {covered[cloud.name][1]:.1f} |"
-            for cloud in clouds
+        *table(
+            "cloud | points | table covered, % | objects covered, %",
+            (
+                [cloud.name, f"{len(cloud.x_in_base):,}", *(f"{share:.1f}" for share in covered[cloud.name])]
+                for cloud in clouds
+            ),
         ),
     ]
     return "\n".join(lines) + "\n"

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.page import folders_with, table
 from benchmarks.seen import WAYS, Knowledge
 from benchmarks.simulated.arm_errors import PresetName
 from benchmarks.simulated.bent import bent_problem
@@ -21,7 +22,7 @@ from jcr.calibration.seen import within_95
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.check import QUICK, check, spread_rows
-from jcr.errors import InputError, RejectedError
+from jcr.errors import RejectedError
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.pipeline import calibrate as run_calibrate
 from jcr.records import Capture, HandEye, Reconstruction
@@ -60,9 +61,7 @@ class Row:
 
 def run(captures: Path) -> str:
     """Markdown: real captures below `captures`, and simulated ones; InputError where there is no capture."""
-    folders = sorted(path.parent for path in captures.glob("*/capture.json"))
-    if not folders:
-        raise InputError(f"{captures}: no folder below it holds a capture.json")
+    folders = folders_with(captures, "capture.json")
     return page([row for folder in folders if (row := of_capture(folder)) is not None], simulated())
 
 
@@ -76,10 +75,11 @@ def page(real: Sequence[Row], made: Sequence[Row]) -> str:
         "`--poses-only`, which takes robot and images for usual. A simulated capture has observations "
         f"instead of images; of more than {QUICK} images, {QUICK} are looked at.",
         "",
-        "| capture | | images | seen point: expected mm | reported | ratio | camera: expected mm | reported | ratio | "
-        "rotation: expected ° | reported | ratio | poses alone, seen point: ratio |",
-        "|---" * 13 + "|",
-        *map(_line, [*real, *made]),
+        *table(
+            "capture | | images | seen point: expected mm | reported | ratio | camera: expected mm | reported | ratio | "
+            "rotation: expected ° | reported | ratio | poses alone, seen point: ratio",
+            map(_cells, [*real, *made]),
+        ),
     ]
     return "\n".join(lines) + "\n"
 
@@ -94,13 +94,13 @@ def _claim(name: str, rows: Sequence[Row]) -> str:
     return f"> Expected error over reported error, {len(rows)} {name}: {'; '.join(parts)}"
 
 
-def _line(row: Row) -> str:
+def _cells(row: Row) -> list[str]:
     cells = [row.capture, row.how, row.images]
     for k in range(3):
         ahead = "" if row.expected is None else f"{row.expected[k]:.3g}"
         share = f"{row.ratios[k]:.2f}" if row.ratios else ""
         cells += [ahead, f"{row.reported[k]:.3g}", share]
-    return "| " + " | ".join([*cells, f"{row.live_ratios[0]:.2f}"]) + " |"
+    return [*cells, f"{row.live_ratios[0]:.2f}"]
 
 
 def of_capture(folder: Path) -> Row | None:

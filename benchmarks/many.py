@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from benchmarks.matching import off
+from benchmarks.page import apart
 from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
@@ -79,6 +79,6 @@ def one(folder: str, count: int) -> None:
         "calibrate_s": done - mapped,
         "cpu_s": used.ru_utime + used.ru_stime,
         "peak_gb": 1024 * used.ru_maxrss / 1e9,
-        "off_mm": off(hand_eye.gripper_from_camera, reference)[0],
+        "off_mm": apart(hand_eye.gripper_from_camera, reference)[0],
     }
     sys.stdout.write(json.dumps(facts) + "\n")

@@ -16,6 +16,7 @@ from PIL import Image
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
+from benchmarks.page import table
 from benchmarks.simulated.surface import solid_labels
 from benchmarks.simulated.truth import read_truth, true_depth, true_labels
 from jcr.calibration.stage import calibrate
@@ -133,22 +134,20 @@ def _accuracy(rows: dict[tuple[str, str], MapScore], scenes: dict[tuple[str, str
         "against the surface that the images show, at 10 mm and 5 mm; colour and labels where the map knows that "
         "surface.",
         "",
-        "| poses | preset | training | F 10 | P 10 | R 10 | F 5 | P 5 | R 5 | false free inside | more than 5 mm in | "
-        "false occupied in seen free space | more than 10 mm off | colour PSNR | label mIoU | unknown |",
-        "|" + "---|" * 16,
     ]
+    found = []
     for (source, preset), s in rows.items():
         seconds = float(scenes[source, preset].history["training_s"])
         shares = (s.f_10mm, s.precision_10mm, s.recall_10mm, s.f_5mm, s.precision_5mm, s.recall_5mm)
         rates = (s.false_free_inside, s.false_free_deep, s.false_occupied, s.false_occupied_far)
-        lines.append(
-            f"| {source} | {preset} | {seconds:.2f} s | "
-            + " | ".join(f"{100 * share:.1f}" for share in shares)
-            + " | "
-            + " | ".join(f"{100 * rate:.3f}" for rate in rates)
-            + f" | {s.color_psnr:.1f} dB | {s.label_iou:.3f} | {100 * s.unknown:.0f} |"
-        )
-    return [*_claims(rows, scenes), "", *lines, ""]
+        cells = [source, preset, f"{seconds:.2f} s", *(f"{100 * share:.1f}" for share in shares)]
+        cells += [f"{100 * rate:.3f}" for rate in rates]
+        found.append([*cells, f"{s.color_psnr:.1f} dB", f"{s.label_iou:.3f}", f"{100 * s.unknown:.0f}"])
+    head = (
+        "poses | preset | training | F 10 | P 10 | R 10 | F 5 | P 5 | R 5 | false free inside | more than 5 mm in | "
+        "false occupied in seen free space | more than 10 mm off | colour PSNR | label mIoU | unknown"
+    )
+    return [*_claims(rows, scenes), "", *lines, *table(head, found), ""]
 
 
 def _claims(rows: dict[tuple[str, str], MapScore], scenes: dict[tuple[str, str], SceneMap]) -> list[str]:
@@ -177,39 +176,35 @@ def _things(scene: SceneMap, places: Places, names: tuple[str, ...]) -> list[str
         mean_iou(found, surface.label[known], (k,)) if (surface.label[known] == k).any() else np.nan
         for k in things
     ]
-    return [
-        f"| calibrated, default preset | {' | '.join(names[k] for k in things)} |",
-        "|---" * (len(things) + 1) + "|",
-        f"| of the shown surface in the map, % | {' | '.join(f'{share:.0f}' for share in mapped)} |",
-        f"| label IoU there | {' | '.join(f'{share:.3f}' for share in iou)} |",
-        "",
+    rows = [
+        ["of the shown surface in the map, %", *(f"{share:.0f}" for share in mapped)],
+        ["label IoU there", *(f"{share:.3f}" for share in iou)],
     ]
+    return [*table(" | ".join(["calibrated, default preset", *(names[k] for k in things)]), rows), ""]
 
 
 def _geometric(clouds: dict[str, PointCloud]) -> list[str]:
     """Labels from geometry alone, on the points: each true thing against the segment that fits it best."""
-    lines = ["| segments from geometry alone | segments | mIoU on the points |", "|---|---|---|"]
+    rows = []
     for source, cloud in clouds.items():
         found, true = label_tabletop(cloud).label, cloud.label
         things, segments = np.unique(true[true > 0]), np.unique(found[found > 0])
         iou = np.array([[mean_iou(found == k, true == t, (True,)) for k in segments] for t in things])
-        rows, columns = linear_sum_assignment(-iou)
-        lines.append(
-            f"| {source} | {len(segments)} for {len(things)} | {iou[rows, columns].sum() / len(things):.3f} |"
-        )
-    return [*lines, ""]
+        mean = iou[linear_sum_assignment(-iou)].sum() / len(things)
+        rows.append([source, f"{len(segments)} for {len(things)}", f"{mean:.3f}"])
+    return [*table("segments from geometry alone | segments | mIoU on the points", rows), ""]
 
 
 def _trained(cloud: PointCloud, places: Places) -> list[str]:
     """What the default preset reaches when it is stopped early."""
-    lines = ["| default preset stopped after | training s | F at 10 mm, % |", "|---|---|---|"]
+    rows = []
     for limit in (1.0, None):
         options = MapOptions(max_seconds=limit or PATIENCE_S)
         scenes = [build_scene(cloud, options) for _ in range(3)]
         seconds = np.median([float(scene.history["training_s"]) for scene in scenes])
         f = 100 * score(scenes[-1], places).f_10mm
-        lines.append(f"| {'its plateau' if limit is None else f'{limit} s'} | {seconds:.2f} | {f:.1f} |")
-    return [*lines, ""]
+        rows.append(["its plateau" if limit is None else f"{limit} s", f"{seconds:.2f}", f"{f:.1f}"])
+    return [*table("default preset stopped after | training s | F at 10 mm, %", rows), ""]
 
 
 def _speed(scene: SceneMap, folder: Path) -> list[str]:
@@ -297,15 +292,12 @@ def true_surface(truth: Truth) -> Surface:
     return Surface(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def true_cloud(truth: Truth, points: int = 200_000, noise: float = 0.0, seed: int = 0) -> PointCloud:
-    """The cloud that perfect poses and depth would give; Gaussian `noise` (m) is added along the rays."""
-    surface, draw = true_surface(truth), np.random.default_rng(seed)
-    chosen = draw.choice(len(surface.image), min(points, len(surface.image)), replace=False)
-    center = truth.base_from_camera[surface.image[chosen], :3, 3]
-    ray = surface.x_in_base[chosen] - center
-    length = np.linalg.norm(ray, axis=1, keepdims=True)
+def true_cloud(truth: Truth) -> PointCloud:
+    """The cloud that perfect poses and depth would give."""
+    surface, draw = true_surface(truth), np.random.default_rng(0)
+    chosen = draw.choice(len(surface.image), min(POINTS, len(surface.image)), replace=False)
     return PointCloud(
-        points_in_base=center + ray * (1 + noise * draw.normal(size=length.shape) / length),
+        points_in_base=surface.x_in_base[chosen],
         color=surface.color[chosen],
         confidence=np.ones(len(chosen)),
         margin=np.zeros(len(chosen)),

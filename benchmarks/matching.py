@@ -9,11 +9,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from benchmarks.page import apart, boards_of, folders_with, number, table
 from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
-from jcr.errors import InputError, RejectedError
-from jcr.geometry import rotation_between_deg, rotation_log
+from jcr.errors import RejectedError
+from jcr.geometry import rotation_log
 from jcr.match.matchers import FeatureName
 from jcr.reconstruct import marker
 from jcr.reconstruct.colmap import reconstruct_colmap
@@ -60,19 +61,18 @@ def run(captures: Path, boards: Sequence[str] = (), long: bool = False) -> str:
     for one that is stored may be of a wrong size. Raises InputError where no capture has a reference, and for a board
     of none.
     """
-    folders = sorted(path.parent for path in captures.glob("*/reference.json"))
-    if not folders:
-        raise InputError(f"{captures}: no folder below it holds a reference.json beside its capture.json")
-    board_of = {name: board for name, _, board in (text.partition("=") for text in boards)}
-    if unknown := board_of.keys() - {folder.name for folder in folders}:
-        raise InputError(f"--boards {', '.join(sorted(unknown))}: no such capture in {captures}")
+    folders = folders_with(captures, "reference.json")
+    board_of = boards_of(boards, folders, captures)
     rows, remade = [], {}
     for folder in folders if long else folders[::EVERY]:
         reference = stored = reference_of(folder)
         if (board := board_of.get(folder.name)) is not None and (made := by_board(folder, board)) is not None:
-            reference, remade[folder.name] = made, f"`{board}`, {apart(made, stored)} from that stored"
+            reference, remade[folder.name] = (
+                made,
+                f"`{board}`, {_apart_in_words(made, stored)} from that stored",
+            )
         rows += [row_of(folder, features, gate, reference) for features, gate in (WAYS if long else FEW)]
-    return table(rows, remade)
+    return page(rows, remade)
 
 
 @dataclass(frozen=True)
@@ -100,13 +100,12 @@ def by_board(folder: Path, board: str) -> Reference | None:
     )
 
 
-def apart(one: Reference, other: Reference) -> str:
-    """Distance of two references in words."""
-    mm, deg = off(one.gripper_from_camera, other.gripper_from_camera)
+def _apart_in_words(one: Reference, other: Reference) -> str:
+    mm, deg = apart(one.gripper_from_camera, other.gripper_from_camera)
     return f"{mm:.1f} mm and {deg:.2f}°"
 
 
-def table(rows: Sequence[Row], remade: Mapping[str, str]) -> str:
+def page(rows: Sequence[Row], remade: Mapping[str, str]) -> str:
     """Markdown of the rows; `remade` says of captures with which board their references were made."""
     counts = []
     for features, gate in WAYS:
@@ -125,9 +124,10 @@ def table(rows: Sequence[Row], remade: Mapping[str, str]) -> str:
             for name, board in remade.items()
         ),
         "",
-        "| capture | features | gate | images registered | off: mm | ° | in σ | joint | ±σ: mm | ° | accepted | s |",
-        "|---" * 12 + "|",
-        *map(line, rows),
+        *table(
+            "capture | features | gate | images registered | off: mm | ° | in σ | joint | ±σ: mm | ° | accepted | s",
+            map(_cells, rows),
+        ),
         "",
         *(
             f"- {row.capture}, {row.features}{'' if row.gate else ', no gate'}: {row.message}"
@@ -151,7 +151,7 @@ def row_of(folder: Path, features: FeatureName, gate: bool, reference: Reference
         seconds = time.perf_counter() - begun
         return Row(folder.name, features, gate, f"{count} of {len(capture)}", seconds, message=str(refusal))
     seconds = time.perf_counter() - begun
-    mm, deg = off(hand_eye.gripper_from_camera, reference.gripper_from_camera)
+    mm, deg = apart(hand_eye.gripper_from_camera, reference.gripper_from_camera)
     std = np.sqrt(np.diag(hand_eye.covariance))
     return Row(
         folder.name,
@@ -172,12 +172,6 @@ def row_of(folder: Path, features: FeatureName, gate: bool, reference: Reference
     )
 
 
-def off(x: Float[ndarray, "4 4"], reference: Float[ndarray, "4 4"]) -> tuple[float, float]:
-    """Distance of two hand-eye transforms in mm and degrees."""
-    mm = 1e3 * float(np.linalg.norm(x[:3, 3] - reference[:3, 3]))
-    return mm, float(rotation_between_deg(x[:3, :3], reference[:3, :3]))
-
-
 def sigmas(
     hand_eye: HandEye, reference: Float[ndarray, "4 4"], its_covariance: Float[ndarray, "6 6"] | None = None
 ) -> float:
@@ -188,20 +182,15 @@ def sigmas(
     return float(np.abs(gap / np.sqrt(variance)).max())
 
 
-def line(row: Row) -> str:
-    """A row of the table."""
-    numbers = (
-        ["–"] * 6
-        if row.off_mm is None
-        else [
-            f"{row.off_mm:.1f}",
-            f"{row.off_deg:.2f}",
-            f"{row.sigmas:.1f}",
-            "" if row.joint is None else f"{row.joint:.1f}",
-            f"{row.std_mm:.1f}",
-            f"{row.std_deg:.2f}",
-        ]
+def _cells(row: Row) -> list[str]:
+    off = (
+        (row.off_mm, 1),
+        (row.off_deg, 2),
+        (row.sigmas, 1),
+        (row.joint, 1),
+        (row.std_mm, 1),
+        (row.std_deg, 2),
     )
+    numbers = ["–"] * 6 if row.off_mm is None else [number(value, digits) for value, digits in off]
     gate, accepted = ("on" if row.gate else "off"), ("yes" if row.accepted else "no")
-    cells = [row.capture, row.features, gate, row.images, *numbers, accepted, f"{row.seconds:.0f}"]
-    return f"| {' | '.join(cells)} |"
+    return [row.capture, row.features, gate, row.images, *numbers, accepted, f"{row.seconds:.0f}"]

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 from scipy.spatial import KDTree
 
+from benchmarks import page
+from benchmarks.page import mm_deg
 from benchmarks.predicted_views import ViewErrors, auc, predicted_views, predictions
 from benchmarks.simulated.surface import truth_points
 from benchmarks.simulated.truth import read_truth
@@ -25,7 +25,7 @@ from jcr.reconstruct.backends import BACKENDS, ReconstructOptions
 from jcr.reconstruct.hub import Weights
 from jcr.reconstruct.views_at_once import da3
 from jcr.reconstruct.views_at_once.views_at_once import Cost, ViewsOptions, reconstruct_views_at_once
-from jcr.records import Capture, HandEye, Reconstruction
+from jcr.records import Capture, Reconstruction
 from jcr.represent.cloud import point_cloud
 from jcr.segment.labels import read_labels
 from jcr.segment.measure import measure
@@ -98,12 +98,11 @@ def run(long: bool = False) -> str:
             "",
             f"{table.capitalize()} table",
             "",
-            "| back end | accepted | translation | rotation | σ | heights (measured) | surface |",
-            "|---" * 7 + "|",
+            *page.table(
+                "back end | accepted | translation | rotation | σ | heights (measured) | surface",
+                (_row(method, found) for (which, method), found in cells.items() if which == table),
+            ),
         ]
-        for (which, method), found in cells.items():
-            if which == table:
-                lines.append(_row(method, found))
     return "\n".join([_claim(cells), *lines]) + "\n"
 
 
@@ -127,10 +126,10 @@ def _claim(cells: dict[tuple[str, str], list[Cell | None]]) -> str:
     return f"> Simulated predictions of an any-view model, {level}: {'; '.join(parts)}.\n"
 
 
-def _row(method: str, found: list[Cell | None]) -> str:
+def _row(method: str, found: list[Cell | None]) -> list[str]:
     there = [cell for cell in found if cell is not None]
     if not there:
-        return f"| {method} | 0 of {len(found)} | | | | | |"
+        return [method, f"0 of {len(found)}", *5 * [""]]
     accepted = sum(cell.converged for cell in there)
     mm, deg, sigmas, height, surface = (
         float(_median([getattr(cell, name) for cell in there]))
@@ -138,10 +137,8 @@ def _row(method: str, found: list[Cell | None]) -> str:
     )
     measured = sum(cell.measured for cell in there)
     heights = f"{height:.1f} % ({measured})" if measured else "none (0)"
-    return (
-        f"| {method} | {accepted} of {len(found)} | {mm:.2f} mm | {deg:.3f}° | {sigmas:.1f} | {heights} | "
-        f"{surface:.1f} mm |"
-    )
+    of = f"{accepted} of {len(found)}"
+    return [method, of, f"{mm:.2f} mm", f"{deg:.3f}°", f"{sigmas:.1f}", heights, f"{surface:.1f} mm"]
 
 
 def _median(values: list[float]) -> float:
@@ -190,7 +187,7 @@ def _cell(capture: Capture, place: Path, reconstructed: Callable[[Capture], Reco
     except RejectedError:
         return None
     truth = read_truth(place)
-    off = _in_gripper_axes(hand_eye, truth.gripper_from_camera)
+    off = step_between(hand_eye.gripper_from_camera, truth.gripper_from_camera)
     sigmas = float(np.sqrt(off @ np.linalg.solve(hand_eye.covariance[:6, :6], off) / 6))
     given = read_labels(capture, reconstruction)
     assert given is not None  # copied beside the images
@@ -214,16 +211,10 @@ def _cell(capture: Capture, place: Path, reconstructed: Callable[[Capture], Reco
     except ValueError:  # no plane, nothing on it
         pass
     return Cell(
-        1e3 * float(np.linalg.norm(off[:3])),
-        float(np.degrees(np.linalg.norm(off[3:]))),
+        *mm_deg(off),
         sigmas,
         hand_eye.converged,
         float(np.median(heights)) if heights else float("nan"),
         len(heights),
         1e3 * float(np.median(distance)),
     )
-
-
-def _in_gripper_axes(hand_eye: HandEye, true: Float[ndarray, "4 4"]) -> Float[ndarray, "6"]:
-    """The step to the truth, in the axes of the covariance."""
-    return step_between(hand_eye.gripper_from_camera, true)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.page import mm_deg, table
 from benchmarks.simulated.problem import HandEyeProblem, error
 from benchmarks.simulated.surface import truth_points
 from benchmarks.simulated.truth import read_truth
@@ -42,30 +43,33 @@ class EndToEnd:
 def run(long: bool = False) -> str:
     """Markdown: median errors and times over seeds, by robot pose noise and number of images."""
     seeds = MANY_SEEDS if long else SEEDS
-    rows = [
+    about = (
         f"Simulated tabletop; true pointmaps at 128x96 with a network's errors (white 0.3 %, smooth distance 1 %, "
         f"2 % outliers, a unit per pair); `--backend predictions`, median of {seeds} draws. The last but one "
-        "column is the true error over the reported one sigma: about 1 where the uncertainty is honest.\n",
-        "| robot pose noise | images | translation | rotation | scale | map surface | error / sigma | time |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    claim = ""
+        "column is the true error over the reported one sigma: about 1 where the uncertainty is honest.\n"
+    )
+    claim, rows = "", []
     for noise in NOISES:
         for images in IMAGES:
             runs = [end_to_end(images, seed, noise) for seed in range(seeds)]
             mm, deg, percent, surface, sigmas, seconds = np.median(
                 [list(vars(r).values()) for r in runs], axis=0
             )
-            rows.append(
-                f"| {noise[0]:g} mm, {noise[1]:g}° | {images} | {mm:.2f} mm | {deg:.3f}° | {percent:.2f} % | "
-                f"{surface:.1f} mm | {sigmas:.1f} | {seconds:.0f} s |"
-            )
+            cells = [
+                f"{noise[0]:g} mm, {noise[1]:g}°",
+                images,
+                f"{mm:.2f} mm",
+                f"{deg:.3f}°",
+                f"{percent:.2f} %",
+            ]
+            rows.append([*cells, f"{surface:.1f} mm", f"{sigmas:.1f}", f"{seconds:.0f} s"])
             claim = (
                 f"> The whole job from simulated predictions of {images} images, robot pose noise {noise[0]:g} mm and "
                 f"{noise[1]:g}°: {mm:.2f} mm and {deg:.3f}° off, the map's surface {surface:.1f} mm, "
                 f"in {seconds:.0f} s.\n"
             )
-    return "\n".join([claim, *rows]) + "\n"
+    head = "robot pose noise | images | translation | rotation | scale | map surface | error / sigma | time"
+    return "\n".join([claim, about, *table(head, rows)]) + "\n"
 
 
 def end_to_end(images: int, seed: int, noise: tuple[float, float]) -> EndToEnd:
@@ -99,8 +103,7 @@ def scored(result: RunResult, capture: Path, true_scale: float) -> EndToEnd:
     )
     off = error(problem, found.gripper_from_camera, found.scale)
     return EndToEnd(
-        1e3 * float(np.linalg.norm(off[:3])),
-        float(np.degrees(np.linalg.norm(off[3:6]))),
+        *mm_deg(off),
         100 * abs(float(off[6])),
         1e3 * float(np.nanmedian(distance)),
         float(np.sqrt(off @ np.linalg.solve(found.covariance, off) / 7)),

@@ -12,18 +12,18 @@ from jaxtyping import Float
 from numpy import ndarray
 from PIL import Image
 
+from benchmarks.page import apart, boards_of, folders_with, number, table
 from benchmarks.peers import opencv
 from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.stage import calibrate as calibrate_stage
 from jcr.camera import unproject
 from jcr.capture.read import read_capture
-from jcr.errors import InputError, RejectedError
+from jcr.errors import RejectedError
 from jcr.geometry import (
     Transforms,
     apply,
     inverse,
     nearest_rotation,
-    rotation_between_deg,
     step_between,
     transform,
 )
@@ -66,12 +66,8 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
     A board is named as CAPTURE=BOARD, in the words of `--board`. Raises InputError where no capture has a
     reference, or a board is of a capture that is not there.
     """
-    folders = sorted(path.parent for path in captures.glob("*/reference.json"))
-    if not folders:
-        raise InputError(f"{captures}: no folder below it holds a reference.json beside its capture.json")
-    board_of = {name: board for name, _, board in (text.partition("=") for text in boards)}
-    if unknown := board_of.keys() - {folder.name for folder in folders}:
-        raise InputError(f"--boards {', '.join(sorted(unknown))}: no such capture in {captures}")
+    folders = folders_with(captures, "reference.json")
+    board_of = boards_of(boards, folders, captures)
     rows = []
     for folder in folders:
         rows += _rows(folder, None)
@@ -88,10 +84,11 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
         "errors of that are said to be below. Left out: each gripper pose predicted by the "
         "other images; where two calibrations predict alike, the images cannot tell which is the better one.",
         "",
-        "| capture | from | images used | off: mm | ° | seen point: mm | 95 % below | in σ | joint | ±σ: mm | ° | "
-        "leave-one-out error: mm / ° | accepted | s |",
-        "|---" * 14 + "|",
-        *map(_line, rows),
+        *table(
+            "capture | from | images used | off: mm | ° | seen point: mm | 95 % below | in σ | joint | ±σ: mm | ° | "
+            "leave-one-out error: mm / ° | accepted | s",
+            map(_cells, rows),
+        ),
         "",
         *(f"- {row.capture}, {row.how}: {row.message}" for row in rows if row.message),
     ]
@@ -161,7 +158,7 @@ def _rows(folder: Path, board: str | None) -> list[Row]:
     seconds = time.perf_counter() - begun
     x, uncertainty = result.hand_eye.gripper_from_camera, result.calibration.uncertainty
     assert uncertainty is not None
-    off_mm, off_deg = _off(x, reference)
+    off_mm, off_deg = apart(x, reference)
     std = np.sqrt(np.diag(result.hand_eye.covariance)[:6])
     error = step_between(x, reference) / std
     joint = std if known.covariance is None else np.hypot(std, np.sqrt(np.diag(known.covariance)))
@@ -186,7 +183,7 @@ def _rows(folder: Path, board: str | None) -> list[Row]:
         return [row]
     rows = result.reconstruction.image_index
     gripper, camera = capture.base_from_gripper[rows], result.reconstruction.recon_from_camera
-    off_mm, off_deg = _off(_park(gripper, camera), reference)
+    off_mm, off_deg = apart(_park(gripper, camera), reference)
     park = Row(folder.name, f"{how}, OpenCV's Park", f"{len(rows)} of {len(capture)}", off_mm, off_deg)
     return [
         row,
@@ -205,7 +202,7 @@ def _intrinsics_row(capture: Capture, board: str, reference: Float[ndarray, "4 4
         hand_eye = calibrate_stage(blind, found)
     except RejectedError:
         return []
-    off_mm, off_deg = _off(hand_eye.gripper_from_camera, reference)
+    off_mm, off_deg = apart(hand_eye.gripper_from_camera, reference)
     how = f"`{board}`, its intrinsics ({found.intrinsics.fx:.1f} px, stored {capture.intrinsics.fx:.1f})"
     fixed = hand_eye.leave_one_out
     error = (
@@ -237,7 +234,7 @@ def _park_leave_one_out(gripper: Transforms, camera: Transforms) -> LeaveOneOut:
         middle = transform(
             nearest_rotation(base_from_board[:, :3, :3].mean(0)), base_from_board[:, :3, 3].mean(0)
         )
-        errors.append(_off(middle @ camera[k] @ inverse(x), gripper[k]))
+        errors.append(apart(middle @ camera[k] @ inverse(x), gripper[k]))
     mm, deg = np.mean(errors, axis=0)
     return LeaveOneOut(translation_mm=mm, rotation_deg=deg, reprojection_px=None, how="each by the others")
 
@@ -269,35 +266,21 @@ def _intrinsics_of_reference(folder: Path, capture: Capture) -> Intrinsics | Non
         return Intrinsics(fx, fy, cx, cy, *image.size, coefficients_of(camera["d"]))
 
 
-def _off(x: Float[ndarray, "4 4"], reference: Float[ndarray, "4 4"]) -> tuple[float, float]:
-    metres = float(np.linalg.norm(x[:3, 3] - reference[:3, 3]))
-    return 1e3 * metres, float(rotation_between_deg(x[:3, :3], reference[:3, :3]))
-
-
-def _line(row: Row) -> str:
-    def shown(value: float | None, digits: int) -> str:
-        return "" if value is None else f"{value:.{digits}f}"
-
-    fixed = (
-        ""
-        if row.leave_one_out is None
-        else f"{row.leave_one_out.translation_mm:.2f} / {row.leave_one_out.rotation_deg:.2f}"
-    )
-    judged = "" if row.seconds == 0 else ("yes" if row.accepted else "**no**")
-    cells = (
+def _cells(row: Row) -> list[str]:
+    error = row.leave_one_out
+    return [
         row.capture,
         row.how,
         row.images,
-        shown(row.off_mm, 2),
-        shown(row.off_deg, 3),
-        shown(row.seen_mm, 2),
-        shown(row.seen_95_mm, 2),
-        shown(row.sigmas, 1),
-        shown(row.joint_sigmas, 1),
-        shown(row.std_mm, 2),
-        shown(row.std_deg, 3),
-        fixed,
-        judged,
-        shown(row.seconds or None, 1),
-    )
-    return "| " + " | ".join(cells) + " |"
+        number(row.off_mm, 2),
+        number(row.off_deg, 3),
+        number(row.seen_mm, 2),
+        number(row.seen_95_mm, 2),
+        number(row.sigmas, 1),
+        number(row.joint_sigmas, 1),
+        number(row.std_mm, 2),
+        number(row.std_deg, 3),
+        "" if error is None else f"{error.translation_mm:.2f} / {error.rotation_deg:.2f}",
+        "" if row.seconds == 0 else "yes" if row.accepted else "**no**",
+        number(row.seconds or None, 1),
+    ]

@@ -1,40 +1,30 @@
-"""`benchmarks robots`: is the reported sigma true of arms that err systematically and of intrinsics that are a little
-wrong, and is the result nearer?
-"""
+"""`benchmarks robots`: is the reported sigma true of arms that err systematically, and is the result nearer?"""
 
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray
 
-from benchmarks.figure import blank
+from benchmarks.figure import blank, png
+from benchmarks.page import table
 from benchmarks.peers import opencv
 from benchmarks.simulated.arm_errors import PresetName
 from benchmarks.simulated.bent import BentProblem, bent_problem
-from benchmarks.simulated.observations import INTRINSICS, observed
 from benchmarks.simulated.problem import error
-from jcr.adjust.intrinsics_prior import FIXED, IntrinsicsPrior, prior_of
-from jcr.adjust.wrist import adjust_wrist, recon_frame
-from jcr.camera import parameters, with_parameters
 from jcr.files import write_bytes
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.handeye.solve import solve_hand_eye
-from jcr.records import HandEye, Intrinsics, Tracks
+from jcr.records import HandEye
 
 ARMS = ROBOT_NAMES
 PRESETS: tuple[PresetName, ...] = get_args(PresetName)
 COUNTS = (8, 12, 30)
 DRAWS, MANY_DRAWS = 1, 8
 """Of each arm; with --long."""
-INTRINSICS_STD = 0.005
-"""Of the focal length, relative, and of the principal point, of the width."""
-POINTS, PIXEL_STD = 400, 0.5
-INTRINSICS_PRESETS: tuple[PresetName, ...] = ("typical", "poor")
 
 Solve = Callable[[BentProblem], HandEye]
 
@@ -82,7 +72,6 @@ def measure(
     presets: Sequence[PresetName] = PRESETS,
     counts: Sequence[int] = COUNTS,
     draws: int = DRAWS,
-    known: Sequence[str] = tuple(KNOWN),
 ) -> list[Row]:
     """A row per size of errors, number of images and way of knowing the robot; draws of each arm."""
     rows = []
@@ -92,65 +81,9 @@ def measure(
                 bent_problem(arm_named(arm), preset, count, seed) for arm in arms for seed in range(draws)
             ]
             cell = tuple(arms), preset, count
-            rows += [_row(*cell, name, [(p, KNOWN[name](p)) for p in problems]) for name in known]
+            rows += [_row(*cell, name, [(p, KNOWN[name](p)) for p in problems]) for name in KNOWN]
             rows.append(_peer(*cell, problems))
     return rows
-
-
-def measure_intrinsics(
-    arms: Sequence[str] = ARMS,
-    presets: Sequence[PresetName] = INTRINSICS_PRESETS,
-    counts: Sequence[int] = COUNTS,
-    draws: int = DRAWS,
-) -> list[Row]:
-    """A row per size of errors, number of images and use of intrinsics that are drawn around the true ones."""
-    rows = []
-    for preset in presets:
-        for count in counts:
-            fixed, measured = [], []
-            for arm in arms:
-                for seed in range(draws):
-                    problem = bent_problem(arm_named(arm), preset, count, seed)
-                    rng = np.random.default_rng([seed, 9])
-                    tracks = observed(problem, rng, POINTS, PIXEL_STD)
-                    given = _drawn(rng)
-                    if len(tracks.image) < 100 * count:
-                        continue
-                    fixed.append((problem, _adjusted(problem, tracks, given, prior_of(given, FIXED))))
-                    measured.append((problem, _adjusted(problem, tracks, given, prior_of(given))))
-            cell = tuple(arms), preset, count
-            rows += [
-                _row_of(*cell, "intrinsics held", *_errors(fixed)),
-                _row_of(*cell, "intrinsics measured", *_errors(measured)),
-            ]
-    return rows
-
-
-def _drawn(rng: np.random.Generator) -> Intrinsics:
-    values = parameters(INTRINSICS)
-    values[:2] *= 1 + INTRINSICS_STD * rng.normal()
-    values[2:4] += INTRINSICS_STD * INTRINSICS.width * rng.normal(size=2)
-    return with_parameters(INTRINSICS, values)
-
-
-def _adjusted(
-    problem: BentProblem, tracks: Tracks, given: Intrinsics, free: IntrinsicsPrior
-) -> tuple[Float[ndarray, "4 4"], float, Float[ndarray, "6 6"], bool]:
-    solved = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
-    start = solved.gripper_from_camera, solved.scale, solved.base_from_recon
-    found = adjust_wrist(
-        problem.base_from_gripper, start, problem.recon_from_camera, given, tracks, prior=free
-    )
-    scale, _ = recon_frame(found, tracks)
-    return found.placed.x[0], scale, found.covariance[:6, :6], True
-
-
-def _errors(
-    answers: list[tuple[BentProblem, tuple[Float[ndarray, "4 4"], float, Float[ndarray, "6 6"], bool]]],
-) -> tuple[Float[ndarray, "k 6"], Float[ndarray, "k 6 6"], Bool[ndarray, " k"]]:
-    off = np.array([error(problem, x, scale)[:6] for problem, (x, scale, _, _) in answers])
-    covariance = np.array([covariance for _, (_, _, covariance, _) in answers])
-    return off, covariance, np.array([accepted for _, (_, _, _, accepted) in answers])
 
 
 def _row(
@@ -160,22 +93,9 @@ def _row(
     known: str,
     answers: list[tuple[BentProblem, HandEye]],
 ) -> Row:
-    parts = [
-        (problem, (solved.gripper_from_camera, solved.scale, solved.covariance[:6, :6], solved.converged))
-        for problem, solved in answers
-    ]
-    return _row_of(arms, preset, count, known, *_errors(parts))
-
-
-def _row_of(
-    arms: tuple[str, ...],
-    preset: PresetName,
-    count: int,
-    known: str,
-    off: Float[ndarray, "k 6"],
-    covariance: Float[ndarray, "k 6 6"],
-    accepted: Bool[ndarray, " k"],
-) -> Row:
+    off = np.array([error(problem, one.gripper_from_camera, one.scale)[:6] for problem, one in answers])
+    covariance = np.array([one.covariance[:6, :6] for _, one in answers])
+    accepted = np.array([one.converged for _, one in answers])
     mm, deg = _lengths(off)
     if not accepted.any():
         return Row(arms, preset, count, known, mm, deg, 0.0)
@@ -215,11 +135,9 @@ def run(out: Path | None = None, long: bool = False) -> str:
     """Markdown: the claims, then tables; an image in `out` shows the shares beyond three sigma."""
     draws, image = (MANY_DRAWS, "robots_long.png") if long else (DRAWS, "robots.png")
     rows = measure(draws=draws)
-    of_intrinsics = (draws + 1) // 2
-    intrinsics = measure_intrinsics(draws=of_intrinsics)
     if out is not None:
         write_bytes(out / image, _figure(rows))
-    return page(rows, draws, intrinsics, image)
+    return page(rows, draws, image)
 
 
 def _figure(rows: list[Row]) -> bytes:
@@ -239,12 +157,10 @@ def _figure(rows: list[Row]) -> bytes:
         if k == 0:
             axes.set_ylabel("% of accepted results beyond 3 σ")
             axes.legend(fontsize=8)
-    with io.BytesIO() as file:
-        figure.savefig(file, format="png", dpi=110)
-        return file.getvalue()
+    return png(figure, 110)
 
 
-def page(rows: list[Row], draws: int, intrinsics: Sequence[Row] = (), image: str = "robots.png") -> str:
+def page(rows: list[Row], draws: int, image: str = "robots.png") -> str:
     """Markdown of measured rows; `draws` is how many of each arm."""
     fixed = [row for row in rows if row.known in KNOWN and row.known != WHITE and row.accepted > 0]
     white = [row for row in rows if row.known == WHITE and row.preset != "white" and row.accepted > 0]
@@ -260,18 +176,11 @@ def page(rows: list[Row], draws: int, intrinsics: Sequence[Row] = (), image: str
         "",
         f"![share of results beyond three sigma]({image})",
         "",
-        *_table(rows),
+        *table(
+            "errors | images | known | median error | accepted | > 3 σ | > 5 σ | squared distance / 6 | σ per axis",
+            map(_cells, rows),
+        ),
     ]
-    if intrinsics:
-        lines += [
-            "",
-            f"Intrinsics drawn around the true ones ({100 * INTRINSICS_STD:g} % of the focal length and of the width), "
-            f"{POINTS} points seen with {PIXEL_STD} px, {(draws + 1) // 2} draws of each arm, nothing known of them: "
-            "held as given, or measurements of that error in the bundle adjustment. Their σ holds what calibrations "
-            "from real images differ by beside it, which simulated ones do not: squared distances are below one.",
-            "",
-            *_table(intrinsics),
-        ]
     return "\n".join(lines) + "\n"
 
 
@@ -281,18 +190,9 @@ def _pooled(rows: Sequence[Row]) -> float:
     return 100 * sum(row.accepted * row.beyond_3 for row in rows) / accepted if accepted else np.nan
 
 
-def _table(rows: Sequence[Row]) -> list[str]:
-    lines = [
-        "| errors | images | known | median error | accepted | > 3 σ | > 5 σ | squared distance / 6 | σ per axis |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for row in rows:
-        cells = [row.preset, f"{row.count}", row.known, f"{row.mm:.2f} mm {row.deg:.3f}°"]
-        if np.isnan(row.distance):
-            cells += ["–" if row.known == PEER else f"{100 * row.accepted:.0f} %", *4 * ["–"]]
-        else:
-            shares = (row.accepted, row.beyond_3, row.beyond_5)
-            cells += [f"{100 * share:.0f} %" for share in shares]
-            cells += [f"{row.distance:.2f}", f"{row.std_mm:.2f} mm"]
-        lines.append("| " + " | ".join(cells) + " |")
-    return lines
+def _cells(row: Row) -> list[str]:
+    cells = [row.preset, f"{row.count}", row.known, f"{row.mm:.2f} mm {row.deg:.3f}°"]
+    if np.isnan(row.distance):
+        return [*cells, "–" if row.known == PEER else f"{100 * row.accepted:.0f} %", *4 * ["–"]]
+    shares = [f"{100 * share:.0f} %" for share in (row.accepted, row.beyond_3, row.beyond_5)]
+    return [*cells, *shares, f"{row.distance:.2f}", f"{row.std_mm:.2f} mm"]

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.page import apart, table
 from jcr.calibration.known_transform import read_hand_eye
 from jcr.capture.read import read_capture
 from jcr.errors import InputError
-from jcr.geometry import rotation_between_deg
 
 REPEATS, MANY_REPEATS = 1, 3
 """With --long."""
@@ -34,20 +34,18 @@ def run(long: bool = False) -> str:
             peak.append(mib)
             stages.append(json.loads((Path(out) / "calibration.json").read_text())["timings_s"])
             found = read_hand_eye(Path(out)).gripper_from_camera
-    off_mm = 1e3 * float(np.linalg.norm(found[:3, 3] - true[:3, 3]))
-    off_deg = float(rotation_between_deg(found[:3, :3], true[:3, :3]))
+    off_mm, off_deg = apart(found, true)
     helped = [_measured("--help")[0] for _ in range(5)]
     images = len(read_capture(CAPTURE))
+    medians = {name: np.median([stage[name] for stage in stages]) for name in stages[0]}
+    medians["whole process"] = np.median(whole)
     lines = [
         f"> Bundled capture, exact robot poses, {images} images: {off_mm:.2f} mm and {off_deg:.3f}° off the truth, "
         f"report and map included in {np.median(whole):.0f} s and {np.median(peak) / 1024:.1f} GiB.",
         "",
         f"`jcr run {CAPTURE} OUT`, median of {repeats} runs",
         "",
-        "| stage | s |",
-        "|---|---|",
-        *(f"| {name} | {np.median([stage[name] for stage in stages]):.1f} |" for name in stages[0]),
-        f"| whole process | {np.median(whole):.1f} |",
+        *table("stage | s", [[name, f"{seconds:.1f}"] for name, seconds in medians.items()]),
         "",
         f"Peak memory {np.median(peak):.0f} MiB (resident set). `jcr --help`: {np.median(helped):.2f} s.",
     ]

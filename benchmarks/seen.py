@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from benchmarks.page import table
 from benchmarks.simulated.arm_errors import PresetName
 from benchmarks.simulated.bent import BentProblem, bent_problem
 from benchmarks.simulated.observations import INTRINSICS, observed
@@ -125,14 +126,21 @@ def page(rows: Sequence[Row]) -> str:
         "of the image, placed on the gripper with intrinsics, transform and scale as estimated, against the true ones "
         "(effective transform).",
         "",
-        "| robot | images | intrinsics | errors within their 95 % | within 3 σ on every axis | seen point: median error "
-        "| 95 % reported below | camera: median error |",
-        "|---" * 8 + "|",
-    ]
-    lines += [
-        f"| {row.preset} | {row.count} | {row.known} | {100 * row.within_95:.0f} % | {100 * row.within_3:.1f} % | "
-        f"{row.seen_mm:.2f} mm | {row.said_mm:.2f} mm | {row.camera_mm:.2f} mm |"
-        for row in rows
+        *table(
+            "robot | images | intrinsics | errors within their 95 % | within 3 σ on every axis | seen point: median "
+            "error | 95 % reported below | camera: median error",
+            (
+                (
+                    row.preset,
+                    row.count,
+                    row.known,
+                    f"{100 * row.within_95:.0f} %",
+                    f"{100 * row.within_3:.1f} %",
+                )
+                + tuple(f"{mm:.2f} mm" for mm in (row.seen_mm, row.said_mm, row.camera_mm))
+                for row in rows
+            ),
+        ),
     ]
     return "\n".join(lines) + "\n"
 

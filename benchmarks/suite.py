@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
-import jcr
 from benchmarks.freshness import is_marked_old
 from benchmarks.table import BENCHES, LONG, PARTS, title_of
 from jcr.errors import InputError
@@ -29,8 +28,7 @@ class Outcome:
     """What became of one bench."""
 
     name: str
-    seconds: float | None = None
-    """None: not run."""
+    seconds: float
     trouble: str = ""
     """Why there is no new page."""
 
@@ -39,25 +37,22 @@ def run(
     benches: dict[str, bool],
     out: Path,
     arguments: dict[str, list[str]],
-    resume: bool,
     report: Callable[[Outcome], None],
 ) -> list[Outcome]:
     """Run the benches, those that are not timed two at a time and then the timed ones alone, and write the index.
 
-    `benches` tells of each name whether it is timed; `arguments` holds what else each is given. With `resume`
-    those are left out whose page is newer than every source file. A bench that fails loses no other one's page.
+    `benches` has of each name whether it is timed; `arguments` holds what else each is given. A bench that fails loses
+    no other one's page.
     """
-    fresh = {name for name in benches if resume and _is_newer(out / f"{name}.md")}
-    todo = [name for name in benches if name not in fresh]
-    outcomes = {name: Outcome(name) for name in fresh}
+    outcomes = dict[str, Outcome]()
 
     def measured(name: str, threads: int) -> None:
         outcomes[name] = _measured(name, out, arguments.get(name, []), threads)
         report(outcomes[name])
 
     with ThreadPoolExecutor(2) as two:
-        list(two.map(lambda name: measured(name, 1), [name for name in todo if not benches[name]]))
-    for name in todo:
+        list(two.map(lambda name: measured(name, 1), [name for name in benches if not benches[name]]))
+    for name in benches:
         if benches[name]:
             measured(name, os.cpu_count() or 1)
     return [outcomes[name] for name in benches]
@@ -78,11 +73,6 @@ def _measured(name: str, out: Path, arguments: Sequence[str], threads: int) -> O
     )
 
 
-def _is_newer(page: Path) -> bool:
-    sources = [*Path(jcr.__file__).parent.rglob("*.py"), *Path(__file__).parent.rglob("*.py")]
-    return page.is_file() and page.stat().st_mtime > max(path.stat().st_mtime for path in sources)
-
-
 def claims(page: Path) -> list[str]:
     """What a bench's page says in a sentence each."""
     if not page.is_file():
@@ -99,12 +89,11 @@ def write_index(
     wall_s: float,
 ) -> None:
     """README.md in `out`: the claims of every page, what failed, and what is `absent` and why."""
-    ran = [outcome for outcome in outcomes if outcome.seconds is not None]
     lines = [
         "# Results",
         "",
-        f"Written by `{command}`, {date.today().isoformat()}. {machine} {len(ran)} of {len(outcomes)} benches were "
-        f"run this time, in {wall_s / 60:.1f} minutes; those that are not timed ran two at a time.",
+        f"Written by `{command}`, {date.today().isoformat()}. {machine} {len(outcomes)} benches in "
+        f"{wall_s / 60:.1f} minutes; those that are not timed ran two at a time.",
         "",
         *MARKS,
         "",
@@ -115,7 +104,7 @@ def write_index(
         "",
         "| bench | s |",
         "|---|---|",
-        *(f"| [{outcome.name}]({outcome.name}.md) | {outcome.seconds:.0f} |" for outcome in ran),
+        *(f"| [{outcome.name}]({outcome.name}.md) | {outcome.seconds:.0f} |" for outcome in outcomes),
         "",
         "```{toctree}",
         ":hidden:",

@@ -116,7 +116,6 @@ BENCHES = {
             "src/jcr/reconstruct/board.py",
             "src/jcr/reconstruct/board_in_view.py",
             "benchmarks/corners.py",
-            "benchmarks/board_intrinsics.py",
         ),
     ),
     "boards": Bench(
@@ -174,13 +173,6 @@ BENCHES = {
         measures=(*SOLVER, *FEATURES, *READING, "src/jcr/cell", "src/jcr/simulate"),
         long="40 draws of every kind of cell instead of 10",
     ),
-    "gate": Bench(
-        "Scenes that mislead matching",
-        HONEST,
-        "scenes that mislead matching, with the robot's gate and without",
-        measures=(*SOLVER, *FEATURES, "src/jcr/simulate"),
-        long="two draws of every scene instead of one, and XFeat",
-    ),
     "many": Bench(
         "Many images",
         TIME,
@@ -203,14 +195,6 @@ BENCHES = {
         draws=True,
         measures=("src/jcr/handeye", "src/jcr/simulate/robots.py", "benchmarks/simulated/problem.py"),
         long="8 draws of every arm instead of 1",
-    ),
-    "limits": Bench(
-        "Where it breaks",
-        HONEST,
-        "where it breaks: one thing made worse at a time",
-        draws=True,
-        measures=(*SOLVER, *FEATURES, "src/jcr/simulate"),
-        long="all levels, not every other one",
     ),
     "attack": Bench(
         "Silent faults",
@@ -275,13 +259,6 @@ BENCHES = {
         measures=(*SOLVER, *FEATURES, "src/jcr/reconstruct/views_at_once", "src/jcr/reconstruct/direct"),
         long="a textured table and errors as on DTU and 7-Scenes, too",
     ),
-    "model_cost": Bench(
-        "What any-view networks cost",
-        TIME,
-        "seconds and memory of any-view networks with random weights, beside what is estimated",
-        True,
-        measures=("src/jcr/reconstruct/views_at_once",),
-    ),
     "align": Bench(
         "Global alignment",
         OTHERS,
@@ -289,41 +266,6 @@ BENCHES = {
         True,
         measures=("src/jcr/reconstruct/global_alignment",),
         long="3 draws of every number of images instead of 1, 10 of every calibration instead of 4",
-    ),
-    "pairs": Bench(
-        "Pairs of a network",
-        TIME,
-        "predicting pairs with every image encoded once, or with every pair",
-        True,
-        measures=("src/jcr/reconstruct/dust3r",),
-        long="ten images instead of six",
-    ),
-    "memory": Bench(
-        "Memory and its budget",
-        TIME,
-        "peak memory against the budget by number of images, COLMAP and small networks",
-        measures=(*FEATURES, *DEPTH, *MAP, "src/jcr/memory.py"),
-        long="20 and 40 images, too",
-    ),
-    "bag": Bench(
-        "Frames chosen from a recording",
-        TIME,
-        "frames chosen from a minute of a robot's MCAP: which, time and memory",
-        True,
-        measures=(*READING,),
-    ),
-    "samples": Bench(
-        "A marker's samples, beside OpenCV",
-        OTHERS,
-        "metric samples of a marker beside OpenCV's five methods",
-        measures=(*SOLVER, "src/jcr/capture/samples.py"),
-    ),
-    "first_day": Bench(
-        "A first day",
-        ROBOTS,
-        "what a new user types and sees, from files as robots write them to a URDF",
-        True,
-        measures=(*WHOLE, "src/jcr/cli", "src/jcr/live"),
     ),
     "live": Bench(
         "Calibrated while capturing",
@@ -339,14 +281,6 @@ BENCHES = {
         True,
         of_captures=True,
         measures=(*SOLVER, *FEATURES, *LIVE),
-    ),
-    "batch": Bench(
-        "Many captures",
-        TIME,
-        "many small captures by one process and by two: time, and memory while they run",
-        True,
-        measures=(*WHOLE, "src/jcr/batch.py"),
-        long="200 captures instead of 32",
     ),
 }
 """In the order of the README's claims."""

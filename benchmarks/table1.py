@@ -8,18 +8,19 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import norm
 
+from benchmarks.page import apart, table
 from benchmarks.peers import grid_search
 from benchmarks.simulated.truth import read_truth
 from benchmarks.synthetic_pairs import PairErrors, pairs_of_capture
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
-from jcr.geometry import Transforms, fit_similarity, rotation_between_deg, rotation_log, scale_translation
+from jcr.geometry import Transforms, fit_similarity, rotation_log, scale_translation
 from jcr.handeye.residuals import paper_residuals
 from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, candidates, reconstruct
 from jcr.reconstruct.colmap import reconstruct_colmap
 from jcr.reconstruct.colmap_options import ColmapOptions
-from jcr.reconstruct.global_alignment.pairs import PairPredictions, write_pairs
+from jcr.reconstruct.global_alignment.pairs import write_pairs
 from jcr.records import Capture, Reconstruction
 from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.scenes import SceneName
@@ -140,29 +141,32 @@ def _claims(cells: dict[Row, list[Cell]]) -> list[str]:
 
 
 def _table(cells: dict[Row, list[Cell]], counts: tuple[int, ...]) -> list[str]:
-    lines = [
-        "| scene | images | method | converged | accepted | poses | δ_t | δ_R | off: mm | ° | scale % | σ |",
-        "|---" * 12 + "|",
-    ]
-    for (scene, count, method), many in cells.items():
-        if count not in counts:
-            continue
+    return table(
+        "scene | images | method | converged | accepted | poses | δ_t | δ_R | off: mm | ° | scale % | σ",
+        ([*row, *_row(many)] for row, many in cells.items() if row[1] in counts),
+    )
 
-        def middle(key: str, digits: int, many: list[Cell] = many) -> str:
-            values = [getattr(cell, key) for cell in many if not np.isnan(getattr(cell, key))]
-            return f"{np.median(values):.{digits}f}" if values else "NA"
 
-        verdicts = [cell.accepted for cell in many if cell.accepted is not None]
-        message = f"{sum(verdicts)} of {len(many)}" if verdicts else "silent"
-        if any(cell.silent for cell in many):
-            message += ", **one wrong**"
-        found = [middle("delta_t", 4), middle("delta_r", 4), middle("off_mm", 2), middle("off_deg", 3)]
-        found += [middle("scale_percent", 2), middle("sigmas", 1)]
-        lines.append(
-            f"| {scene} | {count} | {method} | {sum(cell.converged for cell in many)} of {len(many)} | {message} | "
-            f"{middle('registered', 0)} | {' | '.join(found)} |"
-        )
-    return lines
+def _row(many: list[Cell]) -> list[str]:
+    def middle(key: str, digits: int) -> str:
+        values = [getattr(cell, key) for cell in many if not np.isnan(getattr(cell, key))]
+        return f"{np.median(values):.{digits}f}" if values else "NA"
+
+    verdicts = [cell.accepted for cell in many if cell.accepted is not None]
+    message = f"{sum(verdicts)} of {len(many)}" if verdicts else "silent"
+    if any(cell.silent for cell in many):
+        message += ", **one wrong**"
+    digits = {
+        "registered": 0,
+        "delta_t": 4,
+        "delta_r": 4,
+        "off_mm": 2,
+        "off_deg": 3,
+        "scale_percent": 2,
+        "sigmas": 1,
+    }
+    right = f"{sum(cell.converged for cell in many)} of {len(many)}"
+    return [right, message, *(middle(key, places) for key, places in digits.items())]
 
 
 def _capture_cells(scene: SceneName, seed: int) -> dict[Row, Cell]:
@@ -179,23 +183,10 @@ def _capture_cells(scene: SceneName, seed: int) -> dict[Row, Cell]:
             capture = replace(
                 whole, images=whole.images[:count], base_from_gripper=whole.base_from_gripper[:count]
             )
-            write_pairs(pairs, _first(predictions, count))
+            write_pairs(pairs, predictions.of_edges(np.flatnonzero((predictions.edges < count).all(1))))
             for method, cell in _methods(capture, truth, pairs):
                 cells[scene, count, method] = cell
     return cells
-
-
-def _first(predictions: PairPredictions, count: int) -> PairPredictions:
-    """The pairs among the first images."""
-    kept = (predictions.edges < count).all(1)
-    return replace(
-        predictions,
-        edges=predictions.edges[kept],
-        pts3d=predictions.pts3d[kept],
-        conf=predictions.conf[kept],
-        pts3d_in_other_view=predictions.pts3d_in_other_view[kept],
-        conf2=predictions.conf2[kept],
-    )
 
 
 def _methods(capture: Capture, truth: Truth, pairs: Path) -> list[tuple[str, Cell]]:
@@ -265,8 +256,7 @@ def _cell(
         len(rows),
         delta_t,
         delta_r,
-        1e3 * float(np.linalg.norm(x[:3, 3] - true[:3, 3])),
-        float(rotation_between_deg(x[:3, :3], true[:3, :3])),
+        *apart(x, true),
         100 * abs(scale / true_scale - 1),
     )
 

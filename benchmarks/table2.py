@@ -10,6 +10,7 @@ from jaxtyping import Int
 from numpy import ndarray
 from scipy.optimize import linear_sum_assignment
 
+from benchmarks.page import table
 from benchmarks.simulated.truth import read_truth
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
@@ -71,19 +72,14 @@ def run(long: bool = False) -> str:
     ]
     for n in COUNTS:
         chosen = [scenes[n, seed] for seed in seeds]
-        lines += [
-            "",
-            f"{n} images (the paper's worst: {PAPER_PERCENT[n]} %)",
-            "",
-            "| object | " + " | ".join(f"seed {seed}" for seed in seeds) + " | worst, mm |",
-            "|---" * (len(seeds) + 2) + "|",
-        ]
+        rows = []
         for row in zip(*(scene.measurements for scene in chosen), strict=True):
             worst = 1e3 * np.nanmax([abs(m.error) if m.measured else np.nan for m in row])
-            lines.append(f"| {row[0].true.name} | {' | '.join(map(_cell, row))} | {worst:.2f} |")
-        iou = " | ".join(f"{scene.mean_iou:.3f}" for scene in chosen)
-        lines.append(f"| *mean IoU of the segments* | {iou} | |")
-        lines.append(f"| *objects too many* | {' | '.join(str(scene.strangers) for scene in chosen)} | |")
+            rows.append([row[0].true.name, *map(_cell, row), f"{worst:.2f}"])
+        rows.append(["*mean IoU of the segments*", *(f"{scene.mean_iou:.3f}" for scene in chosen), ""])
+        rows.append(["*objects too many*", *(scene.strangers for scene in chosen), ""])
+        head = " | ".join(["object", *(f"seed {seed}" for seed in seeds), "worst, mm"])
+        lines += ["", f"{n} images (the paper's worst: {PAPER_PERCENT[n]} %)", "", *table(head, rows)]
     return (
         "\n".join([*lines, "", *_honesty([m for scene in scenes.values() for m in scene.measurements])])
         + "\n"

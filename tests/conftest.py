@@ -1,11 +1,12 @@
 import fcntl
+import gc
 import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
@@ -19,6 +20,7 @@ from benchmarks.simulated.truth import read_truth
 from jcr.geometry import apply, transform
 from jcr.simulate.scenes import make_scene
 from places import ROOT, SHARED
+from sift_once import find_sift_once
 
 if TYPE_CHECKING:
     import trimesh
@@ -44,17 +46,23 @@ def shrunk_capture(source: Path, folder: Path, images: int, width: int) -> Path:
     return folder
 
 
+find_sift_once()
+
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A job in the background of a shell ignores Ctrl-C, and so would the commands that tests interrupt.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-SLOW_FIXTURES = {"done", "opengl", "real_captures", "tiny_sam", "garbage_weights"}
+SLOW_FIXTURES = {"done", "small_done", "opengl", "real_captures", "tiny_sam", "garbage_weights"}
 """They run the command line, draw, reconstruct from images, or load a network."""
 
 
-FIRST = "faults/test_faults.py", "calibration/test_faults.py"
-"""Files that the two workers begin with: one makes the run of `done`, the other takes longer and does without it."""
+FIRST = (
+    "faults/test_faults.py", "calibration/test_faults.py",
+    "view/test_view.py", "test_real_captures.py", "test_without_torch.py", "test_examples.py", "test_verify.py",
+)  # fmt: skip
+"""Files that the two workers begin with: one makes the run of `done`, the other takes longer and does without it; then
+those that take long and would come last, when one worker has nothing left."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -65,6 +73,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     rank = {ROOT / "tests" / name: k for k, name in enumerate(FIRST)}
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: rank.get(item.path, len(rank) + (item.path not in slow)))
+
+
+def pytest_collection_finish() -> None:
+    """Modules and tests stay to the end: the garbage collector, 4 % of the suite's time, need not walk them."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000, 20, 20)
 
 
 @pytest.hookimpl(wrapper=True)
@@ -99,26 +114,42 @@ def tabletop() -> Path:
     return ROOT / "examples" / "tabletop"
 
 
+def made_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """A folder that `make` fills, once for all workers of pytest-xdist; no test changes it."""
+    base = tmp_path_factory.getbasetemp()
+    together = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "made"
+    together.mkdir(exist_ok=True)
+    with (together / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (together / name).exists():
+            make(together / name)
+    return together / name
+
+
+def run_by_command(capture: Path, out: Path) -> None:
+    command = [sys.executable, "-m", "jcr", "run", str(capture), str(out), "--quiet"]
+    finished = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert finished.returncode == 0, finished.stderr
+    assert "report:" in finished.stdout
+
+
 @pytest.fixture(scope="session")
 def small_capture(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> Path:
     """Five images of the bundled capture, 200 pixels wide: the first attempt is kept, a whole run takes seconds."""
-    return shrunk_capture(tabletop, tmp_path_factory.mktemp("small") / "capture", 5, 200)
+    return made_once(tmp_path_factory, "capture", lambda folder: shrunk_capture(tabletop, folder, 5, 200))
 
 
 @pytest.fixture(scope="session")
 def done(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> Path:
-    """The run folder of the bundled capture, made once by the command line; each worker of pytest-xdist has a copy."""
-    base = tmp_path_factory.getbasetemp()
-    together = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    made = together / "made" / "tabletop"
-    with (together / "made.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not made.exists():
-            command = [sys.executable, "-m", "jcr", "run", str(tabletop), str(made), "--quiet"]
-            finished = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
-            assert finished.returncode == 0, finished.stderr
-            assert "report:" in finished.stdout
+    """The run folder of the bundled capture, a copy of this worker's own."""
+    made = made_once(tmp_path_factory, "tabletop", lambda out: run_by_command(tabletop, out))
     return shutil.copytree(made, tmp_path_factory.mktemp("run") / "tabletop")
+
+
+@pytest.fixture(scope="session")
+def small_done(tmp_path_factory: pytest.TempPathFactory, small_capture: Path) -> Path:
+    """The run folder of `small_capture`; no test changes it."""
+    return made_once(tmp_path_factory, "small", lambda out: run_by_command(small_capture, out))
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from types import FunctionType
 from typing import Any
 
-CALLS = 20
+CALLS = 4
 """Of one function in one test."""
 
 _checks: Counter[tuple[str, str]] = Counter()

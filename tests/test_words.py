@@ -4,6 +4,7 @@ import ast
 import io
 import re
 import tokenize
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -61,11 +62,6 @@ def faults(text: str) -> list[str]:
     ]
 
 
-def comments(file: Path) -> list[str]:
-    """The comments of a Python file."""
-    return [token.string for token in tokens(file) if token.type == tokenize.COMMENT]
-
-
 def docstrings(file: Path) -> list[str]:
     """The docstrings of a module, its classes and functions."""
     documented = (ast.Module, ast.ClassDef, ast.FunctionDef)
@@ -75,7 +71,7 @@ def docstrings(file: Path) -> list[str]:
 
 def names(file: Path) -> list[str]:
     """The identifiers of a Python file in which a word stands that no identifier has."""
-    found = {token.string for token in tokens(file) if token.type == tokenize.NAME}
+    found = comments_and_names(file)[1]
     if file.name in OF_FILES_ONLY_IN:
         found -= OF_FILES
     return sorted(
@@ -85,9 +81,12 @@ def names(file: Path) -> list[str]:
     )
 
 
-def tokens(file: Path) -> list[tokenize.TokenInfo]:
-    """The tokens of a Python file."""
-    return list(tokenize.generate_tokens(io.StringIO(file.read_text()).readline))
+@cache
+def comments_and_names(file: Path) -> tuple[list[str], frozenset[str]]:
+    """The comments and the identifiers of a Python file."""
+    tokens = list(tokenize.generate_tokens(io.StringIO(file.read_text()).readline))
+    comments = [token.string for token in tokens if token.type == tokenize.COMMENT]
+    return comments, frozenset(token.string for token in tokens if token.type == tokenize.NAME)
 
 
 def strings(file: Path) -> list[str]:
@@ -127,8 +126,12 @@ def test_documents_show_it_in_the_words_of_the_field(page: Path):
 
 
 def test_source_is_in_the_words_of_the_field():
-    texts = {file: strings(file) + comments(file) for file in MODULES}
-    texts |= {file: docstrings(file) + comments(file) for file in TESTS if file.name != Path(__file__).name}
+    texts = {file: strings(file) + comments_and_names(file)[0] for file in MODULES}
+    texts |= {
+        file: docstrings(file) + comments_and_names(file)[0]
+        for file in TESTS
+        if file.name != Path(__file__).name
+    }
     found = {
         str(file.relative_to(ROOT)): [f for t in some for f in faults(t)] for file, some in texts.items()
     }

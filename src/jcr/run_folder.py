@@ -36,7 +36,7 @@ from jcr.depth.options import DepthOptions
 from jcr.errors import InputError
 from jcr.files import read_bytes, remove_unfinished, write_text
 from jcr.reconstruct.backends import ReconstructOptions, candidates
-from jcr.reconstruct.reconstruction_npz import FORMAT, WITH_DEPTH, read_reconstruction, write_reconstruction
+from jcr.reconstruct.reconstruction_npz import FORMAT, read_reconstruction, write_reconstruction
 from jcr.records import Attempt, Capture, PointCloud, Reconstruction
 from jcr.represent.cloud_ply import read_cloud, write_cloud
 from jcr.represent.map_file import FILE as MAP
@@ -179,7 +179,7 @@ class RunFolder:
         """Whether there is a map, sound or not."""
         return (self.path / MAP).is_file()
 
-    def earlier(self, capture: Capture, state: State) -> State | None:
+    def earlier(self, state: State) -> State | None:
         """The state of an earlier run whose reconstruction was made from the same; else it is to be made again.
 
         A state that cannot be read proves nothing: to make every stage again is always right.
@@ -188,19 +188,12 @@ class RunFolder:
             found = self.state()
         except InputError:
             return None
-        if found.reconstruct == state.reconstruct:
-            return found
-        return found if found.reconstruct in fingerprints_with_depth(capture, state.options) else None
+        return found if found.reconstruct == state.reconstruct else None
 
-    def reuse_reconstruction(self, capture: Capture, state: State) -> tuple[Reconstruction, State] | None:
+    def reuse_reconstruction(self, state: State) -> tuple[Reconstruction, State] | None:
         """The reconstruction of an earlier run of the same, with its pointmaps, and that run's state."""
-        if (earlier := self.earlier(capture, state)) is None:
-            return None
-        if earlier.reconstruct == state.reconstruct:
-            return self.reconstruction(state.depth), earlier
-        found = self.reconstruction()  # with its depth in one file: from now on in two
-        self.keep_reconstruction(found, state.model_copy(update={"attempts": earlier.attempts}))
-        return found, earlier
+        earlier = self.earlier(state)
+        return None if earlier is None else (self.reconstruction(state.depth), earlier)
 
     def reuse_live(self, capture: Capture, state: State) -> tuple[Reconstruction, State] | None:
         """The same of the calibration that `jcr capture` left in the capture's own folder; it is then kept here too."""
@@ -208,7 +201,7 @@ class RunFolder:
         if live.path.resolve() == self.path.resolve():
             return None
         try:
-            found = live.reuse_reconstruction(capture, state)
+            found = live.reuse_reconstruction(state)
         except InputError:
             return None  # Damaged; it is made again.
         if found is not None:
@@ -347,7 +340,7 @@ def locked(path: Path) -> Iterator[RunFolder]:
 
 
 def _with_depth_apart(content: bytes) -> bytes:
-    """A run.json in which reconstruct had the options of the depth, as it is written now."""
+    """A run.json of version 0.1, in which reconstruct had the options of the depth, as it is written now."""
     try:
         state = json.loads(content)
         old = state["options"]["reconstruct"]
@@ -371,21 +364,12 @@ def state_of(capture: Capture, options: MadeWith) -> State:
     )
 
 
-def fingerprints_with_depth(capture: Capture, options: MadeWith) -> list[str]:
-    """Those of the same reconstruction in files that hold its depth too: with the same depth, or none."""
-    made = _deciding(options.reconstruct)
-    return [
-        fingerprint(capture, made | {"dense": dense, "priors": priors}, WITH_DEPTH)
-        for dense, priors in ((True, options.depth.priors), (False, True), (False, False))
-    ]
-
-
 def _deciding(options: ReconstructOptions) -> dict[str, Any]:
     """The options as they decide a reconstruction: what auto stands for changes with the weights on this machine."""
     return options.as_json() | {"backend": candidates(options)}
 
 
-def fingerprint(capture: Capture, options: dict[str, Any], format: str = FORMAT) -> str:
+def fingerprint(capture: Capture, options: dict[str, Any]) -> str:
     """A hash of all that a stage's result depends on: images, poses, intrinsics, options, version and file format."""
     digest = hashlib.sha256()
     for name in capture.images:
@@ -400,5 +384,5 @@ def fingerprint(capture: Capture, options: dict[str, Any], format: str = FORMAT)
         files = sorted(path.iterdir()) if path.is_dir() else [path] if path.is_file() else []
         states = [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
         options = options | {name: states or options[name]}
-    digest.update(json.dumps([intrinsics, options, __version__, format], sort_keys=True).encode())
+    digest.update(json.dumps([intrinsics, options, __version__, FORMAT], sort_keys=True).encode())
     return digest.hexdigest()

@@ -154,7 +154,7 @@ def _reused(
     """What an earlier run, or `jcr capture`, chose from the same input, calibrated, and how it was chosen; None where it
     is to be made."""
     start = time.perf_counter()
-    reused = folder.reuse_reconstruction(capture, state) or folder.reuse_live(capture, state)
+    reused = folder.reuse_reconstruction(state) or folder.reuse_live(capture, state)
     if reused is None:
         return None
     reconstruction, earlier = reused
@@ -200,7 +200,7 @@ def _failed(
     from jcr.report.html import failed_report_html
 
     board = proposed_for(capture, options.reconstruct.board)
-    if folder.earlier(capture, state) is None:
+    if folder.earlier(state) is None:
         folder.forget_reconstruction()
     content = failed_file(
         capture,

@@ -32,6 +32,7 @@ def two_cameras() -> tuple[CellProblem, Scene, Freedom]:
     return problem, scene, replace(freedom, nuisance=free)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_residuals():
     problem, scene, freedom = two_cameras()
     images = ImageProblem.of(scene, problem.observations, freedom)

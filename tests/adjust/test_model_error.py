@@ -50,6 +50,7 @@ def test_displacements_are_beside_what_the_intrinsics_express():
     assert displacements((INTRINSICS,), (exact,), x_px, np.zeros(500, int)).shape == (500, 2, 0)
 
 
+@pytest.mark.slow
 def test_the_size_of_what_the_model_leaves_is_found():
     of_none, of_some, of_much = (
         adjusted(warp_px).given.evidence.problem.freedom.model_error_std[0] for warp_px in (0.0, 0.3, 1.0)

@@ -52,6 +52,7 @@ def adjusted(seed: int, stated: str) -> tuple[ImageEvidence, Float[ndarray, "11 
     return found, step_between(problem.recon_from_camera, found.scene.world_from_rig)[1:, 3:]
 
 
+@pytest.mark.slow
 def test_what_matches_state_is_believed_as_far_as_residuals_show_it():
     common = {
         name: [adjusted(seed, name)[0].noise.common for seed in SEEDS]

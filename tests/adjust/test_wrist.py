@@ -94,7 +94,7 @@ def test_robot_noise_is_found_and_the_ellipsoid_covers():
         errors = error(problem, adjusted.placed.x[0], recon_frame(adjusted, tracks)[0])
         inside += errors @ np.linalg.solve(adjusted.covariance[:7, :7], errors) < chi2.ppf(0.95, 7)
         # A part of a few random errors looks smooth.
-        estimates.append(np.hypot(adjusted.noise, adjusted.systematic_left))
+        estimates.append(adjusted.noise.together)
     assert inside / runs >= 0.88
     assert np.mean(estimates, axis=0) == pytest.approx(noise, rel=0.2)
 

@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+import pytest
 
 import jcr
 from benchmarks.simulated.observations import INTRINSICS, observed
@@ -14,6 +15,7 @@ from jcr.handeye.fit import Cues
 from jcr.handeye.systematic import smooth_errors
 
 
+@pytest.mark.slow
 def test_cameras_that_were_placed_with_a_wrong_focal_length_are_within_sigma_once_it_is_considered():
     without, considered = [], []
     for seed in range(6):

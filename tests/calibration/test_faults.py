@@ -23,7 +23,7 @@ from jcr.cell.carried import exchanged, refined
 from jcr.geometry import inverse, retract, step_between
 from jcr.handeye.arms import RobotName, arm_named
 from jcr.handeye.solve import solve_hand_eye
-from jcr.handeye.systematic import systematic_errors
+from jcr.handeye.systematic import smooth_errors
 from jcr.records import BENT, Capture, Finding, Kind, Reconstruction
 from jcr.records.words import sentence
 
@@ -182,7 +182,7 @@ def test_a_change_of_the_tool_in_translation_alone_is_named_in_few_images_howeve
     problem = hand_eye_problem(np.random.default_rng(0), 8, robot_noise=(3e-4, 1e-3))
     gripper = problem.base_from_gripper.copy()
     gripper[4:, :3, 3] += 1e-3 * mm * gripper[4:, :3, 0]
-    systematic = systematic_errors(gripper)
+    systematic = smooth_errors(gripper)
     hand_eye = solve_hand_eye(gripper, problem.recon_from_camera, systematic=systematic)
     found = sequence_fault(hand_eye, gripper, problem.recon_from_camera, list("abcdefgh"), systematic)
     assert found is not None and found.kind is Kind.SLIP and found.images == ("d", "e")

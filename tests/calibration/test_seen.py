@@ -133,6 +133,7 @@ def test_each_intrinsics_have_a_transform_of_their_own():
     assert with_given_intrinsics(replace(estimate, intrinsics_cross=None), given, DISTANCE_M) is None
 
 
+@pytest.mark.slow
 def test_points_of_the_scene_are_where_they_are_said_to_be():
     inside, sizes = [], []
     for seed in range(6):

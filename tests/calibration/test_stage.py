@@ -1,6 +1,7 @@
 """The calibration stage on simulated observations: how many of them it adjusts."""
 
 import numpy as np
+import pytest
 
 from benchmarks.attack import reconstructed
 from benchmarks.simulated.faults import faulty_capture
@@ -12,6 +13,7 @@ from jcr.geometry import step_between
 from jcr.records import Tracks
 
 
+@pytest.mark.slow
 def test_of_many_observations_whole_tracks_are_adjusted_up_to_a_number(monkeypatch):
     images = 8
     found = faulty_capture(np.random.default_rng(3), images)

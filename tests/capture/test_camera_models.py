@@ -99,7 +99,8 @@ def through(intrinsics: Intrinsics, image: np.ndarray, original: Intrinsics) -> 
 def test_a_capture_through_another_intrinsics_gives_the_same_calibration(
     model: str, tabletop: Path, tmp_path: Path
 ):
-    capture = jcr.read_capture(tabletop)
+    whole = jcr.read_capture(tabletop)
+    capture = replace(whole, images=whole.images[:8], base_from_gripper=whole.base_from_gripper[:8])
     original = capture.intrinsics
     assert original is not None
     distortion = {"rational": RATIONAL.distortion, "fisheye": FISHEYE.distortion}[model]

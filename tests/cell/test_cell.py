@@ -2,7 +2,6 @@
 
 import json
 import os
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -38,7 +37,6 @@ from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_b
 from jcr.progress import silent
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.relocate import Features
-from jcr.reconstruct.relocate import features as sift_features
 from jcr.records import Capture, CellCamera, Finding, HandEye, Intrinsics, Reconstruction, Tracks
 from jcr.records import Kind as FindingKind
 
@@ -85,6 +83,7 @@ WANTED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "preset"), [("fixed", "white"), ("wrists", "typical"), ("arms", "white"), ("carried", "typical")]
 )
@@ -99,6 +98,7 @@ def test_the_truth_lies_within_what_is_said_of_the_error(kind: Kind, preset):
     assert np.sqrt(np.diag(covariance)[:3]).max() < 0.012
 
 
+@pytest.mark.slow
 def test_exact_robots_and_images_give_the_exact_answer():
     for kind, (name, of) in WANTED.items():
         problem = cell_problem(kind, "white", COUNT, seed=4, noise_px=1e-4, points=120)
@@ -150,22 +150,6 @@ def test_images_alone_leave_one_similarity_open():
     assert np.allclose(along, fixed * np.eye(7), rtol=1e-6, atol=1e-6 * fixed)
     values = np.linalg.eigvalsh(found.information - fixed * unseen @ unseen.T)
     assert (np.abs(values) > 1e-8 * values[-1]).sum() == len(values) - 7
-
-
-@pytest.fixture(scope="module", autouse=True)
-def features_found_once() -> Iterator[None]:
-    """Features of an image are found once for all tests of this file."""
-    found: dict[tuple[bytes, Intrinsics], Features] = {}
-
-    def features(image: np.ndarray, intrinsics: Intrinsics) -> Features:
-        key = image.tobytes(), intrinsics
-        if key not in found:
-            found[key] = sift_features(image, intrinsics)
-        return found[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(localise, "features", features)
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -293,6 +277,7 @@ def test_a_second_camera_on_the_gripper_is_placed_by_images_of_two_gripper_poses
     assert far_from_gripper(both) is None and far_from_gripper(replace(far, mount="base")) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("zoom", [1.0, 1.03])
 def test_a_zoom_of_a_second_camera_is_named_with_its_size_and_none_where_there_is_none(zoom: float):
     problem = cell_problem("wrists", "white", COUNT, seed=1, points=150)

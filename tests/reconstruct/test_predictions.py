@@ -283,6 +283,7 @@ class FakeMapAnything:
         return answers
 
 
+@pytest.mark.slow
 def test_an_any_view_model_is_given_our_intrinsics_and_the_robot_names_what_it_denies(
     capture: Capture, truth: dict[str, Any]
 ) -> None:

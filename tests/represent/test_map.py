@@ -332,14 +332,14 @@ def test_a_loaded_map_answers_as_the_saved_one(scene: "SceneMap", tmp_path: Path
     assert again.history == scene.history
 
 
-def test_the_same_seed_gives_the_same_map(cloud: PointCloud, scene: "SceneMap"):
+def test_the_same_seed_gives_the_same_map():
     from jcr.represent.build import build_scene
 
-    again = build_scene(cloud, OPTIONS, values={"warmth": warmth(cloud)})
+    cloud, coarse = analytic_scene.cloud(5000), replace(OPTIONS, cell=0.03)
     x = uniform(20_000)
-    assert np.array_equal(scene.query(x).occupancy, again.query(x).occupancy)
-    assert np.array_equal(scene.query(x).color, again.query(x).color)
-    untrained = [build_scene(cloud, replace(OPTIONS, map_seed=k, max_seconds=0.0)) for k in (0, 1)]
+    one, again = (build_scene(cloud, coarse, values={"warmth": warmth(cloud)}).query(x) for _ in "12")
+    assert np.array_equal(one.occupancy, again.occupancy) and np.array_equal(one.color, again.color)
+    untrained = [build_scene(cloud, replace(coarse, map_seed=k, max_seconds=0.0)) for k in (0, 1)]
     assert not np.array_equal(untrained[0].query(x).color, untrained[1].query(x).color)
 
 

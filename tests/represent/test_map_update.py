@@ -12,6 +12,7 @@ import pytest
 from benchmarks.simulated.truth import read_truth, true_depth
 from jcr.camera import rays, resized, undistort_image
 from jcr.capture.added import read_added, read_pose, with_images, write_added
+from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
 from jcr.depth.added import extend
 from jcr.errors import InputError
@@ -67,9 +68,10 @@ def scene_of(truth: Truth, without: str = "") -> Scene:
 
 
 @pytest.fixture(scope="module")
-def whole(truth: Truth) -> list[View]:
-    """Views of the whole scene from the first eight places."""
-    return list(render(scene_of(truth), truth.intrinsics, truth.base_from_camera[:8]))
+def whole(truth: Truth, capture: Capture) -> list[View]:
+    """Views of the whole scene from the first eight places: images and true depth of the capture."""
+    images = [read_image(capture.folder / name) for name in capture.images[:8]]
+    return [View(image, true_depth(truth, k), None) for k, image in enumerate(images)]
 
 
 def known_reconstruction(truth: Truth, rendered: list[View]) -> tuple[Reconstruction, HandEye]:

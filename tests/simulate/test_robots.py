@@ -75,6 +75,7 @@ def test_effective_hand_eye_of_errors_that_only_move_gripper_or_base():
     assert rotation_angle(elbow[:3, :3] @ physical[:3, :3].T) > 1e-3
 
 
+@pytest.mark.slow
 def test_effective_hand_eye_predicts_the_camera_better_than_the_physical_one():
     noise = (1e-3, 2e-3)
     better = []

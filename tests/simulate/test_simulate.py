@@ -12,6 +12,7 @@ import pytest
 
 from benchmarks.simulated.surface import solid_labels, truth_points, winding_number
 from benchmarks.simulated.truth import read_truth, true_depth, true_labels
+from in_process import run_jcr
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_exp, rotation_log, skew, transform
 from jcr.records import Intrinsics
@@ -53,10 +54,10 @@ def test_objects_stand_on_the_table_and_apart(name):
 
 @pytest.mark.parametrize("make", CATALOGUE.values(), ids=CATALOGUE)
 def test_surfaces_close_and_face_outwards(make):
-    thing = make(np.random.default_rng(0))
-    corners = np.concatenate([part.mesh.vertices for part in thing.parts])
+    parts = make(np.random.default_rng(0))
+    corners = np.concatenate([part.mesh.vertices for part in parts])
     x = np.random.default_rng(1).uniform(corners.min(0) - 0.01, corners.max(0) + 0.01, (1000, 3))
-    rotations = sum(winding_number(part.mesh, x) for part in thing.parts)
+    rotations = sum(winding_number(part.mesh, x) for part in parts)
     # The open ends of a mug's handle and an apple's stalk leak a little, and little else than beside them.
     assert (np.abs(rotations - rotations.round()) > 0.05).mean() < 0.02
     assert rotations.round().min() == 0 and rotations.round().max() >= 1
@@ -294,14 +295,12 @@ def test_options_that_mean_nothing_are_refused_in_one_line(tmp_path):
 @pytest.mark.gl
 @pytest.mark.usefixtures("opengl")
 def test_command_line(tmp_path):
-    jcr = [sys.executable, "-c", "from jcr.cli import main; main()", "simulate"]
-    command = [*jcr, str(tmp_path / "out"), "--images", "2", "--json"]
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = run_jcr("simulate", tmp_path / "out", "--images", "2", "--json")
     assert (done.returncode, json.loads(done.stdout)) == (0, {"capture": str(tmp_path / "out")})
-    again = subprocess.run(command, capture_output=True, text=True)
+    again = run_jcr("simulate", tmp_path / "out", "--images", "2", "--json")
     assert again.returncode == 2 and again.stderr.startswith("error: ") and again.stderr.count("\n") == 1
     # A machine without OpenGL: the remedy is named, and nothing is left behind.
-    command[len(jcr)] = str(tmp_path / "blind")
+    command = [sys.executable, "-m", "jcr", "simulate", str(tmp_path / "blind")]
     blind = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"MUJOCO_GL": "disable"})
     assert blind.returncode == 2 and "apt-get install" in blind.stderr and blind.stderr.count("\n") == 1
     assert not (tmp_path / "blind").exists()

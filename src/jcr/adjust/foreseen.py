@@ -155,10 +155,8 @@ def _shown(
     angle, ratio = SAME_FEATURE
     for i, pose in enumerate(cameras):
         x_px = project(intrinsics, x_in_camera := apply(inverse(pose), points))
-        inside = (
-            (x_in_camera[:, 2] > 0)
-            & (x_px > 0).all(1)
-            & (x_px < [intrinsics.width, intrinsics.height]).all(1)
+        inside = ((x_px > 0) & (x_px < [intrinsics.width, intrinsics.height])).all(1) & (
+            x_in_camera[:, 2] > 0
         )
         to = pose[:3, 3] - points
         distance = np.linalg.norm(to, axis=1)

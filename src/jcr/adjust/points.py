@@ -32,11 +32,11 @@ class PointsPlaced:
     """Of the triangulation of each by itself."""
 
 
-def points_in_base(adjusted: Adjusted, seed: int = 0) -> PointsPlaced:
+def points_in_base(adjusted: Adjusted) -> PointsPlaced:
     """Some of the adjusted points."""
     placed, images = adjusted.most_likely, adjusted.given.evidence
     count = len(images.scene.points_in_world)
-    some = np.sort(np.random.default_rng(seed).permutation(count)[:SOME])
+    some = np.sort(np.random.default_rng(0).permutation(count)[:SOME])
     base_from_world, scale = placed.z[0][:3, :3], placed.scale
     ahead = scale * images.scene.points_in_world[some] @ base_from_world.T
     by_column, own = _of_points(adjusted, some)

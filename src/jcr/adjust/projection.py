@@ -215,9 +215,8 @@ def derivatives(scene: Scene, view: View, problem: ImageProblem, weight: Float[n
         by_world[rows] = here
         own[rows, :, :3] = -here
         own[rows, :, 3:] = _crossed(here, (view.from_rig[rows] @ rotation.T)[:, None])
-    of_images = Derivatives(
-        shared=shared, own=own, by_point=by_world, residual=view.residual_px * root[..., 0]
-    )
+    residual = view.residual_px * root[..., 0]
+    of_images = Derivatives(shared=shared, own=own, by_point=by_world, residual=residual)
     if problem.observations.boards is None:
         return of_images
     of_boards = problem.observations.boards.derivatives(
@@ -290,11 +289,8 @@ def _by_cameras(scene: Scene, view: View, problem: ImageProblem) -> Float[ndarra
 
 def _by_nuisances(scene: Scene, view: View, problem: ImageProblem, own: Nuisances) -> Float[ndarray, "k 2 e"]:
     """Derivative of every observation by the steps of nuisances."""
-    image, about, directions = (
-        problem.observations.image,
-        view.from_centre_px,
-        problem.freedom.nuisance.directions,
-    )
+    image, about = problem.observations.image, view.from_centre_px
+    directions = problem.freedom.nuisance.directions
     of_images = directions[:-PRISM].reshape(OF_IMAGE, -1, directions.shape[1])
     focal, sheared, *offset = of_images[:, image]
     shear_px = _of_camera(problem, [camera.fx / camera.height for camera in scene.cameras]) * about[:, 1]

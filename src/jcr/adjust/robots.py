@@ -37,7 +37,7 @@ from jcr.handeye.equation import (
 )
 from jcr.handeye.mixed_model import Equations, left_out, solve
 from jcr.handeye.systematic import Region
-from jcr.records import Budget, ModelError
+from jcr.records import Budget, ModelError, RobotNoise
 
 TINY_STEP = 1e-6
 """m, rad, or standard deviations of what is small: for derivatives by differences."""
@@ -78,7 +78,7 @@ class Adjusted:
 
     placed: Placed
     covariance: Float[ndarray, "p p"]
-    """Of steps as `moved` takes them."""
+    """Of steps as `after_step` takes them."""
     budget: Budget
     """Of the first arm's X and scale, by what they come from."""
     most_likely: Placed
@@ -90,20 +90,9 @@ class Adjusted:
     given: "Given"
 
     @property
-    def noise(self) -> tuple[float, float]:
-        """m, rad per axis: the robots' random errors."""
-        sigma_t, sigma_r = np.sqrt(self.equations.variances(self.log_sizes)[:2]).tolist()
-        return sigma_t, sigma_r
-
-    @property
-    def systematic(self) -> float:
-        """rad: size of the robots' systematic errors."""
-        return float(np.sqrt(self.equations.variances(self.log_sizes)[2]))
-
-    @property
-    def systematic_left(self) -> tuple[float, float]:
-        """m, rad per axis: what of these is left in the poses."""
-        return self.equations.systematic_left(self.log_sizes)
+    def noise(self) -> RobotNoise:
+        """Errors of the gripper poses, the same of all arms."""
+        return self.equations.noise(self.log_sizes)
 
     @property
     def first_camera_column(self) -> int:
@@ -112,7 +101,8 @@ class Adjusted:
 
     def leave_one_out(self) -> Float[ndarray, "m 6"]:
         """Steps from the reported to the adjusted gripper poses (m, rad), each by an adjustment without that pose."""
-        return left_out(solve(self.equations, self.log_sizes), self.noise)[0]
+        random = self.noise.translation, self.noise.rotation
+        return left_out(solve(self.equations, self.log_sizes), random)[0]
 
     def intrinsics_covariance(self, c: int) -> Float[ndarray, "q q"]:
         """Of the parameters of a camera, in the order of camera.parameters."""
@@ -147,10 +137,6 @@ class Adjusted:
         columns = freedom.intrinsics_columns[c]
         return slice(first + columns.start, first + columns.stop), freedom.intrinsics[c].directions
 
-    def moved(self, step: Float[ndarray, " p"]) -> Placed:
-        """Everything after a step: X, log scale, base of the first arm; X and base of others; then the `free` ones."""
-        return after_step(self.placed, step, self.given)
-
     def transform(self, of: Callable[[Placed], Transform]) -> tuple[Transform, Float[ndarray, "6 6"]]:
         """A transform that follows from where everything is, and the covariance of its step."""
         found, j = of(self.placed), self.derivative(of)
@@ -164,11 +150,9 @@ class Adjusted:
         cameras = self.first_camera_column
         size[cameras:] = np.minimum(1e-2 * std[cameras:], 1e-2) + 1e-9
         j = np.empty((6, len(size)))
-        for k, small in enumerate(size):
-            step = np.zeros(len(size))
-            step[k] = small
-            ahead, behind = of(self.moved(step)), of(self.moved(-step))
-            j[:, k] = (step_between(found, ahead) - step_between(found, behind)) / (2 * small)
+        for k, step in enumerate(np.diag(size)):
+            ahead, behind = (of(after_step(self.placed, way * step, self.given)) for way in (1, -1))
+            j[:, k] = (step_between(found, ahead) - step_between(found, behind)) / (2 * size[k])
         return j
 
 
@@ -316,7 +300,8 @@ def _bent(arms: Sequence[ArmPoses], region: Region) -> Float[ndarray, "s s"] | N
 
 
 def after_step(placed: Placed, step: Float[ndarray, " p"], given: Given) -> Placed:
-    """Everything after a step of the unknowns of the mixed model."""
+    """Everything after a step of the unknowns of the mixed model: X, log scale, base of the first arm; X and base of
+    others; then the `free` ones."""
     own = np.stack([step[columns_of_arm(arm)] for arm in range(len(placed.x))])
     of_images = np.zeros(len(given.evidence.gradient))
     of_images[given.free] = step[given.arm_unknowns :]

@@ -126,14 +126,8 @@ class Freedom:
     @property
     def std(self) -> Float[ndarray, " l"]:
         """Of all camera columns."""
-        return np.concatenate(
-            [
-                *(prior.std for prior in self.intrinsics),
-                self.nuisance.std,
-                self.model_error_std,
-                self.board_std,
-            ]
-        )
+        of_cameras = (prior.std for prior in self.intrinsics)
+        return np.concatenate([*of_cameras, self.nuisance.std, self.model_error_std, self.board_std])
 
     @property
     def intrinsics_columns(self) -> list[slice]:
@@ -144,7 +138,7 @@ class Freedom:
     @property
     def nuisance_columns(self) -> slice:
         """After the intrinsics."""
-        begin = sum(len(prior.std) for prior in self.intrinsics)
+        begin = self.intrinsics_columns[-1].stop
         return slice(begin, begin + len(self.nuisance.std))
 
     @property
@@ -199,11 +193,9 @@ def at_start(scene: Scene, freedom: Freedom) -> Scene:
 def with_freedom(scene: Scene, before: Freedom, freedom: Freedom) -> Scene:
     """The scene with its cameras as they are, as far as another freedom about the same start can express them."""
     along = np.zeros(len(freedom.std))
-    for camera, start, prior, columns in zip(
-        scene.cameras, freedom.start, freedom.intrinsics, freedom.intrinsics_columns, strict=True
-    ):
-        off = parameters(camera) - parameters(start)
-        along[columns] = _along(prior.directions, prior.std, off)
+    each = zip(scene.cameras, freedom.start, freedom.intrinsics, freedom.intrinsics_columns, strict=True)
+    for camera, start, prior, columns in each:
+        along[columns] = _along(prior.directions, prior.std, parameters(camera) - parameters(start))
     nuisance = freedom.nuisance
     of_images = scene.nuisances(before).ravel()
     along[freedom.nuisance_columns] = _along(nuisance.directions, nuisance.std, of_images)
@@ -225,11 +217,10 @@ def _along(
 def stepped(scene: Scene, freedom: Freedom, step: Float[ndarray, " d"]) -> Scene:
     """Cameras, mounts and rigs after a step in the order of the columns; points stay."""
     along = scene.camera_steps + step[: len(freedom.std)]
+    each = zip(freedom.start, freedom.intrinsics, freedom.intrinsics_columns, strict=True)
     cameras = tuple(
         with_parameters(start, parameters(start) + prior.directions @ along[columns])
-        for start, prior, columns in zip(
-            freedom.start, freedom.intrinsics, freedom.intrinsics_columns, strict=True
-        )
+        for start, prior, columns in each
     )
     mounts = scene.rig_from_camera.copy()
     for c, columns in enumerate(freedom.mount_columns):

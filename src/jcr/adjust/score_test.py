@@ -10,6 +10,7 @@ free (`freed`) is what they come to.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -29,6 +30,10 @@ from jcr.records import Intrinsics
 WEAK = {"fx": 0.3, "fy": 0.3, "cx": 0.2, "cy": 0.2}
 """Standard deviations that only keep finite what the images cannot see: focal lengths relative, centre per width."""
 WEAK_DISTORTION, WEAK_SHEAR, WEAK_FOCAL, WEAK_OFFSET, WEAK_PRISM = 1.0, 0.3, 0.05, 0.1, 0.3
+
+
+OfImage = Literal["focal", "shear", "x", "y"]
+"""What NuisancePrior has of each image, in its order."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,30 +72,10 @@ class Alternatives:
         """Combinations: these parameters of the camera."""
         return np.eye(self.columns)[:, [self.names.index(name) for name in names]]
 
-    def common_focal(self) -> Float[ndarray, "e 1"]:
-        """Combination: both focal lengths by one factor."""
-        return self.of_camera(("fx", "fy")).sum(1, keepdims=True)
-
-    def focal_of_images(self, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
-        """Combinations: the logarithm of each image's focal length moves by its share."""
-        return self._of_images(0, shares)
-
-    def shear_of_images(self, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
-        """Combinations: x of each image moves by its share of the focal length over its height."""
-        return self._of_images(1, shares)
-
-    def offset_by_gravity(self) -> Float[ndarray, "e 2"]:
-        """Combinations: the offset of each image in x by gravity along x, in y by gravity along y."""
-        x, y = self.down_in_camera[:, :2].T
-        return np.concatenate([self._of_images(2, x[:, None]), self._of_images(3, y[:, None])], axis=1)
-
-    def prism(self) -> Float[ndarray, "e 4"]:
-        """Combinations: the coefficients of a thin prism."""
-        return np.eye(self.columns)[:, -PRISM:]
-
-    def _of_images(self, block: int, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
+    def of_images(self, nuisance: OfImage, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
+        """Combinations: this nuisance of each image moves by its share."""
         out = np.zeros((self.columns, shares.shape[1]))
-        first = len(self.names) + block * self.images
+        first = len(self.names) + get_args(OfImage).index(nuisance) * self.images
         out[first : first + self.images] = shares
         return out
 
@@ -142,6 +127,7 @@ def alternatives(
     coupling = hessian[np.ix_(kept, rest)]
     by_column = over(cholesky(hessian[np.ix_(kept, kept)]), coupling)
     start = given.evidence.scene.cameras[camera]
+    now, rig = adjusted.placed.scene, problem.observations.rig[mine]
     return Alternatives(
         hessian=hessian[np.ix_(rest, rest)] - coupling.T @ by_column,
         right=right[rest] - by_column.T @ right[kept],
@@ -152,14 +138,10 @@ def alternatives(
         names=parameter_names(start),
         units=units_of(start),
         distance=_distances(wider, mine),
-        down_in_camera=_down(adjusted, camera, mine),
+        down_in_camera=-(adjusted.placed.z[0] @ now.world_from_rig[rig] @ now.rig_from_camera[camera])[
+            :, 2, :3
+        ],
     )
-
-
-def _down(adjusted: Adjusted, camera: int, images: Int[ndarray, " m"]) -> Float[ndarray, "m 3"]:
-    """Of each image, the direction against the base's z axis in its camera."""
-    scene, rig = adjusted.placed.scene, adjusted.given.evidence.problem.observations.rig[images]
-    return -(adjusted.placed.z[0] @ scene.world_from_rig[rig] @ scene.rig_from_camera[camera])[:, 2, :3]
 
 
 def nuisances_of(images: Int[ndarray, " m"], count: int) -> Int[ndarray, " r"]:
@@ -187,7 +169,7 @@ def _with_all_free(
     left = freedom.model_error_std
     all_free = replace(
         freedom,
-        intrinsics=_with_one(freedom.intrinsics, camera, wider),
+        intrinsics=with_intrinsics(freedom, wider, camera).intrinsics,
         nuisance=NuisancePrior(np.eye(len(freedom.nuisance.directions))[:, rows], _weak_nuisances(m)),
         model_error_std=left if model_error_std is None else np.full_like(left, model_error_std),
     )
@@ -201,12 +183,6 @@ def _with_all_free(
         steps[freedom.model_error_columns.start : freedom.board_columns.stop],
     ]
     return evidence(replace(scene, camera_steps=wider_steps), replace(problem, freedom=all_free), found.noise)
-
-
-def _with_one(
-    priors: tuple[IntrinsicsPrior, ...], camera: int, prior: IntrinsicsPrior
-) -> tuple[IntrinsicsPrior, ...]:
-    return (*priors[:camera], prior, *priors[camera + 1 :])
 
 
 def _place_by_kept(
@@ -260,7 +236,8 @@ def freed_intrinsics(
 
 def with_intrinsics(freedom: Freedom, prior: IntrinsicsPrior, camera: int = 0) -> Freedom:
     """The freedom with another prior of a camera's intrinsics."""
-    return replace(freedom, intrinsics=_with_one(freedom.intrinsics, camera, prior))
+    priors = freedom.intrinsics
+    return replace(freedom, intrinsics=(*priors[:camera], prior, *priors[camera + 1 :]))
 
 
 def beyond_prior(adjusted: Adjusted, prior: IntrinsicsPrior, camera: int = 0) -> Float[ndarray, " q"]:
@@ -334,11 +311,8 @@ def spanned(combinations: Float[ndarray, "e p"]) -> Float[ndarray, "e r"]:
     return u[:, size > 1e-9 * size.max(initial=1e-300)]
 
 
-def tested(
-    equations: Alternatives, free: Float[ndarray, "e p"], beside: Float[ndarray, "e q"] | None = None
-) -> Tested:
+def tested(equations: Alternatives, free: Float[ndarray, "e p"], beside: Float[ndarray, "e q"]) -> Tested:
     """The test of freeing the combinations `free`, with those of `beside` free under both hypotheses."""
-    beside = np.zeros((equations.columns, 0)) if beside is None else beside
     q, both = beside.shape[1], np.concatenate([beside, free], axis=1)
     fewer, more = spanned(beside), spanned(both)
     without, gain_without, _ = _step(equations, fewer)
@@ -365,9 +339,8 @@ def _step(
 def _dispersion(images: ImageEvidence) -> float:
     """Of the weighted residuals, and no less than that of their sums over cells of the images (cluster sampling;
     Liang and Zeger, Biometrika 73, 1986)."""
-    problem, view = images.problem, images.view
-    weight = images.weight
-    pull = weight[:, None] * view.residual_px
+    problem, weight = images.problem, images.weight
+    pull = weight[:, None] * images.view.residual_px
     taken = 3 * len(problem.points) + 6 * len(problem.seen.rows)
     share = max(1 - taken / (2 * len(weight)), 0.1)
     scale = 2 * weight.sum() * share

@@ -19,7 +19,6 @@ from jcr.calibration.case import Case
 from jcr.calibration.consider import with_intrinsics_considered
 from jcr.geometry import inverse, retract, scale_translation, step_between
 from jcr.handeye.equation import predict
-from jcr.handeye.fit import exceeds
 from jcr.handeye.residuals import paper_residuals
 from jcr.handeye.solve import judged
 from jcr.records import (
@@ -29,7 +28,6 @@ from jcr.records import (
     LeaveOneOut,
     PaperResiduals,
     RobotExamined,
-    RobotNoise,
     Tracks,
 )
 
@@ -51,7 +49,8 @@ def adjusted(case: Case) -> Case:
     if not case.hand_eye.converged:
         return case
     refined = judged(refined_by(case, found))
-    if case.tracks.from_pointmaps and not _is_nearer(refined.leave_one_out, case.hand_eye.leave_one_out):
+    nearer, than = refined.leave_one_out, case.hand_eye.leave_one_out
+    if case.tracks.from_pointmaps and (nearer is None or than is None or nearer.length_m >= than.length_m):
         return case
     return replace(case, hand_eye=refined)
 
@@ -112,19 +111,6 @@ def estimate_in(found: Adjusted, scale: float, base_from_recon: Float[ndarray, "
     )
 
 
-def robot_noise_of(found: Adjusted) -> RobotNoise:
-    """The errors of the gripper poses, as an adjustment found them."""
-    given = found.given.noise
-    return RobotNoise(
-        translation=found.noise[0],
-        rotation=found.noise[1],
-        estimated=exceeds(found.noise, given),
-        given=given,
-        systematic=found.systematic,
-        systematic_left=found.systematic_left,
-    )
-
-
 def _considered(case: Case) -> Case:
     """The case with what errors of its given intrinsics do to a fit to poses, which cannot estimate them."""
     made_with_them = case.reconstruction.evidence is None and not case.tracks.from_pointmaps
@@ -143,11 +129,6 @@ def _considered(case: Case) -> Case:
     return replace(case, hand_eye=judged(considered))
 
 
-def _is_nearer(one: LeaveOneOut | None, other: LeaveOneOut | None) -> bool:
-    """Whether the leave-one-out error is smaller; not, where there are too few images."""
-    return one is not None and other is not None and one.length_m < other.length_m
-
-
 def refined_by(case: Case, found: Adjusted) -> HandEye:
     """The calibration of a case as an adjustment has it; not judged yet."""
     before, used = case.hand_eye.before or case.hand_eye, case.used
@@ -156,7 +137,8 @@ def refined_by(case: Case, found: Adjusted) -> HandEye:
     gripper, camera = case.base_from_gripper, case.recon_from_camera
     # Rejected poses are measured against where their cameras show them.
     predicted = estimate.base_from_recon @ scale_translation(camera, estimate.scale) @ inverse(x)
-    predicted[used] = _adjusted_poses(found)
+    placed, rigs = found.placed, found.given.arms[0].rigs
+    predicted[used] = predict(placed.x[0], placed.scale, placed.z[0], placed.scene.world_from_rig[rigs])
     metres, radians = np.linalg.norm(step_between(gripper, predicted).reshape(-1, 2, 3), axis=2).T
     reprojection = np.full(len(gripper), np.nan)
     evidence = found.given.evidence
@@ -172,16 +154,10 @@ def refined_by(case: Case, found: Adjusted) -> HandEye:
             reprojection_px=reprojection,
         ),
         residuals=PaperResiduals(*paper_residuals(gripper, camera, x, estimate.scale, before.inliers)),
-        robot=RobotExamined(robot_noise_of(found)),
+        robot=RobotExamined(found.noise),
         leave_one_out=_leave_one_out(found),
         before=before,
     )
-
-
-def _adjusted_poses(found: Adjusted) -> Float[ndarray, "u 4 4"]:
-    """base_from_gripper where images and robot together put it."""
-    placed, rigs = found.placed, found.given.arms[0].rigs
-    return predict(placed.x[0], placed.scale, placed.z[0], placed.scene.world_from_rig[rigs])
 
 
 def _leave_one_out(found: Adjusted) -> LeaveOneOut | None:

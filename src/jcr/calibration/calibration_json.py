@@ -29,13 +29,11 @@ from jcr.records import (
     LeaveOneOut,
     LengthCheck,
     Mount,
-    NextPose,
     PaperResiduals,
     PosePairs,
     Reconstruction,
     Requirement,
     RobotExamined,
-    RobotNoise,
     ScaleCheck,
     Verdict,
     strongest_first,
@@ -44,6 +42,11 @@ from jcr.records import (
 from jcr.records.words import doubt_of, remedy, sentence, text
 
 FORMAT = "jcr.calibration/1"
+OF_HAND_EYE = (
+    *("gripper_from_camera", "base_from_recon", "scale", "residuals", "observability", "requirement"),
+    "with_given_intrinsics",
+)
+"""Fields of the file that a HandEye has by the same names."""
 
 
 class Observed(Part):
@@ -56,11 +59,6 @@ class Noise(Part):
     translation_mm: float
     rotation_deg: float
     estimated: bool
-
-    @classmethod
-    def of(cls, noise: RobotNoise) -> "Noise":
-        """The random part."""
-        return cls(**mm_and_deg(noise.translation, noise.rotation), estimated=noise.estimated)
 
 
 class JointOffset(Part):
@@ -120,12 +118,6 @@ class Proposal(Part):
     within_95_mm: Spread | None = None
     """Of a point seen as in `uncertainty.seen`; null in files of earlier versions."""
     rotation_95_deg: Spread | None = None
-
-    @classmethod
-    def of(cls, pose: NextPose, like: str) -> "Proposal":
-        """That of a calibration, near the image `like`."""
-        given = {name: value for name, value in vars(pose).items() if name in cls.model_fields}
-        return cls.model_validate(given | {"like": like})
 
 
 class CalibrationFile(Part):
@@ -248,31 +240,27 @@ def calibration_file(
 ) -> CalibrationFile:
     """The file of a calibration of `capture`; poses that were given are capture and reconstruction in one."""
     names = [capture.images[row] for row in reconstruction.image_index[hand_eye.inliers]]
+    proposals = [vars(pose) | {"like": names[pose.like]} for pose in hand_eye.next_poses]
+    noise, measured = hand_eye.robot_noise, hand_eye.scale_evidence
     content = {
         "mount": "gripper",
-        "gripper_from_camera": hand_eye.gripper_from_camera,
-        "base_from_recon": hand_eye.base_from_recon,
-        "scale": hand_eye.scale,
+        **{name: getattr(hand_eye, name) for name in OF_HAND_EYE},
         "backend": reconstruction.backend,
         "images": image_verdicts(capture, reconstruction, hand_eye),
-        "residuals": hand_eye.residuals,
         "uncertainty": Uncertainty.of(hand_eye.estimate, hand_eye.in_use),
         "held_out": hand_eye.leave_one_out,
-        "observability": hand_eye.observability,
-        "robot_noise": Noise.of(hand_eye.robot_noise),
+        "robot_noise": mm_and_deg(noise.translation, noise.rotation) | {"estimated": noise.estimated},
         "intrinsics": IntrinsicsAndStd.of(hand_eye.intrinsics, hand_eye.estimate.intrinsics_std),
         "timings_s": timings_s,
         "version": version,
-        "next_poses": [Proposal.of(pose, names[pose.like]) for pose in hand_eye.next_poses],
-        "scale_check": hand_eye.scale_evidence.network,
+        "next_poses": [{name: pose[name] for name in Proposal.model_fields} for pose in proposals],
+        "scale_check": measured.network,
         "robot_errors": RobotErrors.of(hand_eye.robot),
         "angle_ratio": hand_eye.robot.angle_ratio,
-        "depth_check": hand_eye.scale_evidence.depth,
-        "lengths": list(hand_eye.scale_evidence.lengths),
-        "board": hand_eye.scale_evidence.board,
-        "requirement": hand_eye.requirement,
+        "depth_check": measured.depth,
+        "lengths": list(measured.lengths),
+        "board": measured.board,
         "attempts": list(attempts),
-        "with_given_intrinsics": hand_eye.with_given_intrinsics,
     }
     if isinstance(capture, Capture) and capture.mount == "base":
         # Of a fixed camera the transform is another one, and there is no name for it with the given intrinsics.
@@ -291,28 +279,28 @@ def failed_file(
     attempts: Sequence[Attempt] = (),
 ) -> CalibrationFile:
     """The file of a capture whose images gave no camera poses at all; `findings` are the reasons, strongest first."""
-    return CalibrationFile(
-        mount=capture.mount,
-        gripper_from_camera=None,
-        scale=None,
-        base_from_recon=None,
-        backend=backend,
-        images=[ImageVerdict(image=name, used=False, reason="not registered") for name in capture.images],
-        residuals=None,
-        uncertainty=None,
-        held_out=None,
-        observability=Observed(
-            observable=False,
-            unobservable=["everything: no camera poses"],
-            advice=[remedy(findings[0]) or text(findings[0])],
-        ),
-        robot_noise=None,
-        intrinsics=IntrinsicsAndStd.of(capture.intrinsics),
-        **_derived(findings, ()),
-        timings_s=timings_s,
-        version=version,
-        attempts=list(attempts),
+    nothing = (
+        "gripper_from_camera",
+        "base_from_recon",
+        "scale",
+        "residuals",
+        "uncertainty",
+        "held_out",
+        "robot_noise",
     )
+    advice = remedy(findings[0]) or text(findings[0])
+    unseen = {"observable": False, "unobservable": ["everything: no camera poses"], "advice": [advice]}
+    content = dict.fromkeys(nothing) | {
+        "mount": capture.mount,
+        "backend": backend,
+        "images": [ImageVerdict(image=name, used=False, reason="not registered") for name in capture.images],
+        "observability": unseen,
+        "intrinsics": IntrinsicsAndStd.of(capture.intrinsics),
+        "timings_s": timings_s,
+        "version": version,
+        "attempts": list(attempts),
+    }
+    return CalibrationFile.model_validate(content | _derived(findings, ()))
 
 
 def image_verdicts(
@@ -378,11 +366,8 @@ def validated(content: dict[str, object], file: Path) -> CalibrationFile:
         found = CalibrationFile.model_validate_json(json.dumps(content), strict=True)
     except ValidationError as error:
         raise InputError(f"{file}: {first_fault(error)}; run the calibration again") from None
-    return _of_earlier_version(found) if found.verdict is None else found
-
-
-def _of_earlier_version(found: CalibrationFile) -> CalibrationFile:
-    """With its warnings as findings; only their words are known."""
+    if found.verdict is not None:
+        return found
     findings = findings_of_words(found.warnings, found.converged)
     if found.converged and found.requirement is not None:
         short = not_exact_enough(found.requirement, found.mostly_systematic)

@@ -80,10 +80,6 @@ class Case:
             return self.chosen_tracks
         return some_of_many(of_images(self.reconstruction.tracks, self.hand_eye.inliers), MOST_OBSERVATIONS)
 
-    def with_tracks(self, tracks: Tracks) -> "Case":
-        """The case with some of its observations."""
-        return replace(self, chosen_tracks=tracks)
-
     @property
     def scene_distance_m(self) -> float | None:
         """Median distance from the camera to what it sees; None where the calibration is not made of images."""

@@ -39,11 +39,9 @@ def with_intrinsics_considered(
     seen = [np.flatnonzero(tracks.image == row) for row in range(len(recon_from_camera))]
     if hand_eye.budget is None or min(map(len, seen)) < FEWEST:
         return hand_eye
+    each = zip(recon_from_camera, seen, strict=True)
     moved = np.array(
-        [
-            _camera_with_other_intrinsics(camera, tracks, rows, intrinsics, prior)
-            for camera, rows in zip(recon_from_camera, seen, strict=True)
-        ]
+        [_camera_with_other_intrinsics(one, tracks, rows, intrinsics, prior) for one, rows in each]
     )
     problem = PoseProblem(
         base_from_gripper=base_from_gripper,
@@ -86,6 +84,4 @@ def _camera_with_other_intrinsics(
     by_pose = np.concatenate([by_x, -by_x @ skew(x_in_camera)], axis=2).reshape(-1, 6)
     by_intrinsics = by_parameters(intrinsics, x_in_camera) @ (prior.directions * prior.std)
     steps = -np.linalg.lstsq(by_pose, by_intrinsics.reshape(len(by_pose), -1), rcond=None)[0].T
-    return np.array(
-        [recon_from_camera @ inverse(transform(rotation_exp(step[3:]), step[:3])) for step in steps]
-    )
+    return recon_from_camera @ inverse(transform(rotation_exp(steps[:, 3:]), steps[:, :3]))

@@ -45,16 +45,24 @@ Cause = Literal["camera", "scene", "either"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Drift:
-    """How far the camera seems to have moved on the gripper since the calibration."""
+class Motion:
+    """One explanation of the new images: a motion of X, or of base_from_recon."""
 
     offset: Float[ndarray, "6"]
-    """The step from the calibrated gripper_from_camera to the one now (m, rad), gripper axes."""
+    """The step from the calibrated transform to the one now (m, rad); of X in gripper axes."""
     covariance: Float[ndarray, "6 6"]
     p_value: float
-    """Of a drift like this or larger where nothing has moved."""
+    """Of a motion like this or larger where nothing has moved."""
+    misfit: float
+    """Squared distance of the new images from it, averaged over the sizes of the robot's errors."""
     misfit_p_value: float | None
-    """Of new images disagreeing like this when one drift explains them; None for one image."""
+    """Of new images disagreeing like this when one motion explains them; None for one image."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drift(Motion):
+    """How far the camera seems to have moved on the gripper since the calibration."""
+
     cause: Cause
     """What explains the images better: the camera moved on the gripper, or the scene moved in the base."""
     detectable: tuple[float, float]
@@ -77,37 +85,17 @@ def drift(
     camera = _estimate_motion(calibrated, old, new, systematic, slice(0, 6))
     scene = _estimate_motion(calibrated, old, new, systematic, slice(7, 13))
     difference = camera.misfit - scene.misfit
-    return Drift(
-        offset=camera.offset,
-        covariance=camera.covariance,
-        p_value=camera.p_value,
-        misfit_p_value=camera.misfit_p_value,
-        cause="either" if abs(difference) < CLEAR else "camera" if difference < 0 else "scene",
-        detectable=detectable(camera.covariance, alpha),
-    )
+    cause = "either" if abs(difference) < CLEAR else "camera" if difference < 0 else "scene"
+    return Drift(**vars(camera), cause=cause, detectable=detectable(camera.covariance, alpha))
 
 
 def detectable(covariance: Float[ndarray, "6 6"], alpha: float) -> tuple[float, float]:
     """Shifts (m) and rotations (rad) in the worst direction that a test at `alpha` finds nine times in ten."""
-
-    def power(squared: float) -> float:
-        return float(ncx2.sf(chi2.isf(alpha, 6), 6, squared))
-
-    length = np.sqrt(root_scalar(lambda squared: power(squared) - POWER, bracket=(1e-3, 1e3)).root)
+    least = chi2.isf(alpha, 6)
+    found = root_scalar(lambda squared: float(ncx2.sf(least, 6, squared)) - POWER, bracket=(1e-3, 1e3))
+    length = np.sqrt(found.root)
     worst = [np.sqrt(np.linalg.eigvalsh(covariance[part, part])[-1]) for part in (TRANSLATION, ROTATION)]
     return float(length * worst[0]), float(length * worst[1])
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Motion:
-    """One explanation of the new images: a motion of X, or of base_from_recon."""
-
-    offset: Float[ndarray, "6"]
-    covariance: Float[ndarray, "6 6"]
-    p_value: float
-    misfit: float
-    """Squared distance of the new images from it, averaged over the sizes of the robot's errors."""
-    misfit_p_value: float | None
 
 
 def _estimate_motion(
@@ -116,7 +104,7 @@ def _estimate_motion(
     new: tuple[NewPoses, NewPoses, Float[ndarray, "k 6 6"]],
     systematic: Float[ndarray, "s s"],
     columns: slice,
-) -> _Motion:
+) -> Motion:
     """Generalised least squares of old and new images together, in which new ones see a moved X or base_from_recon."""
     x, scale, z = calibrated.gripper_from_camera, calibrated.scale, calibrated.base_from_recon
     of_x = columns.start == 0
@@ -186,7 +174,7 @@ def _averaged(
     known_sizes: Iterable[tuple[ndarray, ndarray, Solution]],
     begun: Float[ndarray, "6"],
     freedom: int,
-) -> _Motion:
+) -> Motion:
     """The motion, and how the new images agree on it, averaged over the sizes of the robot's errors that the old images
     leave open.
 
@@ -203,7 +191,7 @@ def _averaged(
     offset = weight @ steps
     off = steps - offset
     distances = np.einsum("ki,ki->k", steps, np.linalg.solve(each, steps[..., None])[..., 0])
-    return _Motion(
+    return Motion(
         offset=offset,
         covariance=np.einsum("k,kij->ij", weight, each) + np.einsum("k,ki,kj->ij", weight, off, off),
         p_value=float(weight @ chi2.sf(distances, 6)),

@@ -97,15 +97,15 @@ class Ahead:
         reach: Float[ndarray, "2 3"] | None = None,
         seed: int = 0,
     ) -> "Ahead":
-        """The `count` poses that help most; `robot` is of the others, `reach` and `seed` as next_poses takes them."""
+        """The `count` that help most; `robot` is of the others, `reach` as `candidates` takes it, drawn with `seed`."""
         x, noise = assumptions.gripper_from_camera, assumptions.noise
         of_random, distance = (noise.translation, noise.rotation), assumptions.distance_m
-        added = next_poses(base_from_gripper, count, x, of_random, reach, seed, distance)
+        possible = candidates(base_from_gripper, x, reach, np.random.default_rng(seed))
+        added = next_poses(base_from_gripper, possible, count, x, of_random, distance)
         ahead = Ahead(assumptions=assumptions, base_from_gripper=base_from_gripper, robot=robot, added=added)
         if count == 0 or len(base_from_gripper) > TOO_MANY:
             return ahead
-        others = candidates(base_from_gripper, x, reach, np.random.default_rng(seed))[:COMPARED]
-        return replace(ahead, added=np.concatenate([added, others]))._best(count)
+        return replace(ahead, added=np.concatenate([added, possible[:COMPARED]]))._best(count)
 
     def _best(self, count: int) -> "Ahead":
         """The `count` of them that leave the least, systematic errors of the robot included, chosen one by one."""

@@ -13,7 +13,7 @@ from jcr.calibration.robot_errors import RobotErrors
 from jcr.errors import RejectedError
 from jcr.handeye.fit import Cues
 from jcr.handeye.solve import solve_hand_eye
-from jcr.records import Capture, Finding, HandEye, Reconstruction
+from jcr.records import Capture, HandEye, Reconstruction
 
 
 def fitted(
@@ -32,9 +32,9 @@ def fitted(
         )
     gripper = capture.base_from_gripper[reconstruction.image_index]
     cues, contradiction = _measured(capture, reconstruction, options), None
-    if cues is not None and cues.offset is None and _shows_scale(gripper, reconstruction, options, robot):
-        # The length is compared with the robot's beside other lengths (checks/lengths.py).
-        cues = None
+    if cues is not None and cues.offset is None and options.bundle_adjustment:
+        # Where the motions determine the scale, it is compared with the length beside others (checks/lengths.py).
+        cues = None if _solved(gripper, reconstruction, options, robot, None).converged else cues
     if cues is None and (metric_std := reconstruction.metric_std) is not None:
         free = _solved(gripper, reconstruction, options, robot, None)
         contradiction = scale_contradiction(free, metric_std)
@@ -47,22 +47,8 @@ def fitted(
         options=options,
         robot=robot,
         cues=cues,
-        hand_eye=hand_eye.with_findings(*_present(contradiction)),
+        hand_eye=hand_eye if contradiction is None else hand_eye.with_findings(contradiction),
     )
-
-
-def _shows_scale(
-    gripper: Float[ndarray, "m 4 4"],
-    reconstruction: Reconstruction,
-    options: CalibrateOptions,
-    robot: RobotErrors,
-) -> bool:
-    """Whether the motions determine the scale, and images can be adjusted with it."""
-    return options.bundle_adjustment and _solved(gripper, reconstruction, options, robot, None).converged
-
-
-def _present(finding: Finding | None) -> tuple[Finding, ...]:
-    return () if finding is None else (finding,)
 
 
 def _solved(

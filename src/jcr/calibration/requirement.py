@@ -7,12 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.expected import (
-    Ahead,
-    Assumptions,
-    typical_noise,
-    worse_of,
-)
+from jcr.calibration.expected import Ahead, Assumptions, typical_noise, worse_of
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import RobotErrors
 from jcr.calibration.seen import Scene, in_use, within_95
@@ -45,7 +40,9 @@ def advised(
     used, robot = gripper[hand_eye.inliers], robot.of(np.flatnonzero(hand_eye.inliers))
     hand_eye = replace(hand_eye, in_use=in_use(hand_eye.estimate, scene or Scene(assumptions.distance_m)))
     required = _required(hand_eye, options)
-    assumptions = replace(assumptions, faults=_by_lasting_faults(hand_eye))
+    # Wrong intrinsics and a bent robot stay what they are with further images.
+    lasting = [one.covariance for one in hand_eye.findings if one.mend == "intrinsics" or one.kind in BENT]
+    assumptions = replace(assumptions, faults=sum(lasting, start=np.zeros((7, 7))))
     if hand_eye.converged:
         reach, proposed = _worthwhile(hand_eye, used, required, assumptions, robot)
         required = replace(required, more_images=reach)
@@ -75,15 +72,8 @@ def not_exact_enough(required: Requirement, systematic: bool) -> Finding | None:
         for name, value in vars(required).items()
         if value is not None
     }
-    return Finding.of(
-        Kind.NOT_EXACT_ENOUGH,
-        "rejects" if required.asked else "warns",
-        mend,
-        value=1e-3 * required.reached_mm,
-        std=None,
-        p=None,
-        **numbers,
-    )
+    finding = Finding.of(Kind.NOT_EXACT_ENOUGH, "rejects" if required.asked else "warns", mend)
+    return replace(finding, value=1e-3 * required.reached_mm, details=numbers)
 
 
 def _required(hand_eye: HandEye, options: CalibrateOptions) -> Requirement:
@@ -153,9 +143,3 @@ def _worthwhile(
             )
         )
     return reach, proposed
-
-
-def _by_lasting_faults(hand_eye: HandEye) -> Float[ndarray, "7 7"]:
-    """What wrong intrinsics and a bent robot add to the covariance."""
-    lasting = (one for one in hand_eye.findings if one.mend == "intrinsics" or one.kind in BENT)
-    return sum((one.covariance for one in lasting), start=np.zeros((7, 7)))

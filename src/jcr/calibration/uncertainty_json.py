@@ -1,5 +1,6 @@
 """The uncertainty of a calibration as calibration.json has it: in mm and degrees, with covariance and budget."""
 
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -10,7 +11,7 @@ from pydantic import AfterValidator, model_validator
 from jcr.arrays_json import Covariance7, Part, PartCovariance7, Spread, Spread3, Square
 from jcr.calibration.seen import joint_covariance
 from jcr.camera import parameter_names
-from jcr.records import COVARIANCE_ORDER, Budget, Estimate, InUse
+from jcr.records import COVARIANCE_ORDER, Budget, Estimate, InUse, Seen
 from jcr.records.words import worst_direction
 
 
@@ -65,26 +66,20 @@ class UncertaintyBudget(Part):
         return self.robot_systematic.translation_mm**2 >= squares
 
 
-class SeenJson(Part):
-    """How exactly a point that the camera sees is placed; 95 % of errors are smaller."""
-
-    distance_mm: Spread
-    within_95_mm: Spread
-    lateral_95_mm: Spread
-    along_95_mm: Spread
-    ray_95_deg: Spread
-    rotation_95_deg: Spread
+def _sizes(found: Seen) -> Seen:
+    if min(size for size in vars(found).values() if isinstance(size, float)) < 0:
+        raise ValueError("a size below 0")
+    return found
 
 
-class SeenAndCorners(SeenJson):
+SeenJson = Annotated[Seen, AfterValidator(_sizes)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenAndCorners(Seen):
     """At the centre of the image, and at its worst corner."""
 
     corners: SeenJson
-
-    @classmethod
-    def of(cls, found: InUse) -> "SeenAndCorners":
-        """Those of a calibration in use."""
-        return cls(**vars(found.seen), corners=SeenJson(**vars(found.corners)))
 
 
 class Joint(Part):
@@ -120,7 +115,7 @@ class Uncertainty(Part):
     worst: str
     """The least certain direction of the translation in words, and its size."""
     budget: UncertaintyBudget | None = None
-    seen: SeenAndCorners | None = None
+    seen: Annotated[SeenAndCorners, AfterValidator(_sizes)] | None = None
     """Null in files of earlier versions."""
     scene_95_mm: Spread | None = None
     """95 % of the errors of points of the reconstruction in the base frame are smaller, at the median point."""
@@ -139,7 +134,7 @@ class Uncertainty(Part):
             order=list(COVARIANCE_ORDER),
             worst=worst_direction(estimate.gripper_from_camera, estimate.covariance),
             budget=UncertaintyBudget.of(estimate.budget),
-            seen=None if in_use is None else SeenAndCorners.of(in_use),
+            seen=None if in_use is None else SeenAndCorners(**vars(in_use.seen), corners=in_use.corners),
             scene_95_mm=None if in_use is None or in_use.scene is None else 1e3 * in_use.scene.within_95_m,
             joint=Joint.of(estimate),
         )

@@ -48,9 +48,7 @@ def moving_parts(images: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndarra
     return out
 
 
-def _background(
-    reduced: Float[ndarray, "n h w 3"],
-) -> tuple[Float[ndarray, "h w 3"], ndarray]:
+def _background(reduced: Float[ndarray, "n h w 3"]) -> tuple[Float[ndarray, "h w 3"], ndarray]:
     """At each pixel the colour on which most images agree, and whether enough of them do."""
     agreeing = np.stack(
         [(np.abs(reduced - one).max(-1) < LEVELS).sum(0) for one in reduced]

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -37,12 +38,6 @@ class CameraViews:
             ),
         )
 
-    @staticmethod
-    def nothing_of(camera: CellCamera) -> "CameraViews":
-        """Before anything is looked at."""
-        count = len(camera.images)
-        return CameraViews(camera, (None,) * count, (0,) * count, (None,) * count)
-
     @property
     def rows(self) -> Int[ndarray, " k"]:
         """Images that were localised."""
@@ -75,17 +70,9 @@ class CameraViews:
         """With why some images are not used."""
         return replace(self, reasons=tuple(reasons.get(k, before) for k, before in enumerate(self.reasons)))
 
-    def refused(
-        self,
-        kind: Kind,
-        mend: Mend = "none",
-        images: tuple[str, ...] = (),
-        value: float | None = None,
-        **details: float | str,
-    ) -> CameraFound:
-        """The camera is not placed, for this finding."""
-        why = Finding.of(kind, "rejects", mend, *images, value=value, std=None, p=None, **details)
-        return self.not_placed(why)
+    def refused(self, kind: Kind, mend: Mend = "none", *images: str, **numbers: Any) -> CameraFound:
+        """The camera is not placed, for this finding, as Finding.of makes it."""
+        return self.not_placed(Finding.of(kind, "rejects", mend, *images, **numbers))
 
     def not_placed(self, *why: Finding) -> CameraFound:
         """The camera with why it is not placed."""

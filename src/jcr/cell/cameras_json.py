@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError, model_validator
 from jcr.arrays_json import Covariance6, Matrix, Part, Spread, Spread3
 from jcr.calibration.findings_json import FindingJson, derived, findings_of_words, require_one_verdict
 from jcr.capture.plain_files import first_fault, is_written, read_json
-from jcr.cell.found import ArmFound, CameraFound, CellFound, ImageFound
+from jcr.cell.found import CameraFound, CellFound, ImageFound
 from jcr.errors import InputError
 from jcr.files import write_text
 from jcr.intrinsics_json import IntrinsicsAndStd
@@ -107,7 +107,14 @@ def cameras_file(found: CellFound, version: str) -> CamerasFile:
     """The file of what was placed."""
     return CamerasFile(
         cameras=[_camera(camera) for camera in found.cameras],
-        arms=[_arm(arm) for arm in found.arms],
+        arms=[
+            ArmPlaced(
+                name=arm.name,
+                base_from_other_base=arm.base_from_other.tolist(),
+                uncertainty=_uncertainty(arm.covariance),
+            )
+            for arm in found.arms
+        ],
         version=version,
     )
 
@@ -115,25 +122,16 @@ def cameras_file(found: CellFound, version: str) -> CamerasFile:
 def _camera(found: CameraFound) -> CameraPlaced:
     key = "base_from_camera" if found.mount == "base" else "gripper_from_camera"
     transform, covariance = found.parent_from_camera, found.covariance
+    sure = None if covariance is None else _uncertainty(covariance, found.std_at_scene, found.scene_distance)
     return CameraPlaced(
         name=found.name,
         mount=found.mount,
         arm=found.arm,
-        uncertainty=None
-        if covariance is None
-        else _uncertainty(covariance, found.std_at_scene, found.scene_distance),
+        uncertainty=sure,
         intrinsics=IntrinsicsAndStd.of(found.intrinsics, found.intrinsics_std),
         pictures=list(found.images),
         **derived(found.findings),
         **{} if transform is None else {key: transform.tolist()},
-    )
-
-
-def _arm(found: ArmFound) -> ArmPlaced:
-    return ArmPlaced(
-        name=found.name,
-        base_from_other_base=found.base_from_other.tolist(),
-        uncertainty=_uncertainty(found.covariance),
     )
 
 
@@ -167,14 +165,12 @@ def read_cameras(folder: Path) -> CamerasFile | None:
         raise InputError(
             f"{file}: {first_fault(error)}; place the cameras again (jcr run, jcr add-camera)"
         ) from None
-    return content.model_copy(update={"cameras": [_of_this_version(camera) for camera in content.cameras]})
-
-
-def _of_this_version(camera: CameraPlaced) -> CameraPlaced:
-    """With its warnings as findings, where an earlier version wrote it."""
-    if camera.verdict is not None:
-        return camera
-    return camera.model_copy(update=derived(findings_of_words(camera.warnings, camera.converged)))
+    cameras = list(content.cameras)
+    for k, camera in enumerate(cameras):
+        if camera.verdict is None:  # an earlier version wrote it
+            findings = findings_of_words(camera.warnings, camera.converged)
+            cameras[k] = camera.model_copy(update=derived(findings))
+    return content.model_copy(update={"cameras": cameras})
 
 
 def in_words(content: CamerasFile) -> list[str]:
@@ -190,25 +186,22 @@ def in_words(content: CamerasFile) -> list[str]:
         used = [image for image in camera.images if image.used]
         points = sum(image.points for image in used)
         lines.append(f"{camera.name}: {name} ({len(used)} of {len(camera.images)} images, {points} points)")
-        with np.printoptions(precision=6, suppress=True):
-            lines += [f"  {row}" for row in str(np.array(camera.parent_from_camera)).splitlines()]
-        scene = (
-            ""
-            if sure.at_scene_mm is None or sure.scene_distance_m is None
-            else f"; ± {significant(sure.at_scene_mm)} mm at the scene, {sure.scene_distance_m:.2f} m away"
-        )
-        lines.append(f"  {_plus_minus(sure)}{scene}")
-        lines += [
-            f"  {'rejected: ' if k == 0 and camera.doubt else ''}{text}"
-            for k, text in enumerate(camera.warnings)
-        ]
+        scene = ""
+        if sure.at_scene_mm is not None and sure.scene_distance_m is not None:
+            scene = f"; ± {significant(sure.at_scene_mm)} mm at the scene, {sure.scene_distance_m:.2f} m away"
+        lines += [*_rows(camera.parent_from_camera), f"  {_plus_minus(sure)}{scene}"]
+        rejected = ["rejected: " if camera.doubt else "", *[""] * len(camera.warnings)]
+        lines += [f"  {first}{text}" for first, text in zip(rejected, camera.warnings, strict=False)]
         lines += [f"  not used: {image.image}: {image.reason}" for image in camera.images if not image.used]
     for arm in content.arms:
-        lines.append(f"base_from_{arm.name}_base")
-        with np.printoptions(precision=6, suppress=True):
-            lines += [f"  {row}" for row in str(np.array(arm.base_from_other_base)).splitlines()]
-        lines.append(f"  {_plus_minus(arm.uncertainty)}")
+        rows = _rows(arm.base_from_other_base)
+        lines += [f"base_from_{arm.name}_base", *rows, f"  {_plus_minus(arm.uncertainty)}"]
     return lines
+
+
+def _rows(matrix: list[list[float]]) -> list[str]:
+    with np.printoptions(precision=6, suppress=True):
+        return [f"  {row}" for row in str(np.array(matrix)).splitlines()]
 
 
 def _plus_minus(sure: TransformUncertainty) -> str:

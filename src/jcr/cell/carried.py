@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jcr.calibration.adjust import adjust_case, estimate_of, robot_noise_of
+from jcr.calibration.adjust import adjust_case, estimate_of
 from jcr.calibration.case import MIN_OBSERVATIONS, Case
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
@@ -96,7 +96,7 @@ def refined(
         replace(
             found,
             estimate=estimate_of(answer, case.tracks).with_fault(faults),
-            robot=replace(found.robot, noise=robot_noise_of(answer)),
+            robot=replace(found.robot, noise=answer.noise),
             plan=replace(found.plan, next_poses=()),
         )
     )

@@ -117,11 +117,7 @@ def cell_images(
 
 
 def _freedom(
-    capture: Capture,
-    hand_eye: HandEye,
-    members: Sequence[Member],
-    cameras: Sequence[Intrinsics],
-    images: int,
+    capture: Capture, hand_eye: HandEye, members: Sequence[Member], cameras: Sequence[Intrinsics], images: int
 ) -> Freedom:
     """Intrinsics free about what was given or found of each camera; a mount only beside another camera on its rig.
 
@@ -129,16 +125,12 @@ def _freedom(
     """
     contradicted = any(one.kind is Kind.INTRINSICS and one.shift is None for one in hand_eye.findings)
     own = prior_about(cameras[0], capture.intrinsics is not None and not contradicted, capture.intrinsics_std)
-    priors = [
-        own,
-        *(
-            prior_about(start, member.camera.intrinsics is not None, member.camera.intrinsics_std)
-            for start, member in zip(cameras[1:], members, strict=True)
-        ),
-    ]
-    return Freedom.of(
-        cameras, priors, images, [False, *(member.rig_from_camera is not None for member in members)]
-    )
+    priors, mounts = [own], [False]
+    for start, member in zip(cameras[1:], members, strict=True):
+        known = member.camera.intrinsics is not None
+        priors.append(prior_about(start, known, member.camera.intrinsics_std))
+        mounts.append(member.rig_from_camera is not None)
+    return Freedom.of(cameras, priors, images, mounts)
 
 
 def _as_given(reconstruction: Reconstruction, hand_eye: HandEye, known: Known) -> RigInformation:

@@ -123,7 +123,7 @@ def guessed_intrinsics(size: tuple[int, int]) -> Intrinsics:
 
 
 def localised(
-    known: Known, image: UInt8[ndarray, "h w 3"], intrinsics: Intrinsics, is_given: bool, seed: int = 0
+    known: Known, image: UInt8[ndarray, "h w 3"], intrinsics: Intrinsics, is_given: bool
 ) -> Shared | int:
     """The image's place, or how few points it shares with the known images where these do not show it."""
     found = features(image, intrinsics)
@@ -134,13 +134,13 @@ def localised(
         np.repeat(np.arange(len(of_image)), [len(mine) for mine, _ in of_image]),
         np.concatenate([known.found[k].x_px[theirs] for k, (_, theirs) in enumerate(of_image)]),
     )
-    best = _located(known, seen, intrinsics, is_given, seed)
+    best = _located(known, seen, intrinsics, is_given)
     # One image's focal length and place bend to each other, and to the networks' errors, which are larger than SIFT's
     # and alike side by side: with them places came out up to 6.4 of their sigmas off, without at most 2.3.
     if isinstance(best, int) or len(best.x_px) >= FEW or known.learned is None or not is_given:
         return best
     seen = seen.and_those(*known.learned.matched(image, best.recon_from_camera))
-    more = _located(known, seen, intrinsics, is_given, seed)
+    more = _located(known, seen, intrinsics, is_given)
     if isinstance(more, int) or len(more.x_px) <= len(best.x_px):
         return best
     rotated = np.linalg.norm(step_between(best.recon_from_camera, more.recon_from_camera)[3:])
@@ -168,13 +168,7 @@ class _Matched:
         )
 
 
-def _located(
-    known: Known,
-    seen: _Matched,
-    intrinsics: Intrinsics,
-    is_given: bool,
-    seed: int,
-) -> Shared | int:
+def _located(known: Known, seen: _Matched, intrinsics: Intrinsics, is_given: bool) -> Shared | int:
     """As `localised`, of what was matched."""
     feature, row, count = seen.feature, seen.row, len(seen.x_px)
     rays = unproject(known.intrinsics, seen.row_x_px)[:, :2]
@@ -184,9 +178,12 @@ def _located(
         return int(good.sum())
     candidate = np.flatnonzero(good)
     x_px, points_seen = seen.x_px[candidate], points[candidate]
-    placed = _estimate_place(x_px, points_seen, intrinsics, is_given, seed)
+    placed = _estimate_place(x_px, points_seen, intrinsics, is_given)
     if is_given:
-        placed = _with_more(placed, _estimate_place(x_px, points_seen, intrinsics, False, seed))
+        # Wrong intrinsics leave those points that agree with a wrong place: another focal length explains more.
+        free = _estimate_place(x_px, points_seen, intrinsics, False)
+        given, more = (0 if place is None else int(place[2].sum()) for place in (placed, free))
+        placed = free if more > CLEARLY_MORE * given else placed
     if placed is None:
         return 0
     recon_from_camera, intrinsics, inlier = placed
@@ -194,11 +191,8 @@ def _located(
         return int(inlier.sum())
     agreed = candidate[inlier]
     # Of the known images' observations those that the point meets.
-    in_camera = np.einsum(
-        "cji,cj->ci",
-        known.recon_from_camera[row, :3, :3],
-        points[feature] - known.recon_from_camera[row, :3, 3],
-    )
+    rotation, centre = known.recon_from_camera[row, :3, :3], known.recon_from_camera[row, :3, 3]
+    in_camera = np.einsum("cji,cj->ci", rotation, points[feature] - centre)
     ahead = in_camera[:, 2] > 1e-6
     miss = np.full(len(row), np.inf)
     miss[ahead] = np.linalg.norm(project(known.intrinsics, in_camera[ahead]) - seen.row_x_px[ahead], axis=1)
@@ -216,13 +210,6 @@ def _located(
     )
 
 
-def _with_more(given: "_Place | None", free: "_Place | None") -> "_Place | None":
-    """The place with the given intrinsics, unless one with another focal length explains clearly more points: wrong
-    intrinsics leave those points that agree with a wrong place."""
-    of_given, of_free = (0 if place is None else int(place[2].sum()) for place in (given, free))
-    return free if of_free > CLEARLY_MORE * of_given else given
-
-
 _Place = tuple[Float[ndarray, "4 4"], Intrinsics, ndarray]
 """Pose, intrinsics and inliers."""
 
@@ -232,16 +219,13 @@ def _estimate_place(
     points: Float[ndarray, "p 3"],
     intrinsics: Intrinsics,
     is_given: bool,
-    seed: int,
 ) -> _Place | None:
     """None where no pose has enough of these."""
-    estimation, refinement = (
-        pycolmap.AbsolutePoseEstimationOptions(),
-        pycolmap.AbsolutePoseRefinementOptions(),
-    )
+    estimation = pycolmap.AbsolutePoseEstimationOptions()
+    refinement = pycolmap.AbsolutePoseRefinementOptions()
     estimation.estimate_focal_length = not is_given
     estimation.ransac.max_error = 2 * GATE_PX * max(1.0, intrinsics.width / 1600)
-    estimation.ransac.max_num_trials, estimation.ransac.random_seed = TRIALS, seed
+    estimation.ransac.max_num_trials, estimation.ransac.random_seed = TRIALS, 0
     refinement.refine_focal_length = not is_given
     refinement.print_summary = False
     camera = camera_of(intrinsics, is_given)
@@ -254,15 +238,8 @@ def _estimate_place(
     recon_from_camera = inverse(transform(motion.rotation.matrix(), motion.translation))
     if not is_given:
         focal, cx, cy, k1, k2 = (float(value) for value in camera.params)
-        intrinsics = Intrinsics(
-            focal,
-            focal,
-            cx - HALF_PIXEL,
-            cy - HALF_PIXEL,
-            intrinsics.width,
-            intrinsics.height,
-            (k1, k2, 0.0, 0.0, 0.0),
-        )
+        size, distortion = (intrinsics.width, intrinsics.height), (k1, k2, 0.0, 0.0, 0.0)
+        intrinsics = Intrinsics(focal, focal, cx - HALF_PIXEL, cy - HALF_PIXEL, *size, distortion)
     return recon_from_camera, intrinsics, np.asarray(found["inlier_mask"], bool)
 
 

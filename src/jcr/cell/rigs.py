@@ -70,7 +70,7 @@ class Rigs:
         if not len(seen.rows):
             most = int(np.argmax(seen.counts))
             best, count = seen.camera.images[most], float(seen.counts[most])
-            return seen.refused(Kind.FEW_POINTS_SHARED, "images", (best,), count)
+            return seen.refused(Kind.FEW_POINTS_SHARED, "images", best, value=count)
         if seen.camera.arm is not None:
             return self._on_other_arm(seen, seen.camera.arm)
         return self._on_same_gripper(seen) if seen.camera.mount == "gripper" else self._fixed(seen)
@@ -78,15 +78,14 @@ class Rigs:
     def _fixed(self, seen: CameraViews) -> Member | CameraFound:
         places = seen.places
         names = [seen.camera.images[k] for k in seen.rows]
-        apart = step_between(places[:, None], places[None])
-        metres, radians = (np.linalg.norm(apart[..., part], axis=-1) for part in (slice(0, 3), slice(3, 6)))
+        metres, radians = _apart(places[:, None], places)
         most_m, most_rad = SAME_PLACE
         if not seen.agrees_with_given:
             most_m, most_rad = SAME_PLACE_OF_UNKNOWN[0] * seen.distance, SAME_PLACE_OF_UNKNOWN[1]
         if metres.max() > most_m or radians.max() > most_rad:
             a, b = np.unravel_index((metres / most_m + radians / most_rad).argmax(), metres.shape)
-            apart_m, apart_rad = float(metres[a, b]), float(radians[a, b])
-            return seen.refused(Kind.NOT_FIXED, "mount", (names[a], names[b]), apart_m, rotation=apart_rad)
+            apart = {"value": float(metres[a, b]), "rotation": float(radians[a, b])}
+            return seen.refused(Kind.NOT_FIXED, "mount", names[a], names[b], **apart)
         middle = int(metres.sum(1).argmin())
         rig = np.full(len(seen.shared), -1)
         rig[seen.rows] = len(self.poses)
@@ -97,22 +96,11 @@ class Rigs:
 
     def _at_own_camera(self, place: Float[ndarray, "4 4"]) -> tuple[Finding, ...]:
         """That a camera stands where the capture's own camera was at an image."""
-        off = step_between(np.stack(self.poses[: len(self._rows)]), place)
-        near = np.flatnonzero(
-            (np.linalg.norm(off[:, :3], axis=1) < AT_A_FRAME[0])
-            & (np.linalg.norm(off[:, 3:], axis=1) < AT_A_FRAME[1])
-        )
-        if not len(near):
-            return ()
-        return (
-            Finding.of(
-                Kind.AT_ANOTHER_CAMERA,
-                "warns",
-                "mount",
-                self._capture.images[self._rows[near[0]]],
-                camera=self._capture.camera_name,
-            ),
-        )
+        metres, radians = _apart(np.stack(self.poses[: len(self._rows)]), place)
+        near = np.flatnonzero((metres < AT_A_FRAME[0]) & (radians < AT_A_FRAME[1]))
+        images = [self._capture.images[self._rows[row]] for row in near[:1]]
+        own = self._capture.camera_name
+        return tuple(Finding.of(Kind.AT_ANOTHER_CAMERA, "warns", "mount", one, camera=own) for one in images)
 
     def _on_same_gripper(self, seen: CameraViews) -> Member | CameraFound:
         assert seen.camera.frame is not None
@@ -129,19 +117,17 @@ class Rigs:
         if not len(taken):
             return seen.refused(Kind.NO_COMMON_POSE, "images")
         wrist = np.stack(self.poses)[rig[taken]]
-        if not _differ(wrist):
-            names = tuple(seen.camera.images[k] for k in taken)
-            return seen.refused(Kind.ONE_GRIPPER_POSE, "images", names)
+        metres, radians = _apart(wrist[:, None], wrist)
+        if not ((metres > SAME_PLACE[0]) | (radians > SAME_PLACE[1])).any():
+            return seen.refused(Kind.ONE_GRIPPER_POSE, "images", *(seen.camera.images[k] for k in taken))
         on_rig = inverse(wrist) @ seen.places[np.isin(seen.rows, taken)]
         between = np.asarray(motion_length(inverse(on_rig)[:, None] @ on_rig[None]))
         middle = int(np.median(between, axis=1).argmin())
-        off = step_between(on_rig[middle], on_rig)
-        astray = (np.linalg.norm(off[:, :3], axis=1) > SAME_PLACE[0]) | (
-            np.linalg.norm(off[:, 3:], axis=1) > SAME_PLACE[1]
-        )
+        metres, radians = _apart(on_rig[middle], on_rig)
+        astray = (metres > SAME_PLACE[0]) | (radians > SAME_PLACE[1])
         if astray.mean() > 0.4:
-            most_m = float(np.linalg.norm(off[:, :3], axis=1).max())
-            return seen.refused(Kind.NOT_RIGID, "mount", value=most_m, camera=self._capture.camera_name)
+            most_m, own = float(metres.max()), self._capture.camera_name
+            return seen.refused(Kind.NOT_RIGID, "mount", value=most_m, camera=own)
         rig[taken[astray]] = -1
         why = "its place on the gripper is not that of its other images"
         seen = seen.without(dict.fromkeys(taken[astray].tolist(), why))
@@ -152,9 +138,8 @@ class Rigs:
         if arm in self.arms:
             return seen.refused(Kind.SECOND_ON_ARM, arm=arm)
         if len(seen.rows) < LEAST_POSES:
-            return seen.refused(
-                Kind.FEW_LOCALISED, "images", value=float(len(seen.rows)), needed=float(LEAST_POSES)
-            )
+            counts = {"value": float(len(seen.rows)), "needed": float(LEAST_POSES)}
+            return seen.refused(Kind.FEW_LOCALISED, "images", **counts)
         places, gripper = seen.places, seen.camera.base_from_gripper[seen.rows]
         std = max(float(np.sqrt(self._hand_eye.covariance[6, 6])), 1e-4)
         found = solve_hand_eye(gripper, places, scale=1.0, scale_std=std)
@@ -194,8 +179,9 @@ class Rigs:
         return [first, *others]
 
 
-def _differ(places: Float[ndarray, "k 4 4"]) -> bool:
-    """Whether two of them are farther apart than SAME_PLACE."""
-    apart = step_between(places[:, None], places[None])
-    metres, radians = (np.linalg.norm(apart[..., part], axis=-1) for part in (slice(0, 3), slice(3, 6)))
-    return bool((metres > SAME_PLACE[0]).any() or (radians > SAME_PLACE[1]).any())
+def _apart(
+    places: Float[ndarray, "*#k 4 4"], others: Float[ndarray, "*#k 4 4"]
+) -> tuple[Float[ndarray, "..."], Float[ndarray, "..."]]:
+    """Distance (m) and angle (rad) between places, which broadcast."""
+    step = step_between(places, others)
+    return np.linalg.norm(step[..., :3], axis=-1), np.linalg.norm(step[..., 3:], axis=-1)

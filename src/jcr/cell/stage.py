@@ -23,12 +23,7 @@ from jcr.capture.images import read_image
 from jcr.cell.camera_views import CameraViews
 from jcr.cell.found import ArmFound, CameraFound, CellFound, ImageFound
 from jcr.cell.images import CellImages, cell_images
-from jcr.cell.localise import (
-    Shared,
-    guessed_intrinsics,
-    known_images,
-    localised,
-)
+from jcr.cell.localise import Shared, guessed_intrinsics, known_images, localised
 from jcr.cell.place_checks import (
     contradicting_image,
     crowded_points,
@@ -40,14 +35,7 @@ from jcr.cell.rigs import Member, Rigs
 from jcr.geometry import inverse, scale_translation
 from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress, silent, steps
-from jcr.records import (
-    Capture,
-    CellCamera,
-    Finding,
-    HandEye,
-    Kind,
-    Reconstruction,
-)
+from jcr.records import Capture, CellCamera, Finding, HandEye, Kind, Reconstruction
 
 SURE_OF_INTRINSICS = 3.5
 """Standard deviations from which a further camera's images are said to contradict its intrinsics: one image of 127
@@ -71,8 +59,13 @@ def place_cameras(
     if not others:
         return CellFound((), (), None)
     if not hand_eye.is_sound:
-        seen = map(CameraViews.nothing_of, others)
-        refused = [one.refused(Kind.OWN_REJECTED, camera=capture.camera_name) for one in seen]
+        why = (Finding.of(Kind.OWN_REJECTED, "rejects", camera=capture.camera_name),)
+        refused = [
+            CameraFound.not_placed(
+                one, why, [0] * len(one.images), ["the camera was not placed"] * len(one.images)
+            )
+            for one in others
+        ]
         return CellFound(tuple(refused), (), None)
     used = np.flatnonzero(hand_eye.inliers)
     rows = reconstruction.image_index[used]

@@ -29,6 +29,8 @@ class Argument:
     text: str
     choices: tuple[str, ...] = ()
     """Its values, where these are few."""
+    aliases: tuple[str, ...] = ()
+    """Its further names, --name, which help does not list: those of earlier versions."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +58,12 @@ def groups(record: Any, program: str) -> list[Group]:
 
 def _argument(action: Any) -> Argument:
     value = "" if action.nargs == 0 else action.metavar or ""
+    flags = action.option_strings  # the aliases come first
     text = " ".join(str(action.help).replace("%%", "%").split())
     return Argument(
-        flag=action.option_strings[-1] if action.option_strings else "",
+        flag=flags[-1] if flags else "",
         value=" ".join(value) if isinstance(value, tuple) else value,
         text=NO_DEFAULT.sub("", text),
         choices=tuple(choice for choice in action.choices or () if choice != "None"),
+        aliases=tuple(flags[:-1]),
     )

@@ -1,8 +1,8 @@
 """`jcr models`: networks and other back ends, their licences, and the weights on this machine; `get` downloads some."""
 
 import sys
-from dataclasses import asdict, dataclass, field
-from typing import Annotated, Literal
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -36,43 +36,23 @@ class Arguments:
     output: Output = field(default_factory=Output)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Model:
-    """A row of the list."""
-
-    backend: str
-    """For --backend."""
-    weights: str
-    """Hub id; empty where none are needed."""
-    licence: str
-    commercial: bool
-    scale: str
-    parameters_m: int
-    """Of the network, in millions; 0 where there is none, or it is not stated."""
-    download_gb: float
-    present: str
-    """yes, or what is missing and the command that gets it."""
-    accuracy: str = ""
-    """As measured; empty: not measured here."""
-
-
 SCALES = {True: "metres", False: "arbitrary", None: "your file's is_metric"}
 
 
-def models() -> list[Model]:
-    """The back ends, in the order of `auto`."""
+def models() -> list[dict[str, Any]]:
+    """The back ends, in the order of `auto`: what --json prints of each."""
     return [
-        Model(
-            backend=row.name,
-            weights=row.hub_id,
-            licence=row.licence,
-            commercial=row.commercial,
-            scale=SCALES[row.metric],
-            parameters_m=row.parameters,
-            download_gb=row.download_gb,
-            present=_present(row),
-            accuracy=row.accuracy,
-        )
+        {
+            "backend": row.name,
+            "weights": row.hub_id,
+            "licence": row.licence,
+            "commercial": row.commercial,
+            "scale": SCALES[row.metric],
+            "parameters_m": row.parameters,
+            "download_gb": row.download_gb,
+            "present": _present(row),
+            "accuracy": row.accuracy,
+        }
         for row in BACKENDS.values()
     ]
 
@@ -84,20 +64,20 @@ def _present(row: Backend) -> str:
     return f"no: {'; '.join(missing)}" if missing else "yes"
 
 
-def as_text(rows: list[Model]) -> str:
+def as_text(rows: list[dict[str, Any]]) -> str:
     """The list for a terminal."""
     lines = []
     for row in rows:
-        size = f", {row.parameters_m} M parameters" if row.parameters_m else ""
-        size += f", {row.download_gb:g} GB" if row.download_gb else ""
-        use = "" if row.commercial else " (not for commercial use)"
+        size = f", {row['parameters_m']} M parameters" if row["parameters_m"] else ""
+        size += f", {row['download_gb']:g} GB" if row["download_gb"] else ""
+        limited = not row["commercial"] and "non-commercial" not in row["licence"]
         lines += [
-            f"{row.backend:<12} {row.weights or 'no weights needed'}{size}",
-            f"{'':<12} licence: {row.licence}" + ("" if "non-commercial" in row.licence else use),
-            f"{'':<12} scale: {row.scale}; here: {row.present}",
+            f"{row['backend']:<12} {row['weights'] or 'no weights needed'}{size}",
+            f"{'':<12} licence: {row['licence']}{' (not for commercial use)' * limited}",
+            f"{'':<12} scale: {row['scale']}; here: {row['present']}",
         ]
-        if row.accuracy:
-            lines.append(f"{'':<12} accuracy: {row.accuracy}")
+        if row["accuracy"]:
+            lines.append(f"{'':<12} accuracy: {row['accuracy']}")
     return "\n".join(lines) + "\n"
 
 
@@ -108,7 +88,7 @@ def main(arguments: Arguments) -> int:
     if arguments.name is not None or arguments.accept_licence or arguments.revision is not None:
         raise InputError("jcr models: a name, --accept-licence and --revision are for jcr models get NAME")
     rows = models()
-    arguments.output.result(as_text(rows), {"models": [asdict(row) for row in rows]})
+    arguments.output.result(as_text(rows), {"models": rows})
     return 0
 
 

@@ -30,9 +30,11 @@ def parsed(record: type, program: str, arguments: Sequence[str]) -> Any:
 
 
 def _complaint(event: _errors.ParseErrorEvent, record: type, program: str, arguments: Sequence[str]) -> str:
-    flags = [argument.flag for group in groups(record, program) for argument in group.arguments]
+    listed = [argument for group in groups(record, program) for argument in group.arguments]
+    flags = [argument.flag for argument in listed]
+    known = {*flags, *(alias for argument in listed for alias in argument.aliases)}
     options = (word.partition("=")[0] for word in arguments if word.startswith("--"))
-    if unknown := next((word for word in options if word.replace("_", "-") not in flags), None):
+    if unknown := next((word for word in options if word.replace("_", "-") not in known), None):
         return f"{program} has no option {unknown}{did_you_mean(unknown, filter(None, flags))}"
     match event:
         case _errors.UnrecognizedArgs(tokens=[first, *_]):

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from jcr.calibration.calibration_json import CalibrationFile, GivenIntrinsicsKept
     from jcr.cell.cameras_json import CameraPlaced
     from jcr.export.views import PosedImages
-    from jcr.records import Capture, Intrinsics, PointCloud, Reconstruction
-    from jcr.represent.scene import SceneMap
+    from jcr.records import Capture, Intrinsics, Reconstruction
 
 
 @dataclass(frozen=True)
@@ -229,16 +228,6 @@ class Run:
         return found.record()
 
     @cached_property
-    def scene(self) -> "SceneMap":
-        """map.safetensors; asked for before what writes it is imported, which needs torch as well."""
-        return self.folder.scene()
-
-    @cached_property
-    def cloud(self) -> "PointCloud":
-        """cloud.ply."""
-        return self.folder.cloud()
-
-    @cached_property
     def capture(self) -> "Capture":
         """The images and poses the run was made from."""
         return self.folder.capture()
@@ -310,32 +299,35 @@ def _joint_offsets(run: Run, path: Path) -> None:
 def _ply(run: Run, path: Path) -> None:
     from jcr.represent.cloud_ply import write_cloud
 
-    write_cloud(path, run.cloud, run.provenance.notes)
+    write_cloud(path, run.folder.cloud(), run.provenance.notes)
+
+
+# A map that is missing is named before what writes it is imported, which needs torch as well.
 
 
 def _glb(run: Run, path: Path) -> None:
-    scene = run.scene
+    scene = run.folder.scene()
     from jcr.export.volume import write_glb
 
     write_glb(path, scene, run.provenance)
 
 
 def _octomap(run: Run, path: Path) -> None:
-    scene = run.scene
+    scene = run.folder.scene()
     from jcr.export.volume import write_octomap
 
     write_octomap(path, scene, run.provenance, run.options.voxel_size)
 
 
 def _esdf(run: Run, path: Path) -> None:
-    scene = run.scene
+    scene = run.folder.scene()
     from jcr.export.volume import write_esdf
 
     write_esdf(path, scene, run.provenance, run.options.unknown or "occupied", run.options.voxel_size)
 
 
 def _spheres(run: Run, path: Path) -> None:
-    scene = run.scene
+    scene = run.folder.scene()
     from jcr.export.volume import write_spheres
 
     write_spheres(path, scene, run.provenance, run.options.unknown or "free", run.options.excess)
@@ -345,7 +337,7 @@ def _nerfstudio(run: Run, path: Path) -> None:
     from jcr.export.views import write_nerfstudio
 
     images = run.options.undistort, run.options.link_images
-    write_nerfstudio(path, run.views, run.cloud, run.provenance, *images, others=run.other_views)
+    write_nerfstudio(path, run.views, run.folder.cloud(), run.provenance, *images, others=run.other_views)
 
 
 def _colmap(run: Run, path: Path) -> None:
@@ -356,11 +348,11 @@ def _colmap(run: Run, path: Path) -> None:
 
 
 def _rerun(run: Run, path: Path) -> None:
-    scene = run.scene
+    scene = run.folder.scene()
     from jcr.export.rrd import write_rrd
 
     base_from_gripper = run.capture.base_from_gripper[run.reconstruction.image_index]
-    write_rrd(path, run.views, base_from_gripper, run.cloud, scene, run.provenance)
+    write_rrd(path, run.views, base_from_gripper, run.folder.cloud(), scene, run.provenance)
 
 
 FORMATS = (

@@ -84,21 +84,22 @@ def write_nerfstudio(
         frames, models = [], []
         for k, one in enumerate((views, *others)):
             below = "images" if k == 0 else f"images/{k}"
-            names, intrinsics = _place_images(made / below, one, undistorted, link)
-            models.append(intrinsics)
+            names, placed = _place_images(made / below, one, undistorted, link)
+            model, intrinsics = _nerfstudio_camera(placed)
+            models.append((model, intrinsics))
             frames += [
                 {
                     "file_path": f"{below}/{name}",
                     "transform_matrix": (base_from_camera @ _OPENGL_FROM_OPENCV).tolist(),
-                    **(_nerfstudio_intrinsics(intrinsics) if others else {}),
+                    **(intrinsics if others else {}),
                 }
                 for name, base_from_camera in zip(names, one.base_from_camera, strict=True)
             ]
-        if len({_nerfstudio_model(intrinsics) for intrinsics in models}) > 1:
+        if len({model for model, _ in models}) > 1:
             raise InputError("nerfstudio has one kind of distortion for all cameras; export with --undistort")
         content = {
-            "camera_model": _nerfstudio_model(models[0]),
-            **_nerfstudio_intrinsics(models[0]),
+            "camera_model": models[0][0],
+            **models[0][1],
             "ply_file_path": "points.ply",
             "frames": frames,
             "about": provenance.notes
@@ -108,16 +109,12 @@ def write_nerfstudio(
         write_cloud(made / "points.ply", cloud, provenance.notes)
 
 
-def _nerfstudio_model(intrinsics: Intrinsics) -> str:
+def _nerfstudio_camera(intrinsics: Intrinsics) -> tuple[str, dict[str, float]]:
+    """The kind of a camera, and its numbers."""
     if intrinsics.model == "rational":
         raise InputError("nerfstudio knows no rational distortion; export with --undistort")
     plain = intrinsics.model == "pinhole" and not any(intrinsics.distortion)
-    return "PINHOLE" if plain else "OPENCV_FISHEYE" if intrinsics.model == "fisheye" else "OPENCV"
-
-
-def _nerfstudio_intrinsics(intrinsics: Intrinsics) -> dict[str, float]:
-    plain = intrinsics.model == "pinhole" and not any(intrinsics.distortion)
-    return {
+    return "PINHOLE" if plain else "OPENCV_FISHEYE" if intrinsics.model == "fisheye" else "OPENCV", {
         "fl_x": intrinsics.fx,
         "fl_y": intrinsics.fy,
         # The centre of the first pixel is (0, 0) here and (0.5, 0.5) there.

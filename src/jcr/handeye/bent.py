@@ -85,9 +85,8 @@ WAYS: dict[Kind, Way] = {
 
 def bends(kinds: Iterable[Kind], base_from_gripper: Poses) -> Float[ndarray, "s b"]:
     """Errors of one standard deviation each of poses that are bent in these ways, s = 6n."""
-    return np.concatenate(
-        [WAYS[kind].std * _flat(WAYS[kind].steps(base_from_gripper)) for kind in kinds], axis=1
-    )
+    ways = [WAYS[kind] for kind in kinds]
+    return np.concatenate([way.std * _flat(way.steps(base_from_gripper)) for way in ways], axis=1)
 
 
 def _flat(steps: Float[ndarray, "n 6 p"]) -> Float[ndarray, "s p"]:

@@ -32,12 +32,10 @@ def closed_form(
     translation. The scale comes out 0 or less where the motions do not show it.
     """
     weights = np.ones(base_from_gripper.shape[:-2]) if weights is None else weights
-    rotation, base_rotation = rotations(
-        base_from_gripper[..., :3, :3], recon_from_camera[..., :3, :3], weights, rounds
-    )
-    translation, scale, base_translation = _translations(
-        base_from_gripper, recon_from_camera, base_rotation, weights
-    )
+    of_gripper, of_camera = base_from_gripper[..., :3, :3], recon_from_camera[..., :3, :3]
+    rotation, base_rotation = rotations(of_gripper, of_camera, weights, rounds)
+    found = _translations(base_from_gripper, recon_from_camera, base_rotation, weights)
+    translation, scale, base_translation = found
     return transform(rotation, translation), scale, transform(base_rotation, base_translation)
 
 
@@ -82,11 +80,8 @@ def rotations(
     pair of Σ w R_C ⊗ R_G solves it (Shah 2013); alone it is ambiguous where all motions are rotations by 180°.
     """
     batch, n = weights.shape[:-1], weights.shape[-1]
-    gripper, camera, weights = (
-        gripper.reshape(-1, n, 3, 3),
-        camera.reshape(-1, n, 3, 3),
-        weights.reshape(-1, n),
-    )
+    gripper, camera = gripper.reshape(-1, n, 3, 3), camera.reshape(-1, n, 3, 3)
+    weights = weights.reshape(-1, n)
     a, b = (np.swapaxes(of, -1, -2)[:, :, None] @ of[:, None] for of in (gripper, camera))
     pairs = (weights[:, :, None] * weights[:, None]).reshape(-1, 1, n * n)
     of_a, of_b = (sine_axis(of).reshape(-1, n * n, 3) for of in (a, b))

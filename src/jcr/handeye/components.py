@@ -57,9 +57,8 @@ def most_likely(
         curvature = information
         if step @ fell > 0:
             along = information @ step
-            curvature = (
-                information - np.outer(along, along) / (step @ along) + np.outer(fell, fell) / (step @ fell)
-            )
+            shown = np.outer(fell, fell) / (step @ fell)
+            curvature = information - np.outer(along, along) / (step @ along) + shown
         if np.abs(step).max() < settled or gained < 1e-9:
             break
     return at, information

@@ -6,7 +6,7 @@ camera's), and the best of them solved. Nothing is ever applied: a reading that 
 
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations
 
 import numpy as np
@@ -133,7 +133,8 @@ def better_reading(
     rough = np.array([_roughly(candidate, recon_from_camera) for candidate in worth])
     # Of a reading that may be named: shuffled poses fit no reading, and each would be solved in vain.
     enough = 1e-3 * ROUGHLY / BETTER * as_given.misfit
-    if rough.min() > min(enough, _roughly(candidates[0], recon_from_camera) / ROUGHLY):
+    limit = min(enough, _roughly(candidates[0], recon_from_camera) / ROUGHLY)
+    if not np.isfinite(rough.min()) or rough.min() > limit:
         return None
     readings = [
         _solved(candidate, recon_from_camera)
@@ -154,13 +155,9 @@ def convention_finding(found: tuple[Reading, Reading], severity: Severity = "rej
         for reading in found
     )
     remedy = OPTIONS.get(found[0].name, "correct them at their source")
-    return Finding(
-        kind=Kind.POSE_CONVENTION,
-        severity=severity,
-        mend="poses",
-        value=1e-3 * found[0].translation_mm,
-        details={"reading": found[0].name, "fits": best, "given": given, "remedy": remedy},
-    )
+    details = {"reading": found[0].name, "fits": best, "given": given, "remedy": remedy}
+    finding = Finding.of(Kind.POSE_CONVENTION, severity, "poses", value=1e-3 * found[0].translation_mm)
+    return replace(finding, details=details)
 
 
 def _solved(candidate: _Candidate, recon_from_camera: Poses) -> Reading:
@@ -203,18 +200,12 @@ def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
     mirror = np.diag([1.0, -1.0, 1.0, 1.0])
     yield _Candidate(MIRRORED, mirror @ base_from_gripper @ mirror, every)
     yield _Candidate("listed in reverse order of the images", base_from_gripper[::-1], every)
-    for shift in (1, 2):
-        if n - shift >= 5:
-            yield _Candidate(
-                f"{shift} ahead of the images (image k has pose k + {shift})",
-                base_from_gripper[shift:],
-                every[: n - shift],
-            )
-            yield _Candidate(
-                f"{shift} behind the images (image k has pose k − {shift})",
-                base_from_gripper[: n - shift],
-                every[shift:],
-            )
+    for shift in range(1, min(2, n - 5) + 1):
+        later, earlier = slice(shift, None), slice(n - shift)
+        ahead = f"{shift} ahead of the images (image k has pose k + {shift})"
+        behind = f"{shift} behind the images (image k has pose k − {shift})"
+        yield _Candidate(ahead, base_from_gripper[later], every[earlier])
+        yield _Candidate(behind, base_from_gripper[earlier], every[later])
     rotation = Rotation.from_matrix(base_from_gripper[:, :3, :3])
 
     def with_rotation(name: str, read: Rotation) -> _Candidate:
@@ -223,21 +214,18 @@ def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
     x, y, z, w = rotation.as_quat().T
     yield with_rotation(WXYZ, Rotation.from_quat(np.stack([y, z, w, x], 1)))
     yield with_rotation(XYZW, Rotation.from_quat(np.stack([w, x, y, z], 1)))
+    in_radians = "in radians that were taken as degrees"
     yield with_rotation(
-        "rotation vectors in radians that were taken as degrees",
-        Rotation.from_rotvec(np.degrees(rotation.as_rotvec())),
+        f"rotation vectors {in_radians}", Rotation.from_rotvec(np.degrees(rotation.as_rotvec()))
     )
     yield with_rotation(TRANSPOSED, rotation.inv())
     angles = {order: _euler(rotation, order) for order in EULER_ORDERS}
     for order in EULER_ORDERS:
-        yield with_rotation(
-            f"Euler angles ({order}) in radians that were taken as degrees",
-            Rotation.from_euler(order, np.degrees(angles[order])),
-        )
+        read = Rotation.from_euler(order, np.degrees(angles[order]))
+        yield with_rotation(f"Euler angles ({order}) {in_radians}", read)
     for taken, meant in EULER_MISTAKES:
-        yield with_rotation(
-            f"Euler angles {meant} that were taken as {taken}", Rotation.from_euler(meant, angles[taken])
-        )
+        read = Rotation.from_euler(meant, angles[taken])
+        yield with_rotation(f"Euler angles {meant} that were taken as {taken}", read)
 
 
 def _degrees_taken_as_radians(base_from_gripper: Poses, recon_from_camera: Poses) -> Iterator[_Candidate]:

@@ -36,8 +36,6 @@ from jcr.handeye.posterior import expected_covariance_at, expected_posterior, po
 from jcr.handeye.systematic import Region
 from jcr.records import Budget, RobotNoise
 
-SHOWN = 1.1
-"""Times the noise that was given: so much more is the residuals' doing."""
 ITERATIONS = 50
 
 Unknowns = tuple[Transform, float, Transform]
@@ -109,15 +107,7 @@ def fit_poses(problem: PoseProblem, start: Unknowns, averaged: bool = True) -> P
     if averaged:
         found = posterior(equations, log_sizes, information, linear.region)
         unknowns, covariance, budget = after(unknowns, found.step), found.covariance, found.budget
-    metres, radians, systematic = np.sqrt(equations.variances(log_sizes)).tolist()
-    noise = RobotNoise(
-        translation=metres,
-        rotation=radians,
-        estimated=exceeds((metres, radians), problem.noise),
-        given=problem.noise,
-        systematic=systematic,
-        systematic_left=equations.systematic_left(log_sizes),
-    )
+    noise = equations.noise(log_sizes)
     leave_one_out, leave_one_out_covariance = _leave_one_out(problem, linear, solution, noise)
     return PoseFit(
         gripper_from_camera=unknowns[0],
@@ -179,11 +169,6 @@ def after(unknowns: Unknowns, step: Float[ndarray, "13"]) -> Unknowns:
     """The unknowns after a step in the order of equation.py."""
     x, scale, z = unknowns
     return retract(x, step[:6]), float(scale * np.exp(step[6])), retract(z, step[7:])
-
-
-def exceeds(noise: tuple[float, float], given: tuple[float, float] | None) -> bool:
-    """Whether a noise is the residuals' doing, and not the one that was given."""
-    return given is None or any(size > SHOWN * known for size, known in zip(noise, given, strict=True))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -66,17 +66,14 @@ class Posture:
 
 
 def inverse_kinematics(
-    arm: Arm,
-    base_from_gripper: Float[ndarray, "n 4 4"],
-    flange_from_tool: Transform | None = None,
-    seed: int = 0,
+    arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"], flange_from_tool: Transform | None = None
 ) -> Posture:
     """Joint angles (n,dof) within the limits, continuous over the poses, and the misfit of each pose.
 
     `flange_from_tool` is the frame of the poses in the gripper frame of `arm`. None: the identity, or where the poses
     are then out of reach, a constant tool that explains them, estimated together with the angles.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     tool = np.eye(4) if flange_from_tool is None else flange_from_tool
     posture = _posture(arm, base_from_gripper, tool, rng)
     if posture.fits or flange_from_tool is not None:
@@ -91,11 +88,9 @@ def inverse_kinematics(
     return min(tried, key=lambda one: float((one.misfit_m**2 + (ARM * one.misfit_rad) ** 2).sum()))
 
 
-def required_posture(
-    arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"], flange_from_tool: Transform | None = None
-) -> Posture:
+def required_posture(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"]) -> Posture:
     """`inverse_kinematics`; InputError with the misfit where the poses do not fit the arm."""
-    posture = inverse_kinematics(arm, base_from_gripper, flange_from_tool)
+    posture = inverse_kinematics(arm, base_from_gripper)
     if posture.misfit_m.max() > REFUSED[0] * arm.reach or posture.misfit_rad.max() > REFUSED[1]:
         raise InputError(
             f"poses do not fit a {arm.name}: {1e3 * posture.misfit_m.max():.0f} mm, "
@@ -163,7 +158,10 @@ def _posture(
 ) -> Posture:
     """The best path through the solutions from many starts, for a known tool."""
     base_from_gripper = base_from_tool @ inverse(flange_from_tool)
-    starts = _starts(arm, len(base_from_tool), rng)
+    # The rest posture, and random angles within the limits (within the middle rotation of wider ones).
+    half = np.minimum(np.diff(arm.limits)[:, 0] / 2, np.pi)
+    starts = arm.limits.mean(1) + half * rng.uniform(-1, 1, (len(base_from_tool), STARTS, arm.dof))
+    starts[:, 0] = arm.rest
     if known is not None:
         starts = np.concatenate([known[:, None], starts], axis=1)
     n, s, dof = starts.shape
@@ -179,15 +177,6 @@ def _misfit(
     """Distance (m) and angle (rad) from each pose."""
     off = inverse(forward_kinematics(arm, joints) @ flange_from_tool) @ base_from_tool
     return np.stack([np.linalg.norm(off[:, :3, 3], axis=1), rotation_angle(off[:, :3, :3])], 1)
-
-
-def _starts(arm: Arm, n: int, rng: np.random.Generator) -> Float[ndarray, "n s dof"]:
-    """The rest posture, and random angles within the limits (within the middle rotation of wider ones)."""
-    middle = arm.limits.mean(1)
-    half = np.minimum(np.diff(arm.limits)[:, 0] / 2, np.pi)
-    starts = middle + half * rng.uniform(-1, 1, (n, STARTS, arm.dof))
-    starts[:, 0] = arm.rest
-    return starts
 
 
 def _path(arm: Arm, found: Float[ndarray, "n s dof"], misfit: Float[ndarray, "n s"]) -> Joints:

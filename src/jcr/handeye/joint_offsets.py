@@ -27,10 +27,8 @@ def systematic_p_value(
     J. Am. Stat. Assoc. 82, 1987).
     """
     both = _linearised(solved, base_from_gripper, recon_from_camera, systematic).equations
-    likely = [
-        float(solve(one, most_likely(one)[0]).log_likelihood)
-        for one in (both, replace(both, systematic=None))
-    ]
+    tried = both, replace(both, systematic=None)
+    likely = [float(solve(one, most_likely(one)[0]).log_likelihood) for one in tried]
     return float(chi2.sf(max(2 * (likely[0] - likely[1]), 0.0), 1) / 2)
 
 

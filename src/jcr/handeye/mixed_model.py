@@ -24,6 +24,8 @@ FACTOR_STD = np.log([10.0, 10.0, 3.0])
 servo arms 1 to 2°."""
 GIVEN_SHARE = 0.3
 """Of a given noise, that a robot has beside it: the middle of the prior."""
+SHOWN = 1.1
+"""Times the noise that was given: so much more is the residuals' doing."""
 LEAST_BESIDE = 0.01
 """Of what is counted anyway, that errors beside it are at least: the logarithm of no error is not finite."""
 RATIO_STD = np.log(4.0)
@@ -95,13 +97,20 @@ class Equations:
         variances = self.variances(log_sizes)
         return variances[..., :1] * self.of_position + variances[..., 1:2] * (1 - self.of_position)
 
-    def systematic_left(self, log_sizes: LogSizes) -> tuple[float, float]:
-        """Root mean square per axis (m, rad) of the systematic part of the residuals."""
-        if self.systematic is None:
-            return 0.0, 0.0
-        variance = self.variances(log_sizes)[2] * np.diag(self.systematic).reshape(-1, 2, 3).mean((0, 2))
-        metres, radians = np.sqrt(variance)
-        return float(metres), float(radians)
+    def noise(self, log_sizes: LogSizes) -> RobotNoise:
+        """The errors of the poses, where their sizes are these and there is a systematic part."""
+        assert self.systematic is not None
+        metres, radians, systematic = np.sqrt(self.variances(log_sizes)).tolist()
+        left = systematic * np.sqrt(np.diag(self.systematic).reshape(-1, 2, 3).mean((0, 2)))
+        shown = SHOWN * np.array(self.given or (0.0, 0.0))
+        return RobotNoise(
+            translation=metres,
+            rotation=radians,
+            estimated=bool((shown < (metres, radians)).any()),
+            given=self.given,
+            systematic=systematic,
+            systematic_left=(float(left[0]), float(left[1])),
+        )
 
     def covariance(self, log_sizes: LogSizes) -> Float[ndarray, "*k s s"]:
         """V of the residuals."""

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.geometry import Transform, inverse, motion_length, nearest_to_lines, rotation_exp, transform
-from jcr.handeye.equation import ASSUMED_NOISE, Poses, most_informative, point_ahead, pose_information
+from jcr.handeye.equation import Poses, most_informative, point_ahead, pose_information
 
 CANDIDATES = 600
 SCENE_AHEAD = (0.1, 2.0)
@@ -19,24 +19,17 @@ SCENE_AHEAD = (0.1, 2.0)
 
 def next_poses(
     base_from_gripper: Poses,
+    possible: Float[ndarray, "k 4 4"],
     count: int,
-    gripper_from_camera: Transform | None = None,
-    noise: tuple[float, float] = ASSUMED_NOISE,
-    reach: Float[ndarray, "2 3"] | None = None,
-    seed: int = 0,
-    distance_m: float | None = None,
+    x: Transform,
+    noise: tuple[float, float],
+    distance_m: float,
 ) -> Float[ndarray, "c 4 4"]:
-    """`count` gripper poses to add, best first.
+    """The `count` of the possible gripper poses to add, best first.
 
-    `reach` is the box (m, base) that gripper positions stay in; by default that of the capture and a quarter
-    more. Without a hand-eye transform that of `assumed_camera` is taken. They are best
-    for a point so far ahead of the camera; by default as far as the scene.
+    They are best for a point so far ahead of the camera, where the gripper poses have that noise (m, rad).
     """
-    x = assumed_camera(base_from_gripper) if gripper_from_camera is None else gripper_from_camera
-    possible = candidates(base_from_gripper, x, reach, np.random.default_rng(seed))
     known = pose_information(base_from_gripper, x, noise).sum(0)
-    if distance_m is None:
-        distance_m = float(np.median(looked_at(base_from_gripper @ x)[1]))
     information = pose_information(possible, x, noise)
     return possible[most_informative(known, information, count, point_ahead(x, distance_m))]
 
@@ -49,7 +42,10 @@ def nearest(poses: Float[ndarray, "c 4 4"], existing: Poses) -> Int[ndarray, " c
 def candidates(
     base_from_gripper: Poses, x: Transform, reach: Float[ndarray, "2 3"] | None, rng: np.random.Generator
 ) -> Float[ndarray, "k 4 4"]:
-    """Gripper poses in reach whose cameras look at the scene from about as far as the capture did."""
+    """Gripper poses whose cameras look at the scene from about as far as the capture did.
+
+    `reach` is the box (m, base) that gripper positions stay in; None: that of the capture and a quarter more.
+    """
     camera = base_from_gripper @ x
     center = camera[:, :3, 3]
     scene, distance = looked_at(camera)

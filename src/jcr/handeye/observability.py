@@ -7,6 +7,7 @@ for general motion, and the sine of the deviation for a nearly degenerate one.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -76,10 +77,10 @@ def observability(
 
 def _unseen(motion: str, at: Float[ndarray, "3"] | None = None, frame: str = "") -> Finding:
     """A direction that motions like this (words.py lists them) do not show; an axis, or point, of a frame."""
-    where = {} if at is None else dict(zip("xyz", at.tolist(), strict=True)) | {"frame": frame}
-    return Finding(
-        kind=Kind.UNOBSERVABLE, severity="rejects", mend="motion", details={"motion": motion, **where}
+    where: dict[str, Any] = (
+        {} if at is None else dict(zip("xyz", at.tolist(), strict=True)) | {"frame": frame}
     )
+    return Finding.of(Kind.UNOBSERVABLE, "rejects", "motion", motion=motion, **where)
 
 
 def _explained(

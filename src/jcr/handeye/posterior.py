@@ -46,11 +46,8 @@ def posterior(
     equations: Equations, log_sizes: LogSizes, information: Information, region: Region | None
 ) -> Posterior:
     """The unknowns averaged over the sizes about their mode; `region` adds what other poses of it would change."""
-
-    def elsewhere(solution: Solution, sizes: LogSizes) -> Stack:
-        return _elsewhere(equations, solution, sizes, region)
-
-    return _averaged(equations, log_sizes, over_sizes(equations, log_sizes, information), elsewhere)
+    found = over_sizes(equations, log_sizes, information)
+    return _averaged(equations, log_sizes, found, lambda one, at: _elsewhere(equations, one, at, region))
 
 
 def expected_posterior(equations: Equations, noise: RobotNoise, region: Region | None) -> Posterior:
@@ -88,10 +85,8 @@ def _averaged(
     step = weight @ steps
     off = steps - step
     covariance = np.einsum("k,kij->ij", weight, each) + np.einsum("k,ki,kj->ij", weight, off, off)
-    of_poses = slice(UNKNOWNS)
-    covariance *= _widening(
-        weight, off[:, of_poses], each[:, of_poses, of_poses], covariance[of_poses, of_poses]
-    )
+    n = UNKNOWNS
+    covariance *= _widening(weight, off[:, :n], each[:, :n, :n], covariance[:n, :n])
     at_mode = elsewhere(solve(equations, mode), mode)
     return Posterior(step, covariance, _budget(equations, mode, at_mode, covariance), mode)
 

@@ -15,14 +15,10 @@ def paper_residuals(
     used: Bool[ndarray, " n"],
 ) -> tuple[float, float]:
     """Mean δ_t (m) and δ_R (Frobenius norm) of A·X − X·B(λ) over consecutive used images (paper, eq. 8)."""
-    g, c = base_from_gripper[used], recon_from_camera[used]
-    a = inverse(g[:-1]) @ g[1:]
-    b = scale_translation(inverse(c[:-1]) @ c[1:], scale)
-    gap = a @ gripper_from_camera - gripper_from_camera @ b
-    return (
-        float(np.linalg.norm(gap[:, :3, 3], axis=1).mean()),
-        float(np.linalg.norm(gap[:, :3, :3], axis=(1, 2)).mean()),
-    )
+    a, b = (inverse(of[used][:-1]) @ of[used][1:] for of in (base_from_gripper, recon_from_camera))
+    gap = a @ gripper_from_camera - gripper_from_camera @ scale_translation(b, scale)
+    translation = np.linalg.norm(gap[:, :3, 3], axis=1).mean()
+    return float(translation), float(np.linalg.norm(gap[:, :3, :3], axis=(1, 2)).mean())
 
 
 def angle_ratio(

@@ -169,12 +169,8 @@ def least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> tuple[I
             if chosen.tobytes() in tried:
                 break
             tried.add(chosen.tobytes())
-            weights = chosen.astype(float)
-            subset = _squared_error(
-                *closed_form(base_from_gripper, recon_from_camera, weights),
-                base_from_gripper,
-                recon_from_camera,
-            )
+            found = closed_form(base_from_gripper, recon_from_camera, chosen.astype(float))
+            subset = _squared_error(*found, base_from_gripper, recon_from_camera)
             cost = float(np.sort(subset)[:keep].sum())
             if cost < best_cost:
                 best, best_cost = chosen, cost

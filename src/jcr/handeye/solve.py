@@ -17,7 +17,7 @@ from jcr.handeye.observability import observability
 from jcr.handeye.residuals import paper_residuals
 from jcr.handeye.robots import Arm, Joints
 from jcr.handeye.robust import robust_fit
-from jcr.handeye.systematic import systematic_errors
+from jcr.handeye.systematic import arm_errors, posed, smooth_errors
 from jcr.least_squares import one_blas_thread
 from jcr.records import (
     Estimate,
@@ -81,7 +81,12 @@ def solve_hand_eye(  # noqa: PLR0913 (published; each is a fact about the captur
     """
     gripper, camera = _checked_pairs(base_from_gripper, recon_from_camera)
     n = len(gripper)
-    cues = _with_scale(cues, scale, scale_std)
+    if scale is not None:
+        if not (np.isfinite([scale, scale_std]).all() and scale > 0 and scale_std > 0):
+            raise InputError(
+                f"scale: {scale} ± {scale_std} must be two positive numbers (m per unit, relative)"
+            )
+        cues = replace(cues or Cues(), scale=(scale, scale_std))
     if robot_noise is not None and not (np.isfinite(robot_noise).all() and min(robot_noise) > 0):
         raise InputError(f"robot_noise: {robot_noise} must be two positive numbers (m, rad)")
     if camera_covariance is not None and camera_covariance.shape != (6 * n, 6 * n):
@@ -89,7 +94,8 @@ def solve_hand_eye(  # noqa: PLR0913 (published; each is a fact about the captur
             f"camera_covariance: shape {camera_covariance.shape}; {n} poses need {(6 * n, 6 * n)}"
         )
     if systematic is None:
-        systematic = systematic_errors(gripper, *_checked_arm(robot, joints, n))
+        arm, angles = _checked_arm(robot, joints, n)
+        systematic = smooth_errors(gripper) if arm is None else arm_errors(*posed(arm, angles, gripper))
     fitted = _fit_distinct(gripper, camera, robot_noise, cues, camera_covariance, systematic)
     return judged(_with_residuals(gripper, camera, *fitted, cues))
 
@@ -173,24 +179,13 @@ def judged(hand_eye: HandEye) -> HandEye:
 
 def _of_agreement(hand_eye: HandEye) -> Iterator[Finding]:
     """Too few images, or none, that fit their gripper poses."""
-    used, n = int(hand_eye.inliers.sum()), len(hand_eye.inliers)
+    used, n = float(hand_eye.inliers.sum()), len(hand_eye.inliers)
     if used < max(3, MIN_SHARE_USED * n) and n > 2:
-        yield Finding(
-            kind=Kind.FEW_AGREE,
-            severity="rejects",
-            mend="reconstruction",
-            value=float(used),
-            details={"images": float(n)},
-        )
+        yield Finding.of(Kind.FEW_AGREE, "rejects", "reconstruction", value=used, images=float(n))
     metres, radians = hand_eye.robot_noise.together
     if metres > MAX_NOISE[0] or radians > MAX_NOISE[1]:
-        yield Finding(
-            kind=Kind.POSES_CONTRADICT_IMAGES,
-            severity="rejects",
-            mend="reconstruction",
-            value=metres,
-            details={"rotation": radians},
-        )
+        kind = Kind.POSES_CONTRADICT_IMAGES
+        yield Finding.of(kind, "rejects", "reconstruction", value=metres, rotation=radians)
 
 
 def _of_uncertainty(hand_eye: HandEye) -> Iterator[Finding]:
@@ -203,13 +198,8 @@ def _of_uncertainty(hand_eye: HandEye) -> Iterator[Finding]:
     parts = {"translation": std[:3].max(), "rotation": std[3:6].max(), "scale": std[6]}
     for (part, value), limit in zip(parts.items(), MAX_STD, strict=True):
         if value > limit:
-            yield Finding(
-                kind=Kind.UNCERTAIN,
-                severity="rejects",
-                mend="images",
-                value=float(value),
-                details={"part": part} | ({"noise_unknown": 1.0} if unknown else {}),
-            )
+            of_noise = {"noise_unknown": 1.0} if unknown else {}
+            yield Finding.of(Kind.UNCERTAIN, "rejects", "images", value=float(value), part=part, **of_noise)
 
 
 def _of_residuals(hand_eye: HandEye) -> Iterator[Finding]:
@@ -219,26 +209,14 @@ def _of_residuals(hand_eye: HandEye) -> Iterator[Finding]:
     if noise.given is not None and (
         metres > SURPRISE * noise.given[0] or radians > SURPRISE * noise.given[1]
     ):
-        yield Finding(
-            kind=Kind.NOISE_ABOVE_GIVEN,
-            severity="warns",
-            value=metres,
-            details={"rotation": radians, "given": noise.given[0], "given_rotation": noise.given[1]},
-        )
+        details = {"rotation": radians, "given": noise.given[0], "given_rotation": noise.given[1]}
+        yield Finding.of(Kind.NOISE_ABOVE_GIVEN, "warns", "none", value=metres, **details)
     if (leave_one_out := hand_eye.leave_one_out) is not None:
         leave_one_out_m, typical = 1e-3 * leave_one_out.translation_mm, float(np.sqrt(3)) * noise.together[0]
         if leave_one_out_m > max(3 * typical, WELL_ABOVE):
-            yield Finding(
-                kind=Kind.LEAVE_ONE_OUT,
-                severity="warns",
-                mend="images",
-                value=leave_one_out_m,
-                details={"residual": typical},
-            )
+            yield Finding.of(Kind.LEAVE_ONE_OUT, "warns", "images", value=leave_one_out_m, residual=typical)
     if len(hand_eye.inliers) < FEW:
-        yield Finding(
-            kind=Kind.FEW_IMAGES, severity="warns", mend="images", value=float(len(hand_eye.inliers))
-        )
+        yield Finding.of(Kind.FEW_IMAGES, "warns", "images", value=float(len(hand_eye.inliers)))
 
 
 def _disagreement(hand_eye: HandEye) -> tuple[float, float]:
@@ -256,14 +234,12 @@ def _disagreement(hand_eye: HandEye) -> tuple[float, float]:
 def _reasons(
     used: Bool[ndarray, " n"], metres: Float[ndarray, " n"], radians: Float[ndarray, " n"], noise: RobotNoise
 ) -> tuple[str | None, ...]:
-    typical_m, typical_rad = noise.together
+    typical = f"(their noise: {1e3 * noise.together[0]:.1f} mm, {np.degrees(noise.together[1]):.2f}°)"
+    put = "from where the other images put it"
     return tuple(
         None
         if is_used
-        else (
-            f"its gripper pose is {1e3 * m:.1f} mm and {np.degrees(rad):.2f}° from where the other "
-            f"images put it (their noise: {1e3 * typical_m:.1f} mm, {np.degrees(typical_rad):.2f}°)"
-        )
+        else f"its gripper pose is {1e3 * m:.1f} mm and {np.degrees(rad):.2f}° {put} {typical}"
         for is_used, m, rad in zip(used, metres, radians, strict=True)
     )
 
@@ -291,15 +267,6 @@ def _checked_pairs(base_from_gripper: ArrayLike, recon_from_camera: ArrayLike) -
     return gripper, camera
 
 
-def _with_scale(cues: Cues | None, scale: float | None, std: float) -> Cues | None:
-    """The cues with a known scale, where one is given."""
-    if scale is None:
-        return cues
-    if not (np.isfinite([scale, std]).all() and scale > 0 and std > 0):
-        raise InputError(f"scale: {scale} ± {std} must be two positive numbers (m per unit, relative)")
-    return replace(cues or Cues(), scale=(scale, std))
-
-
 def _checked_arm(
     robot: str | Arm | None, joints: ArrayLike | None, count: int
 ) -> tuple[Arm | None, Joints | None]:
@@ -310,10 +277,7 @@ def _checked_arm(
     arm = arm_named(robot) if isinstance(robot, str) else robot
     if joints is None:
         return arm, None
-    try:
-        angles = np.asarray(joints, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError("joints: not numbers; give an array (n,dof) in rad") from None
+    angles = _numbers(joints, "joints", "(n,dof) in rad")
     if angles.shape != (count, arm.dof):
         raise InputError(
             f"joints: shape {angles.shape}; {count} poses of a {arm.name} need {(count, arm.dof)}"
@@ -323,13 +287,17 @@ def _checked_arm(
     return arm, angles
 
 
-def _checked(transforms: ArrayLike, name: str) -> Float[ndarray, "n 4 4"]:
+def _numbers(values: ArrayLike, name: str, shape: str) -> Float[ndarray, "..."]:
     try:
-        stack = np.asarray(transforms, dtype=np.float64)
+        return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise InputError(f"{name}: not numbers; give an array (n,4,4)") from None
+        raise InputError(f"{name}: not numbers; give an array {shape}") from None
+
+
+def _checked(transforms: ArrayLike, name: str) -> Float[ndarray, "n 4 4"]:
+    stack = _numbers(transforms, name, "(n,4,4)")
     if stack.ndim != 3 or stack.shape[1:] != (4, 4):
         raise InputError(f"{name}: shape {stack.shape}; give one 4x4 matrix per image, (n,4,4)")
-    return np.stack([require_rigid(matrix, f"{name}[{i}]") for i, matrix in enumerate(stack)] or [np.eye(4)])[
-        : len(stack)
-    ]
+    return np.array([require_rigid(matrix, f"{name}[{i}]") for i, matrix in enumerate(stack)]).reshape(
+        -1, 4, 4
+    )

@@ -34,20 +34,8 @@ LEAST_FREE = 0.4
 """One less a pose's leverage counts as at least this: of three or four images every pose is nearly fitted by itself."""
 
 
-def systematic_errors(
-    base_from_gripper: Poses, arm: Arm | None = None, joints: Joints | None = None
-) -> Float[ndarray, "s s"]:
-    """Covariance (6n,6n) of systematic errors at 1 rad: those of the arm, or of nobody knows what.
-
-    Without `joints` (n,dof) they are found from the poses. InputError where poses, joints and arm do not fit.
-    """
-    if arm is None:
-        return smooth_errors(base_from_gripper)
-    return arm_errors(*posed(arm, joints, base_from_gripper))
-
-
 def posed(arm: Arm, joints: Joints | None, base_from_gripper: Poses) -> tuple[Arm, Joints]:
-    """The arm with the tool that it carries, and its joint angles at the poses.
+    """The arm with the tool that it carries, and its joint angles at the poses, which show them where `joints` is None.
 
     InputError where poses, joints and arm do not fit.
     """
@@ -98,8 +86,7 @@ class Region:
     @staticmethod
     def of_poses(jacobian: Float[ndarray, "s p"]) -> "Region":
         """That of the poses whose residuals have this derivative; the least change where these do not determine it."""
-        by_unknown = np.delete(jacobian[:, :13], SCALE, axis=1)
-        return Region.of_unknowns(by_unknown, jacobian.shape[1])
+        return Region.of_unknowns(np.delete(jacobian[:, :13], SCALE, axis=1), jacobian.shape[1])
 
     @staticmethod
     def of_unknowns(by_unknown: Float[ndarray, "s u"], unknowns: int) -> "Region":

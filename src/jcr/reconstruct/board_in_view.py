@@ -26,13 +26,10 @@ LONG_SIDE_PX = 800
 def board_in_view(images: Sequence[UInt8[ndarray, "h w 3"]]) -> str | None:
     """A --board for what the images show, with SIDE (and MARKER) for the lengths; None without a board."""
     chosen = [images[k] for k in np.unique(np.linspace(0, len(images) - 1, LOOKED_AT).astype(int))]
-    grey = [_smaller(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) for image in chosen]
+    grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in chosen]
+    if (factor := LONG_SIDE_PX / max(grey[0].shape)) < 1:
+        grey = [cv2.resize(one, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) for one in grey]
     return _tags(grey) or _chessboard(grey)
-
-
-def _smaller(grey: UInt8[ndarray, "h w"]) -> UInt8[ndarray, "h2 w2"]:
-    factor = LONG_SIDE_PX / max(grey.shape)
-    return cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else grey
 
 
 def _tags(grey: list[UInt8[ndarray, "h w"]]) -> str | None:

@@ -6,7 +6,6 @@ with the cameras fixed.
 
 import tempfile
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +16,13 @@ from numpy import ndarray
 from jcr.capture import colmap_model, transforms_json
 from jcr.capture.images import read_image
 from jcr.errors import InputError, RejectedError
-from jcr.geometry import inverse
 from jcr.match.matchers import Matcher
 from jcr.match.pairs import all_pairs
 from jcr.match.verify import write_geometries, write_keypoints
 from jcr.memory import plan
 from jcr.progress import Progress, silent
 from jcr.reconstruct.colmap_options import ColmapOptions
+from jcr.reconstruct.placed import model_of
 from jcr.reconstruct.sfm import enter, log_level, sift_features, tracks_of
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
@@ -115,15 +114,6 @@ def _triangulated(
         pairs = all_pairs(len(images))
         write_keypoints(database, matcher.x_px)
         write_geometries(database, matcher.geometries(pairs, np.zeros((len(pairs), 2))))
-        model = pycolmap.Reconstruction()
-        model.add_camera_with_trivial_rig(cameras[0])
-        with closing(pycolmap.Database.open(database)) as db:
-            for image, camera_from_recon in zip(
-                db.read_all_images(), inverse(recon_from_camera), strict=True
-            ):
-                image.points2D = pycolmap.Point2DList(
-                    [pycolmap.Point2D(xy) for xy in db.read_keypoints(image.image_id)[:, :2]]
-                )
-                model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera_from_recon[:3]))
+        model = model_of(database, cameras[0], dict(enumerate(recon_from_camera)))
         model = pycolmap.triangulate_points(model, database, folder, Path(folder))
         return tracks_of(model, range(1, len(images) + 1), (intrinsics.width, intrinsics.height))

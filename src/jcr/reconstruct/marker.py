@@ -3,6 +3,7 @@
 Pose of a plane from its points: IPPE (Collins and Bartoli, IJCV 2014), then least squares in pixels.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -58,7 +59,11 @@ def reconstruct_marker(
     intrinsics, intrinsics_notes = _intrinsics(capture, board, seen)
     notes += intrinsics_notes
     if (fold_px := fold_distance_px(intrinsics)) is not None:
-        seen = [_within(sightings, intrinsics, fold_px) for sightings in seen]
+        centre, limit_px = np.array([intrinsics.cx, intrinsics.cy]), WITHIN_FOLD * fold_px
+        seen = [
+            [s for s in sightings if np.linalg.norm(s.x_px - centre, axis=1).max() < limit_px]
+            for sightings in seen
+        ]
         notes.append(f"the distortion folds over at {fold_px:.0f} px from the centre: nothing beyond is used")
     poses = [{s.body: pose for s in sightings if (pose := pose_of_body(s, intrinsics))} for sightings in seen]
     recon_from_camera, recon_from_body = locate_cameras_and_bodies(poses)
@@ -120,12 +125,6 @@ def _intrinsics(
     ]
 
 
-def _within(sightings: Sequence[Sighting], intrinsics: Intrinsics, fold_px: float) -> list[Sighting]:
-    """The sightings whose points all lie where the distortion has an inverse."""
-    centre, limit_px = np.array([intrinsics.cx, intrinsics.cy]), WITHIN_FOLD * fold_px
-    return [s for s in sightings if np.linalg.norm(s.x_px - centre, axis=1).max() < limit_px]
-
-
 def pose_of_body(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:
     """The body's pose, unless its points lie on a line, miss, or leave open which way it is tilted."""
     x, x_px = sighting.x_in_body, sighting.x_px
@@ -165,14 +164,11 @@ def locate_cameras_and_bodies(
 
     A camera is placed by the body that it sees best, a body by the camera that sees it best.
     """
-    counts: dict[int, int] = {}
-    for bodies in poses:
-        for body in bodies:
-            counts[body] = counts.get(body, 0) + 1
+    counts = Counter(body for bodies in poses for body in bodies)
     cameras: dict[int, Float[ndarray, "4 4"]] = {}
     if not counts:
         return cameras, {}
-    placed = {max(sorted(counts), key=lambda body: counts[body]): np.eye(4)}
+    placed = {max(sorted(counts), key=counts.__getitem__): np.eye(4)}
     while True:
         new = [
             row for row, bodies in enumerate(poses) if row not in cameras and bodies.keys() & placed.keys()
@@ -229,22 +225,15 @@ def adjust_bodies(
 
 
 def _tracks(sightings: Sequence[Sequence[Sighting]], bodies: dict[int, Float[ndarray, "4 4"]]) -> Tracks:
-    place: dict[tuple[int, int], int] = {}
-    points, image, x_px, point = [], [], [], []
-    for row, shown in enumerate(sightings):
-        for s in shown:
-            x_in_recon = apply(bodies[s.body], s.x_in_body)
-            for k, index in enumerate(s.index):
-                if (s.body, index) not in place:
-                    place[s.body, index] = len(points)
-                    points.append(x_in_recon[k])
-                image.append(row)
-                x_px.append(s.x_px[k])
-                point.append(place[s.body, index])
+    seen = [(row, s) for row, shown in enumerate(sightings) for s in shown]
+    names = [(s.body, index) for _, s in seen for index in s.index]
+    place = {name: k for k, name in enumerate(dict.fromkeys(names))}
+    point = np.array([place[name] for name in names])
+    x_in_recon = np.concatenate([apply(bodies[s.body], s.x_in_body) for _, s in seen])
     return Tracks(
-        image=np.array(image),
-        x_px=np.array(x_px),
-        point=np.array(point),
-        points_in_recon=np.array(points),
+        image=np.repeat([row for row, _ in seen], [len(s.index) for _, s in seen]),
+        x_px=np.concatenate([s.x_px for _, s in seen]),
+        point=point,
+        points_in_recon=x_in_recon[np.unique(point, return_index=True)[1]],
         from_board=True,
     )

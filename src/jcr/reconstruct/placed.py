@@ -124,15 +124,7 @@ def retriangulated(
             if model is not None:
                 adjust(model)
                 poses = dict(zip(sorted(poses), poses_of(model, sorted(poses)), strict=True))
-            model = pycolmap.Reconstruction()
-            model.add_camera_with_trivial_rig(camera)
-            with closing(pycolmap.Database.open(database)) as db:
-                for row, pose in sorted(poses.items()):
-                    image = db.read_image(row + 1)
-                    image.points2D = pycolmap.Point2DList(
-                        [pycolmap.Point2D(xy) for xy in db.read_keypoints(row + 1)[:, :2]]
-                    )
-                    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(inverse(pose)[:3]))
+            model = model_of(database, camera, poses)
             options = pycolmap.IncrementalPipelineOptions()
             options.num_threads = options.mapper.num_threads = 1
             options.ba_global_max_refinements = refinements
@@ -142,6 +134,21 @@ def retriangulated(
             )
         assert model is not None
         return model
+
+
+def model_of(
+    database: Path, camera: pycolmap.Camera, recon_from_camera: dict[int, Float[ndarray, "4 4"]]
+) -> pycolmap.Reconstruction:
+    """A model of cameras by row, with the keypoints that a database has of their images, and no point yet."""
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera)
+    with closing(pycolmap.Database.open(database)) as db:
+        for row, pose in sorted(recon_from_camera.items()):
+            image = db.read_image(row + 1)
+            keypoints = [pycolmap.Point2D(xy) for xy in db.read_keypoints(row + 1)[:, :2]]
+            image.points2D = pycolmap.Point2DList(keypoints)
+            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(inverse(pose)[:3]))
+    return model
 
 
 def shared_points(model: pycolmap.Reconstruction, some: set[int]) -> int:

@@ -15,6 +15,9 @@ from jcr.records import Intrinsics, Pointmaps, Reconstruction
 LARGEST_MISFIT = 0.02
 """Median distance of points' projections from their own pixels, over the width, at which poses are wrong."""
 
+SAMPLES = 20_000
+"""Pixels of all images that the pinhole is fitted to, about."""
+
 
 @dataclass(frozen=True)
 class PosedPointmaps:
@@ -76,7 +79,6 @@ def fit_pinhole(
     recon_from_camera: Float[ndarray, "m 4 4"],
     points_in_recon: Float[ndarray, "m h w 3"],
     confidence: Float[ndarray, "m h w"],
-    samples: int = 20_000,
 ) -> tuple[Intrinsics, float]:
     """The pinhole that best projects points onto their pixels, and the median misfit in pixels.
 
@@ -84,7 +86,7 @@ def fit_pinhole(
     and McClure). The misfit is infinite where half the points lie behind their camera.
     """
     count, height, width = confidence.shape
-    stride = max(1, int(np.sqrt(confidence.size / samples)))
+    stride = max(1, int(np.sqrt(confidence.size / SAMPLES)))
     v, u = np.mgrid[:height:stride, :width:stride].reshape(2, -1)
     rays, pixels, weights = [], [], []
     for k in range(count):

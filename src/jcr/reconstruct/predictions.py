@@ -161,7 +161,7 @@ def _plain_grid(original: tuple[int, int], size: tuple[int, int], source: str) -
         if published.size == size:
             return published
     if abs(size[0] * original[1] - size[1] * original[0]) <= max(original):
-        return ImageGrid(original, size, (0, 0), size)
+        return ImageGrid.uncropped(original, size)
     raise InputError(
         f"{source}: pointmaps of {size[0]}x{size[1]} are no plain resize of {original[0]}x{original[1]} "
         "images; give their crop as array 'grid'"

@@ -42,6 +42,19 @@ class ImageGrid:
     size: tuple[int, int]
     """Width, height of what the network sees."""
 
+    @classmethod
+    def uncropped(cls, original_size: tuple[int, int], size: tuple[int, int]) -> "ImageGrid":
+        """The whole image resized to `size`."""
+        return cls(original_size, size, (0, 0), size)
+
+    @classmethod
+    def shrunk(cls, original_size: tuple[int, int], long_edge: int) -> "ImageGrid":
+        """The whole image, its long edge reduced to `long_edge` where it is longer."""
+        scale = min(1.0, long_edge / max(original_size))
+        return cls.uncropped(
+            original_size, (round(original_size[0] * scale), round(original_size[1] * scale))
+        )
+
     @property
     def scale(self) -> Float[ndarray, "2"]:
         """Resized over original, for x and y (they differ by the rounding of the sizes)."""

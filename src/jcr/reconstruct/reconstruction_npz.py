@@ -20,7 +20,8 @@ from jcr.records import Boards, Body, CameraEvidence, Pointmaps, Reconstruction,
 FORMAT = "jcr.reconstruction/8"
 """Changes with what the file holds."""
 WITH_DEPTH = "jcr.reconstruction/5"
-"""Read as well: it holds estimated depth as pointmaps without confidence, and no standard deviations of observations."""
+"""Version 0.1's, read as well: it holds estimated depth, or none as pointmaps without confidence, and no standard
+deviations of observations."""
 OF_TRACKS = ("image", "x_px", "point", "points_in_recon", "std_px")
 OF_POINTMAPS = ("points_in_recon", "confidence", "colors", "reason", "depth_std")
 

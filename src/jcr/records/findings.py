@@ -128,14 +128,7 @@ class Finding:
     ) -> "Finding":
         """A finding about these images, with further numbers and names as `details`."""
         return cls(
-            kind=kind,
-            severity=severity,
-            mend=mend,
-            images=images,
-            value=value,
-            std=std,
-            p=p,
-            details=details,
+            kind=kind, severity=severity, mend=mend, images=images, value=value, std=std, p=p, details=details
         )
 
     @property
@@ -149,10 +142,7 @@ def no_reconstruction(error: RejectedError) -> tuple[Finding, ...]:
     """The failure of every back end as findings."""
     details = {"text": error.what, "remedy": "; ".join(error.remedies)}
     failed = Finding(kind=Kind.NO_RECONSTRUCTION, severity="rejects", mend="reconstruction", details=details)
-    more = (
-        Finding(kind=Kind.RECONSTRUCTION, severity="warns", details={"text": text}) for text in error.also
-    )
-    return (failed, *more)
+    return (failed, *(Finding.of(Kind.RECONSTRUCTION, "warns", text=text) for text in error.also))
 
 
 CAMERA = frozenset(
@@ -205,13 +195,7 @@ def strongest_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 CONSEQUENCES = frozenset(
-    {
-        Kind.FEW_AGREE,
-        Kind.POSES_CONTRADICT_IMAGES,
-        Kind.NOISE_ABOVE_GIVEN,
-        Kind.UNCERTAIN,
-        Kind.LEAVE_ONE_OUT,
-    }
+    {Kind.FEW_AGREE, Kind.POSES_CONTRADICT_IMAGES, Kind.NOISE_ABOVE_GIVEN, Kind.UNCERTAIN, Kind.LEAVE_ONE_OUT}
 )
 """Kinds that are so because of what rejects a calibration, where that is a cause."""
 OF_FEW_IMAGES = frozenset({Kind.UNOBSERVABLE, Kind.SLIP, Kind.DRIFT, Kind.DELAY})

@@ -130,16 +130,28 @@ def _said(words: Words, finding: Finding) -> str:
 def _quantities(finding: Finding) -> dict[str, Any]:
     """What templates name: the finding's details and its numbers in the units in which they are read."""
     named = {"images": finding.images, "p": finding.p, "value": finding.value} | dict(finding.details)
+    for name, number in finding.details.items():
+        if not isinstance(number, str):
+            named |= {f"{name}_mm": 1e3 * number, f"{name}_deg": np.degrees(number)}
     if finding.p is not None:
         named["chance"] = f"p = {finding.p:.0e}"
         named["rough_chance"] = f"p = {finding.p:.1g}" if finding.p > 1e-6 else "p < 1e-6"
-    if finding.value is not None:
-        named |= {"mm": 1e3 * finding.value, "percent": 100 * finding.value}
-    if finding.std is not None:
-        named |= {"std": significant(finding.std), "std_percent": significant(100 * finding.std)}
+    if (value := finding.value) is not None:
+        named |= {"mm": 1e3 * value, "percent": 100 * value, "way": _Way(value), "size": abs(value)}
+        named |= {"size_percent": 100 * abs(value), "size_deg": np.degrees(abs(value))}
+    if (std := finding.std) is not None:
+        for unit, per in (("", 1), ("_percent", 100), ("_mm", 1e3), ("_deg", np.degrees(1))):
+            named[f"std{unit}"] = significant(per * std)
     if "rotation" in finding.details:
-        named["deg"] = np.degrees(_number(finding, "rotation"))
-    return named
+        named["deg"] = named["rotation_deg"]
+    return named | _of_axis(finding)
+
+
+class _Way(float):
+    """A number whose sign a template names: {way:long|short}."""
+
+    def __format__(self, words: str) -> str:
+        return words.split("|")[self <= 0]
 
 
 def _number(finding: Finding, name: str) -> float:
@@ -199,10 +211,7 @@ _UNSEEN = {
         "translation along {axis}: all rotations are about it (planar or SCARA motion)",
         f"{_TILT}, or give the camera's known height along it",
     ),
-    "one axis, translation": (
-        "translation along {axis}: all rotations are about it (one fixed axis)",
-        _TILT,
-    ),
+    "one axis, translation": ("translation along {axis}: all rotations are about it (one fixed axis)", _TILT),
     "one axis, scale": (
         "scale: the camera moves on circles about one axis only",
         "move the gripper sideways and in height as well",
@@ -252,12 +261,6 @@ def _to_be_sure(finding: Finding) -> str:
     )
 
 
-def _noisier(finding: Finding) -> str:
-    given = f"{1e3 * _number(finding, 'given'):.2g} mm, {np.degrees(_number(finding, 'given_rotation')):.2g}°"
-    found = "gripper poses and images disagree by {mm:.2g} mm and {deg:.2g}° per axis"
-    return f"{_said(found, finding)}, more than the given robot noise ({given}): the larger is used"
-
-
 def _to_be_exact(finding: Finding) -> str:
     if finding.mend == "images":
         more = int(_number(finding, "more_images"))
@@ -267,12 +270,6 @@ def _to_be_exact(finding: Finding) -> str:
     return (
         "a dozen more images would not be enough; move closer to the scene, or use a better camera or robot"
     )
-
-
-def _left_out(finding: Finding) -> str:
-    typical = f"{1e3 * _number(finding, 'residual'):.1f} mm"
-    much = "the leave-one-out error ({mm:.1f} mm) is well above the fit's residual"
-    return f"{_said(much, finding)} ({typical}): too few images for this motion"
 
 
 def _blurred(finding: Finding) -> str:
@@ -292,12 +289,6 @@ def _not_registered(finding: Finding) -> str:
 
 
 # The camera.
-
-
-def _by_distance(finding: Finding) -> str:
-    grows = "grows" if _value_and_std(finding)[0] > 0 else "shrinks"
-    size = f"{abs(100 * _value_and_std(finding)[0]):.1f} ± {_quantities(finding)['std_percent']} %"
-    return f"the focal length {grows} by {size} from the nearest view to the farthest ({_said('{chance}', finding)})"
 
 
 def _intrinsics(finding: Finding) -> str:
@@ -368,15 +359,6 @@ def _one_part(finding: Finding) -> str:
     )
 
 
-def _delayed(finding: Finding) -> str:
-    value, error = _value_and_std(finding)
-    how = f"{abs(value):.3f} ± {significant(error)} of the time from one image to the next"
-    if finding.details["unit"] == "s":
-        how = f"{1e3 * abs(value):.0f} ± {significant(1e3 * error)} ms"
-    late = "late" if value > 0 else "early"
-    return f"the gripper poses look as if read {how} too {late} ({_said('{chance}', finding)})"
-
-
 # The robot.
 
 
@@ -387,28 +369,6 @@ def _joints_off(finding: Finding) -> str:
     )
     named = f"joint{'s' * (len(finding.joints) > 1)} {joined(str(k) for k in finding.joints)}"
     return f"robot: {named} seem off by {sizes} ({_said('{rough_chance}', finding)})"
-
-
-def _lengths(finding: Finding) -> str:
-    value, std = _value_and_std(finding)
-    size = f"{100 * abs(value):.1f} ± {significant(100 * std)} % too {'long' if value > 0 else 'short'}"
-    return (
-        f"along {_of_axis(finding)['axis']} the robot's positions are {size} beside those across it "
-        f"({_said('{chance}', finding)})"
-    )
-
-
-def _leans(finding: Finding) -> str:
-    size, std = (np.degrees(number) for number in _value_and_std(finding))
-    which = "leans towards the gripper" if size > 0 else "leans away from the gripper"
-    by = f"{abs(size):.1f} ± {significant(std)}° per metre of reach"
-    return f"the robot's base {which} by {by}, which its poses do not say ({_said('{chance}', finding)})"
-
-
-def _sags(finding: Finding) -> str:
-    size, std = (np.degrees(number) for number in _value_and_std(finding))
-    by = f"{size:.2f} ± {significant(std)}° where it is level"
-    return f"the gripper rotates by {by}, as a tool does that sags under its weight ({_said('{chance}', finding)})"
 
 
 def _angles_differ(finding: Finding) -> str:
@@ -442,11 +402,6 @@ def _scales(finding: Finding) -> str:
     off, std = _value_and_std(finding)
     names = (LENGTHS[str(finding.details[name])] for name in ("one", "other"))
     return f"{' and '.join(names)} contradict each other by {100 * abs(off):.1f} ± {100 * std:.1f} %"
-
-
-def _board_side(finding: Finding) -> str:
-    side, std = (1e3 * value for value in _value_and_std(finding))
-    return f"by the robot's positions the sides of {finding.details['board']} are {side:.2f} ± {significant(std)} mm"
 
 
 def _to_board_side(finding: Finding) -> str:
@@ -525,11 +480,20 @@ _TEXT: dict[Kind, Words] = {
     Kind.FEW_AGREE: "only {value:.0f} of {images:.0f} images agree on one calibration",
     Kind.POSES_CONTRADICT_IMAGES: "gripper poses and images disagree by {mm:.0f} mm and {deg:.1f}° per axis",
     Kind.POSE_CONVENTION: "the poses fit when read as {reading}: {fits}, instead of {given}",
-    Kind.NOISE_ABOVE_GIVEN: _noisier,
+    Kind.NOISE_ABOVE_GIVEN: (
+        "gripper poses and images disagree by {mm:.2g} mm and {deg:.2g}° per axis, more than the given robot noise "
+        "({given_mm:.2g} mm, {given_rotation_deg:.2g}°): the larger is used"
+    ),
     Kind.UNCERTAIN: _uncertain,
-    Kind.LEAVE_ONE_OUT: _left_out,
+    Kind.LEAVE_ONE_OUT: (
+        "the leave-one-out error ({mm:.1f} mm) is well above the fit's residual ({residual_mm:.1f} mm): too few images "
+        "for this motion"
+    ),
     Kind.NOT_EXACT_ENOUGH: lambda f: f"{SHORT}: {_reached(f.details)}",
-    Kind.FOCUS_BY_DISTANCE: _by_distance,
+    Kind.FOCUS_BY_DISTANCE: (
+        "the focal length {way:grows|shrinks} by {size_percent:.1f} ± {std_percent} % from the nearest view to the "
+        "farthest ({chance})"
+    ),
     Kind.FOCUS_BY_IMAGE: (
         "the focal length differs between images by {percent:.1f} % (rms, each ± {std_percent} %; {chance})"
     ),
@@ -561,7 +525,10 @@ _TEXT: dict[Kind, Words] = {
         "the camera seems to drift on the gripper by {mm:.1f} mm and {deg:.2f}° from the first image to the last "
         "({chance})"
     ),
-    Kind.DELAY: _delayed,
+    Kind.DELAY: (
+        "the gripper poses look as if read {size:.3f} ± {std} of the time from one image to the next too "
+        "{way:late|early} ({chance})"
+    ),
     Kind.WRONG_MOUNT: "the images fit a camera that the gripper carries, not a fixed one",
     Kind.ROBOT_UNUSED: "the capture's robot is not used: {text}",
     Kind.SYSTEMATIC_ERRORS: (
@@ -569,13 +536,22 @@ _TEXT: dict[Kind, Words] = {
         "offsets or link errors"
     ),
     Kind.JOINT_OFFSETS: _joints_off,
-    Kind.LENGTHS: _lengths,
-    Kind.BASE_LEANS: _leans,
-    Kind.TOOL_SAGS: _sags,
+    Kind.LENGTHS: (
+        "along {axis} the robot's positions are {size_percent:.1f} ± {std_percent} % too {way:long|short} beside those "
+        "across it ({chance})"
+    ),
+    Kind.BASE_LEANS: (
+        "the robot's base leans {way:towards|away from} the gripper by {size_deg:.1f} ± {std_deg}° per metre of reach, "
+        "which its poses do not say ({chance})"
+    ),
+    Kind.TOOL_SAGS: (
+        "the gripper rotates by {size_deg:.2f} ± {std_deg}° where it is level, as a tool does that sags under its "
+        "weight ({chance})"
+    ),
     Kind.ANGLE_RATIO: _angles_differ,
     Kind.BOARD_SIZE: _board_size,
     Kind.SCALES: _scales,
-    Kind.BOARD_SIDE: _board_side,
+    Kind.BOARD_SIDE: "by the robot's positions the sides of {board} are {mm:.2f} ± {std_mm} mm",
     Kind.BOARD_MOVED: _board_moved,
     Kind.BOARD_NOT_FOUND: _board_not_found,
     Kind.NETWORK_SCALE: lambda f: network_scale(*(100 * x for x in _value_and_std(f))),

@@ -18,13 +18,13 @@ GIMBAL_LOCK = np.radians(89.9)
 """Pitch beyond which roll and yaw rotate about nearly the same axis."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Notation:
     """A transform, or a part of it, as numbers with one-sigma uncertainties in the same unit."""
 
     name: str
-    unit: str
     components: tuple[str, ...]
+    unit: str
     value: Float[ndarray, " k"]
     std: Float[ndarray, " k"]
     note: str = ""
@@ -47,42 +47,15 @@ def notations(
         fixed_axes += "; at gimbal lock: only the sum or difference of roll and yaw has a meaning"
     else:
         std_rpy = _std(roll_pitch_yaw_jacobian(rpy), noise)
-    names = ("roll", "pitch", "yaw")
+    angles = "Roll, pitch, yaw", ("roll", "pitch", "yaw")
+    degrees = np.degrees(rpy), np.degrees(std_rpy)
+    x, std_x = gripper_from_camera[:3, 3], np.sqrt(np.diag(covariance)[:3])
     return [
-        Notation(
-            name="Translation",
-            unit="m",
-            components=("x", "y", "z"),
-            value=gripper_from_camera[:3, 3],
-            std=np.sqrt(np.diag(covariance)[:3]),
-        ),
-        Notation(
-            name="Quaternion",
-            unit="",
-            components=("x", "y", "z", "w"),
-            value=quat_xyzw,
-            std=std_quat,
-            note="x, y, z, w: the scalar last",
-        ),
-        Notation(
-            name="Roll, pitch, yaw", unit="rad", components=names, value=rpy, std=std_rpy, note=fixed_axes
-        ),
-        Notation(
-            name="Roll, pitch, yaw",
-            unit="deg",
-            components=names,
-            value=np.degrees(rpy),
-            std=np.degrees(std_rpy),
-            note=fixed_axes,
-        ),
-        Notation(
-            name="Rotation vector",
-            unit="rad",
-            components=("rx", "ry", "rz"),
-            value=rotvec,
-            std=std_rotvec,
-            note="axis times angle",
-        ),
+        Notation("Translation", ("x", "y", "z"), "m", x, std_x),
+        Notation("Quaternion", tuple("xyzw"), "", quat_xyzw, std_quat, "x, y, z, w: the scalar last"),
+        Notation(*angles, "rad", rpy, std_rpy, fixed_axes),
+        Notation(*angles, "deg", *degrees, fixed_axes),
+        Notation("Rotation vector", ("rx", "ry", "rz"), "rad", rotvec, std_rotvec, "axis times angle"),
     ]
 
 

@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from jcr.calibration.words import leave_one_out_text
 from jcr.geometry import step_between
@@ -24,8 +22,9 @@ def residuals_section(result: RunResult | PosesResult) -> Section:
     fits = [now] if before is None else [now, before]
     names, used = shown_names(result.calibration.images), now.inliers
     columns = []
-    for residual, unit in ((_residual_mm, " mm"), (_residual_deg, "°")):
-        values = [residual(fit) for fit in fits]
+    mm = [1e3 * fit.images.translation_residual_m for fit in fits]
+    deg = [np.degrees(fit.images.rotation_residual_rad) for fit in fits]
+    for values, unit in ((mm, " mm"), (deg, "°")):
         longest = max(float(value[used].max(initial=0.0)) for value in values) or 1.0
         columns.append([_bar([value[k] for value in values], longest, unit) for k in range(len(used))])
     content = {
@@ -38,14 +37,6 @@ def residuals_section(result: RunResult | PosesResult) -> Section:
         "whole": _whole(fits[::-1]),
     }
     return Section("residuals", content)
-
-
-def _residual_mm(fit: HandEye) -> Float[ndarray, " n"]:
-    return 1e3 * fit.images.translation_residual_m
-
-
-def _residual_deg(fit: HandEye) -> Float[ndarray, " n"]:
-    return np.degrees(fit.images.rotation_residual_rad)
 
 
 def _refinement(before: HandEye, now: HandEye) -> tuple[str, str]:

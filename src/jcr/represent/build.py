@@ -115,8 +115,8 @@ def feature_lattices(seen: SeenGrid) -> list[Lattice]:
 
 
 @contextmanager
-def threads_of_one_core(device: torch.device, count: int | None = None) -> Iterator[Executor]:
-    """`count` threads, by default one for each core, in which torch works without threads of its own; one on a GPU.
+def threads_of_one_core(device: torch.device) -> Iterator[Executor]:
+    """A thread for each core, in which torch works without threads of its own; one on a GPU.
 
     Torch's own wait for each other, spinning, after each of thousands of short operations: where another process takes
     one core, the training that should last a second lasted a minute.
@@ -124,7 +124,7 @@ def threads_of_one_core(device: torch.device, count: int | None = None) -> Itera
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with ThreadPoolExecutor((count or threads) if device.type == "cpu" else 1) as pool:
+        with ThreadPoolExecutor(threads if device.type == "cpu" else 1) as pool:
             yield pool
     finally:
         torch.set_num_threads(threads)

@@ -1,7 +1,7 @@
 """A robot as spheres: its URDF's collision shapes covered by spheres, and where joint values put them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
@@ -60,13 +60,8 @@ class RobotSpheres:
         if unknown:
             raise InputError(f"links {sorted(unknown)}: the robot has only {', '.join(self.links)}")
         kept = ~np.isin(self.link, [self.links.index(name) for name in names])
-        return RobotSpheres(
-            links=self.links,
-            joint_names=self.joint_names,
-            joints=self.joints,
-            link=self.link[kept],
-            centers_in_link=self.centers_in_link[kept],
-            radii=self.radii[kept],
+        return replace(
+            self, link=self.link[kept], centers_in_link=self.centers_in_link[kept], radii=self.radii[kept]
         )
 
     def centers(self, joint_values: JointValues) -> Float[ndarray, "*batch s 3"]:

@@ -51,13 +51,13 @@ PLANES, SAMPLE = 400, 20_000
 """Planes through three random points that are tried, and points each is tried on."""
 
 
-def support_plane(cloud: PointCloud, seed: int = 0) -> Support:
+def support_plane(cloud: PointCloud) -> Support:
     """The plane with most points on it that has the cameras on one side (RANSAC, then robust least squares).
 
     What was filled in by planes is left out of the fit and its noise: it lies on planes by construction.
     Raises InputError when no plane holds a tenth of the points.
     """
-    draw = np.random.default_rng(seed)
+    draw = np.random.default_rng(0)
     filled = np.zeros(len(cloud.image), bool) if cloud.reason is None else cloud.reason == PRIOR
     if (~filled).sum() < FEWEST_MEASURED:
         filled[:] = False
@@ -210,13 +210,9 @@ def _joined(
             if overlap or (
                 floats
                 and count[small] < 0.25 * count[large]
-                and _distance(x_in_support[rows[small], :2], x_in_support[rows[large], :2])
+                and KDTree(x_in_support[rows[large], :2]).query(x_in_support[rows[small], :2])[0].min()
                 < 2.5 * options.object_gap
             ):
                 joined[small] = joined[large]
                 break
     return joined[part]
-
-
-def _distance(a: Float[ndarray, "n 2"], b: Float[ndarray, "k 2"]) -> float:
-    return float(KDTree(b).query(a)[0].min())

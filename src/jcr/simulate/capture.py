@@ -21,7 +21,7 @@ from jcr.simulate.render import render
 from jcr.simulate.robots import EFFECTIVE_POSES
 from jcr.simulate.scenes import Scene, make_scene, moved
 from jcr.simulate.taken import image_suffix, pinhole, stated_intrinsics, with_robot_noise, write_image
-from jcr.simulate.truth import Truth, write_depth, write_labels, write_robot, write_truth
+from jcr.simulate.truth import Truth, write_pixels, write_robot, write_truth
 
 
 def simulate(out: Path, options: SimulateOptions | None = None, progress: Progress = silent) -> Path:
@@ -96,8 +96,7 @@ def _write_images(
     for k, view in zip(steps(progress, "render", range(len(truth.images))), views, strict=True):
         write_image(truth.folder / truth.images[k], view.image, options, [7, k])
         if options.truth == "full" and view.depth is not None and view.label is not None:
-            write_depth(truth, k, view.depth)
-            write_labels(truth, k, view.label)
+            write_pixels(truth, k, view.depth, view.label)
         if view.depth is not None and options.depth is not None:
             measured = _measured(view.depth, options.depth, np.random.default_rng([options.seed, 8, k]))
             write_bytes(truth.folder / depths[k], encode_png(measured))

@@ -42,13 +42,16 @@ class Part:
     """Strength of the highlight, 0 to 1."""
 
 
+Parts = tuple[Part, ...]
+"""Of an object, in its frame: z up, standing on z = 0."""
+
+
 @dataclass(frozen=True)
 class TableObject:
     """Something rigid that stands on the table."""
 
     name: str
-    parts: tuple[Part, ...]
-    """In the object's frame: z up, standing on z = 0."""
+    parts: Parts
     base_from_object: Float[ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
 
     @property
@@ -79,31 +82,31 @@ class TableObject:
         return np.concatenate([part.mesh.vertices for part in self.parts])
 
 
-def carton(rng: np.random.Generator) -> TableObject:
+def carton(rng: np.random.Generator) -> Parts:
     """A printed package, upright."""
-    return _package("carton", rng, rng.uniform((0.08, 0.045, 0.10), (0.13, 0.065, 0.17)))
+    return _package(rng, rng.uniform((0.08, 0.045, 0.10), (0.13, 0.065, 0.17)))
 
 
-def package(rng: np.random.Generator) -> TableObject:
+def package(rng: np.random.Generator) -> Parts:
     """A flat printed package, lying."""
-    return _package("box", rng, rng.uniform((0.12, 0.09, 0.05), (0.17, 0.13, 0.08)))
+    return _package(rng, rng.uniform((0.12, 0.09, 0.05), (0.17, 0.13, 0.08)))
 
 
 def carried_package(rng: np.random.Generator) -> TableObject:
     """A larger printed package, which a gripper carries before a fixed camera."""
-    return _package("carried", rng, rng.uniform((0.16, 0.11, 0.19), (0.2, 0.14, 0.23)))
+    return TableObject("carried", _package(rng, rng.uniform((0.16, 0.11, 0.19), (0.2, 0.14, 0.23))))
 
 
-def book(rng: np.random.Generator) -> TableObject:
+def book(rng: np.random.Generator) -> Parts:
     """A closed book, lying, whose pages show on three sides."""
     x, y, z = rng.uniform((0.12, 0.17, 0.018), (0.15, 0.21, 0.035))
     color = _paint(rng)
     cover = Part(box((x, y, z), ("+z",)), color, textures.printed(rng, 720, 512, color))
     pages = Part(box((x, y, z), ("+x", "+y", "-y")), (0.85, 0.83, 0.76))
-    return TableObject("book", (cover, pages, Part(box((x, y, z), ("-x", "-z")), color)))
+    return cover, pages, Part(box((x, y, z), ("-x", "-z")), color)
 
 
-def block(rng: np.random.Generator) -> TableObject:
+def block(rng: np.random.Generator) -> Parts:
     """A wooden toy block with painted sides."""
     edge = rng.uniform(0.04, 0.055)
     sides = ("+x", "-x", "+y", "-y", "+z", "-z")
@@ -111,10 +114,10 @@ def block(rng: np.random.Generator) -> TableObject:
     for side in sides:
         color = _paint(rng)
         parts.append(Part(box((edge, edge, edge), (side,)), color, textures.printed(rng, 192, 192, color)))
-    return TableObject("block", tuple(parts))
+    return tuple(parts)
 
 
-def can(rng: np.random.Generator) -> TableObject:
+def can(rng: np.random.Generator) -> Parts:
     """A tin with a printed label."""
     radius, height = rng.uniform((0.031, 0.09), (0.039, 0.12))
     color = _paint(rng)
@@ -127,13 +130,10 @@ def can(rng: np.random.Generator) -> TableObject:
         [(rim, height), (rim - 0.002, height), (rim - 0.002, lid)],
         [(rim - 0.002, lid), (0.0, lid)],
     )
-    return TableObject(
-        "can",
-        (Part(label, color, _wrap(textures.printed(rng, 320, 320, color))), Part(metal, _STEEL, shine=0.3)),
-    )
+    return (Part(label, color, _wrap(textures.printed(rng, 320, 320, color))), Part(metal, _STEEL, shine=0.3))
 
 
-def bottle(rng: np.random.Generator) -> TableObject:
+def bottle(rng: np.random.Generator) -> Parts:
     """A bottle with a label and a screw cap."""
     radius, height = rng.uniform((0.028, 0.15), (0.035, 0.19))
     color, glass = _paint(rng), _paint(rng)
@@ -150,17 +150,14 @@ def bottle(rng: np.random.Generator) -> TableObject:
         [(0.5 * radius, 0.9 * height), (0.5 * radius, height)],
         [(0.5 * radius, height), (0.0, height)],
     )
-    return TableObject(
-        "bottle",
-        (
-            Part(body, glass, textures.glaze(rng, 256, 256, glass), shine=0.2),
-            Part(label, color, _wrap(textures.printed(rng, 320, 320, color))),
-            Part(cap, _WHITE),
-        ),
+    return (
+        Part(body, glass, textures.glaze(rng, 256, 256, glass), shine=0.2),
+        Part(label, color, _wrap(textures.printed(rng, 320, 320, color))),
+        Part(cap, _WHITE),
     )
 
 
-def mug(rng: np.random.Generator) -> TableObject:
+def mug(rng: np.random.Generator) -> Parts:
     """A mug with a handle and an image around it."""
     radius, height = rng.uniform((0.038, 0.085), (0.043, 0.105))
     color = _WHITE if rng.random() < 0.5 else _paint(rng)
@@ -177,17 +174,14 @@ def mug(rng: np.random.Generator) -> TableObject:
         [radius - 0.002 + 0.03 * np.cos(angle), 0 * angle, 0.52 * height + 0.3 * height * np.sin(angle)], -1
     )
     print_around = _wrap(textures.printed(rng, 320, 320, color))
-    return TableObject(
-        "mug",
-        (
-            Part(outside, color, print_around),
-            Part(rest, color, shine=0.2),
-            Part(tube(path, 0.0055), color, shine=0.2),
-        ),
+    return (
+        Part(outside, color, print_around),
+        Part(rest, color, shine=0.2),
+        Part(tube(path, 0.0055), color, shine=0.2),
     )
 
 
-def tape(rng: np.random.Generator) -> TableObject:
+def tape(rng: np.random.Generator) -> Parts:
     """A roll of tape, lying."""
     # Packing tape: a 76 mm core, about 48 mm wide.
     inner, thickness, height = rng.uniform((0.0378, 0.008, 0.046), (0.0382, 0.018, 0.05))
@@ -199,17 +193,14 @@ def tape(rng: np.random.Generator) -> TableObject:
         [(inner + 0.002, height), (inner, height)],
         [(inner, height), (inner, 0.0)],
     )
-    return TableObject(
-        "tape",
-        (
-            Part(band, color, _wrap(textures.printed(rng, 128, 256, color))),
-            Part(edges, color, textures.glaze(rng, 64, 512, color)),
-            Part(core, _PAPER),
-        ),
+    return (
+        Part(band, color, _wrap(textures.printed(rng, 128, 256, color))),
+        Part(edges, color, textures.glaze(rng, 64, 512, color)),
+        Part(core, _PAPER),
     )
 
 
-def bowl(rng: np.random.Generator) -> TableObject:
+def bowl(rng: np.random.Generator) -> Parts:
     """A painted bowl on a foot."""
     radius, height = rng.uniform((0.06, 0.045), (0.075, 0.06))
     color, foot, wall = _paint(rng), 0.45 * radius, 0.004
@@ -221,17 +212,14 @@ def bowl(rng: np.random.Generator) -> TableObject:
         [(foot, 0.0), (foot, 0.006)],
         [(radius, height), (radius - wall, height)],
     )
-    return TableObject(
-        "bowl",
-        (
-            Part(outside, color, textures.glaze(rng, 200, 800, color), shine=0.2),
-            Part(inside, _WHITE, textures.glaze(rng, 200, 800, _WHITE), shine=0.2),
-            Part(rest, color),
-        ),
+    return (
+        Part(outside, color, textures.glaze(rng, 200, 800, color), shine=0.2),
+        Part(inside, _WHITE, textures.glaze(rng, 200, 800, _WHITE), shine=0.2),
+        Part(rest, color),
     )
 
 
-def fruit(rng: np.random.Generator) -> TableObject:
+def fruit(rng: np.random.Generator) -> Parts:
     """An apple: a ball with a dimple and a stalk."""
     radius = rng.uniform(0.033, 0.04)
     angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 25)
@@ -245,13 +233,10 @@ def fruit(rng: np.random.Generator) -> TableObject:
     foot, tip = float(z[-1]), float(z[-1]) + 0.2 * radius
     stalk = revolved([(0.002, foot), (0.002, tip)], [(0.002, tip), (0.0, tip)], segments=8)
     flesh = revolved(list(zip(r.tolist(), z.tolist(), strict=True)))
-    return TableObject(
-        "apple",
-        (Part(flesh, color, textures.glaze(rng, 256, 512, color), shine=0.2), Part(stalk, (0.3, 0.2, 0.1))),
-    )
+    return (Part(flesh, color, textures.glaze(rng, 256, 512, color), shine=0.2), Part(stalk, (0.3, 0.2, 0.1)))
 
 
-def toolbox(rng: np.random.Generator) -> TableObject:
+def toolbox(rng: np.random.Generator) -> Parts:
     """A toolbox: body, lid with a sticker and a grip, latches."""
     x, y, z = rng.uniform((0.24, 0.12, 0.08), (0.28, 0.14, 0.10))
     color, sticker = _paint(rng), _paint(rng)
@@ -271,10 +256,10 @@ def toolbox(rng: np.random.Generator) -> TableObject:
         for end in (-1, 1):
             latch = box((0.03, 0.006, 0.04)).moved((end * 0.3 * x, side * (y / 2 + 0.006), z - 0.02))
             parts.append(Part(latch, _STEEL, shine=0.3))
-    return TableObject("toolbox", tuple(parts))
+    return tuple(parts)
 
 
-CATALOGUE: dict[str, Callable[[np.random.Generator], TableObject]] = {
+CATALOGUE: dict[str, Callable[[np.random.Generator], Parts]] = {
     "carton": carton,
     "box": package,
     "book": book,
@@ -289,7 +274,7 @@ CATALOGUE: dict[str, Callable[[np.random.Generator], TableObject]] = {
 }
 
 
-def _package(name: str, rng: np.random.Generator, size: Float[ndarray, "3"]) -> TableObject:
+def _package(rng: np.random.Generator, size: Float[ndarray, "3"]) -> Parts:
     color = _paint(rng)
     parts = []
     for sides, (width, height) in (
@@ -299,7 +284,7 @@ def _package(name: str, rng: np.random.Generator, size: Float[ndarray, "3"]) -> 
     ):
         texture = textures.printed(rng, round(4000 * height), round(4000 * width), color)
         parts.append(Part(box(tuple(size), sides), color, texture))
-    return TableObject(name, tuple(parts))
+    return tuple(parts)
 
 
 def _paint(rng: np.random.Generator) -> Color:

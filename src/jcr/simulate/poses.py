@@ -111,10 +111,6 @@ def _varied(count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.r
     return _look_at(aim, *views.T)
 
 
-def _two(count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator) -> Cameras:
-    return _varied(2, target, gripper_from_camera, rng)
-
-
 def _orbit(count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator) -> Cameras:
     azimuth = 180 + np.linspace(-100, 100, count) + rng.uniform(-5, 5, count)
     elevation, roll = rng.uniform(45, 75, count), rng.uniform(-40, 40, count)
@@ -178,5 +174,5 @@ _PATTERNS: dict[Pattern, Callable[[int, ndarray, ndarray, np.random.Generator], 
     "planar": _planar,
     "pivot": _pivot,
     "camera-centre": _camera_centre,
-    "two": _two,
+    "two": lambda _, *others: _varied(2, *others),
 }

@@ -83,7 +83,7 @@ def make_scene(name: SceneName, seed: int, table: TableName | None = None) -> Sc
     layout, looks, lamp = (np.random.default_rng([seed, stream]) for stream in (1, 2, 3))
     recipe = RECIPES[name]
     center = np.array([layout.uniform(0.46, 0.52), layout.uniform(-0.03, 0.03), layout.uniform(-0.05, 0.08)])
-    things = [CATALOGUE[thing](looks) for thing in recipe.objects]
+    things = [TableObject(thing, CATALOGUE[thing](looks)) for thing in recipe.objects]
     top = _table_top(looks, table or recipe.table, recipe.plain_table)
     body = Part(box(_TABLE_SIZE, ("+x", "-x", "+y", "-y", "-z")), (0.45, 0.42, 0.38))
     parts = tuple(replace(part, mesh=part.mesh.moved((0.0, 0.0, -_TABLE_SIZE[2]))) for part in (top, body))
@@ -113,11 +113,9 @@ def _table_top(rng: np.random.Generator, table: TableName, plain: bool) -> Part:
         color = (0.80, 0.79, 0.76) if table == "light" else (0.16, 0.16, 0.17)
         texture = textures.laminate(rng, *shape, color, contrast=0.03 if table == "light" else 0.08)
     else:
-        light, dark = (
-            ((0.80, 0.66, 0.48), (0.50, 0.34, 0.20))
-            if table == "light"
-            else ((0.36, 0.25, 0.17), (0.13, 0.08, 0.05))
-        )
+        light, dark = ((0.80, 0.66, 0.48), (0.50, 0.34, 0.20))
+        if table == "dark":
+            light, dark = ((0.36, 0.25, 0.17), (0.13, 0.08, 0.05))
         texture = textures.wood(rng, *shape, light, dark)
     r, g, b = texture.reshape(-1, 3).mean(0) / 255
     return Part(box(_TABLE_SIZE, ("+z",)), (float(r), float(g), float(b)), texture, shine=0.0)

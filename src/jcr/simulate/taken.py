@@ -44,9 +44,9 @@ def stated_intrinsics(
     camera: Intrinsics, options: SimulateOptions, rng: np.random.Generator
 ) -> Intrinsics | None:
     """The intrinsics that capture.json gives: with the errors that the options ask for, or None where it gives none."""
-    return (
-        None if options.unknown_intrinsics else with_intrinsics_error(camera, options.intrinsics_error, rng)
-    )
+    if options.unknown_intrinsics:
+        return None
+    return with_intrinsics_error(camera, options.intrinsics_error, rng)
 
 
 def with_robot_noise(

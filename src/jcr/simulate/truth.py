@@ -62,7 +62,9 @@ def write_truth(truth: Truth) -> None:
     """Write truth/scene.json of its capture folder."""
     content = {"format": "jcr.truth/1", "depth_unit_m": DEPTH_UNIT_M} | asdict(truth)
     del content["folder"]
-    write_text(_folder(truth) / "scene.json", json.dumps(content, indent=1, default=np.ndarray.tolist) + "\n")
+    write_text(
+        truth.folder / "truth" / "scene.json", json.dumps(content, indent=1, default=np.ndarray.tolist) + "\n"
+    )
 
 
 def write_robot(truth: Truth, bent: BentArm, joints: Float[ndarray, "n dof"]) -> None:
@@ -75,26 +77,14 @@ def write_robot(truth: Truth, bent: BentArm, joints: Float[ndarray, "n dof"]) ->
         "reported_base_from_gripper": bent.reported(joints).tolist(),
         "base_from_gripper": truth.base_from_gripper.tolist(),
     }
-    write_text(_folder(truth) / "robot.json", json.dumps(content, indent=1) + "\n")
+    write_text(truth.folder / "truth" / "robot.json", json.dumps(content, indent=1) + "\n")
 
 
-def write_depth(truth: Truth, image: int, depth: Float[ndarray, "h w"]) -> None:
-    """Write the depth (m) of one image as a 16-bit PNG in tenths of millimetres."""
-    _write(_path(truth, "depth", image), np.round(depth / DEPTH_UNIT_M).astype(np.uint16))
-
-
-def write_labels(truth: Truth, image: int, label: UInt8[ndarray, "h w"]) -> None:
-    """Write the labels of one image as a PNG."""
-    _write(_path(truth, "labels", image), label)
-
-
-def _folder(truth: Truth) -> Path:
-    return truth.folder / "truth"
-
-
-def _path(truth: Truth, kind: str, image: int) -> Path:
-    return _folder(truth) / kind / f"{Path(truth.images[image]).stem}.png"
-
-
-def _write(path: Path, pixels: ndarray) -> None:
-    write_bytes(path, encode_png(pixels))
+def write_pixels(
+    truth: Truth, image: int, depth: Float[ndarray, "h w"], label: UInt8[ndarray, "h w"]
+) -> None:
+    """Write the depth (m) of one image as a 16-bit PNG in tenths of millimetres, and its labels as a PNG."""
+    counts = np.round(depth / DEPTH_UNIT_M).astype(np.uint16)
+    for kind, pixels in (("depth", counts), ("labels", label)):
+        file = truth.folder / "truth" / kind / f"{Path(truth.images[image]).stem}.png"
+        write_bytes(file, encode_png(pixels))

@@ -36,10 +36,10 @@ class MapPoints:
     label: Int[ndarray, " n"]
 
 
-def map_points(scene: SceneMap, seed: int = 0) -> MapPoints:
+def map_points(scene: SceneMap) -> MapPoints:
     """Points drawn evenly in the cells that rays ended in and beside these, of occupancy LEAST or more."""
     hit = binary_dilation((scene.seen.state.cpu().numpy() & HIT) != 0)
-    cell, draw = scene.seen.cell, np.random.default_rng(seed)
+    cell, draw = scene.seen.cell, np.random.default_rng(0)
     zyx = np.argwhere(hit)
     if len(zyx):
         zyx = zyx[draw.integers(len(zyx), size=2 * MAP_POINTS)]

@@ -65,7 +65,7 @@ def read_joints(path: Path, robot: "yourdfpy.URDF", images: int) -> Float[ndarra
 
 
 def solve_joints(
-    robot: "yourdfpy.URDF", tip: str, base_from_tip: Float[ndarray, "n 4 4"], seed: int = 0
+    robot: "yourdfpy.URDF", tip: str, base_from_tip: Float[ndarray, "n 4 4"]
 ) -> Float[ndarray, "n dof"]:
     """Joint values (n,dof) that put the link `tip` at poses in the robot's base, near to each other in turn.
 
@@ -74,7 +74,7 @@ def solve_joints(
     if tip not in robot.link_map:
         raise InputError(f"--tip {tip}: the URDF has no such link; it has {', '.join(robot.link_map)}")
     low, high = np.array([_limits(joint) for joint in robot.actuated_joints]).T
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
 
     def miss(values: Float[ndarray, " dof"], goal: Float[ndarray, "4 4"]) -> Float[ndarray, "6"]:
         robot.update_cfg(values)

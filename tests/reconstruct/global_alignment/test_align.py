@@ -75,6 +75,7 @@ def test_points_in_recon_are_the_surface():
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_fast_beats_adam_and_both_are_near_the_truth():
     predictions, truth = synthetic_pairs(complete_pairs(4), (32, 24), seed=1)
     fast = errors(align(predictions), truth)

@@ -101,6 +101,7 @@ def test_an_exact_robot_more_than_halves_the_errors_of_few_cameras(count: int):
     assert np.mean(chosen) < 0.5 * np.mean(free)
 
 
+@pytest.mark.slow
 def test_a_wrong_gripper_pose_leaves_the_cameras_free_and_is_named():
     made = case(7, 1, NOISE)
     poses = made.capture.base_from_gripper.copy()

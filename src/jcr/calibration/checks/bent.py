@@ -76,16 +76,9 @@ def _finding(found: Bent, shift: Float[ndarray, "7"], metre: Float[ndarray, "7"]
         details = {"frame": "gripper"} | dict(zip("xyz", along.tolist(), strict=True))
     else:
         value, std, details = float(found.size[0]), float(np.sqrt(found.covariance[0, 0])), {}
-    return Finding(
-        kind=found.kind,
-        severity="warns",
-        mend="robot",
-        value=value,
-        std=std,
-        p=float(np.exp(max(found.log_p, -700))),
-        shift=tuple(shift.tolist()),
-        details=details,
-    )
+    p = float(np.exp(max(found.log_p, -700)))
+    finding = Finding.of(found.kind, "warns", "robot", value=value, std=std, p=p, **details)
+    return replace(finding, shift=tuple(shift.tolist()))
 
 
 def _longest(found: Bent) -> tuple[float, float, Float[ndarray, "3"]]:

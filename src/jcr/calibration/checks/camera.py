@@ -17,7 +17,7 @@ from numpy import ndarray
 
 from jcr.adjust.model_error import TYPICAL
 from jcr.adjust.robots import Adjusted
-from jcr.adjust.scene import OF_IMAGE
+from jcr.adjust.scene import OF_IMAGE, PRISM
 from jcr.adjust.score_test import (
     Alternatives,
     Tested,
@@ -31,7 +31,7 @@ from jcr.adjust.score_test import (
 from jcr.calibration.adjust import adjust_case, focal_of_each
 from jcr.calibration.case import Case, Checked, of_points
 from jcr.calibration.checks.given_intrinsics import intrinsics_contradiction
-from jcr.calibration.checks.imaged import Combinations, Imaged, of_case
+from jcr.calibration.checks.imaged import Imaged, of_case
 from jcr.camera import parameter_names, parameters
 from jcr.geometry import step_between
 from jcr.records import Finding, Intrinsics, Kind, Mend, Tracks
@@ -67,7 +67,7 @@ ASPECT = ("fx", "p1", "p2")
 """Of estimated intrinsics, whose focal length is one and whose tangential distortion is none: what is tested."""
 MENDS: dict[Kind, Mend] = {Kind.THIN_PRISM: "intrinsics", Kind.CENTRE_SAGS: "mount"}
 """What would help where other images would not."""
-FOCUS = {"distance", "scatter", "zoom"}
+FOCUS = {Kind.FOCUS_BY_DISTANCE, Kind.FOCUS_BY_IMAGE, Kind.ZOOM}
 """Of a focal length that differs between images, one is named."""
 NEARLY_ALL = 0.9
 """Of the squares of what the focal length differs by."""
@@ -94,20 +94,14 @@ def with_contradiction(
 ) -> tuple[Finding, ...]:
     """What was found of one camera, where its given intrinsics are contradicted as a whole: with the parameters that a
     test of these named, if it did."""
-    if not contradiction:
-        return faults
-    (whole,) = contradiction
-    named = [
-        replace(one, shift=whole.shift, intrinsics_shift=None)
-        for one in faults
-        if one.kind is Kind.INTRINSICS
-    ]
-    return (*(one for one in faults if one.kind is not Kind.INTRINSICS), *(named or [whole]))
+    named = [one for one in faults if contradiction and one.kind is Kind.INTRINSICS]
+    whole = [replace(one, shift=contradiction[0].shift, intrinsics_shift=None) for one in named]
+    return (*(one for one in faults if one not in named), *(whole or contradiction))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class _Hypothesis:
-    kind: str
+    kind: Kind
     free: Float[ndarray, "e p"]
     """The combinations that it is about."""
     beside: Float[ndarray, "e q"]
@@ -116,11 +110,6 @@ class _Hypothesis:
     """That were searched."""
     after: int = 0
     """Image before a change."""
-
-    @property
-    def of_intrinsics(self) -> bool:
-        """The same intrinsics would be right for all images."""
-        return self.kind in ("intrinsics", "aspect")
 
     @property
     def both(self) -> Float[ndarray, "e r"]:
@@ -145,14 +134,12 @@ class _State:
     @cached_property
     def equations(self) -> Alternatives:
         """Of what may be freed beside."""
-        imaged = self.imaged
-        return alternatives(self.adjusted, imaged.prior, imaged.camera, imaged.place)
+        return self.equations_with(None)
 
-    @cached_property
-    def equations_of_a_good_camera(self) -> Alternatives:
-        """The same where its model may leave as little as that of a good camera: the rest needs another explanation."""
+    def equations_with(self, model_error_std: float | None) -> Alternatives:
+        """The same where what the cameras' models leave is of this size."""
         imaged = self.imaged
-        return alternatives(self.adjusted, imaged.prior, imaged.camera, imaged.place, TYPICAL)
+        return alternatives(self.adjusted, imaged.prior, imaged.camera, imaged.place, model_error_std)
 
     @property
     def camera(self) -> Intrinsics:
@@ -167,17 +154,14 @@ class _State:
         of_all = evidence.scene.nuisances(evidence.problem.freedom)
         return np.r_[of_camera, of_all[nuisances_of(imaged.images, len(evidence.problem.observations.rig))]]
 
-    def shift_from(self, before: "_State") -> Float[ndarray, "7"]:
-        """How far the camera's place is from what it was, in records.COVARIANCE_ORDER."""
-        (then, scale), (now, new_scale) = (self.imaged.answer(one.adjusted) for one in (before, self))
-        return np.r_[step_between(then, now), np.log(new_scale / scale)]
-
 
 def camera_faults(imaged: Imaged) -> tuple[Finding, ...]:
     """What speaks against one camera in all its images, at most AT_ONCE of it."""
     if len(imaged.names) < MIN_IMAGES:
         return ()
-    found = () if imaged.free is None else (_freed_before(imaged.free),)
+    found = ()
+    if (free := imaged.free) is not None:  # a focal length of each image, as the user asked
+        found = (_Hypothesis(Kind.FOCUS_BY_IMAGE, free, np.zeros((len(free), 0))),)
     state = _State(imaged, found, imaged.adjusted)
     named: list[Finding] = []
     dismissed: list[_Hypothesis] = []
@@ -186,21 +170,14 @@ def camera_faults(imaged: Imaged) -> tuple[Finding, ...]:
         if best is None:
             break
         alone = tested(state.equations, best.both, _all(state))
-        after = None
-        if (np.abs(alone.shift) > OF_FIRST_STEP * MATERIAL * imaged.std).any():
-            after = _with(state, best)
-        found = None if after is None else _finding(after, state, alone)
-        if after is None or found is None or not is_material(found, imaged.std):
+        far = (np.abs(alone.shift) > OF_FIRST_STEP * MATERIAL * imaged.std).any()
+        after = _with(state, best) if far else None
+        if after is not None and is_material(found := _finding(after, state, alone), imaged.std):
+            named.append(found)
+            state = after
+        else:
             dismissed.append(best)
-            continue
-        named.append(found)
-        state = after
     return tuple(named)
-
-
-def _freed_before(free: Combinations) -> _Hypothesis:
-    """A focal length of each image that is free as the user asked."""
-    return _Hypothesis(kind="scatter", free=free, beside=np.zeros((len(free), 0)))
 
 
 def _of_fewer_points(case: Case) -> Case:
@@ -209,9 +186,9 @@ def _of_fewer_points(case: Case) -> Case:
     few = len(np.unique(tracks.point)) <= MOST_POINTS and len(tracks.image) <= most
     if len(case.used) < MIN_IMAGES or few:
         return case
-    fewer = case.with_tracks(of_some(tracks, most))
-    varies = case.options.focus == "varies"
-    return replace(fewer, adjusted=adjust_case(fewer, combinations=focal_of_each(case) if varies else None))
+    fewer = replace(case, chosen_tracks=of_some(tracks, most))
+    free = focal_of_each(case) if case.options.focus == "varies" else None
+    return replace(fewer, adjusted=adjust_case(fewer, combinations=free))
 
 
 def _with(state: _State, best: _Hypothesis) -> _State | None:
@@ -219,7 +196,7 @@ def _with(state: _State, best: _Hypothesis) -> _State | None:
     images then show nothing any more."""
     try:
         after = _State.of(state.imaged, (*state.found, best))
-        simple = _simpler(after) if best.kind == "scatter" else None
+        simple = _simpler(after) if best.kind is Kind.FOCUS_BY_IMAGE else None
         return after if simple is None else _State.of(state.imaged, (*state.found, simple))
     except np.linalg.LinAlgError:
         return None
@@ -227,15 +204,10 @@ def _with(state: _State, best: _Hypothesis) -> _State | None:
 
 def is_material(found: Finding, std: Float[ndarray, "6"]) -> bool:
     """Whether what was freed is large enough to be a fault, and moves the calibration."""
-    if found.value is not None and found.value < LEAST_PX.get(found.kind, -np.inf):
-        return False
-    if (
-        found.kind in OF_EACH
-        and found.value is not None
-        and found.std is not None
-        and found.value < SURE * found.std
-    ):
-        return False
+    if found.value is not None and found.std is not None:
+        least = SURE * found.std if found.kind in OF_EACH else -np.inf
+        if found.value < max(least, LEAST_PX.get(found.kind, -np.inf)):
+            return False
     assert found.shift is not None
     return bool((np.abs(found.shift[:6]) > MATERIAL * std).any())
 
@@ -245,22 +217,24 @@ def _finding(after: _State, before: _State, alone: Tested) -> Finding:
     best = after.found[-1]
     last = tested(after.equations, best.free, np.concatenate([_all(before), best.beside], axis=1))
     p = float(np.exp(max(alone.log_p + np.log(best.places), -700)))
-    size = _of_intrinsics(after, last) if best.of_intrinsics else _size(after, last)
+    size = _of_intrinsics(after, last) if best.kind is Kind.INTRINSICS else _size(after, last)
+    (then, scale), (now, new_scale) = (after.imaged.answer(one.adjusted) for one in (before, after))
     moved = parameters(after.camera) - parameters(before.camera)
     return Finding(
+        kind=best.kind,
         severity="warns",
         p=p,
-        shift=tuple(after.shift_from(before).tolist()),
+        shift=(*step_between(then, now).tolist(), float(np.log(new_scale / scale))),
         intrinsics_shift=tuple(moved.tolist()),
         **size,
     )
 
 
-def of_some(tracks: Tracks, most: int, seed: int = 0) -> Tracks:
+def of_some(tracks: Tracks, most: int) -> Tracks:
     """A random choice of the points that most images see, with no more than `most` observations, and all corners of
     boards."""
     count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
-    order = np.random.default_rng(seed).permutation(len(count))
+    order = np.random.default_rng(0).permutation(len(count))
     enough = order[np.argsort(count[order] < WELL_SEEN, kind="stable")]
     chosen = tracks.on_board
     shown = enough[count[enough] >= 2][:MOST_POINTS]
@@ -288,7 +262,8 @@ def _most_likely(state: _State, dismissed: Sequence[_Hypothesis]) -> _Hypothesis
     ]
     if len(likely) < 2:
         return likely[0] if likely else None
-    return min(likely, key=lambda one: _log_p(one, state, state.equations_of_a_good_camera))
+    of_a_good_camera = state.equations_with(TYPICAL)
+    return min(likely, key=lambda one: _log_p(one, state, of_a_good_camera))
 
 
 def _log_p(one: _Hypothesis, state: _State, equations: Alternatives) -> float:
@@ -302,16 +277,15 @@ def _alike(one: _Hypothesis, other: _Hypothesis) -> bool:
 
 def _simpler(state: _State) -> _Hypothesis | None:
     """A focal length that follows distance, or changed once, where that explains nearly all that it scatters."""
-    scatter, best = state.found[-1], None
+    scatter = state.found[-1]
     focal = scatter.free @ _value(scatter, state.total)
-    for candidate in _hypotheses(state):
-        if candidate.kind not in FOCUS or candidate.kind == scatter.kind:
-            continue
-        along = candidate.free[:, 0]
-        explained = float((along @ focal) ** 2 / ((along @ along) * (focal @ focal)))
-        if best is None or explained > best[0]:
-            best = explained, candidate
-    return best[1] if best is not None and best[0] > NEARLY_ALL else None
+
+    def explained(one: _Hypothesis) -> float:
+        along = one.free[:, 0]
+        return float((along @ focal) ** 2 / ((along @ along) * (focal @ focal)))
+
+    best = max((one for one in _hypotheses(state) if one.kind in FOCUS - {scatter.kind}), key=explained)
+    return best if explained(best) > NEARLY_ALL else None
 
 
 def _value(fault: _Hypothesis, total: Float[ndarray, " e"]) -> Float[ndarray, " p"]:
@@ -325,36 +299,42 @@ def _hypotheses(state: _State) -> list[_Hypothesis]:
     far = np.log(equations.distance)
     far = far - far.mean()
     steps = np.arange(LEAST_PART, m - LEAST_PART + 1)
-    common, nothing = equations.common_focal(), np.zeros((equations.columns, 0))
+    common, nothing = (
+        equations.of_camera(("fx", "fy")).sum(1, keepdims=True),
+        np.zeros((equations.columns, 0)),
+    )
+    x, y = equations.down_in_camera[:, :2].T
+    sag = [equations.of_images("x", x[:, None]), equations.of_images("y", y[:, None])]
     found = [
-        _Hypothesis(kind="distance", free=equations.focal_of_images(far[:, None]), beside=common),
-        _Hypothesis(kind="scatter", free=equations.focal_of_images(differences(m)), beside=common),
-        _Hypothesis(kind="shear", free=equations.shear_of_images(np.ones((m, 1))), beside=common),
-        _Hypothesis(kind="shear of each", free=equations.shear_of_images(np.eye(m)), beside=common),
+        _Hypothesis(Kind.FOCUS_BY_DISTANCE, equations.of_images("focal", far[:, None]), common),
+        _Hypothesis(Kind.FOCUS_BY_IMAGE, equations.of_images("focal", differences(m)), common),
+        _Hypothesis(Kind.ROLLING_SHUTTER, equations.of_images("shear", np.ones((m, 1))), common),
+        _Hypothesis(Kind.ROLLING_SHUTTER_BY_IMAGE, equations.of_images("shear", np.eye(m)), common),
     ]
     for k in steps:
         after = (np.arange(m) >= k) - (m - k) / m
-        free = equations.focal_of_images(after[:, None])
-        found.append(_Hypothesis(kind="zoom", free=free, beside=common, places=len(steps), after=int(k) - 1))
+        free = equations.of_images("focal", after[:, None])
+        found.append(_Hypothesis(Kind.ZOOM, free, common, len(steps), int(k) - 1))
     of_centre = np.concatenate([common, equations.of_camera(("cx", "cy"))], axis=1)
-    found.append(_Hypothesis(kind="sag", free=equations.offset_by_gravity(), beside=of_centre))
+    found.append(_Hypothesis(Kind.CENTRE_SAGS, np.concatenate(sag, axis=1), of_centre))
     if len(state.adjusted.given.evidence.scene.cameras) == 1:  # all images share the glass
-        found.append(_Hypothesis(kind="prism", free=equations.prism(), beside=of_centre))
+        found.append(_Hypothesis(Kind.THIN_PRISM, np.eye(equations.columns)[:, -PRISM:], of_centre))
     # Intrinsics that are wrong in all images include the focal length that shows nothing in the others.
-    kind = "intrinsics" if state.imaged.is_given else "aspect"
-    found.append(_Hypothesis(kind=kind, free=equations.of_camera(_freed(kind, equations)), beside=nothing))
+    found.append(_Hypothesis(Kind.INTRINSICS, equations.of_camera(_freed(state)), nothing))
     return found
 
 
 def _of_intrinsics(after: _State, last: Tested) -> dict[str, Any]:
     """The fields of a finding that say which intrinsics the images show."""
-    equations, kind = after.equations, after.found[-1].kind
-    units = dict(zip(equations.names, equations.units, strict=True))
+    units = dict(zip(after.equations.names, after.equations.units, strict=True))
     std = np.sqrt(np.maximum(np.diag(last.covariance), 0.0))
-    names = _freed(kind, equations)
-    shown = {name: std[k] * units[name] for k, name in enumerate(names)}
-    details = _parameters(shown, after.imaged.start, after.camera)
-    return {"kind": Kind.INTRINSICS, "mend": "intrinsics", "details": details}
+    given, now = parameters(after.imaged.start), parameters(after.camera)
+    found: dict[str, float] = {}
+    for name, old, new in zip(parameter_names(after.camera), given, now, strict=True):
+        if name in INTRINSICS:
+            found |= {name: float(new), f"{name}_given": float(old)}
+    found |= {f"{name}_std": float(std[k] * units[name]) for k, name in enumerate(_freed(after))}
+    return {"mend": "intrinsics", "details": found}
 
 
 def _size(after: _State, last: Tested) -> dict[str, Any]:
@@ -365,29 +345,22 @@ def _size(after: _State, last: Tested) -> dict[str, Any]:
     typical, each = float(np.sqrt(np.mean(value**2))), float(np.median(std))
     spread = float(np.ptp(np.log(equations.distance)))
     focal_px, width = after.imaged.start.fx, after.camera.width
-    changed = tuple(after.imaged.names[fault.after : fault.after + 2])
     match fault.kind:
-        case "distance":
-            kind, size, error = Kind.FOCUS_BY_DISTANCE, spread * value[0], spread * std[0]
-        case "scatter":
-            kind, size, error = Kind.FOCUS_BY_IMAGE, np.sqrt(value @ value / equations.images), each
-        case "zoom":
-            kind, size, error = Kind.ZOOM, value[0], std[0]
-        case "shear":
-            kind, size, error = Kind.ROLLING_SHUTTER, focal_px * typical, focal_px * each
-        case "shear of each":
-            kind, size, error = Kind.ROLLING_SHUTTER_BY_IMAGE, focal_px * typical, focal_px * each
-        case "prism":
-            kind, (size, error) = Kind.THIN_PRISM, _largest_px(after, value, last.covariance)
+        case Kind.FOCUS_BY_DISTANCE:
+            size, error = spread * value[0], spread * std[0]
+        case Kind.FOCUS_BY_IMAGE:
+            size, error = np.sqrt(value @ value / equations.images), each
+        case Kind.ZOOM:
+            size, error = value[0], std[0]
+        case Kind.THIN_PRISM:
+            size, error = _largest_px(after, value, last.covariance)
+        case Kind.CENTRE_SAGS:
+            size, error = width * typical, width * each / np.sqrt(2)
         case _:
-            kind, size, error = Kind.CENTRE_SAGS, width * typical, width * each / np.sqrt(2)
-    return {
-        "kind": kind,
-        "mend": MENDS.get(kind, "images"),
-        "value": float(size),
-        "std": float(error),
-        "images": changed if fault.kind == "zoom" else (),
-    }
+            size, error = focal_px * typical, focal_px * each
+    changed = after.imaged.names[fault.after : fault.after + 2] if fault.kind is Kind.ZOOM else ()
+    mend = MENDS.get(fault.kind, "images")
+    return {"mend": mend, "value": float(size), "std": float(error), "images": tuple(changed)}
 
 
 def _largest_px(
@@ -401,15 +374,7 @@ def _largest_px(
     return float(moved[k]), float(np.sqrt(along @ covariance @ along))
 
 
-def _freed(kind: str, equations: Alternatives) -> tuple[str, ...]:
-    """Parameters of the intrinsics that a hypothesis frees, of those that the model has."""
-    return tuple(name for name in (INTRINSICS if kind == "intrinsics" else ASPECT) if name in equations.names)
-
-
-def _parameters(std: dict[str, float], given: Intrinsics, now: Intrinsics) -> dict[str, float]:
-    """Parameters as they are and as they were given; standard deviations of those that were freed."""
-    found: dict[str, float] = {}
-    for name, old, new in zip(parameter_names(given), parameters(given), parameters(now), strict=True):
-        if name in INTRINSICS:
-            found |= {name: float(new), f"{name}_given": float(old)}
-    return found | {f"{name}_std": float(value) for name, value in std.items()}
+def _freed(state: _State) -> tuple[str, ...]:
+    """Parameters of the intrinsics that are tested, of those that the model has."""
+    tested_names = INTRINSICS if state.imaged.is_given else ASPECT
+    return tuple(name for name in tested_names if name in state.equations.names)

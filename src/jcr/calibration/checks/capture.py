@@ -19,9 +19,8 @@ def check_registered(case: Case) -> Checked:
     every = len(case.used) == len(capture)
     if every or hand_eye.observability.observable or not observability(capture.base_from_gripper).observable:
         return Checked()
-    few = Finding.of(
-        Kind.FEW_USED, "rejects", "reconstruction", value=float(len(case.used)), of=float(len(capture))
-    )
+    counts = {"value": float(len(case.used)), "of": float(len(capture))}
+    few = Finding.of(Kind.FEW_USED, "rejects", "reconstruction", **counts)
     findings = tuple(
         replace(one, mend="reconstruction") if one.kind is Kind.UNOBSERVABLE else one
         for one in hand_eye.findings
@@ -36,11 +35,8 @@ def check_convention(case: Case) -> Checked:
     """
     rows, capture = case.reconstruction.image_index, case.capture
     by_name = paired_by_name(capture.images, capture.base_from_gripper)
-    found = better_reading(
-        case.base_from_gripper,
-        case.recon_from_camera,
-        {by_number: poses[rows] for by_number, poses in by_name.items()},
-    )
+    by_name = {by_number: poses[rows] for by_number, poses in by_name.items()}
+    found = better_reading(case.base_from_gripper, case.recon_from_camera, by_name)
     if found is None:
         return Checked()
     observable = case.hand_eye.observability.observable

@@ -71,9 +71,8 @@ def _pairs(
         inside = (u >= 1) & (v >= 1) & (u < depth.shape[1] - 1) & (v < depth.shape[0] - 1)
         seen, u, v = seen[inside], u[inside], v[inside]
         around = np.stack([depth[v + dv, u + du] for dv in (-1, 0, 1) for du in (-1, 0, 1)])
-        x_in_camera = apply(
-            inverse(reconstruction.recon_from_camera[k]), tracks.points_in_recon[tracks.point[seen]]
-        )
+        camera_from_recon = inverse(reconstruction.recon_from_camera[k])
+        x_in_camera = apply(camera_from_recon, tracks.points_in_recon[tracks.point[seen]])
         # At the edge of a thing, colour and depth are of different ones.
         whole = (around > 0).all(0) & (np.ptp(around, axis=0) < 0.03 * around[4]) & (x_in_camera[:, 2] > 0)
         parts.append((around[4][whole].astype(float), scale * x_in_camera[whole, 2], np.full(whole.sum(), k)))

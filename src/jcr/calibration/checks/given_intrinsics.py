@@ -8,8 +8,6 @@ covariance, in which what few images, a flat scene or little rotation leave open
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from jcr.adjust.intrinsics_prior import ESTIMATED, FIXED, prior_of
 from jcr.adjust.robots import Adjusted
@@ -20,7 +18,7 @@ from jcr.calibration.checks.imaged import Imaged, of_case
 from jcr.camera import PARAMETERS, by_parameters, parameters, unproject
 from jcr.geometry import ARM, step_between
 from jcr.handeye.solve import judged
-from jcr.records import Estimate, Finding, Kind
+from jcr.records import Finding, Kind
 
 SURE = 5.0
 """Standard deviations, widened for an estimated robot noise. Of 48 simulated webcam captures of 5 to 15 images with the
@@ -52,10 +50,14 @@ def intrinsics_contradiction(case: Case) -> Checked:
         estimate_of(one, case.tracks) for one in (freed, adjust_case(case, prior=prior_of(given, FIXED)))
     )
     # Camera poses may have been found with other intrinsics than those given: the farther of the two answers counts.
-    shift = max(
-        (_shift(start, with_found) for start in (fit.estimate, as_given)),
-        key=lambda by: float(np.linalg.norm(by[:6] * [1, 1, 1, ARM, ARM, ARM])),
-    )
+    shifts = [
+        np.append(
+            step_between(start.gripper_from_camera, with_found.gripper_from_camera),
+            np.log(with_found.scale / start.scale),
+        )
+        for start in (fit.estimate, as_given)
+    ]
+    shift = max(shifts, key=lambda by: float(np.linalg.norm(by[:6] * [1, 1, 1, ARM, ARM, ARM])))
     # Where the intrinsics are wrong, bundle adjustment bends the robot's poses to them: the fit to camera poses bends
     # least.
     return Checked((replace(contradicted, shift=tuple(shift.tolist())),), case.hand_eye.before)
@@ -77,12 +79,6 @@ def contradicted_by(imaged: Imaged, sure: float = SURE) -> tuple[Adjusted, Findi
         return None
     severity = "warns" if surely else "informs"
     return freed, Finding.of(Kind.INTRINSICS, severity, "intrinsics", **found)
-
-
-def _shift(start: Estimate, end: Estimate) -> Float[ndarray, "7"]:
-    """From one estimate to another, in records.COVARIANCE_ORDER."""
-    step = step_between(start.gripper_from_camera, end.gripper_from_camera)
-    return np.append(step, np.log(end.scale / start.scale))
 
 
 def _found_off(imaged: Imaged, adjusted: Adjusted, sure: float, share: float) -> dict[str, float]:

@@ -32,25 +32,16 @@ def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: HandEye) ->
             continue
         if fits.any():
             is_pose_of[row] = int(np.where(fits, metres, np.inf).argmin())
-        findings.append(
-            Finding.of(
-                Kind.POSE_CONTRADICTS_IMAGE,
-                "warns",
-                "poses",
-                capture.images[row],
-                value=float(metres[row]),
-                rotation=float(radians[row]),
-            )
-        )
-    swapped = [(i, j) for i, j in is_pose_of.items() if i < j and is_pose_of.get(j) == i]
-    named = {capture.images[row] for pair in swapped for row in pair}
-    return (
-        *(
-            Finding.of(Kind.POSES_SWAPPED, "rejects", "poses", capture.images[i], capture.images[j])
-            for i, j in swapped
-        ),
-        *(finding for finding in findings if finding.images[0] not in named),
-    )
+        off = {"value": float(metres[row]), "rotation": float(radians[row])}
+        image = capture.images[row]
+        findings.append(Finding.of(Kind.POSE_CONTRADICTS_IMAGE, "warns", "poses", image, **off))
+    pairs = [(i, j) for i, j in is_pose_of.items() if i < j and is_pose_of.get(j) == i]
+    swapped = [
+        Finding.of(Kind.POSES_SWAPPED, "rejects", "poses", capture.images[i], capture.images[j])
+        for i, j in pairs
+    ]
+    named = {image for one in swapped for image in one.images}
+    return (*swapped, *(finding for finding in findings if finding.images[0] not in named))
 
 
 def _shown_poses(

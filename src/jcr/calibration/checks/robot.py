@@ -57,12 +57,6 @@ def _systematic_finding(robot: RobotExamined) -> Finding | None:
         return Finding.of(Kind.SYSTEMATIC_ERRORS, "informs", "robot", value=left[0], p=p, rotation=left[1])
     sizes = {f"joint_{k + 1}": float(offsets.offset[k]) for k in off}
     stds = {f"joint_{k + 1}_std": float(offsets.std[k]) for k in off}
-    return Finding(
-        kind=Kind.JOINT_OFFSETS,
-        severity="informs",
-        mend="robot",
-        joints=tuple(k + 1 for k in off),
-        value=float(np.abs(offsets.offset[off]).max()),
-        p=p,
-        details=sizes | stds,
-    )
+    value = float(np.abs(offsets.offset[off]).max())
+    finding = Finding.of(Kind.JOINT_OFFSETS, "informs", "robot", value=value, p=p, **sizes, **stds)
+    return replace(finding, joints=tuple(k + 1 for k in off))

@@ -7,7 +7,8 @@ whose p is multiplied by the number of places that were tried.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,6 +16,7 @@ from numpy import ndarray
 from scipy.linalg import solve_triangular
 
 from jcr.calibration.case import Case, Checked
+from jcr.calibration.robot_errors import of_poses
 from jcr.distributions import f as f_distribution
 from jcr.handeye.equation import PRIOR_STD, ROTATION, TRANSLATION, Poses, residuals
 from jcr.records import Finding, HandEye, Kind
@@ -63,14 +65,11 @@ def sequence_fault(
     recon_from_camera: Poses,
     images: Sequence[str],
     systematic: Float[ndarray, "r r"],
-    time_s: Float[ndarray, " m"] | None = None,
-    still: bool = False,
 ) -> Finding | None:
     """What the order of the images shows against one calibration of them; None where that is nothing.
 
     `images` are their names in the order of taking, `systematic` is the covariance of the systematic errors of their
-    poses at 1 rad, `time_s` when they were taken; without, delay is counted in
-    intervals between images. `still`: the arm is known to have stood at each, and nothing can be read late.
+    poses at 1 rad. Delay is counted in intervals between images.
     """
     m = len(base_from_gripper)
     if m < MIN_IMAGES or not hand_eye.observability.observable:
@@ -81,119 +80,71 @@ def sequence_fault(
     residual, by = residuals(
         fit.gripper_from_camera, fit.scale, fit.base_from_recon, base_from_gripper, recon_from_camera
     )
-    robot = fit.robot_noise
+    robot, every = fit.robot_noise, np.arange(m)
     noise = robot.translation, robot.rotation
-    problem = _Problem(residual, by, robot.systematic**2 * systematic, noise)
+    problem = _Equations(every, residual, by, robot.systematic**2 * systematic, noise)
     # An image that is rejected between others that agree is wrong by itself; after a slip several in a row are.
     rejected = np.pad(~hand_eye.inliers, 1)
     in_order = problem.of(np.flatnonzero(hand_eye.inliers | rejected[:-2] | rejected[2:]))
-    std = np.sqrt(np.diag(hand_eye.covariance)[:6])
-
     places = np.unique(
         np.linspace(LEAST_PART, m - LEAST_PART, min(m - 2 * LEAST_PART + 1, MANY_PLACES)).astype(int)
     )
-    slip, k = min(
-        ((in_order.moved_by(_after(k, m)), k) for k in places.tolist()), key=lambda one: one[0].log_p
-    )
+    after = {k: (every >= k).astype(float) for k in places.tolist()}
+    slip, k = min(((in_order.moved_by(after[k]), k) for k in after), key=lambda one: one[0].log_p)
     drift = in_order.moved_by(np.linspace(-0.5, 0.5, m))
-    found = [(slip.log_p + np.log(len(places)), slip, "slip"), (drift.log_p, drift, "drift")]
-    if not still:
-        ordered = time_s is not None and (np.diff(time_s) > 0).all()
-        moment = time_s if time_s is not None and ordered else np.arange(m, dtype=float)
-        delay = problem.of(np.arange(m)).tested(_velocity(base_from_gripper, moment)[..., None])
-        found.append((delay.log_p, delay, "delay"))
-    log_p, best, kind = min(found, key=lambda one: one[0])
-    if log_p > LOG_P:
+    delay = problem.tested(_velocity(base_from_gripper)[..., None])
+    # Of each fault the shares of its X in the images, which other orders must not explain as well.
+    found = [
+        (slip.log_p + np.log(len(places)), slip, Kind.SLIP, after[k]),
+        (drift.log_p, drift, Kind.DRIFT, every / m),
+        (delay.log_p, delay, Kind.DELAY, None),
+    ]
+    log_p, best, kind, share = min(found, key=lambda one: one[0])
+    if log_p > LOG_P or (share is not None and not in_order.is_of_the_order(share, best)):
         return None
-    if kind != "delay" and not in_order.is_of_the_order(
-        _after(k, m) if kind == "slip" else np.arange(m) / m, best
-    ):
+    std = np.sqrt(np.diag(hand_eye.covariance)[:6])
+    if not (np.abs(best.shift[:6] if share is None else best.value) > MATERIAL * std).any():
         return None
-    if not (np.abs(best.shift[:6] if kind == "delay" else best.value) > MATERIAL * std).any():
-        return None
-    p = float(np.exp(max(log_p, -700)))
-    if kind == "delay":
-        return _delay(best, p, "interval" if time_s is None else "s")
-    return _drift(best, p) if kind == "drift" else _slip(best, p, k, images)
+    finding = Finding.of(kind, "warns", "mount", p=float(np.exp(max(log_p, -700))))
+    return replace(finding, **_size(kind, best, k, images))
 
 
-def _drift(found: _Found, p: float) -> Finding:
+def _size(kind: Kind, found: _Found, place: int, images: Sequence[str]) -> dict[str, Any]:
+    """The fields of a finding that state how large the fault is; a slip is before the image at `place`."""
+    if kind is Kind.DELAY:
+        std = float(np.sqrt(found.covariance[0, 0]))
+        shift, unit = tuple(found.shift.tolist()), {"unit": "interval"}
+        return {"mend": "poses", "value": float(found.value[0]), "std": std, "shift": shift, "details": unit}
     metres, radians = np.linalg.norm(found.value.reshape(2, 3), axis=1).tolist()
-    return Finding(
-        kind=Kind.DRIFT,
-        severity="warns",
-        mend="mount",
-        value=metres,
-        p=p,
-        shift=(*(found.value / 2).tolist(), 0.0),
-        details={"rotation": radians},
-    )
-
-
-def _delay(found: _Found, p: float, unit: str) -> Finding:
-    return Finding(
-        kind=Kind.DELAY,
-        severity="warns",
-        mend="poses",
-        value=float(found.value[0]),
-        std=float(np.sqrt(found.covariance[0, 0])),
-        p=p,
-        shift=tuple(found.shift.tolist()),
-        details={"unit": unit},
-    )
-
-
-def _slip(found: _Found, p: float, place: int, images: Sequence[str]) -> Finding:
-    """A slip between the image before the place and that at it."""
-    m, (metres, radians) = len(images), np.linalg.norm(found.value.reshape(2, 3), axis=1).tolist()
-    count, longer = max((place, "before"), (m - place, "after"))
-    return Finding(
-        kind=Kind.SLIP,
-        severity="rejects" if metres > LARGE_SLIP[0] or radians > LARGE_SLIP[1] else "warns",
-        mend="mount",
-        images=(images[place - 1], images[place]),
-        value=metres,
-        p=p,
-        shift=(*found.value.tolist(), 0.0),
-        details={"rotation": radians, "longer": longer, "count": float(count)},
-    )
-
-
-def _after(place: int, images: int) -> Float[ndarray, " m"]:
-    return (np.arange(images) >= place).astype(float)
+    if kind is Kind.DRIFT:
+        shift = (*(found.value / 2).tolist(), 0.0)
+        return {"value": metres, "shift": shift, "details": {"rotation": radians}}
+    count, longer = max((place, "before"), (len(images) - place, "after"))
+    return {
+        "severity": "rejects" if metres > LARGE_SLIP[0] or radians > LARGE_SLIP[1] else "warns",
+        "images": (images[place - 1], images[place]),
+        "value": metres,
+        "shift": (*found.value.tolist(), 0.0),
+        "details": {"rotation": radians, "longer": longer, "count": float(count)},
+    }
 
 
 @dataclass(frozen=True)
-class _Problem:
-    """The linearised equations of all images."""
+class _Equations:
+    """Those of some images, linearised."""
 
-    residual: Float[ndarray, "m 6"]
-    by: Float[ndarray, "m 6 13"]
+    images: Int[ndarray, " k"]
+    residual: Float[ndarray, "k 6"]
+    by: Float[ndarray, "k 6 13"]
     systematic: Float[ndarray, "r r"]
     """Covariance of the systematic errors."""
     noise: tuple[float, float]
     """m, rad per axis: random errors, as they are without a fault."""
 
     def of(self, images: Int[ndarray, " k"]) -> "_Equations":
-        """Those of some images."""
-        rows = (6 * images[:, None] + np.arange(6)).ravel()
-        systematic = self.systematic[np.ix_(rows, rows)]
-        return _Equations(
-            images=images,
-            residual=self.residual[images],
-            by=self.by[images],
-            systematic=systematic,
-            noise=self.noise,
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Equations:
-    images: Int[ndarray, " k"]
-    residual: Float[ndarray, "k 6"]
-    by: Float[ndarray, "k 6 13"]
-    systematic: Float[ndarray, "r r"]
-    noise: tuple[float, float]
+        """Those of some images, where these are of all."""
+        systematic = of_poses(self.systematic, images)
+        return _Equations(images, self.residual[images], self.by[images], systematic, self.noise)
 
     def tested(self, columns: Float[ndarray, "m 6 p"]) -> _Found:
         """What columns, given for all images, explain, in units of the noise that they leave.
@@ -234,17 +185,13 @@ class _Equations:
         as_much = others = 0
         for _ in range(GROUPINGS):
             shuffled[self.images] = rng.permutation(share[self.images])
-            if _same_groups(shuffled[self.images], share[self.images]):
-                continue  # of 8 images one order in 35 has the same halves
+            one, other = (of[self.images] - of[self.images].mean() for of in (shuffled, share))
+            # A calibration takes up a constant and a sign; of 8 images one order in 35 has the same halves.
+            if np.allclose(one, other) or np.allclose(one, -other):
+                continue
             others += 1
             as_much += self.moved_by(shuffled).log_p <= found.log_p + 1e-9
         return as_much <= BY_CHANCE * others
-
-
-def _same_groups(one: Float[ndarray, " k"], other: Float[ndarray, " k"]) -> bool:
-    """Whether shares differ by no more than a constant and a sign, which a calibration takes up."""
-    one, other = one - one.mean(), other - other.mean()
-    return bool(np.allclose(one, other) or np.allclose(one, -other))
 
 
 def _tested(
@@ -267,14 +214,14 @@ def _tested(
     return _Found(log_p=log_p, base=found[:13], value=found[13:], covariance=inverse[13:, 13:], shift=shift)
 
 
-def _velocity(base_from_gripper: Poses, moment: Float[ndarray, " m"]) -> Float[ndarray, "m 6"]:
-    """Steps per unit of time (base axes) at each image of an arm that goes smoothly through all of them."""
+def _velocity(base_from_gripper: Poses) -> Float[ndarray, "m 6"]:
+    """Steps per interval (base axes) at each image of an arm that goes smoothly through all of them."""
     # They take as long to import as all of SciPy that every command needs.
     from scipy.interpolate import CubicSpline
     from scipy.spatial.transform import Rotation, RotationSpline
 
+    moment, little = np.arange(len(base_from_gripper), dtype=float), 1e-3
     position = CubicSpline(moment, base_from_gripper[:, :3, 3])
     rotation = RotationSpline(moment, Rotation.from_matrix(base_from_gripper[:, :3, :3]))
-    little = 1e-3 * float(np.diff(moment).min())
     rotation_between = rotation(moment + little) * rotation(moment - little).inv()
     return np.concatenate([position(moment, 1), rotation_between.as_rotvec() / (2 * little)], axis=1)

@@ -53,8 +53,7 @@ CHECKS = (
     Check(check_convention, _fit_was_rejected),
     Check(check_camera, lambda case: case.shows_camera and case.adjusted is not None),
     Check(
-        check_bent,
-        lambda case: case.shows_camera and case.adjusted is not None and not _has(case, CAMERA),
+        check_bent, lambda case: case.shows_camera and case.adjusted is not None and not _has(case, CAMERA)
     ),
     Check(check_boards, lambda case: case.reconstruction.tracks.boards is not None),
     Check(check_lengths),

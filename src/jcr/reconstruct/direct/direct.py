@@ -82,7 +82,9 @@ def reconstruct_direct(
     images = [read_image(capture.folder / name) for name in capture.images]
     given, warnings = usable_intrinsics(capture.intrinsics)
     notes: tuple[str, ...] = ()
-    intrinsics = given or _guessed_intrinsics(capture.image_size)
+    width, height = capture.image_size
+    focal = GUESSED_FOCAL * max(width, height)
+    intrinsics = given or Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
     levels = pyramid(images, intrinsics)
     known = given is not None
     found = search(levels, capture.base_from_gripper, known, report)
@@ -158,11 +160,6 @@ def images_that_fit(
             raise RejectedError("direct alignment: fewer than three images fit together", "take more")
         rows, level = rows[fits], level.rows(np.flatnonzero(fits))
         cameras = Cameras(cameras.base_from_camera[fits], cameras.zoom)
-
-
-def _guessed_intrinsics(size: tuple[int, int]) -> Intrinsics:
-    focal = GUESSED_FOCAL * max(size)
-    return Intrinsics(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2, *size)
 
 
 def pyramid(images: Sequence[UInt8[ndarray, "h w 3"]], intrinsics: Intrinsics) -> dict[int, Level]:

@@ -16,6 +16,11 @@ from jcr.reconstruct.global_alignment.pairs import PairPredictions
 FEW_IMAGES = 12
 """Up to here "auto" predicts every pair (132); a chain that is wrong costs more than it saves."""
 
+LEAST_OVERLAP, WIDER = 0.02, 1.5
+"""Share of an image's points that the other one of a pair must see, in a field of view half again as wide as its own."""
+SAMPLES = 1000
+"""Points of an image, about."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PairOptions:
@@ -53,14 +58,14 @@ def _both_orders(edges: Int[ndarray, "e 2"]) -> Int[ndarray, "e2 2"]:
 
 
 def overlapping_pairs(
-    chain: PairPredictions, base_from_gripper: Float[ndarray, "n 4 4"], least_overlap: float = 0.02
+    chain: PairPredictions, base_from_gripper: Float[ndarray, "n 4 4"]
 ) -> tuple[Int[ndarray, "e 2"], str]:
     """Pairs that can see something in common, in both orders, and in words how that was found.
 
     `chain` holds the pairs of neighbours, `window_pairs(n, 1)`. From their relative camera poses and the
     robot's come a first hand-eye calibration and the pairs' scales; with them every image's points go into
     the base frame and from there into every other camera. A pair is left out only when less than
-    `least_overlap` of the points of either image fall into half again the other's field of view. All pairs
+    LEAST_OVERLAP of the points of either image fall into half again the other's field of view. All pairs
     are kept where the motions do not determine where the camera looks, or the chain contradicts the robot.
     """
     everything = complete_pairs(len(base_from_gripper))
@@ -79,7 +84,7 @@ def overlapping_pairs(
         for j, others in enumerate(points):
             seen[i, j] = _share_in_view(apply(camera_from_base[j], x_in_base), others)
     first, second = everything.T
-    keep = (np.maximum(seen, seen.T)[first, second] >= least_overlap) | (np.abs(first - second) == 1)
+    keep = (np.maximum(seen, seen.T)[first, second] >= LEAST_OVERLAP) | (np.abs(first - second) == 1)
     return everything[keep], f"{keep.sum()} of {len(keep)} pairs predicted: the others share no view"
 
 
@@ -126,7 +131,7 @@ class _ChainView:
     """Of the next, in its own camera frame."""
 
 
-def _chain_views(chain: PairPredictions, count: int, samples: int = 1000) -> list[_ChainView]:
+def _chain_views(chain: PairPredictions, count: int) -> list[_ChainView]:
     row = {(int(first), int(second)): e for e, (first, second) in enumerate(chain.edges)}
     views = []
     for k in range(count - 1):
@@ -134,24 +139,22 @@ def _chain_views(chain: PairPredictions, count: int, samples: int = 1000) -> lis
         # The same pixels of the next image, in the camera frame of image k and in their own.
         confidence = np.minimum(chain.conf2[there], chain.conf[back]).ravel()
         best = np.argsort(confidence)[-len(confidence) // 2 :]
-        pixels = best[:: max(1, len(best) // samples)]
+        pixels = best[:: max(1, len(best) // SAMPLES)]
         in_camera = chain.pts3d_in_other_view[there].reshape(-1, 3)[pixels].astype(np.float64)
         in_next = chain.pts3d[back].reshape(-1, 3)[pixels].astype(np.float64)
         camera_from_next, scale = fit_similarity(in_camera, in_next)
-        own = np.argsort(chain.conf[there].ravel())[-len(confidence) // 2 :][:: max(1, len(best) // samples)]
+        own = np.argsort(chain.conf[there].ravel())[-len(confidence) // 2 :][:: max(1, len(best) // SAMPLES)]
         points = chain.pts3d[there].reshape(-1, 3)[own].astype(np.float64)
         views.append(_ChainView(camera_from_next, points, scale * in_next))
         chain.release()
     return views
 
 
-def _share_in_view(
-    x_in_camera: Float[ndarray, "n 3"], view: Float[ndarray, "p 3"], widen: float = 1.5
-) -> float:
+def _share_in_view(x_in_camera: Float[ndarray, "n 3"], view: Float[ndarray, "p 3"]) -> float:
     """Fraction of points that fall into the field of view that a camera's own points span, widened."""
     directions = view[:, :2] / np.maximum(view[:, 2:], 1e-6)
     low, high = np.quantile(directions, [0.01, 0.99], axis=0)
-    middle, half = (low + high) / 2, widen * (high - low) / 2
+    middle, half = (low + high) / 2, WIDER * (high - low) / 2
     ahead = x_in_camera[:, 2] > 1e-6
     inside = np.abs(x_in_camera[ahead, :2] / x_in_camera[ahead, 2:] - middle) <= half
     return float(inside.all(-1).sum() / len(x_in_camera))

@@ -168,7 +168,7 @@ class _Predictor:
         for e, edge in enumerate(edges.tolist()):
             found = None
             if known is not None and (row := rows.get(tuple(edge))) is not None:
-                found = [known.pts3d[row], known.conf[row], known.pts3d_in_other_view[row], known.conf2[row]]
+                found = [array[row] for array in known.pointmaps]
             elif self.cache is not None:
                 try:
                     found = self.cache.read(self._pair_key(edge), shapes)

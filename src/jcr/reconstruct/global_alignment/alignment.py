@@ -100,13 +100,12 @@ def pinhole_of(predictions: PairPredictions, options: AlignOptions) -> Pinhole:
         raise InputError(
             "focal 'given', but the predictions carry no intrinsics; add them or ask for 'shared'"
         )
-    known = given is not None and options.focal in ("auto", "given")
     height, width = predictions.conf.shape[1:]
     middle = (width / 2, height / 2) if given is None else (given.cx, given.cy)
     return Pinhole(
         principal_point_px=options.principal_point_px or middle,
         aspect=given.fy / given.fx if given else 1.0,
-        focal_px=given.fx if given and known else None,
+        focal_px=given.fx if given and options.focal in ("auto", "given") else None,
         shared=options.focal != "own",
     )
 
@@ -132,8 +131,8 @@ def check_connected(predictions: PairPredictions) -> None:
         joined = reached[predictions.edges].any(axis=1)
         reached[predictions.edges[joined].ravel()] = True
     if not reached.all():
-        names = [predictions.images[k] if predictions.images else f"#{k}" for k in np.flatnonzero(~reached)]
+        names = ", ".join(predictions.names[k] for k in np.flatnonzero(~reached))
         raise InputError(
-            f"no chain of pairs joins {', '.join(names)} to the other images; predict pairs between them, "
+            f"no chain of pairs joins {names} to the other images; predict pairs between them, "
             "or leave these images out"
         )

@@ -370,7 +370,7 @@ def _notes(predictions: PairPredictions, residual: Float[ndarray, " e"]) -> tupl
     bad = np.flatnonzero(residual > CONTRADICTION * float(np.median(residual)))
     if not len(bad):
         return ()
-    names = predictions.images or tuple(f"#{k}" for k in range(predictions.image_count))
+    names = predictions.names
     pairs = ", ".join(f"{names[n]}-{names[m]}" for n, m in predictions.edges[bad[:5]])
     more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
     return (f"{len(bad)} of {len(residual)} pairs contradict the others and count little: {pairs}{more}",)

@@ -143,10 +143,8 @@ def contradictions(cameras: HandEyeCameras, predictions: PairPredictions) -> tup
     strain = cameras.strain()
     if strain.max() <= STRAIN or len(strain) < 5:
         return ()
-    names = [
-        predictions.images[k] if predictions.images else f"#{k}" for k in np.flatnonzero(strain > STRAIN)
-    ]
+    names = ", ".join(predictions.names[k] for k in np.flatnonzero(strain > STRAIN))
     return (
-        f"the images contradict the gripper poses of {', '.join(names)} by up to {strain.max():.0f} times the "
+        f"the images contradict the gripper poses of {names} by up to {strain.max():.0f} times the "
         "robot pose noise; these poses are wrong",
     )

@@ -4,7 +4,7 @@ import math
 import mmap
 import struct
 import zipfile
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -50,9 +50,24 @@ class PairPredictions:
         """Images that the edges join."""
         return len(self.images) or int(self.edges.max()) + 1
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the images, for messages: their numbers where they have none."""
+        return self.images or tuple(f"#{k}" for k in range(self.image_count))
+
+    @property
+    def pointmaps(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+        """Points and confidences of the first views, and of the second ones."""
+        return self.pts3d, self.conf, self.pts3d_in_other_view, self.conf2
+
+    def of_edges(self, rows: ndarray) -> "PairPredictions":
+        """Some of the pairs."""
+        kept = {name: getattr(self, name)[rows] for name in ARRAYS}
+        return replace(self, **kept)
+
     def release(self) -> None:
         """Take pointmaps that lie in a file out of the resident set; they come back page by page when read."""
-        for array in (self.pts3d, self.conf, self.pts3d_in_other_view, self.conf2):
+        for array in self.pointmaps:
             _release(array)
 
 

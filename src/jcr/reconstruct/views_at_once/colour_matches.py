@@ -62,6 +62,8 @@ def colour_matches(gray: UInt8[ndarray, "n h w"], geometry: Geometry, keypoints:
     """Where other views show up to `keypoints` corners of each view."""
     count, height, width = gray.shape
     directions = rays(geometry.pinhole)
+    axis = geometry.recon_from_camera[:, :3, 2]
+    apart_deg = np.degrees(np.arccos(np.clip(axis @ axis.T, -1, 1)))
     starts, points, views, pixels = [], [], [], []
     total = 0
     for n in range(count):
@@ -71,15 +73,13 @@ def colour_matches(gray: UInt8[ndarray, "n h w"], geometry: Geometry, keypoints:
             continue
         corners = corners[:, 0]
         x_in_recon = apply(geometry.recon_from_camera[n], geometry.depth[n][..., None] * directions)
-        matched = np.zeros(len(corners), bool)
         for m in range(count):
-            if m == n or _apart_deg(geometry, n, m) > WIDEST_DEG:
+            if m == n or apart_deg[n, m] > WIDEST_DEG:
                 continue
             good, there = _locate_corners(gray[n], gray[m], corners, x_in_recon, geometry, n, m)
             points.append(total + np.flatnonzero(good))
             views.append(np.full(good.sum(), m))
             pixels.append(there[good])
-            matched |= good
         starts.append(np.column_stack([np.full(len(corners), n), corners]))
         total += len(corners)
     if not points:
@@ -115,12 +115,6 @@ def _textured_both_ways(gray: UInt8[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
     # Sobel's weights of white noise: 12 of the 64 parts.
     least -= noise**2 * 12 / 64 * WINDOW[0] * WINDOW[1]
     return least > 2 * (noise / LARGEST_STD_PX) ** 2
-
-
-def _apart_deg(geometry: Geometry, n: int, m: int) -> float:
-    """Angle between the optical axes."""
-    first, second = geometry.recon_from_camera[n, :3, 2], geometry.recon_from_camera[m, :3, 2]
-    return float(np.degrees(np.arccos(np.clip(first @ second, -1, 1))))
 
 
 def _locate_corners(

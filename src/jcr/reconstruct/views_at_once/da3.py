@@ -56,7 +56,8 @@ def load(weights: Path, device: str) -> Predict:
         network = build(name)
         network.load_state_dict({key.removeprefix("model."): state[key] for key in state})
     except (OSError, ValueError, KeyError, RuntimeError, SafetensorError) as error:
-        raise InputError(f"{weights}: no weights of Depth Anything 3 ({_line(error)})") from None
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{weights}: no weights of Depth Anything 3 ({reason})") from None
     return partial(predict, network.to(device))
 
 
@@ -104,8 +105,9 @@ def predict(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) -> Pre
 
 def grid_of(size: tuple[int, int], long_edge: int = LONG_EDGE) -> ImageGrid:
     """Nothing is cropped: the long edge becomes `long_edge`, then each edge the nearest multiple of the patch."""
-    width, height = (_multiple(round(edge * long_edge / max(size))) for edge in size)
-    return ImageGrid(size, (width, height), (0, 0), (width, height))
+    edges = (round(edge * long_edge / max(size)) for edge in size)
+    width, height = (max(1, (edge + PATCH // 2) // PATCH) * PATCH for edge in edges)
+    return ImageGrid.uncropped(size, (width, height))
 
 
 def resized(image: UInt8[ndarray, "h w 3"], grid: ImageGrid, long_edge: int) -> UInt8[ndarray, "h2 w2 3"]:
@@ -120,10 +122,6 @@ def resized(image: UInt8[ndarray, "h w 3"], grid: ImageGrid, long_edge: int) -> 
     return image
 
 
-def _multiple(edge: int) -> int:
-    return max(1, (edge + PATCH // 2) // PATCH) * PATCH
-
-
 def _from_first(recon_from_camera: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n 4 4"]:
     """camera_from_first, in units of the median distance between the first camera and the others, itself included."""
     first_from_camera = inverse(recon_from_camera[0]) @ recon_from_camera
@@ -131,7 +129,3 @@ def _from_first(recon_from_camera: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n
     camera_from_first = inverse(first_from_camera)
     camera_from_first[:, :3, 3] /= max(distance[(len(distance) - 1) // 2], LEAST_UNIT)
     return camera_from_first
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]

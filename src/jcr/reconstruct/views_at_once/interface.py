@@ -1,7 +1,7 @@
 """What goes into an any-view model and what comes out, in our conventions; its adapter converts at the border."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -117,11 +117,8 @@ def checked(predicted: Predicted, model: str) -> Predicted:
         raise InputError(
             f"{model} gave no usable depth or camera; its weights may be damaged, get them again"
         )
-    return Predicted(
-        grid=predicted.grid,
+    return replace(
+        predicted,
         x_in_camera=np.where(there[..., None], predicted.x_in_camera, 0).astype(np.float32),
         confidence=np.where(there, confidence, 0).astype(np.float32),
-        pinholes=predicted.pinholes,
-        recon_from_camera=poses,
-        is_metric=predicted.is_metric,
     )

@@ -24,6 +24,7 @@ from jcr.reconstruct.views_at_once.interface import (
 )
 
 LONG_EDGE = 640
+"""Of the images that it is shown, at most; nothing is cropped."""
 
 
 def load(weights: Path, device: str) -> Predict:
@@ -38,7 +39,7 @@ def load(weights: Path, device: str) -> Predict:
 
 def predict(network: nn.Module, views: Views) -> Predicted:
     """Every view by itself, given the field of view where the intrinsics are known."""
-    grid = grid_of(views.size)
+    grid = ImageGrid.shrunk(views.size, LONG_EDGE)
     device = next(network.parameters()).device.type
     fov_deg = None
     if views.pinhole is not None:
@@ -64,10 +65,3 @@ def predict(network: nn.Module, views: Views) -> Predicted:
         is_metric=True,
     )
     return checked(made, "MoGe-2")
-
-
-def grid_of(size: tuple[int, int]) -> ImageGrid:
-    """The long edge becomes 640 or stays below; nothing is cropped."""
-    scale = min(1.0, LONG_EDGE / max(size))
-    shown = round(size[0] * scale), round(size[1] * scale)
-    return ImageGrid(size, shown, (0, 0), shown)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.adjust.images import ImageEvidence, adjust_images
@@ -61,8 +61,9 @@ def refine(predicted: Predicted, images: PreparedImages, pinhole: Intrinsics) ->
     """
     poses = predicted.recon_from_camera
     assert poses is not None
-    work = _working_grid(images.grid.size)
-    gray = np.stack([cv2.cvtColor(_shrunk(image, work), cv2.COLOR_RGB2GRAY) for image in images.colors])
+    work = ImageGrid.shrunk(images.grid.size, LONG_EDGE)
+    smaller = [cv2.resize(image, work.size, interpolation=cv2.INTER_AREA) for image in images.colors]
+    gray = np.stack([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in smaller])
     camera = work.grid_intrinsics(pinhole)
     depth = _depth_on(work, predicted)
     factor = np.ones(predicted.confidence.shape, np.float32)
@@ -81,10 +82,11 @@ def refine(predicted: Predicted, images: PreparedImages, pinhole: Intrinsics) ->
         factor = factor * np.stack([smooth_factor(c, *predicted.grid.size[::-1]) for c in change])
     assert adjusted is not None
     tracks = adjusted.tracks
+    seen_px = images.grid.grid_from_original(work.original_from_grid(tracks.x_px))
     return Refined(
         recon_from_camera=poses,
         depth_factor=factor,
-        tracks=replace(tracks, x_px=_capture_px(images, work.original_from_grid(tracks.x_px))),
+        tracks=replace(tracks, x_px=images.original_px(seen_px)),
         pinhole=pinhole if images.pinhole is not None else work.original_intrinsics(camera),
         evidence=CameraEvidence(poses, adjusted.shown.rig_covariance()),
         error_px=adjusted.error_px / float(work.scale.mean()),
@@ -100,20 +102,6 @@ class _Adjusted:
     """Without outliers; none where most points came to lie behind their cameras."""
     error_px: float
     """Median, of these."""
-
-
-def _working_grid(size: tuple[int, int]) -> ImageGrid:
-    scale = min(1.0, LONG_EDGE / max(size))
-    shown = round(size[0] * scale), round(size[1] * scale)
-    return ImageGrid(size, shown, (0, 0), shown)
-
-
-def _shrunk(image: UInt8[ndarray, "h w 3"], grid: ImageGrid) -> UInt8[ndarray, "h2 w2 3"]:
-    return (
-        image
-        if grid.size == grid.original_size
-        else cv2.resize(image, grid.size, interpolation=cv2.INTER_AREA)
-    )
 
 
 def _depth_on(grid: ImageGrid, predicted: Predicted) -> Float[ndarray, "n h w"]:
@@ -213,8 +201,3 @@ def smooth_factor(coefficients: Float[ndarray, "6"], height: int, width: int) ->
     """The factor at every pixel of an image of that size."""
     y, x = np.meshgrid(np.linspace(0, 1, height), np.linspace(0, 1, width), indexing="ij")
     return np.exp(_basis(x, y) @ coefficients).astype(np.float32)
-
-
-def _capture_px(images: PreparedImages, x_px: Float[ndarray, "k 2"]) -> Float[ndarray, "k 2"]:
-    """Pixels of the undistorted images in the capture's own."""
-    return images.original_px(images.grid.grid_from_original(x_px))

@@ -57,7 +57,7 @@ def reconstruct_single_views(
         base_from_gripper=capture.base_from_gripper[sparse.image_index],
         intrinsics=sparse.intrinsics,
     )
-    images = prepare_images(placed, lambda size: ImageGrid(size, size, (0, 0), size))
+    images = prepare_images(placed, lambda size: ImageGrid.uncropped(size, size))
     assert (
         images.pinhole is not None and images.intrinsics_of_capture is not None
     )  # structure from motion found them

@@ -131,7 +131,7 @@ def reconstruct_views_at_once(
     """
     report = progress or silent
     _require_memory(capture, options)
-    images = prepare_images(capture, lambda size: ImageGrid(size, size, (0, 0), size))
+    images = prepare_images(capture, lambda size: ImageGrid.uncropped(size, size))
     predict = predict or loaded(options.load, options.weights.path, options.device)
     report("reconstruct", 0.0)
     predicted = with_known_rays(predict(Views(images.colors, images.pinhole)), images)
