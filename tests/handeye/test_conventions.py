@@ -10,7 +10,14 @@ from scipy.spatial.transform import Rotation
 from benchmarks.simulated.problem import hand_eye_problem
 from jcr.capture.names import paired_by_name
 from jcr.geometry import inverse, transform
-from jcr.handeye.conventions import BY_NUMBER, BY_TEXT, MIRRORED, better_reading, convention_finding
+from jcr.handeye import conventions
+from jcr.handeye.conventions import (
+    BY_NUMBER,
+    BY_TEXT,
+    MIRRORED,
+    better_reading,
+    convention_finding,
+)
 from jcr.records.words import sentence
 
 
@@ -104,3 +111,14 @@ def test_sound_poses_are_left_alone(noise):
     for seed in range(2):
         problem = hand_eye_problem(np.random.default_rng(seed), 10, robot_noise=noise)
         assert better_reading(problem.base_from_gripper, problem.recon_from_camera) is None
+
+
+def test_shuffled_poses_are_read_in_few_ways(monkeypatch: pytest.MonkeyPatch):
+    """No reading fits them, and each that is solved takes as long as the calibration itself: 14 of them were."""
+    solved = []
+    solve = conventions.solve_hand_eye
+    monkeypatch.setattr(conventions, "solve_hand_eye", lambda *poses: solved.append(1) or solve(*poses))
+    rng = np.random.default_rng(0)
+    p = hand_eye_problem(rng, 12)
+    assert better_reading(p.base_from_gripper[rng.permutation(12)], p.recon_from_camera) is None
+    assert len(solved) <= 4

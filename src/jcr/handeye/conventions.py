@@ -62,6 +62,23 @@ EULER_ORDERS = (
 """SciPy's names, lower case about fixed axes, upper case about moving ones; the usual ones first."""
 
 
+def _euler_mistakes() -> list[tuple[str, str]]:
+    """The order that angles were taken in, and the one that was meant, the usual ones first, each mistake once.
+
+    Angles about fixed axes are those about the moving ones, reversed, so that a mistake has two names.
+    """
+    rank = {order: k for k, order in enumerate(EULER_ORDERS)}
+    found: dict[frozenset[tuple[str, str]], tuple[str, str]] = {}
+    for mistake in sorted(permutations(EULER_ORDERS, 2), key=lambda pair: rank[pair[0]] + rank[pair[1]]):
+        taken, meant = mistake
+        other = taken[::-1].swapcase(), meant[::-1].swapcase()
+        found.setdefault(frozenset({mistake, other}), mistake)
+    return list(found.values())
+
+
+EULER_MISTAKES = _euler_mistakes()
+
+
 @dataclass(frozen=True)
 class Reading:
     """One way to read the poses, and how well it fits."""
@@ -114,12 +131,15 @@ def better_reading(
     order = np.argsort(np.round(gaps / SAME_ANGLE), kind="stable")[:SOLVED]
     worth = [others[k] for k in order if gaps[k] < 2 * gaps.min() + SAME_ANGLE]
     rough = np.array([_roughly(candidate, recon_from_camera) for candidate in worth])
-    if not np.isfinite(rough.min()) or rough.min() > _roughly(candidates[0], recon_from_camera) / ROUGHLY:
+    # Of a reading that may be named: shuffled poses fit no reading, and each would be solved in vain.
+    enough = 1e-3 * ROUGHLY / BETTER * as_given.misfit
+    limit = min(enough, _roughly(candidates[0], recon_from_camera) / ROUGHLY)
+    if not np.isfinite(rough.min()) or rough.min() > limit:
         return None
     readings = [
         _solved(candidate, recon_from_camera)
         for candidate, error in zip(worth, rough, strict=True)
-        if error <= ROUGHLY * rough.min()
+        if error <= min(ROUGHLY * rough.min(), enough)
     ]
     least = min(reading.misfit for reading in readings)
     best = next(reading for reading in readings if reading.misfit < 1.05 * least + 0.01)
@@ -203,8 +223,7 @@ def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
     for order in EULER_ORDERS:
         read = Rotation.from_euler(order, np.degrees(angles[order]))
         yield with_rotation(f"Euler angles ({order}) {in_radians}", read)
-    k = {order: rank for rank, order in enumerate(EULER_ORDERS)}
-    for taken, meant in sorted(permutations(EULER_ORDERS, 2), key=lambda pair: k[pair[0]] + k[pair[1]]):
+    for taken, meant in EULER_MISTAKES:
         read = Rotation.from_euler(meant, angles[taken])
         yield with_rotation(f"Euler angles {meant} that were taken as {taken}", read)
 

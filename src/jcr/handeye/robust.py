@@ -10,7 +10,6 @@ least, and yet none is wrong: it costs less to take the arm for a worse one than
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -194,11 +193,12 @@ def _congruent_triples(a: Float[ndarray, "n n 4 4"], b: Float[ndarray, "n n 4 4"
     """Triples of images whose three motions rotate by the same angle in gripper and camera, best first."""
     n = len(a)
     gap = np.abs(rotation_angle(a[..., :3, :3]) - rotation_angle(b[..., :3, :3]))
-    i, j, k = np.array(list(combinations(range(n), 3))).T
+    row = np.arange(n)
+    i, j, k = np.nonzero((row[:, None, None] < row[:, None]) & (row[:, None] < row))
     worst = np.maximum(np.maximum(gap[i, j], gap[i, k]), gap[j, k])
     # Two motions about one axis fix nothing: prefer triples that rotate about two.
-    axes_ij, axes_ik = sine_axis(a[i, j, :3, :3]), sine_axis(a[i, k, :3, :3])
-    spread = np.linalg.norm(np.cross(axes_ij, axes_ik), axis=1)
+    axes = sine_axis(a[..., :3, :3])
+    spread = np.linalg.norm(np.cross(axes[i, j], axes[i, k]), axis=1)
     # The 0.3 quantile of all gaps comes from pairs of sound images even when 30 % of the images are wrong.
     typical = max(float(np.quantile(gap[np.triu_indices(n, 1)], 0.3)), np.radians(0.05))
     order = np.argsort(worst / typical + 0.02 / np.maximum(spread, 1e-6), kind="stable")[:MAX_TRIPLES]

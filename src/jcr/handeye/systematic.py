@@ -97,8 +97,9 @@ class Region:
 
     def left(self, systematic: Float[ndarray, "s s"]) -> Float[ndarray, "s s"]:
         """Covariance of what a systematic error leaves after the effective transform took its part."""
-        keep = np.eye(len(self.by_unknown)) - self.by_unknown @ self.fit
-        return keep @ systematic @ keep.T
+        # (I − J A) S (I − J A)ᵀ, without a product of two matrices of the residuals' size.
+        half = systematic - self.by_unknown @ (self.fit @ systematic)
+        return half - (half @ self.fit.T) @ self.by_unknown.T
 
     def spread(self, second_moment: Float[ndarray, "*k m 6 6"]) -> Float[ndarray, "*k p p"]:
         """Covariance (p,p) of the unknowns for other poses of the same region, from E[e'e'ᵀ] of each of m used poses.

@@ -20,6 +20,8 @@ LEAST_RIGHT = 0.5
 """Share of guided matches that one geometry must explain: chance fills the whole band."""
 NARROWEST_PX, WIDEST_PX = 4.0, 25.0
 """Of the band around the line."""
+TWICE_PX = 3.0
+"""Between two places at which one keypoint may have been found."""
 
 
 def band_px(focal_px: float, std_rad: float) -> float:
@@ -74,23 +76,21 @@ def guided_rows(
     Descriptors are of unit length.
     """
     h_i, h_j = (np.concatenate([view.rays[k], np.ones((len(view.rays[k]), 1))], 1) for k in (i, j))
+    if min(len(h_i), len(h_j)) < 2:
+        return np.zeros((0, 2), dtype=int)
     length = max(float(np.linalg.norm(i_from_j[:3, 3])), 1e-9)
     essential = skew(i_from_j[:3, 3] / length) @ i_from_j[:3, :3]
     line_i, line_j = h_j @ essential.T, h_i @ essential
     off = np.abs(h_i @ line_i.T)
-    off_i = off / np.maximum(np.linalg.norm(line_i[:, :2], axis=1), 1e-12)
-    off_j = off / np.maximum(np.linalg.norm(line_j[:, :2], axis=1), 1e-12)[:, None]
-    near = np.maximum(off_i, off_j) < band / view.intrinsics.fx
-    alike = np.where(near, descriptor_i @ descriptor_j.T, -1.0)
-    if min(alike.shape) < 2:
-        return np.zeros((0, 2), dtype=int)
-    best = alike.argmax(1)
-    row = np.arange(len(alike))
-    first = alike[row, best]
-    others = alike.copy()
+    # Of its distances from the two lines a match has the larger: that whose line has the smaller norm.
+    norm_i, norm_j = (np.maximum(np.linalg.norm(line[:, :2], axis=1), 1e-12) for line in (line_i, line_j))
+    cosine = descriptor_i @ descriptor_j.T
+    cosine[off >= band / view.intrinsics.fx * np.minimum(norm_i, norm_j[:, None])] = -1.0
+    best = cosine.argmax(1)
+    nearest = np.arccos(np.clip(cosine[np.arange(len(best)), best], -1, 1))
+    row = np.flatnonzero((cosine.argmax(0)[best] == np.arange(len(best))) & (nearest < LARGEST_ANGLE))
+    others, x_px, at = cosine[row], view.x_px[j], view.x_px[j][best[row]]
     # A keypoint found twice is no rival of itself.
-    twice = np.linalg.norm(view.x_px[j][best][:, None] - view.x_px[j][None], axis=2) < 3.0
-    others[twice] = -1.0
-    angle, next_angle = (np.arccos(np.clip(of, -1, 1)) for of in (first, others.max(1)))
-    good = (alike.argmax(0)[best] == row) & (angle < LARGEST_ANGLE) & (angle < RATIO * next_angle)
-    return np.stack([row[good], best[good]], 1)
+    others[(at[:, :1] - x_px[:, 0]) ** 2 + (at[:, 1:] - x_px[:, 1]) ** 2 < TWICE_PX**2] = -1.0
+    good = row[nearest[row] < RATIO * np.arccos(np.clip(others.max(1), -1, 1))]
+    return np.stack([good, best[good]], 1)

@@ -25,6 +25,9 @@ LARGEST_MOVE = 0.15
 """The same of its position, as a share of the distance to the scene."""
 MIN_INLIERS = 15
 MAX_ERROR_PX = 6.0
+REFINEMENTS = (1, 5)
+"""Of the points, their cameras fixed, after they are triangulated the first and the second time; COLMAP's is 5, which
+takes twice as long as 1."""
 LEAST_SHARED = 15
 """Points that a joined model must share with the map; with fewer only the robot would tie the two."""
 
@@ -117,13 +120,14 @@ def retriangulated(
     with tempfile.TemporaryDirectory(prefix="jcr-placed-") as folder:
         poses = recon_from_camera
         model = None
-        for _ in range(2):
+        for refinements in REFINEMENTS:
             if model is not None:
                 adjust(model)
                 poses = dict(zip(sorted(poses), poses_of(model, sorted(poses)), strict=True))
             model = model_of(database, camera, poses)
             options = pycolmap.IncrementalPipelineOptions()
             options.num_threads = options.mapper.num_threads = 1
+            options.ba_global_max_refinements = refinements
             options.random_seed = options.triangulation.random_seed = 0
             model = pycolmap.triangulate_points(
                 model, database, folder, Path(folder), refine_intrinsics=False, options=options
