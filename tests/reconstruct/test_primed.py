@@ -11,7 +11,7 @@ from jcr.match.stage import Matched
 from jcr.match.verify import write_geometries, write_keypoints
 from jcr.reconstruct.placed import poses_of
 from jcr.reconstruct.primed import primed
-from jcr.reconstruct.sfm import adjust_robustly, camera_of, enter, log_level, map_incrementally
+from jcr.reconstruct.sfm import adjust_robustly, camera_of, enter, map_incrementally, quiet_colmap
 from points_of_a_table import IMAGES, INTRINSICS, PointsOfATable, matched_pairs_of
 
 pytestmark = pytest.mark.slow
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(autouse=True)
 def quiet():
-    with log_level(False):
+    with quiet_colmap():
         yield
 
 

@@ -13,8 +13,6 @@ class ColmapOptions:
     """Images whose long side is larger are reduced to this before features are extracted."""
     seed: int = 0
     """Same seed, same result, bit for bit."""
-    verbose: bool = False
-    """Let COLMAP's own log through."""
     features: FeatureName = "sift"
     """What is matched between images."""
     robot_checks: bool = True

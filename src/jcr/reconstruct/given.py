@@ -23,7 +23,7 @@ from jcr.memory import plan
 from jcr.progress import Progress, silent
 from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.reconstruct.placed import model_of
-from jcr.reconstruct.sfm import enter, log_level, sift_features, tracks_of
+from jcr.reconstruct.sfm import enter, quiet_colmap, sift_features, tracks_of
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
 MIN_POINTS = 50
@@ -105,7 +105,7 @@ def _triangulated(
     report: Progress,
 ) -> Tracks:
     """Points of matched features, with intrinsics and cameras fixed."""
-    with log_level(options.verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
+    with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
         cameras = enter(database, len(images), [intrinsics], True, options.working_size_px)
         found = sift_features(images, cameras[0], options.memory_gb, report)

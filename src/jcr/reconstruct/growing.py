@@ -34,10 +34,10 @@ from jcr.reconstruct.sfm import (
     adjust_robustly,
     enter,
     intrinsics_of,
-    log_level,
     map_incrementally,
     matched_pairs,
     pipeline_options,
+    quiet_colmap,
     sift_features,
     tracks_of,
 )
@@ -70,7 +70,7 @@ class Growing:
         self._rows = list(range(len(capture)))
         self._all_intrinsics, self._known, _ = starting_intrinsics(capture)
         self._kept = KeptFeatures.growing(capture.folder)
-        with log_level(False):
+        with quiet_colmap():
             self._map_all()
 
     def _map_all(self) -> None:
@@ -135,7 +135,7 @@ class Growing:
         x_px = self._matcher.x_px[row]
         rays = unproject(self._view.intrinsics, x_px)[:, :2]
         self._view = View([*self._view.x_px, x_px], self._view.intrinsics, [*self._view.rays, rays])
-        with log_level(False):
+        with quiet_colmap():
             self._match(row)
             if self._model is not None:
                 self._register([row, *self._left_out(row)])

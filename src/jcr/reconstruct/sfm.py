@@ -86,7 +86,7 @@ def structure_from_motion(
     than three images register.
     """
     seed = options.seed
-    with log_level(options.verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
+    with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
         cameras = enter(database, len(images), all_intrinsics, known, options.working_size_px)
         matcher = matcher_of(options, images, cameras[0], known, report, kept)
@@ -555,8 +555,8 @@ def intrinsics_of(camera: pycolmap.Camera, like: Intrinsics) -> Intrinsics:
 
 
 @contextmanager
-def log_level(verbose: bool) -> Iterator[None]:
-    """COLMAP writes its log to stderr through glog; only fatal errors unless `verbose`.
+def quiet_colmap() -> Iterator[None]:
+    """COLMAP writes its log to stderr through glog: within, only fatal errors.
 
     Importing pycolmap replaces what SIGTERM does by glog's handler, which prints a page of C++ frames. Python does not
     know of it: what Python has for the signal is set again, and glog's handler is gone for good.
@@ -566,7 +566,7 @@ def log_level(verbose: bool) -> Iterator[None]:
     if on_termination is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, on_termination)
     before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = (pycolmap.logging.INFO if verbose else pycolmap.logging.FATAL).value
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     try:
         yield
     finally:
