@@ -189,9 +189,9 @@ def linearised(
         # A unit of the world that is that of its rigs' places, all alike: what λ is counted in. Boards take no part: λ
         # would then be of their size too, and no longer that of the cameras and points.
         boards, first = problem.observations.boards, problem.freedom.first_rig
-        rigs = slice(first, None if boards is None else first + 6 * boards.first_rig)
-        by_similarity = np.zeros((len(information), 7))
-        by_similarity[rigs] = similarities(scene, problem.freedom)[rigs]
+        rigs = slice(first, len(information) if boards is None else first + 6 * boards.first_rig)
+        by_similarity = similarities(scene, problem.freedom)
+        by_similarity[problem.freedom.board_columns] = by_similarity[rigs.stop :] = 0.0
         information += information_along(by_similarity, float(information.diagonal()[rigs].mean()))
     found = ImageEvidence(
         scene=scene, problem=problem, information=information, gradient=-normal.right, noise=noise, view=view
