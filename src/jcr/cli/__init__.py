@@ -93,8 +93,10 @@ LONGEST_LINE = 2000
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and exit with its status."""
-    # Threads of BLAS gain nothing on small matrices, and wait by spinning: a tenth of the processor time of a run.
+    # Threads of BLAS gain nothing on small matrices. These, and torch's, wait by spinning: a tenth of the processor time
+    # of a run, and two seconds of its fifteen.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     _open_closed_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # of an ASCII terminal, which has no ±
