@@ -96,16 +96,16 @@ def page(
 
 def _jobs(place: Path) -> Iterator[tuple[str, Spent]]:
     """Every job once."""
-    program, jcr = [sys.executable, "-c"], [sys.executable, "-m", "jcr", "calibrate"]
+    program, command = [sys.executable, "-c"], [sys.executable, "-m", "jcr"]
+    jcr = [*command, "calibrate"]
     kept = str(place / "kept")
     yield (
         ALONE,
         _spent([*program, f"from benchmarks.speed import colmap_alone; colmap_alone({str(place)!r})"]),
     )
-    yield (
-        ALL_OF_IT,
-        _spent([*program, f"from benchmarks.speed import run_by_stage; run_by_stage({str(place)!r})"]),
-    )
+    yield ALL_OF_IT, _spent([*command, "run", str(CAPTURE), str(place / "whole"), "--quiet"])
+    by_stage = f"from benchmarks.speed import run_by_stage; run_by_stage({str(place)!r})"
+    _spent([*program, f"from jcr.cli import wait_asleep; wait_asleep(); {by_stage}"])
     yield CALIBRATED, _spent([*jcr, str(CAPTURE), kept, "--quiet"])
     (place / "kept" / "calibration.json").unlink()
     yield KEPT, _spent([*jcr, str(CAPTURE), kept, "--quiet"])
@@ -141,7 +141,7 @@ def colmap_alone(place: str) -> None:
 
 
 def run_by_stage(place: str) -> None:
-    """In a process of its own: `jcr run`, and the processor seconds of its stages in a file."""
+    """In a process of its own: what `jcr run` does, and the processor seconds of its stages in a file."""
     import jcr
     from jcr import attempts, stages
     from jcr.report import html
