@@ -170,3 +170,22 @@ def test_torch_stays_where_networks_are():
         and package(file) not in TORCH_PACKAGES
     ]
     assert not outside
+
+
+POSITIONAL = {"Intrinsics"}
+"""fx, fy, cx, cy, width, height: public, in the order of every library."""
+
+
+def test_records_of_five_fields_and_more_are_made_by_name():
+    by_place = {}
+    for module, file in FILES.items():
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ClassDef) and any(
+                ast.unparse(one).startswith("dataclass") and "kw_only=True" not in ast.unparse(one)
+                for one in node.decorator_list
+            ):
+                fields = [one for one in node.body if isinstance(one, ast.AnnAssign)]
+                types = [ast.unparse(one.annotation) for one in fields]
+                by_place[f"{module}.{node.name}"] = (*types, "KW_ONLY").index("KW_ONLY")
+    assert len(by_place) > 100, "the records are read"
+    assert {name.rpartition(".")[2] for name, count in by_place.items() if count >= 5} == POSITIONAL
