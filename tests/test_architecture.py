@@ -1,6 +1,7 @@
 """Imports run one way: read from the source, so that a shortcut is found on the day it is taken."""
 
 import ast
+import re
 import sys
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -189,3 +190,16 @@ def test_records_of_five_fields_and_more_are_made_by_name():
                 by_place[f"{module}.{node.name}"] = (*types, "KW_ONLY").index("KW_ONLY")
     assert len(by_place) > 100, "the records are read"
     assert {name.rpartition(".")[2] for name, count in by_place.items() if count >= 5} == POSITIONAL
+
+
+def test_pages_are_made_by_templates_that_escape():
+    """HTML in an f-string is a place where a name of a file becomes markup."""
+    tag = re.compile(r"</?(a|b|button|div|form|i|img|li|p|script|span|svg|table|td|th|tr|ul)[ >]")
+    assert tag.search('<td class="x">'), "the pattern finds a tag"
+    against = [
+        f"{module}:{node.lineno}"
+        for module, file in FILES.items()
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.JoinedStr) and tag.search("".join(map(ast.unparse, node.values)))
+    ]
+    assert not against
