@@ -21,8 +21,6 @@ from jcr.records.words import doubt_of
 from jcr.rounding import significant
 
 FILE, FORMAT = "cameras.json", "jcr.cameras/1"
-ORDER = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
-"""Of the covariances: the step (geometry.retract) that takes the transform to the true one, in axes of its parent."""
 
 
 class TransformUncertainty(Part):
@@ -31,7 +29,8 @@ class TransformUncertainty(Part):
     translation_std_mm: Spread3
     rotation_std_deg: Spread3
     covariance: Covariance6
-    """In ORDER; m and rad."""
+    """Of the step (geometry.retract) that takes the transform to the true one: translation (m), rotation vector (rad), in
+    axes of its parent."""
     at_scene_mm: Spread | None = None
     """Along the worst axis, of a point at `scene_distance_m` before the camera."""
     scene_distance_m: Spread | None = None

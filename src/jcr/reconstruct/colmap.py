@@ -46,7 +46,7 @@ def reconstruct_colmap(
             is_known,
             options,
             report,
-            capture.base_from_gripper if options.robot_checks else None,
+            capture.base_from_gripper,
             capture.images,
             KeptFeatures.of(capture) if options.features == "sift" else None,
         )

@@ -4,7 +4,7 @@ import math
 import mmap
 import struct
 import zipfile
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -59,11 +59,6 @@ class PairPredictions:
     def pointmaps(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
         """Points and confidences of the first views, and of the second ones."""
         return self.pts3d, self.conf, self.pts3d_in_other_view, self.conf2
-
-    def of_edges(self, rows: ndarray) -> "PairPredictions":
-        """Some of the pairs."""
-        kept = {name: getattr(self, name)[rows] for name in ARRAYS}
-        return replace(self, **kept)
 
     def release(self) -> None:
         """Take pointmaps that lie in a file out of the resident set; they come back page by page when read."""
