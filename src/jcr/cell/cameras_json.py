@@ -29,8 +29,8 @@ class TransformUncertainty(Part):
     translation_std_mm: Spread3
     rotation_std_deg: Spread3
     covariance: Covariance6
-    """Of the step (geometry.retract) that takes the transform to the true one: translation (m), rotation vector (rad), in
-    axes of its parent."""
+    """Of the step (geometry.retract) to the true transform: translation (m) and rotation vector (rad), in axes of its
+    parent."""
     at_scene_mm: Spread | None = None
     """Along the worst axis, of a point at `scene_distance_m` before the camera."""
     scene_distance_m: Spread | None = None
