@@ -18,7 +18,7 @@ from jcr.represent.seen import HIT
 LEAST = 0.02
 """Occupancy of the most doubtful points that a threshold can bring to sight."""
 PACKAGE = "jcr.view"
-"""Of the templates."""
+"""The package of the templates."""
 MAP_POINTS = 150_000
 UNKNOWN_CELLS = 300_000
 """Asked to find the edge of the unknown."""

@@ -93,7 +93,7 @@ class Equations:
 
     normal: Float[ndarray, "p p"]
     gradient: Float[ndarray, "k p"]
-    """Of each point; their sum is the gradient."""
+    """Gradient of each point; their sum is that of the cost."""
     by_depth: Float[ndarray, "k p"]
     depth_gradient: Float[ndarray, " k"]
     depth_information: Float[ndarray, " k"]

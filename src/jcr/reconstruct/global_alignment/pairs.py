@@ -31,10 +31,10 @@ class PairPredictions:
     edges: Int[ndarray, "e 2"]
     pts3d: Float[ndarray, "e h w 3"]
     conf: Float[ndarray, "e h w"]
-    """Of `pts3d`, at least 0; the network's own is at least 1."""
+    """Confidence of `pts3d`, at least 0; the network's own is at least 1."""
     pts3d_in_other_view: Float[ndarray, "e h w 3"]
     conf2: Float[ndarray, "e h w"]
-    """Of `pts3d_in_other_view`."""
+    """Confidence of `pts3d_in_other_view`."""
     images: tuple[str, ...] = ()
     """Names of the images in the capture; empty when the file has none."""
     colors: UInt8[ndarray, "n h w 3"] | None = None

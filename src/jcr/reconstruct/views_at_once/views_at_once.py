@@ -50,11 +50,11 @@ class Cost:
     base_gb: float
     """Weights, in main memory, and what their library takes."""
     view_gb: float
-    """Of each view."""
+    """Memory of each view."""
     view_s: float
-    """Of each view on one core of a desktop's processor."""
+    """Seconds for each view on one core of a desktop's processor."""
     pair_s: float
-    """Of each pair of views, likewise."""
+    """Seconds for each pair of views on that core."""
 
     def bytes(self, views: int) -> float:
         """Peak of main memory on a CPU, over what the program takes without it."""
@@ -76,9 +76,9 @@ class ViewsOptions:
     """One model and where it runs."""
 
     backend: str
-    """For the record: its row of the table of back ends."""
+    """Its row of the table of back ends, for the record."""
     load: Callable[[Path, str], Predict]
-    """Of the folder of its weights, and the device."""
+    """Loads the model from the folder of its weights, on the device."""
     weights: Weights
     cost: Cost
     takes_poses: bool = False
