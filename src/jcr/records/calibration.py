@@ -249,7 +249,7 @@ class WithGivenIntrinsics:
     """In COVARIANCE_ORDER; with its distance from the transform that belongs to the estimated intrinsics."""
     intrinsics: Intrinsics
     seen: Seen
-    """The same for these intrinsics; what they place wrongly is included."""
+    """Uncertainty of a seen point with these intrinsics, what they place wrongly included."""
     differs_mm: float
     """How far apart the two pairs place a point at the centre of the image, at the same distance."""
 
