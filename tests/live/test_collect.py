@@ -135,6 +135,7 @@ def test_a_program_whose_pose_is_refused_is_answered_with_another_next_pose(tmp_
     assert kept["next_joints"] is None and np.allclose(refused["next_joints"], poses[1][:3, 3])
 
 
+@pytest.mark.slow
 def test_a_program_that_sends_poses_is_answered_with_the_calibration(tmp_path: Path, tabletop: Path):
     poses, at, answers = list(jcr.read_capture(tabletop).base_from_gripper), [-1], []
 

@@ -101,7 +101,7 @@ class Ahead:
     ) -> "Ahead":
         """The `count` that help most; `robot` is of the others, `reach` as `candidates` takes it, drawn with `seed`.
 
-        `is_likely`: of which poses an image is likely to register; others are taken only where there are none.
+        `is_likely`: whether an image at a pose is likely to register; others are taken only where none is.
         """
         x, noise = assumptions.gripper_from_camera, assumptions.noise
         of_random, distance = (noise.translation, noise.rotation), assumptions.distance_m
