@@ -14,6 +14,7 @@ from jcr.adjust.intrinsics_prior import IntrinsicsPrior
 from jcr.adjust.projection import view_of
 from jcr.adjust.robots import Adjusted
 from jcr.adjust.score_test import focal_lengths
+from jcr.adjust.together import START_NOISE
 from jcr.adjust.wrist import WristOptions, adjust_wrist, recon_frame
 from jcr.calibration.case import Case
 from jcr.calibration.consider import with_intrinsics_considered
@@ -81,9 +82,19 @@ def adjust_case(
             combinations=combinations,
             exchanged=exchanged,
             near=case.adjusted if case.hand_eye.converged else None,
+            start_noise=_start_noise(fit),
             bent=bent,
         ),
     )
+
+
+def _start_noise(fit: HandEye) -> tuple[float, float]:
+    """m, rad per axis of gripper poses: what the fit to camera poses left of them, random and systematic.
+
+    Images that begin bent to poses that contradict them take ten times the steps to come back.
+    """
+    metres, radians = fit.robot_noise.together
+    return max(START_NOISE[0], metres), max(START_NOISE[1], radians)
 
 
 def focal_of_each(case: Case) -> Float[ndarray, "e p"]:
