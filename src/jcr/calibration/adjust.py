@@ -64,7 +64,7 @@ def adjust_case(
     exchanged: bool = False,
     bent: Float[ndarray, "s b"] | None = None,
 ) -> Adjusted:
-    """The used images and gripper poses of a case adjusted, from its fit to poses or from its accepted adjustment.
+    """The used images and gripper poses of a case adjusted, from its fit to poses or from its adjustment.
 
     `prior` takes the place of the case's; the rest is that of WristOptions.
     """
@@ -81,7 +81,7 @@ def adjust_case(
             systematic=case.systematic,
             combinations=combinations,
             exchanged=exchanged,
-            near=case.adjusted if case.hand_eye.converged else None,
+            near=case.adjusted,
             start_noise=_start_noise(fit),
             bent=bent,
         ),

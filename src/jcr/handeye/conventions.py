@@ -18,6 +18,7 @@ from jcr.geometry import Transform, fit_similarity, inverse, retract, rotation_e
 from jcr.handeye.closed_form import closed_form, initial_estimate
 from jcr.handeye.equation import Poses
 from jcr.handeye.fit import PoseProblem, fit_poses
+from jcr.handeye.observability import observability
 from jcr.handeye.robust import least_trimmed
 from jcr.handeye.solve import solve_hand_eye
 from jcr.handeye.systematic import smooth_errors
@@ -129,8 +130,9 @@ def better_reading(
     others = candidates[1:]
     camera_angle = _angles(recon_from_camera)
     gaps = [_incongruence(candidate, camera_angle) for candidate in others]
-    if min(gaps) > CONGRUENT:
-        # Lost rotations take seconds to find again: only where no cheaper reading has the cameras' angles.
+    if min(gaps) > CONGRUENT and observability(base_from_gripper).observable:
+        # Lost rotations take a second to find again: only where no cheaper reading has the cameras' angles, and not of
+        # rotations about one axis, which read in degrees are as degenerate.
         unwound = list(_degrees_taken_as_radians(base_from_gripper, recon_from_camera))
         others += unwound
         gaps += [_incongruence(candidate, camera_angle) for candidate in unwound]
