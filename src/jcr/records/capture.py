@@ -106,7 +106,7 @@ class Capture:
     robot: str | None = None
     """Name of the arm, one of jcr.handeye.arms.ROBOT_NAMES."""
     urdf: Path | None = None
-    """Of the arm, where it was given."""
+    """File of the arm, where it was given; not relative to `folder`."""
     orientation: int = 1
     """EXIF's, of all images: 1 as the sensor has them; others were rotated upright, and the camera frame is theirs."""
     bits: tuple[int, ...] = (8,)
