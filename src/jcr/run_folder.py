@@ -322,7 +322,8 @@ def locked(path: Path) -> Iterator[RunFolder]:
         path.mkdir(parents=True, exist_ok=True)
         lock = (path / LOCK).open("w", encoding="utf-8")
     except (FileExistsError, NotADirectoryError):
-        raise InputError(f"{path}: is a file; name a folder for the results") from None
+        file = next(part for part in (path, *path.parents) if part.is_file())
+        raise InputError(f"{file}: is a file; name a folder for the results") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); choose another folder") from None
     with lock:
