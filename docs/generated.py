@@ -32,7 +32,21 @@ from jcr.run_folder import State
 REFERENCE = Path(__file__).parent / "reference"
 SCHEMAS = REFERENCE / "schemas"
 EXAMPLE = Path(__file__).parents[1] / "examples" / "01_quick_start.py"
-RESULTS_OF_CALLS = ("jcr.records:Pointmaps",)
+RESULTS_OF_CALLS = (
+    "jcr.calibration.expected:Expectation",
+    "jcr.live.calibration_progress:LeftOut",
+    "jcr.records.calibration:ImageResiduals",
+    "jcr.records.calibration:LeaveOneOut",
+    "jcr.records.calibration:NextPose",
+    "jcr.records.calibration:Plan",
+    "jcr.records.calibration:RobotExamined",
+    "jcr.records.calibration:ScaleEvidence",
+    "jcr.records.calibration:WithGivenIntrinsics",
+    "jcr.records:Pointmaps",
+    "jcr.records:Tracks",
+    "jcr.segment.measure:ObjectSize",
+    "jcr.segment.tabletop:Support",
+)
 """What is in a record of the package, is no name of its own, and a user reads."""
 FORMATS = {
     "calibration.json": (

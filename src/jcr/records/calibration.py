@@ -77,8 +77,9 @@ class NextPose:
     like: int
     """Row of the existing pose that it is nearest to."""
     moved_m: float
-    """From there."""
+    """Distance of the gripper's origin from there."""
     rotation_rad: float
+    """Angle of the rotation from there."""
 
 
 @dataclass(frozen=True, kw_only=True)
