@@ -168,7 +168,7 @@ def test_every_page_that_a_checkout_has_is_installed():
 
 
 def test_the_readme_is_short_before_its_limits():
-    assert len((ROOT / "README.md").read_text().split("## Limits")[0].split()) <= 700
+    assert len((ROOT / "README.md").read_text().split("## Limits")[0].split()) <= 600
 
 
 def test_the_schema_of_captures_takes_ours_and_knows_every_key_that_is_read():

@@ -15,7 +15,8 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.cli import call, dispatch
 from jcr.errors import InputError
 from jcr.reconstruct.backends import ReconstructOptions
-from jcr.records import Capture
+from jcr.records import Capture, CellCamera
+from jcr.results import RunOptions
 from jcr.run_folder import MadeWith, RunFolder, state_of
 
 
@@ -30,6 +31,39 @@ def test_a_sound_folder_is_read(sound: Path):
     assert folder.options().calibrate.robot_noise == (0.1, 0.05)
     assert len(folder.capture()) == RUN_IMAGES and folder.calibration().converged
     assert folder.state().attempts == tuple(folder.calibration().attempts)
+
+
+def test_a_run_with_files_beside_its_images_is_complete_in_relative_folders(
+    sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(sound, "out")
+    for file in (
+        "cell/images/0.png",
+        "cell/0.depth.png",
+        "cell/fixed/0.png",
+        "cell/robot.urdf",
+        "out/added/0.png",
+    ):
+        Path(file).parent.mkdir(parents=True, exist_ok=True)
+        Path(file).write_bytes(b"image")
+    other = CellCamera(name="fixed", mount="base", images=("fixed/0.png",), image_size=(64, 48))
+    capture = Capture(
+        folder=Path("cell"),
+        images=("images/0.png",),
+        base_from_gripper=np.eye(4)[None],
+        image_size=(64, 48),
+        urdf=Path("cell/robot.urdf"),
+        depths=("0.depth.png",),
+        others=(other,),
+    )
+    folder, options = RunFolder(Path("out")), RunOptions(map=None)
+    for name in ("reconstruction.npz", "report.html"):
+        (folder.path / name).touch()
+    folder.keep_complete(capture, options)
+    assert folder.is_complete(capture, options)
+    Path("cell/fixed/0.png").write_bytes(b"another image")
+    assert not folder.is_complete(capture, options)
 
 
 Content = dict[str, Any]

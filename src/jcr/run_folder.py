@@ -293,12 +293,12 @@ class RunFolder:
 
     def _completion(self, capture: Capture, options: Any) -> str:
         made = fingerprint(capture, _deciding(options.reconstruct))
-        files = [*filter(None, (capture.urdf, *(capture.depths or ())))]
-        files += [
+        paths = [] if capture.urdf is None else [capture.urdf]
+        paths += [capture.folder / name for name in capture.depths or () if name is not None]
+        paths += [
             (camera.folder or capture.folder) / name for camera in capture.others for name in camera.images
         ]
-        files += sorted((self.path / ADDED).rglob("*"))
-        paths = [capture.folder / file for file in files]
+        paths += sorted((self.path / ADDED).rglob("*"))
         states = [[str(path), path.stat().st_size, path.stat().st_mtime_ns] for path in paths]
         digest = hashlib.sha256(json.dumps([made, asdict(options), states], default=str).encode())
         with np.printoptions(threshold=sys.maxsize):
@@ -322,7 +322,8 @@ def locked(path: Path) -> Iterator[RunFolder]:
         path.mkdir(parents=True, exist_ok=True)
         lock = (path / LOCK).open("w", encoding="utf-8")
     except (FileExistsError, NotADirectoryError):
-        raise InputError(f"{path}: is a file; name a folder for the results") from None
+        file = next(part for part in (path, *path.parents) if part.is_file())
+        raise InputError(f"{file}: is a file; name a folder for the results") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); choose another folder") from None
     with lock:

@@ -175,7 +175,10 @@ FAULTS = {
         lambda c: (c / "capture.json").unlink(),
         "no capture.json and no poses.csv beside its",
     ),
-    "not JSON": (lambda c: (c / "capture.json").write_text("{'frames': []"), "not JSON at line 1"),
+    "not JSON": (
+        lambda c: (c / "capture.json").write_text("{'frames': []"),
+        "not JSON at line 1.*correct it there",
+    ),
     "not UTF-8": (lambda c: (c / "capture.json").write_bytes(b'{"frames": "\xff"}'), "not UTF-8"),
     "deeply nested": (lambda c: (c / "capture.json").write_text("[" * 100_000), "nested too deeply"),
     "key twice": (lambda c: (c / "capture.json").write_text('{"frames": [], "frames": []}'), "appears twice"),
@@ -291,6 +294,12 @@ def test_joints_and_the_robot_are_kept_and_written_again(capture: Path, tmp_path
     edit(capture, lambda c: c.update(robot="cobot 9"))
     read = jcr.read_capture(capture)
     assert read.robot is None and "robot 'cobot 9' is not one of ur3e" in read.notes[0]
+
+
+def test_options_that_a_capture_json_is_not_read_by_are_noted(capture: Path):
+    assert jcr.read_capture(capture, {"pose_inverted": True, "format": "capture"}).notes == ()
+    (note,) = jcr.read_capture(capture, {"pose_convention": "kuka", "urdf": "arm.urdf"}).notes
+    assert note.startswith("--pose-convention and --urdf are not used")
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,8 @@ from in_process import run_jcr
 from jcr.cli import COMMANDS, dispatch
 from jcr.cli.arguments import groups
 from jcr.cli.help import COMMON, MANY
+from jcr.cli.query import read_points
+from jcr.errors import InputError
 from jcr.represent.cloud_ply import read_cloud
 from jcr.represent.options import MapOptions
 
@@ -283,6 +285,18 @@ def test_help_names_units_and_gives_defaults_only_where_they_are_values(capsys: 
     assert not re.search(r"\(default:\s+(None|True|False)\)", text)
     assert "--no-bundle-adjustment Use camera poses only" in text
     assert text.index("--pose-convention") < text.index("--require") < text.index("--backend")
+
+
+def test_wrong_input_is_refused_before_a_camera_is_opened_or_a_map_read(tmp_path: Path):
+    wrong = run_jcr("capture", tmp_path / "out", "--camera", 77, "--poses", "ure:1")
+    assert wrong.returncode == 2 and wrong.stderr.startswith("error: --poses ure:1: give ur:HOST")
+    (tmp_path / "file").touch()
+    wrong = run_jcr("capture", tmp_path / "file" / "out", "--camera", 77, "--poses", "typed")
+    assert wrong.stderr == f"error: {tmp_path / 'file'}: is a file; name a folder for the results\n"
+    (tmp_path / "points.csv").write_text("x,y,z\n0,0,0\n0,nan,0\n")
+    with pytest.raises(InputError, match=r"points\.csv: point 2 is not finite"):
+        read_points(tmp_path / "points.csv")
+    assert [file.name for file in tmp_path.iterdir()].count("out") == 0
 
 
 @pytest.mark.slow

@@ -1,7 +1,7 @@
 """The capture folder: `capture.json` and the images it names."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +26,12 @@ MAX_BYTES = 32_000_000
 """More takes long to read, and is no capture."""
 MOST_ROTATION = 6 * np.pi + 0.01
 """rad: no joint rotates farther to either side."""
+OF_EVERY_FORMAT = ("format", "pose_inverted")
+"""Options of reading that a capture.json obeys too."""
 
 
 def read(path: Path, options: ReadOptions | None = None) -> Capture:
-    """The capture in a folder, or named by its capture.json; no option touches it."""
+    """The capture in a folder, or named by its capture.json; no option changes how (`unused_options`)."""
     folder, file = (path, path / FILE) if path.is_dir() else (path.parent, path)
     if not file.is_file():
         raise InputError(f"{folder}: holds no capture.json; name a capture folder")
@@ -73,6 +75,20 @@ def read(path: Path, options: ReadOptions | None = None) -> Capture:
         depths=depth_of_frames(frames, folder, str(file)),
     )
     return with_cameras(capture, content.get("cameras"), file)
+
+
+def unused_options(options: ReadOptions) -> str | None:
+    """A note that names the options which were given and a capture.json is not read by; None where there are none."""
+    usual = asdict(ReadOptions())
+    given = [
+        f"--{name.replace('_', '-')}"
+        for name, value in asdict(options).items()
+        if name not in OF_EVERY_FORMAT and value != usual[name]
+    ]
+    if not given:
+        return None
+    are = "is" if len(given) == 1 else "are"
+    return f"{' and '.join(given)} {are} not used: capture.json holds 4x4 poses in metres, and its own intrinsics"
 
 
 def write(folder: Path, capture: Capture, **remarks: Any) -> None:

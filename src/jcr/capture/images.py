@@ -89,7 +89,7 @@ def read_stored(path: Path) -> tuple[UInt8[ndarray, "h w 3"], HowStored]:
                     opened = shown
                 pixels = np.asarray(ImageOps.exif_transpose(opened).convert("RGB"))
     except FileNotFoundError:
-        raise InputError(f"{path}: no such image; correct its name in the capture or add the file") from None
+        raise InputError(f"{path}: no such image; correct its name or add the file") from None
     except InputError:
         raise
     except Image.DecompressionBombError:

@@ -95,7 +95,7 @@ def read_json(file: Path) -> Any:
         return json.loads(read_text(file), object_pairs_hook=unique)
     except json.JSONDecodeError as error:
         raise InputError(
-            f"{file}: not JSON at line {error.lineno}, column {error.colno}: {error.msg}"
+            f"{file}: not JSON at line {error.lineno}, column {error.colno}: {error.msg}; correct it there"
         ) from None
     except ValueError as error:
         if isinstance(error, InputError):

@@ -103,7 +103,11 @@ def read_source(
         require_frames(len(found), str(path), at_least)
         require_motion(found.base_from_gripper, str(path))
         rotated = how_rotated(found)
-        remarks = (None if rotated is None else sentence(rotated), how_scaled(found))
+        remarks = (
+            None if rotated is None else sentence(rotated),
+            how_scaled(found),
+            capture_json.unused_options(options) if row.name == "capture" else None,
+        )
         return replace(found, notes=(*found.notes, *filter(None, remarks)))
     if into is None:
         raise InputError(f"{path}: its images are inside it; give a folder to extract them to: into=FOLDER")

@@ -87,6 +87,7 @@ def main(arguments: Arguments) -> int:
     options = arguments.collect
     if options.until_accurate and options.require is None:
         raise InputError("--until-accurate: needs --require MM DEG, the accuracy that is meant")
+    _require_source(arguments.poses)
     answers: list[Answer] = []
 
     def tell(answer: "Answer", lines: list[str]) -> None:
@@ -160,6 +161,13 @@ def _print(text: str) -> None:
     sys.stderr.flush()
 
 
+def _require_source(poses: str) -> None:
+    """Raise InputError where `--poses` is no source, before a camera is opened."""
+    kind, _, address = poses.partition(":")
+    if poses not in ("typed", "tcp") and not (kind in _SPOKEN and address):
+        raise InputError(f"--poses {poses}: give ur:HOST, franka:HOST, xarm:HOST, typed or tcp")
+
+
 def _states(arguments: Arguments) -> "States | None":
     """The states of an arm that is watched; None of poses that are typed or sent."""
     from jcr.live import franka, ur, xarm
@@ -184,15 +192,13 @@ def _asks(arguments: Arguments, states: "States | None", lines: "Iterator[str]")
         yield from asks_at_rest(states)
     elif arguments.poses == "typed":
         yield from typed_poses(lines, _print, arguments.pose_convention, arguments.pose_units)
-    elif arguments.poses == "tcp":
+    else:
         host, port = _address(arguments.listen, 7464, "--listen ")
         token = arguments.token or os.environ.get("JCR_TOKEN")
         listen = Listen(host, port, token, arguments.timeout)
         with bound(listen) as server:
             _print("waiting for poses on {}:{}".format(*server.getsockname()[:2]))
             yield from served_poses(server, listen)
-    else:
-        raise InputError(f"--poses {arguments.poses}: give ur:HOST, franka:HOST, xarm:HOST, typed or tcp")
 
 
 _SPOKEN: dict[str, ConventionName] = {"ur": "ur", "franka": "franka", "xarm": "xarm"}

@@ -110,7 +110,10 @@ def read_points(path: Path) -> Float[ndarray, "n 3"]:
         raise InputError(
             f"{path}: expected points of shape (n, 3) in metres, got {points.shape} {points.dtype}"
         )
-    return points.astype(np.float64)
+    points = points.astype(np.float64)
+    if not (finite := np.isfinite(points).all(1)).all():
+        raise InputError(f"{path}: point {finite.argmin() + 1} is not finite; remove it")
+    return points
 
 
 def _read_csv(path: Path) -> ndarray:

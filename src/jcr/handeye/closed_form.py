@@ -28,7 +28,7 @@ def closed_form(
     """Closed-form `gripper_from_camera` (...,4,4), scale (...) and `base_from_recon` (...,4,4).
 
     Rotation first, then translation and scale by one linear least squares (the paper's scale recovery
-    problem, eq. 6, whose grid search over λ it makes needless); of motions that leave them open, the smallest
+    problem, eq. 8 to 10, whose grid search over λ it makes needless); of motions that leave them open, the smallest
     translation. The scale comes out 0 or less where the motions do not show it.
     """
     weights = np.ones(base_from_gripper.shape[:-2]) if weights is None else weights

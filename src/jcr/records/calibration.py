@@ -77,8 +77,9 @@ class NextPose:
     like: int
     """Row of the existing pose that it is nearest to."""
     moved_m: float
-    """How far this pose is from that one (m)."""
+    """Distance of the gripper's origin from there (m)."""
     rotation_rad: float
+    """Angle of the rotation from there (rad)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -106,7 +106,7 @@ class Capture:
     robot: str | None = None
     """Name of the arm, one of jcr.handeye.arms.ROBOT_NAMES."""
     urdf: Path | None = None
-    """The arm's URDF file; None where none was given."""
+    """The arm's URDF file, not relative to `folder`; None where none was given."""
     orientation: int = 1
     """EXIF's, of all images: 1 as the sensor has them; others were rotated upright, and the camera frame is theirs."""
     bits: tuple[int, ...] = (8,)
