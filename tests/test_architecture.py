@@ -3,6 +3,7 @@
 import ast
 import re
 import sys
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -82,6 +83,7 @@ def named(node: ast.Import | ast.ImportFrom) -> list[str]:
     return [module if module in FILES else node.module for module in inside]
 
 
+@cache
 def imports(file: Path) -> list[str]:
     statements = ast.walk(ast.parse(file.read_text()))
     return [

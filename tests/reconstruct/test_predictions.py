@@ -220,6 +220,7 @@ def test_faults_in_a_file_are_named(capture: Capture, truth: dict[str, Any]) -> 
         reconstruct_predictions(capture, capture.folder / "absent.npz")
 
 
+@pytest.mark.slow
 def test_a_network_gives_the_same_record(
     capture: Capture, truth: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
