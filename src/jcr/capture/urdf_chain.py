@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 ANY_ANGLE = (-2 * np.pi, 2 * np.pi)
 
 
-def read_chain(file: Path, dof: int, gripper: str | None = None) -> Arm:
-    """The arm of `dof` joints in a URDF file; its gripper frame is `gripper`, or the link behind the last joint.
+def read_chain(file: Path, dof: int) -> Arm:
+    """The arm of `dof` joints in a URDF file; its gripper frame is the link behind the last joint.
 
     InputError where the file is no URDF, has no such chain or several, or has a joint in it that does not rotate.
     """
-    return chain_of(load_urdf(file, build_scene_graph=False), dof, str(file), gripper)
+    return chain_of(load_urdf(file, build_scene_graph=False), dof, str(file))
 
 
 def load_urdf(file: Path, build_scene_graph: bool) -> "yourdfpy.URDF":
@@ -65,24 +65,20 @@ def _check(joint: "yourdfpy.Joint", where: str) -> None:
         raise InputError(f"{where}: its limits are not finite; correct them there")
 
 
-def chain_of(urdf: "yourdfpy.URDF", dof: int, where: str, gripper: str | None = None) -> Arm:
+def chain_of(urdf: "yourdfpy.URDF", dof: int, where: str) -> Arm:
     """The arm of `dof` joints in a loaded URDF, as `read_chain`; `where` begins the messages."""
     by_child = {joint.child: joint for joint in urdf.robot.joints}
-    links = [link.name for link in urdf.robot.links] if gripper is None else [gripper]
-    chains = {link: _chain(by_child, link) for link in links}
-    if gripper is None:
-        # A chain that ends with its last moving joint: what is fixed behind that is the gripper's affair.
-        chains = {
-            link: chain
-            for link, chain in chains.items()
-            if chain and chain[-1].type != "fixed" and _moving(chain) == dof
-        }
+    chains = {link.name: _chain(by_child, link.name) for link in urdf.robot.links}
+    # A chain ends with its last moving joint: what is fixed behind that belongs to the gripper.
+    chains = {
+        link: chain
+        for link, chain in chains.items()
+        if chain and chain[-1].type != "fixed" and sum(joint.type != "fixed" for joint in chain) == dof
+    }
     if len(chains) != 1:
         found = f"chains to {', '.join(chains)}" if chains else "no chain"
         raise InputError(f"{where}: {found} with {dof} joints; give as many joints per frame as the arm has")
-    ((link, chain),) = chains.items()
-    if _moving(chain) != dof:
-        raise InputError(f"{where}: {_moving(chain)} joints move {link}, but frames have {dof} joints")
+    (chain,) = chains.values()
     return _arm(chain, where)
 
 
@@ -94,10 +90,6 @@ def _chain(by_child: dict, link: str) -> list:
         chain.insert(0, by_child[link])
         link = by_child[link].parent
     return chain
-
-
-def _moving(chain: list) -> int:
-    return sum(joint.type != "fixed" for joint in chain)
 
 
 def _limits(joint: "yourdfpy.Joint") -> tuple[float, float]:

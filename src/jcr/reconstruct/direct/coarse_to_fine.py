@@ -19,7 +19,7 @@ MEET_WITHIN = (0.1, 2.0)
 AGREED = 0.5
 """Cost of a point beyond which its depth is not used."""
 IMAGES_AT_FULL = 10
-"""Images that get all points; with more each has fewer, as each point is seen more often."""
+"""Most images that each get all points; with more each has fewer, as each point is seen more often."""
 SETTLED = 0.995
 """A round that leaves more of the cost than this was the last."""
 
