@@ -55,7 +55,7 @@ from jcr.handeye.mixed_model import solve
 from jcr.handeye.posterior import posterior
 from jcr.least_squares import one_blas_thread
 
-START_NOISE = (1e-3, np.radians(0.2))
+START_NOISE = (1e-3, float(np.radians(0.2)))
 """m, rad; of gripper poses, until it is estimated."""
 ROUNDS = 25
 """Of an adjustment, with the sizes of errors estimated in each."""
@@ -77,6 +77,7 @@ def adjust(
     noise: tuple[float, float] | None = None,
     prior: RigInformation | None = None,
     near: Adjusted | None = None,
+    start_noise: tuple[float, float] = START_NOISE,
 ) -> Adjusted:
     """Adjust images and robots from a scene that is near.
 
@@ -94,7 +95,7 @@ def adjust(
         z=np.stack([arm.start[1] for arm in arms]),
         scene=scene,
     )
-    white = np.tile(np.repeat(noise or START_NOISE, 3), sum(len(arm.rigs) for arm in arms))
+    white = np.tile(np.repeat(noise or start_noise, 3), sum(len(arm.rigs) for arm in arms))
     pixels = noise_of(scene, view_of(scene, problem), problem)
     scene, *_ = minimised(scene, problem, pixels, [_rig_information(placed, arms, np.diag(white))])
     return _settled(replace(placed, scene=scene), problem, pixels, tuple(arms), noise)

@@ -11,7 +11,7 @@ from jcr.adjust.intrinsics_prior import FIXED, IntrinsicsPrior, prior_of
 from jcr.adjust.robots import Adjusted, ArmPoses
 from jcr.adjust.scene import Freedom, Observations, Scene
 from jcr.adjust.score_test import freed
-from jcr.adjust.together import adjust
+from jcr.adjust.together import START_NOISE, adjust
 from jcr.geometry import Transform, apply, fit_similarity, scale_translation
 from jcr.handeye.equation import Poses
 from jcr.handeye.fit import Unknowns
@@ -31,6 +31,8 @@ class WristOptions:
     """The camera stands still, and the arm carries what it sees."""
     near: Adjusted | None = None
     """An adjustment of the same poses and tracks, or of more of them, to begin from."""
+    start_noise: tuple[float, float] = START_NOISE
+    """m, rad; of the gripper poses, until it is estimated."""
     bent: Float[ndarray, "s b"] | None = None
     """Errors that were found of the gripper poses (handeye/bent.py), of one standard deviation each."""
 
@@ -80,6 +82,7 @@ def adjust_wrist(
         [arm],
         noise,
         near=options.near,
+        start_noise=options.start_noise,
     )
 
 

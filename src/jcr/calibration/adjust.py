@@ -14,6 +14,7 @@ from jcr.adjust.intrinsics_prior import IntrinsicsPrior
 from jcr.adjust.projection import view_of
 from jcr.adjust.robots import Adjusted
 from jcr.adjust.score_test import focal_lengths
+from jcr.adjust.together import START_NOISE
 from jcr.adjust.wrist import WristOptions, adjust_wrist, recon_frame
 from jcr.calibration.case import Case
 from jcr.calibration.consider import with_intrinsics_considered
@@ -63,7 +64,7 @@ def adjust_case(
     exchanged: bool = False,
     bent: Float[ndarray, "s b"] | None = None,
 ) -> Adjusted:
-    """The used images and gripper poses of a case adjusted, from its fit to poses or from its accepted adjustment.
+    """The used images and gripper poses of a case adjusted, from its fit to poses or from its adjustment.
 
     `prior` takes the place of the case's; the rest is that of WristOptions.
     """
@@ -80,10 +81,20 @@ def adjust_case(
             systematic=case.systematic,
             combinations=combinations,
             exchanged=exchanged,
-            near=case.adjusted if case.hand_eye.converged else None,
+            near=case.adjusted,
+            start_noise=_start_noise(fit),
             bent=bent,
         ),
     )
+
+
+def _start_noise(fit: HandEye) -> tuple[float, float]:
+    """m, rad per axis of gripper poses: what the fit to camera poses left of them, random and systematic.
+
+    Images that begin bent to poses that contradict them take ten times the steps to come back.
+    """
+    metres, radians = fit.robot_noise.together
+    return max(START_NOISE[0], metres), max(START_NOISE[1], radians)
 
 
 def focal_of_each(case: Case) -> Float[ndarray, "e p"]:

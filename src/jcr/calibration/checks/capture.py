@@ -36,7 +36,10 @@ def check_convention(case: Case) -> Checked:
     rows, capture = case.reconstruction.image_index, case.capture
     by_name = paired_by_name(capture.images, capture.base_from_gripper)
     by_name = {by_number: poses[rows] for by_number, poses in by_name.items()}
-    found = better_reading(case.base_from_gripper, case.recon_from_camera, by_name)
+    # Of other readings neither noise nor cues are known, nor are their camera poses weighed.
+    alone = case.cues is None and case.reconstruction.evidence is None
+    solved = case.hand_eye if alone and case.hand_eye.robot_noise.given is None else None
+    found = better_reading(case.base_from_gripper, case.recon_from_camera, by_name, solved)
     if found is None:
         return Checked()
     observable = case.hand_eye.observability.observable

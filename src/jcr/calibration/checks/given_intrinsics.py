@@ -67,10 +67,10 @@ def contradicted_by(imaged: Imaged, sure: float = SURE) -> tuple[Adjusted, Findi
     """The images adjusted as if no intrinsics had been given for one camera, and what they show against those that were;
     None where that is nothing. A finding of less than `sure` standard deviations only informs: it leaves doubt.
 
-    Only when one Gauss-Newton step from the adjustment with these, the intrinsics freed, leaves some doubt, or the
-    camera is rejected, are the intrinsics adjusted until they settle.
+    Only when one Gauss-Newton step from the adjustment with these, the intrinsics freed, leaves some doubt are the
+    intrinsics adjusted until they settle.
     """
-    if imaged.std.any() and not _found_off(imaged, imaged.adjusted, *DOUBT):
+    if not _found_off(imaged, imaged.adjusted, *DOUBT):
         return None
     freed = imaged.adjust(prior_of(imaged.start, ESTIMATED), None)
     surely = _found_off(imaged, freed, sure, 1.0)
