@@ -44,8 +44,8 @@ class Row:
     """Largest difference between the two in standard deviations of the latter, over translation and rotation; None
     where one has no calibration."""
     in_other_order: float | None
-    """The same between two calibrations at once: of the images in the order of taking, and in that of the names that
-    the capture has; None where these orders are the same."""
+    """The same between two calibrations at once: under the names of a live capture, and under those that the capture
+    has; None where both sort alike."""
     latency_s: tuple[float, ...]
     """Processor time from each image to the state with it."""
     finish_s: float
@@ -70,7 +70,7 @@ def page(rows: Sequence[Row], simulated: Sequence[float]) -> str:
     lines = [
         f"> at most {max(apart, default=0.0):.2g} σ between the end of the live calibration and the calibration at once",
         f"> the same verdict in {same} of {len(rows)}",
-        f"> at most {max(order, default=0.0):.2g} σ between calibrations at once of the images in two orders",
+        f"> at most {max(order, default=0.0):.2g} σ between calibrations at once of the same images under other names",
         f"> {simulated[AT - 1]:.1f} s of processor time after image {AT}, {simulated[-1]:.1f} s after image "
         f"{len(simulated)} (640×480)",
         "",
@@ -78,11 +78,9 @@ def page(rows: Sequence[Row], simulated: Sequence[float]) -> str:
         "the same images and poses in a folder where nothing is kept: it finds features and pairs itself. Seconds are "
         "of the processor, on one core.",
         "",
-        "Images are reconstructed in the order of their names, which a live capture gives in the order of taking. Where "
-        "the names of a capture are in another order (10.png comes before 2.png), `other order` is how far apart the "
-        "calibrations at once in these two orders are: matches are sought from the earlier image to the later, "
-        "RANSAC draws and COLMAP begins elsewhere, and many images have other pairs. The reported σ does not "
-        "include it.",
+        "Images are reconstructed in the order of their gripper poses. Where the names of a capture are in another "
+        "order than its images (10.png before 2.png), `other order` is how far apart the calibrations at once under "
+        "these names and under those of a live capture are.",
         "",
         f"| capture | images | verdict live | at once | apart, σ | other order, σ | image {AT}, s | last, s | "
         "slowest, s | end, s | at once, s |",

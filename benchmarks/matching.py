@@ -2,8 +2,10 @@
 
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 from jaxtyping import Float
@@ -15,11 +17,13 @@ from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
 from jcr.geometry import rotation_log
-from jcr.match.matchers import FeatureName
-from jcr.reconstruct import marker
+from jcr.match.matchers import FeatureName, Matcher
+from jcr.match.pairs import all_pairs
+from jcr.match.stage import Matched
+from jcr.reconstruct import marker, sfm
 from jcr.reconstruct.colmap import reconstruct_colmap
 from jcr.reconstruct.colmap_options import ColmapOptions
-from jcr.records import HandEye
+from jcr.records import HandEye, Intrinsics
 
 WAYS: tuple[tuple[FeatureName, bool], ...] = (
     ("sift", True),
@@ -144,7 +148,8 @@ def row_of(folder: Path, features: FeatureName, gate: bool, reference: Reference
     begun = time.perf_counter()
     made = None
     try:
-        made = reconstruct_colmap(capture, ColmapOptions(features=features, robot_checks=gate))
+        with nullcontext() if gate else images_alone():
+            made = reconstruct_colmap(capture, ColmapOptions(features=features))
         hand_eye = calibrate(capture, made)
     except RejectedError as refusal:
         count = 0 if made is None else len(made.image_index)
@@ -170,6 +175,22 @@ def row_of(folder: Path, features: FeatureName, gate: bool, reference: Reference
         hand_eye.converged,
         "; ".join((*hand_eye.warnings, *made.warnings, *made.notes)),
     )
+
+
+def images_alone() -> AbstractContextManager[object]:
+    """Structure from motion without gripper poses: all pairs are matched, none is judged, and no image is placed."""
+
+    def match_all(
+        matcher: Matcher, gripper: Float[ndarray, "n 4 4"], working: Intrinsics, *_: object
+    ) -> Matched:
+        pairs = all_pairs(len(matcher.x_px))
+        geometries = matcher.geometries(pairs, np.zeros((len(pairs), 2)))
+        return Matched(geometries=geometries, gate=None, intrinsics=working)
+
+    def place_none(database: Path, model: object, matcher: Matcher, matched: Matched, *_: object) -> object:
+        return model, matched
+
+    return patch.multiple(sfm, match_with_robot=match_all, _with_predicted_images=place_none)
 
 
 def sigmas(

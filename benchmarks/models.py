@@ -3,8 +3,10 @@
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -23,7 +25,7 @@ from jcr.geometry import step_between
 from jcr.reconstruct import backends
 from jcr.reconstruct.backends import BACKENDS, ReconstructOptions
 from jcr.reconstruct.hub import Weights
-from jcr.reconstruct.views_at_once import da3
+from jcr.reconstruct.views_at_once import views_at_once
 from jcr.reconstruct.views_at_once.views_at_once import Cost, ViewsOptions, reconstruct_views_at_once
 from jcr.records import Capture, Reconstruction
 from jcr.represent.cloud import point_cloud
@@ -155,14 +157,16 @@ def _methods(
     def predicted(errors: ViewErrors, refined: bool) -> Callable[[Capture], Reconstruction]:
         options = ViewsOptions(
             backend="da3",
-            load=da3.load,
+            load=lambda weights, device: predictions(place, errors, seed),
             weights=Weights(Path("simulated"), "simulated", BACKENDS["da3"].licence),
             cost=Cost(0.0, 0.0, 0.0, 0.0),
-            refined=refined,
         )
-        return lambda capture: reconstruct_views_at_once(
-            capture, options, predict=predictions(place, errors, seed)
-        )
+
+        def made(capture: Capture) -> Reconstruction:
+            with nullcontext() if refined else patch.object(views_at_once, "refine", return_value=None):
+                return reconstruct_views_at_once(capture, options)
+
+        return made
 
     def by_name(name: str) -> Callable[[Capture], Reconstruction]:
         return lambda capture: backends.reconstruct(capture, ReconstructOptions(backend=name))

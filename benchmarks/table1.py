@@ -20,7 +20,7 @@ from jcr.handeye.residuals import paper_residuals
 from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, candidates, reconstruct
 from jcr.reconstruct.colmap import reconstruct_colmap
 from jcr.reconstruct.colmap_options import ColmapOptions
-from jcr.reconstruct.global_alignment.pairs import write_pairs
+from jcr.reconstruct.global_alignment.pairs import ARRAYS, write_pairs
 from jcr.records import Capture, Reconstruction
 from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.scenes import SceneName
@@ -183,7 +183,10 @@ def _capture_cells(scene: SceneName, seed: int) -> dict[Row, Cell]:
             capture = replace(
                 whole, images=whole.images[:count], base_from_gripper=whole.base_from_gripper[:count]
             )
-            write_pairs(pairs, predictions.of_edges(np.flatnonzero((predictions.edges < count).all(1))))
+            among = (predictions.edges < count).all(1)
+            write_pairs(
+                pairs, replace(predictions, **{name: vars(predictions)[name][among] for name in ARRAYS})
+            )
             for method, cell in _methods(capture, truth, pairs):
                 cells[scene, count, method] = cell
     return cells

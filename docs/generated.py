@@ -32,8 +32,6 @@ from jcr.run_folder import State
 REFERENCE = Path(__file__).parent / "reference"
 SCHEMAS = REFERENCE / "schemas"
 EXAMPLE = Path(__file__).parents[1] / "examples" / "01_quick_start.py"
-RESULTS_OF_CALLS = ("jcr.records:Pointmaps",)
-"""What is in a record of the package, is no name of its own, and a user reads."""
 FORMATS = {
     "calibration.json": (
         CalibrationFile,
@@ -47,7 +45,7 @@ FORMATS = {
     ),
     "depth.npz": (
         DepthAbout,
-        "The array `about` in it, as JSON; other arrays have the names of [Pointmaps](api.md#pointmaps).",
+        "The array `about` in it, as JSON; other arrays have the names of [Pointmaps](api.md#jcrpointmaps).",
     ),
 }
 """Files of a run folder that a pydantic model in the source describes."""
@@ -119,24 +117,20 @@ def api_page() -> str:
     ]
     for name in jcr.__all__:
         parts += _entry(f"jcr.{name}", getattr(jcr, name))
-    parts += ["## Parts of these", ""]
-    for place in RESULTS_OF_CALLS:
-        module, _, name = place.partition(":")
-        parts += _entry(name, getattr(import_module(module), name), "###")
     return "\n".join(parts) + "\n"
 
 
-def _entry(name: str, value: Any, level: str = "##") -> list[str]:
+def _entry(name: str, value: Any) -> list[str]:
     if inspect.isfunction(value):
         return [
             "",
-            f"{level} {name}",
+            f"## {name}",
             "",
             f"```python\n{_signature(name, value)}\n```",
             "",
             _text(value.__doc__ or ""),
         ]
-    lines = ["", f"{level} {name}", "", _text(value.__doc__ or "")]
+    lines = ["", f"## {name}", "", _text(value.__doc__ or "")]
     if is_dataclass(value):
         said, kinds = described(value), annotations(value)
         rows = [

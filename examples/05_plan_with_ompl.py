@@ -17,8 +17,6 @@ from numpy import ndarray
 from ompl import base, geometric, util
 
 import jcr
-from jcr.represent.robot import RobotSpheres, load_robot
-from jcr.represent.scene import SceneMap
 
 ARM = Path(__file__).parent / "arm.urdf"
 START = np.array([-0.34, 0.80, -0.66, 1.04, 0.08, 1.10])
@@ -32,7 +30,7 @@ STEP_RAD = 0.01
 class Clearance:
     """Whether the arm touches the mapped scene at joint values (…,6)."""
 
-    def __init__(self, scene: SceneMap, arm: RobotSpheres) -> None:
+    def __init__(self, scene: jcr.SceneMap, arm: jcr.RobotSpheres) -> None:
         self.scene = scene
         self.arm = arm.without(("foot",))  # bolted to the table
         self.gripper = arm.without(tuple(link for link in arm.links if link != "gripper"))
@@ -100,7 +98,7 @@ def main() -> None:
     out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/tabletop")
     util.RNG.setSeed(1)
     util.setLogLevel(util.LogLevel.LOG_ERROR)
-    clearance = Clearance(jcr.load_map(out), load_robot(ARM))
+    clearance = Clearance(jcr.load_map(out), jcr.load_robot(ARM))
     straight = np.linspace(START, GOAL, 100)
     print(f"straight on: touches at {int(clearance.touches(straight).sum())} of {len(straight)} steps")
     path = plan(clearance, START, GOAL)

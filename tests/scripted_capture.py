@@ -84,6 +84,10 @@ class Scripted:
         )
         return self.progress
 
+    def propose_elsewhere(self, base_from_gripper: ndarray) -> Progress:
+        self.progress = replace(self.progress, next_joints=base_from_gripper[:3, 3])
+        return self.progress
+
     def finish(self) -> Any:
         self.finished += 1
         requirement = a_hand_eye(True).requirement

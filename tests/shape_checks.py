@@ -24,21 +24,27 @@ def begin() -> None:
 
 
 def checked(function: Callable[..., Any]) -> Callable[..., Any]:
-    """What jaxtyping calls to check arguments, or a result: beartype, until `CALLS` calls were found right."""
-    from beartype import beartype
+    """What jaxtyping calls to check arguments, or a result: beartype, until `CALLS` calls were found right.
 
+    Beartype writes a checker when a function is first called: of all that are imported a test calls a few.
+    """
     name = function.__module__, function.__qualname__
     if "<locals>" in function.__qualname__:  # defined again in each call of what is around it
         _checks[name] += 1
         if _checks[name] > CALLS:
             return function
-    sound = beartype(function)
+    checker: Callable[..., Any] | None = None
 
     def counted(*arguments: Any, **named: Any) -> Any:
+        nonlocal checker
+        if checker is None:
+            from beartype import beartype
+
+            checker = beartype(function)
         _checks[name] += 1
         if _checks[name] == 2 * CALLS:  # arguments and result
             _rest(*name)
-        return sound(*arguments, **named)
+        return checker(*arguments, **named)
 
     return counted
 

@@ -1,7 +1,9 @@
 """Imports run one way: read from the source, so that a shortcut is found on the day it is taken."""
 
 import ast
+import re
 import sys
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -81,6 +83,7 @@ def named(node: ast.Import | ast.ImportFrom) -> list[str]:
     return [module if module in FILES else node.module for module in inside]
 
 
+@cache
 def imports(file: Path) -> list[str]:
     statements = ast.walk(ast.parse(file.read_text()))
     return [
@@ -170,3 +173,35 @@ def test_torch_stays_where_networks_are():
         and package(file) not in TORCH_PACKAGES
     ]
     assert not outside
+
+
+POSITIONAL = {"Intrinsics"}
+"""fx, fy, cx, cy, width, height: public, in the order of every library."""
+
+
+def test_records_of_five_fields_and_more_are_made_by_name():
+    by_place = {}
+    for module, file in FILES.items():
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ClassDef) and any(
+                ast.unparse(one).startswith("dataclass") and "kw_only=True" not in ast.unparse(one)
+                for one in node.decorator_list
+            ):
+                fields = [one for one in node.body if isinstance(one, ast.AnnAssign)]
+                types = [ast.unparse(one.annotation) for one in fields]
+                by_place[f"{module}.{node.name}"] = (*types, "KW_ONLY").index("KW_ONLY")
+    assert len(by_place) > 100, "the records are read"
+    assert {name.rpartition(".")[2] for name, count in by_place.items() if count >= 5} == POSITIONAL
+
+
+def test_pages_are_made_by_templates_that_escape():
+    """HTML in an f-string is a place where a name of a file becomes markup."""
+    tag = re.compile(r"</?(a|b|button|div|form|i|img|li|p|script|span|svg|table|td|th|tr|ul)[ >]")
+    assert tag.search('<td class="x">'), "the pattern finds a tag"
+    against = [
+        f"{module}:{node.lineno}"
+        for module, file in FILES.items()
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.JoinedStr) and tag.search("".join(map(ast.unparse, node.values)))
+    ]
+    assert not against

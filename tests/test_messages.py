@@ -37,9 +37,9 @@ def is_message(node: ast.expr, named: set[str]) -> bool:
             return False
 
 
-def bound(tree: ast.AST) -> Iterator[tuple[ast.AST, str, ast.expr]]:
+def bound(nodes: list[ast.AST]) -> Iterator[tuple[ast.AST, str, ast.expr]]:
     """What gives names to values: the statement or comprehension, the name, the value or what it goes through."""
-    for node in ast.walk(tree):
+    for node in nodes:
         match node:
             case ast.Assign(targets=[ast.Name(id=name)], value=value):
                 yield node, name, value
@@ -55,8 +55,9 @@ def readings(tree: ast.AST) -> Iterator[int]:
     """Lines on which a message is read."""
     scopes = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)] or [tree]
     for scope in scopes:
-        named = {name for _, name, value in bound(scope) if is_message(value, set())}
-        for node in ast.walk(scope):
+        nodes = list(ast.walk(scope))
+        named = {name for _, name, value in bound(nodes) if is_message(value, set())}
+        for node in nodes:
             match node:
                 case ast.Compare(left=left, ops=ops, comparators=comparators):
                     sides = [left, *comparators]

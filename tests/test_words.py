@@ -1,9 +1,7 @@
 """The field's words in what a person reads: documents, help, messages, docstrings, comments and identifiers."""
 
 import ast
-import io
 import re
-import tokenize
 from functools import cache
 from pathlib import Path
 
@@ -49,6 +47,15 @@ MEANT = re.compile(
 """Words in another meaning: disk room, one after the other; and options."""
 
 
+STRING_OR_COMMENT = re.compile(
+    r"(#[^\n]*)"
+    r'|(?:\b[bfruBFRU]{1,2})?(?:"""(?:[^"\\]+|\\.|"(?!""))*"""|"(?!"")(?:[^"\\\n]+|\\.)*")'
+    r"|(?:\b[bfruBFRU]{1,2})?(?:'''(?:[^'\\]+|\\.|'(?!''))*'''|'(?!'')(?:[^'\\\n]+|\\.)*')",
+    re.DOTALL,
+)
+"""A comment, or a whole string of Python 3.11 with its prefix. Python's own tokenizer takes many times as long."""
+
+
 def without_code(text: str) -> str:
     """What is not between backticks: names keep their spelling."""
     return re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)", " ", text, flags=re.DOTALL)
@@ -83,10 +90,15 @@ def names(file: Path) -> list[str]:
 
 @cache
 def comments_and_names(file: Path) -> tuple[list[str], frozenset[str]]:
-    """The comments and the identifiers of a Python file."""
-    tokens = list(tokenize.generate_tokens(io.StringIO(file.read_text()).readline))
-    comments = [token.string for token in tokens if token.type == tokenize.COMMENT]
-    return comments, frozenset(token.string for token in tokens if token.type == tokenize.NAME)
+    """The comments and the identifiers of a Python file; what stands in its strings is neither."""
+    comments: list[str] = []
+
+    def taken_out(found: re.Match[str]) -> str:
+        comments.extend(filter(None, [found[1]]))
+        return " "
+
+    code = STRING_OR_COMMENT.sub(taken_out, file.read_text())
+    return comments, frozenset(re.findall(r"\b[^\W\d]\w*", code))
 
 
 def strings(file: Path) -> list[str]:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from jcr.calibration.calibration_json import CalibrationFile
     from jcr.calibration.difference import Difference, compare
     from jcr.calibration.options import CalibrateOptions
+    from jcr.calibration.seen import SeenInBase
     from jcr.capture.options import ReadOptions
     from jcr.capture.read import read_capture
     from jcr.cell.cameras_json import CamerasFile
@@ -28,28 +29,35 @@ if TYPE_CHECKING:
     from jcr.handeye.robots import Arm
     from jcr.handeye.solve import solve_hand_eye
     from jcr.live.calibration import LiveCalibration
-    from jcr.live.calibration_progress import Progress
+    from jcr.live.calibration_progress import Progress, Reached
     from jcr.pipeline import add_camera, build_map, calibrate, measure, run
     from jcr.reconstruct.backends import ReconstructOptions
     from jcr.records import (
+        Budget,
         Capture,
         CellCamera,
         Finding,
         HandEye,
         Intrinsics,
+        NextPose,
         Observability,
         PointCloud,
+        Pointmaps,
         PosePairs,
         Reconstruction,
         Requirement,
+        RobotNoise,
     )
+    from jcr.records import Kind as FindingKind
+    from jcr.represent.distance import DistanceGrid
     from jcr.represent.map_file import load_map
     from jcr.represent.options import CloudOptions, MapOptions
+    from jcr.represent.robot import RobotSpheres, load_robot
     from jcr.represent.sample import Sample
     from jcr.represent.scene import SceneMap
     from jcr.results import RunOptions, RunResult, SavedRun, load_run
     from jcr.segment.measure import Measured
-    from jcr.segment.options import SegmentOptions
+    from jcr.segment.options import SegmentOptions, TabletopOptions
     from jcr.touch_test import Touched, touch
     from jcr.verify import Verification, VerifyOptions
     from jcr.verify import verify as verify_run
@@ -63,22 +71,29 @@ _MODULE_OF = {
     "CloudOptions": "jcr.represent.options",
     "MapOptions": "jcr.represent.options",
     "SegmentOptions": "jcr.segment.options",
+    "TabletopOptions": "jcr.segment.options",
     "DepthOptions": "jcr.depth.options",
     "ExportOptions": "jcr.export.options",
     "VerifyOptions": "jcr.verify",
     "RunOptions": "jcr.results",
+    "Budget": "jcr.records",
     "Capture": "jcr.records",
     "CellCamera": "jcr.records",
     "Intrinsics": "jcr.records",
     "PosePairs": "jcr.records",
     "Reconstruction": "jcr.records",
     "PointCloud": "jcr.records",
+    "Pointmaps": "jcr.records",
     "HandEye": "jcr.records",
     "Observability": "jcr.records",
     "Requirement": "jcr.records",
+    "RobotNoise": "jcr.records",
     "Finding": "jcr.records",
+    "FindingKind": "jcr.records:Kind",
+    "NextPose": "jcr.records",
     "Arm": "jcr.handeye.robots",
     "Cues": "jcr.handeye.fit",
+    "SeenInBase": "jcr.calibration.seen",
     "RunResult": "jcr.results",
     "SavedRun": "jcr.results",
     "Difference": "jcr.calibration.difference",
@@ -86,6 +101,8 @@ _MODULE_OF = {
     "Touched": "jcr.touch_test",
     "Verification": "jcr.verify",
     "SceneMap": "jcr.represent.scene",
+    "DistanceGrid": "jcr.represent.distance",
+    "RobotSpheres": "jcr.represent.robot",
     "Measured": "jcr.segment.measure",
     "Sample": "jcr.represent.sample",
     "CalibrationFile": "jcr.calibration.calibration_json",
@@ -100,17 +117,20 @@ _MODULE_OF = {
     "solve_hand_eye": "jcr.handeye.solve",
     "LiveCalibration": "jcr.live.calibration",
     "Progress": "jcr.live.calibration_progress",
+    "Reached": "jcr.live.calibration_progress",
     "run": "jcr.pipeline",
     "add_camera": "jcr.pipeline",
     "calibrate": "jcr.pipeline",
     "build_map": "jcr.pipeline",
     "measure": "jcr.pipeline",
     "load_map": "jcr.represent.map_file",
+    "load_robot": "jcr.represent.robot",
 }
 """Of each name that is imported when it is asked for, and its name there where that differs."""
 
 __all__ = [
     "Arm",
+    "Budget",
     "CalibrateOptions",
     "CalibrationFile",
     "CamerasFile",
@@ -123,26 +143,34 @@ __all__ = [
     "Examination",
     "ExportOptions",
     "Finding",
+    "FindingKind",
     "HandEye",
     "InputError",
     "Intrinsics",
     "LiveCalibration",
     "MapOptions",
     "Measured",
+    "NextPose",
     "NotTrustedError",
     "Observability",
     "PointCloud",
+    "Pointmaps",
     "PosePairs",
     "Progress",
+    "Reached",
     "ReadOptions",
     "ReconstructOptions",
     "Reconstruction",
     "RejectedError",
     "Requirement",
+    "RobotNoise",
+    "RobotSpheres",
     "RunOptions",
     "RunResult",
     "SavedRun",
+    "SeenInBase",
     "SegmentOptions",
+    "TabletopOptions",
     "Touched",
     "Verification",
     "VerifyOptions",
@@ -153,6 +181,7 @@ __all__ = [
     "compare",
     "export_run",
     "load_map",
+    "load_robot",
     "load_run",
     "measure",
     "read_capture",
@@ -162,7 +191,7 @@ __all__ = [
     "verify_run",
 ]
 if find_spec("torch"):
-    __all__ += ["Sample", "SceneMap"]
+    __all__ += ["DistanceGrid", "Sample", "SceneMap"]
 
 
 def __getattr__(name: str) -> Any:

@@ -33,7 +33,7 @@ from jcr.run_folder import CAPTURE, RunFolder, fingerprint
 STATE = "batch.json"
 """In each run folder: its row of the table, and a fingerprint of what it was made from."""
 RETRIES = 3
-"""Of a task whose Ray node died."""
+"""How often a task is started again whose Ray node died."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +64,7 @@ class Row:
     images: int = 0
     used: int = 0
     offset_std_mm: float | None = None
-    """Of the worst axis, as the next."""
+    """One sigma of the camera's translation along its worst axis; `turn_std_deg` is that of its rotation."""
     turn_std_deg: float | None = None
     scale_std_percent: float | None = None
     held_out_mm: float | None = None

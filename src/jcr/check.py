@@ -68,7 +68,7 @@ class Examination:
     """Variance of the Laplacian, relative to the median image's; empty where there are no images."""
     largest_move_m: float
     largest_rotation_rad: float
-    """Between any two gripper poses."""
+    """Largest angle between two gripper poses."""
     observability: Observability
     expected: Expectation | None
     """What a calibration of the images that count would report; None of fewer than three."""
@@ -76,7 +76,7 @@ class Examination:
     """Rows of the images that are expected to register: those that did; of images not tried, those that are clear."""
     suggestions: tuple[NextPose, ...]
     hand_eye: HandEye | None
-    """From sparse features, where the images were looked at and registered."""
+    """The calibration by sparse features; None where the images were not registered."""
     angle_ratio: tuple[float, float] | None
     """Rotation angles between cameras over those between grippers, and its standard deviation; 1 is right whatever
     gripper_from_camera is. None without cameras to compare with."""

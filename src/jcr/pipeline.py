@@ -58,8 +58,8 @@ def run(
     check_known_length(capture, options.calibrate.known_length)
     options, missing = _possible(options.for_capture(capture, backend), capture)
     with locked(Path(out)) as folder, ThreadPoolExecutor(1) as beside:
-        # Torch takes more than a second to import, and COLMAP leaves a core idle.
-        importing = None if options.map is None else beside.submit(_why_no_map)
+        # Torch takes more than a second to import, the loops of depth as long to load, and COLMAP leaves a core idle.
+        importing = None if options.map is None else beside.submit(_why_no_map, options.estimates_depth)
         capture = folder.keep_capture(capture)
         added = None if options.map is None else read_added(folder.path, capture)
         result = stages.calibrated(capture, folder, options, progress or silent)
@@ -98,10 +98,14 @@ def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, str | 
     return replace(options, map=None), _why_no_map()
 
 
-def _why_no_map() -> str | None:
-    """What to install before a map can be made; None where all that makes one is imported."""
+def _why_no_map(estimate_depth: bool = False) -> str | None:
+    """What to install before a map can be made; None where all that makes one is imported, its loops compiled."""
     from jcr.represent.map_file import require_packages
 
+    if estimate_depth:
+        from jcr.depth.compile_loops import compile_loops
+
+        compile_loops()
     try:
         require_packages("the map", ", then `jcr map`")
     except InputError as error:

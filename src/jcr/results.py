@@ -15,7 +15,7 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.cell.cameras_json import CamerasFile
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError
-from jcr.reconstruct.backends import ReconstructOptions, with_cameras_of
+from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, tries, with_cameras_of
 from jcr.records import (
     Capture,
     HandEye,
@@ -71,6 +71,11 @@ class RunOptions:
     def needs_depth(self) -> bool:
         """Whether anything needs dense depth: a map, or a known length, which ends on surfaces."""
         return self.map is not None or self.calibrate.known_length is not None
+
+    @property
+    def estimates_depth(self) -> bool:
+        """Whether dense depth is needed, and the back end that is tried first predicts none."""
+        return self.needs_depth and not BACKENDS[tries(self.reconstruct)[0].backend].predicts_depth
 
     @property
     def made_with(self) -> MadeWith:

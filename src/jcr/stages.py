@@ -13,7 +13,6 @@ from jcr.cell.cameras_json import CamerasFile, cameras_file
 from jcr.depth.densify import densify, plan_depth
 from jcr.memory import give_back
 from jcr.progress import Progress
-from jcr.reconstruct.backends import BACKENDS, tries
 from jcr.reconstruct.board_in_view import proposed_for
 from jcr.records import Attempt, Capture, CellCamera
 from jcr.records.words import sentence
@@ -177,7 +176,7 @@ def _chosen(
     capture: Capture, folder: RunFolder, options: RunOptions, state: State, progress: Progress
 ) -> tuple[Tried, tuple[Attempt, ...]]:
     """What is chosen now, and how; its reconstruction is kept as soon as it is sure."""
-    if options.needs_depth and not BACKENDS[tries(options.reconstruct)[0].backend].predicts_depth:
+    if options.estimates_depth:
         plan_depth(capture, options.depth, options.reconstruct.memory_gb)
     tried = choose(
         capture,

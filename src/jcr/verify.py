@@ -31,7 +31,7 @@ from jcr.records.words import sentence
 from jcr.run_folder import RunFolder
 
 ROUNDING = 1e-9
-"""Of a pose that is written and read."""
+"""Largest change of a number of a pose that is written and read again."""
 MIN_TO_RECALIBRATE = 5
 """Images of another scene; with fewer a wrong one cannot be outvoted."""
 
@@ -52,7 +52,7 @@ class Verification:
 
     moved: bool
     cause: Cause
-    """Of what was found, where it has moved."""
+    """What has moved, where something has."""
     offset: Float[ndarray, "6"]
     """Drift: translation (m) and rotation vector (rad) of the camera in gripper axes."""
     std: Float[ndarray, "6"]

@@ -26,7 +26,11 @@ def mm_of_page(data: bytes) -> tuple[ndarray, ndarray]:
 
 @pytest.mark.parametrize(
     "spec",
-    ["charuco:8x5:0.030:0.022:DICT_4X4_50", "charuco:7x5:0.031:0.0233:DICT_5X5_50", "chessboard:8x5:0.027"],
+    [
+        "charuco:8x5:0.030:0.022:DICT_4X4_50",
+        "charuco:7x5:0.031:0.0233:DICT_5X5_50",
+        pytest.param("chessboard:8x5:0.027", marks=pytest.mark.slow),
+    ],
 )
 def test_a_printed_board_is_found_whole_and_at_its_size(spec: str):
     sheet = board_sheet(spec)

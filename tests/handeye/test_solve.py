@@ -283,8 +283,15 @@ UNSEEN = {
 
 
 @pytest.mark.parametrize("pattern", UNSEEN)
-@pytest.mark.parametrize("deviation_deg", [0.0, 3.0])
-@pytest.mark.parametrize("noise", [(0.0, 0.0), NOISE])
+@pytest.mark.parametrize(
+    ("noise", "deviation_deg"),
+    [
+        ((0.0, 0.0), 0.0),
+        (NOISE, 3.0),
+        pytest.param((0.0, 0.0), 3.0, marks=pytest.mark.slow),
+        pytest.param(NOISE, 0.0, marks=pytest.mark.slow),
+    ],
+)
 def test_motions_that_show_too_little_are_named(pattern, deviation_deg, noise):
     for seed in range(2):
         problem = hand_eye_problem(

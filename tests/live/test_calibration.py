@@ -18,7 +18,7 @@ from jcr.capture.images import read_image
 from jcr.geometry import inverse, rotation_exp, step_between, transform
 from jcr.live.calibration import LiveCalibration
 from jcr.live.calibration_progress import Progress
-from jcr.reconstruct.colmap import reconstruct_colmap
+from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.records import Kind
 
 REQUIRED = (2.0, 0.3)
@@ -107,9 +107,35 @@ def test_the_end_is_the_batch_calibration_without_finding_features_again(
     # A batch reads what is kept, and writes nothing there; what is damaged is found again.
     assert kept == {file.name: file.stat().st_mtime_ns for file in (folder / "live" / "features").iterdir()}
     next((folder / "live" / "features").glob("image-*")).write_bytes(b"damaged")
-    again = reconstruct_colmap(jcr.read_capture(folder))
+    again = reconstruct(jcr.read_capture(folder), ReconstructOptions(backend="colmap"))
     assert np.array_equal(again.recon_from_camera, result.reconstruction.recon_from_camera)
     assert found == ["detect"]
+
+
+@pytest.mark.slow
+def test_the_end_depends_neither_on_names_nor_on_the_order_of_the_images(small_capture: Path, tmp_path: Path):
+    capture = jcr.read_capture(small_capture)
+    batch = jcr.calibrate(small_capture, tmp_path / "batch")
+    with closing(LiveCalibration(tmp_path / "capture", intrinsics=capture.intrinsics)) as live:
+        for k in (3, 0, 4, 2, 1):
+            live.add(read_image(small_capture / capture.images[k]), capture.base_from_gripper[k])
+        result = live.finish()
+    assert batch.covariance is not None
+    away = step_between(result.gripper_from_camera, batch.gripper_from_camera)
+    assert np.abs(away / np.sqrt(np.diag(batch.covariance)[:6])).max() < 1e-5
+
+
+@pytest.mark.slow
+def test_a_place_that_shows_what_another_does_is_not_proposed_again(resumed: LiveCalibration, tabletop: Path):
+    places = []
+    for _ in range(3):
+        pose = resumed.progress.next_pose
+        assert pose is not None
+        x = resumed.progress.hand_eye.gripper_from_camera  # pyright: ignore[reportOptionalMemberAccess]
+        places.append((pose.base_from_gripper @ x)[:3, 3])
+        state = resumed.add(still(tabletop, 0), pose.base_from_gripper)
+        assert state.refused is not None and state.refused.kind is Kind.FRAME_REPEATED
+    assert all(np.linalg.norm(places[k] - places[j]) > 0.05 for k in range(3) for j in range(k))
 
 
 @pytest.mark.slow

@@ -64,7 +64,7 @@ def test_pairs_are_read_as_they_were_found_while_images_and_intrinsics_are_the_s
     def found(
         camera: pycolmap.Camera, digests: str, writes: bool = True
     ) -> tuple[Points, KeepingMatcher, dict]:
-        points, kept = Points(), KeptFeatures(tmp_path, writes, list(digests))
+        points, kept = Points(), KeptFeatures(tmp_path, writes, list(digests), [(0.0,), (1.0,), (2.0,)])
         matcher = KeepingMatcher(points, camera, known, 0, kept)
         return points, matcher, in_numbers(matcher.geometries(PAIRS, rolls))
 
@@ -86,3 +86,20 @@ def test_features_are_those_of_the_same_file_at_the_same_size(tmp_path: Path):
     there = same.features(1, (640, 480))
     assert there is not None and np.array_equal(there[0], x_px) and np.array_equal(there[1], descriptors)
     assert same.features(0, (640, 480)) is None and same.features(1, (320, 240)) is None
+
+
+def test_a_pair_is_matched_from_the_image_whose_pose_comes_first_whichever_row_it_has(tmp_path: Path):
+    camera, rolls = camera_of(INTRINSICS, True), np.zeros((1, 2))
+    keys = [(1.0,), (0.0,), (2.0,)]
+    wanted = Matcher(Points(), np.ones(2), camera, True, 0)
+    found = KeepingMatcher(Points(), camera, True, 0, KeptFeatures(tmp_path, True, list("abc"), keys))
+    geometry, there = wanted.geometries([(1, 0)], rolls)[1, 0], found.geometries([(0, 1)], rolls)[0, 1]
+    assert list(found.raw) == [(0, 1)]
+    assert np.array_equal(there.inlier_matches, np.asarray(geometry.inlier_matches)[:, ::-1])
+    assert there.E is not None and np.array_equal(there.E, np.asarray(geometry.E).T)
+    # A reconstruction in the order of the poses finds the pair as it would match it.
+    points, kept = Points(), KeptFeatures(tmp_path, False, list("bac"), sorted(keys))
+    points.x_px[:2] = points.x_px[1::-1]
+    again = KeepingMatcher(points, camera, True, 0, kept).geometries([(0, 1)], rolls)
+    assert not points.matched
+    assert in_numbers(again) == in_numbers({(0, 1): geometry})

@@ -96,8 +96,8 @@ def test_a_new_back_end_is_one_row(
 def test_a_row_is_called_with_the_options_as_it_takes_them(with_mine: ModuleType) -> None:
     capture = Capture(
         folder=Path(),
-        images=("b.png", "a.png"),
-        base_from_gripper=np.tile(np.eye(4), (2, 1, 1)),
+        images=("a.png", "b.png"),
+        base_from_gripper=np.stack([np.diag([1.0, 1.0, 1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0])]),
         image_size=(64, 48),
     )
     seen = []

@@ -220,6 +220,7 @@ def test_faults_in_a_file_are_named(capture: Capture, truth: dict[str, Any]) -> 
         reconstruct_predictions(capture, capture.folder / "absent.npz")
 
 
+@pytest.mark.slow
 def test_a_network_gives_the_same_record(
     capture: Capture, truth: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -295,11 +296,11 @@ def test_an_any_view_model_is_given_our_intrinsics_and_the_robot_names_what_it_d
     model = FakeMapAnything(truth)
     options = ViewsOptions(
         backend="mapanything",
-        load=mapanything.load,
+        load=lambda weights, device: partial(mapanything.predict, model),
         weights=Weights(Path("X"), "X", "Apache-2.0"),
         cost=Cost(0.0, 0.0, 0.0, 0.0),
     )
-    result = reconstruct_views_at_once(capture, options, predict=partial(mapanything.predict, model))
+    result = reconstruct_views_at_once(capture, options)
     view = model.views[0]
     assert view["img"].shape == (1, 3, 378, 518) and view["data_norm_type"] == ["dinov2"]
     assert view["img"][0, 1].mean() == pytest.approx(-0.456 / 0.224, abs=1e-5)
@@ -325,7 +326,7 @@ def test_an_any_view_model_is_given_our_intrinsics_and_the_robot_names_what_it_d
         image_size=capture.image_size,
         intrinsics=capture.intrinsics,
     )
-    found = reconstruct_views_at_once(off, options, predict=partial(mapanything.predict, model))
+    found = reconstruct_views_at_once(off, options)
     named = [note for note in found.warnings if "check its pose" in note]
     assert len(named) == 1 and named[0].startswith("1.png: its angles to the other views differ")
 

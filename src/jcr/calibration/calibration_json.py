@@ -72,14 +72,14 @@ class RobotErrors(Part):
     """Systematic errors of the gripper poses, as estimated."""
 
     systematic_deg: Spread
-    """Of joint offsets where the arm is known, else of the gripper's rotation."""
+    """One sigma of the joint offsets where the arm is known, else of the gripper's rotation."""
     translation_mm: Spread
     """What of them is left in the poses per axis, after the effective hand-eye transform took its part."""
     rotation_deg: Spread
     p: Annotated[float, Field(ge=0, le=1)] | None = None
     """Chance of residuals like these where the robot's errors are random alone."""
     joints: list[JointOffset] | None = None
-    """From the base on; null where the arm is not known."""
+    """The joints from the base on; null where the arm is not known."""
 
     @classmethod
     def of(cls, robot: RobotExamined) -> "RobotErrors":
@@ -114,7 +114,7 @@ class Proposal(Part):
     base_from_gripper: Matrix
     like: str
     expected_std: Numbers7
-    """In the order of `uncertainty`."""
+    """One standard deviation of each unknown once this pose is added, in the order of `uncertainty`."""
     within_95_mm: Spread | None = None
     """Of a point seen as in `uncertainty.seen`; null in files of earlier versions."""
     rotation_95_deg: Spread | None = None

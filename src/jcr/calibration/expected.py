@@ -6,10 +6,11 @@ of random and systematic errors of the robot, and of how much images tell. The l
 some of the images found, else usual ones.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from jcr.adjust.foreseen import ForeseenCamera, foreseen
@@ -96,11 +97,17 @@ class Ahead:
         count: int,
         reach: Float[ndarray, "2 3"] | None = None,
         seed: int = 0,
+        is_likely: Callable[[Poses], Bool[ndarray, " k"]] | None = None,
     ) -> "Ahead":
-        """The `count` that help most; `robot` is of the others, `reach` as `candidates` takes it, drawn with `seed`."""
+        """The `count` that help most; `robot` is of the others, `reach` as `candidates` takes it, drawn with `seed`.
+
+        `is_likely`: whether an image at a pose is likely to register; others are taken only where none is.
+        """
         x, noise = assumptions.gripper_from_camera, assumptions.noise
         of_random, distance = (noise.translation, noise.rotation), assumptions.distance_m
         possible = candidates(base_from_gripper, x, reach, np.random.default_rng(seed))
+        if is_likely is not None and (likely := is_likely(possible)).any():
+            possible = possible[likely]
         added = next_poses(base_from_gripper, possible, count, x, of_random, distance)
         ahead = Ahead(assumptions=assumptions, base_from_gripper=base_from_gripper, robot=robot, added=added)
         if count == 0 or len(base_from_gripper) > TOO_MANY:

@@ -87,7 +87,7 @@ class Joint(Part):
 
     covariance: Square
     order: list[str]
-    """Of `uncertainty`, then fx, fy, cx, cy and the distortion."""
+    """Names of the rows: those of `uncertainty`, then fx, fy, cx, cy and the distortion."""
 
     @model_validator(mode="after")
     def _is_square(self) -> "Joint":

@@ -123,16 +123,16 @@ class _Heard:
     """What one pass over a bag found, its images aside."""
 
     topics: list[str]
-    """Of cameras on which something was recorded."""
+    """Topics of cameras on which something was recorded."""
     cameras: list[Any]
     """Connections of all camera topics."""
     aligned: list[Any]
     """Connections of depth that has the pixels of a colour image."""
     recorded: dict[str, _Recorded]
     infos: dict[str, Any]
-    """By camera topic the connection of its CameraInfo."""
+    """The connection of the CameraInfo of each camera topic."""
     camera_infos: dict[str, Any]
-    """By the topic of a CameraInfo its first message."""
+    """The first message on each topic of a CameraInfo."""
     tree: TfTree
     joint_states: list[Any]
 
@@ -197,7 +197,7 @@ class _Frames:
     mounts: dict[str, Mount | None]
     poses_at: PosesAt
     topic: str
-    """Of the chosen camera."""
+    """Topic of the chosen camera."""
     stamps: Int[np.ndarray, " n"]
     base_from_gripper: Float[np.ndarray, "n 4 4"]
 

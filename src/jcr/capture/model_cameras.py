@@ -21,7 +21,7 @@ from jcr.geometry import step_between
 from jcr.records import Capture, CellCamera, Intrinsics
 
 ONE_PLACE = (0.02, np.radians(1.0))
-"""Of the model's extent, and rad: images of one fixed camera differ by less."""
+"""Share of the model's extent, and rad: images of one fixed camera differ by less."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +30,7 @@ class ModelCamera:
 
     name: str
     images: tuple[str, ...]
-    """Relative to the folder of the capture."""
+    """Paths relative to the folder of the capture."""
     recon_from_camera: Float[ndarray, "k 4 4"]
     moment: tuple[int, ...]
     """Of each image; the same number where cameras of a rig were triggered together."""

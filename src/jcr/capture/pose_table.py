@@ -25,7 +25,7 @@ _SHOWN: tuple[ConventionName, ...] = ("quat-xyzw", "rpy", "kuka", "fanuc", "abb"
 _LAST_ROW = {"m30": "0", "m31": "0", "m32": "0", "m33": "1"}
 
 _LATEST_NS = np.iinfo(np.int64).max
-"""In the year 2262."""
+"""The last nanosecond that fits 64 bits, in the year 2262."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ FOLDER = "cameras"
 NOT_ITS_NAME = re.compile(
     r"^(observation\.)?(images?[./])?|[./](color|rgb|image(_raw|_rect|_rect_color|_color)?|compressed)(?=[./]|$)"
 )
-"""Of a topic or key what all cameras have."""
+"""Parts of a topic or key that all cameras have."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class RecordedCamera:
     name: str
     mount: Mount
     images_of_rows: ImagesOfRows
-    """Of rows of the chosen camera's frames, those that it has."""
+    """Images of the rows of the chosen camera's frames, where it has some."""
     intrinsics_of_size: IntrinsicsOfSize
 
 

@@ -30,12 +30,12 @@ class Recording:
     source: Path
     options: ReadOptions
     names: Sequence[str]
-    """Of the frames' files, without ending."""
+    """Names of the frames' files, without their endings."""
     base_from_gripper: Float[ndarray, "n 4 4"]
     speed: Float[ndarray, " n"]
     """m/s, rotation counted as jcr.geometry.motion_length does."""
     gap_ns: Int[ndarray, " n"]
-    """Between the two poses around each frame; 0 where none is interpolated."""
+    """Time between the two poses around each frame; 0 where none is interpolated."""
     images_of_rows: ImagesOfRows
     intrinsics_of_size: IntrinsicsOfSize
     joints: Float[ndarray, "n j"] | None = None

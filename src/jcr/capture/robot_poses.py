@@ -12,9 +12,9 @@ from jcr.errors import InputError
 from jcr.geometry import HUGE, require_rigid, transform
 
 QUATERNION_TOLERANCE = 1e-2
-"""On its length; three printed digits pass."""
+"""Largest distance of a quaternion's length from 1; three printed digits pass."""
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
-"""Of a unit of length."""
+"""Metres in each unit of length."""
 RADIANS_LIMIT = 2 * np.pi + 0.01
 """No angle in radians is larger, and no wrist worth calibrating keeps all of its angles smaller in degrees."""
 LEAST_REACH = 0.25

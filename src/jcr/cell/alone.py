@@ -29,7 +29,7 @@ from jcr.records import (
 )
 
 LEAST_POSES = 3
-"""With fewer images nothing is reconstructed."""
+"""Fewer images than this are not reconstructed."""
 
 
 def of_camera(capture: Capture, camera: CellCamera) -> Capture:

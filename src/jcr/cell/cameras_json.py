@@ -21,8 +21,6 @@ from jcr.records.words import doubt_of
 from jcr.rounding import significant
 
 FILE, FORMAT = "cameras.json", "jcr.cameras/1"
-ORDER = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
-"""Of the covariances: the step (geometry.retract) that takes the transform to the true one, in axes of its parent."""
 
 
 class TransformUncertainty(Part):
@@ -31,9 +29,10 @@ class TransformUncertainty(Part):
     translation_std_mm: Spread3
     rotation_std_deg: Spread3
     covariance: Covariance6
-    """In ORDER; m and rad."""
+    """Of the step (geometry.retract) to the true transform: translation (m) and rotation vector (rad), in axes of its
+    parent."""
     at_scene_mm: Spread | None = None
-    """Along the worst axis, of a point at `scene_distance_m` before the camera."""
+    """One sigma along the worst axis of a point `scene_distance_m` before the camera."""
     scene_distance_m: Spread | None = None
 
 
@@ -45,9 +44,9 @@ class CameraPlaced(Part):
     arm: str | None
     """null: the capture's own arm."""
     base_from_camera: Matrix | None = None
-    """Of a fixed camera."""
+    """Where a fixed camera is; null for one on a gripper."""
     gripper_from_camera: Matrix | None = None
-    """Of a camera on a gripper."""
+    """Where a camera on a gripper is; null for a fixed one."""
     uncertainty: TransformUncertainty | None = None
     intrinsics: IntrinsicsAndStd | None = None
     images: list[ImageFound] = Field(alias="pictures")
@@ -86,7 +85,7 @@ class ArmPlaced(Part):
 
     name: str
     base_from_other_base: Matrix
-    """From its base to that of the capture's own arm."""
+    """The transform from its base to that of the capture's own arm."""
     uncertainty: TransformUncertainty
 
 

@@ -39,7 +39,7 @@ class CameraFound(Assessed):
     parent_from_camera: Float[ndarray, "4 4"] | None = None
     """base_from_camera or gripper_from_camera, of its own arm; None where it was not found."""
     covariance: Float[ndarray, "6 6"] | None = None
-    """Of its step."""
+    """Covariance (6,6) of the step that takes the transform to the true one."""
     scene_distance: float | None = None
     """m along the optical axis to what it sees."""
     intrinsics: Intrinsics | None = None
@@ -72,7 +72,7 @@ class ArmFound:
 
     name: str
     base_from_other: Float[ndarray, "4 4"]
-    """From its base to that of the capture's own arm."""
+    """The transform from its base to that of the capture's own arm."""
     covariance: Float[ndarray, "6 6"]
 
 

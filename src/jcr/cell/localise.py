@@ -40,7 +40,7 @@ FEW = 120
 CLEARLY_MORE = 1.1
 """Times the points that agree with given intrinsics: more are no chance of RANSAC."""
 SAME_VIEW = np.radians(5.0)
-"""By which the place with these may be rotated against that without."""
+"""Largest rotation between the place with these and the place without."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Shared:
     intrinsics: Intrinsics
     points_in_recon: Float[ndarray, "p 3"]
     x_px: Float[ndarray, "p 2"]
-    """In the image."""
+    """Pixels of the image."""
     row: Int[ndarray, " k"]
     """Image of known pose of each further observation."""
     row_x_px: Float[ndarray, "k 2"]

@@ -28,7 +28,7 @@ SAME_PLACE_OF_UNKNOWN = (0.2, np.radians(6.0))
 AT_A_FRAME = (0.01, np.radians(1.0))
 """m, rad: nearer than this to where the wrist camera was, a fixed camera is likely to be that camera."""
 LEAST_POSES = 3
-"""Of another arm, or of another camera on the gripper: images."""
+"""Fewest images of another arm, or of another camera on the gripper."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class Member:
 
     seen: CameraViews
     rig: Int[ndarray, " k"]
-    """Of each image; -1 where it is not used."""
+    """The rig of each image; -1 where it is not used."""
     rig_from_camera: Float[ndarray, "4 4"] | None
     """Where it is not the rig's first camera."""
     arm: int | None

@@ -6,6 +6,7 @@ status: 0 done, 2 the user's input is wrong, 3 rejected, 1 a bug. Each has an `o
 --json its result is one JSON object on stdout, with --quiet nothing but errors and warnings comes on stderr.
 """
 
+import atexit
 import contextlib
 import errno
 import io
@@ -14,6 +15,7 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from types import ModuleType
+from typing import NoReturn
 
 from jcr.cli.output import Quiet
 from jcr.errors import InputError, RejectedError, did_you_mean, printable
@@ -97,7 +99,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     _open_closed_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # of an ASCII terminal, which has no ±
-    sys.exit(dispatch(sys.argv[1:] if arguments is None else arguments))
+    _end(_guarded(lambda: dispatch(sys.argv[1:] if arguments is None else arguments)))
+
+
+def _end(status: int) -> NoReturn:
+    """End the process now that all is written: the interpreter would take every module apart, torch's and the
+    compiler's for a second."""
+    atexit._run_exitfuncs()
+    with contextlib.suppress(OSError):
+        sys.stderr.flush()
+    os._exit(status)
 
 
 def wait_asleep() -> None:

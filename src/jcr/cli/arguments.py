@@ -18,7 +18,7 @@ NO_DEFAULT = re.compile(r" *\(default: *(?:None|True|False|)\)")
 """What the parser adds to options that have no value, and of switches."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Argument:
     """One argument as help shows it."""
 

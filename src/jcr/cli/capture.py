@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from jcr.results import RunResult
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Take a capture live, with a camera and the gripper poses of a robot, and see what is still missing.
 

@@ -32,7 +32,7 @@ class Format:
 
     name: FormatName
     file: str
-    """In OUT/export, where the user names none; ends with / for a folder."""
+    """Its name in OUT/export, where the user gives no path; ends with / for a folder."""
     about: str
     write: Callable[["Run", Path], None]
 

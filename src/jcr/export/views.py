@@ -33,13 +33,13 @@ class PosedImages:
     """The registered images of a capture, their cameras in the base frame and what they saw in common."""
 
     folder: Path
-    """Of the capture."""
+    """Folder of the capture."""
     images: tuple[str, ...]
-    """Relative to that folder."""
+    """Paths relative to that folder."""
     base_from_camera: Float[ndarray, "m 4 4"]
     intrinsics: Intrinsics
     tracks: Tracks
-    """As the reconstruction has them; see `points_in_base` for the points."""
+    """Tracks of the reconstruction; `points_in_base` has their points in the base frame."""
     points_in_base: Float[ndarray, "p 3"]
     beside: tuple[int, ...] | None = None
     """Of a further camera on the same gripper: rows of the capture's own images that its images were taken with."""
@@ -164,7 +164,7 @@ class _Further:
     views: PosedImages
     intrinsics: Intrinsics
     names: list[str]
-    """In the folder of images."""
+    """Names in the folder of images."""
 
 
 def _colmap_model(

@@ -1,13 +1,13 @@
 """A calibration that is made while the images are taken: after each image, how exact it is and what is missing."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8, UInt16
+from jaxtyping import Float, Float32, Int, UInt8, UInt16
 from numpy import ndarray
 
 from jcr.calibration.case import Case, of_points
@@ -29,7 +29,7 @@ from jcr.live.calibration_left_out import left_out
 from jcr.live.calibration_progress import LeftOut, Progress, Reached
 from jcr.live.folder import LiveFolder
 from jcr.live.look import STILL, grid
-from jcr.live.next_pose import Reach, before_calibration, proposed
+from jcr.live.next_pose import Reach, Tried, before_calibration, proposed
 from jcr.options import checked_options
 from jcr.reconstruct.growing import Growing
 from jcr.records import Capture, Finding, HandEye, Intrinsics, Kind, Tracks, strongest_first
@@ -78,6 +78,9 @@ class LiveCalibration:
         self._of_image: dict[str, tuple[Finding, ...]] = {}
         self._grids: dict[str, Float32[ndarray, "gh gw"]] = {}
         self._history = _read_history(folder.folder / HISTORY)
+        self._refused: list[Float[ndarray, "4 4"]] = []
+        self._next_pose: Callable[[], dict[str, Any]] = dict
+        """Fields of Progress, of the capture as it was calibrated last and the gripper poses refused since."""
         self.progress = Progress(images=tuple(folder.names), history=self._history)
 
     def add(
@@ -96,7 +99,7 @@ class LiveCalibration:
         """
         refused = self.fault(image, base_from_gripper)
         if refused is not None:
-            return self._refusing(refused)
+            return self._refusing(refused, base_from_gripper)
         self.live.add(image, base_from_gripper, joints, depth_mm, time_s)
         return self.update()
 
@@ -121,7 +124,7 @@ class LiveCalibration:
         old = self.live.names[index]
         refused = self.fault(image, base_from_gripper, without=old)
         if refused is not None:
-            return self._refusing(refused)
+            return self._refusing(refused, base_from_gripper)
         self.live.add(image, base_from_gripper, joints, depth_mm, time_s, replaces=old)
         return self.update()
 
@@ -186,6 +189,7 @@ class LiveCalibration:
         if capture is not None:
             self._extend(capture)
         added = new[-1] if new and before <= len(names) else None
+        self._refused.clear()
         self.progress = self._calibrated(capture, added)
         return self.progress
 
@@ -195,7 +199,16 @@ class LiveCalibration:
             self._map.close()
         self.live.close()
 
-    def _refusing(self, refused: Finding) -> Progress:
+    @one_blas_thread
+    def propose_elsewhere(self, base_from_gripper: Float[ndarray, "4 4"]) -> Progress:
+        """The state with a next pose away from a gripper pose at which no image could be kept."""
+        self._refused.append(base_from_gripper)
+        self.progress = replace(self.progress, **self._next_pose())
+        return self.progress
+
+    def _refusing(self, refused: Finding, base_from_gripper: Float[ndarray, "4 4"]) -> Progress:
+        if refused.kind is Kind.FRAME_REPEATED:
+            self.propose_elsewhere(base_from_gripper)
         self.progress = replace(self.progress, added=None, refused=refused)
         return self.progress
 
@@ -252,17 +265,22 @@ class LiveCalibration:
         made = None if self._map is None or not names else self._map.reconstruction()
         registered = () if made is None else tuple(names[row] for row in made.image_index)
         state = Progress(images=names, added=added, registered=registered, history=self._history)
+        rows = np.zeros(0, int) if made is None else made.image_index
+        if capture is None:
+            self._next_pose = dict
+        else:
+            self._next_pose = lambda: before_calibration(self._tried(capture, rows), self._reach)
         if capture is None or made is None or len(registered) < FEWEST:
-            state = replace(state, findings=strongest_first([*of_images, *_too_few(len(names))]))
-            return replace(state, **before_calibration(capture, self._reach))
+            findings = strongest_first([*of_images, *_too_few(len(names))])
+            return replace(state, findings=findings, **self._next_pose())
         tracks = _longest(made.tracks, min(OBSERVATIONS[0] * len(registered), OBSERVATIONS[1]))
         made = replace(made, tracks=tracks)
         robot = robot_errors(capture, self._options).of(made.image_index)
         try:
             case = checked(capture, made, self._options, robot)
         except RejectedError:
-            state = replace(state, findings=strongest_first([*of_images, *_too_few(len(names))]))
-            return replace(state, **before_calibration(capture, self._reach))
+            findings = strongest_first([*of_images, *_too_few(len(names))])
+            return replace(state, findings=findings, **self._next_pose())
         assumptions = assumed_of(case)
         hand_eye = advised(
             case.hand_eye, case.base_from_gripper, self._options, robot, assumptions, case.scene_in_base
@@ -273,6 +291,9 @@ class LiveCalibration:
             proof = left_out(capture, made, hand_eye.inliers, robot, self._options)
         findings = [*of_images, *_contradicting(case, hand_eye), *hand_eye.findings, *_disagreeing(proof)]
         self._remember(len(names), hand_eye)
+        self._next_pose = lambda: proposed(
+            case, hand_eye, robot, assumptions, self._reach, self._tried(capture, rows)
+        )
         return replace(
             state,
             hand_eye=hand_eye,
@@ -280,8 +301,11 @@ class LiveCalibration:
             history=self._history,
             left_out=proof,
             points_in_base=_points(case, hand_eye),
-            **proposed(case, hand_eye, robot, assumptions, self._reach),
+            **self._next_pose(),
         )
+
+    def _tried(self, capture: Capture, registered: Int[ndarray, " m"]) -> Tried:
+        return Tried(capture, registered, tuple(self._refused))
 
     def _not_registered(self, names: tuple[str, ...]) -> list[Finding]:
         """Images that stay out of the map, where there is one or there are enough for one."""

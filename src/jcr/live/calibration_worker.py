@@ -1,9 +1,13 @@
 """A calibration that is made in a thread of its own, so that neither the camera nor the source of poses waits for it."""
 
+import queue
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+
+from jaxtyping import Float
+from numpy import ndarray
 
 from jcr.errors import InputError, RejectedError
 from jcr.live.calibration_progress import Progress
@@ -34,6 +38,7 @@ class CalibrationWorker:
         """`until_accurate`: as soon as the calibration is as accurate as required, it is finished, too."""
         self._calibration, self._heard, self._until_accurate = calibration, heard, until_accurate
         self._changed = threading.Event()
+        self._refused: queue.SimpleQueue[Float[ndarray, "4 4"]] = queue.SimpleQueue()
         self._ended = self._abandoned = False
         self._calibrated: tuple[str, ...] = ()
         self._thread = threading.Thread(target=self._watch, daemon=True)
@@ -45,6 +50,11 @@ class CalibrationWorker:
 
     def changed(self) -> None:
         """Images were added to the capture, or taken out of it."""
+        self._changed.set()
+
+    def refused(self, base_from_gripper: Float[ndarray, "4 4"]) -> None:
+        """No image could be kept at a gripper pose: the next one is proposed elsewhere."""
+        self._refused.put(base_from_gripper)
         self._changed.set()
 
     def finish(self) -> None:
@@ -82,10 +92,11 @@ class CalibrationWorker:
 
     def _calibrate(self) -> None:
         names = tuple(self._calibration.live.names)
-        if names == self._calibrated:
-            return
-        progress = self._calibration.update()
-        self._calibrated = progress.images
-        self._heard(progress)
-        if self._until_accurate and progress.is_accurate:
-            self._heard(self._calibration.finish())
+        if names != self._calibrated:
+            progress = self._calibration.update()
+            self._calibrated = progress.images
+            self._heard(progress)
+            if self._until_accurate and progress.is_accurate:
+                self._heard(self._calibration.finish())
+        while not self._refused.empty():
+            self._heard(self._calibration.propose_elsewhere(self._refused.get()))

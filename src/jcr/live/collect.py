@@ -116,8 +116,8 @@ class LiveCapture:
         self._worker = CalibrationWorker(calibration, self._events.put, options.until_accurate)
         self._frames = iter(camera.frames)
         self._looks = {name: Look.of(read_image(self.live.folder / name)) for name in self.live.names}
-        self._waiting: list[tuple[str, Ask]] = []
-        """Images whose requests are answered with the calibration."""
+        self._waiting: list[tuple[str | None, Ask, Answer]] = []
+        """Requests that are answered with the calibration: the image that it must have, None of one that was refused."""
         self._answered = threading.Event()
 
     def press(self, command: Command) -> None:
@@ -199,16 +199,21 @@ class LiveCapture:
             self._show("", is_over=True)
         if isinstance(name, InputError):
             answer: Answer = {"accepted": False, "reason": str(name), "done": self.shown.is_over}
-            ask.answer(answer)
             self._show(f"refused: {name}", is_refusal=True)
             self._tell(answer, [f"refused: {name}"])
+            self._worker.refused(ask.base_from_gripper)
+            self._answer(ask, None, answer)
             return
         self._show(f"kept {name}", is_over=len(self.live.names) >= self.options.most)
         self._tell(_accepted(name, self.shown.is_over), [f"kept {name}"])
+        self._answer(ask, name, _accepted(name, self.shown.is_over))
+
+    def _answer(self, ask: Ask, name: str | None, answer: Answer) -> None:
+        """Answer a request, at once or with the calibration and the next pose."""
         if ask.waits:
-            self._waiting.append((name, ask))
+            self._waiting.append((name, ask, answer))
         else:
-            ask.answer(_accepted(name, self.shown.is_over))
+            ask.answer(answer)
 
     def _frame(self, ask: Ask) -> Frame | InputError:
         """A frame at rest, or why none is kept."""
@@ -309,8 +314,7 @@ class LiveCapture:
         lines = progress_lines(state, self.options.require, self.words)
         self._tell({"calibration": progress_answer(state)}, lines)
         # Whether an accurate calibration ends the capture is known when it is finished.
-        if not (self.options.until_accurate and state.is_accurate):
-            self._answer_waiting()
+        self._answer_waiting(with_kept=not (self.options.until_accurate and state.is_accurate))
 
     def _end_if_accurate(self, result: "RunResult") -> None:
         required = result.hand_eye.requirement
@@ -318,14 +322,17 @@ class LiveCapture:
             self._show("", is_over=True, result=result)
         self._answer_waiting()
 
-    def _answer_waiting(self, of_all: bool = False) -> None:
-        """Answer the requests whose images the calibration has, or all of them."""
+    def _answer_waiting(self, of_all: bool = False, with_kept: bool = True) -> None:
+        """Answer the requests that were refused, and those whose images the calibration has, or all of them."""
         state, waiting = self.shown.progress, self._waiting
-        is_due = [of_all or self.shown.is_over or name in state.images for name, _ in waiting]
+        is_due = [
+            of_all or self.shown.is_over or name is None or (with_kept and name in state.images)
+            for name, _, _ in waiting
+        ]
         self._waiting = [one for one, due in zip(waiting, is_due, strict=True) if not due]
-        for (name, ask), due in zip(waiting, is_due, strict=True):
+        for (_, ask, answer), due in zip(waiting, is_due, strict=True):
             if due:
-                ask.answer(progress_answer(state) | _accepted(name, self.shown.is_over))
+                ask.answer(progress_answer(state) | answer | {"done": self.shown.is_over})
 
     def _show(self, event: str, *, is_refusal: bool = False, **changes: object) -> None:
         self.shown = replace(

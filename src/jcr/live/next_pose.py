@@ -4,21 +4,24 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.calibration.case import Case
-from jcr.calibration.expected import Ahead, Assumptions, assumed, typical_camera
+from jcr.calibration.expected import Ahead, Assumptions, assumed, scene_distance, typical_camera
 from jcr.calibration.robot_errors import RobotErrors, errors_of
+from jcr.geometry import rotation_angle
 from jcr.handeye.robots import Arm
 from jcr.live.arm_words import Path, joints_at
 from jcr.records import Capture, HandEye
 
 PROPOSALS = 12
-"""Poses that are compared; the first that the arm reaches and whose image is likely to register is proposed."""
+"""Poses that are compared; the first that the arm reaches is proposed."""
 ALIKE, ELSEWHERE_M = np.radians(25.0), 0.06
 """Largest angle between the lines of sight of a proposed image and the nearest that registered, and least distance (m)
-of its camera from where an image did not register."""
+of its camera from where an image did not register or was refused."""
+AIMED = 0.1, np.radians(5.0)
+"""Largest standard deviations (m, rad) of a rejected calibration by which cameras can still be aimed at the scene."""
 
 
 @dataclass(frozen=True)
@@ -31,55 +34,100 @@ class Reach:
     """Lower and upper corner (m, base frame) of gripper positions."""
 
 
-def before_calibration(capture: Capture | None, reach: Reach) -> dict[str, Any]:
-    """The next pose by a usual robot and usual images, as fields of Progress; none below two images."""
-    if capture is None or len(capture) < 2:
+@dataclass(frozen=True)
+class Tried:
+    """Where images were taken, and which of them help to say where the next one will register."""
+
+    capture: Capture
+    registered: Int[ndarray, " m"]
+    """Rows of the capture; of fewer than two, all images count as if they had registered."""
+    refused: tuple[Float[ndarray, "4 4"], ...] = ()
+    """Gripper poses (base_from_gripper) at which no image was kept since the last one that was."""
+
+    @property
+    def is_registered(self) -> Bool[ndarray, " n"]:
+        """Of every image of the capture."""
+        rows = np.arange(len(self.capture))
+        return np.isin(rows, self.registered) if len(self.registered) >= 2 else np.ones(len(rows), bool)
+
+    def likely(self, added: Float[ndarray, "c 4 4"], x: Float[ndarray, "4 4"]) -> Bool[ndarray, " c"]:
+        """Which gripper poses are likely to give an image that registers, by gripper_from_camera `x`.
+
+        It looks along nearly the same line as an image that registered, and not from where one did not. After an image
+        that did not, the camera may look elsewhere than `x` shows: then the gripper is rotated as little.
+        """
+        poses, there = self.capture.base_from_gripper, self.is_registered
+        known, failed = poses[there], np.concatenate([poses[~there], np.reshape(self.refused, (-1, 4, 4))])
+        if len(self.refused) or not there[-1]:
+            relative = np.swapaxes(known[:, :3, :3], 1, 2) @ added[:, None, :3, :3]
+            angle = np.asarray(rotation_angle(relative)).min(1)
+        else:
+            cosine = (added @ x)[:, :3, 2] @ (known @ x)[:, :3, 2].T
+            angle = np.arccos(np.clip(cosine, -1, 1)).min(1)
+        between = (added @ x)[:, None, :3, 3] - (failed @ x)[:, :3, 3]
+        return (angle < ALIKE) & (np.linalg.norm(between, axis=2).min(1, initial=np.inf) > ELSEWHERE_M)
+
+
+def before_calibration(tried: Tried, reach: Reach, hand_eye: HandEye | None = None) -> dict[str, Any]:
+    """The next pose by a usual robot and usual images, as fields of Progress; none below two images.
+
+    The camera is where a rejected calibration puts it, if that is exact enough to aim by, else at the gripper.
+    """
+    capture = tried.capture
+    if len(capture) < 2:
         return {}
-    poses = capture.base_from_gripper
+    there = np.flatnonzero(tried.is_registered)
+    poses = capture.base_from_gripper[there]
     camera = typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
-    count = 1 if reach.arm is None else PROPOSALS
-    ahead = Ahead.of(assumed(poses, camera), poses, errors_of(poses), count, reach.box)
-    return _first_reached(ahead, Path(poses, capture.joints), reach.arm, capture.images)
+    assumptions = assumed(poses, camera)
+    if hand_eye is not None and _is_aimed(hand_eye):
+        x = hand_eye.gripper_from_camera
+        assumptions = replace(assumptions, gripper_from_camera=x, distance_m=scene_distance(poses @ x))
+    return _best(assumptions, poses, errors_of(poses), tried, there, reach)
 
 
 def proposed(
-    case: Case, hand_eye: HandEye, robot: RobotErrors, assumptions: Assumptions, reach: Reach
+    case: Case, hand_eye: HandEye, robot: RobotErrors, assumptions: Assumptions, reach: Reach, tried: Tried
 ) -> dict[str, Any]:
     """The next pose by what the calibration knows of robot and images, as fields of Progress."""
     if not hand_eye.is_sound:
-        return before_calibration(case.capture, reach)
+        return before_calibration(tried, reach, hand_eye)
     used, pose = case.used, hand_eye.next_poses[0]
-    poses, names = case.base_from_gripper[used], tuple(case.names[row] for row in used)
+    rows = case.reconstruction.image_index[used]
     is_free = reach.arm is None and reach.box is None
-    if is_free and _registers(case, pose.base_from_gripper[None])[0]:
-        return {"next_pose": pose, "next_like": names[pose.like]}
-    ahead = Ahead.of(assumptions, poses, robot.of(used), PROPOSALS, reach.box)
-    likely = _registers(case, ahead.added)
-    ahead = replace(ahead, added=ahead.added[likely if likely.any() else slice(None)])
-    angles = case.capture.joints
-    of_used = None if angles is None else angles[case.reconstruction.image_index[used]]
-    return _first_reached(ahead, Path(poses, of_used), reach.arm, names)
+    if is_free and tried.likely(pose.base_from_gripper[None], hand_eye.gripper_from_camera)[0]:
+        return {"next_pose": pose, "next_like": tried.capture.images[rows[pose.like]]}
+    return _best(assumptions, case.base_from_gripper[used], robot.of(used), tried, rows, reach)
 
 
-def _first_reached(ahead: Ahead, path: Path, arm: Arm | None, names: tuple[str, ...]) -> dict[str, Any]:
-    """The first of the poses that the arm reaches within its joint limits, and the angles; else the first, without."""
-    row, joints = 0, None
-    for k, pose in enumerate(ahead.added if arm is not None else ()):
-        if arm is not None and (joints := joints_at(arm, path, pose)) is not None:
-            row = k
+def _is_aimed(hand_eye: HandEye) -> bool:
+    std = np.sqrt(np.diag(hand_eye.covariance))
+    return bool(std[:3].max() < AIMED[0] and std[3:6].max() < AIMED[1])
+
+
+def _best(
+    assumptions: Assumptions,
+    poses: Float[ndarray, "m 4 4"],
+    robot: RobotErrors,
+    tried: Tried,
+    rows: Int[ndarray, " m"],
+    reach: Reach,
+) -> dict[str, Any]:
+    """The best pose to add to those of the capture's `rows` that the arm reaches within its joint limits, and the angles
+    there; else the best, without."""
+    capture, joints = tried.capture, None
+    ahead = Ahead.of(
+        assumptions,
+        poses,
+        robot,
+        1 if reach.arm is None else PROPOSALS,
+        reach.box,
+        is_likely=lambda added: tried.likely(added, assumptions.gripper_from_camera),
+    )
+    path = Path(poses, None if capture.joints is None else capture.joints[rows])
+    for k, pose in enumerate(ahead.added if reach.arm is not None else ()):
+        if reach.arm is not None and (joints := joints_at(reach.arm, path, pose)) is not None:
+            ahead = replace(ahead, added=ahead.added[k : k + 1])
             break
-    ahead = replace(ahead, added=ahead.added[row : row + 1])
     best = ahead.next_pose(1, ahead.expected(1))
-    return {"next_pose": best, "next_joints": joints, "next_like": names[best.like]}
-
-
-def _registers(case: Case, added: Float[ndarray, "c 4 4"]) -> Bool[ndarray, " c"]:
-    """Which gripper poses are likely to give an image that registers: one that looks along nearly the same line as
-    an image that registered, and not from where one did not."""
-    x, capture = case.hand_eye.gripper_from_camera, case.capture
-    there = np.isin(np.arange(len(capture)), case.reconstruction.image_index)
-    camera, known = added @ x, capture.base_from_gripper[there] @ x
-    angle = np.arccos(np.clip(camera[:, :3, 2] @ known[:, :3, 2].T, -1, 1)).min(1)
-    failed = capture.base_from_gripper[~there] @ x
-    away = np.linalg.norm(camera[:, None, :3, 3] - failed[:, :3, 3], axis=2).min(1, initial=np.inf)
-    return (angle < ALIKE) & (away > ELSEWHERE_M)
+    return {"next_pose": best, "next_joints": joints, "next_like": capture.images[rows[best.like]]}

@@ -18,6 +18,7 @@ from numpy import ndarray
 from jcr.files import read_bytes, written_whole
 from jcr.match.gate import Key
 from jcr.match.matchers import Features, Matcher
+from jcr.match.order import order_key
 from jcr.match.sift import Sift
 from jcr.match.verify import Geometries
 from jcr.records import Capture
@@ -46,20 +47,33 @@ class KeptFeatures:
     """Whether what is found is written, too: only a capture that is being taken changes its folder."""
     digests: list[str] = field(default_factory=list)
     """Of the images' files."""
+    order_keys: list[tuple[float, ...]] = field(default_factory=list)
+    """Of the images' gripper poses: pairs are matched from the image that comes first in a reconstruction."""
 
     @staticmethod
     def of(capture: Capture) -> "KeptFeatures | None":
         """To be read, of a capture that was calibrated while it was taken; None of another."""
         if not (capture.folder / FOLDER).is_dir():
             return None
-        digests = [file_digest(capture.folder / name) for name in capture.images]
-        return KeptFeatures(capture.folder / FOLDER, False, digests)
+        kept = KeptFeatures(capture.folder / FOLDER, False)
+        for name, pose in zip(capture.images, capture.base_from_gripper, strict=True):
+            kept.append(capture.folder / name, pose)
+        return kept
 
     @staticmethod
     def growing(folder: Path) -> "KeptFeatures":
         """To be read and written, of the folder of a capture, so far without images."""
         (folder / FOLDER).mkdir(parents=True, exist_ok=True)
         return KeptFeatures(folder / FOLDER, True)
+
+    def append(self, file: Path, base_from_gripper: Float[ndarray, "4 4"]) -> None:
+        """Count one more image, in the next row."""
+        self.digests.append(file_digest(file))
+        self.order_keys.append(order_key(base_from_gripper))
+
+    def in_order(self, key: Key) -> Key:
+        """A pair with that image first which comes first in a reconstruction."""
+        return key if self.order_keys[key[0]] <= self.order_keys[key[1]] else (key[1], key[0])
 
     def features(self, row: int, size: tuple[int, int]) -> Sift | None:
         """Of an image at a working size (px); None where there are none."""
@@ -115,17 +129,20 @@ class KeepingMatcher(Matcher):
         self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], coarse: bool = False
     ) -> Geometries:
         """Verified two-view geometries of pairs; neither the rotations of the images (rad) nor `coarse` change them."""
-        there = {key: self._kept.pair(key, self._depends) for key in pairs}
+        matched_as = {key: self._kept.in_order(key) for key in pairs}
+        there = {key: self._kept.pair(matched_as[key], self._depends) for key in pairs}
         new = [k for k, key in enumerate(pairs) if there[key] is None]
-        found = super().geometries([pairs[k] for k in new], rolls[new])
+        made = super().geometries([matched_as[pairs[k]] for k in new], rolls[new])
+        found = {}
         for key, one in there.items():
-            if one is not None:
-                self.raw[key], geometry = one
-                if geometry is not None:
-                    found[key] = geometry
-            elif self._kept.is_written:
-                self._kept.keep_pair(key, self._depends, (self.raw[key], found.get(key)))
-        return {key: found[key] for key in pairs if key in found}
+            if one is None:
+                one = self.raw.pop(matched_as[key]), made.get(matched_as[key])
+                if self._kept.is_written:
+                    self._kept.keep_pair(matched_as[key], self._depends, one)
+            self.raw[key], geometry = one if key == matched_as[key] else _reversed(one)
+            if geometry is not None:
+                found[key] = geometry
+        return found
 
     def images_added(self) -> None:
         """Take note of images that the features have since the last pairs."""
@@ -135,6 +152,14 @@ class KeepingMatcher(Matcher):
 def _camera_text(camera: pycolmap.Camera, known: bool, seed: int) -> str:
     """All of a matcher by which geometries of the same images differ."""
     return f"{camera.model.name} {camera.width} {camera.height} {camera.params.tolist()} {known} {seed}"
+
+
+def _reversed(pair: MatchedPair) -> MatchedPair:
+    """The same matches from the second image to the first."""
+    rows, geometry = pair
+    if geometry is not None:
+        geometry.invert()
+    return rows[:, ::-1], geometry
 
 
 def _name(*depends: str) -> str:

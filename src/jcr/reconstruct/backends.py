@@ -12,6 +12,7 @@ from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.extras import extra, install, is_installed
+from jcr.match.order import order_by_pose
 from jcr.progress import Progress
 from jcr.reconstruct.hub import HUB_FILES, HUB_ID, Weights, cached_files
 from jcr.records import Boards, CameraEvidence, Capture, Reconstruction
@@ -143,7 +144,7 @@ class Backend:
     install: str = ""
     """The command that does so."""
     keeps_order: bool = False
-    """Whether its input counts images in the capture's own order."""
+    """Whether its input or its options count images in the capture's own order."""
     accuracy: str = ""
     """As measured, and where that stands; empty: not measured here."""
     revision: str = ""
@@ -192,6 +193,7 @@ BACKENDS: dict[str, Backend] = {
             options=("weights", "pair_graph"),
             hub_id="naver/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric",
             revision="06e7259f34c3060f322df5cb0c7b9094f57e41fc",
+            keeps_order=True,
             package="torch",
             install=install("networks"),
             parameters=689,
@@ -208,6 +210,7 @@ BACKENDS: dict[str, Backend] = {
             selected_by="weights",
             hub_id="naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt",
             revision="61c57447d7b0adc8a1a30b2b0adec7a8935aa2a3",
+            keeps_order=True,
             package="torch",
             install=install("networks"),
             parameters=571,
@@ -411,20 +414,17 @@ def reconstruct(
                 else ", or choose another"
             )
         )
-    # By name, so that the order of the frames changes nothing.
-    order = np.argsort(np.array(capture.images), kind="stable")
-    if row.keeps_order:
-        order = np.arange(len(capture))
-    by_name = replace(
+    order = np.arange(len(capture)) if row.keeps_order else order_by_pose(capture.base_from_gripper)
+    in_order = replace(
         capture,
         images=tuple(capture.images[k] for k in order),
         base_from_gripper=capture.base_from_gripper[order],
     )
-    made = row.reconstruct(by_name, replace(options, backend=row.name), progress)
+    made = row.reconstruct(in_order, replace(options, backend=row.name), progress)
     if options.board is not None and row.name != MARKER:
         from jcr.reconstruct.board_corners import with_boards
 
-        made = with_boards(by_name, made, options.board, progress)
+        made = with_boards(in_order, made, options.board, progress)
     return _of_capture(made, order)
 
 

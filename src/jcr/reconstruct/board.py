@@ -29,9 +29,9 @@ LARGEST = 1.0
 PRINTED = 0.002
 """Relative one-sigma error of a printed board's size."""
 SIDE, MARKER = "SIDE", "MARKER"
-"""In place of lengths that are unknown: the side is then the unit."""
+"""Words in place of lengths that are unknown: the side is then the unit."""
 RATIOS = (0.75, 0.7, 0.8, 0.6, 0.5)
-"""Of marker to square of a ChArUco board, those that are usual."""
+"""Usual ratios of marker to square of a ChArUco board."""
 
 
 @dataclass(frozen=True)

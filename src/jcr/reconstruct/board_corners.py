@@ -22,9 +22,9 @@ from jcr.reconstruct.board_in_view import board_in_view
 from jcr.records import Boards, Body, Capture, Intrinsics, Reconstruction, Tracks
 
 FEWEST_POINTS = 4
-"""Of a body in an image."""
+"""Fewest points of a body in an image."""
 FEWEST_IMAGES = 2
-"""Of a body."""
+"""Fewest images of a body."""
 SAME_PLACE = 0.006
 """Of the image's width: rms distance of corners from where those of other images, triangulated, are projected."""
 MOST_PAIRS = 100

@@ -14,7 +14,7 @@ from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.records import Capture, Intrinsics, Reconstruction
 
 _FILM_DIAGONAL_MM = 43.27
-"""Of the 36 x 24 mm frame that EXIF's equivalent focal length refers to."""
+"""Diagonal of the 36 x 24 mm frame that EXIF's equivalent focal length refers to."""
 _START_FOCALS = (0.8, 0.5, 1.2)
 """In long sides, for a camera without known intrinsics. COLMAP's 1.2 alone fails on two of three real wrist
 cameras (true values 0.5 to 0.7); from 0.8 all three converge."""
@@ -46,7 +46,7 @@ def reconstruct_colmap(
             is_known,
             options,
             report,
-            capture.base_from_gripper if options.robot_checks else None,
+            capture.base_from_gripper,
             capture.images,
             KeptFeatures.of(capture) if options.features == "sift" else None,
         )

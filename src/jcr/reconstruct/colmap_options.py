@@ -15,7 +15,5 @@ class ColmapOptions:
     """Same seed, same result, bit for bit."""
     features: FeatureName = "sift"
     """What is matched between images."""
-    robot_checks: bool = True
-    """Let the gripper poses check the matches; off, images alone decide."""
     memory_gb: float = 8.0
     """Peak resident set of the process, the program itself included."""

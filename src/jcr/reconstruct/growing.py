@@ -22,7 +22,7 @@ from jcr.capture.images import read_image
 from jcr.handeye.closed_form import motions
 from jcr.match import gate as robot
 from jcr.match.gate import Gate, Key, Pair
-from jcr.match.kept import KeepingMatcher, KeptFeatures, file_digest
+from jcr.match.kept import KeepingMatcher, KeptFeatures
 from jcr.match.pairs import NEIGHBOURS, near_pairs, seen_in_common
 from jcr.match.still import hidden
 from jcr.match.verify import Geometries, View, pair_of, write_geometries, write_keypoints
@@ -76,7 +76,8 @@ class Growing:
     def _map_all(self) -> None:
         capture, known = self._capture, self._known
         images = [read_image(capture.folder / name) for name in capture.images]
-        self._kept.digests.extend(file_digest(capture.folder / name) for name in capture.images)
+        for name, pose in zip(capture.images, capture.base_from_gripper, strict=True):
+            self._kept.append(capture.folder / name, pose)
         cameras = enter(self._database, len(capture), self._all_intrinsics, known, OPTIONS.working_size_px)
         self._features = sift_features(images, cameras[0], OPTIONS.memory_gb, silent, self._kept)
         self._matcher = KeepingMatcher(self._features, cameras[0], known, OPTIONS.seed, self._kept)
@@ -129,7 +130,7 @@ class Growing:
         row = len(self._view.x_px)
         self._rows.append(row)
         self._matched_with[row] = 0
-        self._kept.digests.append(file_digest(capture.folder / capture.images[-1]))
+        self._kept.append(capture.folder / capture.images[-1], capture.base_from_gripper[-1])
         self._features.add(image)
         self._matcher.images_added()
         x_px = self._matcher.x_px[row]

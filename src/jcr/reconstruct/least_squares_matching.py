@@ -9,8 +9,10 @@ equations (Förstner, "On the geometric precision of digital correlation", 1982)
 the smallest counts, and an observation where none is small keeps its keypoint.
 """
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import no_type_check
+from typing import Any, no_type_check
 
 import cv2
 import numpy as np
@@ -38,6 +40,8 @@ _FREE = 8
 """Unknowns: shift x y, gain, offset, affine part by rows."""
 _STEEPEST = 5.0
 """Scale from one image to another beyond which the warp is none."""
+_POINTS_AT_ONCE = 256
+"""Tracks that a thread aligns in one go."""
 _FLAT = 1e-3
 """Standard deviation, in grey levels, of a patch without texture."""
 
@@ -50,8 +54,8 @@ def align_tracks(
 ) -> Tracks:
     """The tracks with the observations moved that could be aligned to their track's reference, and how surely.
 
-    The images are of the size of `lens`, to which the tracks belong; rows of cameras and images are those of the tracks.
-    The reference is the observation that shows the surface at the median scale. It stays where it is.
+    The images are of the size of `intrinsics`, to which the tracks belong; rows of cameras and images are those of the
+    tracks. The reference is the observation that shows the surface at the median scale. It stays where it is.
     """
     order = np.lexsort((tracks.image, tracks.point))
     image, x_px, point = tracks.image[order], tracks.x_px[order].astype(np.float64), tracks.point[order]
@@ -72,7 +76,7 @@ def align_tracks(
         level_from_image = np.array([level.shape[2] / intrinsics.width, level.shape[1] / intrinsics.height])
         seen_px = _resized(start_px, level_from_image)
         aligned_px, affine, variance_px = seen_px.copy(), start_affine.copy(), np.full(len(point), np.inf)
-        _align_all(
+        _align_in_threads(
             level,
             image,
             ends,
@@ -90,6 +94,23 @@ def align_tracks(
     refined, std_px = np.empty_like(found), np.empty(len(found))
     refined[order], std_px[order] = found, np.sqrt(_with_references(variance, reference, of_reference))
     return replace(tracks, x_px=refined, std_px=std_px)
+
+
+def _align_in_threads(
+    greys: UInt8[ndarray, "m h w"],
+    image: Int[ndarray, " k"],
+    ends: Int[ndarray, " p_1"],
+    reference: Int[ndarray, " p"],
+    *observations: Any,
+) -> None:
+    """`_align_all`, some tracks at a time; each thread writes to the observations of its own."""
+
+    def align(first: int) -> None:
+        some = slice(first, first + _POINTS_AT_ONCE)
+        _align_all(greys, image, ends[first : some.stop + 1], reference[some], *observations)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(align, range(0, len(reference), _POINTS_AT_ONCE)))
 
 
 def _with_references(

@@ -20,7 +20,7 @@ from jcr.handeye.robust import robust_fit
 LEAST_MAPPED = 4
 """Cameras from which another one can be predicted."""
 LARGEST_ROTATION = np.radians(4)
-"""Between a resectioned camera and its prediction."""
+"""Largest rotation between a resectioned camera and its prediction."""
 LARGEST_MOVE = 0.15
 """The same of its position, as a share of the distance to the scene."""
 MIN_INLIERS = 15

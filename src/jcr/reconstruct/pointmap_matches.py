@@ -151,7 +151,7 @@ class _Surface:
     """Means of `seen` over patches, by confidence, lest the nearest of noisy points be the noisiest."""
     stride: int
     tree: KDTree
-    """Of every `stride`-th pixel of `smooth`."""
+    """Search tree of every `stride`-th pixel of `smooth`."""
 
 
 def _surface(points: Float[ndarray, "h w 3"], confidence: Float[ndarray, "h w"]) -> _Surface:

@@ -112,9 +112,9 @@ class PreparedImages:
     colors: UInt8[ndarray, "n h w 3"]
     grid: ImageGrid
     intrinsics_of_capture: Intrinsics | None
-    """Of the capture's own images, with distortion; None: unknown."""
+    """The camera of the capture's own images, with distortion; None: unknown."""
     pinhole: Intrinsics | None
-    """Of the undistorted images that `grid` resizes; None: unknown."""
+    """The camera of the undistorted images that `grid` resizes; None: unknown."""
     warnings: tuple[str, ...] = ()
 
     @property

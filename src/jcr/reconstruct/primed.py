@@ -21,9 +21,9 @@ from jcr.match.verify import Geometries
 from jcr.reconstruct.placed import retriangulated
 
 LEAST_POINTS = 30
-"""Of an image that is where the robot puts it."""
+"""Fewest points of an image that is where the robot puts it."""
 LEAST_SHARE = 0.5
-"""Of the keypoints that match in other images: as many must end in points."""
+"""Least share of the keypoints that match in other images, that must end in points."""
 
 
 def primed(

@@ -34,7 +34,7 @@ class BoardsJson(BaseModel):
     side: Positive
     size_std: Positive | None
     numbers: list[int]
-    """Of the bodies."""
+    """Numbers of the bodies."""
     elsewhere: list[int]
     proposed: str | None
 

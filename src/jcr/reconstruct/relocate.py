@@ -27,7 +27,7 @@ MIN_POINTS = 30
 LOSS_SCALE = 2.0
 """Cauchy loss, in sigma."""
 MEASUREMENTS = 10
-"""Of the image's noise, at most."""
+"""How often the image's noise is estimated, at most."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class Features:
     """What is found in one image."""
 
     x_px: Float[ndarray, "k 2"]
-    """In the original image, distorted."""
+    """Pixels of the original image, distorted."""
     rays: Float[ndarray, "k 2"]
     """(x/z, y/z), undistorted."""
     descriptors: Float32[ndarray, "k 128"]
-    """Of unit length."""
+    """Descriptors of unit length."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Located:
 
     recon_from_camera: Float[ndarray, "4 4"]
     covariance: Float[ndarray, "6 6"]
-    """Of a step of the camera (geometry.retract; recon units, rad)."""
+    """Covariance of a step of the camera (geometry.retract; recon units, rad)."""
     points: int
     sigma_px: float
     """Noise of its image coordinates."""

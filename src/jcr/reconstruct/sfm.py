@@ -27,7 +27,6 @@ from jcr.geometry import inverse
 from jcr.match.guided import guided
 from jcr.match.kept import KeepingMatcher, KeptFeatures
 from jcr.match.matchers import Matcher
-from jcr.match.pairs import all_pairs
 from jcr.match.sift import BYTES_OF_FEATURES, grey_of
 from jcr.match.sift_features import SiftFeatures
 from jcr.match.stage import Matched, match_with_robot
@@ -72,18 +71,18 @@ def structure_from_motion(
     known: bool,
     options: ColmapOptions,
     report: Progress,
-    base_from_gripper: Float[ndarray, "n 4 4"] | None = None,
-    names: Sequence[str] = (),
-    kept: KeptFeatures | None = None,
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    names: Sequence[str],
+    kept: KeptFeatures | None,
 ) -> Reconstruction:
     """Camera poses and tracks of images of one camera; the same, bit for bit, for the same seed.
 
-    With gripper poses the robot checks the matches (`match.stage`); `names` are those of the images, for notes. SIFT
-    features and pairs that are `kept` are not found again.
+    The gripper poses check the matches (`match.stage`); `names` are those of the images, for notes. SIFT features and
+    pairs that are `kept` are not found again.
 
-    A `known` intrinsics are the only ones of `all_intrinsics`, do not fold over, and are held; unknown ones are starting
-    points, tried in turn, for a focal length and two radial coefficients. Raises RejectedError when fewer
-    than three images register.
+    `known` intrinsics are the only ones of `all_intrinsics`, do not fold over, and stay fixed; unknown ones are starting
+    points, tried in turn, for a focal length and two radial coefficients. Raises RejectedError when fewer than three
+    images register.
     """
     seed = options.seed
     with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
@@ -132,7 +131,7 @@ def _map_of_pairs(
     matcher: Matcher,
     matched: Matched,
     cameras: list[pycolmap.Camera],
-    base_from_gripper: Float[ndarray, "n 4 4"] | None,
+    base_from_gripper: Float[ndarray, "n 4 4"],
     names: Sequence[str],
     known: bool,
     seed: int,
@@ -141,7 +140,7 @@ def _map_of_pairs(
     """The map of the matched pairs, of many images from the robot's poses, and the pairs with those added that place
     images which COLMAP's mapper left out."""
     count, model = len(matcher.x_px), None
-    if known and matched.gate is not None and base_from_gripper is not None and count > _MANY:
+    if known and matched.gate is not None and count > _MANY:
         model = primed(
             database,
             cameras[0],
@@ -152,7 +151,7 @@ def _map_of_pairs(
         )
     if model is None or model.num_reg_images() < count:
         model = map_incrementally(database, count, cameras, known, seed, report, model)
-    if model is not None and base_from_gripper is not None and model.num_reg_images() < count:
+    if model is not None and model.num_reg_images() < count:
         return _with_predicted_images(database, model, matcher, matched, base_from_gripper, names)
     return model, matched
 
@@ -219,7 +218,7 @@ def sift_features(
 def matched_pairs(
     database: Path,
     matcher: Matcher,
-    base_from_gripper: Float[ndarray, "n 4 4"] | None,
+    base_from_gripper: Float[ndarray, "n 4 4"],
     intrinsics: Intrinsics,
     cameras: list[pycolmap.Camera],
     known: bool,
@@ -229,22 +228,15 @@ def matched_pairs(
     """The pairs that a mapper may believe, written into the database; intrinsics that the robot found come first."""
     report("matching", 0.0)
     working = resized(intrinsics, cameras[0].width, cameras[0].height)
-    if base_from_gripper is None:
-        n = len(matcher.x_px)
-        pairs = all_pairs(n)
-        matched = Matched(
-            geometries=matcher.geometries(pairs, np.zeros((len(pairs), 2))), gate=None, intrinsics=working
-        )
-    else:
-        matched = match_with_robot(
-            matcher,
-            base_from_gripper,
-            working,
-            known,
-            names,
-            (intrinsics.width, intrinsics.height),
-            lambda fraction: report("matching", fraction),
-        )
+    matched = match_with_robot(
+        matcher,
+        base_from_gripper,
+        working,
+        known,
+        names,
+        (intrinsics.width, intrinsics.height),
+        lambda fraction: report("matching", fraction),
+    )
     write_keypoints(database, matcher.x_px)
     write_geometries(database, matched.geometries)
     if not known and matched.intrinsics != working:

@@ -69,7 +69,7 @@ class NextPose:
 
     base_from_gripper: Float[ndarray, "4 4"]
     expected_std: Float[ndarray, "7"]
-    """In COVARIANCE_ORDER."""
+    """One standard deviation of each unknown once this pose is added, in COVARIANCE_ORDER."""
     within_95_mm: float
     """Distance that 95 % of the errors of a seen point stay below, as Seen has it."""
     rotation_95_deg: float
@@ -77,7 +77,7 @@ class NextPose:
     like: int
     """Row of the existing pose that it is nearest to."""
     moved_m: float
-    """From there."""
+    """How far this pose is from that one (m)."""
     rotation_rad: float
 
 
@@ -193,13 +193,13 @@ class Seen:
     """How exactly a point that the camera sees is placed: 95 % of errors are smaller."""
 
     distance_mm: float
-    """From the camera, along the ray."""
+    """Distance of the point from the camera along its ray (mm)."""
     within_95_mm: float
     """Distance of the point from where it is, in three dimensions."""
     lateral_95_mm: float
     """Across the ray."""
     along_95_mm: float
-    """Along the ray, of a distance that was measured in the reconstruction."""
+    """95 % bound of the error along the ray (mm), for a distance that was measured in the reconstruction."""
     ray_95_deg: float
     """Direction of the ray."""
     rotation_95_deg: float
@@ -233,7 +233,7 @@ class InUse:
     errors."""
 
     seen: Seen
-    """At the centre of the image, at the median distance of the scene."""
+    """Uncertainty of a point at the centre of the image, at the median distance of the scene."""
     corners: Seen
     """The same at the worst corner of the image."""
     scene: SceneUncertainty | None = None
@@ -249,7 +249,7 @@ class WithGivenIntrinsics:
     """In COVARIANCE_ORDER; with its distance from the transform that belongs to the estimated intrinsics."""
     intrinsics: Intrinsics
     seen: Seen
-    """With what the given intrinsics place wrongly."""
+    """Uncertainty of a seen point with these intrinsics, what they place wrongly included."""
     differs_mm: float
     """How far apart the two pairs place a point at the centre of the image, at the same distance."""
 
@@ -275,13 +275,13 @@ class Estimate:
     base_from_recon: Float[ndarray, "4 4"]
     """Rigid; maps recon coordinates *already multiplied by scale* to the base frame."""
     covariance: Float[ndarray, "7 7"]
-    """In COVARIANCE_ORDER."""
+    """Covariance of the estimate, in COVARIANCE_ORDER."""
     budget: Budget | None = None
     """Parts of the covariance; None where it was not divided."""
     intrinsics: Intrinsics | None = None
     """Refined by bundle adjustment; None when poses alone were given."""
     intrinsics_covariance: Float[ndarray, "q q"] | None = None
-    """In the order of camera.parameters; None where they were not refined."""
+    """Covariance of the intrinsics in the order of camera.parameters; None where they were not refined."""
     intrinsics_cross: Float[ndarray, "7 q"] | None = None
     """Covariance of COVARIANCE_ORDER (rows) with camera.parameters (columns); None where these were not refined."""
     model_error: ModelError | None = None
@@ -387,18 +387,18 @@ class BoardFound:
     images: int
     corners: int
     side_mm: float
-    """Of a square or tag by the robot's positions alone."""
+    """Side of a square or tag (mm) by the robot's positions alone."""
     side_std_mm: float
     stated_mm: float | None
     """None: unknown."""
     rms_px: float
-    """Of the corners' reprojection errors, per axis."""
+    """Root mean square of the corners' reprojection errors, per axis (px)."""
     bend_mm: float
     """Between the lowest and the highest corner beside the plane; the largest of all bodies."""
     centres_in_base: tuple[tuple[float, float, float], ...]
-    """Of the bodies (m)."""
+    """Centres of the bodies in the base frame (m)."""
     tilts_deg: tuple[float, ...]
-    """Of the bodies, from the horizontal of the base."""
+    """Angles of the bodies from the base's horizontal plane."""
     shape_mm: tuple[tuple[float, float, float], ...] = ()
     """Of the body that bends most, each corner's x and y on it and its height above its plane, by the robot's positions;
     empty in files of earlier versions."""
@@ -423,7 +423,7 @@ class Plan:
     """How exact the calibration must be, and the poses that would make it so."""
 
     excitation: Excitation | None = None
-    """Of the used poses by themselves."""
+    """What the used poses show by themselves."""
     next_poses: tuple[NextPose, ...] = ()
     """Those that would shrink the reported uncertainty most; `like` counts the used poses."""
     requirement: Requirement | None = None

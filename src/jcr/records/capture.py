@@ -73,7 +73,7 @@ class CellCamera:
     arm: str | None = None
     """The other arm that carries it; None: the capture's own, or none."""
     base_from_gripper: Float[ndarray, "k 4 4"] | None = None
-    """Of the other arm, in its own base, at each image."""
+    """Gripper poses of the other arm in its own base, one for each image."""
 
     @property
     def watches_gripper(self) -> bool:
@@ -106,7 +106,7 @@ class Capture:
     robot: str | None = None
     """Name of the arm, one of jcr.handeye.arms.ROBOT_NAMES."""
     urdf: Path | None = None
-    """Of the arm, where it was given."""
+    """The arm's URDF file; None where none was given."""
     orientation: int = 1
     """EXIF's, of all images: 1 as the sensor has them; others were rotated upright, and the camera frame is theirs."""
     bits: tuple[int, ...] = (8,)

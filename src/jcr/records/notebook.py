@@ -1,13 +1,15 @@
 """Records as HTML tables, which notebooks show."""
 
 from collections.abc import Iterable, Sequence
-from html import escape
+
+TEMPLATE = """\
+<p><b>{{ heading }}</b></p><table>
+{%- for row in rows %}<tr><th>{{ row[0] }}</th>{% for cell in row[1:] %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor -%}
+</table><p>{{ note }}</p>"""
 
 
 def table(heading: str, rows: Iterable[Sequence[str]], note: str = "") -> str:
     """A heading, rows whose first cell names them, and a note below; all of it text."""
-    cells = "".join(
-        f"<tr><th>{escape(name)}</th>{''.join(f'<td>{escape(cell)}</td>' for cell in others)}</tr>"
-        for name, *others in rows
-    )
-    return f"<p><b>{escape(heading)}</b></p><table>{cells}</table><p>{escape(note)}</p>"
+    from jinja2 import Template  # which no command needs for its help
+
+    return Template(TEMPLATE, autoescape=True).render(heading=heading, rows=rows, note=note)

@@ -14,7 +14,7 @@ class Body:
     """A board, or a single tag, among the points of tracks: rigid, and unrelated to other bodies."""
 
     number: int
-    """Of the tag; 0 for a board."""
+    """Number of the tag; 0 for a board."""
     point: Int[ndarray, " c"]
     """Rows of `Tracks.points_in_recon`, its corners."""
     x_in_body: Float[ndarray, "c 3"]
@@ -26,7 +26,7 @@ class Boards:
     """The boards or tags of one `--board`."""
 
     spec: str
-    """As `--board` names them."""
+    """The boards as `--board` names them."""
     side: float
     """Of a square or a tag, in the unit of `Body.x_in_body`: metres, or 1 where it is unknown."""
     size_std: float | None
@@ -46,7 +46,7 @@ class Tracks:
     image: Int[ndarray, " k"]
     """Row of the reconstruction (not of the capture) that each observation belongs to."""
     x_px: Float[ndarray, "k 2"]
-    """In the capture's original image, distorted as the camera made it."""
+    """Pixels of the capture's original image, distorted as the camera made it."""
     point: Int[ndarray, " k"]
     """Row of `points_in_recon`."""
     points_in_recon: Float[ndarray, "p 3"]
@@ -129,7 +129,7 @@ class Reconstruction:
     """Rows of the capture that were registered, ascending."""
     recon_from_camera: Float[ndarray, "m 4 4"]
     intrinsics: Intrinsics
-    """Of the capture's original images: given, or estimated by the back end."""
+    """The camera of the capture's original images: given, or estimated by the back end."""
     tracks: Tracks
     backend: str
     pointmaps: Pointmaps | None = None

@@ -14,7 +14,7 @@ class Requirement:
     translation_mm: float
     rotation_deg: float
     asked: bool
-    """By the user; else the default, for grasping."""
+    """Whether the user asked for it; else it is the default, for grasping."""
     distance_mm: float
     """From the camera to the point that the translation is of; 0: the camera itself."""
     reached_mm: float

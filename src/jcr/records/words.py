@@ -240,7 +240,7 @@ _UNSEEN = {
         "move that point too: take two or more images with it 10 cm away from where it was",
     ),
 }
-"""By what the motions are like: what is unobservable, and the remedy."""
+"""For each kind of motion what is unobservable, and the remedy."""
 
 
 # Poses and images.
@@ -691,4 +691,4 @@ _REMEDY: dict[Kind, Words] = {
     Kind.CLOCK_JUMPS: "check that images and poses are stamped by one clock",
     Kind.LEFT_OUT_DISAGREE: "add images at other poses until both agree",
 }
-"""Of kinds that have one."""
+"""The remedy of each kind that has one."""

@@ -13,7 +13,7 @@ from jcr.results import RunResult
 from jcr.rounding import significant
 
 CELLS = 16
-"""Of the frame's width."""
+"""Cells across the frame's width."""
 BINS = 24
 FAR = 99.0
 """Percent of the errors that the histogram shows; the rest is in its last bar."""

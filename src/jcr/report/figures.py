@@ -28,7 +28,7 @@ from jcr.report.svg import (
 )
 
 CAMERA_LENGTH = 0.07
-"""Of a drawn pyramid, as a share of the figure's contents."""
+"""Length of a drawn pyramid, as a share of the figure's contents."""
 COURSE_HEIGHT = 240.0
 """px."""
 

@@ -56,7 +56,7 @@ LINKS = {
     "objects": "Objects",
     "details": "Details",
 }
-"""To the sections, by their names."""
+"""Texts of the links to the sections, by the sections' names."""
 
 
 def report_html(result: RunResult, options: Options | None = None) -> str:

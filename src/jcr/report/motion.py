@@ -17,7 +17,7 @@ ANY_CONVENTION = "quat-xyzw"
 MATRICES = {"franka": "the matrix by columns", "matrix": "the matrix by rows"}
 """Conventions that write all 16 numbers."""
 PARTS = ("translation x", "translation y", "translation z", "rotation x", "rotation y", "rotation z", "scale")
-"""Of a direction, in records.COVARIANCE_ORDER."""
+"""Names of a direction's parts, in records.COVARIANCE_ORDER."""
 NAMED = 0.4
 """Share of a unit direction from which a part is named."""
 GENERAL = 0.4

@@ -5,7 +5,7 @@ n(R) has the covariance J C Jᵀ with J = dn/dr at r = 0.
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -26,6 +26,7 @@ class Notation:
     components: tuple[str, ...]
     unit: str
     value: Float[ndarray, " k"]
+    _: KW_ONLY
     std: Float[ndarray, " k"]
     note: str = ""
 
@@ -48,14 +49,17 @@ def notations(
     else:
         std_rpy = _std(roll_pitch_yaw_jacobian(rpy), noise)
     angles = "Roll, pitch, yaw", ("roll", "pitch", "yaw")
-    degrees = np.degrees(rpy), np.degrees(std_rpy)
     x, std_x = gripper_from_camera[:3, 3], np.sqrt(np.diag(covariance)[:3])
     return [
-        Notation("Translation", ("x", "y", "z"), "m", x, std_x),
-        Notation("Quaternion", tuple("xyzw"), "", quat_xyzw, std_quat, "x, y, z, w: the scalar last"),
-        Notation(*angles, "rad", rpy, std_rpy, fixed_axes),
-        Notation(*angles, "deg", *degrees, fixed_axes),
-        Notation("Rotation vector", ("rx", "ry", "rz"), "rad", rotvec, std_rotvec, "axis times angle"),
+        Notation("Translation", ("x", "y", "z"), "m", x, std=std_x),
+        Notation(
+            "Quaternion", tuple("xyzw"), "", quat_xyzw, std=std_quat, note="x, y, z, w: the scalar last"
+        ),
+        Notation(*angles, "rad", rpy, std=std_rpy, note=fixed_axes),
+        Notation(*angles, "deg", np.degrees(rpy), std=np.degrees(std_rpy), note=fixed_axes),
+        Notation(
+            "Rotation vector", ("rx", "ry", "rz"), "rad", rotvec, std=std_rotvec, note="axis times angle"
+        ),
     ]
 
 

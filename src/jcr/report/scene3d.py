@@ -20,7 +20,7 @@ from jcr.report.render import Section
 from jcr.results import RunResult
 
 POINTS = 60_000
-"""Of each layer, at most."""
+"""Most points of each layer."""
 TRACK_SIZE = 0.006
 """Side (m) of the squares that are drawn in place of tracked features."""
 

@@ -64,7 +64,7 @@ class View:
     axes: Float[ndarray, "2 3"]
     """Right and up of the panel, in the base frame."""
     middle: Float[ndarray, "2"]
-    """Along these axes (m), what is drawn at `centre`."""
+    """Coordinates along these axes (m) of what is drawn at `centre`."""
     centre: Float[ndarray, "2"]
     """px."""
     zoom: float

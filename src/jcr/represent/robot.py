@@ -4,10 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-import trimesh
 from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.ndimage import distance_transform_edt
@@ -16,6 +15,9 @@ from scipy.spatial import KDTree
 
 from jcr.errors import InputError
 from jcr.geometry import apply, rotation_exp, transform
+
+if TYPE_CHECKING:
+    import trimesh
 
 VOXELS, CANDIDATES = 100_000, 1000
 """At most this many in a shape's bounding box; and of these, drawn as centres of spheres at a time."""
@@ -201,7 +203,7 @@ def _joints(robot: Any, links: tuple[str, ...], path: Path) -> tuple[RobotJoint,
 
 
 def spheres_of_shape(
-    shape: trimesh.Trimesh, link_from_shape: Float[ndarray, "4 4"], excess: float
+    shape: "trimesh.Trimesh", link_from_shape: Float[ndarray, "4 4"], excess: float
 ) -> tuple[Float[ndarray, "s 3"], Float[ndarray, " s"]]:
     """Centres (s,3) in the link and radii (s,) of spheres that together hold all of a solid shape.
 
@@ -209,7 +211,9 @@ def spheres_of_shape(
     for half a voxel of the search (a sixth of the excess, for shapes up to 15 cm). Of such balls, always the
     one that holds most of what none holds yet is taken (greedy set cover).
     """
-    if isinstance(shape, trimesh.primitives.Sphere):
+    from trimesh.primitives import Sphere  # half a second, and maps of captures without a URDF do without
+
+    if isinstance(shape, Sphere):
         ball: Any = shape.primitive
         return apply(link_from_shape, np.asarray(ball.center)[None]), np.array([float(ball.radius)])
     pitch = max(excess / 3, float(np.prod(shape.extents) / VOXELS) ** (1 / 3))

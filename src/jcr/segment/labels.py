@@ -24,7 +24,7 @@ class LabelImages:
     labels: Int[ndarray, "m h w"]
     """0 = none."""
     names: tuple[str, ...]
-    """Of each label, from 0 = none."""
+    """Name of each label; label 0 is none."""
 
 
 def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages | None:

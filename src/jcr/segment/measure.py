@@ -41,7 +41,7 @@ class ObjectSize:
     name: str
     points: int
     height: float
-    """Of its top above the plane, metres."""
+    """Height of its top above the plane, metres."""
     height_std: float
     top_seen: bool
     """Whether the top rests on no single image; else `height` is of what was seen, and it may be higher."""

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from transformers import Sam2Model
 
 IMAGE_MEAN, IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Of RGB in [0, 1], as the network was trained with."""
+"""Mean and standard deviation of RGB in [0, 1] that the network was trained with."""
 SIDE_POINTS, BATCH = 16, 64
 """Prompts on a side of the image, and prompts a forward pass."""
 LEAST_QUALITY, LEAST_STABILITY = 0.7, 0.9

@@ -54,7 +54,7 @@ class BentArm:
 
     arm: Arm
     errors: Float[ndarray, " p"]
-    """In the order of `error_names`; m and rad."""
+    """The errors in the order of `error_names`; m and rad."""
 
     def reported(self, joints: Joints) -> Float[ndarray, "n 4 4"]:
         """base_from_gripper (n,4,4) as the controller computes it."""

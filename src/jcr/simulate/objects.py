@@ -43,7 +43,7 @@ class Part:
 
 
 Parts = tuple[Part, ...]
-"""Of an object, in its frame: z up, standing on z = 0."""
+"""Parts of an object in its frame: z up, standing on z = 0."""
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ class View:
     depth: Float[ndarray, "h w"] | None
     """Along the optical axis at the pixel's centre, in metres; 0: nothing there. None when not asked for."""
     label: UInt8[ndarray, "h w"] | None
-    """Of the scene's `labels`, at the pixel's centre."""
+    """Row of the scene's `labels` at each pixel's centre."""
 
 
 def render(

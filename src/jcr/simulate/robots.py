@@ -34,7 +34,7 @@ ASIDE, START_SPREAD, LOOKING_STEPS = 0.35, 0.7, 15
 """Arms with fewer than six joints: rad by which the aim moves about the base, rad about the rest posture at which the
 search for a view begins, and its steps."""
 REACHING_STEPS = 16
-"""Of other arms towards a wished view; where that leaves them is the view."""
+"""Steps that other arms take towards a wished view; where they end is their view."""
 STRIDE = 0.4
 """rad by which joints move about a posture while what the gripper carries is watched."""
 NEAREST, FARTHEST = 0.6, 1.5

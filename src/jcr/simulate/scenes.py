@@ -40,7 +40,7 @@ RECIPES: dict[SceneName, Recipe] = {
 _TABLE_SIZE = (0.95, 1.2, 0.04)
 _TEXEL_M = 0.0005
 _GAP = 0.015
-"""Between the bounding circles of neighbours, in metres."""
+"""Least distance between the bounding circles of neighbours, in metres."""
 
 
 @dataclass(frozen=True, kw_only=True)

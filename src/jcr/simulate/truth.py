@@ -24,13 +24,13 @@ class TrueObject:
     name: str
     label: int
     height: float
-    """Of its highest point above the table, in metres."""
+    """Height of its highest point above the table, in metres."""
     footprint_in_base: Float[ndarray, "k 2"]
     """Convex outline seen from straight above: x and y in metres."""
     base_from_box: Float[ndarray, "4 4"]
     """Centre and axes of the smallest upright box around it, z up."""
     box_size: Float[ndarray, "3"]
-    """Along the axes of that box, in metres."""
+    """Sides of that box along its axes, in metres."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,12 +38,12 @@ class Truth:
     """What a simulated capture should be found to show."""
 
     folder: Path
-    """Of the capture."""
+    """Folder of the capture."""
     scene: str
     seed: int
-    """Of the scene: `make_scene` makes its meshes again."""
+    """Seed of the scene: `make_scene` makes its meshes again."""
     images: tuple[str, ...]
-    """As in capture.json."""
+    """Names of the images in capture.json."""
     gripper_from_camera: Float[ndarray, "4 4"]
     base_from_gripper: Float[ndarray, "n 4 4"]
     """Where the gripper was, whatever the robot reported."""

@@ -11,11 +11,14 @@ from numpy import ndarray
 from scipy.ndimage import binary_dilation
 from skimage.measure import marching_cubes
 
+from jcr.report.render import render
 from jcr.represent.scene import SceneMap, Unknown
 from jcr.represent.seen import HIT
 
 LEAST = 0.02
 """Occupancy of the most doubtful points that a threshold can bring to sight."""
+PACKAGE = "jcr.view"
+"""The package of the templates."""
 MAP_POINTS = 150_000
 UNKNOWN_CELLS = 300_000
 """Asked to find the edge of the unknown."""
@@ -65,12 +68,7 @@ def unknown_edge(scene: SceneMap) -> tuple[Float[ndarray, "v 3"], Integer[ndarra
 
 def colour_bar(colors: Sequence[Sequence[int]], low: str, high: str) -> str:
     """A bar of RGB colours from left to right, named at both ends, as HTML."""
-    stops = ", ".join(f"rgb({r}, {g}, {b})" for r, g, b in colors)
-    return (
-        '<div style="padding: 0 0.7em 0.4em; font-size: 0.75em">'
-        f'<div style="height: 0.8em; border-radius: 3px; background: linear-gradient(to right, {stops})"></div>'
-        f'<div style="display: flex; justify-content: space-between"><span>{low}</span><span>{high}</span></div></div>'
-    )
+    return render("bar.html", {"colors": colors, "low": low, "high": high}, PACKAGE)
 
 
 SLICE_LEGENDS: dict[str, str] = {

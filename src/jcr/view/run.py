@@ -18,9 +18,9 @@ from jcr.represent.scene import SceneMap
 from jcr.run_folder import RunFolder
 
 CLOUD_POINTS = 200_000
-"""Of pointmaps that no map was made of yet, at most."""
+"""Most points that are drawn of pointmaps without a map."""
 GREY = 128
-"""Of images that are not to be had."""
+"""Grey level of images that cannot be read."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,6 @@
 """The viewer: a run in 3D in the browser, with switches, a sphere to drag and values to click for."""
 
 import threading
-from html import escape
 from typing import Any, get_args
 
 import numpy as np
@@ -16,9 +15,11 @@ from jcr.progress import Progress, silent
 from jcr.records import verdict_of
 from jcr.records.words import reached_in_words, sentence
 from jcr.report.raster import TRACK_COLOR, label_colors
+from jcr.report.render import render
 from jcr.represent.scene import Unknown
 from jcr.view.layers import (
     LEAST,
+    PACKAGE,
     SLICE_LEGENDS,
     MapPoints,
     SliceOf,
@@ -316,10 +317,8 @@ class Viewer:
             return colour_bar(
                 [_by_occupancy(np.array([share])).tolist() for share in (0.0, 0.5, 1.0)], "occupancy 0", "1"
             )
-        return " ".join(
-            f'<span style="color:rgb({r},{g},{b})">&#9632;</span> {escape(name)}'
-            for name, (r, g, b) in zip(self.scene.label_names, self._palette.tolist(), strict=True)
-        )
+        labels = zip(self.scene.label_names, self._palette.tolist(), strict=True)
+        return render("labels.html", {"labels": list(labels)}, PACKAGE)
 
     def show_slice(self) -> None:
         """Draw the slice that is asked for, and the edge of the unknown."""

@@ -121,15 +121,12 @@ class Fake:
         )
 
 
-def options(**changes):
+def options(predict, **changes):
     from jcr.reconstruct.views_at_once.views_at_once import Cost, ViewsOptions
-
-    def load(weights, device):
-        raise AssertionError
 
     made = ViewsOptions(
         backend="da3",
-        load=load,
+        load=lambda weights, device: predict,
         weights=Weights(Path("weights"), "weights", "Apache-2.0"),
         cost=Cost(0.1, 0.1, 1.0, 0.1),
     )
@@ -141,7 +138,7 @@ def found(capture: Capture) -> Reconstruction:
     """By one pass of the model."""
     from jcr.reconstruct.views_at_once.views_at_once import reconstruct_views_at_once
 
-    return reconstruct_views_at_once(capture, options(), predict=Fake())
+    return reconstruct_views_at_once(capture, options(Fake()))
 
 
 def test_matches_by_colour_put_predicted_cameras_right_and_show_how_surely(
@@ -201,7 +198,7 @@ def test_a_second_pass_is_shown_the_robots_cameras_and_stands_where_it_is_better
     from jcr.reconstruct.views_at_once.views_at_once import reconstruct_views_at_once
 
     predict = Fake(better_again=better)
-    twice = reconstruct_views_at_once(capture, options(takes_poses=True), predict=predict)
+    twice = reconstruct_views_at_once(capture, options(predict, takes_poses=True))
     assert predict.shown[0] is None and len(predict.shown) == 2
     between = inverse(predict.shown[1][0]) @ predict.shown[1]
     true = inverse(base_from_camera()[0]) @ base_from_camera()
@@ -224,9 +221,7 @@ def test_a_view_that_the_robot_contradicts_is_named(capture: Capture) -> None:
         (rotated, "2.png: its angles to the other views"),
         (shifted, "3.png: its matches lie"),
     ):
-        found = reconstruct_views_at_once(
-            replace(capture, base_from_gripper=gripper), options(), predict=Fake()
-        )
+        found = reconstruct_views_at_once(replace(capture, base_from_gripper=gripper), options(Fake()))
         named = [text for text in found.warnings if "check its pose" in text]
         assert len(named) == 1 and named[0].startswith(said), named
 
@@ -235,7 +230,7 @@ def test_what_does_not_fit_the_memory_is_refused_before_it_is_begun(capture: Cap
     from jcr.reconstruct.views_at_once.views_at_once import reconstruct_views_at_once
 
     with pytest.raises(InputError, match=r"--backend da3 with 6 images needs .* raise --memory-gb"):
-        reconstruct_views_at_once(capture, options(memory_gb=0.3), predict=Fake())
+        reconstruct_views_at_once(capture, options(Fake(), memory_gb=0.3))
 
 
 def test_single_views_take_their_cameras_and_fit_their_depth(capture: Capture) -> None:
@@ -262,11 +257,6 @@ def test_single_views_take_their_cameras_and_fit_their_depth(capture: Capture) -
         ),
         backend="colmap",
     )
-    made = SingleViewsOptions(
-        load=options().load,
-        weights=Weights(Path("w"), "w", "MIT"),
-        cameras=lambda capture, progress: sparse,
-    )
 
     def one_by_one(views):
         found = Fake(bend=0.02)(views)
@@ -274,7 +264,12 @@ def test_single_views_take_their_cameras_and_fit_their_depth(capture: Capture) -
         points = found.x_in_camera * np.float32(0.5 * 1.1)
         return replace(found, x_in_camera=points, recon_from_camera=None, is_metric=True)
 
-    found = reconstruct_single_views(capture, made, predict=one_by_one)
+    made = SingleViewsOptions(
+        load=lambda weights, device: one_by_one,
+        weights=Weights(Path("w"), "w", "MIT"),
+        cameras=lambda capture, progress: sparse,
+    )
+    found = reconstruct_single_views(capture, made)
     base, scale = fit_similarity(base_from_camera()[:, :3, 3], found.recon_from_camera[:, :3, 3])
     assert found.is_metric and scale == pytest.approx(1 / 1.1, rel=0.02), (
         "its metre is kept, to be held against the robot's"

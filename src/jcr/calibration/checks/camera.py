@@ -7,7 +7,7 @@ own camera and a further one of a cell are tested alike (imaged.py).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -106,6 +106,7 @@ class _Hypothesis:
     """The combinations that it is about."""
     beside: Float[ndarray, "e q"]
     """What is free with it and shows nothing."""
+    _: KW_ONLY
     places: int = 1
     """That were searched."""
     after: int = 0
@@ -314,7 +315,7 @@ def _hypotheses(state: _State) -> list[_Hypothesis]:
     for k in steps:
         after = (np.arange(m) >= k) - (m - k) / m
         free = equations.of_images("focal", after[:, None])
-        found.append(_Hypothesis(Kind.ZOOM, free, common, len(steps), int(k) - 1))
+        found.append(_Hypothesis(Kind.ZOOM, free, common, places=len(steps), after=int(k) - 1))
     of_centre = np.concatenate([common, equations.of_camera(("cx", "cy"))], axis=1)
     found.append(_Hypothesis(Kind.CENTRE_SAGS, np.concatenate(sag, axis=1), of_centre))
     if len(state.adjusted.given.evidence.scene.cameras) == 1:  # all images share the glass

@@ -82,7 +82,9 @@ def sequence_fault(
     )
     robot, every = fit.robot_noise, np.arange(m)
     noise = robot.translation, robot.rotation
-    problem = _Equations(every, residual, by, robot.systematic**2 * systematic, noise)
+    problem = _Equations(
+        images=every, residual=residual, by=by, systematic=robot.systematic**2 * systematic, noise=noise
+    )
     # An image that is rejected between others that agree is wrong by itself; after a slip several in a row are.
     rejected = np.pad(~hand_eye.inliers, 1)
     in_order = problem.of(np.flatnonzero(hand_eye.inliers | rejected[:-2] | rejected[2:]))
@@ -129,7 +131,7 @@ def _size(kind: Kind, found: _Found, place: int, images: Sequence[str]) -> dict[
     }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Equations:
     """Those of some images, linearised."""
 
@@ -143,8 +145,13 @@ class _Equations:
 
     def of(self, images: Int[ndarray, " k"]) -> "_Equations":
         """Those of some images, where these are of all."""
-        systematic = of_poses(self.systematic, images)
-        return _Equations(images, self.residual[images], self.by[images], systematic, self.noise)
+        return replace(
+            self,
+            images=images,
+            residual=self.residual[images],
+            by=self.by[images],
+            systematic=of_poses(self.systematic, images),
+        )
 
     def tested(self, columns: Float[ndarray, "m 6 p"]) -> _Found:
         """What columns, given for all images, explain, in units of the noise that they leave.

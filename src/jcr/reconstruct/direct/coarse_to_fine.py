@@ -13,13 +13,13 @@ from jcr.reconstruct.direct.photometric import Cameras, Level, Points, energy, e
 DEPTHS = 40
 """Tried along a ray, evenly spaced in inverse depth."""
 DEPTH_RANGE = (0.55, 1.8)
-"""Of the distance at which the cameras' axes meet."""
+"""Nearest and farthest depth, as shares of the distance at which the cameras' axes meet."""
 MEET_WITHIN = (0.1, 2.0)
 """m. Distance at which they may."""
 AGREED = 0.5
 """Cost of a point beyond which its depth is not used."""
 IMAGES_AT_FULL = 10
-"""With more images each has fewer points, as each point is seen more often."""
+"""Images that get all points; with more each has fewer, as each point is seen more often."""
 SETTLED = 0.995
 """A round that leaves more of the cost than this was the last."""
 
@@ -29,7 +29,7 @@ class Stage:
     """One level of the pyramid."""
 
     height: int
-    """Of the images, in pixels."""
+    """Height of the images in pixels."""
     per_image: int
     """Points."""
     rounds: int

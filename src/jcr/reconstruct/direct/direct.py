@@ -54,7 +54,7 @@ GAIN_ROUNDS = 3
 LEAST_GAIN = 0.05
 """Difference of log brightness below which it is left alone: shading and gloss look like as much."""
 GUESSED_FOCAL = 0.8
-"""In long sides, where nothing is known of the intrinsics."""
+"""Focal length in long sides of the image, where nothing is known of the intrinsics."""
 LEAST_AGREED = 0.25
 """Share of the points that the views must agree on in the end."""
 LEAST_POINTS = 100

@@ -71,7 +71,7 @@ class Cameras:
     zoom: float = 1.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Points:
     """Pixels with a depth."""
 
@@ -84,16 +84,16 @@ class Points:
 
     def where(self, kept: Bool[ndarray, " k"] | slice) -> "Points":
         """Some of them."""
-        return Points(self.host[kept], self.x_px[kept], self.color[kept], self.depth[kept], self.agreed[kept])
+        return Points(**{name: values[kept] for name, values in vars(self).items()})
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Equations:
     """Gauss-Newton equations of cameras, log focal length last, with the log depths eliminated (Schur)."""
 
     normal: Float[ndarray, "p p"]
     gradient: Float[ndarray, "k p"]
-    """Of each point; their sum is the gradient."""
+    """Gradient of each point; their sum is that of the cost."""
     by_depth: Float[ndarray, "k p"]
     depth_gradient: Float[ndarray, " k"]
     depth_information: Float[ndarray, " k"]
@@ -154,11 +154,17 @@ def on_rays(
     color = level.color.reshape(level.count, level.grid.height, level.grid.width, 3)[
         host, x_px[:, 1], x_px[:, 0]
     ]
-    points = Points(host, x_px.astype(float), color, depths[0, host], np.ones(len(host), bool))
+    points = Points(
+        host=host,
+        x_px=x_px.astype(float),
+        color=color,
+        depth=depths[0, host],
+        agreed=np.ones(len(host), bool),
+    )
     cost = np.stack([_cost(level, cameras, replace(points, depth=depth[host]), sigma) for depth in depths])
     best = cost.argmin(0)
     found = cost[best, np.arange(len(host))]
-    return Points(host, points.x_px, color, depths[best, host], found < least), float(found.mean())
+    return replace(points, depth=depths[best, host], agreed=found < least), float(found.mean())
 
 
 def _cost(level: Level, cameras: Cameras, points: Points, sigma: float) -> Float[ndarray, " k"]:
@@ -281,7 +287,13 @@ def equations(level: Level, cameras: Cameras, points: Points, sigma: float, tied
         by_depth[rows] = b
         normal += (flat.T @ flat) - (b / information[rows, None]).T @ b
         gradient[rows] = (a * r).sum(1) - b * (depth_gradient[rows] / information[rows])[:, None]
-    return Equations(normal, gradient, by_depth, depth_gradient, information)
+    return Equations(
+        normal=normal,
+        gradient=gradient,
+        by_depth=by_depth,
+        depth_gradient=depth_gradient,
+        depth_information=information,
+    )
 
 
 def _linearised(

@@ -126,9 +126,9 @@ class _ChainView:
 
     camera_from_next: Float[ndarray, "4 4"]
     points: Float[ndarray, "p 3"]
-    """Of the first, in its camera frame."""
+    """Points of the first image in its camera frame."""
     next_points: Float[ndarray, "p 3"]
-    """Of the next, in its own camera frame."""
+    """Points of the next image in its own camera frame."""
 
 
 def _chain_views(chain: PairPredictions, count: int) -> list[_ChainView]:

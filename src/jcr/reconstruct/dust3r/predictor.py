@@ -43,11 +43,11 @@ class MemoryEstimate:
 
     weights: int
     features: int
-    """Of all images."""
+    """Bytes of the features of all images."""
     per_pair: int
     """Working memory of the decoder and heads, per pair of a batch."""
     pointmaps: int
-    """Of all pairs, in main memory."""
+    """Bytes of the pointmaps of all pairs, in main memory."""
 
     @property
     def one_pair(self) -> int:

@@ -62,7 +62,7 @@ class Alignment:
     """fx, fy of each image."""
     principal_point_px: tuple[float, float]
     depth: Float[ndarray, "n h w"]
-    """Along the optical axis, recon units."""
+    """Depth along the optical axis, recon units."""
     confidence: Float[ndarray, "n h w"]
     """The network's, averaged over the pairs, each pair counting as far as it agrees with this depth."""
     pair_scale: Float[ndarray, " e"]

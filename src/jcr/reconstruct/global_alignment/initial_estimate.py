@@ -20,7 +20,7 @@ class PairSimilarities:
 
     first_from_second: Float[ndarray, "e 4 4"]
     log_ratio: Float[ndarray, " e"]
-    """Of the second image's unit to the first's."""
+    """Log of the ratio of the second image's unit to the first's."""
     residual: Float[ndarray, " e"]
     """Median distance after the fit, relative to the distance of the points."""
 

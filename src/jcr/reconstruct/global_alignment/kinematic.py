@@ -31,7 +31,7 @@ VAGUE = 10.0
 STRAIN = 5.0
 """Standard deviations by which a gripper pose may move before the user is warned."""
 START_NOISE = 0.001
-"""Of the robot (rad) until it is measured."""
+"""Robot pose noise (rad) until it is estimated."""
 LEAST_NOISE = 1e-5
 """rad: a tenth of what the best arm repeats."""
 

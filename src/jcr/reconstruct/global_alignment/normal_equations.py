@@ -127,7 +127,7 @@ class ReducedEquations:
     gain: Float[ndarray, "t c"]
     offset: Float[ndarray, " t"]
     error_variance: Float[ndarray, "n 6"]
-    """Of the pairs' errors where the cameras are given, in the observers' axes."""
+    """Variances of the pairs' errors where the cameras are given, in the observers' axes."""
 
     def pair_step(self, local_step: Float[ndarray, " c"]) -> Float[ndarray, "n 6"]:
         """Change of the pairs' errors (recon axes) once the local unknowns have moved."""

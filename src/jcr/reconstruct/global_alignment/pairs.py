@@ -4,7 +4,7 @@ import math
 import mmap
 import struct
 import zipfile
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -31,10 +31,10 @@ class PairPredictions:
     edges: Int[ndarray, "e 2"]
     pts3d: Float[ndarray, "e h w 3"]
     conf: Float[ndarray, "e h w"]
-    """Of `pts3d`, at least 0; the network's own is at least 1."""
+    """Confidence of `pts3d`, at least 0; the network's own is at least 1."""
     pts3d_in_other_view: Float[ndarray, "e h w 3"]
     conf2: Float[ndarray, "e h w"]
-    """Of `pts3d_in_other_view`."""
+    """Confidence of `pts3d_in_other_view`."""
     images: tuple[str, ...] = ()
     """Names of the images in the capture; empty when the file has none."""
     colors: UInt8[ndarray, "n h w 3"] | None = None
@@ -59,11 +59,6 @@ class PairPredictions:
     def pointmaps(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
         """Points and confidences of the first views, and of the second ones."""
         return self.pts3d, self.conf, self.pts3d_in_other_view, self.conf2
-
-    def of_edges(self, rows: ndarray) -> "PairPredictions":
-        """Some of the pairs."""
-        kept = {name: getattr(self, name)[rows] for name in ARRAYS}
-        return replace(self, **kept)
 
     def release(self) -> None:
         """Take pointmaps that lie in a file out of the resident set; they come back page by page when read."""

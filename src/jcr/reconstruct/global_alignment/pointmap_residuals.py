@@ -37,7 +37,7 @@ class State:
     pair_error: Float[ndarray, "e 6"]
     """Twist (v, ω), in the axes of a pair's first camera, by which the network misplaced its second view."""
     log_depth: list[Float[ndarray, " _"]]
-    """Of the observed pixels of each image."""
+    """Log depths of the observed pixels of each image."""
 
 
 @dataclass(frozen=True)

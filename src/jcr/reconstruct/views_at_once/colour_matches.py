@@ -23,7 +23,7 @@ LEVELS = 3
 WIDEST_DEG = 70.0
 """Angle between views beyond which a surface looks too different to be compared."""
 LARGEST_RETURN_PX = 0.5
-"""Between a keypoint and where the flow there and back puts it."""
+"""Largest distance between a keypoint and where the flow there and back puts it."""
 LEAST_CORRELATION = 0.8
 """Of the patches around both ends, which brightness and contrast leave alone."""
 PATCH_RADIUS = 5
@@ -42,7 +42,7 @@ class Geometry:
     pinhole: Intrinsics
     recon_from_camera: Float[ndarray, "n 4 4"]
     depth: Float[ndarray, "n h w"]
-    """Along z; 0 where nothing is known."""
+    """Depth along z; 0 where nothing is known."""
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ class Views:
     colors: UInt8[ndarray, "n h w 3"]
     """RGB, upright and without distortion, in the camera's own resolution: resizing is part of a model."""
     pinhole: Intrinsics | None
-    """Of these images; None: unknown."""
+    """The camera of these images; None: unknown."""
     recon_from_camera: Float[ndarray, "n 4 4"] | None = None
     """Camera poses to go by, for models that take them; None: the images alone."""
 

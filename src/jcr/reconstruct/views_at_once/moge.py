@@ -24,7 +24,7 @@ from jcr.reconstruct.views_at_once.interface import (
 )
 
 LONG_EDGE = 640
-"""Of the images that it is shown, at most; nothing is cropped."""
+"""Longest side of the images that it is shown; nothing is cropped."""
 
 
 def load(weights: Path, device: str) -> Predict:

@@ -24,10 +24,10 @@ from jcr.reconstruct.views_at_once.interface import Predicted
 from jcr.records import CameraEvidence, Intrinsics, Tracks
 
 LONG_EDGE = 960
-"""Of the images that are compared; larger ones are made smaller."""
+"""Longest side of the images that are compared; larger ones are made smaller."""
 ROUNDS = 3
 KEYPOINTS = 4000
-"""Of all images together."""
+"""Keypoints of all images together."""
 LEAST_MATCHES = 25
 """Of an image, in bundle adjustment: with fewer it is left where it was predicted, and nothing is refined."""
 LARGEST_PX = 4.0
@@ -43,9 +43,9 @@ class Refined:
     recon_from_camera: Float[ndarray, "n 4 4"]
     """The first camera is where it was."""
     depth_factor: Float[ndarray, "n h w"]
-    """By which to multiply the predicted points, on the model's grid."""
+    """Factor of the predicted points, on the model's grid."""
     tracks: Tracks
-    """In the capture's own images."""
+    """Tracks in the capture's own images."""
     pinhole: Intrinsics
     """Of the undistorted images, as given, or with the focal length that the images show."""
     evidence: CameraEvidence

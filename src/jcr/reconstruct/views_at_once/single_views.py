@@ -41,15 +41,13 @@ def reconstruct_single_views(
     capture: Capture,
     options: SingleViewsOptions,
     progress: Progress | None = None,
-    predict: Predict | None = None,
 ) -> Reconstruction:
     """Cameras and tracks of the one, pointmaps of the other, in the model's metres.
 
-    `predict` takes the place of the weights. Raises what `cameras` raises, and InputError for weights that are missing
-    or damaged.
+    Raises what `cameras` raises, and InputError for weights that are missing or damaged.
     """
     report = progress or silent
-    predict = predict or loaded(options.load, options.weights.path, options.device)
+    predict = loaded(options.load, options.weights.path, options.device)
     sparse = options.cameras(capture, progress)
     placed = replace(
         capture,

@@ -50,11 +50,11 @@ class Cost:
     base_gb: float
     """Weights, in main memory, and what their library takes."""
     view_gb: float
-    """Of each view."""
+    """Memory of each view."""
     view_s: float
-    """Of each view on one core of a desktop's processor."""
+    """Seconds for each view on one core of a desktop's processor."""
     pair_s: float
-    """Of each pair of views, likewise."""
+    """Seconds for each pair of views on that core."""
 
     def bytes(self, views: int) -> float:
         """Peak of main memory on a CPU, over what the program takes without it."""
@@ -76,16 +76,14 @@ class ViewsOptions:
     """One model and where it runs."""
 
     backend: str
-    """For the record: its row of the table of back ends."""
+    """Its row of the table of back ends, for the record."""
     load: Callable[[Path, str], Predict]
-    """Of the folder of its weights, and the device."""
+    """Loads the model from the folder of its weights, on the device."""
     weights: Weights
     cost: Cost
     takes_poses: bool = False
     device: str = "cpu"
     memory_gb: float = 8.0
-    refined: bool = True
-    """Whether matches by colour may replace the predicted cameras."""
 
 
 @dataclass(frozen=True)
@@ -122,17 +120,16 @@ class _Candidate:
 
 
 def reconstruct_views_at_once(
-    capture: Capture, options: ViewsOptions, progress: Progress | None = None, predict: Predict | None = None
+    capture: Capture, options: ViewsOptions, progress: Progress | None = None
 ) -> Reconstruction:
     """Camera poses with their covariance, pointmaps and tracks; in the model's own unit.
 
-    `predict` takes the place of the weights. Raises InputError for weights that are missing or damaged, or where the
-    memory does not suffice.
+    Raises InputError for weights that are missing or damaged, or where the memory does not suffice.
     """
     report = progress or silent
     _require_memory(capture, options)
     images = prepare_images(capture, lambda size: ImageGrid.uncropped(size, size))
-    predict = predict or loaded(options.load, options.weights.path, options.device)
+    predict = loaded(options.load, options.weights.path, options.device)
     report("reconstruct", 0.0)
     predicted = with_known_rays(predict(Views(images.colors, images.pinhole)), images)
     report("reconstruct", 0.5)
@@ -141,7 +138,7 @@ def reconstruct_views_at_once(
             f"--backend {options.backend} sees one view at a time and gives no cameras; choose another"
         )
     pinhole = images.pinhole or _own_pinhole(predicted, options.backend)
-    chosen, notes, warnings = _predicted_or_refined(capture, images, predicted, pinhole, options)
+    chosen, notes, warnings = _predicted_or_refined(capture, images, predicted, pinhole)
     if options.takes_poses and chosen.hand_eye.converged:
         chosen, note = _second_pass(capture, images, chosen, pinhole, predict)
         notes = (*notes, note)
@@ -193,16 +190,14 @@ def _own_pinhole(predicted: Predicted, backend: str) -> Intrinsics:
 
 
 def _predicted_or_refined(
-    capture: Capture, images: PreparedImages, predicted: Predicted, pinhole: Intrinsics, options: ViewsOptions
+    capture: Capture, images: PreparedImages, predicted: Predicted, pinhole: Intrinsics
 ) -> tuple[_Candidate, tuple[str, ...], tuple[str, ...]]:
     """The prediction or its refinement, whichever predicts images left out better; notes; and warnings."""
     gripper = capture.base_from_gripper
     as_predicted = _candidate("as predicted", gripper, predicted, None)
-    refined = refine(predicted, images, pinhole) if options.refined else None
+    refined = refine(predicted, images, pinhole)
     if refined is None:
         note = "too few matches by colour: the cameras are as the model has them"
-        if not options.refined:
-            return as_predicted, (), ()
         return as_predicted, (note,), _contradicted(capture, as_predicted, pinhole)
     adjusted = _candidate("refined", gripper, predicted, refined)
     kept, left = (

@@ -1,0 +1,95 @@
+"""The proposed pose shows the scene, and none is proposed twice at which no image could be kept."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy import ndarray
+
+import jcr
+from jcr.geometry import apply, inverse, rotation_exp, transform
+from jcr.live.next_pose import AIMED, ELSEWHERE_M, Reach, Tried, before_calibration
+from jcr.records import Capture, HandEye
+from jcr.simulate.poses import looking_at
+
+SCENE = np.array([0.5, 0.0, 0.1])
+TILTED = transform(rotation_exp(np.array([0.6, 0.2, 0.0])), np.array([0.06, -0.03, 0.05]))
+"""gripper_from_camera of a camera that looks 36° past the gripper's axis."""
+
+
+def seen() -> tuple[Capture, HandEye]:
+    """A capture of four views from one line, and the rejected calibration of it: rotations about one axis only."""
+    rng = np.random.default_rng(0)
+    facing = looking_at(SCENE + np.array([0.0, -0.3, 0.45]), SCENE, rng)
+    about = [transform(rotation_exp(np.array([0.0, 0.0, angle])), SCENE) for angle in (-0.5, -0.2, 0.2, 0.5)]
+    cameras = np.array([one @ transform(np.eye(3), -SCENE) @ facing for one in about])
+    cameras[2, :3, 3] += 0.03
+    poses = cameras @ inverse(TILTED)
+    capture = Capture(
+        folder=Path(),
+        images=tuple(f"{k}.png" for k in range(4)),
+        base_from_gripper=poses,
+        image_size=(640, 480),
+    )
+    return capture, jcr.solve_hand_eye(poses, cameras)
+
+
+def next_pose(tried: Tried, hand_eye: HandEye | None) -> ndarray:
+    return before_calibration(tried, Reach(), hand_eye)["next_pose"].base_from_gripper
+
+
+def past_scene(base_from_gripper: ndarray) -> float:
+    """The angle (rad) by which the camera looks past the scene."""
+    x, y, z = apply(inverse(base_from_gripper @ TILTED), SCENE)
+    return float(np.arctan2(np.hypot(x, y), z))
+
+
+def test_a_rejected_calibration_that_knows_where_the_camera_looks_aims_the_next_image():
+    capture, hand_eye = seen()
+    assert not hand_eye.is_sound and not hand_eye.observability.observable
+    # Of planar rotations the translation along their axis stays open; only the rotation is known here.
+    aimed = replace(
+        hand_eye,
+        estimate=replace(
+            hand_eye.estimate, gripper_from_camera=TILTED, covariance=np.diag([*6 * [1e-6], 1e-6])
+        ),
+    )
+    tried = Tried(capture, np.arange(4))
+    assert past_scene(next_pose(tried, aimed)) < np.radians(8)
+    unknown = replace(
+        aimed, estimate=replace(aimed.estimate, covariance=np.diag([*3 * [AIMED[0] ** 2], *3 * [0.1], 1e-6]))
+    )
+    assert np.array_equal(next_pose(tried, unknown), next_pose(tried, None))
+
+
+@pytest.mark.parametrize("is_calibrated", [True, False])
+def test_each_refused_pose_is_followed_by_one_elsewhere_that_is_rotated_little(is_calibrated: bool):
+    capture, hand_eye = seen()
+    aimed = replace(
+        hand_eye,
+        estimate=replace(hand_eye.estimate, gripper_from_camera=TILTED, covariance=np.diag(7 * [1e-6])),
+    )
+    tried = Tried(capture, np.arange(4))
+    for _ in range(5):
+        new = next_pose(tried, aimed if is_calibrated else None)
+        assert all(
+            np.linalg.norm((new @ TILTED)[:3, 3] - (old @ TILTED)[:3, 3]) > 0.5 * ELSEWHERE_M
+            for old in tried.refused
+        )
+        if tried.refused:
+            nearest = min(np.trace(old[:3, :3].T @ new[:3, :3]) for old in -capture.base_from_gripper)
+            assert np.degrees(np.arccos((-nearest - 1) / 2)) < 25
+        tried = replace(tried, refused=(*tried.refused, new))
+
+
+def test_an_image_that_did_not_register_counts_as_a_place_without_images():
+    capture, _ = seen()
+    first = next_pose(Tried(capture, np.arange(4)), None)
+    more = replace(
+        capture,
+        images=(*capture.images, "4.png"),
+        base_from_gripper=np.concatenate([capture.base_from_gripper, first[None]]),
+    )
+    after = next_pose(Tried(more, np.arange(4)), None)
+    assert np.linalg.norm(after[:3, 3] - first[:3, 3]) > 0.99 * ELSEWHERE_M
