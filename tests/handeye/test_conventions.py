@@ -114,11 +114,13 @@ def test_sound_poses_are_left_alone(noise):
 
 
 def test_shuffled_poses_are_read_in_few_ways(monkeypatch: pytest.MonkeyPatch):
-    """No reading fits them, and each that is solved takes as long as the calibration itself: 14 of them were."""
+    """No reading fits them, and each that is solved takes as long as the calibration itself: of 15 none is now."""
     solved = []
     solve = conventions.solve_hand_eye
     monkeypatch.setattr(conventions, "solve_hand_eye", lambda *poses: solved.append(1) or solve(*poses))
     rng = np.random.default_rng(0)
     p = hand_eye_problem(rng, 12)
-    assert better_reading(p.base_from_gripper[rng.permutation(12)], p.recon_from_camera) is None
-    assert len(solved) <= 4
+    shuffled = p.base_from_gripper[rng.permutation(12)]
+    given = solve(shuffled, p.recon_from_camera)
+    assert better_reading(shuffled, p.recon_from_camera, solved=given) is None
+    assert not solved
