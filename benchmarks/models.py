@@ -20,6 +20,7 @@ from benchmarks.table1 import WEBCAM
 from benchmarks.table2 import matched
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
+from jcr.depth.densify import densify
 from jcr.errors import RejectedError
 from jcr.geometry import step_between
 from jcr.reconstruct import backends
@@ -152,7 +153,7 @@ def _median(values: list[float]) -> float:
 def _methods(
     place: Path, seed: int, levels: Mapping[str, ViewErrors]
 ) -> dict[str, Callable[[Capture], Reconstruction]]:
-    """What rotates the capture in a folder into a reconstruction, by name."""
+    """What makes the capture in a folder a reconstruction, by name."""
 
     def predicted(errors: ViewErrors, refined: bool) -> Callable[[Capture], Reconstruction]:
         options = ViewsOptions(
@@ -186,7 +187,7 @@ def _methods(
 def _cell(capture: Capture, place: Path, reconstructed: Callable[[Capture], Reconstruction]) -> Cell | None:
     """Errors of a back end on the simulated capture in a folder; None where it failed."""
     try:
-        reconstruction = reconstructed(capture)
+        reconstruction = densify(capture, reconstructed(capture))
         hand_eye = calibrate(capture, reconstruction)
     except RejectedError:
         return None
