@@ -19,6 +19,8 @@ from jcr.reconstruct.backends import BACKENDS
 CHECKOUT = Path(__file__).parents[1]
 CLAIM = "> "
 """Begins the lines of a bench's page that say in a sentence what was found."""
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+"""Environment of benches that run two at a time; those that are timed have a user's."""
 MARKS = ("<!-- python -m benchmarks all: begin -->", "<!-- python -m benchmarks all: end -->")
 """Lines of the index between which the claims go."""
 
@@ -46,21 +48,23 @@ def run(
     """
     outcomes = dict[str, Outcome]()
 
-    def measured(name: str, threads: int) -> None:
-        outcomes[name] = _measured(name, out, arguments.get(name, []), threads)
+    def measured(name: str, environment: Mapping[str, str]) -> None:
+        outcomes[name] = _measured(name, out, arguments.get(name, []), environment)
         report(outcomes[name])
 
     with ThreadPoolExecutor(2) as two:
-        list(two.map(lambda name: measured(name, 1), [name for name in benches if not benches[name]]))
+        list(
+            two.map(lambda name: measured(name, ONE_THREAD), [name for name in benches if not benches[name]])
+        )
     for name in benches:
         if benches[name]:
-            measured(name, os.cpu_count() or 1)
+            measured(name, {})
     return [outcomes[name] for name in benches]
 
 
-def _measured(name: str, out: Path, arguments: Sequence[str], threads: int) -> Outcome:
+def _measured(name: str, out: Path, arguments: Sequence[str], environment: Mapping[str, str]) -> Outcome:
     begun = time.perf_counter()
-    environment = os.environ | {"OMP_NUM_THREADS": str(threads), "OPENBLAS_NUM_THREADS": str(threads)}
+    environment = os.environ | environment
     environment["PYTHONPATH"] = os.pathsep.join([str(CHECKOUT), os.environ.get("PYTHONPATH", "")])
     command = [sys.executable, "-m", "benchmarks", name, *arguments, "--out", str(out)]
     done = subprocess.run(
