@@ -224,7 +224,7 @@ BACKENDS: dict[str, Backend] = {
             auto=True,
             options=("features", "board"),
             selected_by="features",
-            accuracy="0.20 mm and 0.036° on the bundled capture (jcr docs results/run)",
+            accuracy="0.02 mm and 0.002° on the bundled capture (jcr docs results/run)",
         ),
         Backend(
             name="da3",
