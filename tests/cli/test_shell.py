@@ -197,3 +197,21 @@ def test_there_is_no_script_for_other_shells(capsys: pytest.CaptureFixture[str])
     assert dispatch(["--completion", "tcsh"]) == 2
     printed = capsys.readouterr().err
     assert all(shell in printed for shell in SHELLS)
+
+
+@pytest.mark.slow
+def test_what_was_written_before_an_error_is_not_lost() -> None:
+    code = """
+import sys
+import jcr.cli as cli
+
+def dispatch(arguments):
+    sys.stdout.write("half of a table")
+    raise cli.InputError("row 3 is wrong")
+
+cli.dispatch = dispatch
+cli.main([])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (2, "half of a table")
+    assert done.stderr == "error: row 3 is wrong\n"

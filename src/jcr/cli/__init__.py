@@ -106,8 +106,9 @@ def _end(status: int) -> NoReturn:
     """End the process now that all is written: the interpreter would take every module apart, torch's and the
     compiler's for a second."""
     atexit._run_exitfuncs()
-    with contextlib.suppress(OSError):
-        sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError):
+            stream.flush()
     os._exit(status)
 
 
