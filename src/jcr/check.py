@@ -131,8 +131,10 @@ def check(
         assumptions = assumed(gripper, _camera(capture), robot_noise)
     x = None if shown.assumptions is None else assumptions.gripper_from_camera
     seen = shown.observability or observability(gripper, x)
-    unseen = seen.findings if shown.hand_eye is None else ()
-    faults = [*shown.faults, *(f"{unobservable(one)}; {remedy(one)}" for one in unseen)]
+    alone_seen = seen.findings if shown.hand_eye is None else ()
+    weak = [f"{unobservable(one)}; {remedy(one)}" for one in alone_seen if "nearly" in one.details]
+    unseen = [f"{unobservable(one)}; {remedy(one)}" for one in alone_seen if "nearly" not in one.details]
+    faults = [*shown.faults, *unseen]
     views = as_causes(alone.views) if faults else alone.views
     causes = [sentence(one) for one in views if one.severity == "rejects"]
     ahead = Ahead.of(assumptions, gripper, alone.robot.of(rows), suggest, reach, seed)
@@ -150,6 +152,7 @@ def check(
         faults=tuple(dict.fromkeys((*causes, *faults))),
         remarks=(
             *alone.remarks,
+            *weak,
             *shown.remarks,
             *([] if angles is None else [sentence(angles)]),
             *(sentence(one) for one in views if one.severity == "warns"),

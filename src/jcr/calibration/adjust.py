@@ -34,10 +34,11 @@ from jcr.records import (
 
 
 def adjusted(case: Case) -> Case:
-    """The case with its images adjusted, and the calibration made of that where it is the better one.
+    """Adjust the images of a case and replace its fit from poses by the calibration that results.
 
-    It replaces an accepted fit; on correspondences between pointmaps, whose errors neighbours share, only where its
-    leave-one-out error is smaller. An answer so wrong that points lie behind the cameras has no adjustment.
+    A rejected fit is replaced too: without intrinsics the fit from poses alone is poor, and the adjustment is not. On
+    correspondences between pointmaps, whose errors neighbours share, it is replaced only where the leave-one-out error
+    becomes smaller. The case stays as it is where the adjustment fails because points lie behind the cameras.
     """
     if not case.is_adjustable:
         return _considered(case)
@@ -47,8 +48,6 @@ def adjusted(case: Case) -> Case:
     except np.linalg.LinAlgError:
         return case
     case = replace(case, adjusted=found)
-    if not case.hand_eye.converged:
-        return case
     refined = judged(refined_by(case, found))
     nearer, than = refined.leave_one_out, case.hand_eye.leave_one_out
     if case.tracks.from_pointmaps and (nearer is None or than is None or nearer.length_m >= than.length_m):

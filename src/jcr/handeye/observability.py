@@ -21,9 +21,9 @@ from jcr.records import Excitation, Finding, Kind, Observability
 MIN_SPREAD = 0.1
 """Metres; camera centres closer together than this show little of scale."""
 WEAK = 0.06
-"""Excitation below which a direction counts as unseen: 3 degrees of deviation give 0.03 to 0.05."""
+"""Excitation below which a direction is named as weakly observed: 3 degrees of deviation give 0.03 to 0.05."""
 EXACT = 0.005
-"""Excitation below which no better measurement would help."""
+"""Excitation below which a direction is unobservable: no better measurement would help."""
 
 
 def excitation(
@@ -71,7 +71,10 @@ def observability(
         return Observability()
     findings = _explained(base_from_gripper, recon_from_camera, found, unseen)
     if found.value[0] >= EXACT * few:
-        findings = [replace(one, details={**one.details, "nearly": 1.0}) for one in findings]
+        # A weak direction has a standard deviation, and that decides (solve.judged); the motions only explain it.
+        findings = [
+            replace(one, severity="warns", details={**one.details, "nearly": 1.0}) for one in findings
+        ]
     return Observability(tuple(replace(one, value=float(found.value[0])) for one in findings))
 
 

@@ -172,8 +172,15 @@ JUDGED = frozenset(
 
 def judged(hand_eye: HandEye) -> HandEye:
     """The calibration with findings of the kinds JUDGED as its numbers are now, after those of other kinds."""
-    others = [finding for finding in hand_eye.findings if finding.kind not in JUDGED]
-    findings = (*others, *_of_agreement(hand_eye), *_of_uncertainty(hand_eye), *_of_residuals(hand_eye))
+    uncertain = tuple(_of_uncertainty(hand_eye))
+    # A direction that is observed weakly explains an uncertainty that rejects, and is named before it.
+    weak = "rejects" if uncertain else "warns"
+    others = [
+        replace(finding, severity=weak) if "nearly" in finding.details else finding
+        for finding in hand_eye.findings
+        if finding.kind not in JUDGED
+    ]
+    findings = (*others, *_of_agreement(hand_eye), *uncertain, *_of_residuals(hand_eye))
     return replace(hand_eye, findings=strongest_first(findings))
 
 

@@ -34,12 +34,12 @@ class Observability:
     """Which directions of (translation, rotation, scale) the motions can see."""
 
     findings: tuple[Finding, ...] = ()
-    """One of kind UNOBSERVABLE per direction that they cannot."""
+    """One of kind UNOBSERVABLE per direction that is unobservable, or nearly so."""
 
     @property
     def observable(self) -> bool:
-        """Whether they see all."""
-        return not self.findings
+        """Whether every direction is observed, however weakly."""
+        return all("nearly" in finding.details for finding in self.findings)
 
     @property
     def unobservable(self) -> tuple[str, ...]:

@@ -173,9 +173,20 @@ def _given_remedy(finding: Finding) -> str:
 
 
 def unobservable(finding: Finding) -> str:
-    """The direction that is unobservable, in words."""
-    grade = "nearly unseen: " if finding.details.get("nearly") else ""
-    return grade + _UNSEEN[str(finding.details["motion"])][0].format(**_of_axis(finding))
+    """Return the direction that is unobservable, or nearly so, in words."""
+    grade = "nearly unobservable: " if "nearly" in finding.details else ""
+    return grade + _direction(finding)
+
+
+def _direction(finding: Finding) -> str:
+    """Return the unobservable direction and the motion that leaves it so, in words."""
+    return _UNSEEN[str(finding.details["motion"])][0].format(**_of_axis(finding))
+
+
+def _unobservable_text(finding: Finding) -> str:
+    """Return the message of an unobservable or nearly unobservable direction."""
+    grade = "nearly unobservable" if "nearly" in finding.details else "unobservable"
+    return f"{grade} from these motions: {_direction(finding)}"
 
 
 def _to_observe(finding: Finding) -> str:
@@ -491,7 +502,7 @@ def _another_scene(finding: Finding) -> str:
 
 
 _TEXT: dict[Kind, Words] = {
-    Kind.UNOBSERVABLE: lambda f: f"unobservable from these motions: {unobservable(f)}",
+    Kind.UNOBSERVABLE: _unobservable_text,
     Kind.FEW_IMAGES: "with {value:.0f} images a wrong one cannot be identified",
     Kind.FEW_AGREE: "only {value:.0f} of {images:.0f} images agree on one calibration",
     Kind.POSES_CONTRADICT_IMAGES: "gripper poses and images disagree by {mm:.0f} mm and {deg:.1f}° per axis",
