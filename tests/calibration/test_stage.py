@@ -12,7 +12,8 @@ from jcr.adjust.wrist import adjust_wrist
 from jcr.calibration import adjust as adjust_stage
 from jcr.calibration import case
 from jcr.calibration.stage import calibrate
-from jcr.geometry import step_between
+from jcr.handeye.solve import solve_hand_eye
+from jcr.geometry import retract, step_between
 from jcr.records import Kind, Tracks
 
 
@@ -42,6 +43,20 @@ def test_of_many_observations_whole_tracks_are_adjusted_up_to_a_number(monkeypat
     errors = step_between(hand_eye.gripper_from_camera, found.gripper_from_camera)
     assert hand_eye.before is not None
     assert (np.abs(errors) < 3 * np.sqrt(np.diag(hand_eye.covariance)[:6])).all()
+
+
+def test_the_adjustment_replaces_a_rejected_fit_from_poses():
+    """Camera poses that are 40 mm and 5° off, as structure from motion without intrinsics can leave them: the fit from
+    poses alone is rejected, and the images that follow from the true poses correct them."""
+    rng = np.random.default_rng(2)
+    capture, reconstruction = reconstructed(faulty_capture(rng, 12), estimated=False)
+    errors = rng.normal(size=(12, 6)) * np.repeat([0.04, np.radians(5.0)], 3)
+    found = replace(reconstruction, recon_from_camera=retract(reconstruction.recon_from_camera, errors))
+    assert not solve_hand_eye(capture.base_from_gripper, found.recon_from_camera).converged
+    calibrated, right = calibrate(capture, found), calibrate(capture, reconstruction)
+    assert calibrated.converged and calibrated.inliers.all()
+    step = step_between(right.gripper_from_camera, calibrated.gripper_from_camera)
+    assert (np.abs(step) < 0.1 * np.sqrt(np.diag(right.covariance)[:6])).all()
 
 
 def test_images_of_contradictory_poses_take_few_steps(monkeypatch):
