@@ -12,8 +12,8 @@ from jcr.adjust.wrist import adjust_wrist
 from jcr.calibration import adjust as adjust_stage
 from jcr.calibration import case
 from jcr.calibration.stage import calibrate
-from jcr.handeye.solve import solve_hand_eye
 from jcr.geometry import retract, step_between
+from jcr.handeye.solve import solve_hand_eye
 from jcr.records import Kind, Tracks
 
 
