@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from jcr.allocator import give_back
 from jcr.calibration.checks.views import as_causes, view_findings
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
@@ -12,7 +13,6 @@ from jcr.calibration.words import leave_one_out_text
 from jcr.depth.densify import densify
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError, RejectedError
-from jcr.memory import give_back
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, reconstruct, tries
 from jcr.records import (
@@ -284,11 +284,10 @@ def again(
     options: CalibrateOptions,
     progress: Progress | None = None,
     depth_options: DepthOptions | None = None,
-    memory_gb: float = 8.0,
 ) -> Tried:
     """A reconstruction that was chosen before, and read in `read_s` seconds, calibrated again; raises as `choose`."""
     tried = _reconstructed(reconstruction, read_s, None)
-    surfaces = _with_surface(capture, tried, options, depth_options or DepthOptions(), progress, memory_gb)
+    surfaces = _with_surface(capture, tried, options, depth_options or DepthOptions(), progress)
     kept = _calibrated(capture, surfaces, options, progress)
     return kept.require_found(_of_images(capture, kept))
 
@@ -327,7 +326,7 @@ def _tried(
         return Tried(account=account, failure=error.with_traceback(None))
     tried = _reconstructed(reconstruction, time.perf_counter() - start, features, options.backend)
     give_back()  # what the back end worked with
-    tried = _with_surface(capture, tried, calibrate_options, depth_options, progress, options.memory_gb)
+    tried = _with_surface(capture, tried, calibrate_options, depth_options, progress)
     reconstructed(tried.reconstruction)
     return _calibrated(capture, tried, calibrate_options, progress)
 
@@ -353,7 +352,6 @@ def _with_surface(
     options: CalibrateOptions,
     depth_options: DepthOptions,
     progress: Progress | None,
-    memory_gb: float,
 ) -> Tried:
     """The attempt as the calibration can take it: a known length ends on surfaces, so here densify comes before it.
 
@@ -363,7 +361,7 @@ def _with_surface(
     if options.known_length is None:
         return tried
     start = time.perf_counter()
-    made = densify(capture, tried.reconstruction, depth_options, progress, memory_gb=memory_gb)
+    made = densify(capture, tried.reconstruction, depth_options, progress)
     seconds = tried.account.reconstruct_s + time.perf_counter() - start
     return replace(tried, made=made, account=replace(tried.account, reconstruct_s=round(seconds, 3)))
 

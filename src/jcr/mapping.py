@@ -4,10 +4,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from jcr.allocator import give_back
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError
-from jcr.memory import give_back
 from jcr.progress import Progress
 from jcr.reconstruct.backends import device_of
 from jcr.records import Capture, PointCloud
@@ -78,8 +78,8 @@ def _extended(result: RunResult, added: Capture, options: RunOptions, progress: 
         return result
     from jcr.depth.added import extend
 
-    memory_gb, count = options.reconstruct.memory_gb, len(result.capture)
-    reconstruction = extend(result.reconstruction, result.hand_eye, count, added, progress, memory_gb)
+    count = len(result.capture)
+    reconstruction = extend(result.reconstruction, result.hand_eye, count, added, progress)
     return replace(result, reconstruction=reconstruction)
 
 

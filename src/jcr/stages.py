@@ -5,13 +5,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from jcr import __version__
+from jcr.allocator import give_back
 from jcr.attempts import NothingFoundError, Tried, again, choose, timings_of
 from jcr.calibration.calibration_json import calibration_file, failed_file
 from jcr.capture.added import write_added
 from jcr.cell.added import read_added_cameras
 from jcr.cell.cameras_json import CamerasFile, cameras_file
-from jcr.depth.densify import densify, plan_depth
-from jcr.memory import give_back
+from jcr.depth.densify import densify
 from jcr.progress import Progress
 from jcr.reconstruct.board_in_view import proposed_for
 from jcr.records import Attempt, Capture, CellCamera
@@ -110,7 +110,6 @@ def densified(result: RunResult, folder: RunFolder, options: RunOptions, progres
         result.reconstruction,
         options.depth,
         progress,
-        memory_gb=options.reconstruct.memory_gb,
     )
     give_back()
     folder.keep_depth(reconstruction, folder.state())
@@ -158,8 +157,6 @@ def _reused(
         return None
     reconstruction, earlier = reused
     read_s = time.perf_counter() - start
-    if options.needs_depth and reconstruction.pointmaps is None:
-        plan_depth(capture, options.depth, options.reconstruct.memory_gb)
     tried = again(
         capture,
         reconstruction,
@@ -167,7 +164,6 @@ def _reused(
         options.calibrate,
         progress,
         options.depth,
-        options.reconstruct.memory_gb,
     )
     return tried, earlier.attempts or tried.attempts
 
@@ -176,8 +172,6 @@ def _chosen(
     capture: Capture, folder: RunFolder, options: RunOptions, state: State, progress: Progress
 ) -> tuple[Tried, tuple[Attempt, ...]]:
     """What is chosen now, and how; its reconstruction is kept as soon as it is sure."""
-    if options.estimates_depth:
-        plan_depth(capture, options.depth, options.reconstruct.memory_gb)
     tried = choose(
         capture,
         options.reconstruct,

@@ -132,10 +132,24 @@ def _z(scene: Scene, dense: Pointmaps, recon_from_camera: ndarray | None = None)
     return np.stack([apply(camera_from_recon, x)[..., 2] for camera_from_recon, x in pairs])
 
 
-def test_a_tight_budget_changes_no_bit(scene: Scene, dense: Pointmaps) -> None:
-    tight = _dense(scene, scene.recon_from_camera, scene.tracks, memory_gb=0.1)  # one thread
+def test_the_number_of_threads_changes_no_bit(scene: Scene, dense: Pointmaps) -> None:
+    tight = _dense(scene, scene.recon_from_camera, scene.tracks, threads=1)
     for name in ("points_in_recon", "confidence", "reason", "depth_std"):
         np.testing.assert_array_equal(getattr(tight, name), getattr(dense, name))
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_memory_that_ends_in_a_worker_thread_ends_the_stage(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, threads: int
+) -> None:
+    """The buffers of the threads are fewer than the images: one that is not returned blocks the stage for ever."""
+
+    def exhausted(*arguments: object) -> None:
+        raise MemoryError("Unable to allocate 5.62 MiB")
+
+    monkeypatch.setattr("jcr.depth.matched.peaks", exhausted)
+    with pytest.raises(MemoryError, match="Unable to allocate"):
+        _dense(scene, scene.recon_from_camera, scene.tracks, threads=threads)
 
 
 def test_depth_is_found_and_reasons_and_sigmas_are_honest(scene: Scene, dense: Pointmaps) -> None:

@@ -16,7 +16,9 @@ import pytest
 from benchmarks.simulated.problem import hand_eye_problem
 from capture_writers import write_easy_handeye2
 from jcr.calibration.calibration_json import read_calibration
+from jcr.errors import InputError
 from jcr.geometry import scale_translation
+from jcr.reconstruct.reconstruction_npz import read_reconstruction
 from waiting import until
 
 pytestmark = pytest.mark.slow
@@ -122,3 +124,15 @@ def test_too_little_address_space_is_one_line(tmp_path: Path):
     )
     assert finished.returncode == 2 and finished.stderr.count("\n") == 1
     assert finished.stderr.startswith("error: out of memory: ") and "ulimit -v" in finished.stderr
+
+
+def test_arrays_larger_than_the_memory_are_refused_unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Zeros pack 1000 to 1: a small file may unpack to more than the machine has."""
+    file = tmp_path / "reconstruction.npz"
+    np.savez_compressed(file, about=np.array("{}"), image_index=np.zeros(1_000_000))
+    assert file.stat().st_size < 20_000
+    monkeypatch.setattr(os, "sysconf", lambda name: {"SC_PHYS_PAGES": 1000, "SC_PAGE_SIZE": 4096}[name])
+    with pytest.raises(
+        InputError, match=r"reconstruction\.npz: unpacks to 0\.0 GB, this machine has 0\.0 GB"
+    ):
+        read_reconstruction(file)

@@ -17,9 +17,9 @@ from importlib import import_module
 from types import ModuleType
 from typing import NoReturn
 
+from jcr.allocator import MORE_MEMORY, require_address_space
 from jcr.cli.output import Quiet
 from jcr.errors import InputError, RejectedError, did_you_mean, printable
-from jcr.memory import MORE_MEMORY, require_address_space
 
 GROUPS = {
     "calibrate": {

@@ -37,7 +37,6 @@ def extend(
     capture_size: int,
     added: Capture,
     report: Progress,
-    memory_gb: float = 8.0,
 ) -> Reconstruction:
     """The reconstruction with further images, oldest first, whose gripper poses are known.
 
@@ -70,7 +69,6 @@ def extend(
         (middle + REACH * (planes - middle))[taken],
         report,
         changing=True,
-        memory_gb=memory_gb,
     )
     for name, of_image in zip(added.images, found.confidence[-new:], strict=True):
         if (of_image > 0).mean() < LEAST_SHARE:

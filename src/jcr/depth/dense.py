@@ -7,11 +7,13 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
+from jcr.allocator import give_back
 from jcr.camera import rays
-from jcr.depth.views import BYTES_OF_RESULT, BYTES_OF_THREAD
-from jcr.memory import ALLOWANCE, GB, relieve, resident
 from jcr.progress import Progress
 from jcr.records import Intrinsics, Pointmaps
+
+MOST_THREADS = 16
+"""Images that are matched at once. Each takes about 400 bytes per pixel while it is matched."""
 
 
 def dense_pointmaps(
@@ -24,32 +26,28 @@ def dense_pointmaps(
     *,
     changing: bool = False,
     priors: bool = True,
-    memory_gb: float = 8.0,
+    threads: int | None = None,
 ) -> Pointmaps:
     """Points in the recon frame, per pixel of undistorted images, with confidence, reason and sigma.
 
     The confidence is the correlation times the number of images that agree, 0 for no estimate.
 
     `neighbours` and `planes` are what `views` chooses; `changing`: the images are of different times, one that sees
-    through a point of another may show what was there before, and nothing is filled by `priors`.
+    through a point of another may show what was there before, and nothing is filled by `priors`. The number of
+    `threads` (default: one per core, at most MOST_THREADS) changes no bit.
     """
     from jcr.depth.fused import fused_depth
     from jcr.depth.matched import match_depth
 
-    pixels = pinhole.width * pinhole.height
-    available = memory_gb * GB - resident() - ALLOWANCE - len(colors) * pixels * BYTES_OF_RESULT
-    threads = max(1, min(os.cpu_count() or 1, int(available // (pixels * BYTES_OF_THREAD))))
+    threads = threads or min(os.cpu_count() or 1, MOST_THREADS)
 
     def progress(start: float, share: float) -> Callable[[float], None]:
-        def relieve_and_report(fraction: float) -> None:
-            relieve(memory_gb * GB)
-            report("dense depth", start + share * fraction)
-
-        return relieve_and_report
+        return lambda fraction: report("dense depth", start + share * fraction)
 
     inverse_depth, score = match_depth(
         colors, recon_from_camera, pinhole, neighbours, planes, threads, progress(0.0, 0.7)
     )
+    give_back()
     found = fused_depth(
         colors,
         recon_from_camera,

@@ -12,8 +12,7 @@ from jcr.camera import pinhole_inside, undistortion
 from jcr.capture.images import read_image
 from jcr.depth.dense import dense_pointmaps
 from jcr.depth.options import DepthOptions
-from jcr.depth.views import BYTES_OF_RESULT, BYTES_OF_THREAD, choose_neighbours, sweep_planes
-from jcr.memory import plan
+from jcr.depth.views import choose_neighbours, sweep_planes
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
@@ -26,13 +25,11 @@ def densify(
     reconstruction: Reconstruction,
     options: DepthOptions | None = None,
     progress: Progress | None = None,
-    *,
-    memory_gb: float = 8.0,
 ) -> Reconstruction:
     """The reconstruction with pointmaps of its images; those that it has, predicted by a network, stay as they are.
 
-    Only cameras, intrinsics and tracks are used, so that it may come before or after the calibration. A smaller budget
-    changes the time, and no bit. Raises InputError where an image cannot be read.
+    Only cameras, intrinsics and tracks are used, so that it may come before or after the calibration.
+    Raises InputError where an image cannot be read.
     """
     if reconstruction.pointmaps is not None:
         return reconstruction
@@ -53,27 +50,8 @@ def densify(
         _planes(tracks, cameras),
         progress or silent,
         priors=options.priors,
-        memory_gb=memory_gb,
     )
     return replace(reconstruction, pointmaps=pointmaps.of_rows(place))
-
-
-def plan_depth(capture: Capture, options: DepthOptions, memory_gb: float) -> None:
-    """Say what memory the dense depth of a capture, and its map, will take, before anything is made.
-
-    Raises InputError where the budget is too small.
-    """
-    import numba  # noqa: F401  (now, for it is a part of the program)
-
-    width, height = capture.image_size
-    pixels = int(width * height * min(1.0, options.pointmap_size_px / max(width, height)) ** 2)
-    plan(
-        len(capture),
-        capture.image_size,
-        memory_gb,
-        result=pixels * BYTES_OF_RESULT,
-        work=pixels * BYTES_OF_THREAD,
-    )
 
 
 def undistorted(

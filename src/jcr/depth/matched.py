@@ -123,13 +123,12 @@ def match_depth(
     for _ in range(threads):
         spaces.put(np.empty(floats_of_windows(*full.greys.shape[1:]), np.float32))
 
-    def one(i: int) -> tuple[Float[ndarray, "h w"], Float[ndarray, "h w"]]:
+    def match(i: int, space: Float[ndarray, " _"]) -> tuple[Float[ndarray, "h w"], Float[ndarray, "h w"]]:
         others, seed = neighbours[i][:COMPARED], 100 * i
         family = np.ascontiguousarray(planes[i])
         reach = np.einsum("di,hwi->dhw", family, rays(half.pinhole))
         span = max(float(reach.min()), LEAST * float(reach.max())), float(reach.max())
 
-        space = spaces.get()
         views = half.views(i, others, recon_from_camera, space)
         found = random_planes(family, span, views[-1], h, blocks_of(w), i)
         asked = np.empty((len(others), *found.shape[1:]), np.uint8)
@@ -144,8 +143,14 @@ def match_depth(
         for n, (size, tries) in enumerate(_FINE):
             spread_planes(found, asked, *views, (*span, size, tries, n == 0), seed + n)
         depth = peaks(found, asked, *views, np.float32(_PEAK))
-        spaces.put(space)
         return np.maximum(depth, np.float32(0.5 * span[0]))[:, : pinhole.width], found[3, :, : pinhole.width]
+
+    def one(i: int) -> tuple[Float[ndarray, "h w"], Float[ndarray, "h w"]]:
+        space = spaces.get()
+        try:
+            return match(i, space)
+        finally:
+            spaces.put(space)  # after an error too, or the other threads wait for the buffer without end
 
     depths, correlations = [], []
     with ThreadPoolExecutor(threads) as pool:

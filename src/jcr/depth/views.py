@@ -1,4 +1,4 @@
-"""What matching takes: which views to compare, where their surfaces may lie (as sparse tracks tell), memory."""
+"""Choose the views to compare, and the range of their surfaces, from sparse tracks."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -6,9 +6,6 @@ from numpy import ndarray
 
 from jcr.geometry import apply, inverse
 from jcr.records import Tracks
-
-BYTES_OF_THREAD, BYTES_OF_RESULT = 400, 150
-"""Per pixel: of the image that a thread works on; of every image."""
 
 
 def choose_neighbours(

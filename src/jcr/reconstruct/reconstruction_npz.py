@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from jcr.allocator import require_memory
 from jcr.capture.plain_files import first_fault, shown
 from jcr.errors import InputError
 from jcr.files import require_file, written_whole
@@ -131,6 +132,8 @@ def read_npz(path: Path, formats: Sequence[str]) -> Iterator[tuple[str, Mapping[
     try:
         # NumPy leaves a file open that it cannot read.
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            if file.zip is not None:
+                require_memory(sum(member.file_size for member in file.zip.infolist()), str(path))
             text = str(file["about"])
             kind = json.loads(text)["format"]
             if kind not in formats:
