@@ -336,6 +336,7 @@ def write_lerobot(
             key: pa.array(states, pa.list_(pa.float64())),
             "timestamp": np.concatenate([np.arange(len(states)) / fps for _, states in rows]),
             "episode_index": np.concatenate([np.full(len(states), index) for index, states in rows]),
+            "frame_index": np.concatenate([np.arange(len(states)) for _, states in rows]),
         }
         if codec is None:
             columns[camera] = [

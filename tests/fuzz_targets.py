@@ -19,8 +19,8 @@ from jcr.calibration.calibration_json import (
 from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_poses
-from jcr.capture import capture_json
 from jcr.capture.camera_info import read_camera_info
+from jcr.capture.formats import capture_json
 from jcr.capture.images import read_image
 from jcr.capture.lerobot_files import Info, read_episode
 from jcr.capture.options import ReadOptions

@@ -24,9 +24,9 @@ from fuzz_targets import NAMES, SIZE, small_capture, sound_run
 from jcr.batch import STATE as BATCH
 from jcr.batch import _finished
 from jcr.calibration.known_transform import read_hand_eye
-from jcr.capture import capture_json
 from jcr.capture.added import read_added, read_pose
 from jcr.capture.camera_info import read_camera_info
+from jcr.capture.formats import capture_json
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_source
 from jcr.capture.urdf_chain import read_chain

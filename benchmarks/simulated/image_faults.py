@@ -17,7 +17,7 @@ from benchmarks.simulated.faults import late
 from benchmarks.simulated.problem import disturbed
 from benchmarks.simulated.rendered import Rendered
 from jcr.camera import project, unproject
-from jcr.capture import capture_json
+from jcr.capture.formats import capture_json
 from jcr.files import write_bytes
 from jcr.geometry import inverse, rotation_exp, transform
 from jcr.records import Capture, Intrinsics

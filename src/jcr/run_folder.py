@@ -24,7 +24,7 @@ from jcr.calibration.calibration_json import CalibrationFile, read_calibration, 
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.words import log
 from jcr.capture.added import FOLDER as ADDED
-from jcr.capture.capture_json import kept
+from jcr.capture.formats.capture_json import kept
 from jcr.capture.plain_files import first_fault
 from jcr.capture.read import read_capture
 from jcr.cell.cameras_json import FILE as CAMERAS

@@ -10,7 +10,8 @@ import pytest
 import yaml
 
 import jcr
-from jcr.capture import camera_info, camera_json, capture_json, colmap_model
+from jcr.capture import camera_info, camera_json
+from jcr.capture.formats import capture_json, colmap
 from jcr.export import ros
 from jcr.intrinsics_json import IntrinsicsAndStd
 from jcr.records import Intrinsics
@@ -52,7 +53,7 @@ def test_a_intrinsics_survives_colmap(intrinsics: Intrinsics, tmp_path: Path):
     image.frame_id = 1
     model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
     model.write_text(str(tmp_path))
-    found = colmap_model.read_intrinsics(tmp_path, SIZE)
+    found = colmap.read_intrinsics(tmp_path, SIZE)
     assert found.model == intrinsics.model and np.allclose(found.distortion, intrinsics.distortion)
     assert np.allclose(
         [found.fx, found.fy, found.cx, found.cy], [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy]

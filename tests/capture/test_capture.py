@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 import jcr
-from jcr.capture import capture_json
+from jcr.capture.formats import capture_json
 from jcr.capture.images import read_image
 
 

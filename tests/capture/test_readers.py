@@ -12,7 +12,7 @@ import capture_writers as writers
 import jcr
 from benchmarks.simulated.problem import HandEyeProblem, hand_eye_problem
 from in_process import run_jcr
-from jcr.capture import capture_json
+from jcr.capture.formats import capture_json
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import read_npy, read_yaml
 from jcr.capture.pose_table import stamp_ns
@@ -70,14 +70,15 @@ def test_images_and_poses_read_back_as_the_same_capture(
 def test_cameras_that_were_given_read_back_with_their_capture(
     name: str, tmp_path: Path, capture: Capture, problem: HandEyeProblem
 ):
-    from jcr.capture import colmap_model, transforms_json
+    from jcr.capture import transforms_json
+    from jcr.capture.formats import colmap
 
     write = writers.write_transforms if name == "transforms" else writers.write_colmap
     path = write(tmp_path, capture, problem.recon_from_camera)
     assert format_of(path) == name
     got = jcr.read_capture(path)
     assert_same(got, capture)
-    reader = transforms_json if name == "transforms" else colmap_model
+    reader = transforms_json if name == "transforms" else colmap
     _, cameras = reader.read_cameras(got.cameras)
     assert np.allclose(cameras, problem.recon_from_camera, atol=1e-9)
     assert_same_calibration(got.base_from_gripper, cameras, problem)

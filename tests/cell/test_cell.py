@@ -24,7 +24,7 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.camera import parameters, project, unproject, with_parameters
 from jcr.capture.added import read_added
-from jcr.capture.capture_json import read, write
+from jcr.capture.formats.capture_json import read, write
 from jcr.cell import alone, carried, localise
 from jcr.cell.added import camera_of, read_added_cameras
 from jcr.cell.cameras_json import cameras_file, read_cameras, write_cameras

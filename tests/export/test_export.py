@@ -443,13 +443,14 @@ def with_others(views: "PosedImages", tmp_path: Path) -> "list[PosedImages]":
 def test_exports_of_several_cameras_come_back(
     kind: str, views: "PosedImages", with_others: "list[PosedImages]", tmp_path: Path
 ):
-    from jcr.capture import colmap_model, transforms_json
+    from jcr.capture import transforms_json
+    from jcr.capture.formats import colmap
     from jcr.export.views import write_colmap, write_nerfstudio
 
     out, about, n = tmp_path / "out", Provenance("base_link"), len(views.points_in_base)
     if kind == "colmap":
         write_colmap(out, views, about, undistorted=False, link=False, others=with_others)
-        names, poses = colmap_model.read_cameras(out / "sparse" / "0")
+        names, poses = colmap.read_cameras(out / "sparse" / "0")
     else:
         zeros, ones = np.zeros(n, int), np.ones(n)
         cloud = PointCloud(

@@ -22,7 +22,7 @@ from conftest import shrunk_capture
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file, failed_file
 from jcr.calibration.stage import calibrate
 from jcr.calibration.words import log
-from jcr.capture.capture_json import kept
+from jcr.capture.formats.capture_json import kept
 from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
 from jcr.capture.robot_poses import numbers_from_poses, poses_from_numbers

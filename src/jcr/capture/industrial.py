@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from jcr.capture.checks import checked_capture
+from jcr.capture.formats.table import with_camera_info
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_yaml
 from jcr.capture.robot_poses import poses_from_numbers
-from jcr.capture.table import with_camera_info
 from jcr.errors import InputError
 from jcr.records import Capture
 

@@ -13,9 +13,9 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.capture.checks import checked_capture, image_sizes, require_images
+from jcr.capture.formats.table import gripper_poses
 from jcr.capture.options import ReadOptions
 from jcr.capture.recorded_cameras import camera_names
-from jcr.capture.table import gripper_poses
 from jcr.errors import InputError
 from jcr.geometry import step_between
 from jcr.records import Capture, CellCamera, Intrinsics

@@ -7,12 +7,12 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from jcr.capture import capture_json
 from jcr.capture.checks import how_rotated, how_scaled, require_frames, require_motion
-from jcr.capture.colmap_model import find_model
+from jcr.capture.formats import capture_json
+from jcr.capture.formats.colmap import find_model
+from jcr.capture.formats.table import find_table, image_names
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.capture.plain_files import read_json, read_yaml
-from jcr.capture.table import find_table, image_names
 from jcr.capture.table_cells import SUFFIXES
 from jcr.errors import InputError
 from jcr.geometry import inverse
@@ -39,15 +39,15 @@ class Format:
 FORMATS = {
     row.name: row
     for row in (
-        Format("capture", "a folder with capture.json", "capture_json:read"),
-        Format("table", "images and a table of gripper poses", "table:read"),
+        Format("capture", "a folder with capture.json", "formats.capture_json:read"),
+        Format("table", "images and a table of gripper poses", "formats.table:read"),
         Format("industrial", "industrial_calibration's cal_data.yaml", "industrial:read"),
-        Format("moveit", "samples of MoveIt Calibration", "samples:read_moveit"),
-        Format("easy_handeye2", "samples of easy_handeye2", "samples:read_easy_handeye2"),
+        Format("moveit", "samples of MoveIt Calibration", "formats.samples:read_moveit"),
+        Format("easy_handeye2", "samples of easy_handeye2", "formats.samples:read_easy_handeye2"),
         Format("transforms", "transforms.json and gripper poses", "transforms_json:read"),
-        Format("colmap", "a COLMAP model and gripper poses", "colmap_model:read"),
-        Format("bag", "a ROS 1 or ROS 2 bag", "bag:read", recording=True),
-        Format("lerobot", "a LeRobot dataset", "lerobot:read", recording=True),
+        Format("colmap", "a COLMAP model and gripper poses", "formats.colmap:read"),
+        Format("bag", "a ROS 1 or ROS 2 bag", "formats.bag:read", recording=True),
+        Format("lerobot", "a LeRobot dataset", "formats.lerobot:read", recording=True),
     )
 }
 

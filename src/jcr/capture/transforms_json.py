@@ -15,10 +15,10 @@ from numpy import ndarray
 
 from jcr.camera import HALF_PIXEL
 from jcr.capture.checks import checked_intrinsics, read_rigid, require_frames
+from jcr.capture.formats.table import IMAGE_SUFFIXES
 from jcr.capture.model_cameras import ModelCamera, capture_of_cameras, one_each
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_json
-from jcr.capture.table import IMAGE_SUFFIXES
 from jcr.errors import InputError
 from jcr.records import COEFFICIENTS, Capture, DistortionModel, Intrinsics
 

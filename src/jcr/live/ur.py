@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from jcr.capture.capture_json import MOST_ROTATION
+from jcr.capture.formats.capture_json import MOST_ROTATION
 from jcr.errors import InputError
 from jcr.live.asks import pose_of_numbers
 from jcr.live.rest import State

@@ -13,7 +13,8 @@ import pycolmap
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from jcr.capture import colmap_model, transforms_json
+from jcr.capture import transforms_json
+from jcr.capture.formats import colmap
 from jcr.capture.images import read_image
 from jcr.errors import InputError, RejectedError
 from jcr.match.matchers import Matcher
@@ -37,7 +38,7 @@ def reconstruct_given(
     Raises InputError when the model knows fewer than three, RejectedError when nothing can be triangulated.
     """
     report = progress or silent
-    reader = colmap_model if cameras.is_dir() else transforms_json
+    reader = colmap if cameras.is_dir() else transforms_json
     names, recon_from_camera = reader.read_cameras(cameras)
     row_of = _rows(names)
     known = [k for k, name in enumerate(capture.images) if row_of(name) is not None]
@@ -92,7 +93,7 @@ def _own_tracks(cameras: Path, names: Sequence[str], size: tuple[int, int]) -> T
             point=np.zeros(0, int),
             points_in_recon=np.zeros((0, 3)),
         )
-    model = colmap_model.read_model(cameras)
+    model = colmap.read_model(cameras)
     id_of = {model.image(image_id).name: image_id for image_id in model.reg_image_ids()}
     return tracks_of(model, [id_of[name] for name in names], size)
 

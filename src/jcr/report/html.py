@@ -8,8 +8,8 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.calibration.calibration_json import CalibrationFile
-from jcr.capture.capture_json import origin
-from jcr.capture.table import TABLES
+from jcr.capture.formats.capture_json import origin
+from jcr.capture.formats.table import TABLES
 from jcr.errors import printable
 from jcr.geometry import scale_translation
 from jcr.records import Capture, HandEye, Intrinsics

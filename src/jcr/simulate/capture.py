@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt16
 from numpy import ndarray
 
-from jcr.capture import capture_json
+from jcr.capture.formats import capture_json
 from jcr.capture.images import encode_png
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture import capture_json
+from jcr.capture.formats import capture_json
 from jcr.files import write_text
 from jcr.geometry import inverse, rotation_exp, transform
 from jcr.progress import Progress, steps
