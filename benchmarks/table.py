@@ -254,13 +254,6 @@ BENCHES = {
         measures=(*SOLVER, "src/jcr/reconstruct/global_alignment", "src/jcr/reconstruct/from_pairs.py", *MAP),
         long="three draws instead of one",
     ),
-    "models": Bench(
-        "Any-view networks",
-        OTHERS,
-        "any-view models from predictions with published errors, beside COLMAP and direct alignment",
-        measures=(*SOLVER, *FEATURES, "src/jcr/reconstruct/views_at_once", "src/jcr/reconstruct/direct"),
-        long="a textured table and errors as on DTU and 7-Scenes, too",
-    ),
     "align": Bench(
         "Global alignment",
         OTHERS,

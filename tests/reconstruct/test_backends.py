@@ -159,7 +159,7 @@ def test_an_option_of_one_back_end_selects_it(present: set[str]) -> None:
     [
         (ReconstructOptions(backend="colmap", predictions=Path("p.npz")), "--predictions p.npz: .*predictions"),
         (ReconstructOptions(backend="predictions", weights="p.npz"), "--weights p.npz: .*mast3r or dust3r or .*mapany"),
-        (ReconstructOptions(backend="direct", board="b"), "--board b: .*colmap or moge or marker or given"),
+        (ReconstructOptions(backend="direct", board="b"), "--board b: .*colmap or marker or given"),
         (ReconstructOptions(backend="mapanything", pair_graph="window"), "--pair-graph window: .*mast3r or dust3r"),
         (ReconstructOptions(pair_graph="robot"), r"--pair-graph robot: .*\(colmap, direct\) does not use it"),
         (ReconstructOptions(board="b", predictions=Path("c")), r"--board b: .*\(predictions\) does not use it"),

@@ -102,12 +102,12 @@ def _get(arguments: Arguments) -> int:
         raise InputError(
             f"jcr models get: {named}; there are {', '.join(with_weights)}, and hub ids OWNER/NAME"
         )
-    hub_id, files, revision = (row.hub_id, row.files, row.revision) if row else (name, HUB_FILES, None)
+    hub_id, revision = (row.hub_id, row.revision) if row else (name, None)
     if row and not (row.commercial or row.has_weights() or arguments.accept_licence or _accepts(row)):
         raise InputError(
             f"jcr models get {name}: its licence is {row.licence}; accept it with --accept-licence, or take da3"
         )
-    folder = download(hub_id, files, arguments.revision or revision, arguments.output.quiet)
+    folder = download(hub_id, HUB_FILES, arguments.revision or revision, arguments.output.quiet)
     text = f"{hub_id}: revision {folder.name[:12]}, checked, in {folder}\n"
     if row and not row.is_installed():
         text += f"its package is missing: {row.install}\n"

@@ -66,25 +66,10 @@ def _views_at_once(
         load=mapanything.load if row.name == "mapanything" else da3.load,
         weights=weights_of(options),
         cost=Cost(*row.cost),
-        takes_poses=row.takes_poses,
         device=device_of(options),
         memory_gb=options.memory_gb,
     )
     return reconstruct_views_at_once(capture, made, progress)
-
-
-def _moge(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    extra("torch", "networks", f"--backend {options.backend}")
-    from jcr.reconstruct.views_at_once import moge
-    from jcr.reconstruct.views_at_once.single_views import SingleViewsOptions, reconstruct_single_views
-
-    def cameras(capture: Capture, progress: Progress | None) -> Reconstruction:
-        return _colmap(capture, replace(options, backend="colmap"), progress)
-
-    made = SingleViewsOptions(
-        load=moge.load, weights=weights_of(options), cameras=cameras, device=device_of(options)
-    )
-    return reconstruct_single_views(capture, made, progress)
 
 
 def _marker(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
@@ -149,15 +134,11 @@ class Backend:
     """As measured, and where that stands; empty: not measured here."""
     revision: str = ""
     """The commit of its weights that `jcr models get` downloads."""
-    files: tuple[str, ...] = HUB_FILES
-    """Of its weights on the hub."""
     parameters: int = 0
     """Of the network, in millions."""
     download_gb: float = 0.0
     commercial: bool = True
     """Whether the licence of its weights allows commercial use."""
-    takes_poses: bool = False
-    """Whether it can be shown camera poses."""
     cost: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """Of an any-view model: views_at_once.Cost, its fields in their order."""
 
@@ -177,7 +158,7 @@ class Backend:
 
     def has_weights(self) -> bool:
         """Whether its published weights are on this machine, or none are needed; nothing is downloaded."""
-        return not self.hub_id or bool(cached_files(self.hub_id, self.files, self.revision))
+        return not self.hub_id or bool(cached_files(self.hub_id, HUB_FILES, self.revision))
 
 
 BACKENDS: dict[str, Backend] = {
@@ -239,7 +220,6 @@ BACKENDS: dict[str, Backend] = {
             install=INSTALL_DA3,
             parameters=135,
             download_gb=0.5,
-            takes_poses=True,
             cost=(1.0, 0.15, 5.5, 0.2),
         ),
         Backend(
@@ -255,7 +235,6 @@ BACKENDS: dict[str, Backend] = {
             install=INSTALL_DA3,
             parameters=34,
             download_gb=0.14,
-            takes_poses=True,
             cost=(0.35, 0.09, 2.4, 0.05),
         ),
         Backend(
@@ -270,7 +249,6 @@ BACKENDS: dict[str, Backend] = {
             revision="00f9c245bbcb60522d1ed7f9e9d88462c6e3f38a",
             package="mapanything",
             install="pip install git+https://github.com/facebookresearch/map-anything",
-            takes_poses=True,
             cost=(5.0, 0.4, 20.0, 4.0),
         ),
         Backend(
@@ -281,20 +259,6 @@ BACKENDS: dict[str, Backend] = {
             tests_camera=False,
             accuracy="0.10 mm and 0.012° on printed, 0.29 mm and 0.023° on plain simulated tables "
             "(jcr docs plain-tables)",
-        ),
-        Backend(
-            name="moge",
-            reconstruct=_moge,
-            licence="MIT",
-            metric=True,
-            options=("weights", "board"),
-            hub_id="Ruicheng/moge-2-vitl",
-            revision="39c4d5e957afe587e04eec59dc2bcc3be5ecd968",
-            package="moge",
-            install="pip install --no-deps dlr-moge dlr-utils3d",
-            files=("model.pt",),
-            parameters=326,
-            download_gb=1.3,
         ),
         Backend(
             name="marker",
@@ -327,8 +291,8 @@ BACKENDS: dict[str, Backend] = {
 """By name; `auto` takes the first that it may.
 
 Networks that see pairs, whose uncertainty is known, come first, metric ones before others. COLMAP needs no weights, and
-sees what networks do not. Networks that see all views come after it: refined by colours they are as good where it works,
-and better than direct alignment on plain tables (jcr docs results/models, with simulated predictions), for more time.
+sees what networks do not. Networks that see all views come after it and before direct alignment: with simulated
+predictions, refined by colours, they are more accurate on plain tables, for more time.
 Direct alignment needs no weights: COLMAP matches what is printed on things, it the colours of plain ones.
 """
 
@@ -553,7 +517,7 @@ def weights_of(options: ReconstructOptions) -> Weights:
     )
     if options.weights is not None and Path(name).exists():
         return Weights(Path(name), name, licence)
-    if cached := cached_files(name, (published or row).files, published and published.revision):
+    if cached := cached_files(name, HUB_FILES, published and published.revision):
         return Weights(cached[0].parent, name, licence)
     if published:
         raise InputError(f"{name}: not on this machine; {weights_command(published)}")

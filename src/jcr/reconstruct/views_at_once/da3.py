@@ -3,8 +3,7 @@
 Its package builds the network of a configuration (`create_object(load_config(...))`, its README), which is all that is
 taken of it: reading images, exporting and the web page are left alone, and so need not be installed. Its conventions:
 cameras are camera_from_recon, x right, y down, z forward; depth is along z, not along the ray; intrinsics count from the
-image's corner; the unit is arbitrary. Where camera poses go in, they are relative to the first view and in units of the
-median distance from it.
+image's corner; the unit is arbitrary.
 """
 
 import json
@@ -17,7 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from numpy import ndarray
 from torch import nn
 
@@ -29,7 +28,6 @@ from jcr.reconstruct.views_at_once.interface import (
     Predicted,
     Views,
     checked,
-    edge_matrix,
     normalised,
     output,
     pinhole_of_edges,
@@ -38,8 +36,6 @@ from jcr.reconstruct.views_at_once.interface import (
 )
 
 LONG_EDGE, PATCH = 504, 14
-LEAST_UNIT = 0.1
-"""Below which the package takes the median distance between cameras for this."""
 
 
 def load(weights: Path, device: str) -> Predict:
@@ -73,19 +69,14 @@ def build(name: str) -> nn.Module:
 
 
 def predict(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) -> Predicted:
-    """One pass over all views; with poses and intrinsics where the views have both."""
+    """Predict all views in one pass."""
     grid = grid_of(views.size, long_edge)
     colors = np.stack([resized(image, grid, long_edge) for image in views.colors])
     device = next(network.parameters()).device.type
-    extrinsics = intrinsics = None
-    if views.recon_from_camera is not None and views.pinhole is not None:
-        extrinsics = torch.from_numpy(_from_first(views.recon_from_camera)).float().to(device)[None]
-        matrix = torch.from_numpy(edge_matrix(grid.grid_intrinsics(views.pinhole))).float().to(device)
-        intrinsics = matrix.expand(1, len(colors), 3, 3)
     # Half the time on a GPU, and what the package does there; on a CPU half precision is no faster.
     half = torch.autocast("cuda", torch.bfloat16) if device == "cuda" else nullcontext()
     with torch.inference_mode(), half:
-        answer = network(normalised(colors, device)[None], extrinsics, intrinsics)
+        answer = network(normalised(colors, device)[None], None, None)
     count, height, width = colors.shape[:3]
     depth = output(answer, "depth", (count, height, width), "Depth Anything 3")
     pinholes = pinhole_of_edges(output(answer, "intrinsics", (count, 3, 3), "Depth Anything 3"))
@@ -120,12 +111,3 @@ def resized(image: UInt8[ndarray, "h w 3"], grid: ImageGrid, long_edge: int) -> 
             image = cv2.resize(image, size, interpolation=cv2.INTER_CUBIC if enlarges else cv2.INTER_AREA)
             width, height = size
     return image
-
-
-def _from_first(recon_from_camera: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n 4 4"]:
-    """camera_from_first, in units of the median distance between the first camera and the others, itself included."""
-    first_from_camera = inverse(recon_from_camera[0]) @ recon_from_camera
-    distance = np.sort(np.linalg.norm(first_from_camera[:, :3, 3], axis=1))
-    camera_from_first = inverse(first_from_camera)
-    camera_from_first[:, :3, 3] /= max(distance[(len(distance) - 1) // 2], LEAST_UNIT)
-    return camera_from_first

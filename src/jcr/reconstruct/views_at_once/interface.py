@@ -25,8 +25,6 @@ class Views:
     """RGB, upright and without distortion, in the camera's own resolution: resizing is part of a model."""
     pinhole: Intrinsics | None
     """The camera of these images; None: unknown."""
-    recon_from_camera: Float[ndarray, "n 4 4"] | None = None
-    """Camera poses to go by, for models that take them; None: the images alone."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -46,8 +44,8 @@ class Predicted:
     """At least 0; 0 means no estimate. Comparable within an image, and no probability."""
     pinholes: Float[ndarray, "n 4"]
     """fx, fy, cx, cy of each view on the grid, pixel (0, 0) a centre."""
-    recon_from_camera: Float[ndarray, "n 4 4"] | None
-    """Rigid; None for models that see one view at a time."""
+    recon_from_camera: Float[ndarray, "n 4 4"]
+    """Rigid camera poses in one frame of the model's choice."""
     is_metric: bool
     """Whether the unit is meant to be the metre."""
 
@@ -60,11 +58,6 @@ def pinhole_of_edges(matrix: Float[ndarray, "*n 3 3"]) -> Float[ndarray, "*n 4"]
     """fx, fy, cx, cy with pixel (0, 0) a centre, of matrices whose origin is the image's corner, as networks have it."""
     fx, fy, cx, cy = matrix[..., 0, 0], matrix[..., 1, 1], matrix[..., 0, 2], matrix[..., 1, 2]
     return np.stack([fx, fy, cx - 0.5, cy - 0.5], axis=-1)
-
-
-def edge_matrix(pinhole: Intrinsics) -> Float[ndarray, "3 3"]:
-    """K with its origin in the image's corner, the inverse of `pinhole_of_edges`."""
-    return pinhole.matrix + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
 
 
 def rays_of(pinholes: Float[ndarray, "n 4"], height: int, width: int) -> Float[ndarray, "n h w 3"]:
@@ -80,12 +73,8 @@ def normalised(colors: UInt8[ndarray, "n h w 3"], device: str) -> torch.Tensor:
     mean, deviation = (
         torch.tensor(values, device=device)[:, None, None] for values in (IMAGENET_MEAN, IMAGENET_STD)
     )
-    return (unit_range(colors, device) - mean) / deviation
-
-
-def unit_range(colors: UInt8[ndarray, "n h w 3"], device: str) -> torch.Tensor:
-    """Images (n,3,h,w) in [0, 1]."""
-    return torch.from_numpy(np.array(colors)).to(device).permute(0, 3, 1, 2) / 255
+    unit_range = torch.from_numpy(np.array(colors)).to(device).permute(0, 3, 1, 2) / 255
+    return (unit_range - mean) / deviation
 
 
 def output(answer: Any, name: str, shape: tuple[int, ...], model: str) -> ndarray:
@@ -112,8 +101,7 @@ def checked(predicted: Predicted, model: str) -> Predicted:
     confidence = predicted.confidence
     there = np.isfinite(predicted.x_in_camera).all(-1) & np.isfinite(confidence) & (confidence > 0)
     there &= predicted.x_in_camera[..., 2] > 0
-    poses = predicted.recon_from_camera
-    if not there.any() or (poses is not None and not np.isfinite(poses).all()):
+    if not there.any() or not np.isfinite(predicted.recon_from_camera).all():
         raise InputError(
             f"{model} gave no usable depth or camera; its weights may be damaged, get them again"
         )

@@ -1,7 +1,7 @@
 """MapAnything (Keetha et al. 2025, arXiv 2509.13414): points and cameras of all views in metres.
 
 Its conventions are ours: cameras x right, y down, z forward, poses recon_from_camera, pixel (0, 0) a centre. It takes
-intrinsics and camera poses.
+intrinsics.
 """
 
 from functools import partial
@@ -46,7 +46,7 @@ def load(weights: Path, device: str) -> Predict:
 
 
 def predict(model: Model, views: Views, device: str = "cpu") -> Predicted:
-    """One pass over all views, given the intrinsics where known, and the poses where the views have them."""
+    """Predict all views in one pass, given the intrinsics where they are known."""
     grid = image_grid(views.size, LONG_EDGE, PATCH, keep_square=True)
     colors = np.stack([resize_and_crop(image, grid) for image in views.colors])
     shown: list[dict[str, Any]] = [
@@ -56,10 +56,6 @@ def predict(model: Model, views: Views, device: str = "cpu") -> Predicted:
         matrix = torch.from_numpy(grid.grid_intrinsics(views.pinhole).matrix).float().to(device)
         for view in shown:
             view["intrinsics"] = matrix[None]
-    if views.recon_from_camera is not None:
-        for view, pose in zip(shown, views.recon_from_camera, strict=True):
-            view["camera_poses"] = torch.from_numpy(pose).float().to(device)[None]
-            view["is_metric_scale"] = torch.tensor([True], device=device)
     with torch.inference_mode():
         # The mask is applied to the confidence: masked points would be zeros.
         answers = model.infer(shown, use_amp=device != "cpu", apply_mask=False)

@@ -60,7 +60,6 @@ def refine(predicted: Predicted, images: PreparedImages, pinhole: Intrinsics) ->
     it, else a first value of the focal length.
     """
     poses = predicted.recon_from_camera
-    assert poses is not None
     work = ImageGrid.shrunk(images.grid.size, LONG_EDGE)
     smaller = [cv2.resize(image, work.size, interpolation=cv2.INTER_AREA) for image in images.colors]
     gray = np.stack([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in smaller])
