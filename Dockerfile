@@ -10,10 +10,10 @@ ARG EXTRAS=networks,view,ros,lerobot,planning,realsense,franka,xarm
 ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1 OMP_NUM_THREADS=4
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]
 
-# libegl1 renders simulated captures, libusb opens a RealSense, v4l-utils tells which cameras there are.
+# libusb opens a RealSense, v4l-utils tells which cameras there are.
 # hadolint ignore=DL3008
 RUN apt-get update \
- && apt-get install -y --no-install-recommends libegl1 libgl1 libusb-1.0-0 v4l-utils \
+ && apt-get install -y --no-install-recommends libusb-1.0-0 v4l-utils \
  && rm -rf /var/lib/apt/lists/*
 
 WORKDIR /opt/jcr

@@ -13,7 +13,6 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from benchmarks.page import mm_deg, table
-from benchmarks.simulated.problem import HandEyeProblem, disturbed, error
 from benchmarks.synthetic_pairs import PairErrors, PairTruth, synthetic_pairs
 from jcr.geometry import (
     apply_similarity,
@@ -28,6 +27,7 @@ from jcr.reconstruct.dust3r.pair_graph import complete_pairs
 from jcr.reconstruct.global_alignment.align import align, align_with_robot
 from jcr.reconstruct.global_alignment.alignment import AlignOptions
 from jcr.reconstruct.global_alignment.pairs import PairPredictions, write_pairs
+from simulation.problem import HandEyeProblem, disturbed, error
 
 SMALL, MIDDLE, LARGE = (64, 48), (128, 96), (512, 384)
 

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.page import mm_deg, table
-from benchmarks.simulated.faults import INTRINSICS, Faults, FaultyCapture, faulty_capture
 from jcr.adjust.intrinsics_prior import ESTIMATED, FIXED, prior_of
 from jcr.adjust.wrist import adjust_wrist
 from jcr.calibration.options import CalibrateOptions
@@ -20,6 +19,7 @@ from jcr.calibration.stage import calibrate
 from jcr.geometry import step_between
 from jcr.handeye.equation import predict
 from jcr.records import Capture, HandEye, Kind, Reconstruction
+from simulation.faults import INTRINSICS, Faults, FaultyCapture, faulty_capture
 
 DRAWS, FEW, CLEAN = 7, 2, 70
 LONG_TIMES = 3

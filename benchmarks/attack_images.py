@@ -19,13 +19,13 @@ from scipy.special import chdtrc
 
 import jcr
 from benchmarks.page import mm_deg, table
-from benchmarks.simulated import image_faults as make
-from benchmarks.simulated.image_faults import IMAGES, Drawn, Fault
-from benchmarks.simulated.rendered import Rendered, rendered
 from jcr.errors import InputError, RejectedError
 from jcr.geometry import step_between
 from jcr.records import CAMERA, Finding, HandEye, Kind
 from jcr.results import RunResult
+from simulation import image_faults as make
+from simulation.image_faults import IMAGES, Drawn, Fault
+from simulation.rendered import Rendered, rendered
 
 SCENES = 5
 SEEDS, LONG_SEEDS = range(1, 2), range(1, 11)

@@ -15,8 +15,6 @@ from numpy import ndarray
 
 from benchmarks import page
 from benchmarks.attack import reconstructed
-from benchmarks.simulated.boards import Sheet, with_sheet
-from benchmarks.simulated.faults import Faults, FaultyCapture, faulty_capture
 from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.stage import calibrate as calibrate_stage
 from jcr.camera import project, unproject
@@ -29,6 +27,8 @@ from jcr.reconstruct.board import PRINTED, Sighting
 from jcr.reconstruct.marker import pose_of_body
 from jcr.records import Capture, HandEye, Intrinsics, Kind, Reconstruction, Tracks
 from jcr.results import RunOptions, RunResult
+from simulation.boards import Sheet, with_sheet
+from simulation.faults import Faults, FaultyCapture, faulty_capture
 
 DRAWS, LONG_DRAWS = 2, 40
 POSE_SCALES = (1.0, 1.01, 1.02, 1.05)

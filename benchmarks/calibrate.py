@@ -12,14 +12,14 @@ from numpy import ndarray
 from benchmarks.figure import blank, png
 from benchmarks.page import mm_deg, table
 from benchmarks.peers import OPENCV_METHODS, andreff_with_scale, grid_search, opencv
-from benchmarks.simulated.observations import INTRINSICS, observed
-from benchmarks.simulated.problem import HandEyeProblem, error, hand_eye_problem
 from jcr.adjust.wrist import adjust_wrist, recon_frame
 from jcr.calibration.case import of_images
 from jcr.files import write_bytes
 from jcr.geometry import scale_translation
 from jcr.handeye.solve import solve_hand_eye
 from jcr.records import HandEye
+from simulation.observations import INTRINSICS, observed
+from simulation.problem import HandEyeProblem, error, hand_eye_problem
 
 COUNTS = (3, 5, 8, 10, 12, 15)
 NOISES = ((0.0, 0.0), (5e-4, np.radians(0.1)), (2e-3, np.radians(0.5)))

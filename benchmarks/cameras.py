@@ -11,8 +11,6 @@ from numpy import ndarray
 from scipy.stats import chi2
 
 from benchmarks.page import folders_with, mm_deg, table
-from benchmarks.simulated.arm_errors import PresetName
-from benchmarks.simulated.cell import BOX, CellProblem, Kind, cell_problem
 from jcr.adjust.intrinsics_prior import prior_of
 from jcr.adjust.robots import Adjusted, Placed
 from jcr.adjust.scene import Freedom, Scene
@@ -25,6 +23,8 @@ from jcr.errors import RejectedError
 from jcr.geometry import inverse, scale_translation, skew, step_between
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.records import Capture, CellCamera
+from simulation.arm_errors import PresetName
+from simulation.cell import BOX, CellProblem, Kind, cell_problem
 
 DRAWS, MANY_DRAWS = 10, 40
 """Of each kind of cell; with --long."""

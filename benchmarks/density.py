@@ -12,7 +12,6 @@ from scipy.spatial import KDTree
 
 from benchmarks.figure import blank, png
 from benchmarks.page import table
-from benchmarks.simulated.surface import truth_points
 from benchmarks.synthetic_pairs import pairs_of_capture
 from benchmarks.table1 import PUBLISHED, WEBCAM
 from jcr.calibration.stage import calibrate
@@ -25,7 +24,8 @@ from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.reconstruct.global_alignment.pairs import write_pairs
 from jcr.records import Capture, HandEye, Reconstruction
 from jcr.represent.cloud import point_cloud
-from jcr.simulate.capture import SimulateOptions, simulate
+from simulation.capture import SimulateOptions, simulate
+from simulation.surface import truth_points
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,7 +12,6 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 
 from benchmarks.map import places_to_ask, score
-from benchmarks.simulated.truth import read_truth, true_depth, true_labels
 from benchmarks.table1 import WEBCAM
 from jcr.calibration.stage import calibrate
 from jcr.camera import project, rays
@@ -23,7 +22,8 @@ from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.records import BOTH, MATCHED, PRIOR, HandEye, Intrinsics, Reconstruction
 from jcr.represent.build import build_scene
 from jcr.represent.cloud import point_cloud
-from jcr.simulate.capture import SimulateOptions, simulate
+from simulation.capture import SimulateOptions, simulate
+from simulation.truth import read_truth, true_depth, true_labels
 
 LIMITS_MM = (2, 5, 10)
 PLAIN, WEAK = 2.0, 6.0

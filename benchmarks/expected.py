@@ -9,9 +9,6 @@ import numpy as np
 
 from benchmarks.page import folders_with, table
 from benchmarks.seen import WAYS, Knowledge
-from benchmarks.simulated.arm_errors import PresetName
-from benchmarks.simulated.bent import bent_problem
-from benchmarks.simulated.observations import observed
 from jcr.calibration.adjust import adjusted
 from jcr.calibration.case import of_images
 from jcr.calibration.expected import Expectation, assumed, assumed_of, expected, typical_camera
@@ -26,6 +23,9 @@ from jcr.errors import RejectedError
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.pipeline import calibrate as run_calibrate
 from jcr.records import Capture, HandEye, Reconstruction
+from simulation.arm_errors import PresetName
+from simulation.bent import bent_problem
+from simulation.observations import observed
 
 ROBOTS: tuple[PresetName, ...] = ("typical", "white", "typical", "typical", "white")
 COUNTS = (6, 8, 12, 20)

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from benchmarks.simulated.arm_errors import PRESETS
 from jcr.calibration.options import CalibrateOptions
 from jcr.geometry import apply, inverse, retract, rotation_angle, transform
 from jcr.handeye.arms import RobotName, arm_named
@@ -19,10 +18,11 @@ from jcr.handeye.known_scale import fit_known_scale
 from jcr.live.calibration import LiveCalibration
 from jcr.live.calibration_progress import Progress
 from jcr.records import Intrinsics
-from jcr.simulate.bent_arm import BentArm, bend
-from jcr.simulate.poses import looking_at
-from jcr.simulate.render import render
-from jcr.simulate.robots import (
+from simulation.arm_errors import PRESETS
+from simulation.bent_arm import BentArm, bend
+from simulation.poses import looking_at
+from simulation.render import render
+from simulation.robots import (
     EFFECTIVE_NOISE,
     EFFECTIVE_POSES,
     about_posture,
@@ -31,8 +31,8 @@ from jcr.simulate.robots import (
     view_size,
     views,
 )
-from jcr.simulate.scenes import Scene, make_scene, moved
-from jcr.simulate.taken import pinhole
+from simulation.scenes import Scene, make_scene, moved
+from simulation.taken import pinhole
 
 REQUIRE = (2.0, 0.3)
 """mm, degrees: 95 % of errors of a seen point, and of directions there."""

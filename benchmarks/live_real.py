@@ -23,7 +23,7 @@ from jcr.pipeline import calibrate
 from jcr.records import Capture
 from jcr.results import RunResult
 from jcr.run_folder import LIVE
-from jcr.simulate.render import render
+from simulation.render import render
 
 MANY = 40
 """Images of the simulated capture."""

@@ -15,7 +15,7 @@ from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.reconstruct.colmap import reconstruct_colmap
-from jcr.simulate.capture import SimulateOptions, simulate
+from simulation.capture import SimulateOptions, simulate
 
 SIZES, LONG_SIZES = (8, 16, 32), (8, 16, 32, 50, 64, 128, 200)
 

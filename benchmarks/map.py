@@ -17,8 +17,6 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
 from benchmarks.page import table
-from benchmarks.simulated.surface import solid_labels
-from benchmarks.simulated.truth import read_truth, true_depth, true_labels
 from jcr.calibration.stage import calibrate
 from jcr.camera import project, rays
 from jcr.capture.read import read_capture
@@ -34,9 +32,10 @@ from jcr.represent.cloud import point_cloud
 from jcr.represent.options import MapOptions
 from jcr.represent.scene import SceneMap
 from jcr.segment.tabletop import label_tabletop
-from jcr.simulate.capture import SimulateOptions, simulate
-from jcr.simulate.scenes import make_scene
-from jcr.simulate.truth import Truth
+from simulation.capture import SimulateOptions, simulate
+from simulation.scenes import make_scene
+from simulation.surface import solid_labels
+from simulation.truth import Truth, read_truth, true_depth, true_labels
 
 VIEWS, POINTS = 12, 200_000
 QUERIES, SPHERES, FCL_SPHERES = 2_000_000, 1_000_000, 20_000

@@ -7,9 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.page import mm_deg, table
-from benchmarks.simulated.problem import HandEyeProblem, error
-from benchmarks.simulated.surface import truth_points
-from benchmarks.simulated.truth import read_truth
 from benchmarks.synthetic_pairs import pairs_of_capture
 from jcr.capture.read import read_capture
 from jcr.pipeline import RunOptions
@@ -17,7 +14,10 @@ from jcr.pipeline import run as run_all
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.global_alignment.pairs import write_pairs
 from jcr.results import RunResult
-from jcr.simulate.capture import SimulateOptions, simulate
+from simulation.capture import SimulateOptions, simulate
+from simulation.problem import HandEyeProblem, error
+from simulation.surface import truth_points
+from simulation.truth import read_truth
 
 SEEDS, MANY_SEEDS = 1, 3
 """MANY_SEEDS with --long."""

@@ -12,13 +12,13 @@ from numpy import ndarray
 from benchmarks.figure import blank, png
 from benchmarks.page import table
 from benchmarks.peers import opencv
-from benchmarks.simulated.arm_errors import PresetName
-from benchmarks.simulated.bent import BentProblem, bent_problem
-from benchmarks.simulated.problem import error
 from jcr.files import write_bytes
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.handeye.solve import solve_hand_eye
 from jcr.records import HandEye
+from simulation.arm_errors import PresetName
+from simulation.bent import BentProblem, bent_problem
+from simulation.problem import error
 
 ARMS = ROBOT_NAMES
 PRESETS: tuple[PresetName, ...] = get_args(PresetName)

@@ -8,9 +8,6 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from benchmarks.page import table
-from benchmarks.simulated.arm_errors import PresetName
-from benchmarks.simulated.bent import BentProblem, bent_problem
-from benchmarks.simulated.observations import INTRINSICS, observed
 from jcr.adjust.intrinsics_prior import ESTIMATED, IntrinsicsPrior, prior_of
 from jcr.adjust.wrist import adjust_wrist
 from jcr.calibration.adjust import estimate_of
@@ -20,6 +17,9 @@ from jcr.geometry import apply, step_between
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.handeye.solve import solve_hand_eye
 from jcr.records import Estimate, Intrinsics
+from simulation.arm_errors import PresetName
+from simulation.bent import BentProblem, bent_problem
+from simulation.observations import INTRINSICS, observed
 
 PRESETS: tuple[PresetName, ...] = ("white", "typical")
 COUNTS = (8, 12, 30)

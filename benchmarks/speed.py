@@ -175,8 +175,8 @@ def _timed(function: Callable, spent: dict[str, float], name: str) -> Callable:
 def _calibration(images: int, repeats: int) -> tuple[int, int, float]:
     """Images, observations, and the processor seconds of their calibration."""
     from benchmarks.attack import reconstructed
-    from benchmarks.simulated.faults import faulty_capture
     from jcr.calibration.stage import calibrate
+    from simulation.faults import faulty_capture
 
     seconds, count = [], 0
     for seed in range(repeats):

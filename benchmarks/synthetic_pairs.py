@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from benchmarks.simulated.truth import read_truth, true_depth
 from jcr.camera import rays
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, transform
 from jcr.reconstruct.dust3r.pair_graph import complete_pairs
 from jcr.reconstruct.global_alignment.pairs import PairPredictions
 from jcr.records import Intrinsics
+from simulation.truth import read_truth, true_depth
 
 SPHERES = np.array([[0.12, 0.04, 0.08, 0.08], [-0.17, 0.13, 0.06, 0.06], [0.03, -0.21, 0.10, 0.10]])
 """Centre and radius, metres; they lie on the table z = 0."""

@@ -10,7 +10,6 @@ from scipy.stats import norm
 
 from benchmarks.page import apart, table
 from benchmarks.peers import grid_search
-from benchmarks.simulated.truth import read_truth
 from benchmarks.synthetic_pairs import PairErrors, pairs_of_capture
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
@@ -22,9 +21,9 @@ from jcr.reconstruct.colmap import reconstruct_colmap
 from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.reconstruct.global_alignment.pairs import ARRAYS, write_pairs
 from jcr.records import Capture, Reconstruction
-from jcr.simulate.capture import SimulateOptions, simulate
-from jcr.simulate.scenes import SceneName
-from jcr.simulate.truth import Truth
+from simulation.capture import SimulateOptions, simulate
+from simulation.scenes import SceneName
+from simulation.truth import Truth, read_truth
 
 SCENES: tuple[SceneName, ...] = ("light8", "light7", "dark")
 COUNTS = (10, 12, 15)

@@ -11,7 +11,6 @@ from numpy import ndarray
 from scipy.optimize import linear_sum_assignment
 
 from benchmarks.page import table
-from benchmarks.simulated.truth import read_truth
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.depth.densify import densify
@@ -20,8 +19,8 @@ from jcr.represent.cloud import point_cloud
 from jcr.segment.labels import read_labels
 from jcr.segment.measure import ObjectSize, measure
 from jcr.segment.tabletop import label_tabletop
-from jcr.simulate.capture import SimulateOptions, simulate
-from jcr.simulate.truth import TrueObject
+from simulation.capture import SimulateOptions, simulate
+from simulation.truth import TrueObject, read_truth
 
 SEEDS, MANY_SEEDS = (3, 4, 5), (3, 4, 5, 6, 7)
 """With --long."""

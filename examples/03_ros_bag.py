@@ -17,7 +17,7 @@ from jcr.capture.options import ReadOptions
 from jcr.check import check
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))  # of the checkout, for what is simulated
-from benchmarks.simulated.ros_bag import write_bag
+from simulation.ros_bag import write_bag
 
 out = Path("out/ros_bag")
 shutil.rmtree(out, ignore_errors=True)

@@ -24,7 +24,7 @@ from jcr.live.rest import asks_at_rest
 from jcr.live.ur import states
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))  # of the checkout, for what is simulated
-from benchmarks.simulated.ur import SimulatedUr
+from simulation.ur import SimulatedUr
 
 
 def simulated_camera(table, arm):

@@ -16,11 +16,11 @@ import pytest
 from PIL import Image
 
 import shape_checks
-from benchmarks.simulated.truth import read_truth
 from jcr.geometry import apply, transform
-from jcr.simulate.scenes import make_scene
 from places import ROOT, SHARED
 from sift_once import find_sift_once
+from simulation.scenes import make_scene
+from simulation.truth import read_truth
 
 if TYPE_CHECKING:
     import trimesh

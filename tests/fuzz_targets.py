@@ -9,8 +9,6 @@ import numpy as np
 from PIL import Image
 
 import capture_writers as writers
-from benchmarks.simulated.problem import hand_eye_problem
-from benchmarks.simulated.ros_bag import write_bag
 from jcr.calibration.calibration_json import (
     calibration_file,
     read_calibration,
@@ -35,6 +33,8 @@ from jcr.records import Attempt, Capture, Intrinsics, PointCloud, Pointmaps, Pos
 from jcr.represent.cloud_ply import read_cloud, write_cloud
 from jcr.represent.map_file import load_map
 from jcr.represent.options import MapOptions
+from simulation.problem import hand_eye_problem
+from simulation.ros_bag import write_bag
 
 SIZE = (16, 12)
 COUNT = 4

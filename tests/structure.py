@@ -18,8 +18,6 @@ import yaml
 from PIL import Image
 
 import capture_writers as writers
-from benchmarks.simulated.problem import hand_eye_problem
-from benchmarks.simulated.ros_bag import write_bag
 from fuzz_targets import NAMES, SIZE, small_capture, sound_run
 from jcr.batch import STATE as BATCH
 from jcr.batch import _finished
@@ -37,6 +35,8 @@ from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_recons
 from jcr.records import Capture
 from jcr.run_folder import RunFolder
 from jcr.segment.labels import _read_names
+from simulation.problem import hand_eye_problem
+from simulation.ros_bag import write_bag
 
 TOO_LONG_S = 5.0
 VALUES = {

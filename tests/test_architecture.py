@@ -28,7 +28,6 @@ LAYERS = [
     {"calibration"},
     {"cell"},
     {"represent", "segment"},
-    {"simulate"},
     {"attempts", "check"},
     {"run_folder"},
     {"results"},

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.simulated.problem import HandEyeProblem, hand_eye_problem
 from jcr import attempts
 from jcr.calibration import stage as calibration_stage
 from jcr.calibration.checks import capture as capture_checks
@@ -22,6 +21,7 @@ from jcr.handeye.solve import solve_hand_eye
 from jcr.reconstruct import backends
 from jcr.reconstruct.backends import Backend, ReconstructOptions
 from jcr.records import Capture, Finding, HandEye, Intrinsics, Kind, Pointmaps, Reconstruction, Tracks
+from simulation.problem import HandEyeProblem, hand_eye_problem
 
 GARBAGE = {
     "enc_embed_dim": 32,

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 import jcr
-from benchmarks.simulated.problem import hand_eye_problem
 from conftest import shrunk_capture
 from jcr.calibration.checks.left_out import left_out_poses
 from jcr.capture.images import BLURRED_EDGE, edge_width, read_image, show_one_view
 from jcr.cli import dispatch
 from jcr.handeye.solve import solve_hand_eye
 from jcr.records import Capture, Intrinsics, Kind, Reconstruction, Tracks
+from simulation.problem import hand_eye_problem
 
 RNG = np.random.default_rng(0)
 INTRINSICS = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480)

@@ -6,8 +6,8 @@ import pytest
 from benchmarks.predictions import end_to_end
 from jcr.errors import InputError
 from jcr.records import Intrinsics
-from jcr.simulate.render import render
-from jcr.simulate.scenes import make_scene
+from simulation.render import render
+from simulation.scenes import make_scene
 
 
 @pytest.mark.gl

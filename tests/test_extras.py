@@ -30,7 +30,6 @@ def test_the_extras_that_are_named_exist():
         "sam",
         "ros",
         "lerobot",
-        "sim",
         "planning",
     }
     assert not {(name, file) for name, file in named if name not in PROJECT["optional-dependencies"]}
@@ -57,7 +56,7 @@ def test_a_package_that_is_there_but_broken_reports_why(tmp_path, monkeypatch: p
     (tmp_path / "brokenpackage.py").write_text("raise ImportError('libmissing.so: no such file')")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(InputError, match=r"cannot be imported \(libmissing.so: no such file\): pip install"):
-        extra("brokenpackage", "sim", "the simulation")
+        extra("brokenpackage", "view", "the simulation")
     monkeypatch.setitem(sys.modules, "brokenpackage", None)
     with pytest.raises(InputError, match="the simulation needs brokenpackage, which is not installed"):
-        extra("brokenpackage", "sim", "the simulation")
+        extra("brokenpackage", "view", "the simulation")

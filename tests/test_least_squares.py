@@ -5,10 +5,10 @@ import pytest
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from benchmarks.simulated.problem import hand_eye_problem
 from jcr.geometry import apply, retract, rotation_exp, skew, step_between, transform
 from jcr.handeye import solve
 from jcr.least_squares import loss_weight, minimise
+from simulation.problem import hand_eye_problem
 
 TIME = np.linspace(0, 4, 60)
 

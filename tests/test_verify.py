@@ -11,7 +11,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jcr
-from benchmarks.simulated.bent import bent_problem
 from jcr.calibration.calibration_json import calibration_file, write_calibration
 from jcr.calibration.drift import drift
 from jcr.calibration.options import CalibrateOptions
@@ -27,7 +26,8 @@ from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.relocate import Located, relocate
 from jcr.records import Capture, Reconstruction, Tracks
 from jcr.run_folder import MadeWith, RunFolder, state_of
-from jcr.simulate.taken import with_robot_noise
+from simulation.bent import bent_problem
+from simulation.taken import with_robot_noise
 
 pytestmark = pytest.mark.slow
 

@@ -24,7 +24,6 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
         ("run_folder.py", "files and state", 1),
         ("results.py", "options, result", 1),
     ),
-    (("simulate/", "captures with known answers", 1),),
     (("segment/", "labels and sizes of objects", 1), ("represent/", "cloud, trained map, queries", 1)),
     (("cell/", "every camera of the cell: fixed, several on a wrist, two arms, eye-to-hand", 1),),
     (("calibration/", "the stage: fit, adjust, checks, verdict, requirement; calibration.json", 1),),

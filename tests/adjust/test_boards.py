@@ -5,8 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.simulated.boards import Sheet, with_sheet
-from benchmarks.simulated.faults import Faults, FaultyCapture, faulty_capture
 from jcr.adjust.boards import shapes_of
 from jcr.adjust.images import ImageEvidence, adjust_images
 from jcr.adjust.intrinsics_prior import FIXED, prior_of
@@ -15,6 +13,8 @@ from jcr.adjust.robots import Adjusted
 from jcr.adjust.scene import Freedom, Observations, Scene, similarities, stepped
 from jcr.adjust.wrist import adjust_wrist
 from jcr.geometry import inverse, step_between
+from simulation.boards import Sheet, with_sheet
+from simulation.faults import Faults, FaultyCapture, faulty_capture
 
 pytestmark = pytest.mark.slow
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.simulated.cell import CellProblem, cell_problem
 from jcr.adjust.intrinsics_prior import MEASURED, prior_of
 from jcr.adjust.projection import ImageProblem, derivatives, view_of
 from jcr.adjust.scene import OF_IMAGE, PRISM, Freedom, NuisancePrior, Scene, at_start, stepped
 from jcr.adjust.together import adjust
+from simulation.cell import CellProblem, cell_problem
 
 COUNT = 6
 

@@ -6,8 +6,6 @@ from functools import cache
 import numpy as np
 import pytest
 
-from benchmarks.simulated.observations import INTRINSICS, observed
-from benchmarks.simulated.problem import hand_eye_problem
 from jcr.adjust.intrinsics_prior import ESTIMATED, FIXED, prior_of
 from jcr.adjust.model_error import TYPICAL, displacements
 from jcr.adjust.robots import Adjusted
@@ -15,6 +13,8 @@ from jcr.adjust.wrist import adjust_wrist
 from jcr.camera import by_parameters, unproject
 from jcr.handeye.solve import solve_hand_eye
 from jcr.records import Intrinsics
+from simulation.observations import INTRINSICS, observed
+from simulation.problem import hand_eye_problem
 
 
 @cache

@@ -7,13 +7,13 @@ import pytest
 from jaxtyping import Float
 from numpy import ndarray
 
-from benchmarks.simulated.observations import INTRINSICS, observed
-from benchmarks.simulated.problem import hand_eye_problem
 from jcr.adjust.images import ImageEvidence, adjust_images
 from jcr.adjust.intrinsics_prior import FIXED, prior_of
 from jcr.adjust.scene import Freedom, Observations, Scene
 from jcr.geometry import step_between
 from jcr.records import Tracks
+from simulation.observations import INTRINSICS, observed
+from simulation.problem import hand_eye_problem
 
 SEEDS = range(6)
 

@@ -5,8 +5,6 @@ import pytest
 from scipy.stats import chi2
 
 import jcr
-from benchmarks.simulated.observations import INTRINSICS, observed
-from benchmarks.simulated.problem import HandEyeProblem, error, hand_eye_problem
 from jcr.adjust import together
 from jcr.adjust.images import median_reprojection_px
 from jcr.adjust.intrinsics_prior import ESTIMATED, MEASURED, prior_of
@@ -15,6 +13,8 @@ from jcr.adjust.wrist import WristOptions, adjust_wrist, recon_frame
 from jcr.camera import parameters, with_parameters
 from jcr.geometry import step_between
 from jcr.records import Intrinsics, Tracks
+from simulation.observations import INTRINSICS, observed
+from simulation.problem import HandEyeProblem, error, hand_eye_problem
 
 
 def solved(

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.attack_images import Case, Outcome, page
-from benchmarks.simulated import image_faults as make
-from benchmarks.simulated.image_faults import IMAGES, Fault, draw
-from benchmarks.simulated.rendered import FOCAL_PX, POSES, SIZE, WIDE, Rendered
 from jcr.geometry import inverse, step_between
 from jcr.records import Intrinsics, Kind
-from jcr.simulate.poses import gripper_poses, random_hand_eye
+from simulation import image_faults as make
+from simulation.image_faults import IMAGES, Fault, draw
+from simulation.poses import gripper_poses, random_hand_eye
+from simulation.rendered import FOCAL_PX, POSES, SIZE, WIDE, Rendered
 
 
 def scene() -> Rendered:

@@ -20,13 +20,13 @@ from benchmarks.freshness import (
     marked,
 )
 from benchmarks.peers import grid_search
-from benchmarks.simulated.problem import hand_eye_problem
 from benchmarks.suite import CLAIM, MARKS, Outcome, claims, run, with_claims, write_index
 from benchmarks.table import BENCHES, LONG, paths_of
 from jcr.cli import call
 from jcr.errors import InputError
 from jcr.geometry import rotation_between_deg, scale_translation
 from places import ROOT
+from simulation.problem import hand_eye_problem
 
 RESULTS = ROOT / "docs" / "results"
 MEASURED = re.compile(r"(\d[\d,.]*\d|\d)\s?(mm|cm|°|%|ms|s|dB|GiB|GB|MiB|M|minutes|times)(?![\w])")

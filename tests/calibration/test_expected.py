@@ -11,7 +11,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.expected import FACTOR, simulated
-from benchmarks.simulated.problem import HandEyeProblem, hand_eye_problem
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file
 from jcr.calibration.expected import Ahead, assumed, expected, typical_camera
 from jcr.calibration.poses import calibrate_poses
@@ -20,6 +19,7 @@ from jcr.check import check
 from jcr.geometry import transform
 from jcr.handeye.next_poses import assumed_camera
 from jcr.records import Intrinsics, NextPose, PosePairs
+from simulation.problem import HandEyeProblem, hand_eye_problem
 
 WITHIN = np.log(FACTOR)
 

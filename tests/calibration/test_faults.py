@@ -8,12 +8,6 @@ import numpy as np
 import pytest
 
 from benchmarks.attack import calibrated, outcome, reconstructed
-from benchmarks.simulated.arm_errors import PresetName
-from benchmarks.simulated.bent import bent_problem
-from benchmarks.simulated.faults import INTRINSICS, Faults, faulty_capture
-from benchmarks.simulated.observations import INTRINSICS as OBSERVED_BY
-from benchmarks.simulated.observations import observed
-from benchmarks.simulated.problem import hand_eye_problem
 from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.checks.camera import is_material, of_some
 from jcr.calibration.checks.sequence import sequence_fault
@@ -26,6 +20,12 @@ from jcr.handeye.solve import solve_hand_eye
 from jcr.handeye.systematic import smooth_errors
 from jcr.records import BENT, Capture, Finding, Kind, Reconstruction
 from jcr.records.words import sentence
+from simulation.arm_errors import PresetName
+from simulation.bent import bent_problem
+from simulation.faults import INTRINSICS, Faults, faulty_capture
+from simulation.observations import INTRINSICS as OBSERVED_BY
+from simulation.observations import observed
+from simulation.problem import hand_eye_problem
 
 pytestmark = pytest.mark.slow
 

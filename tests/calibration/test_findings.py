@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.simulated.problem import hand_eye_problem
 from jcr.calibration.calibration_json import (
     CalibrationFile,
     calibration_file,
@@ -37,6 +36,7 @@ from jcr.records import (
 )
 from jcr.records.words import remedy, sentence, text
 from places import ROOT
+from simulation.problem import hand_eye_problem
 
 GOLDEN = ROOT / "tests" / "golden"
 """Files as the version before findings wrote them."""

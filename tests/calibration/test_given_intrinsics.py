@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.simulated.observations import INTRINSICS, observed
-from benchmarks.simulated.problem import HandEyeProblem, error, hand_eye_problem
 from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.records import Capture, HandEye, Intrinsics, Reconstruction
+from simulation.observations import INTRINSICS, observed
+from simulation.problem import HandEyeProblem, error, hand_eye_problem
 
 
 def pictured(

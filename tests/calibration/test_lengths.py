@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from benchmarks.attack import reconstructed
-from benchmarks.simulated.boards import Sheet, with_sheet
-from benchmarks.simulated.faults import Faults, faulty_capture
 from jcr.calibration import fit
 from jcr.calibration.checks import lengths
 from jcr.calibration.checks.lengths import Length, contradiction, finding_of
@@ -16,6 +14,8 @@ from jcr.calibration.stage import calibrate
 from jcr.geometry import step_between
 from jcr.records import DepthCheck, Finding, HandEye, Kind
 from jcr.records.words import sentence
+from simulation.boards import Sheet, with_sheet
+from simulation.faults import Faults, faulty_capture
 
 pytestmark = pytest.mark.slow
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.simulated.problem import HandEyeProblem, disturbed, hand_eye_problem
 from jcr import pipeline, stages
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file, write_calibration
 from jcr.calibration.expected import assumed_of_poses
@@ -26,6 +25,7 @@ from jcr.records import Finding, HandEye, Kind, PosePairs
 from jcr.records.words import sentence
 from jcr.report.html import poses_report_html
 from jcr.results import PosesResult, RunOptions
+from simulation.problem import HandEyeProblem, disturbed, hand_eye_problem
 
 DISAGREE = Finding(
     kind=Kind.EARLIER_VERSION, severity="rejects", details={"text": "the images disagree", "remedy": ""}

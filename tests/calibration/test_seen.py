@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from benchmarks.seen import BENT, WAYS, measure
-from benchmarks.simulated.observations import INTRINSICS, observed
-from benchmarks.simulated.problem import HandEyeProblem, hand_eye_problem
 from jcr.adjust.intrinsics_prior import ESTIMATED, prior_of
 from jcr.adjust.points import points_in_base
 from jcr.adjust.robots import Adjusted
@@ -28,6 +26,8 @@ from jcr.camera import parameters, unproject, with_parameters
 from jcr.geometry import apply, inverse, retract
 from jcr.handeye.solve import solve_hand_eye
 from jcr.records import Estimate, HandEye, Intrinsics, Tracks
+from simulation.observations import INTRINSICS, observed
+from simulation.problem import HandEyeProblem, hand_eye_problem
 
 X_PX = np.array([[319.5, 239.5], [40.0, 30.0], [600.0, 450.0]])
 DISTANCE_M = 0.45

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from benchmarks.attack import reconstructed
-from benchmarks.simulated.faults import faulty_capture
 from jcr.adjust import images
 from jcr.adjust.wrist import adjust_wrist
 from jcr.calibration import adjust as adjust_stage
@@ -15,6 +14,7 @@ from jcr.calibration.stage import calibrate
 from jcr.geometry import retract, step_between
 from jcr.handeye.solve import solve_hand_eye
 from jcr.records import Kind, Tracks
+from simulation.faults import faulty_capture
 
 
 @pytest.mark.slow

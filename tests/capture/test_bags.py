@@ -11,8 +11,6 @@ import pytest
 
 import capture_writers as writers
 import jcr
-from benchmarks.simulated.problem import hand_eye_problem
-from benchmarks.simulated.ros_bag import nearest_view, write_bag
 from in_process import run_jcr
 from jcr.capture.best_frames import best_frames
 from jcr.capture.depth_images import read_depth
@@ -23,6 +21,8 @@ from jcr.capture.ros_image import depth_of, image_of
 from jcr.files import write_bytes
 from jcr.geometry import rotation_exp, transform
 from jcr.records import Capture, CellCamera
+from simulation.problem import hand_eye_problem
+from simulation.ros_bag import nearest_view, write_bag
 
 pytest.importorskip("rosbags", reason="rosbags is not installed (extra ros)")
 FRAMES = ReadOptions(base_frame="base_link", gripper_frame="tool0", frames=12)

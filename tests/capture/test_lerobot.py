@@ -10,11 +10,11 @@ import pytest
 
 import capture_writers as writers
 import jcr
-from benchmarks.simulated.problem import HandEyeProblem, hand_eye_problem
 from jcr.capture.images import read_image
 from jcr.capture.joints import read_arm
 from jcr.capture.options import ReadOptions
 from jcr.records import Capture
+from simulation.problem import HandEyeProblem, hand_eye_problem
 
 pytestmark = [
     pytest.mark.skipif(find_spec(name) is None, reason=f"{name} is not installed (extra lerobot)")

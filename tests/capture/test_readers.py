@@ -10,7 +10,6 @@ import pytest
 
 import capture_writers as writers
 import jcr
-from benchmarks.simulated.problem import HandEyeProblem, hand_eye_problem
 from in_process import run_jcr
 from jcr.capture.formats import capture_json
 from jcr.capture.options import ReadOptions
@@ -21,6 +20,7 @@ from jcr.capture.robot_poses import CONVENTIONS, poses_from_numbers
 from jcr.cli.query import read_points
 from jcr.geometry import scale_translation
 from jcr.records import Capture, PosePairs
+from simulation.problem import HandEyeProblem, hand_eye_problem
 
 
 @pytest.fixture(scope="module")

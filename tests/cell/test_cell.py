@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import jcr
-from benchmarks.simulated.cell import CellProblem, Kind, cell_problem
 from jcr.adjust.images import evidence, noise_of
 from jcr.adjust.intrinsics_prior import FIXED, prior_of
 from jcr.adjust.projection import ImageProblem, view_of
@@ -39,6 +38,7 @@ from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.relocate import Features
 from jcr.records import Capture, CellCamera, Finding, HandEye, Intrinsics, Reconstruction, Tracks
 from jcr.records import Kind as FindingKind
+from simulation.cell import CellProblem, Kind, cell_problem
 
 COUNT = 8
 OLD = 9

@@ -15,7 +15,6 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from benchmarks.simulated.problem import hand_eye_problem
 from capture_writers import write_easy_handeye2
 from jcr.cli import COMMANDS, dispatch
 from jcr.cli.arguments import groups
@@ -26,6 +25,7 @@ from jcr.export.formats import FORMATS
 from jcr.export.options import FormatName
 from jcr.geometry import scale_translation
 from places import ROOT
+from simulation.problem import hand_eye_problem
 
 
 @pytest.fixture(scope="module")

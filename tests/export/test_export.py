@@ -20,8 +20,6 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import jcr
-from benchmarks.simulated.surface import solid_labels
-from benchmarks.simulated.truth import read_truth
 from jcr.calibration.calibration_json import read_calibration
 from jcr.camera import project, unproject
 from jcr.capture.images import read_image
@@ -35,8 +33,10 @@ from jcr.files import write_bytes
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics, PointCloud, Tracks
 from jcr.represent.cloud_ply import read_cloud
-from jcr.simulate.scenes import make_scene
 from places import ROOT
+from simulation.scenes import make_scene
+from simulation.surface import solid_labels
+from simulation.truth import read_truth
 
 if TYPE_CHECKING:
     import trimesh

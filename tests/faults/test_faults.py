@@ -23,8 +23,6 @@ import pytest
 from PIL import Image
 
 from benchmarks.attack import reconstructed
-from benchmarks.simulated.faults import Faults, faulty_capture
-from benchmarks.simulated.problem import hand_eye_problem
 from jcr import attempts, pipeline, run_folder
 from jcr.calibration.calibration_json import read_calibration
 from jcr.calibration.checks import capture as capture_checks
@@ -36,6 +34,8 @@ from jcr.handeye.arms import arm_named
 from jcr.handeye.robots import forward_kinematics
 from jcr.records import Capture, Reconstruction
 from jcr.run_folder import RunFolder
+from simulation.faults import Faults, faulty_capture
+from simulation.problem import hand_eye_problem
 
 SIZE = (96, 72)
 COUNT = 6

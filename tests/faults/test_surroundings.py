@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.simulated.problem import hand_eye_problem
 from capture_writers import write_easy_handeye2
 from jcr.calibration.calibration_json import read_calibration
 from jcr.errors import InputError
 from jcr.geometry import scale_translation
 from jcr.reconstruct.reconstruction_npz import read_reconstruction
+from simulation.problem import hand_eye_problem
 from waiting import until
 
 pytestmark = pytest.mark.slow

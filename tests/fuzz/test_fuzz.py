@@ -13,11 +13,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import jcr
-from benchmarks.simulated.problem import HandEyeProblem, error, hand_eye_problem
 from fuzz_targets import Target, targets
 from jcr.errors import InputError
 from jcr.geometry import rotation_exp, transform
-from jcr.simulate.poses import Pattern
+from simulation.poses import Pattern
+from simulation.problem import HandEyeProblem, error, hand_eye_problem
 
 pytestmark = pytest.mark.slow
 

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.simulated.problem import hand_eye_problem
 from jcr.geometry import inverse, retract, rotation_exp, scale_translation, step_between, transform
 from jcr.handeye.closed_form import closed_form, initial_estimate
+from simulation.problem import hand_eye_problem
 
 repeatable = settings(derandomize=True, deadline=None, max_examples=30)
 seeds = st.integers(0, 2**32 - 1)

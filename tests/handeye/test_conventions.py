@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.simulated.problem import hand_eye_problem
 from jcr.capture.names import paired_by_name
 from jcr.geometry import inverse, transform
 from jcr.handeye import conventions
@@ -19,6 +18,7 @@ from jcr.handeye.conventions import (
     convention_finding,
 )
 from jcr.records.words import sentence
+from simulation.problem import hand_eye_problem
 
 
 def with_rotation(poses: np.ndarray, rotation: Rotation) -> np.ndarray:

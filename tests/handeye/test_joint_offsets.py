@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from benchmarks.simulated.arm_errors import PresetName
-from benchmarks.simulated.bent import bent_problem
 from jcr.geometry import rotation_exp, transform
 from jcr.handeye.arms import arm_named
 from jcr.handeye.joint_offsets import joint_offsets, systematic_p_value
 from jcr.handeye.residuals import angle_ratio
 from jcr.handeye.solve import solve_hand_eye
 from jcr.handeye.systematic import arm_errors, posed
+from simulation.arm_errors import PresetName
+from simulation.bent import bent_problem
 
 
 def examined(preset: PresetName, seed: int):

@@ -20,7 +20,7 @@ from jcr.handeye.robots import (
     joint_frames,
     with_tool,
 )
-from jcr.simulate.bent_arm import BentArm, error_names
+from simulation.bent_arm import BentArm, error_names
 
 H = np.pi / 2
 Z = (0, 0, 1)

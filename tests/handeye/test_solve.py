@@ -6,7 +6,6 @@ import pytest
 from scipy.stats import chi2
 
 import jcr
-from benchmarks.simulated.problem import error, hand_eye_problem
 from jcr.geometry import inverse, retract, rotation_between_deg, rotation_exp, scale_translation, transform
 from jcr.handeye.closed_form import closed_form
 from jcr.handeye.equation import PRIOR_STD, residuals, residuals_by_camera
@@ -14,6 +13,7 @@ from jcr.handeye.fit import Cues, PoseProblem, fit_poses
 from jcr.handeye.mixed_model import Equations, left_out, solve
 from jcr.handeye.systematic import smooth_errors
 from jcr.records import Kind
+from simulation.problem import error, hand_eye_problem
 
 NOISE = (5e-4, np.radians(0.1))
 

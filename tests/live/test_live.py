@@ -18,7 +18,6 @@ import pytest
 from numpy import ndarray
 
 import jcr
-from benchmarks.simulated.ur import SimulatedUr
 from jcr.capture.images import read_image
 from jcr.live import line_server, ur
 from jcr.live.asks import Ask, pose_of_numbers
@@ -32,6 +31,7 @@ from jcr.live.rest import asks_at_rest
 from jcr.live.typed import typed_poses
 from places import ROOT
 from scripted_capture import Scripted
+from simulation.ur import SimulatedUr
 from waiting import until
 
 RATE = 10

@@ -11,7 +11,7 @@ import jcr
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.live.next_pose import AIMED, ELSEWHERE_M, Reach, Tried, before_calibration
 from jcr.records import Capture, HandEye
-from jcr.simulate.poses import looking_at
+from simulation.poses import looking_at
 
 SCENE = np.array([0.5, 0.0, 0.1])
 TILTED = transform(rotation_exp(np.array([0.6, 0.2, 0.0])), np.array([0.06, -0.03, 0.05]))

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from benchmarks.simulated.problem import HandEyeProblem, hand_eye_problem
 from jcr.geometry import inverse, rotation_angle, rotation_exp, transform
 from jcr.handeye.closed_form import motions
 from jcr.match.epipolar import translation_of_x
@@ -13,6 +12,7 @@ from jcr.match.still import hidden, still_cells
 from jcr.match.two_view import Reading, readings
 from jcr.match.verify import View
 from jcr.records import Intrinsics
+from simulation.problem import HandEyeProblem, hand_eye_problem
 
 N = 8
 FOCAL = 600.0

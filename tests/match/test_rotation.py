@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from benchmarks.simulated.problem import hand_eye_problem
 from jcr.geometry import inverse, rotation_angle, rotation_exp
 from jcr.handeye.closed_form import motions
 from jcr.match.rotation import rotation_of_x
+from simulation.problem import hand_eye_problem
 
 
 def pairs(seed: int, n: int = 8) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from benchmarks.attack import reconstructed
-from benchmarks.simulated.faults import Faults, FaultyCapture, faulty_capture
 from jcr.calibration.stage import calibrate
 from jcr.camera import project
 from jcr.geometry import apply, inverse, rotation_exp, transform
@@ -16,6 +15,7 @@ from jcr.reconstruct.board import Board, Sighting, boards, is_of_unknown_size, s
 from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Capture, Kind, Reconstruction
 from jcr.records.words import sentence
+from simulation.faults import Faults, FaultyCapture, faulty_capture
 
 pytestmark = pytest.mark.slow
 

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 import jcr
-from benchmarks.simulated.boards import with_chessboard
-from benchmarks.simulated.truth import read_truth
 from jcr.capture.images import encode_png, read_image
 from jcr.files import write_bytes
 from jcr.geometry import inverse, rotation_exp, transform
 from jcr.records import Kind
 from jcr.records.words import sentence
 from jcr.results import RunResult
+from simulation.boards import with_chessboard
+from simulation.truth import read_truth
 
 pytestmark = pytest.mark.slow
 ROWS = (0, 1, 2, 3, 5, 8, 10, 11)

@@ -11,7 +11,6 @@ from jaxtyping import Float
 from numpy import ndarray
 from PIL import Image
 
-from benchmarks.simulated.truth import read_truth
 from jcr.camera import project
 from jcr.capture.read import read_capture
 from jcr.depth.densify import densify, undistorted
@@ -23,6 +22,7 @@ from jcr.progress import silent
 from jcr.reconstruct.colmap import reconstruct_colmap
 from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.records import Capture, Reconstruction
+from simulation.truth import read_truth
 
 pytestmark = pytest.mark.slow
 

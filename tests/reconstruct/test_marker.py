@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from benchmarks.real import run as run_real
-from benchmarks.simulated.problem import TARGET_IN_BASE, HandEyeProblem, hand_eye_problem
 from jcr.calibration.stage import calibrate
 from jcr.camera import unproject
 from jcr.capture.read import read_capture
@@ -23,6 +22,7 @@ from jcr.reconstruct.marker import reconstruct_marker
 from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Intrinsics, Kind
 from places import SHARED
+from simulation.problem import TARGET_IN_BASE, HandEyeProblem, hand_eye_problem
 
 pytestmark = pytest.mark.slow
 

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from benchmarks.attack import reconstructed
-from benchmarks.simulated.boards import Sheet, with_sheet
-from benchmarks.simulated.faults import Faults, faulty_capture
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import encode_png
@@ -17,6 +15,8 @@ from jcr.report.board import board_section
 from jcr.report.html import report_html
 from jcr.report.svg import Figure
 from jcr.results import RunResult
+from simulation.boards import Sheet, with_sheet
+from simulation.faults import Faults, faulty_capture
 
 pytestmark = pytest.mark.slow
 BEND_M = 2e-3

@@ -16,7 +16,6 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 import jcr
-from benchmarks.simulated.truth import read_truth
 from chromium import Chromium
 from conftest import shrunk_capture
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file, failed_file
@@ -57,7 +56,7 @@ from jcr.represent.cloud import point_cloud
 from jcr.represent.options import MapOptions
 from jcr.results import RunResult
 from jcr.rounding import decimals_of, significant
-from jcr.simulate.truth import Truth
+from simulation.truth import Truth, read_truth
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.simulated.truth import read_truth, true_depth
 from jcr.camera import rays, resized, undistort_image
 from jcr.capture.added import read_added, read_pose, with_images, write_added
 from jcr.capture.images import read_image
@@ -34,10 +33,10 @@ from jcr.records import (
 )
 from jcr.represent.cloud import LEAST_SURE, point_cloud
 from jcr.represent.options import CloudOptions, MapOptions
-from jcr.simulate.capture import SimulateOptions, simulate
-from jcr.simulate.render import View, render
-from jcr.simulate.scenes import Scene, make_scene
-from jcr.simulate.truth import Truth
+from simulation.capture import SimulateOptions, simulate
+from simulation.render import View, render
+from simulation.scenes import Scene, make_scene
+from simulation.truth import Truth, read_truth, true_depth
 
 if TYPE_CHECKING:
     from jcr.represent.scene import SceneMap

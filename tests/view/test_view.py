@@ -15,13 +15,12 @@ import pytest
 from scipy.ndimage import minimum_filter
 from scipy.spatial.transform import Rotation
 
-from benchmarks.simulated.truth import read_truth
 from chromium import Chromium
 from jcr.camera import project
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse
-from jcr.simulate.truth import Truth
 from jcr.view.robot import read_joints, read_urdf, solve_joints
+from simulation.truth import Truth, read_truth
 from waiting import until
 
 if TYPE_CHECKING:

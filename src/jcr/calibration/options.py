@@ -29,7 +29,7 @@ class CalibrateOptions:
     """Samples: metres per unit of the camera poses, known to 0.2 %; unset: 1 for a marker of known size, otherwise
     estimated."""
     robot: Annotated[str | None, tyro.conf.arg(metavar="ARM")] = None
-    """Name of the arm (see `jcr simulate --help`), to model its joint offsets and link errors; unset: the arm named in
+    """Name of the arm (see `jcr capture --help`), to model its joint offsets and link errors; unset: the arm named in
     the capture, if any."""
     known_height: Annotated[float | None, tyro.conf.arg(metavar="MM")] = None
     """Planar or SCARA arms: the camera's height above the gripper's origin along its rotation axis."""

@@ -44,7 +44,6 @@ GROUPS = {
     "prepare": {
         "capture": "take a capture live, with advice on the next pose",
         "board": "draw a calibration board to print, if you want one",
-        "simulate": "simulate a capture, with ground truth",
     },
     "more": {
         "models": "list back ends with their licences; download weights",

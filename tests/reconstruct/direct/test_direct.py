@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.simulated.truth import read_truth
 from jcr.calibration.stage import calibrate
 from jcr.camera import rays
 from jcr.capture.images import read_image
@@ -26,7 +25,8 @@ from jcr.reconstruct.direct.photometric import (
 )
 from jcr.reconstruct.direct.search import starting_hand_eyes
 from jcr.records import Intrinsics
-from jcr.simulate.capture import SimulateOptions, simulate
+from simulation.capture import SimulateOptions, simulate
+from simulation.truth import read_truth
 
 pytestmark = pytest.mark.slow
 

@@ -7,11 +7,11 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial.distance import cdist
 
-from benchmarks.simulated.truth import read_truth, true_depth, true_labels
 from jcr.camera import rays
 from jcr.geometry import apply, inverse, transform
-from jcr.simulate.meshes import Mesh
-from jcr.simulate.scenes import Scene
+from simulation.meshes import Mesh
+from simulation.scenes import Scene
+from simulation.truth import read_truth, true_depth, true_labels
 
 
 def solid_labels(scene: Scene, x_in_base: Float[ndarray, "n 3"]) -> Int[ndarray, "n"]:

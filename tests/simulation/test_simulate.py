@@ -10,18 +10,18 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.simulated.surface import solid_labels, truth_points, winding_number
-from benchmarks.simulated.truth import read_truth, true_depth, true_labels
-from in_process import run_jcr
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_exp, rotation_log, skew, transform
 from jcr.records import Intrinsics
-from jcr.simulate.capture import SimulateOptions, simulate
-from jcr.simulate.objects import CATALOGUE
-from jcr.simulate.poses import gripper_poses, random_hand_eye
-from jcr.simulate.render import render
-from jcr.simulate.scenes import RECIPES, make_scene
-from jcr.simulate.taken import with_robot_noise
+from places import ROOT
+from simulation.capture import SimulateOptions, simulate
+from simulation.objects import CATALOGUE
+from simulation.poses import gripper_poses, random_hand_eye
+from simulation.render import render
+from simulation.scenes import RECIPES, make_scene
+from simulation.surface import solid_labels, truth_points, winding_number
+from simulation.taken import with_robot_noise
+from simulation.truth import read_truth, true_depth, true_labels
 
 CAMERA = Intrinsics(610.0, 610.0, 319.5, 239.5, 640, 480)
 
@@ -295,12 +295,13 @@ def test_options_that_mean_nothing_are_refused_in_one_line(tmp_path):
 @pytest.mark.gl
 @pytest.mark.usefixtures("opengl")
 def test_command_line(tmp_path):
-    done = run_jcr("simulate", tmp_path / "out", "--images", "2", "--json")
-    assert (done.returncode, json.loads(done.stdout)) == (0, {"capture": str(tmp_path / "out")})
-    again = run_jcr("simulate", tmp_path / "out", "--images", "2", "--json")
+    command = [sys.executable, "-m", "simulation", str(tmp_path / "out"), "--images", "2"]
+    assert subprocess.run(command, cwd=ROOT).returncode == 0 and (tmp_path / "out/capture.json").is_file()
+    again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert again.returncode == 2 and again.stderr.startswith("error: ") and again.stderr.count("\n") == 1
     # A machine without OpenGL: the remedy is named, and nothing is left behind.
-    command = [sys.executable, "-m", "jcr", "simulate", str(tmp_path / "blind")]
-    blind = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"MUJOCO_GL": "disable"})
+    command[3] = str(tmp_path / "blind")
+    environment = os.environ | {"MUJOCO_GL": "disable"}
+    blind = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment)
     assert blind.returncode == 2 and "apt-get install" in blind.stderr and blind.stderr.count("\n") == 1
     assert not (tmp_path / "blind").exists()

@@ -8,10 +8,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.handeye.arms import RobotName, arm_named
-from jcr.simulate.bent_arm import BentArm, ErrorSizes, bend
-from jcr.simulate.options import SimulateOptions
-from jcr.simulate.poses import gripper_poses, random_hand_eye
-from jcr.simulate.robots import effective_about, hand_eye_on, patterned, table_center
+from simulation.bent_arm import BentArm, ErrorSizes, bend
+from simulation.options import SimulateOptions
+from simulation.poses import gripper_poses, random_hand_eye
+from simulation.robots import effective_about, hand_eye_on, patterned, table_center
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.geometry import rotation_exp, scale_translation, step_between, transform
-from jcr.simulate.poses import Pattern, gripper_poses, random_hand_eye
+from simulation.poses import Pattern, gripper_poses, random_hand_eye
 
 TARGET_IN_BASE = np.array([0.5, 0.0, 0.0])
 

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from jcr.simulate.bent_arm import ErrorSizes
+from simulation.bent_arm import ErrorSizes
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from scipy.spatial.transform import Rotation, Slerp
 
-from benchmarks.simulated.problem import disturbed
 from jcr.capture.depth_images import read_depth
 from jcr.capture.images import read_image
 from jcr.extras import extra
 from jcr.geometry import ARM, rotation_between_deg, transform
 from jcr.records import Capture
+from simulation.problem import disturbed
 
 FPS, TF_HZ = 30.0, 100.0
 START_NS = 1_700_000_000_123_456_789

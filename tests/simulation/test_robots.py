@@ -7,18 +7,17 @@ import numpy as np
 import pytest
 
 import jcr
-from benchmarks.simulated.arm_errors import PRESETS, ArmErrors
-from benchmarks.simulated.bent import bent_problem
-from benchmarks.simulated.truth import read_truth, true_depth, true_labels
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, rotation_log, transform
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.handeye.known_scale import fit_known_scale
 from jcr.handeye.robots import error_std, forward_kinematics
 from jcr.records import Intrinsics
-from jcr.simulate.bent_arm import BentArm, ErrorSizes, bend, error_names
-from jcr.simulate.capture import SimulateOptions, simulate
-from jcr.simulate.robots import (
+from simulation.arm_errors import PRESETS, ArmErrors
+from simulation.bent import bent_problem
+from simulation.bent_arm import BentArm, ErrorSizes, bend, error_names
+from simulation.capture import SimulateOptions, simulate
+from simulation.robots import (
     about_posture,
     effective_about,
     hand_eye_on,
@@ -26,7 +25,8 @@ from jcr.simulate.robots import (
     table_center,
     views,
 )
-from jcr.simulate.taken import with_intrinsics_error
+from simulation.taken import with_intrinsics_error
+from simulation.truth import read_truth, true_depth, true_labels
 
 
 def only(arm, name: str, value: float) -> BentArm:

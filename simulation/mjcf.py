@@ -7,8 +7,8 @@ import numpy as np
 from numpy import ndarray
 
 from jcr.capture.images import encode_png
-from jcr.simulate.objects import Part
-from jcr.simulate.scenes import Scene
+from simulation.objects import Part
+from simulation.scenes import Scene
 
 LABEL_PREFIX = "label-"
 """Geoms are named `label-<label>-<part>`; others belong to no label."""

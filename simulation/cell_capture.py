@@ -14,14 +14,14 @@ from jcr.files import write_text
 from jcr.geometry import inverse, rotation_exp, transform
 from jcr.progress import Progress, steps
 from jcr.records import Capture, CellCamera, Intrinsics, Mount
-from jcr.simulate.motion import Motion, bent_arm, motion_of
-from jcr.simulate.objects import carried_package
-from jcr.simulate.options import SimulateOptions
-from jcr.simulate.poses import looking_at, random_hand_eye
-from jcr.simulate.render import render
-from jcr.simulate.robots import EFFECTIVE_POSES, about_posture, effective_exchanged, table_center
-from jcr.simulate.scenes import Scene, make_scene, moved
-from jcr.simulate.taken import image_suffix, pinhole, stated_intrinsics, with_robot_noise, write_image
+from simulation.motion import Motion, bent_arm, motion_of
+from simulation.objects import carried_package
+from simulation.options import SimulateOptions
+from simulation.poses import looking_at, random_hand_eye
+from simulation.render import render
+from simulation.robots import EFFECTIVE_POSES, about_posture, effective_exchanged, table_center
+from simulation.scenes import Scene, make_scene, moved
+from simulation.taken import image_suffix, pinhole, stated_intrinsics, with_robot_noise, write_image
 
 AHEAD = 0.06
 """m from the gripper's frame to the bottom of what it carries."""

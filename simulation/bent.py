@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from benchmarks.simulated.arm_errors import PRESETS, ArmErrors, PresetName
-from benchmarks.simulated.problem import HandEyeProblem, disturbed
 from jcr.geometry import rotation_exp, scale_translation, transform
 from jcr.handeye.robots import Arm
-from jcr.simulate.bent_arm import BentArm, bend
-from jcr.simulate.robots import effective_about, hand_eye_on, views
+from simulation.arm_errors import PRESETS, ArmErrors, PresetName
+from simulation.bent_arm import BentArm, bend
+from simulation.problem import HandEyeProblem, disturbed
+from simulation.robots import effective_about, hand_eye_on, views
 
 
 @dataclass(frozen=True)

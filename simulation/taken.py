@@ -14,7 +14,7 @@ from jcr.capture.images import encode_png
 from jcr.files import write_bytes
 from jcr.geometry import retract
 from jcr.records import Intrinsics
-from jcr.simulate.options import SimulateOptions
+from simulation.options import SimulateOptions
 
 _WIDTH, _HEIGHT = 640, 480
 

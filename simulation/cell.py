@@ -2,7 +2,7 @@
 
 Four kinds: `fixed`, a camera beside the table that a wrist camera maps; `wrists`, two cameras on one wrist; `arms`, two
 arms with a wrist camera each before one table; `carried`, a fixed camera that watches a box in the gripper. Poses are
-those of arms that bend as simulate/bent_arm.py has it, and the truth is the effective transform.
+those of arms that bend of bent_arm.py, and the truth is the effective transform.
 """
 
 from dataclasses import dataclass, field
@@ -12,9 +12,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from benchmarks.simulated.arm_errors import PRESETS, PresetName
-from benchmarks.simulated.observations import INTRINSICS
-from benchmarks.simulated.problem import disturbed
 from jcr.adjust.robots import ArmPoses
 from jcr.adjust.scene import Observations
 from jcr.camera import project
@@ -30,9 +27,12 @@ from jcr.handeye.arms import arm_named
 from jcr.handeye.known_scale import Fit, fit_known_scale
 from jcr.handeye.systematic import smooth_errors
 from jcr.records import Intrinsics
-from jcr.simulate.bent_arm import BentArm, bend
-from jcr.simulate.poses import looking_at, random_hand_eye
-from jcr.simulate.robots import (
+from simulation.arm_errors import PRESETS, PresetName
+from simulation.bent_arm import BentArm, bend
+from simulation.observations import INTRINSICS
+from simulation.poses import looking_at, random_hand_eye
+from simulation.problem import disturbed
+from simulation.robots import (
     EFFECTIVE_NOISE,
     EFFECTIVE_POSES,
     about_posture,

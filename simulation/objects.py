@@ -9,10 +9,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.geometry import apply, rotation_exp, transform
-from jcr.simulate import textures
-from jcr.simulate.meshes import Mesh, box, revolved, tube
-from jcr.simulate.textures import Color, Image
-from jcr.simulate.truth import TrueObject
+from simulation import textures
+from simulation.meshes import Mesh, box, revolved, tube
+from simulation.textures import Color, Image
+from simulation.truth import TrueObject
 
 _WHITE, _STEEL, _PAPER, _BLACK = (
     (0.88, 0.87, 0.84),

@@ -13,15 +13,15 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from benchmarks.simulated.faults import late
-from benchmarks.simulated.problem import disturbed
-from benchmarks.simulated.rendered import Rendered
 from jcr.camera import project, unproject
 from jcr.capture.formats import capture_json
 from jcr.files import write_bytes
 from jcr.geometry import inverse, rotation_exp, transform
 from jcr.records import Capture, Intrinsics
-from jcr.simulate.taken import encoded
+from simulation.faults import late
+from simulation.problem import disturbed
+from simulation.rendered import Rendered
+from simulation.taken import encoded
 
 Poses = Float[ndarray, "n 4 4"]
 Images = list[UInt8[ndarray, "h w 3"]]

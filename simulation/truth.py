@@ -1,17 +1,19 @@
-"""The truth beside a simulated capture, in files (`benchmarks/simulated/truth.py` reads them)."""
+"""Ground truth of a simulated capture, in files beside it."""
 
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from jcr.capture.images import encode_png
 from jcr.files import write_bytes, write_text
+from jcr.intrinsics_json import IntrinsicsJson
 from jcr.records import Intrinsics
-from jcr.simulate.bent_arm import BentArm
+from simulation.bent_arm import BentArm
 
 DEPTH_UNIT_M = 1e-4
 """Metres per count of the 16-bit depth images."""
@@ -88,3 +90,36 @@ def write_pixels(
     for kind, pixels in (("depth", counts), ("labels", label)):
         file = truth.folder / "truth" / kind / f"{Path(truth.images[image]).stem}.png"
         write_bytes(file, encode_png(pixels))
+
+
+def read_truth(folder: Path) -> Truth:
+    """The truth of a capture folder that `python -m simulation` made; FileNotFoundError where there is none."""
+    content = json.loads((folder / "truth" / "scene.json").read_text())
+    del content["format"], content["depth_unit_m"]
+    for name in ("gripper_from_camera", "base_from_gripper", "base_from_camera", "workspace_in_base"):
+        content[name] = np.array(content[name], float)
+    for name in ("images", "labels"):
+        content[name] = tuple(content[name])
+    for one in content["objects"]:
+        one |= {name: np.array(value, float) for name, value in one.items() if isinstance(value, list)}
+    objects = tuple(TrueObject(**one) for one in content["objects"])
+    intrinsics = IntrinsicsJson.model_validate(content["intrinsics"]).record()
+    return Truth(**content | {"folder": folder, "objects": objects, "intrinsics": intrinsics})
+
+
+def true_depth(truth: Truth, image: int) -> Float[ndarray, "h w"]:
+    """Depth (m) along the optical axis at the pixels of one image; 0 where there is nothing."""
+    return _pixels(truth, "depth", image) * DEPTH_UNIT_M
+
+
+def true_labels(truth: Truth, image: int) -> UInt8[ndarray, "h w"]:
+    """Labels of the pixels of one image."""
+    return _pixels(truth, "labels", image)
+
+
+def _pixels(truth: Truth, kind: str, image: int) -> ndarray:
+    path = truth.folder / "truth" / kind / f"{Path(truth.images[image]).stem}.png"
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise FileNotFoundError(f"{path}: simulate the capture again with --truth full")
+    return pixels

@@ -10,10 +10,10 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from jcr.geometry import transform
-from jcr.simulate import textures
-from jcr.simulate.meshes import box
-from jcr.simulate.objects import CATALOGUE, Part, TableObject
-from jcr.simulate.truth import TrueObject
+from simulation import textures
+from simulation.meshes import box
+from simulation.objects import CATALOGUE, Part, TableObject
+from simulation.truth import TrueObject
 
 SceneName = Literal["tabletop", "light8", "light7", "dark", "measuring"]
 TableName = Literal["light", "dark"]

@@ -8,15 +8,15 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from benchmarks.simulated.arm_errors import PRESETS
 from jcr.geometry import transform
 from jcr.handeye.arms import RobotName, arm_named
 from jcr.records import Intrinsics
-from jcr.simulate.bent_arm import bend
-from jcr.simulate.poses import gripper_poses, random_hand_eye
-from jcr.simulate.render import render
-from jcr.simulate.robots import effective_about, hand_eye_on, patterned, table_center
-from jcr.simulate.scenes import Scene, make_scene, moved
+from simulation.arm_errors import PRESETS
+from simulation.bent_arm import bend
+from simulation.poses import gripper_poses, random_hand_eye
+from simulation.render import render
+from simulation.robots import effective_about, hand_eye_on, patterned, table_center
+from simulation.scenes import Scene, make_scene, moved
 
 SIZE, WIDE = (640, 480), (960, 720)
 """px: of a camera's images, and of those rendered, of the same focal length."""

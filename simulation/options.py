@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 import tyro
 
 from jcr.handeye.arms import CHOICES, RobotName
-from jcr.simulate.poses import Pattern
-from jcr.simulate.scenes import SceneName, TableName
+from simulation.poses import Pattern
+from simulation.scenes import SceneName, TableName
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,7 @@ class SimulateOptions:
     show the true ones."""
     unknown_intrinsics: bool = False
     """Leave the intrinsics out of capture.json. (Known or not, the camera is a pinhole without distortion.)"""
-    intrinsics_error: Annotated[float, tyro.conf.arg(aliases=("--lens-error",))] = 0.0
+    intrinsics_error: float = 0.0
     """Sigma of the errors of the intrinsics in capture.json, in percent: of the focal length (fx and fy alike), and of
     the image's width for each coordinate of the principal point. The images show the true ones."""
     noise: float = 0.0

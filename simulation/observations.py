@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from benchmarks.simulated.problem import HandEyeProblem
 from jcr.camera import project
 from jcr.geometry import apply, inverse
 from jcr.records import Intrinsics, Tracks
+from simulation.problem import HandEyeProblem
 
 INTRINSICS = Intrinsics(620.0, 618.0, 322.0, 236.0, 640, 480, (-0.08, 0.05, 1e-3, -5e-4, 0.01))
 

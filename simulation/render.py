@@ -16,8 +16,8 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.records import Intrinsics
-from jcr.simulate.mjcf import CAMERA, LABEL_PREFIX, to_mjcf
-from jcr.simulate.scenes import Scene
+from simulation.mjcf import CAMERA, LABEL_PREFIX, to_mjcf
+from simulation.scenes import Scene
 
 _SUPERSAMPLING = 2
 
@@ -79,7 +79,7 @@ def _renderers(mjcf: str, files: dict[str, bytes], *sizes: tuple[int, int]) -> I
     if platform.system() == "Linux":
         egl = ctypes.util.find_library("EGL") or not ctypes.util.find_library("OSMesa")
         os.environ.setdefault("MUJOCO_GL", "egl" if egl else "osmesa")
-    mujoco: Any = extra("mujoco", "sim", "the simulation")
+    mujoco: Any = extra("mujoco", "dev", "the simulation")
     model = mujoco.MjModel.from_xml_string(mjcf, files)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

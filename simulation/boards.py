@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from benchmarks.simulated.faults import INTRINSICS, FaultyCapture
 from jcr.camera import project
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Boards, Body, Intrinsics
+from simulation.faults import INTRINSICS, FaultyCapture
 
 SQUARE_PX, SAMPLES = 40, 3
 """Of the printed pattern, and of the drawn image a pixel's samples to a side."""

@@ -11,13 +11,13 @@ from numpy import ndarray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from benchmarks.simulated.problem import TARGET_IN_BASE, disturbed
 from jcr.camera import NO_DISTORTION, parameter_names, parameters, project, with_parameters, zoomed
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.handeye.known_scale import fit_known_scale
 from jcr.records import Intrinsics, Tracks
-from jcr.simulate.poses import gripper_poses, random_hand_eye
-from jcr.simulate.robots import EFFECTIVE_NOISE, EFFECTIVE_POSES
+from simulation.poses import gripper_poses, random_hand_eye
+from simulation.problem import TARGET_IN_BASE, disturbed
+from simulation.robots import EFFECTIVE_NOISE, EFFECTIVE_POSES
 
 INTRINSICS = Intrinsics(620.0, 620.0, 319.5, 239.5, 640, 480, NO_DISTORTION)
 """What the user believes the camera to be."""

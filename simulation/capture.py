@@ -14,14 +14,14 @@ from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.progress import Progress, silent, steps
 from jcr.records import Capture
-from jcr.simulate.cell_capture import add_cameras, simulate_eye_to_hand
-from jcr.simulate.motion import Motion, motion_of
-from jcr.simulate.options import SimulateOptions
-from jcr.simulate.render import render
-from jcr.simulate.robots import EFFECTIVE_POSES
-from jcr.simulate.scenes import Scene, make_scene, moved
-from jcr.simulate.taken import image_suffix, pinhole, stated_intrinsics, with_robot_noise, write_image
-from jcr.simulate.truth import Truth, write_pixels, write_robot, write_truth
+from simulation.cell_capture import add_cameras, simulate_eye_to_hand
+from simulation.motion import Motion, motion_of
+from simulation.options import SimulateOptions
+from simulation.render import render
+from simulation.robots import EFFECTIVE_POSES
+from simulation.scenes import Scene, make_scene, moved
+from simulation.taken import image_suffix, pinhole, stated_intrinsics, with_robot_noise, write_image
+from simulation.truth import Truth, write_pixels, write_robot, write_truth
 
 
 def simulate(out: Path, options: SimulateOptions | None = None, progress: Progress = silent) -> Path:
@@ -61,7 +61,7 @@ def simulate(out: Path, options: SimulateOptions | None = None, progress: Progre
         others=others,
     )
     # Last: a folder with a capture.json is a complete capture.
-    capture_json.write(out, capture, source={"program": "jcr simulate", "options": asdict(options)})
+    capture_json.write(out, capture, source={"program": "python -m simulation", "options": asdict(options)})
     return out
 
 

@@ -3,8 +3,8 @@ import pytest
 
 from jcr.errors import InputError
 from jcr.records import Intrinsics
-from jcr.simulate.render import render
-from jcr.simulate.scenes import make_scene
+from simulation.render import render
+from simulation.scenes import make_scene
 
 
 @pytest.fixture(scope="session")

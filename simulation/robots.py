@@ -14,15 +14,15 @@ from jcr.geometry import inverse, rotation_exp, skew, transform
 from jcr.handeye.inverse_kinematics import inverse_kinematics, reach_toward
 from jcr.handeye.known_scale import Fit, fit_known_scale
 from jcr.handeye.robots import Arm, Joints, forward_kinematics, kinematic_jacobian
-from jcr.simulate.bent_arm import BentArm
-from jcr.simulate.poses import Pattern, gripper_poses, random_hand_eye
+from simulation.bent_arm import BentArm
+from simulation.poses import Pattern, gripper_poses, random_hand_eye
 
 EFFECTIVE_POSES = 120
 """Poses to which the effective hand-eye transform is fitted."""
 EFFECTIVE_NOISE = (1e-3, 2e-3)
 """m, rad: errors of equal weight in that fit."""
 WRIST_OF_VIEWS = 1.05
-"""m: reach without the last link of a UR5e, for which the views of simulate.poses are made; others are scaled."""
+"""m: reach without the last link of a UR5e, for which the views of simulation.poses are made; others are scaled."""
 TARGET_X = 0.5
 """m: distance of the middle of the table from the base of such an arm."""
 LOWER_TABLE, LEAST_SIZE = 0.2, 0.55

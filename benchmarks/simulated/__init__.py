@@ -1,1 +1,0 @@
-"""Problems and machines with known answers, without images: for benches, tests and examples."""

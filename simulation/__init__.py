@@ -1,0 +1,1 @@
+"""Captures, problems and machines with known answers, for benches, tests and examples; not installed."""

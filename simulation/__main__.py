@@ -1,0 +1,50 @@
+"""Write a simulated capture with its ground truth: `python -m simulation OUT`, in a checkout."""
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jcr.errors import InputError
+from jcr.progress import progress_bars
+from simulation.capture import simulate
+from simulation.options import SimulateOptions
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """A capture of a simulated tabletop, rendered with MuJoCo, with the ground truth beside it.
+
+    OUT holds capture.json and images/ as any capture does, reference.json (the true hand-eye transform; for a robot
+    with errors the effective one, and the physical one beside it) and truth/ (scene.json: heights, boxes, poses;
+    robot.json: the robot's errors; depth and labels per image).
+
+    examples:
+      python -m simulation captures/simulated
+      python -m simulation captures/noisy --seed 3 --robot-noise 0.5 0.1
+      python -m simulation captures/measuring --scene measuring --images 10
+      python -m simulation captures/orbit --pattern orbit --unknown-intrinsics
+      python -m simulation captures/bent --robot ur5e --joint-offsets 0.1 --link-errors 0.3 --intrinsics-error 0.5
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """New folder to write."""
+    simulate: Annotated[SimulateOptions, tyro.conf.arg(name="")] = field(default_factory=SimulateOptions)
+
+
+def main() -> int:
+    """Write the capture and return the exit status."""
+    arguments = tyro.cli(Arguments, prog="python -m simulation")
+    try:
+        with progress_bars() as progress:
+            simulate(arguments.out, arguments.simulate, progress)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
