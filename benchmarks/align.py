@@ -14,6 +14,7 @@ from numpy import ndarray
 
 from benchmarks.page import mm_deg, table
 from benchmarks.synthetic_pairs import PairErrors, PairTruth, synthetic_pairs
+from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.geometry import (
     apply_similarity,
     fit_similarity,
@@ -22,7 +23,6 @@ from jcr.geometry import (
     rotation_exp,
     transform,
 )
-from jcr.handeye.solve import solve_hand_eye
 from jcr.reconstruct.dust3r.pair_graph import complete_pairs
 from jcr.reconstruct.global_alignment.align import align, align_with_robot
 from jcr.reconstruct.global_alignment.alignment import AlignOptions

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.page import mm_deg, table
-from jcr.adjust.intrinsics_prior import ESTIMATED, FIXED, prior_of
-from jcr.adjust.wrist import adjust_wrist
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
+from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, prior_of
+from jcr.estimation.pose_equations import predict
+from jcr.estimation.wrist import adjust_wrist
 from jcr.geometry import step_between
-from jcr.handeye.equation import predict
 from jcr.records import Capture, HandEye, Kind, Reconstruction
 from simulation.faults import INTRINSICS, Faults, FaultyCapture, faulty_capture
 

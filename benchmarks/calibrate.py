@@ -12,11 +12,11 @@ from numpy import ndarray
 from benchmarks.figure import blank, png
 from benchmarks.page import mm_deg, table
 from benchmarks.peers import OPENCV_METHODS, andreff_with_scale, grid_search, opencv
-from jcr.adjust.wrist import adjust_wrist, recon_frame
 from jcr.calibration.case import of_images
+from jcr.estimation.hand_eye import solve_hand_eye
+from jcr.estimation.wrist import adjust_wrist, recon_frame
 from jcr.files import write_bytes
 from jcr.geometry import scale_translation
-from jcr.handeye.solve import solve_hand_eye
 from jcr.records import HandEye
 from simulation.observations import INTRINSICS, observed
 from simulation.problem import HandEyeProblem, error, hand_eye_problem

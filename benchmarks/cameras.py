@@ -11,15 +11,15 @@ from numpy import ndarray
 from scipy.stats import chi2
 
 from benchmarks.page import folders_with, mm_deg, table
-from jcr.adjust.intrinsics_prior import prior_of
-from jcr.adjust.robots import Adjusted, Placed
-from jcr.adjust.scene import Freedom, Scene
-from jcr.adjust.together import adjust
 from jcr.calibration.stage import calibrate
 from jcr.camera import parameters, with_parameters
 from jcr.capture.read import read_capture
 from jcr.cell.stage import place_cameras
 from jcr.errors import RejectedError
+from jcr.estimation.image_robots import Adjusted, Placed
+from jcr.estimation.intrinsics_prior import prior_of
+from jcr.estimation.scene import Freedom, Scene
+from jcr.estimation.together import adjust
 from jcr.geometry import inverse, scale_translation, skew, step_between
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.records import Capture, CellCamera

@@ -20,7 +20,7 @@ from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.check import QUICK, check, spread_rows
 from jcr.errors import RejectedError
-from jcr.handeye.arms import ROBOT_NAMES, arm_named
+from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.pipeline import calibrate as run_calibrate
 from jcr.records import Capture, HandEye, Reconstruction
 from simulation.arm_errors import PresetName

@@ -11,10 +11,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.options import CalibrateOptions
+from jcr.estimation.arms import RobotName, arm_named
+from jcr.estimation.inverse_kinematics import reach_toward
+from jcr.estimation.known_scale import fit_known_scale
 from jcr.geometry import apply, inverse, retract, rotation_angle, transform
-from jcr.handeye.arms import RobotName, arm_named
-from jcr.handeye.inverse_kinematics import reach_toward
-from jcr.handeye.known_scale import fit_known_scale
 from jcr.live.calibration import LiveCalibration
 from jcr.live.calibration_progress import Progress
 from jcr.records import Intrinsics

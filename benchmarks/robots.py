@@ -12,9 +12,9 @@ from numpy import ndarray
 from benchmarks.figure import blank, png
 from benchmarks.page import table
 from benchmarks.peers import opencv
+from jcr.estimation.arms import ROBOT_NAMES, arm_named
+from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.files import write_bytes
-from jcr.handeye.arms import ROBOT_NAMES, arm_named
-from jcr.handeye.solve import solve_hand_eye
 from jcr.records import HandEye
 from simulation.arm_errors import PresetName
 from simulation.bent import BentProblem, bent_problem

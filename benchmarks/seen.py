@@ -8,14 +8,14 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from benchmarks.page import table
-from jcr.adjust.intrinsics_prior import ESTIMATED, IntrinsicsPrior, prior_of
-from jcr.adjust.wrist import adjust_wrist
 from jcr.calibration.adjust import estimate_of
 from jcr.calibration.seen import seen_uncertainty, within_95
 from jcr.camera import parameters, unproject, with_parameters
+from jcr.estimation.arms import ROBOT_NAMES, arm_named
+from jcr.estimation.hand_eye import solve_hand_eye
+from jcr.estimation.intrinsics_prior import ESTIMATED, IntrinsicsPrior, prior_of
+from jcr.estimation.wrist import adjust_wrist
 from jcr.geometry import apply, step_between
-from jcr.handeye.arms import ROBOT_NAMES, arm_named
-from jcr.handeye.solve import solve_hand_eye
 from jcr.records import Estimate, Intrinsics
 from simulation.arm_errors import PresetName
 from simulation.bent import BentProblem, bent_problem

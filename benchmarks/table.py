@@ -37,8 +37,7 @@ ROBOTS, HONEST, MAPPED, TIME, OTHERS = PARTS = (
     "Beside other methods",
 )
 SOLVER = (
-    "src/jcr/handeye",
-    "src/jcr/adjust",
+    "src/jcr/estimation",
     "src/jcr/calibration",
     "src/jcr/camera.py",
     "src/jcr/geometry.py",
@@ -187,7 +186,7 @@ BENCHES = {
         OTHERS,
         "hand-eye solvers on the same simulated poses, for accuracy and time",
         draws=True,
-        measures=("src/jcr/handeye", "simulation/problem.py"),
+        measures=("src/jcr/estimation", "simulation/problem.py"),
         long="15 draws instead of 4",
     ),
     "robots": Bench(
@@ -195,7 +194,7 @@ BENCHES = {
         HONEST,
         "arms with systematic errors: is the result within its sigma, and nearer than others'",
         draws=True,
-        measures=("src/jcr/handeye", "simulation/robots.py", "simulation/problem.py"),
+        measures=("src/jcr/estimation", "simulation/robots.py", "simulation/problem.py"),
         long="8 draws of every arm instead of 1",
     ),
     "attack": Bench(

@@ -14,8 +14,8 @@ from benchmarks.synthetic_pairs import PairErrors, pairs_of_capture
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
+from jcr.estimation.residuals import paper_residuals
 from jcr.geometry import Transforms, fit_similarity, rotation_log, scale_translation
-from jcr.handeye.residuals import paper_residuals
 from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, candidates, reconstruct
 from jcr.reconstruct.colmap import reconstruct_colmap
 from jcr.reconstruct.colmap_options import ColmapOptions

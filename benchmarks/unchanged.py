@@ -16,20 +16,20 @@ import numpy as np
 
 from benchmarks.attack import CASES, IMAGES, calibrated
 from benchmarks.cameras import COUNT, answered, wanted
-from benchmarks.simulated.bent import bent_problem
-from benchmarks.simulated.boards import Sheet, with_sheet
-from benchmarks.simulated.cell import Kind, cell_problem
-from benchmarks.simulated.faults import Faults, faulty_capture
-from benchmarks.simulated.problem import hand_eye_problem
 from jcr.calibration.stage import calibrate
+from jcr.estimation.arms import arm_named
+from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.geometry import step_between
-from jcr.handeye.arms import arm_named
-from jcr.handeye.solve import solve_hand_eye
 from jcr.records import HandEye
 from jcr.run_folder import RunFolder
+from simulation.bent import bent_problem
+from simulation.boards import Sheet, with_sheet
+from simulation.cell import Kind, cell_problem
+from simulation.faults import Faults, faulty_capture
+from simulation.problem import hand_eye_problem
 
 Record = dict[str, Any]
-COUNTED = (("jcr.adjust.images", "without_points"), ("jcr.handeye.fit", "linearised"))
+COUNTED = (("jcr.estimation.images", "without_points"), ("jcr.estimation.fit", "linearised"))
 """Functions whose calls are counted as linearisations, by module."""
 CELLS: tuple[Kind, ...] = ("fixed", "wrists", "arms", "carried")
 ARMS = (("panda", "typical", 12), ("ur5e", "low-cost", 8), ("iiwa7", "white", 30))
@@ -75,7 +75,7 @@ def measure(runs: Path, out: Path) -> None:
             record = {"verdict": f"failed: {type(error).__name__}", "findings": [], "x": None, "std": None}
         record |= {"linearisations": calls[0], "seconds": round(time.process_time() - start, 3)}
         records[name] = record
-        print(f"{name}: {record['verdict']}, {record['seconds']:.1f} s", file=sys.stderr, flush=True)
+        sys.stderr.write(f"{name}: {record['verdict']}, {record['seconds']:.1f} s\n")
     out.write_text(json.dumps(records, indent=1) + "\n")
 
 
@@ -87,12 +87,15 @@ def compare(before: Path, after: Path) -> int:
         differences = list(_differences(old[name], new[name]))
         changed += bool(differences)
         for text in differences:
-            print(f"{name}: {text}")
+            sys.stdout.write(f"{name}: {text}\n")
     both = [name for name in old if name in new]
     for what in ("linearisations", "seconds"):
-        print(f"{what}: {sum(old[n][what] for n in both):.0f} before, {sum(new[n][what] for n in both):.0f} after")
-    print(f"{changed} of {len(both)} problems differ; {len(old) - len(both)} only before, "
-          f"{len(new) - len(both)} only after")  # fmt: skip
+        totals = [sum(one[name][what] for name in both) for one in (old, new)]
+        sys.stdout.write(f"{what}: {totals[0]:.0f} before, {totals[1]:.0f} after\n")
+    alone = [len(one) - len(both) for one in (old, new)]
+    sys.stdout.write(
+        f"{changed} of {len(both)} problems differ; {alone[0]} only before, {alone[1]} only after\n"
+    )
     return changed
 
 

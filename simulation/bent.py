@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.estimation.kinematics import Arm
 from jcr.geometry import rotation_exp, scale_translation, transform
-from jcr.handeye.robots import Arm
 from simulation.arm_errors import PRESETS, ArmErrors, PresetName
 from simulation.bent_arm import BentArm, bend
 from simulation.problem import HandEyeProblem, disturbed

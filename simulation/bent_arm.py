@@ -1,6 +1,6 @@
 """An arm that differs from the one that its controller computes: joint offsets, link errors, sag, eccentric gears.
 
-Offsets and link errors are those of handeye/robots.py. Light and low-cost arms have two kinds more:
+Offsets and link errors are those of estimation/kinematics.py. Light and low-cost arms have two kinds more:
 
 - sag: elastic deflection under gravity, φ times the horizontal lever of the gripper about the joint's axis, divided by
   the arm's reach (rad at full stretch);
@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.geometry import rotation_exp, transform
-from jcr.handeye.robots import (
+from jcr.estimation.kinematics import (
     LINK_ERRORS,
     Arm,
     Joints,
@@ -24,6 +23,7 @@ from jcr.handeye.robots import (
     joint_frames,
     perpendicular,
 )
+from jcr.geometry import rotation_exp, transform
 
 NAMES = (
     ("joint {}",),

@@ -12,9 +12,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.robots import ArmPoses
-from jcr.adjust.scene import Observations
 from jcr.camera import project
+from jcr.estimation.arms import arm_named
+from jcr.estimation.image_robots import ArmPoses
+from jcr.estimation.known_scale import Fit, fit_known_scale
+from jcr.estimation.scene import Observations
+from jcr.estimation.systematic import smooth_errors
 from jcr.geometry import (
     apply,
     apply_similarity,
@@ -23,9 +26,6 @@ from jcr.geometry import (
     scale_translation,
     transform,
 )
-from jcr.handeye.arms import arm_named
-from jcr.handeye.known_scale import Fit, fit_known_scale
-from jcr.handeye.systematic import smooth_errors
 from jcr.records import Intrinsics
 from simulation.arm_errors import PRESETS, PresetName
 from simulation.bent_arm import BentArm, bend

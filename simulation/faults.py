@@ -12,8 +12,8 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from jcr.camera import NO_DISTORTION, parameter_names, parameters, project, with_parameters, zoomed
+from jcr.estimation.known_scale import fit_known_scale
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.handeye.known_scale import fit_known_scale
 from jcr.records import Intrinsics, Tracks
 from simulation.poses import gripper_poses, random_hand_eye
 from simulation.problem import TARGET_IN_BASE, disturbed

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.handeye.arms import RobotName, arm_named
+from jcr.estimation.arms import RobotName, arm_named
 from simulation.bent_arm import BentArm, ErrorSizes, bend
 from simulation.options import SimulateOptions
 from simulation.poses import gripper_poses, random_hand_eye

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from jcr.handeye.arms import CHOICES, RobotName
+from jcr.estimation.arms import CHOICES, RobotName
 from simulation.poses import Pattern
 from simulation.scenes import SceneName, TableName
 

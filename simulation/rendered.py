@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
+from jcr.estimation.arms import RobotName, arm_named
 from jcr.geometry import transform
-from jcr.handeye.arms import RobotName, arm_named
 from jcr.records import Intrinsics
 from simulation.arm_errors import PRESETS
 from simulation.bent_arm import bend

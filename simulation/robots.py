@@ -10,10 +10,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.errors import InputError
+from jcr.estimation.inverse_kinematics import inverse_kinematics, reach_toward
+from jcr.estimation.kinematics import Arm, Joints, forward_kinematics, kinematic_jacobian
+from jcr.estimation.known_scale import Fit, fit_known_scale
 from jcr.geometry import inverse, rotation_exp, skew, transform
-from jcr.handeye.inverse_kinematics import inverse_kinematics, reach_toward
-from jcr.handeye.known_scale import Fit, fit_known_scale
-from jcr.handeye.robots import Arm, Joints, forward_kinematics, kinematic_jacobian
 from simulation.bent_arm import BentArm
 from simulation.poses import Pattern, gripper_poses, random_hand_eye
 

@@ -13,8 +13,8 @@ from jcr.capture.images import encode_png
 from jcr.capture.options import ReadOptions
 from jcr.capture.transforms_json import OPENGL_FROM_OPENCV
 from jcr.capture.urdf_chain import read_chain
+from jcr.estimation.kinematics import forward_kinematics
 from jcr.geometry import inverse
-from jcr.handeye.robots import forward_kinematics
 from jcr.records import Capture
 
 HALF_PIXEL = 0.5

@@ -100,11 +100,11 @@ def test_notebooks_show_records_as_tables(tabletop: Path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "first", ["import jcr.adjust.wrist as b, jcr.handeye.solve as s", "import jcr; jcr.calibrate"]
+    "first", ["import jcr.estimation.wrist as b, jcr.estimation.hand_eye as s", "import jcr; jcr.calibrate"]
 )
 def test_packages_and_functions_have_names_of_their_own(first: str):
     done = python(
-        f"{first}\nimport jcr.adjust.wrist as b, jcr.handeye.solve as s, jcr\n"
+        f"{first}\nimport jcr.estimation.wrist as b, jcr.estimation.hand_eye as s, jcr\n"
         "assert jcr.calibrate is jcr.pipeline.calibrate and s.solve_hand_eye is jcr.solve_hand_eye and b.adjust"
     )
     assert done.returncode == 0, done.stderr

@@ -16,8 +16,8 @@ from jcr.calibration.checks import capture as capture_checks
 from jcr.calibration.options import CalibrateOptions
 from jcr.cli import dispatch
 from jcr.errors import InputError, RejectedError
+from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.geometry import rotation_exp, transform
-from jcr.handeye.solve import solve_hand_eye
 from jcr.reconstruct import backends
 from jcr.reconstruct.backends import Backend, ReconstructOptions
 from jcr.records import Capture, Finding, HandEye, Intrinsics, Kind, Pointmaps, Reconstruction, Tracks

@@ -15,7 +15,7 @@ from conftest import shrunk_capture
 from jcr.calibration.checks.left_out import left_out_poses
 from jcr.capture.images import BLURRED_EDGE, edge_width, read_image, show_one_view
 from jcr.cli import dispatch
-from jcr.handeye.solve import solve_hand_eye
+from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.records import Capture, Intrinsics, Kind, Reconstruction, Tracks
 from simulation.problem import hand_eye_problem
 

@@ -5,8 +5,8 @@ import pytest
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from jcr.estimation import hand_eye
 from jcr.geometry import apply, retract, rotation_exp, skew, step_between, transform
-from jcr.handeye import solve
 from jcr.least_squares import loss_weight, minimise
 from simulation.problem import hand_eye_problem
 
@@ -129,8 +129,8 @@ def test_small_systems_are_solved_by_one_blas_thread(monkeypatch: pytest.MonkeyP
         seen.extend(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")
         raise InterruptedError
 
-    monkeypatch.setattr(solve, "robust_fit", look)
+    monkeypatch.setattr(hand_eye, "robust_fit", look)
     problem = hand_eye_problem(np.random.default_rng(0), 6)
     with threadpool_limits(2, user_api="blas"), pytest.raises(InterruptedError):
-        solve.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+        hand_eye.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     assert seen and set(seen) == {1}

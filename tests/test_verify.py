@@ -17,11 +17,11 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
 from jcr.cli import dispatch
+from jcr.estimation.arms import arm_named
+from jcr.estimation.closed_form import initial_estimate
+from jcr.estimation.fit import PoseProblem, fit_poses
+from jcr.estimation.systematic import arm_errors, posed, smooth_errors
 from jcr.geometry import inverse, rotation_exp, scale_translation, step_between, transform
-from jcr.handeye.arms import arm_named
-from jcr.handeye.closed_form import initial_estimate
-from jcr.handeye.fit import PoseProblem, fit_poses
-from jcr.handeye.systematic import arm_errors, posed, smooth_errors
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.relocate import Located, relocate
 from jcr.records import Capture, Reconstruction, Tracks

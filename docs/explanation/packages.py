@@ -31,8 +31,8 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
     (("reconstruct/", "the table of back ends: COLMAP, boards, networks, given cameras", 1),),
     (("match/", "features and matches that the robot checks", 1),),
     (("capture/", "readers of every format, and their checks", 1),),
-    (("adjust/", "the one bundle adjustment: what images show, tied to the robots", 1),),
-    (("handeye/", "AX = XB with scale: arrays in, arrays out; no image, no file", 1),),
+    (("estimation/", "the one bundle adjustment: what images show, tied to the robots", 1),),
+    (("estimation/", "AX = XB with scale: arrays in, arrays out; no image, no file", 1),),
     (
         ("camera.py", "projection, distortion, derivatives", 1),
         ("arrays_json, intrinsics_json", "parts of our files", 1),

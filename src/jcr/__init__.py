@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from jcr.check import Examination
     from jcr.check import check as check_capture
     from jcr.depth.options import DepthOptions
+    from jcr.estimation.fit import Cues
+    from jcr.estimation.hand_eye import solve_hand_eye
+    from jcr.estimation.kinematics import Arm
     from jcr.export.formats import export_run
     from jcr.export.options import ExportOptions
-    from jcr.handeye.fit import Cues
-    from jcr.handeye.robots import Arm
-    from jcr.handeye.solve import solve_hand_eye
     from jcr.live.calibration import LiveCalibration
     from jcr.live.calibration_progress import Progress, Reached
     from jcr.pipeline import add_camera, build_map, calibrate, measure, run
@@ -91,8 +91,8 @@ _MODULE_OF = {
     "Finding": "jcr.records",
     "FindingKind": "jcr.records:Kind",
     "NextPose": "jcr.records",
-    "Arm": "jcr.handeye.robots",
-    "Cues": "jcr.handeye.fit",
+    "Arm": "jcr.estimation.kinematics",
+    "Cues": "jcr.estimation.fit",
     "SeenInBase": "jcr.calibration.seen",
     "RunResult": "jcr.results",
     "SavedRun": "jcr.results",
@@ -114,7 +114,7 @@ _MODULE_OF = {
     "verify_run": "jcr.verify:verify",
     "export_run": "jcr.export.formats",
     "read_capture": "jcr.capture.read",
-    "solve_hand_eye": "jcr.handeye.solve",
+    "solve_hand_eye": "jcr.estimation.hand_eye",
     "LiveCalibration": "jcr.live.calibration",
     "Progress": "jcr.live.calibration_progress",
     "Reached": "jcr.live.calibration_progress",

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.adjust.foreseen import ForeseenCamera
 from jcr.calibration.adjust import adjusted
 from jcr.calibration.case import Case
 from jcr.calibration.checks.left_out import left_out_poses
 from jcr.calibration.checks.robot import angle_finding
 from jcr.calibration.checks.views import as_causes, view_findings
+from jcr.calibration.conventions import better_reading, convention_finding
 from jcr.calibration.expected import (
     FEWEST,
     Ahead,
@@ -33,11 +33,11 @@ from jcr.camera import fold_distance_px
 from jcr.capture.images import brightness_and_sharpness, exposure_fault, read_image
 from jcr.capture.read import read_source
 from jcr.errors import RejectedError
+from jcr.estimation.foreseen import ForeseenCamera
+from jcr.estimation.hand_eye import SCALE_STD, solve_hand_eye
+from jcr.estimation.observability import observability
+from jcr.estimation.residuals import angle_ratio
 from jcr.geometry import largest_motion
-from jcr.handeye.conventions import better_reading, convention_finding
-from jcr.handeye.observability import observability
-from jcr.handeye.residuals import angle_ratio
-from jcr.handeye.solve import SCALE_STD, solve_hand_eye
 from jcr.progress import Progress
 from jcr.reconstruct.board_in_view import proposed
 from jcr.reconstruct.colmap import reconstruct_colmap

@@ -19,9 +19,9 @@ from jcr.capture.read import read_source
 from jcr.cell.added import camera_of, read_added_cameras
 from jcr.distributions import chi2
 from jcr.errors import InputError, RejectedError
+from jcr.estimation.fit import PoseFit, PoseProblem, fit_poses
+from jcr.estimation.pose_equations import Poses
 from jcr.geometry import step_between
-from jcr.handeye.equation import Poses
-from jcr.handeye.fit import PoseFit, PoseProblem, fit_poses
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 import jcr
-from jcr.adjust.intrinsics_prior import prior_of
 from jcr.calibration.consider import with_intrinsics_considered
 from jcr.camera import parameters, with_parameters
+from jcr.estimation.fit import Cues
+from jcr.estimation.intrinsics_prior import prior_of
+from jcr.estimation.systematic import smooth_errors
 from jcr.geometry import inverse, transform
-from jcr.handeye.fit import Cues
-from jcr.handeye.systematic import smooth_errors
 from simulation.observations import INTRINSICS, observed
 from simulation.problem import error, hand_eye_problem
 

@@ -16,9 +16,9 @@ from jcr.capture.depth_images import read_depth
 from jcr.capture.images import encode_png
 from jcr.capture.read import read_capture
 from jcr.errors import InputError
+from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.files import write_bytes
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.handeye.solve import solve_hand_eye
 from jcr.records import (
     MATCHED,
     PRIOR,

@@ -16,8 +16,8 @@ from jcr.calibration.expected import Ahead, assumed, expected, typical_camera
 from jcr.calibration.poses import calibrate_poses
 from jcr.calibration.robot_errors import errors_of
 from jcr.check import check
+from jcr.estimation.next_poses import assumed_camera
 from jcr.geometry import transform
-from jcr.handeye.next_poses import assumed_camera
 from jcr.records import Intrinsics, NextPose, PosePairs
 from simulation.problem import HandEyeProblem, hand_eye_problem
 

@@ -14,10 +14,10 @@ from jcr.calibration.checks.sequence import sequence_fault
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.cell.carried import exchanged, refined
+from jcr.estimation.arms import RobotName, arm_named
+from jcr.estimation.hand_eye import solve_hand_eye
+from jcr.estimation.systematic import smooth_errors
 from jcr.geometry import inverse, retract, step_between
-from jcr.handeye.arms import RobotName, arm_named
-from jcr.handeye.solve import solve_hand_eye
-from jcr.handeye.systematic import smooth_errors
 from jcr.records import BENT, Capture, Finding, Kind, Reconstruction
 from jcr.records.words import sentence
 from simulation.arm_errors import PresetName

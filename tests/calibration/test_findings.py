@@ -20,8 +20,8 @@ from jcr.calibration.verdict import with_findings
 from jcr.calibration.words import summary
 from jcr.cell.cameras_json import in_words, read_cameras
 from jcr.errors import InputError
+from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.geometry import rotation_exp, transform
-from jcr.handeye.solve import solve_hand_eye
 from jcr.records import (
     CAMERA,
     Capture,

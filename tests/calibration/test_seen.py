@@ -7,10 +7,6 @@ import numpy as np
 import pytest
 
 from benchmarks.seen import BENT, WAYS, measure
-from jcr.adjust.intrinsics_prior import ESTIMATED, prior_of
-from jcr.adjust.points import points_in_base
-from jcr.adjust.robots import Adjusted
-from jcr.adjust.wrist import adjust_wrist
 from jcr.calibration.adjust import estimate_of
 from jcr.calibration.seen import (
     Scene,
@@ -23,8 +19,12 @@ from jcr.calibration.seen import (
     within_95,
 )
 from jcr.camera import parameters, unproject, with_parameters
+from jcr.estimation.hand_eye import solve_hand_eye
+from jcr.estimation.image_robots import Adjusted
+from jcr.estimation.intrinsics_prior import ESTIMATED, prior_of
+from jcr.estimation.points import points_in_base
+from jcr.estimation.wrist import adjust_wrist
 from jcr.geometry import apply, inverse, retract
-from jcr.handeye.solve import solve_hand_eye
 from jcr.records import Estimate, HandEye, Intrinsics, Tracks
 from simulation.observations import INTRINSICS, observed
 from simulation.problem import HandEyeProblem, hand_eye_problem

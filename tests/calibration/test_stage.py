@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from benchmarks.attack import reconstructed
-from jcr.adjust import images
-from jcr.adjust.wrist import adjust_wrist
 from jcr.calibration import adjust as adjust_stage
 from jcr.calibration import case
 from jcr.calibration.stage import calibrate
+from jcr.estimation import images
+from jcr.estimation.hand_eye import solve_hand_eye
+from jcr.estimation.wrist import adjust_wrist
 from jcr.geometry import retract, step_between
-from jcr.handeye.solve import solve_hand_eye
 from jcr.records import Kind, Tracks
 from simulation.faults import faulty_capture
 

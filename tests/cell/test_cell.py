@@ -11,12 +11,6 @@ import numpy as np
 import pytest
 
 import jcr
-from jcr.adjust.images import evidence, noise_of
-from jcr.adjust.intrinsics_prior import FIXED, prior_of
-from jcr.adjust.projection import ImageProblem, view_of
-from jcr.adjust.robots import Adjusted
-from jcr.adjust.scene import Freedom, Scene, at_start, similarities
-from jcr.adjust.together import adjust
 from jcr.calibration.checks.camera import camera_faults
 from jcr.calibration.checks.imaged import Imaged
 from jcr.calibration.options import CalibrateOptions
@@ -32,6 +26,12 @@ from jcr.cell.images import CellImages
 from jcr.cell.place_checks import far_from_gripper
 from jcr.cell.stage import place_cameras
 from jcr.errors import RejectedError
+from jcr.estimation.image_robots import Adjusted
+from jcr.estimation.images import evidence, noise_of
+from jcr.estimation.intrinsics_prior import FIXED, prior_of
+from jcr.estimation.projection import ImageProblem, view_of
+from jcr.estimation.scene import Freedom, Scene, at_start, similarities
+from jcr.estimation.together import adjust
 from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.progress import silent
 from jcr.reconstruct.backends import ReconstructOptions

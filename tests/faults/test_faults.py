@@ -29,9 +29,9 @@ from jcr.calibration.checks import capture as capture_checks
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.cli import dispatch
+from jcr.estimation.arms import arm_named
+from jcr.estimation.kinematics import forward_kinematics
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
-from jcr.handeye.arms import arm_named
-from jcr.handeye.robots import forward_kinematics
 from jcr.records import Capture, Reconstruction
 from jcr.run_folder import RunFolder
 from simulation.faults import Faults, faulty_capture

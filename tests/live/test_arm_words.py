@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from jcr.capture.robot_poses import CONVENTIONS, numbers_from_poses, poses_from_numbers
+from jcr.estimation.arms import arm_named
+from jcr.estimation.kinematics import forward_kinematics
 from jcr.geometry import inverse, rotation_angle, rotation_exp, transform
-from jcr.handeye.arms import arm_named
-from jcr.handeye.robots import forward_kinematics
 from jcr.live.arm_words import ArmWords, Path, joints_at, pose_lines
 from jcr.live.typed import typed_poses
 

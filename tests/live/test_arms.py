@@ -17,9 +17,9 @@ import pytest
 import jcr
 from fake_arms import fake_xarm
 from jcr.camera import project
+from jcr.estimation.arms import arm_named
+from jcr.estimation.kinematics import forward_kinematics
 from jcr.geometry import inverse, rotation_exp, transform
-from jcr.handeye.arms import arm_named
-from jcr.handeye.robots import forward_kinematics
 from jcr.live.camera import CameraOptions
 from jcr.live.devices import keep_to
 from jcr.records import Intrinsics

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from jcr.estimation.closed_form import motions
 from jcr.geometry import inverse, rotation_angle, rotation_exp, transform
-from jcr.handeye.closed_form import motions
 from jcr.match.epipolar import translation_of_x
 from jcr.match.gate import Pair, angle_tolerance, by_quarters, judge, rolls
 from jcr.match.moved import moved_things

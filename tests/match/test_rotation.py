@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from jcr.estimation.closed_form import motions
 from jcr.geometry import inverse, rotation_angle, rotation_exp
-from jcr.handeye.closed_form import motions
 from jcr.match.rotation import rotation_of_x
 from simulation.problem import hand_eye_problem
 

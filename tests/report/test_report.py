@@ -30,8 +30,8 @@ from jcr.cell.found import ArmFound, CameraFound, CellFound, ImageFound
 from jcr.cli.output import Output
 from jcr.cli.result import show
 from jcr.errors import RejectedError
+from jcr.estimation.observability import excitation
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.handeye.observability import excitation
 from jcr.records import (
     COVARIANCE_ORDER,
     Capture,

@@ -8,10 +8,10 @@ import pytest
 
 import jcr
 from jcr.errors import InputError
+from jcr.estimation.arms import ROBOT_NAMES, arm_named
+from jcr.estimation.kinematics import error_std, forward_kinematics
+from jcr.estimation.known_scale import fit_known_scale
 from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, rotation_log, transform
-from jcr.handeye.arms import ROBOT_NAMES, arm_named
-from jcr.handeye.known_scale import fit_known_scale
-from jcr.handeye.robots import error_std, forward_kinematics
 from jcr.records import Intrinsics
 from simulation.arm_errors import PRESETS, ArmErrors
 from simulation.bent import bent_problem

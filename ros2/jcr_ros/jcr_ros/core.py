@@ -20,8 +20,8 @@ from jcr.capture.camera_info import intrinsics_of_ros
 from jcr.capture.camera_json import intrinsics_as_json
 from jcr.capture.ros_image import image_of
 from jcr.errors import InputError
+from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.export.ros import CameraMount, camera_mount
-from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.live.arm_words import ArmWords
 from jcr.live.asks import Answer, Ask
 from jcr.live.calibration import LiveCalibration

@@ -1,4 +1,4 @@
-"""The second step of a calibration: images, points, intrinsics and robot adjusted together (adjust/).
+"""The second step of a calibration: images, points, intrinsics and robot adjusted together (estimation/).
 
 Where images add nothing to the poses, what the errors of given intrinsics would do is added to the fit instead.
 """
@@ -9,19 +9,19 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.images import median_reprojection_px
-from jcr.adjust.intrinsics_prior import IntrinsicsPrior
-from jcr.adjust.projection import view_of
-from jcr.adjust.robots import Adjusted
-from jcr.adjust.score_test import focal_lengths
-from jcr.adjust.together import START_NOISE
-from jcr.adjust.wrist import WristOptions, adjust_wrist, recon_frame
 from jcr.calibration.case import Case
 from jcr.calibration.consider import with_intrinsics_considered
+from jcr.estimation.hand_eye import judged
+from jcr.estimation.image_robots import Adjusted
+from jcr.estimation.images import median_reprojection_px
+from jcr.estimation.intrinsics_prior import IntrinsicsPrior
+from jcr.estimation.pose_equations import predict
+from jcr.estimation.projection import view_of
+from jcr.estimation.residuals import paper_residuals
+from jcr.estimation.score_test import focal_lengths
+from jcr.estimation.together import START_NOISE
+from jcr.estimation.wrist import WristOptions, adjust_wrist, recon_frame
 from jcr.geometry import inverse, retract, scale_translation, step_between
-from jcr.handeye.equation import predict
-from jcr.handeye.residuals import paper_residuals
-from jcr.handeye.solve import judged
 from jcr.records import (
     Estimate,
     HandEye,

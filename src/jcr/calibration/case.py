@@ -7,13 +7,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from jcr.adjust.intrinsics_prior import IntrinsicsPrior, prior_about
-from jcr.adjust.points import points_in_base
-from jcr.adjust.robots import Adjusted
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import RobotErrors, of_poses
 from jcr.calibration.seen import Scene, scene_uncertainty
-from jcr.handeye.fit import Cues
+from jcr.estimation.fit import Cues
+from jcr.estimation.image_robots import Adjusted
+from jcr.estimation.intrinsics_prior import IntrinsicsPrior, prior_about
+from jcr.estimation.points import points_in_base
 from jcr.records import Capture, Finding, HandEye, Reconstruction, Tracks
 
 MIN_OBSERVATIONS = 200

@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.intrinsics_prior import IntrinsicsPrior
 from jcr.camera import by_parameters, by_point
+from jcr.estimation.closed_form import initial_estimate
+from jcr.estimation.fit import Cues, PoseProblem, fit_poses
+from jcr.estimation.intrinsics_prior import IntrinsicsPrior
 from jcr.geometry import apply, inverse, rotation_exp, skew, step_between, transform
-from jcr.handeye.closed_form import initial_estimate
-from jcr.handeye.fit import Cues, PoseProblem, fit_poses
 from jcr.records import HandEye, Intrinsics, Tracks
 
 FEWEST = 6

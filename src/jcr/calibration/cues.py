@@ -7,8 +7,8 @@ from numpy import ndarray
 from jcr.calibration.options import LengthInImage
 from jcr.camera import project, unproject
 from jcr.errors import InputError
+from jcr.estimation.fit import Poses
 from jcr.geometry import rotation_angle
-from jcr.handeye.fit import Poses
 from jcr.records import Capture, Finding, HandEye, Kind, Reconstruction
 
 LENGTH_STD = 0.01

@@ -19,10 +19,11 @@ from scipy.linalg import block_diag
 from scipy.optimize import root_scalar
 from scipy.stats import chi2, ncx2
 
-from jcr.geometry import retract, step_between
-from jcr.handeye.cholesky import lower
-from jcr.handeye.components import most_likely, over_sizes
-from jcr.handeye.equation import (
+from jcr.estimation.cholesky import lower
+from jcr.estimation.components import most_likely, over_sizes
+from jcr.estimation.fit import PoseFit, Unknowns
+from jcr.estimation.mixed_model import Equations, Solution, solve
+from jcr.estimation.pose_equations import (
     PRIOR_STD,
     ROTATION,
     SCALE,
@@ -31,9 +32,8 @@ from jcr.handeye.equation import (
     residuals,
     residuals_by_camera,
 )
-from jcr.handeye.fit import PoseFit, Unknowns
-from jcr.handeye.mixed_model import Equations, Solution, solve
-from jcr.handeye.systematic import Region
+from jcr.estimation.systematic import Region
+from jcr.geometry import retract, step_between
 
 CLEAR = 10.0
 """Difference of −2 log likelihoods by which one explanation is preferred to the other (odds of 150 to 1)."""

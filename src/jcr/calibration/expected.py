@@ -1,9 +1,9 @@
 """How exact a calibration will be, before it is made: one expectation for `jcr check` and proposed poses.
 
-It is the covariance that the calibration itself would report, by its own equations (adjust/foreseen.py where there are
-images, handeye/fit.py where camera poses are given): of the gripper poses, of what is known of the intrinsics before,
-of random and systematic errors of the robot, and of how much images tell. The last two are those that a calibration of
-some of the images found, else usual ones.
+It is the covariance that the calibration itself would report, by its own equations (estimation/foreseen.py where there
+are images, estimation/fit.py where camera poses are given): of the gripper poses, of what is known of the intrinsics
+before, of random and systematic errors of the robot, and of how much images tell. The last two are those that a
+calibration of some of the images found, else usual ones.
 """
 
 from collections.abc import Callable
@@ -13,18 +13,18 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.adjust.foreseen import ForeseenCamera, foreseen
-from jcr.adjust.intrinsics_prior import prior_about
-from jcr.adjust.robots import ArmPoses
 from jcr.calibration.adjust import estimate_in
 from jcr.calibration.case import Case
 from jcr.calibration.robot_errors import RobotErrors, of_poses
 from jcr.calibration.seen import Scene, in_use, within_95
+from jcr.estimation.fit import Cues, expected_fit
+from jcr.estimation.foreseen import ForeseenCamera, foreseen
+from jcr.estimation.image_robots import ArmPoses
+from jcr.estimation.intrinsics_prior import prior_about
+from jcr.estimation.mixed_model import GIVEN_SHARE, TYPICAL
+from jcr.estimation.next_poses import assumed_camera, candidates, looked_at, nearest, next_poses
+from jcr.estimation.pose_equations import Poses, point_ahead, uncertainty
 from jcr.geometry import inverse, rotation_angle
-from jcr.handeye.equation import Poses, point_ahead, uncertainty
-from jcr.handeye.fit import Cues, expected_fit
-from jcr.handeye.mixed_model import GIVEN_SHARE, TYPICAL
-from jcr.handeye.next_poses import assumed_camera, candidates, looked_at, nearest, next_poses
 from jcr.least_squares import one_blas_thread
 from jcr.records import Estimate, HandEye, Intrinsics, NextPose, RobotNoise, Seen, Where
 

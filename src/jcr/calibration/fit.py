@@ -11,8 +11,8 @@ from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import RobotErrors
 from jcr.errors import RejectedError
-from jcr.handeye.fit import Cues
-from jcr.handeye.solve import solve_hand_eye
+from jcr.estimation.fit import Cues
+from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.records import Capture, HandEye, Reconstruction
 
 

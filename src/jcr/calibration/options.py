@@ -50,7 +50,7 @@ class CalibrateOptions:
 
 def check_options(options: CalibrateOptions) -> None:
     """Raise InputError, before any work, if a number or a name is not valid."""
-    from jcr.handeye.arms import arm_named
+    from jcr.estimation.arms import arm_named
 
     for flag, pair in (("--require", options.require), ("--robot-noise", options.robot_noise)):
         if pair is not None and not all(0 < value < inf for value in pair):

@@ -2,16 +2,16 @@
 
 import numpy as np
 
+from jcr.calibration.conventions import better_reading, convention_finding
 from jcr.calibration.cues import height_cue
 from jcr.calibration.expected import assumed_of_poses
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import RobotErrors, errors_of
 from jcr.errors import InputError
-from jcr.handeye.arms import arm_named
-from jcr.handeye.conventions import better_reading, convention_finding
-from jcr.handeye.fit import Cues
-from jcr.handeye.solve import SCALE_STD, solve_hand_eye
+from jcr.estimation.arms import arm_named
+from jcr.estimation.fit import Cues
+from jcr.estimation.hand_eye import SCALE_STD, solve_hand_eye
 from jcr.records import Finding, HandEye, Kind, PosePairs
 
 METRIC_STD = 0.005

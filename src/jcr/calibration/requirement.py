@@ -11,8 +11,8 @@ from jcr.calibration.expected import Ahead, Assumptions, typical_noise, worse_of
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import RobotErrors
 from jcr.calibration.seen import Scene, in_use, within_95
-from jcr.handeye.next_poses import assumed_camera
-from jcr.handeye.observability import excitation
+from jcr.estimation.next_poses import assumed_camera
+from jcr.estimation.observability import excitation
 from jcr.records import BENT, Finding, HandEye, Kind, Mend, NextPose, Plan, Requirement, Where
 
 GRASPING = (5.0, 1.0)

@@ -9,13 +9,13 @@ from numpy import ndarray
 from jcr.calibration.options import CalibrateOptions
 from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError
-from jcr.handeye.arms import arm_named
-from jcr.handeye.equation import Poses
-from jcr.handeye.inverse_kinematics import reach_toward
-from jcr.handeye.mounting import LengthError
-from jcr.handeye.next_poses import nearest
-from jcr.handeye.robots import Arm, Joints
-from jcr.handeye.systematic import arm_errors, posed, smooth_errors
+from jcr.estimation.arms import arm_named
+from jcr.estimation.inverse_kinematics import reach_toward
+from jcr.estimation.kinematics import Arm, Joints
+from jcr.estimation.mounting import LengthError
+from jcr.estimation.next_poses import nearest
+from jcr.estimation.pose_equations import Poses
+from jcr.estimation.systematic import arm_errors, posed, smooth_errors
 from jcr.records import Capture, Finding, Kind
 
 

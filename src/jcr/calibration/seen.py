@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.model_error import second_moment_px2
-from jcr.adjust.points import PointsPlaced
 from jcr.camera import NORMALIZED, by_parameters, by_point, parameters, unproject
 from jcr.distributions import chi2
+from jcr.estimation.model_error import second_moment_px2
+from jcr.estimation.points import PointsPlaced
 from jcr.geometry import by_similarity, retract, skew
 from jcr.records import Estimate, HandEye, Intrinsics, InUse, SceneUncertainty, Seen, WithGivenIntrinsics
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from jcr.calibration.case import Case, Checked
-from jcr.handeye.solve import judged
+from jcr.estimation.hand_eye import judged
 from jcr.records import Finding, HandEye, verdict_of
 
 

@@ -9,8 +9,8 @@ from numpy import ndarray
 from jcr.capture.images import BLURRED
 from jcr.capture.options import MIN_FRAMES
 from jcr.errors import InputError
+from jcr.estimation.pose_equations import ASSUMED_NOISE, most_informative, pose_information
 from jcr.geometry import inverse, motion_length
-from jcr.handeye.equation import ASSUMED_NOISE, most_informative, pose_information
 
 STILL = 0.005
 """m/s, rotation counted at ARM: a tenth of a pixel in an exposure of 20 ms, half a metre away."""

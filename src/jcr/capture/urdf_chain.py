@@ -9,8 +9,8 @@ from numpy import ndarray
 
 from jcr.capture.plain_files import read_text
 from jcr.errors import InputError
+from jcr.estimation.kinematics import Arm
 from jcr.geometry import require_rigid
-from jcr.handeye.robots import Arm
 
 if TYPE_CHECKING:
     import yourdfpy

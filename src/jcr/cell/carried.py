@@ -3,7 +3,7 @@
 In the frame of the carried object the camera moves as a wrist camera does in the base: with the inverse gripper poses
 everything that calibrates a wrist camera calibrates this one, from matches that the robot checks to the verdict. Only
 the robot's errors are not those of inverse poses, so that the answer and its covariance are found once more with the
-errors where they are (adjust/robots.py).
+errors where they are (estimation/image_robots.py).
 """
 
 from dataclasses import replace
@@ -20,8 +20,8 @@ from jcr.cell.alone import found_alone, not_registered, of_camera
 from jcr.cell.background import write_moving_parts
 from jcr.cell.found import CameraFound
 from jcr.errors import RejectedError
+from jcr.estimation.hand_eye import judged, solve_hand_eye
 from jcr.geometry import inverse
-from jcr.handeye.solve import judged, solve_hand_eye
 from jcr.progress import Progress
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.records import Capture, CellCamera, Finding, HandEye, Kind, Reconstruction

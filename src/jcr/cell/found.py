@@ -12,7 +12,7 @@ from jcr.geometry import skew
 from jcr.records import Assessed, CellCamera, Finding, Intrinsics, Mount
 
 if TYPE_CHECKING:
-    from jcr.adjust.robots import Adjusted, Placed
+    from jcr.estimation.image_robots import Adjusted, Placed
 
 
 @dataclass(frozen=True, kw_only=True)

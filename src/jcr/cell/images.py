@@ -7,15 +7,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.intrinsics_prior import IntrinsicsPrior, prior_about
-from jcr.adjust.robots import Adjusted, ArmPoses
-from jcr.adjust.scene import Freedom, Observations, RigInformation, Scene
-from jcr.adjust.score_test import freed, with_intrinsics
-from jcr.adjust.together import adjust
 from jcr.calibration.case import MIN_OBSERVATIONS, of_images
 from jcr.calibration.options import CalibrateOptions
 from jcr.cell.localise import Known
 from jcr.cell.rigs import Member, Rigs
+from jcr.estimation.image_robots import Adjusted, ArmPoses
+from jcr.estimation.intrinsics_prior import IntrinsicsPrior, prior_about
+from jcr.estimation.scene import Freedom, Observations, RigInformation, Scene
+from jcr.estimation.score_test import freed, with_intrinsics
+from jcr.estimation.together import adjust
 from jcr.reconstruct.least_squares_matching import KEYPOINT_STD_PX
 from jcr.records import Capture, HandEye, Intrinsics, Kind, Reconstruction
 

@@ -7,7 +7,7 @@ import numpy as np
 from jcr.cell.found import CameraFound
 from jcr.cell.localise import LEAST_SPREAD, spread
 from jcr.cell.rigs import Member
-from jcr.handeye.solve import MAX_STD
+from jcr.estimation.hand_eye import MAX_STD
 from jcr.records import Finding, Kind
 
 MEDIAN_PX = 3.0

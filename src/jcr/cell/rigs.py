@@ -9,16 +9,16 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.adjust.robots import ArmPoses
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
 from jcr.cell.camera_views import CameraViews
 from jcr.cell.found import CameraFound
 from jcr.cell.localise import Shared
+from jcr.estimation.bent import bends
+from jcr.estimation.hand_eye import solve_hand_eye
+from jcr.estimation.image_robots import ArmPoses
+from jcr.estimation.systematic import smooth_errors
 from jcr.geometry import inverse, motion_length, step_between
-from jcr.handeye.bent import bends
-from jcr.handeye.solve import solve_hand_eye
-from jcr.handeye.systematic import smooth_errors
 from jcr.records import BENT, Capture, CellCamera, Finding, HandEye, Kind
 
 SAME_PLACE = (0.02, np.radians(2.0))

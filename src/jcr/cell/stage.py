@@ -1,7 +1,7 @@
 """Further cameras of a cell, placed with the calibration of the capture's own: images first, then robots.
 
 Every image of another camera is localised in the reconstruction (localise.py); all images are adjusted together with
-the arms' poses (adjust/). The calibration of the capture's own camera stays as it was found: what is found here of
+the arms' poses (estimation/). The calibration of the capture's own camera stays as it was found: what is found here of
 others rests on the same images.
 """
 
@@ -11,9 +11,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.images import median_reprojection_px
-from jcr.adjust.intrinsics_prior import ESTIMATED, prior_of
-from jcr.adjust.robots import Adjusted, Placed
 from jcr.calibration.checks.camera import camera_faults, with_contradiction
 from jcr.calibration.checks.given_intrinsics import contradicted_by
 from jcr.calibration.checks.imaged import Imaged
@@ -32,6 +29,9 @@ from jcr.cell.place_checks import (
     with_faults,
 )
 from jcr.cell.rigs import Member, Rigs
+from jcr.estimation.image_robots import Adjusted, Placed
+from jcr.estimation.images import median_reprojection_px
+from jcr.estimation.intrinsics_prior import ESTIMATED, prior_of
 from jcr.geometry import inverse, scale_translation
 from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress, silent, steps

@@ -12,7 +12,7 @@ import tyro
 from jcr.capture.options import ConventionName, UnitsName
 from jcr.cli.output import Output
 from jcr.errors import InputError
-from jcr.handeye.arms import CHOICES, ROBOT_NAMES, RobotName
+from jcr.estimation.arms import CHOICES, ROBOT_NAMES, RobotName
 from jcr.live.camera import CameraOptions
 from jcr.live.collect import LEAST_IMAGES, CollectOptions
 
@@ -206,7 +206,7 @@ _SPOKEN: dict[str, ConventionName] = {"ur": "ur", "franka": "franka", "xarm": "x
 
 
 def _words(arguments: Arguments, live: "LiveFolder") -> "ArmWords":
-    from jcr.handeye.arms import arm_named
+    from jcr.estimation.arms import arm_named
     from jcr.live.arm_words import ArmWords
 
     convention = arguments.pose_convention

@@ -21,9 +21,9 @@ from jcr.calibration.stage import checked
 from jcr.capture.camera_json import intrinsics_as_json
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
 from jcr.errors import RejectedError
+from jcr.estimation.arms import arm_named
 from jcr.files import read_bytes, write_text
 from jcr.geometry import apply, largest_motion
-from jcr.handeye.arms import arm_named
 from jcr.least_squares import one_blas_thread
 from jcr.live.calibration_left_out import left_out
 from jcr.live.calibration_progress import LeftOut, Progress, Reached
@@ -51,8 +51,8 @@ class LiveCalibration:
 
     `folder` is that of the capture, or its LiveFolder; a capture that was begun there is continued, from its files.
     `intrinsics` are of images as they are given to `add`; None: they are estimated. `robot` names the arm
-    (jcr.handeye.arms.ROBOT_NAMES). `reach` (2,3) is the box (m, base frame) in which gripper poses are proposed. Images
-    and poses are written into the folder as they come, and it can be read by jcr.read_capture at any time.
+    (jcr.estimation.arms.ROBOT_NAMES). `reach` (2,3) is the box (m, base frame) in which gripper poses are proposed.
+    Images and poses are written into the folder as they come, and it can be read by jcr.read_capture at any time.
     """
 
     def __init__(

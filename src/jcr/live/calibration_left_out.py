@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from jcr.adjust.robots import Adjusted
 from jcr.calibration.adjust import adjusted
 from jcr.calibration.case import Case, of_images, some_of_many
 from jcr.calibration.fit import fitted
@@ -22,6 +21,7 @@ from jcr.calibration.robot_errors import RobotErrors
 from jcr.calibration.seen import seen_in_base
 from jcr.camera import unproject
 from jcr.distributions import chi2
+from jcr.estimation.image_robots import Adjusted
 from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, transform
 from jcr.live.calibration_progress import LeftOut
 from jcr.records import Capture, Reconstruction, Tracks

@@ -16,8 +16,8 @@ from jcr.capture.formats.capture_json import FILE, read_joints
 from jcr.capture.images import encode_png, read_image
 from jcr.capture.plain_files import contained, read_json
 from jcr.errors import InputError
+from jcr.estimation.arms import ROBOT_NAMES
 from jcr.files import remove_unfinished, write_bytes, write_text
-from jcr.handeye.arms import ROBOT_NAMES
 from jcr.records import Capture
 
 IMAGES = "images"

@@ -10,8 +10,8 @@ from numpy import ndarray
 from jcr.calibration.case import Case
 from jcr.calibration.expected import Ahead, Assumptions, assumed, scene_distance, typical_camera
 from jcr.calibration.robot_errors import RobotErrors, errors_of
+from jcr.estimation.kinematics import Arm
 from jcr.geometry import rotation_angle
-from jcr.handeye.robots import Arm
 from jcr.live.arm_words import Path, joints_at
 from jcr.records import Capture, HandEye
 

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
+from jcr.estimation.closed_form import sine_axis
 from jcr.geometry import nearest_rotation, rotation_exp, rotation_log, skew
-from jcr.handeye.closed_form import sine_axis
 
 MAX_HYPOTHESES = 3000
 LEAST_ACROSS = 0.25

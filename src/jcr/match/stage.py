@@ -14,8 +14,8 @@ import pycolmap
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from jcr.estimation.closed_form import motions
 from jcr.geometry import rotation_angle
-from jcr.handeye.closed_form import motions
 from jcr.match import gate as robot
 from jcr.match.epipolar import translation_of_x
 from jcr.match.focal import focal_by_robot

@@ -1,8 +1,8 @@
 """Corners of a board or of tags among the tracks of a reconstruction that features made.
 
 The cameras are known up to one similarity, so that corners are triangulated as any other points. What the board shows
-beside that, its shape and its size, the adjustment takes as a prior (adjust/boards.py). Where a body is not at one place
-in all images, the place that most images agree on counts.
+beside that, its shape and its size, the adjustment takes as a prior (estimation/boards.py). Where a body is not at one
+place in all images, the place that most images agree on counts.
 """
 
 from collections.abc import Iterator, Sequence

@@ -19,7 +19,7 @@ from numpy import ndarray
 
 from jcr.camera import unproject
 from jcr.capture.images import read_image
-from jcr.handeye.closed_form import motions
+from jcr.estimation.closed_form import motions
 from jcr.match import gate as robot
 from jcr.match.gate import Gate, Key, Pair
 from jcr.match.kept import KeepingMatcher, KeptFeatures

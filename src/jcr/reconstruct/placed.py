@@ -14,8 +14,8 @@ import pycolmap
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.estimation.robust import robust_fit
 from jcr.geometry import inverse, nearest_rotation, rotation_angle, transform
-from jcr.handeye.robust import robust_fit
 
 LEAST_MAPPED = 4
 """Cameras from which another one can be predicted."""

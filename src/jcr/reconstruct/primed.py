@@ -14,7 +14,7 @@ import pycolmap
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.handeye.closed_form import motions
+from jcr.estimation.closed_form import motions
 from jcr.match.epipolar import translation_of_x
 from jcr.match.gate import Gate
 from jcr.match.verify import Geometries

@@ -54,7 +54,7 @@ class Observability:
 
 @dataclass(frozen=True)
 class Excitation:
-    """Principal directions of what the motions see, least seen first (handeye/observability.py)."""
+    """Principal directions of what the motions see, least seen first (estimation/observability.py)."""
 
     value: Float[ndarray, "7"]
     direction: Float[ndarray, "7 7"]
@@ -257,7 +257,7 @@ class WithGivenIntrinsics:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelError:
-    """What the intrinsics leave of the distortion: polynomials over the image (adjust/model_error.py), in widths of
+    """What the intrinsics leave of the distortion: polynomials over the image (estimation/model_error.py), in widths of
     it."""
 
     likeliest: Float[ndarray, " e"]

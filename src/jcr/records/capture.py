@@ -104,7 +104,7 @@ class Capture:
     joints: Float[ndarray, "n dof"] | None = None
     """Joint angles (rad) at each image, from the base on; None: not recorded."""
     robot: str | None = None
-    """Name of the arm, one of jcr.handeye.arms.ROBOT_NAMES."""
+    """Name of the arm, one of jcr.estimation.arms.ROBOT_NAMES."""
     urdf: Path | None = None
     """The arm's URDF file, not relative to `folder`; None where none was given."""
     orientation: int = 1

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jcr.capture.robot_poses import CONVENTIONS, OF_ARM, numbers_from_poses, units_of
-from jcr.handeye.observability import WEAK
+from jcr.estimation.observability import WEAK
 from jcr.records import Excitation, NextPose
 from jcr.report.render import Section
 from jcr.results import PosesResult, RunResult

@@ -1,6 +1,6 @@
 """Are the robot's poses bent by where its gripper is? An axis of wrong length, a stand that leans, a tool that sags.
 
-What the residuals show surely (handeye/bent.py) is free in the adjustment that follows. The calibration stays that of
+What the residuals show surely (estimation/bent.py) is free in the adjustment that follows. The calibration stays that of
 the effective transform, which predicts best from the poses as they are reported; how far it is from that of the true
 poses, and what the scale may be off by, counts as uncertainty.
 """
@@ -13,9 +13,9 @@ from numpy import ndarray
 
 from jcr.calibration.adjust import adjust_case, refined_by
 from jcr.calibration.case import Case, Checked
+from jcr.estimation.bent import STRAINS, WAYS, Bent, bends, by_scale, tested, to_straight
+from jcr.estimation.hand_eye import judged
 from jcr.geometry import step_between
-from jcr.handeye.bent import STRAINS, WAYS, Bent, bends, by_scale, tested, to_straight
-from jcr.handeye.solve import judged
 from jcr.records import Finding, Kind
 
 LOG_P = float(np.log(1e-6))

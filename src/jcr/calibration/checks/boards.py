@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.robots import Adjusted, size_of_boards
 from jcr.calibration.case import Case, Checked
+from jcr.estimation.image_robots import Adjusted, size_of_boards
 from jcr.geometry import apply
 from jcr.records import BoardFound, Boards, Finding, Kind
 

@@ -1,9 +1,9 @@
 """Is it one camera in all images? A focus that moves, a zoom, a rolling shutter, intrinsics that are a little wrong.
 
-Each is a hypothesis of adjust/score_test.py, tested beside a focal length that is wrong by one factor in all images. The
-images are adjusted with the one of least p free, which shows its value and what it does to the camera's place; then the
-next is tested beside it. Whether intrinsics that were given can be those of the images at all is asked last. A capture's
-own camera and a further one of a cell are tested alike (imaged.py).
+Each is a hypothesis of estimation/score_test.py, tested beside a focal length that is wrong by one factor in all images.
+The images are adjusted with the one of least p free, which shows its value and what it does to the camera's place; then
+the next is tested beside it. Whether intrinsics that were given can be those of the images at all is asked last. A
+capture's own camera and a further one of a cell are tested alike (imaged.py).
 """
 
 from collections.abc import Sequence
@@ -15,10 +15,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.model_error import TYPICAL
-from jcr.adjust.robots import Adjusted
-from jcr.adjust.scene import OF_IMAGE, PRISM
-from jcr.adjust.score_test import (
+from jcr.calibration.adjust import adjust_case, focal_of_each
+from jcr.calibration.case import Case, Checked, of_points
+from jcr.calibration.checks.given_intrinsics import intrinsics_contradiction
+from jcr.calibration.checks.imaged import Imaged, of_case
+from jcr.camera import parameter_names, parameters
+from jcr.estimation.image_robots import Adjusted
+from jcr.estimation.model_error import TYPICAL
+from jcr.estimation.scene import OF_IMAGE, PRISM
+from jcr.estimation.score_test import (
     Alternatives,
     Tested,
     alternatives,
@@ -28,11 +33,6 @@ from jcr.adjust.score_test import (
     spanned,
     tested,
 )
-from jcr.calibration.adjust import adjust_case, focal_of_each
-from jcr.calibration.case import Case, Checked, of_points
-from jcr.calibration.checks.given_intrinsics import intrinsics_contradiction
-from jcr.calibration.checks.imaged import Imaged, of_case
-from jcr.camera import parameter_names, parameters
 from jcr.geometry import step_between
 from jcr.records import Finding, Intrinsics, Kind, Mend, Tracks
 

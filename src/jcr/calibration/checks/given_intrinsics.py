@@ -9,15 +9,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from jcr.adjust.intrinsics_prior import ESTIMATED, FIXED, prior_of
-from jcr.adjust.robots import Adjusted
-from jcr.adjust.score_test import freed_intrinsics
 from jcr.calibration.adjust import adjust_case, estimate_of, refined_by
 from jcr.calibration.case import Case, Checked
 from jcr.calibration.checks.imaged import Imaged, of_case
 from jcr.camera import PARAMETERS, by_parameters, parameters, unproject
+from jcr.estimation.hand_eye import judged
+from jcr.estimation.image_robots import Adjusted
+from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, prior_of
+from jcr.estimation.score_test import freed_intrinsics
 from jcr.geometry import ARM, step_between
-from jcr.handeye.solve import judged
 from jcr.records import Finding, Kind
 
 SURE = 5.0

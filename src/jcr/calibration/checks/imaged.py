@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.adjust.intrinsics_prior import IntrinsicsPrior
-from jcr.adjust.robots import Adjusted, Placed
-from jcr.adjust.score_test import first_x
 from jcr.calibration.adjust import adjust_case, estimate_of, focal_of_each
 from jcr.calibration.case import Case
+from jcr.estimation.image_robots import Adjusted, Placed
+from jcr.estimation.intrinsics_prior import IntrinsicsPrior
+from jcr.estimation.score_test import first_x
 from jcr.records import Intrinsics
 
 Combinations = Float[ndarray, "e p"]

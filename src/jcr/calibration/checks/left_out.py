@@ -5,8 +5,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.capture.images import read_image
+from jcr.estimation.pose_equations import predict
 from jcr.geometry import step_between
-from jcr.handeye.equation import predict
 from jcr.reconstruct.relocate import Located, relocate
 from jcr.records import Capture, Finding, HandEye, Kind, Reconstruction
 

@@ -15,14 +15,14 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.robots import Adjusted, KnownLength, size_of_boards
-from jcr.adjust.together import with_lengths
 from jcr.calibration.adjust import refined_by
 from jcr.calibration.case import Case, Checked
 from jcr.calibration.checks.depth_camera import depth_check
 from jcr.calibration.cues import CONTRADICTED, length_cue
-from jcr.handeye.equation import SCALE
-from jcr.handeye.solve import judged
+from jcr.estimation.hand_eye import judged
+from jcr.estimation.image_robots import Adjusted, KnownLength, size_of_boards
+from jcr.estimation.pose_equations import SCALE
+from jcr.estimation.together import with_lengths
 from jcr.records import Finding, HandEye, Kind, LengthCheck, LengthName, ScaleCheck, ScaleEvidence
 
 DEPTH_STD, NETWORK_STD = 0.02, 0.05

@@ -6,8 +6,8 @@ import numpy as np
 
 from jcr.calibration.case import Case, Checked
 from jcr.calibration.robot_errors import of_poses
-from jcr.handeye.joint_offsets import joint_offsets, systematic_p_value
-from jcr.handeye.residuals import angle_ratio
+from jcr.estimation.joint_offsets import joint_offsets, systematic_p_value
+from jcr.estimation.residuals import angle_ratio
 from jcr.records import CAMERA, AngleRatio, Finding, Kind, RobotExamined
 
 MIN_EXAMINED = 4

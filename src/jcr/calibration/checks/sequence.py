@@ -18,7 +18,7 @@ from scipy.linalg import solve_triangular
 from jcr.calibration.case import Case, Checked
 from jcr.calibration.robot_errors import of_poses
 from jcr.distributions import f as f_distribution
-from jcr.handeye.equation import PRIOR_STD, ROTATION, TRANSLATION, Poses, residuals
+from jcr.estimation.pose_equations import PRIOR_STD, ROTATION, TRANSLATION, Poses, residuals
 from jcr.records import Finding, HandEye, Kind
 
 LOG_P = float(np.log(1e-4))

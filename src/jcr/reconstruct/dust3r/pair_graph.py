@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from jcr.estimation.closed_form import rotations
 from jcr.geometry import apply, fit_similarity, inverse, rotation_angle, transform
-from jcr.handeye.closed_form import rotations
 from jcr.reconstruct.global_alignment.pairs import PairPredictions
 
 FEW_IMAGES = 12

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.estimation.closed_form import initial_estimate
+from jcr.estimation.systematic import REACH
 from jcr.geometry import inverse, retract, scale_translation, skew, step_axes, step_between
-from jcr.handeye.closed_form import initial_estimate
-from jcr.handeye.systematic import REACH
 from jcr.reconstruct.global_alignment.gauss_newton import (
     FINE_TOLERANCE,
     NORMAL_SQUARE_MEDIAN,

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.images import ImageEvidence, adjust_images
-from jcr.adjust.intrinsics_prior import ESTIMATED, FIXED, prior_of
-from jcr.adjust.scene import Freedom, Observations, Scene
 from jcr.camera import unproject
+from jcr.estimation.images import ImageEvidence, adjust_images
+from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, prior_of
+from jcr.estimation.scene import Freedom, Observations, Scene
 from jcr.geometry import inverse
 from jcr.reconstruct.preprocess import ImageGrid, PreparedImages
 from jcr.reconstruct.views_at_once.colour_matches import Geometry, Matches, colour_matches

@@ -18,8 +18,8 @@ from numpy import ndarray
 
 from jcr.camera import rays
 from jcr.errors import InputError
+from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.geometry import apply
-from jcr.handeye.solve import solve_hand_eye
 from jcr.memory import ALLOWANCE, GB, announce, require, resident
 from jcr.progress import Progress, silent
 from jcr.reconstruct.hub import Weights

@@ -1,0 +1,378 @@
+"""Pose-convention diagnosis: gripper poses that do not fit the images, read in other ways people write them.
+
+Readings are ranked by screw congruence (a gripper's rotation between two images has the angle of its
+camera's), and the best of them solved. Nothing is ever applied: a reading that fits is named.
+"""
+
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import permutations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+from jcr.estimation.closed_form import closed_form, initial_estimate
+from jcr.estimation.fit import PoseProblem, fit_poses
+from jcr.estimation.hand_eye import solve_hand_eye
+from jcr.estimation.observability import observability
+from jcr.estimation.pose_equations import Poses
+from jcr.estimation.robust import least_trimmed
+from jcr.estimation.systematic import smooth_errors
+from jcr.geometry import Transform, fit_similarity, inverse, retract, rotation_exp, skew, transform
+from jcr.least_squares import minimise
+from jcr.records import Finding, HandEye, Kind, RobotNoise, Severity
+
+SOLVED = 24
+"""At most this many readings are solved in full, the most congruent ones."""
+SAME_ANGLE = np.radians(0.1)
+"""Relabelled axes keep every angle: among readings this alike, the usual mistakes are solved first."""
+FITS = 3.0
+"""mm; poses that agree with the images to this need no other reading."""
+CONGRUENT = np.radians(1.5)
+"""Readings whose angles miss the cameras' by less than this are worth solving."""
+BETTER = 3.0
+"""A reading is named when it fits this many times better than the poses as given."""
+ROUGHLY = 2.0
+"""A closed form shows how well a reading fits to this factor."""
+ROTATION, ON_MULTIPLE = 2 * np.pi, 1.5
+"""Degrees: numbers that were taken as radians are known up to multiples of the one, and lie as near one as the other."""
+MIN_SHARE = 0.8
+"""of the images must agree under it."""
+INVERSES = "their inverses (gripper_from_base was given)"
+WXYZ = "quaternions w, x, y, z that were taken as x, y, z, w"
+XYZW = "quaternions x, y, z, w that were taken as w, x, y, z"
+TRANSPOSED = "transposed rotations"
+MIRRORED = "mirrored ones (the images are mirrored, or the base's axes are left-handed)"
+BY_NUMBER = "those of the images in order of their names as numbers (1, 2, … 10)"
+BY_TEXT = "those of the images in order of their names as text (1, 10, 11, … 2)"
+OPTIONS = {
+    BY_NUMBER: "add a column image with the images' names",
+    BY_TEXT: "add a column image with the images' names",
+    MIRRORED: "switch off the driver's mirroring or flip the images back, or correct the sign of one axis of the poses",
+    INVERSES: "add --pose-inverted",
+    WXYZ: "in a table add --pose-convention quat-wxyz",
+    XYZW: "in a table add --pose-convention quat-xyzw",
+    TRANSPOSED: "in a table of matrices add --pose-convention franka",
+}
+"""What reads poses so."""
+EULER_ORDERS = (
+    *("xyz", "ZYX", "zyx", "XYZ", "ZYZ", "zyz", "xzy", "yxz", "yzx", "zxy", "XZY", "YXZ", "YZX", "ZXY"),
+    *("xyx", "xzx", "yxy", "yzy", "zxz", "XYX", "XZX", "YXY", "YZY", "ZXZ"),
+)
+"""SciPy's names, lower case about fixed axes, upper case about moving ones; the usual ones first."""
+
+
+def _euler_mistakes() -> list[tuple[str, str]]:
+    """The order that angles were taken in, and the one that was meant, the usual ones first, each mistake once.
+
+    Angles about fixed axes are those about the moving ones, reversed, so that a mistake has two names.
+    """
+    rank = {order: k for k, order in enumerate(EULER_ORDERS)}
+    found: dict[frozenset[tuple[str, str]], tuple[str, str]] = {}
+    for mistake in sorted(permutations(EULER_ORDERS, 2), key=lambda pair: rank[pair[0]] + rank[pair[1]]):
+        taken, meant = mistake
+        other = taken[::-1].swapcase(), meant[::-1].swapcase()
+        found.setdefault(frozenset({mistake, other}), mistake)
+    return list(found.values())
+
+
+EULER_MISTAKES = _euler_mistakes()
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One way to read the poses, and how well it fits."""
+
+    name: str
+    translation_mm: float
+    """Errors per axis that the fit leaves, random and systematic; infinite when nothing fits."""
+    rotation_deg: float
+    used: int
+    """Images that agree."""
+
+    @property
+    def misfit(self) -> float:
+        """Size of the noise, a degree counted as 5 mm."""
+        return self.translation_mm + 5 * self.rotation_deg
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    name: str
+    base_from_gripper: Float[ndarray, "k 4 4"]
+    image: Int[ndarray, " k"]
+    """Row of the camera that each pose belongs to."""
+
+
+def better_reading(
+    base_from_gripper: Poses,
+    recon_from_camera: Poses,
+    by_name: Mapping[bool, Poses] | None = None,
+    solved: HandEye | None = None,
+) -> tuple[Reading, Reading] | None:
+    """The reading that fits far better than the poses as given, and those; None when there is none.
+
+    `by_name` holds the poses by other orders of the images' names: as numbers (True), as text (False). `solved` is the
+    calibration of the poses as given, where there is one from the camera poses alone.
+    """
+    n = len(base_from_gripper)
+    candidates = list(_candidates(base_from_gripper))
+    every = np.arange(n)
+    for by_number, poses in (by_name or {}).items():
+        candidates.append(_Candidate(BY_NUMBER if by_number else BY_TEXT, poses, every))
+    given = candidates[0]
+    as_given = _solved(given, recon_from_camera) if solved is None else _reading(given, solved)
+    if as_given.misfit < FITS and as_given.used >= MIN_SHARE * n:
+        return None
+    others = candidates[1:]
+    camera_angle = _angles(recon_from_camera)
+    gaps = [_incongruence(candidate, camera_angle) for candidate in others]
+    if min(gaps) > CONGRUENT and observability(base_from_gripper).observable:
+        # Lost rotations take a second to find again: only where no cheaper reading has the cameras' angles, and not of
+        # rotations about one axis, which read in degrees are as degenerate.
+        unwound = list(_degrees_taken_as_radians(base_from_gripper, recon_from_camera))
+        others += unwound
+        gaps += [_incongruence(candidate, camera_angle) for candidate in unwound]
+    gaps = np.array(gaps)
+    order = np.argsort(np.round(gaps / SAME_ANGLE), kind="stable")[:SOLVED]
+    worth = [others[k] for k in order if gaps[k] < 2 * gaps.min() + SAME_ANGLE]
+    agree, errors = zip(*(_roughly(candidate, recon_from_camera) for candidate in worth), strict=True)
+    rough = np.array(errors)
+    # Of a reading that may be named: shuffled poses fit no reading, and each would be solved in vain.
+    enough = 1e-3 * ROUGHLY / BETTER * as_given.misfit
+    limit = min(enough, _roughly(given, recon_from_camera)[1] / ROUGHLY)
+    if not np.isfinite(rough.min()) or rough.min() > limit:
+        return None
+    readings = [
+        _solved(candidate, recon_from_camera)
+        for candidate, images, error in zip(worth, agree, rough, strict=True)
+        if error <= min(ROUGHLY * rough.min(), enough)
+        and _least_misfit(candidate, recon_from_camera, images) * BETTER < as_given.misfit
+    ]
+    if not readings:
+        return None
+    least = min(reading.misfit for reading in readings)
+    best = next(reading for reading in readings if reading.misfit < 1.05 * least + 0.01)
+    if best.used >= MIN_SHARE * (n - 2) and best.misfit * BETTER < as_given.misfit:
+        return best, as_given
+    return None
+
+
+def convention_finding(found: tuple[Reading, Reading], severity: Severity = "rejects") -> Finding:
+    """That the poses fit when read so, and what reads them so."""
+    best, given = (
+        f"{reading.translation_mm:.1f} mm and {reading.rotation_deg:.2f}° per axis over {reading.used} images"
+        for reading in found
+    )
+    remedy = OPTIONS.get(found[0].name, "correct them at their source")
+    details = {"reading": found[0].name, "fits": best, "given": given, "remedy": remedy}
+    finding = Finding.of(Kind.POSE_CONVENTION, severity, "poses", value=1e-3 * found[0].translation_mm)
+    return replace(finding, details=details)
+
+
+def _solved(candidate: _Candidate, recon_from_camera: Poses) -> Reading:
+    return _reading(
+        candidate, solve_hand_eye(candidate.base_from_gripper, recon_from_camera[candidate.image])
+    )
+
+
+def _reading(candidate: _Candidate, solved: HandEye) -> Reading:
+    """A candidate, and how well its calibration fits."""
+    return Reading(candidate.name, *_mm_deg(solved.robot_noise), int(solved.inliers.sum()))
+
+
+def _mm_deg(noise: RobotNoise) -> tuple[float, float]:
+    """Of all errors together."""
+    metres, radians = noise.together
+    return 1e3 * metres, float(np.degrees(radians))
+
+
+def _least_misfit(candidate: _Candidate, recon_from_camera: Poses, agree: Bool[ndarray, " k"]) -> float:
+    """Misfit of a candidate in the images that agree best: in a tenth of the time of a whole solution, which uses
+    more."""
+    gripper, camera = candidate.base_from_gripper[agree], recon_from_camera[candidate.image[agree]]
+    used = np.ones(len(gripper), dtype=bool)
+    problem = PoseProblem(
+        base_from_gripper=gripper, recon_from_camera=camera, used=used, systematic=smooth_errors(gripper)
+    )
+    fit = fit_poses(problem, initial_estimate(gripper, camera), averaged=False)
+    return Reading(candidate.name, *_mm_deg(fit.noise), len(gripper)).misfit
+
+
+def _roughly(candidate: _Candidate, recon_from_camera: Poses) -> tuple[Bool[ndarray, " k"], float]:
+    """The images that agree best, and the error (m) that a closed form leaves in them: in a hundredth of the time of a
+    fit.
+
+    Infinite where its scale is negative: so it fits mirrored poses, which nobody can see from.
+    """
+    camera = recon_from_camera[candidate.image]
+    agree, error = least_trimmed(candidate.base_from_gripper, camera)
+    _, scale, _ = closed_form(candidate.base_from_gripper, camera, agree.astype(float))
+    return agree, error if scale > 0 else np.inf
+
+
+def _incongruence(candidate: _Candidate, camera_angle: Float[ndarray, "n n"]) -> float:
+    """Typical difference (rad) between the angles of gripper and camera motions."""
+    gap = np.abs(
+        _angles(candidate.base_from_gripper) - camera_angle[np.ix_(candidate.image, candidate.image)]
+    )
+    return float(np.quantile(gap[np.triu_indices(len(gap), 1)], 0.6))
+
+
+def _angles(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n n"]:
+    """Angles (rad) of all relative rotations, by their traces: rough near 0 and π, but quick."""
+    flat = a_from_b[:, :3, :3].reshape(-1, 9)
+    return np.arccos(np.clip((flat @ flat.T - 1) / 2, -1, 1))
+
+
+def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
+    """As given first; then one mistake at a time."""
+    n = len(base_from_gripper)
+    every = np.arange(n)
+    yield _Candidate("they are given", base_from_gripper, every)
+    yield _Candidate(INVERSES, inverse(base_from_gripper), every)
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    yield _Candidate(MIRRORED, mirror @ base_from_gripper @ mirror, every)
+    yield _Candidate("listed in reverse order of the images", base_from_gripper[::-1], every)
+    for shift in range(1, min(2, n - 5) + 1):
+        later, earlier = slice(shift, None), slice(n - shift)
+        ahead = f"{shift} ahead of the images (image k has pose k + {shift})"
+        behind = f"{shift} behind the images (image k has pose k − {shift})"
+        yield _Candidate(ahead, base_from_gripper[later], every[earlier])
+        yield _Candidate(behind, base_from_gripper[earlier], every[later])
+    rotation = Rotation.from_matrix(base_from_gripper[:, :3, :3])
+
+    def with_rotation(name: str, read: Rotation) -> _Candidate:
+        return _Candidate(name, transform(read.as_matrix(), base_from_gripper[:, :3, 3]), every)
+
+    x, y, z, w = rotation.as_quat().T
+    yield with_rotation(WXYZ, Rotation.from_quat(np.stack([y, z, w, x], 1)))
+    yield with_rotation(XYZW, Rotation.from_quat(np.stack([w, x, y, z], 1)))
+    in_radians = "in radians that were taken as degrees"
+    yield with_rotation(
+        f"rotation vectors {in_radians}", Rotation.from_rotvec(np.degrees(rotation.as_rotvec()))
+    )
+    yield with_rotation(TRANSPOSED, rotation.inv())
+    angles = {order: _euler(rotation, order) for order in EULER_ORDERS}
+    for order in EULER_ORDERS:
+        read = Rotation.from_euler(order, np.degrees(angles[order]))
+        yield with_rotation(f"Euler angles ({order}) {in_radians}", read)
+    for taken, meant in EULER_MISTAKES:
+        read = Rotation.from_euler(meant, angles[taken])
+        yield with_rotation(f"Euler angles {meant} that were taken as {taken}", read)
+
+
+def _degrees_taken_as_radians(base_from_gripper: Poses, recon_from_camera: Poses) -> Iterator[_Candidate]:
+    """Rotation vectors or Euler angles in degrees that were taken as radians: known up to multiples of 2π degrees.
+
+    The positions alone give the cameras' orientations in the base, hence all grippers' from any one of them.
+    Every possibility for the first image is tried, and must put the others on their multiples.
+    """
+    position = base_from_gripper[:, :3, 3]
+    base_rotation = _rotation_from_positions(position, recon_from_camera)
+    if base_rotation is None:
+        return
+    camera = base_rotation @ recon_from_camera[:, :3, :3]
+    read = Rotation.from_matrix(base_from_gripper[:, :3, :3])
+    for order in (None, *EULER_ORDERS[:4]):
+        numbers, along = _written(read, order)
+        multiples = np.meshgrid(*[np.arange(-29, 30)] * along.shape[1], indexing="ij")
+        first = ROTATION * np.stack(multiples, -1).reshape(-1, 1, along.shape[1]) @ along[0] + numbers[0]
+        first = first[(np.abs(first) <= [180, 90 if order else 180, 180]).all(2)]
+        gripper_from_camera = np.swapaxes(_rotations(first, order), 1, 2) @ camera[0]
+        for k in range(1, len(position)):
+            off = _nearest(camera[k] @ np.swapaxes(gripper_from_camera, 1, 2), order, numbers[k], along[k])[1]
+            gripper_from_camera = gripper_from_camera[off < ON_MULTIPLE]
+            if len(gripper_from_camera) == 0:  # an empty stack of rotations is no rotation for SciPy
+                break
+        else:
+            meant = [
+                _nearest((one @ gripper_from_camera[0].T)[None], order, numbers[k], along[k])[0]
+                for k, one in enumerate(camera)
+            ]
+            what = "rotation vectors" if order is None else f"Euler angles ({order})"
+            yield _Candidate(
+                f"{what} in degrees that were taken as radians",
+                transform(_rotations(np.concatenate(meant), order), position),
+                np.arange(len(position)),
+            )
+
+
+def _written(
+    rotation: Rotation, order: str | None
+) -> tuple[Float[ndarray, "n v 3"], Float[ndarray, "n d 3"]]:
+    """Numbers that write rotations as vectors (None) or Euler angles, in each of v ways, and along what they are known
+    up to multiples."""
+    if order is None:
+        vector = rotation.as_rotvec()
+        return vector[:, None], (vector / np.linalg.norm(vector, axis=1, keepdims=True).clip(1e-12))[:, None]
+    angles = _euler(rotation, order)
+    # The same rotation has two triples, and the one that was meant is not known.
+    both = np.stack([angles, angles * [1, -1, 1] + np.pi], axis=1)
+    return both, np.tile(np.eye(3), (len(angles), 1, 1))
+
+
+def _nearest(
+    expected: Float[ndarray, "m 3 3"],
+    order: str | None,
+    numbers: Float[ndarray, "v 3"],
+    along: Float[ndarray, "d 3"],
+) -> tuple[Float[ndarray, "m 3"], Float[ndarray, " m"]]:
+    """What an image's numbers may have been (degrees), nearest to those of expected rotations, and how far off."""
+    read = Rotation.from_matrix(expected)
+    degrees = np.degrees(read.as_rotvec() if order is None else _euler(read, order))[:, None]
+    possible = numbers + ROTATION * np.round((degrees - numbers) @ along.T / ROTATION) @ along
+    off = np.abs(possible - degrees).max(2)
+    return possible[np.arange(len(off)), off.argmin(1)], off.min(1)
+
+
+def _rotations(degrees: Float[ndarray, "m 3"], order: str | None) -> Float[ndarray, "m 3 3"]:
+    if order is None:
+        return rotation_exp(np.radians(degrees))
+    return Rotation.from_euler(order, degrees, degrees=True).as_matrix()
+
+
+def _euler(rotation: Rotation, order: str) -> Float[ndarray, "*batch 3"]:
+    """Euler angles (rad), also at gimbal lock, where SciPy warns that any of the equal answers will do."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return rotation.as_euler(order)
+
+
+Unknowns = tuple[Transform, float, Float[ndarray, "3"]]
+"""base_from_recon, the scale, and the gripper's place in the camera in recon units times the scale."""
+
+
+def _rotation_from_positions(
+    position: Float[ndarray, "n 3"], recon_from_camera: Poses
+) -> Float[ndarray, "3 3"] | None:
+    """Rotation of base_from_recon from gripper positions alone; None when they do not fit the cameras.
+
+    A gripper is at position = R_Z (λ c − R_C w) + z with w the gripper's offset in the camera: no orientation
+    of the gripper enters.
+    """
+    camera, center = recon_from_camera[:, :3, :3], recon_from_camera[:, :3, 3]
+
+    def linearised(unknowns: Unknowns) -> tuple[Float[ndarray, "n 3"], Float[ndarray, "n 3 10"]]:
+        base_from_recon, scale, w = unknowns
+        rotation = base_from_recon[:3, :3]
+        arm = (scale * center - camera @ w) @ rotation.T
+        rows = np.zeros((len(position), 3, 10))
+        rows[:, :, :3] = np.eye(3)
+        rows[:, :, 3:6] = -skew(arm)
+        rows[:, :, 6] = center @ rotation.T * scale
+        rows[:, :, 7:] = -rotation @ camera
+        return arm + base_from_recon[:3, 3] - position, rows
+
+    def moved(unknowns: Unknowns, step: Float[ndarray, "10"]) -> Unknowns:
+        base_from_recon, scale, w = unknowns
+        return retract(base_from_recon, step[:6]), scale * float(np.exp(step[6])), w + step[7:]
+
+    found = minimise(linearised, (*fit_similarity(position, center), np.zeros(3)), moved)
+    spread = np.sqrt(((position - position.mean(0)) ** 2).sum(1).mean())
+    left = np.sqrt(2 * found.cost / len(position))
+    rotation = found.unknowns[0][:3, :3]
+    return rotation if left < 0.1 * spread and 3 * len(position) > 12 else None

@@ -1,0 +1,1 @@
+"""Estimation of hand-eye transforms, cameras, points and robot errors from images and reported gripper poses."""

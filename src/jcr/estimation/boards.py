@@ -1,0 +1,220 @@
+"""The shape of boards and tags, known before: a normal prior of their corners in the adjustment of images.
+
+A body is a rig that no arm moves. It observes its own corners as a camera observes points, but in three dimensions: with
+the body's rotation R and origin t, its size e^l and its deformation D a, the residual of the corner that is printed at x
+and is at p in the world is e^(-l) Rᵀ (p - t) - x - D a, independent of the world's similarity. All bodies of a capture
+come from one printer, so they share l. A board bends and is stretched in a few smooth ways beside that; what is left is
+independent from corner to corner.
+
+How large each is: with the shape free, ten real boards of 100 to 250 mm leave 0.05 to 0.25 mm about a surface of second
+order, their triangulation included (docs/results/check_points.md), and sheets bend by up to 3.6 mm, which the corners
+show to a few hundredths: the prior of the bend decides only where they show little.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from numpy.polynomial.legendre import legvander2d
+
+from jcr.estimation.elimination import Derivatives
+from jcr.geometry import apply, fit_similarity, skew
+from jcr.records import Boards
+
+CORNER_STD_M = np.array([5e-5, 5e-5, 1e-4])
+"""Of a corner by itself, along the axes of its body."""
+STRETCH_STD = 1e-3
+"""Relative: by how much more a printer stretches one side than the other."""
+BEND_STD_M = {2: 3e-4, 3: 1e-4}
+"""Rms height of each polynomial of this degree over the corners."""
+SIZE_STD = 10.0
+"""Of the logarithm of the size in the world: nothing is known of it, for nothing is known of the world's own."""
+FEWEST_TO_BEND = 9
+"""Corners of a body with fewer show no bend beside its tilt."""
+FEWEST_CORNERS = 4
+"""Of a body whose pose its corners determine."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoardShapes:
+    """Corners of bodies, in the order of their points; an element each."""
+
+    point: Int[ndarray, " c"]
+    """Row of the scene's points, ascending."""
+    body: Int[ndarray, " c"]
+    """Row of the bodies."""
+    first_rig: int
+    """The rig that the first body is."""
+    x_in_body: Float[ndarray, "c 3"]
+    """In the unit of the world where the adjustment starts."""
+    by_shape: Float[ndarray, "c 3 s"]
+    """Displacement by each column of what is free of the shape; 0 for the first, the logarithm of the size."""
+    shape_std: Float[ndarray, " s"]
+    unit: float
+    """Of the world, where the adjustment starts, that a unit of the stated size is."""
+
+    @property
+    def rig(self) -> Int[ndarray, " c"]:
+        """Of each corner's body."""
+        return self.first_rig + self.body
+
+    def of_points(self, kept: Int[ndarray, " p"]) -> "BoardShapes":
+        """Of a scene whose points are these rows, ascending, of the present one."""
+        rows = np.flatnonzero(np.isin(self.point, kept))
+        return replace(
+            self,
+            point=np.searchsorted(kept, self.point[rows]),
+            body=self.body[rows],
+            x_in_body=self.x_in_body[rows],
+            by_shape=self.by_shape[rows],
+        )
+
+    def is_corner(self, points: int) -> Bool[ndarray, " p"]:
+        """Which of this many points are corners."""
+        out = np.zeros(points, bool)
+        out[self.point] = True
+        return out
+
+    def residual(
+        self,
+        world_from_rig: Float[ndarray, "m 4 4"],
+        points_in_world: Float[ndarray, "p 3"],
+        shape: Float[ndarray, " s"],
+    ) -> Float[ndarray, "c 3"]:
+        """Of each corner along the axes of its body, in standard deviations."""
+        in_body = self._in_body(world_from_rig, points_in_world, shape)
+        return (in_body - self.x_in_body - self.by_shape @ shape) / CORNER_STD_M
+
+    def derivatives(
+        self,
+        world_from_rig: Float[ndarray, "m 4 4"],
+        points_in_world: Float[ndarray, "p 3"],
+        shape: Float[ndarray, " s"],
+        columns: slice,
+        shared: int,
+    ) -> Derivatives:
+        """Two rows a corner, across and above its body; the second is half empty. `columns` are those of the shape among
+        the `shared` ones."""
+        c = len(self.point)
+        residual, by = np.zeros((c, 4)), np.zeros((c, 4, shared + 9))
+        residual[:, :3] = self.residual(world_from_rig, points_in_world, shape)
+        to_body = np.exp(-shape[0]) * np.swapaxes(world_from_rig[self.rig, :3, :3], 1, 2)
+        ahead = points_in_world[self.point] - world_from_rig[self.rig, :3, 3]
+        by_shape = -self.by_shape
+        by_shape[:, :, 0] -= (to_body @ ahead[..., None])[..., 0]
+        by[:, :3, columns] = by_shape
+        by[:, :3, shared : shared + 3] = -to_body
+        by[:, :3, shared + 3 : shared + 6] = to_body @ skew(ahead)
+        by[:, :3, shared + 6 :] = to_body
+        by[:, :3] /= CORNER_STD_M[:, None]
+        by = by.reshape(2 * c, 2, -1)
+        return Derivatives(
+            shared=by[:, :, :shared],
+            own=by[:, :, shared : shared + 6],
+            by_point=by[:, :, shared + 6 :],
+            residual=residual.reshape(-1, 2),
+        )
+
+    def point_information(
+        self, world_from_rig: Float[ndarray, "m 4 4"], shape: Float[ndarray, " s"], points: int
+    ) -> Float[ndarray, "p 3 3"]:
+        """What the shape alone shows of each point where its body is known; 0 of those that are no corners."""
+        whitened = np.exp(-shape[0]) * np.swapaxes(world_from_rig[self.rig, :3, :3], 1, 2)
+        whitened /= CORNER_STD_M[:, None]
+        out = np.zeros((points, 3, 3))
+        out[self.point] = np.swapaxes(whitened, 1, 2) @ whitened
+        return out
+
+    def bend(self, shape: Float[ndarray, " s"]) -> Float[ndarray, " c"]:
+        """Height of each corner above the plane of its body, in the unit of the world."""
+        return self.by_shape[:, 2] @ shape
+
+    def _in_body(
+        self,
+        world_from_rig: Float[ndarray, "m 4 4"],
+        points_in_world: Float[ndarray, "p 3"],
+        shape: Float[ndarray, " s"],
+    ) -> Float[ndarray, "c 3"]:
+        pose = world_from_rig[self.rig]
+        ahead = points_in_world[self.point] - pose[:, :3, 3]
+        return np.exp(-shape[0]) * (ahead[:, None] @ pose[:, :3, :3])[:, 0]
+
+
+@dataclass(frozen=True)
+class _SeenBody:
+    """The corners of a body that take part, and about where it is in the world."""
+
+    point: Int[ndarray, " c"]
+    """Row of the scene's points."""
+    x_in_body: Float[ndarray, "c 3"]
+    world_from_body: Float[ndarray, "4 4"]
+    size: float
+    """In the world over the stated one."""
+
+
+def shapes_of(
+    boards: Boards | None, points_in_world: Float[ndarray, "p 3"], seen: Bool[ndarray, " p"], first_rig: int
+) -> tuple[BoardShapes | None, Float[ndarray, "b 4 4"]]:
+    """The shapes of boards whose corners are among triangulated points, and where their bodies are about.
+
+    Corners that are not `seen` take no part, nor do bodies with fewer than four that are; None where there is none.
+    """
+    bodies = [] if boards is None else list(_seen_bodies(boards, points_in_world, seen))
+    if not bodies:
+        return None, np.zeros((0, 4, 4))
+    corners = [len(body.point) for body in bodies]
+    unit = float(np.average([body.size for body in bodies], weights=corners))
+    ways, std = zip(*(_deformations(unit * body.x_in_body) for body in bodies), strict=True)
+    each = np.split(np.arange(sum(corners)), np.cumsum(corners)[:-1])
+    by_shape, column = np.zeros((sum(corners), 3, 1 + sum(map(len, std)))), 1
+    for rows, own in zip(each, ways, strict=True):
+        by_shape[rows, :, column : column + own.shape[2]] = own
+        column += own.shape[2]
+    point = np.concatenate([body.point for body in bodies])
+    order = np.argsort(point)
+    shapes = BoardShapes(
+        point=point[order],
+        body=np.repeat(np.arange(len(bodies)), corners)[order],
+        first_rig=first_rig,
+        x_in_body=unit * np.concatenate([body.x_in_body for body in bodies])[order],
+        by_shape=by_shape[order],
+        shape_std=np.concatenate([[SIZE_STD], *std]),
+        unit=unit,
+    )
+    return shapes, np.stack([body.world_from_body for body in bodies])
+
+
+def _seen_bodies(
+    boards: Boards, points_in_world: Float[ndarray, "p 3"], seen: Bool[ndarray, " p"]
+) -> Iterator[_SeenBody]:
+    """The bodies whose seen corners determine where they are."""
+    for body in boards.bodies:
+        rows = np.flatnonzero(seen[body.point])
+        x, there = body.x_in_body[rows], points_in_world[body.point[rows]]
+        if len(rows) < FEWEST_CORNERS or np.linalg.matrix_rank(x - x.mean(0), tol=0.1 * np.ptp(x)) < 2:
+            continue
+        pose, size = fit_similarity(there, x)
+        if np.abs(apply(pose, size * x) - there).max() < size * np.ptp(x):
+            yield _SeenBody(body.point[rows], x, pose, size)
+
+
+def _deformations(x: Float[ndarray, "c 3"]) -> tuple[Float[ndarray, "c 3 w"], Sequence[float]]:
+    """The ways in which a body may deform, and their standard deviations."""
+    if len(x) < FEWEST_TO_BEND:
+        return np.zeros((len(x), 3, 0)), ()
+    across = x[:, :2] - x[:, :2].mean(0)
+    stretch = np.column_stack([across[:, 0] / 2, -across[:, 1] / 2, np.zeros(len(x))])
+    ways, std = [stretch], [STRETCH_STD]
+    u, v = (2 * across / np.ptp(across, axis=0)).T
+    every = legvander2d(u, v, [3, 3]).reshape(-1, 4, 4)
+    degree = np.add.outer(np.arange(4), np.arange(4))
+    basis = np.concatenate([every[:, degree == d] for d in range(4)], axis=1)
+    heights, found = np.linalg.qr(basis)
+    shown = np.abs(found.diagonal()) > 1e-3 * np.sqrt(len(x))
+    for k, d in enumerate(np.repeat(range(4), range(1, 5))):
+        if d >= 2 and shown[k]:
+            ways.append(np.column_stack([np.zeros((len(x), 2)), np.sqrt(len(x)) * heights[:, k]]))
+            std.append(BEND_STD_M[int(d)])
+    return np.stack(ways, axis=2), std

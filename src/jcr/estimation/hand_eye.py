@@ -1,0 +1,310 @@
+"""From poses to a judged hand-eye calibration: robust fit, uncertainty, observability, leave-one-out error."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from numpy.typing import ArrayLike
+
+from jcr.errors import InputError
+from jcr.estimation.arms import arm_named
+from jcr.estimation.fit import Cues, PoseFit
+from jcr.estimation.kinematics import Arm, Joints
+from jcr.estimation.observability import observability
+from jcr.estimation.pose_equations import Poses
+from jcr.estimation.residuals import paper_residuals
+from jcr.estimation.robust import robust_fit
+from jcr.estimation.systematic import arm_errors, posed, smooth_errors
+from jcr.geometry import require_rigid
+from jcr.least_squares import one_blas_thread
+from jcr.records import (
+    Estimate,
+    Finding,
+    HandEye,
+    ImageResiduals,
+    Kind,
+    LeaveOneOut,
+    PaperResiduals,
+    RobotExamined,
+    RobotNoise,
+    strongest_first,
+)
+
+MAX_NOISE = (0.02, np.radians(3.0))
+"""m, rad: worse than the worst servo arm; poses and images then do not belong together."""
+MAX_STD = (0.02, np.radians(3.0), 0.05)
+"""m, rad, relative scale: an answer less certain than this is none."""
+MIN_SHARE_USED = 0.6
+SCALE_STD = 0.002
+"""Relative; of a printed marker's size."""
+FEW = 5
+"""Images, below which a wrong one cannot be outvoted and the robot pose noise is hardly known."""
+WELL_ABOVE = 2e-3
+"""m: of a smaller leave-one-out error nothing is said."""
+SURPRISE = 1.5
+"""Times the robot noise that was given; more is worth saying."""
+
+
+@one_blas_thread
+def solve_hand_eye(  # noqa: PLR0913 (published; each is a fact about the capture)
+    base_from_gripper: ArrayLike,
+    recon_from_camera: ArrayLike,
+    *,
+    robot_noise: tuple[float, float] | None = None,
+    cues: Cues | None = None,
+    camera_covariance: Float[ndarray, "r r"] | None = None,
+    scale: float | None = None,
+    scale_std: float = SCALE_STD,
+    joints: ArrayLike | None = None,
+    robot: str | Arm | None = None,
+    systematic: Float[ndarray, "r r"] | None = None,
+) -> HandEye:
+    """Hand-eye calibration with unknown scale from camera poses of your own.
+
+    Takes two stacks (n,4,4), n ≥ 2, taken at the same instants and in the same order: gripper poses in the base frame
+    (m) and camera poses in any frame and unit. `robot_noise` is a lower bound on the noise of the gripper poses (1 sigma
+    per axis: m, rad); the residuals may show more. `camera_covariance` (6n,6n), as records.CameraEvidence defines it, is
+    needed if the camera poses are not exact compared with the gripper poses.
+
+    `robot` names the arm (jcr.estimation.arms.ROBOT_NAMES) and `joints` (n,dof) are its angles (rad), starting at the
+    base: they determine how joint offsets and link errors affect the poses. With `robot` only, the angles are computed
+    from the poses; with neither, systematic errors are assumed to vary smoothly over the poses. `systematic` is their
+    covariance, if it is known already (systematic.py).
+
+    `scale` (metres per unit of the camera poses, 1 if these are metric) is known to `scale_std` (relative); without it
+    the scale is estimated.
+
+    Raises InputError for shapes, values or counts that cannot be poses, and for poses or angles that do not fit the
+    robot. Degenerate motion raises nothing; it is in the result (`observability`, `converged`).
+    """
+    gripper, camera = _checked_pairs(base_from_gripper, recon_from_camera)
+    n = len(gripper)
+    if scale is not None:
+        if not (np.isfinite([scale, scale_std]).all() and scale > 0 and scale_std > 0):
+            raise InputError(
+                f"scale: {scale} ± {scale_std} must be two positive numbers (m per unit, relative)"
+            )
+        cues = replace(cues or Cues(), scale=(scale, scale_std))
+    if robot_noise is not None and not (np.isfinite(robot_noise).all() and min(robot_noise) > 0):
+        raise InputError(f"robot_noise: {robot_noise} must be two positive numbers (m, rad)")
+    if camera_covariance is not None and camera_covariance.shape != (6 * n, 6 * n):
+        raise InputError(
+            f"camera_covariance: shape {camera_covariance.shape}; {n} poses need {(6 * n, 6 * n)}"
+        )
+    if systematic is None:
+        arm, angles = _checked_arm(robot, joints, n)
+        systematic = smooth_errors(gripper) if arm is None else arm_errors(*posed(arm, angles, gripper))
+    fitted = _fit_distinct(gripper, camera, robot_noise, cues, camera_covariance, systematic)
+    return judged(_with_residuals(gripper, camera, *fitted, cues))
+
+
+def _fit_distinct(
+    gripper: Poses,
+    camera: Poses,
+    noise: tuple[float, float] | None,
+    cues: Cues | None,
+    covariance: Float[ndarray, "r r"] | None,
+    systematic: Float[ndarray, "r r"],
+) -> tuple[PoseFit, Bool[ndarray, " d"], Int[ndarray, " n"]]:
+    """The robust fit to the distinct images, which of these it uses, and which of these each image is.
+
+    Sorted by what the poses are, not by how they came: the same images in any order, the same last bit. An image that
+    was given twice is one: its error counted as two would pass for agreement.
+    """
+    n = len(gripper)
+    pairs = np.concatenate([gripper.reshape(n, 16), camera.reshape(n, 16)], axis=1)
+    _, order, back = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
+    rows = (6 * order[:, None] + np.arange(6)).ravel()
+    among = np.ix_(rows, rows)
+    if covariance is not None:
+        covariance = covariance[among]
+    return *robust_fit(gripper[order], camera[order], noise, cues, covariance, systematic[among]), back
+
+
+def _with_residuals(
+    gripper: Poses,
+    camera: Poses,
+    fit: PoseFit,
+    used_distinct: Bool[ndarray, " d"],
+    distinct: Int[ndarray, " n"],
+    cues: Cues | None,
+) -> HandEye:
+    """The calibration of a fit to distinct images, not judged yet; `distinct` is which of these each image is."""
+    used = used_distinct[distinct]
+    seen = observability(gripper[used], fit.gripper_from_camera, camera[used], cues)
+    delta_t, delta_r = paper_residuals(gripper, camera, fit.gripper_from_camera, fit.scale, used)
+    metres, radians = np.linalg.norm(fit.residual[distinct].reshape(-1, 2, 3), axis=2).T
+    return HandEye(
+        estimate=Estimate(
+            gripper_from_camera=fit.gripper_from_camera,
+            scale=fit.scale,
+            base_from_recon=fit.base_from_recon,
+            covariance=fit.covariance,
+            budget=fit.budget,
+        ),
+        images=ImageResiduals(
+            inliers=used,
+            translation_residual_m=metres,
+            rotation_residual_rad=radians,
+            reasons=_reasons(used, metres, radians, fit.noise),
+        ),
+        residuals=PaperResiduals(delta_t, delta_r),
+        robot=RobotExamined(fit.noise),
+        leave_one_out=_leave_one_out(fit, used_distinct),
+        findings=seen.findings,
+    )
+
+
+JUDGED = frozenset(
+    {
+        Kind.FEW_AGREE,
+        Kind.POSES_CONTRADICT_IMAGES,
+        Kind.UNCERTAIN,
+        Kind.NOISE_ABOVE_GIVEN,
+        Kind.LEAVE_ONE_OUT,
+        Kind.FEW_IMAGES,
+    }
+)
+"""Kinds of findings that the numbers of a calibration decide by themselves."""
+
+
+def judged(hand_eye: HandEye) -> HandEye:
+    """The calibration with findings of the kinds JUDGED as its numbers are now, after those of other kinds."""
+    uncertain = tuple(_of_uncertainty(hand_eye))
+    # A direction that is observed weakly explains an uncertainty that rejects, and is named before it.
+    weak = "rejects" if uncertain else "warns"
+    others = [
+        replace(finding, severity=weak) if "nearly" in finding.details else finding
+        for finding in hand_eye.findings
+        if finding.kind not in JUDGED
+    ]
+    findings = (*others, *_of_agreement(hand_eye), *uncertain, *_of_residuals(hand_eye))
+    return replace(hand_eye, findings=strongest_first(findings))
+
+
+def _of_agreement(hand_eye: HandEye) -> Iterator[Finding]:
+    """Too few images, or none, that fit their gripper poses."""
+    used, n = float(hand_eye.inliers.sum()), len(hand_eye.inliers)
+    if used < max(3, MIN_SHARE_USED * n) and n > 2:
+        yield Finding.of(Kind.FEW_AGREE, "rejects", "reconstruction", value=used, images=float(n))
+    metres, radians = hand_eye.robot_noise.together
+    if metres > MAX_NOISE[0] or radians > MAX_NOISE[1]:
+        kind = Kind.POSES_CONTRADICT_IMAGES
+        yield Finding.of(kind, "rejects", "reconstruction", value=metres, rotation=radians)
+
+
+def _of_uncertainty(hand_eye: HandEye) -> Iterator[Finding]:
+    """Each part of the answer that is too uncertain."""
+    if not hand_eye.observability.observable:
+        return
+    std = np.sqrt(np.diag(hand_eye.covariance))
+    # Of few images half the uncertainty may be that the robot pose noise is hardly known.
+    unknown = hand_eye.robot_noise.given is None and int(hand_eye.inliers.sum()) < FEW
+    parts = {"translation": std[:3].max(), "rotation": std[3:6].max(), "scale": std[6]}
+    for (part, value), limit in zip(parts.items(), MAX_STD, strict=True):
+        if value > limit:
+            of_noise = {"noise_unknown": 1.0} if unknown else {}
+            yield Finding.of(Kind.UNCERTAIN, "rejects", "images", value=float(value), part=part, **of_noise)
+
+
+def _of_residuals(hand_eye: HandEye) -> Iterator[Finding]:
+    """What a user should know of an answer that may still be accepted."""
+    noise = hand_eye.robot_noise
+    metres, radians = _disagreement(hand_eye)
+    if noise.given is not None and (
+        metres > SURPRISE * noise.given[0] or radians > SURPRISE * noise.given[1]
+    ):
+        details = {"rotation": radians, "given": noise.given[0], "given_rotation": noise.given[1]}
+        yield Finding.of(Kind.NOISE_ABOVE_GIVEN, "warns", "none", value=metres, **details)
+    if (leave_one_out := hand_eye.leave_one_out) is not None:
+        leave_one_out_m, typical = 1e-3 * leave_one_out.translation_mm, float(np.sqrt(3)) * noise.together[0]
+        if leave_one_out_m > max(3 * typical, WELL_ABOVE):
+            yield Finding.of(Kind.LEAVE_ONE_OUT, "warns", "images", value=leave_one_out_m, residual=typical)
+    if len(hand_eye.inliers) < FEW:
+        yield Finding.of(Kind.FEW_IMAGES, "warns", "images", value=float(len(hand_eye.inliers)))
+
+
+def _disagreement(hand_eye: HandEye) -> tuple[float, float]:
+    """Root mean square residual of the used images per axis (m, rad), made up for the 13 unknowns that were fitted."""
+    used = hand_eye.inliers
+    count = 6 * int(used.sum())
+    fitted = count / max(count - 13, 1)
+    metres, radians = (
+        float(np.sqrt(fitted * (residual[used] ** 2).mean() / 3))
+        for residual in (hand_eye.images.translation_residual_m, hand_eye.images.rotation_residual_rad)
+    )
+    return metres, radians
+
+
+def _reasons(
+    used: Bool[ndarray, " n"], metres: Float[ndarray, " n"], radians: Float[ndarray, " n"], noise: RobotNoise
+) -> tuple[str | None, ...]:
+    typical = f"(their noise: {1e3 * noise.together[0]:.1f} mm, {np.degrees(noise.together[1]):.2f}°)"
+    put = "from where the other images put it"
+    return tuple(
+        None
+        if is_used
+        else f"its gripper pose is {1e3 * m:.1f} mm and {np.degrees(rad):.2f}° {put} {typical}"
+        for is_used, m, rad in zip(used, metres, radians, strict=True)
+    )
+
+
+def _leave_one_out(fit: PoseFit, used: Bool[ndarray, " n"]) -> LeaveOneOut | None:
+    """Each used image predicted by a fit to the others; None when too few are left to fit."""
+    if used.sum() < 4:
+        return None
+    metres, radians = np.linalg.norm(fit.leave_one_out[used].reshape(-1, 2, 3), axis=2).mean(0)
+    return LeaveOneOut(
+        1e3 * float(metres), float(np.degrees(radians)), None, "each image predicted by the others"
+    )
+
+
+def _checked_pairs(base_from_gripper: ArrayLike, recon_from_camera: ArrayLike) -> tuple[Poses, Poses]:
+    gripper = _checked(base_from_gripper, "base_from_gripper")
+    camera = _checked(recon_from_camera, "recon_from_camera")
+    n = len(gripper)
+    if len(camera) != n:
+        raise InputError(
+            f"recon_from_camera: {len(camera)} camera poses for {n} gripper poses; give one per image"
+        )
+    if n < 2:
+        raise InputError(f"base_from_gripper: {n} pose; a hand-eye calibration needs three or more")
+    return gripper, camera
+
+
+def _checked_arm(
+    robot: str | Arm | None, joints: ArrayLike | None, count: int
+) -> tuple[Arm | None, Joints | None]:
+    if robot is None:
+        if joints is not None:
+            raise InputError("joints: which robot? name it (robot=), or leave the joint angles out")
+        return None, None
+    arm = arm_named(robot) if isinstance(robot, str) else robot
+    if joints is None:
+        return arm, None
+    angles = _numbers(joints, "joints", "(n,dof) in rad")
+    if angles.shape != (count, arm.dof):
+        raise InputError(
+            f"joints: shape {angles.shape}; {count} poses of a {arm.name} need {(count, arm.dof)}"
+        )
+    if not np.isfinite(angles).all():
+        raise InputError("joints: NaN or infinite; give the angle of every joint at every image")
+    return arm, angles
+
+
+def _numbers(values: ArrayLike, name: str, shape: str) -> Float[ndarray, "..."]:
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{name}: not numbers; give an array {shape}") from None
+
+
+def _checked(transforms: ArrayLike, name: str) -> Float[ndarray, "n 4 4"]:
+    stack = _numbers(transforms, name, "(n,4,4)")
+    if stack.ndim != 3 or stack.shape[1:] != (4, 4):
+        raise InputError(f"{name}: shape {stack.shape}; give one 4x4 matrix per image, (n,4,4)")
+    return np.array([require_rigid(matrix, f"{name}[{i}]") for i, matrix in enumerate(stack)]).reshape(
+        -1, 4, 4
+    )

@@ -1,0 +1,69 @@
+"""Which joints of an arm seem off: the systematic part of the residuals, separated by the arm's own geometry."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.distributions import chi2
+from jcr.estimation.components import most_likely
+from jcr.estimation.fit import Linearised, PoseProblem, linearised
+from jcr.estimation.kinematics import Arm, Joints, error_jacobian
+from jcr.estimation.mixed_model import solve
+from jcr.estimation.pose_equations import Poses
+from jcr.records import HandEye, JointOffsets
+
+Systematic = Float[ndarray, "s s"]
+"""Covariance of the systematic errors of the used poses at 1 rad."""
+
+
+def systematic_p_value(
+    solved: HandEye, base_from_gripper: Poses, recon_from_camera: Poses, systematic: Systematic
+) -> float:
+    """Chance of residuals like these where errors are random alone, from the used poses of a fit to poses.
+
+    A likelihood ratio of the size of the systematic part, which is not negative: half the tail of χ²(1) (Self and Liang,
+    J. Am. Stat. Assoc. 82, 1987).
+    """
+    both = _linearised(solved, base_from_gripper, recon_from_camera, systematic).equations
+    tried = both, replace(both, systematic=None)
+    likely = [float(solve(one, most_likely(one)[0]).log_likelihood) for one in tried]
+    return float(chi2.sf(max(2 * (likely[0] - likely[1]), 0.0), 1) / 2)
+
+
+def joint_offsets(
+    solved: HandEye,
+    base_from_gripper: Poses,
+    recon_from_camera: Poses,
+    systematic: Systematic,
+    arm: Arm,
+    joints: Joints,
+) -> JointOffsets:
+    """By how much each joint is off (rad), true angle less reported one, and how surely; from the used poses.
+
+    Best linear unbiased prediction (Searle, Casella and McCulloch 1992, chapter 7) at the sizes of the errors that the
+    fit found. What no pose shows, as an offset of the first joint, keeps the standard deviation of any joint.
+    """
+    linear = _linearised(solved, base_from_gripper, recon_from_camera, systematic)
+    sizes = most_likely(linear.equations)[0]
+    solution = solve(linear.equations, sizes)
+    size = float(np.sqrt(linear.equations.variances(sizes)[2]))
+    columns = error_jacobian(arm, joints)[:, :, : arm.dof].reshape(-1, arm.dof)
+    columns = columns - linear.region.by_unknown @ (linear.region.fit @ columns)
+    offset = size**2 * columns.T @ solution.weighed_left
+    known = np.diag(columns.T @ solution.projection @ columns)
+    return JointOffsets(offset, size * np.sqrt(np.maximum(1 - size**2 * known, 0.0)), size)
+
+
+def _linearised(
+    solved: HandEye, base_from_gripper: Poses, recon_from_camera: Poses, systematic: Systematic
+) -> Linearised:
+    problem = PoseProblem(
+        base_from_gripper=base_from_gripper,
+        recon_from_camera=recon_from_camera,
+        used=np.ones(len(base_from_gripper), bool),
+        systematic=systematic,
+        noise=solved.robot_noise.given,
+    )
+    return linearised(problem, (solved.gripper_from_camera, solved.scale, solved.base_from_recon))

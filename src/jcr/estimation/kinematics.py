@@ -1,0 +1,168 @@
+"""Serial arms: forward kinematics, and the errors by which a real arm differs from the one its controller computes.
+
+A chain is F₁ R(a₁, q₁) F₂ R(a₂, q₂) … R(aₙ, qₙ) F: fixed transforms between joint frames, and a rotation about
+an axis in each. Denavit-Hartenberg tables of both conventions and URDF chains have that form.
+
+Each joint has errors of two kinds, the main ones of industrial arms:
+
+- the offset of its zero, q + φ (rad);
+- the error of where its axis sits on the link before it, F · exp(ξ): two translations (m) and two rotations (rad),
+  perpendicular to the axis. A rotation about the axis is the joint offset; a translation along the axis moves a later
+  axis or the gripper, and is contained in their errors.
+
+With a constant at the gripper these are complete (Mooring, Roth and Driels, "Fundamentals of Manipulator Calibration",
+1991; parallel axes need the rotations, as in Hayati 1983). Errors that only move the base (the offset of the first
+joint) or the gripper (that of the last joint) are not identifiable: they add to the hand-eye transform or to the base,
+which the estimator leaves free anyway.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.estimation.pose_equations import Poses
+from jcr.geometry import ARM, Transform, rotation_exp, transform
+
+Joints = Float[ndarray, "n dof"]
+LINK_ERRORS = 4
+"""Of each joint: two translations, two rotations."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Arm:
+    """A chain of revolute joints from the base to the gripper (the flange, unless said otherwise)."""
+
+    name: str
+    parent_from_joint: Float[ndarray, "dof 4 4"]
+    """Each joint's frame in that of the joint before it (the base), at angle zero."""
+    axes: Float[ndarray, "dof 3"]
+    """Unit vectors in the joints' frames."""
+    last_from_gripper: Transform
+    limits: Float[ndarray, "dof 2"]
+    """Lowest and highest angle (rad)."""
+    rest: Float[ndarray, " dof"]
+    """A usual posture (rad) over a table, gripper down; the initial estimate of inverse kinematics."""
+    forward: Float[ndarray, "3"] = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    """Unit vector in the gripper frame along which a tool points."""
+
+    @property
+    def dof(self) -> int:
+        """Number of joints."""
+        return len(self.axes)
+
+    @property
+    def reach(self) -> float:
+        """Longest way from the second joint's axis to the gripper along the links, in metres."""
+        links = [*self.parent_from_joint[2:, :3, 3], self.last_from_gripper[:3, 3]]
+        return float(np.linalg.norm(links, axis=1).sum())
+
+
+def from_dh(
+    name: str,
+    rows: Sequence[tuple[float, float, float, float]],
+    limits: Sequence[tuple[float, float]],
+    rest: Sequence[float],
+    *,
+    modified: bool,
+    last_from_gripper: Transform | None = None,
+) -> Arm:
+    """An arm from rows (a, d, α, θ₀) in metres and radians, of standard (distal) or modified (Craig) parameters.
+
+    Standard: R_z(q+θ₀) T_z(d) T_x(a) R_x(α). Modified: R_x(α) T_x(a) R_z(q+θ₀) T_z(d), α and a being those of
+    the link before.
+    """
+    frame, frames = np.eye(4), []
+    for a, d, alpha, theta in rows:
+        about_x = transform(rotation_exp(np.array([alpha, 0.0, 0.0])), np.array([a, 0.0, 0.0]))
+        about_z = transform(rotation_exp(np.array([0.0, 0.0, theta])), np.array([0.0, 0.0, d]))
+        frames.append(frame @ about_x if modified else frame)
+        frame = about_z if modified else about_z @ about_x
+    return Arm(
+        name=name,
+        parent_from_joint=np.stack(frames),
+        axes=np.tile([0.0, 0.0, 1.0], (len(rows), 1)),
+        last_from_gripper=frame if last_from_gripper is None else frame @ last_from_gripper,
+        limits=np.array(limits, float),
+        rest=np.array(rest, float),
+    )
+
+
+def with_tool(arm: Arm, flange_from_tool: Transform) -> Arm:
+    """The arm with its gripper frame at a tool."""
+    return replace(arm, last_from_gripper=arm.last_from_gripper @ flange_from_tool)
+
+
+def joint_frames(arm: Arm, joints: Joints) -> tuple[Float[ndarray, "n dof 4 4"], Poses]:
+    """base_from_joint of each joint, not yet rotated by it, and base_from_gripper."""
+    rotated = transform(rotation_exp(joints[..., None] * arm.axes), np.zeros(3))
+    frames = np.empty((*joints.shape, 4, 4))
+    at = np.broadcast_to(np.eye(4), (len(joints), 4, 4))
+    for i in range(arm.dof):
+        frames[:, i] = at @ arm.parent_from_joint[i]
+        at = frames[:, i] @ rotated[:, i]
+    return frames, at @ arm.last_from_gripper
+
+
+def forward_kinematics(arm: Arm, joints: Joints) -> Poses:
+    """base_from_gripper (n,4,4) of the nominal arm at joint angles (n,dof) in rad."""
+    return joint_frames(arm, joints)[1]
+
+
+def kinematic_jacobian(arm: Arm, joints: Joints) -> tuple[Poses, Float[ndarray, "n 6 dof"]]:
+    """base_from_gripper, and its twist (v of the gripper's origin, ω; base axes) per rad of each joint."""
+    frames, gripper = joint_frames(arm, joints)
+    return gripper, np.swapaxes(axis_twists(arm, frames, gripper), 1, 2)
+
+
+def error_std(arm: Arm, joint_offset: float, link: float) -> Float[ndarray, " p"]:
+    """One standard deviation of each column of `error_jacobian`, from those of a joint's offset (rad) and a link (m).
+
+    A link's rotations have that of its translations divided by geometry.ARM (0.3 m), a typical length of a link: 0.3 mm
+    goes with 0.06°.
+    """
+    return np.r_[np.full(arm.dof, joint_offset), np.tile([link, link, link / ARM, link / ARM], arm.dof)]
+
+
+def error_jacobian(arm: Arm, joints: Joints) -> Float[ndarray, "n 6 p"]:
+    """Derivative of the gripper's true pose by the arm's errors, at errors zero; p = 5 dof.
+
+    Rows are those of `equation.residuals`, steps of geometry.retract from the reported pose (m, rad; base axes), to
+    which errors φ add `error_jacobian · φ`. Columns are the offsets of all joints, then the errors of each link.
+    """
+    frames, gripper = joint_frames(arm, joints)
+    sideways = frames[..., :3, :3] @ perpendicular(arm.axes)
+    links = np.zeros((*joints.shape, LINK_ERRORS, 6))
+    links[..., :2, :3] = np.swapaxes(sideways, -1, -2)
+    for k in range(2):
+        links[..., 2 + k, :] = _twist(frames, gripper, sideways[..., k])
+    about = axis_twists(arm, frames, gripper)
+    return np.swapaxes(np.concatenate([about, links.reshape(len(joints), -1, 6)], axis=1), 1, 2)
+
+
+def axis_twists(arm: Arm, frames: Float[ndarray, "n dof 4 4"], gripper: Poses) -> Float[ndarray, "n dof 6"]:
+    """The gripper's twist (v of its origin, ω; base axes) per rad of each joint, from `joint_frames`."""
+    return _twist(frames, gripper, (frames[..., :3, :3] @ arm.axes[..., None])[..., 0])
+
+
+def _twist(
+    frames: Float[ndarray, "n dof 4 4"], gripper: Poses, axis_in_base: Float[ndarray, "n dof 3"]
+) -> Float[ndarray, "n dof 6"]:
+    lever = gripper[:, None, :3, 3] - frames[..., :3, 3]
+    return np.concatenate([np.cross(axis_in_base, lever), axis_in_base], axis=-1)
+
+
+def perpendicular(axes: Float[ndarray, "dof 3"]) -> Float[ndarray, "dof 3 2"]:
+    """Two unit vectors perpendicular to each axis: the frame's x and y where the axis is its z."""
+    order = np.argsort(np.abs(axes), axis=1, kind="stable")
+    first = np.eye(3)[order[:, 0]]
+    first = first - (first * axes).sum(1, keepdims=True) * axes
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(axes, first)], -1)
+
+
+def unwrapped(angles: Float[ndarray, "*n"]) -> Float[ndarray, "*n"]:
+    """Angles in [-π, π)."""
+    return (angles + np.pi) % (2 * np.pi) - np.pi

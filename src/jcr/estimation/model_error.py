@@ -1,0 +1,114 @@
+"""What a camera's model leaves of its distortion: a displacement that is smooth over the image, the same in all images.
+
+A few coefficients do not bend every ray as a cheap camera does. What they leave is common to all images: it does not
+average out, it hardly shows in the pixels' noise, and it moves the intrinsics that are fitted with it. It is a random
+effect here as the systematic errors of the robot are: polynomials over the image, of one size that is estimated with
+the rest (MacKay, "Bayesian interpolation", Neural Computation 4, 1992, eq. 4.9). What the intrinsics can express is
+taken out of them, so that the intrinsics are those that fit the image best.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+from numpy.polynomial.legendre import legvander2d
+
+from jcr.camera import by_parameters, unproject
+from jcr.estimation.intrinsics_prior import IntrinsicsPrior
+from jcr.records import Intrinsics, ModelError
+
+DEGREE = 5
+"""Of the polynomials."""
+TYPICAL = 1e-4
+"""Of the width, per polynomial: the middle of the prior of their size, a weak one."""
+UPDATES, SETTLED = 100, 1e-3
+"""Most updates of the size, and the relative change of its square that ends them."""
+WORTH = 2.0
+"""Polynomials that the typical size counts for, beside those that the images determine."""
+
+
+def displacements(
+    cameras: tuple[Intrinsics, ...],
+    priors: tuple[IntrinsicsPrior, ...],
+    x_px: Float[ndarray, "k 2"],
+    camera: Int[ndarray, " k"],
+) -> Float[ndarray, "k 2 e"]:
+    """Of each observation by each polynomial, in widths of the image; none for a camera whose intrinsics are exact."""
+    blocks = [np.zeros((len(camera), 2, 0))]
+    for c, (intrinsics, prior) in enumerate(zip(cameras, priors, strict=True)):
+        rows = np.flatnonzero(camera == c)
+        if len(rows) <= (count := polynomials_of(prior)) or count == 0:
+            continue
+        by_prior = by_parameters(intrinsics, unproject(intrinsics, x_px[rows])) @ prior.directions
+        block = np.zeros((len(camera), 2, count))
+        block[rows] = intrinsics.width * _beside(_polynomials(x_px[rows], intrinsics), by_prior)
+        blocks.append(block)
+    return np.concatenate(blocks, axis=2)
+
+
+def size_of(
+    likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], std: Float[ndarray, " e"]
+) -> Float[ndarray, " e"]:
+    """The size of displacements, from where they are likeliest with a prior of size `std` and how well that is known.
+
+    At the fixed point of MacKay's update, beside a weak prior.
+    """
+    posterior = np.linalg.inv(covariance)
+    right = posterior @ likeliest
+    # Of the images alone, along directions that they measure independently.
+    known, directions = np.linalg.eigh(posterior - np.diag(std**-2.0))
+    known, right = np.maximum(known, 0.0), directions.T @ right
+    variance = float(std[0] ** 2)
+    for _ in range(UPDATES):
+        information = known + 1 / variance
+        determined = float((known / information).sum())
+        squares = float(((right / information) ** 2).sum())
+        before, variance = variance, (squares + WORTH * TYPICAL**2) / (determined + WORTH)
+        if abs(np.log(variance / before)) < SETTLED:
+            break
+    return np.full(len(std), np.sqrt(variance))
+
+
+def expressed(
+    camera: Intrinsics, prior: IntrinsicsPrior, x_px: Float[ndarray, "k 2"]
+) -> Float[ndarray, "q e"]:
+    """By how much the camera's parameters express each polynomial over these pixels."""
+    by_prior = by_parameters(camera, unproject(camera, x_px)) @ prior.directions
+    polynomials = camera.width * _polynomials(x_px, camera)
+    fit = np.linalg.lstsq(
+        by_prior.reshape(2 * len(x_px), -1), polynomials.reshape(2 * len(x_px), -1), rcond=None
+    )[0]
+    return prior.directions @ fit
+
+
+def second_moment_px2(
+    left: ModelError, camera: Intrinsics, x_px: Float[ndarray, "*points 2"]
+) -> Float[ndarray, "*points 2 2"]:
+    """Of the displacement at pixels (px²): who projects with the camera alone errs by it and by what is unknown of
+    it."""
+    flat = x_px.reshape(-1, 2)
+    by = camera.width * _polynomials(flat, camera)
+    by = by - by_parameters(camera, unproject(camera, flat)) @ left.expressed
+    moment = left.covariance + np.outer(left.likeliest, left.likeliest)
+    return (by @ moment @ np.swapaxes(by, 1, 2)).reshape(*x_px.shape, 2)
+
+
+def polynomials_of(prior: IntrinsicsPrior) -> int:
+    """How many displacements a camera has whose intrinsics are known like this; 0 where they are exact."""
+    return (DEGREE + 1) * (DEGREE + 2) if len(prior.std) else 0
+
+
+def _polynomials(x_px: Float[ndarray, "k 2"], camera: Intrinsics) -> Float[ndarray, "k 2 e"]:
+    """Of x, then of y: products of Legendre polynomials, up to a total degree, over a square about the image."""
+    u, v = ((2 * x_px - [camera.width - 1, camera.height - 1]) / max(camera.width, camera.height)).T
+    every = legvander2d(u, v, [DEGREE, DEGREE]).reshape(-1, DEGREE + 1, DEGREE + 1)
+    i, j = np.nonzero(np.add.outer(np.arange(DEGREE + 1), np.arange(DEGREE + 1)) <= DEGREE)
+    kept = every[:, i, j]
+    nothing = np.zeros_like(kept)
+    return np.stack([np.hstack([kept, nothing]), np.hstack([nothing, kept])], axis=1)
+
+
+def _beside(by: Float[ndarray, "k 2 e"], expressed: Float[ndarray, "k 2 q"]) -> Float[ndarray, "k 2 e"]:
+    """Displacements without what others express, over these observations."""
+    flat, basis = by.reshape(-1, by.shape[2]), expressed.reshape(-1, expressed.shape[2])
+    orthonormal = np.linalg.qr(basis)[0]
+    return (flat - orthonormal @ (orthonormal.T @ flat)).reshape(by.shape)

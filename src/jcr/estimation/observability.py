@@ -1,0 +1,132 @@
+"""Which parts of the calibration the motions can see.
+
+The excitation of a direction of (translation, rotation, scale) is by how many metres, root mean square over
+the images, one metre along it moves the reported gripper positions, after base_from_recon has followed as
+well as it can; rotations count at geometry.ARM, scale by the spread of the camera centres. It is about 0.4
+for general motion, and the sine of the deviation for a nearly degenerate one.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from jcr.estimation.fit import Cues
+from jcr.estimation.pose_equations import BASE_ROTATION, ROTATION, SCALE, Poses, residuals
+from jcr.geometry import ARM, Transform, transform
+from jcr.records import Excitation, Finding, Kind, Observability
+
+MIN_SPREAD = 0.1
+"""Metres; camera centres closer together than this show little of scale."""
+WEAK = 0.06
+"""Excitation below which a direction is named as weakly observed: 3 degrees of deviation give 0.03 to 0.05."""
+EXACT = 0.005
+"""Excitation below which a direction is unobservable: no better measurement would help."""
+
+
+def excitation(
+    base_from_gripper: Poses, gripper_from_camera: Transform | None, cues: Cues | None = None
+) -> Excitation:
+    """What gripper poses (n,4,4) can see of X and λ; without an X the camera is put at the gripper."""
+    n = len(base_from_gripper)
+    offset = np.zeros(3) if gripper_from_camera is None else gripper_from_camera[:3, 3]
+    # An offset that was never seen may be anything; the excitation hardly depends on a plausible one.
+    offset = offset * min(1.0, ARM / max(float(np.linalg.norm(offset)), 1e-9))
+    x = transform(np.eye(3), offset)
+    camera = base_from_gripper @ x
+    base_from_centers = transform(np.eye(3), camera[:, :3, 3].mean(0))
+    camera[:, :3, 3] -= base_from_centers[:3, 3]
+    spread = max(float(np.sqrt((camera[:, :3, 3] ** 2).sum(1).mean())), MIN_SPREAD)
+    _, j = residuals(x, 1.0, base_from_centers, base_from_gripper, camera)
+    unit = np.ones(13)
+    unit[ROTATION], unit[SCALE], unit[BASE_ROTATION] = ARM, spread, ARM
+    j *= np.repeat([1.0, ARM], 3)[:, None] / unit
+    hessian = np.einsum("nij,nik->jk", j, j) / n
+    seen = hessian[:7, :7] - hessian[:7, 7:] @ np.linalg.pinv(hessian[7:, 7:], rcond=1e-12) @ hessian[7:, :7]
+    if cues is not None and cues.scale is not None:
+        seen[6, 6] += 1.0
+    if cues is not None and cues.offset is not None:
+        seen[:3, :3] += np.outer(cues.offset[0], cues.offset[0])
+    squared, vectors = np.linalg.eigh(seen)
+    return Excitation(np.sqrt(np.maximum(squared, 0.0)), vectors.T, spread)
+
+
+def observability(
+    base_from_gripper: Poses,
+    gripper_from_camera: Transform | None = None,
+    recon_from_camera: Poses | None = None,
+    cues: Cues | None = None,
+) -> Observability:
+    """A finding for each unseen direction; camera poses, if given, distinguish an orbit from a fixed tool."""
+    n = len(base_from_gripper)
+    if n == 2:
+        return Observability((_unseen("two images"),))
+    found = excitation(base_from_gripper, gripper_from_camera, cues)
+    # Few images excite less by chance alone: three general ones as little as twenty at three degrees.
+    few = min(1.0, (n - 2) / 4)
+    unseen = found.value < WEAK * few
+    if not unseen.any():
+        return Observability()
+    findings = _explained(base_from_gripper, recon_from_camera, found, unseen)
+    if found.value[0] >= EXACT * few:
+        # A weak direction has a standard deviation, and that decides (solve.judged); the motions only explain it.
+        findings = [
+            replace(one, severity="warns", details={**one.details, "nearly": 1.0}) for one in findings
+        ]
+    return Observability(tuple(replace(one, value=float(found.value[0])) for one in findings))
+
+
+def _unseen(motion: str, at: Float[ndarray, "3"] | None = None, frame: str = "") -> Finding:
+    """A direction that motions like this (words.py lists them) do not show; an axis, or point, of a frame."""
+    where: dict[str, Any] = (
+        {} if at is None else dict(zip("xyz", at.tolist(), strict=True)) | {"frame": frame}
+    )
+    return Finding.of(Kind.UNOBSERVABLE, "rejects", "motion", motion=motion, **where)
+
+
+def _explained(
+    base_from_gripper: Poses, recon_from_camera: Poses | None, found: Excitation, unseen: Bool[ndarray, "7"]
+) -> list[Finding]:
+    # The mean rotation shrinks every direction that rotates; one it keeps long is a common axis.
+    u, length, _ = np.linalg.svd(base_from_gripper[:, :3, :3].mean(0))
+    still = np.sqrt(np.maximum(1 - length**2, 0.0)) < WEAK
+    if still.all():
+        return [_unseen("no rotation")]
+    loses_scale = np.abs(found.direction[unseen][:, 6]).max() > 0.2
+    if still.any():
+        if unseen.sum() == 1 and not loses_scale:
+            return [_unseen("planar", u[:, 0], "base")]
+        parts = ("translation", "scale", "rotation")[: max(int(unseen.sum()), 2)]
+        return [_unseen(f"one axis, {part}", u[:, 0], "base") for part in parts]
+    if loses_scale:
+        return [_lost_scale(base_from_gripper, recon_from_camera)]
+    weakest = found.direction[0]
+    what, axis = max(
+        (("translation", weakest[:3]), ("rotation", weakest[3:6])), key=lambda part: np.linalg.norm(part[1])
+    )
+    return [_unseen(f"weak {what}", axis / np.linalg.norm(axis), "gripper")]
+
+
+def _lost_scale(base_from_gripper: Poses, recon_from_camera: Poses | None) -> Finding:
+    """Scale is lost when a point fixed to the gripper stays where it is: which point it is."""
+    tool = still_point(base_from_gripper)[0]
+    if recon_from_camera is None:
+        return _unseen("one point", tool, "gripper")
+    # Which point it is, the cameras know better than X, whose offset trades against the lost scale.
+    in_camera, moves, spread = still_point(recon_from_camera)
+    if moves > 0.5 * spread:
+        return _unseen("own centre")
+    if in_camera[2] > np.cos(np.radians(8)) * np.linalg.norm(in_camera):
+        return _unseen("look-at")
+    return _unseen("tool point", tool, "gripper")
+
+
+def still_point(a_from_b: Poses) -> tuple[Float[ndarray, "3"], float, float]:
+    """The point of frame b that moves least in a, how far it moves, and how far b's origin does (rms)."""
+    rotation, position = a_from_b[:, :3, :3], a_from_b[:, :3, 3]
+    rows, right = (rotation - rotation.mean(0)).reshape(-1, 3), (position - position.mean(0)).ravel()
+    point = np.linalg.lstsq(rows, -right, rcond=1e-9)[0]
+    n = len(a_from_b)
+    return point, float(np.linalg.norm(rows @ point + right)) / n**0.5, float(np.linalg.norm(right)) / n**0.5

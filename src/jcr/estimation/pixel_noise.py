@@ -1,0 +1,224 @@
+"""How large the errors of image observations are: one model for every adjustment.
+
+The size comes from the median point, for wrong matches are many; what neighbours share of their errors from sums over
+cells of the images.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from jcr.distributions import chi2
+from jcr.estimation.elimination import point_blocks
+from jcr.estimation.scene import Observations
+from jcr.least_squares import loss_weight
+
+LOSS_SCALE = 2.0
+"""Cauchy loss: observations count half at this many sigma."""
+CELLS = 8
+"""Across the width of an image: so near each other features share errors, of a texture, a shadow or what the distortion
+model leaves."""
+MIN_SIGMA_PX = 0.02
+RATIOS = (0.25, 100.0)
+"""Of the variances of other cameras' observations to that of the first's: of few points that only one other sees, a
+camera seems as good as its weight makes it."""
+FAR_OFF = 6.0
+"""Median residuals; seven sigma."""
+COMMON = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
+"""Shares of the variance of the median observation that are tried as what all observations have in common."""
+SCALE_STEPS = 10
+NEAREST = 0.05
+"""Of the median depth: no camera focuses on what is nearer, and a mismatch that two images place in front of both
+fixes them where it lies, the surer the nearer it comes."""
+LEAST_LEFT = 0.1
+"""Of an observation's variance after its point took its part: below, the residual shows nothing of it."""
+
+
+@dataclass(frozen=True)
+class PixelNoise:
+    """Errors of image observations."""
+
+    sigma_px: Float[ndarray, " g"]
+    """Of one coordinate, by group of observations: the features of each camera, then the corners of boards, which are
+    found in another way."""
+    inflation: float = 1.0
+    """Of the variance of what many observations show together, because neighbours share errors; one for all cameras, for
+    where points follow the few observations of one its own residuals do not show it."""
+    common: float = 1.0
+    """Share of the variance of a median observation that all have alike; the rest is as its match states it."""
+
+    def change(self, before: "PixelNoise") -> float:
+        """Of the sizes, relative; the largest."""
+        return float(np.abs(np.log(self.sigma_px / before.sigma_px)).max())
+
+    def variance_px2(self, layout: "Layout") -> Float[ndarray, " k"]:
+        """Of one coordinate of each observation."""
+        return self.sigma_px[layout.group] ** 2 * layout.relative_variance(self.common)
+
+    def weights(
+        self, residual_px: Float[ndarray, "k 2"], depth: Float[ndarray, " k"], layout: "Layout"
+    ) -> Float[ndarray, " k"]:
+        """Inverse variances of observations under the Cauchy loss; those of points behind a camera, or so near that no
+        camera shows them, are 0."""
+        variance = self.variance_px2(layout)
+        squared = (residual_px**2).sum(1) / variance
+        weight = loss_weight("cauchy", squared / LOSS_SCALE**2) / (variance * self.inflation)
+        nearest = NEAREST * max(float(np.median(depth)), 0.0) if len(depth) else 0.0
+        return (depth > max(nearest, 1e-9)) * weight
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """What of the observations the estimate needs and no adjustment changes."""
+
+    camera: Int[ndarray, " k"]
+    """Of each observation."""
+    group: Int[ndarray, " k"]
+    """Of each observation, as PixelNoise counts them."""
+    groups: int
+    point: Int[ndarray, " k"]
+    cell: Int[ndarray, " k"]
+    """The images of a fixed camera show the same features with the same errors: their cells are one."""
+    stated_variance: Float[ndarray, " k"]
+    """As matching states it, over the median observation's."""
+    median_square: Float[ndarray, " p"]
+    """Median of a point's sum of squared residuals where an image coordinate's variance is 1: of the 2n errors of n
+    views its position takes up 3, but for a corner of a board, whose place is known."""
+
+    @staticmethod
+    def of(observations: Observations, widths: Int[ndarray, " c"]) -> "Layout":
+        """Of observations in images of these widths (px), by camera."""
+        camera = observations.camera[observations.image]
+        column, row = (CELLS * observations.x_px / widths[camera, None]).astype(int).T
+        keys = np.stack([observations.rig[observations.image], camera, row, column])
+        _, cell = np.unique(keys, axis=1, return_inverse=True)
+        seen = np.bincount(observations.point)
+        corner = np.zeros(len(seen), bool)
+        if observations.boards is not None:
+            corner = observations.boards.is_corner(len(seen))
+        freedom = np.maximum(2 * seen - 3 * ~corner, 1)
+        cameras = len(widths)
+        stated = (observations.std_px / np.median(observations.std_px)) ** 2 if len(camera) else np.ones(0)
+        return Layout(
+            camera=camera,
+            group=np.where(corner[observations.point], cameras, camera),
+            groups=cameras + bool(corner.any()),
+            point=observations.point,
+            cell=cell.ravel(),
+            stated_variance=stated,
+            median_square=chi2.ppf(0.5, freedom),
+        )
+
+    @property
+    def states_variances(self) -> bool:
+        """Whether matching distinguishes the observations."""
+        return bool(np.ptp(self.stated_variance) > 0) if len(self.stated_variance) else False
+
+    def relative_variance(self, common: float) -> Float[ndarray, " k"]:
+        """Of each observation over the median one's, where all have this share of that in common."""
+        return common + (1 - common) * self.stated_variance
+
+    def squares_of_cells(self, pull: Float[ndarray, "k 2"]) -> float:
+        """Squared sums over cells of what each observation pulls, added up."""
+        return sum(float((np.bincount(self.cell, along) ** 2).sum()) for along in pull.T)
+
+
+def pixel_noise(
+    layout: Layout,
+    residual_px: Float[ndarray, "k 2"],
+    depth: Float[ndarray, " k"],
+    ratio: Float[ndarray, " g"],
+    common: float = 1.0,
+) -> PixelNoise:
+    """From the median point none of whose observations is far off, and from cells of the images.
+
+    `ratio` is that of the variances of each group's observations to those of the first. Were errors independent, the
+    squared sum over a cell of what each observation pulls would be, on average, the sum of the squares; what it is times
+    that is what the errors that neighbours share cost of the images' information (the variance inflation of cluster
+    sampling; Liang and Zeger, Biometrika 73, 1986).
+    """
+    relative = (residual_px**2).sum(1) / (ratio[layout.group] * layout.relative_variance(common))
+    far = relative > FAR_OFF**2 * np.median(relative)
+    squares = np.bincount(layout.point, relative) / layout.median_square
+    clean = np.bincount(layout.point, far) == 0
+    factor = float(np.median(squares[clean] if clean.any() else squares))
+    noise = PixelNoise(np.maximum(np.sqrt(factor * ratio), MIN_SIGMA_PX), common=common)
+    pull = noise.weights(residual_px, depth, layout)[:, None] * residual_px
+    # Of points that are all behind their cameras nothing pulls.
+    inflation = layout.squares_of_cells(pull) / max(float((pull**2).sum()), 1e-300)
+    return replace(noise, inflation=max(1.0, inflation))
+
+
+def left_of_points(
+    layout: Layout,
+    before: PixelNoise,
+    residual_px: Float[ndarray, "k 2"],
+    depth: Float[ndarray, " k"],
+    by_point: Float[ndarray, "k 2 3"],
+    starts: Int[ndarray, " p"],
+    known: Float[ndarray, "p 3 3"] | None = None,
+) -> Float[ndarray, " k"]:
+    """Share of each observation's variance that its residual has after the points took their part (their leverage).
+
+    `by_point` are derivatives by the points, `starts` each point's first observation, `known` the information that each
+    point has beside its observations.
+    """
+    weight = replace(before, inflation=1.0).weights(residual_px, depth, layout)
+    j = np.sqrt(weight)[:, None, None] * by_point
+    blocks = point_blocks(j, starts)
+    inverse = np.linalg.inv(blocks if known is None else blocks + known)[layout.point]
+    return 1 - np.minimum(np.einsum("kai,kij,kaj->k", j, inverse, j) / 2, 1.0)
+
+
+def variance_ratios(
+    layout: Layout,
+    before: PixelNoise,
+    residual_px: Float[ndarray, "k 2"],
+    depth: Float[ndarray, " k"],
+    left: Float[ndarray, " k"],
+) -> Float[ndarray, " g"]:
+    """Variances of each group's observations over those of the first.
+
+    From their sums of squares over what is left of them, for a group whose residuals are small because points follow
+    it is not the better one.
+    """
+    count = len(before.sigma_px)
+    ratio = np.ones(count)
+    if count == 1:
+        return ratio
+    tame = replace(before, inflation=1.0).weights(residual_px, depth, layout) * before.variance_px2(layout)
+    square = (residual_px**2).sum(1) / layout.relative_variance(before.common)
+    for c in range(count):
+        rows = layout.group == c
+        if rows.any():
+            ratio[c] = (tame[rows] @ square[rows]) / max(2 * float(tame[rows] @ left[rows]), 1e-12)
+    return np.clip(ratio / max(ratio[0], 1e-12), *RATIOS)
+
+
+def common_share(
+    layout: Layout,
+    residual_px: Float[ndarray, "k 2"],
+    left: Float[ndarray, " k"],
+    ratio: Float[ndarray, " g"],
+) -> float:
+    """The share of variance that all observations have alike under which the residuals are likeliest.
+
+    Each at its likeliest size, under the Student's t distribution whose negative logarithm is the loss.
+    """
+    if not layout.states_variances:
+        return 1.0
+    shown = left > LEAST_LEFT
+    square = (residual_px[shown] ** 2).sum(1) / (ratio[layout.group] * left)[shown]
+
+    def cost(common: float) -> float:
+        relative = layout.relative_variance(common)[shown]
+        variance = float(np.median(square / relative))
+        for _ in range(SCALE_STEPS):
+            weight = loss_weight("cauchy", square / (relative * variance) / LOSS_SCALE**2)
+            variance = max(float((weight * square / relative).mean()) / 2, MIN_SIGMA_PX**2)
+        heavy = LOSS_SCALE**2 / 2 * np.log1p(square / (relative * variance) / LOSS_SCALE**2)
+        return float((heavy + np.log(relative * variance)).sum())
+
+    return min(COMMON, key=cost)

@@ -1,0 +1,210 @@
+"""The unknowns averaged over the sizes of the errors, with a calibrated covariance, and its causes.
+
+Cov = E[C] + Var[θ̂] over the sizes (components.py). A mixture has longer tails than a normal distribution of its
+covariance: the covariance is scaled until its 99 % ellipsoid holds 99 %, for an accepted answer that is many standard
+deviations off is the worst fault.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.distributions import chi2
+from jcr.estimation.cholesky import cholesky, lower
+from jcr.estimation.components import Information, Weighed, expected_information, over_sizes
+from jcr.estimation.mixed_model import Each, Equations, LogSizes, Solution, solve
+from jcr.estimation.pose_equations import UNKNOWNS
+from jcr.estimation.systematic import Region
+from jcr.records import Budget, RobotNoise
+
+COVERED = 0.99
+"""By the ellipsoid that holds what it states."""
+HALVINGS = 40
+"""Of the interval in which the size of that ellipsoid lies, to 1e-11 of it: scipy.optimize takes longer to import than
+a calibration of a few images."""
+
+Square = Float[ndarray, "p p"]
+Stack = Float[ndarray, "*k p p"]
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """The unknowns averaged over the sizes."""
+
+    step: Float[ndarray, " p"]
+    covariance: Square
+    """Scaled so that its 99 % ellipsoid holds 99 %."""
+    budget: Budget
+    log_sizes: LogSizes
+    """At the mode."""
+
+
+def posterior(
+    equations: Equations, log_sizes: LogSizes, information: Information, region: Region | None
+) -> Posterior:
+    """The unknowns averaged over the sizes about their mode; `region` adds what other poses of it would change."""
+    found = over_sizes(equations, log_sizes, information)
+    return _averaged(equations, log_sizes, found, lambda one, at: _elsewhere(equations, one, at, region))
+
+
+def expected_posterior(equations: Equations, noise: RobotNoise, region: Region | None) -> Posterior:
+    """The posterior to expect of a robot with this noise, before there are any residuals: those of `equations` are 0.
+
+    In the density of the sizes the squares of residuals are replaced by their expectations, tr(P V) for the covariance V
+    that the noise gives them.
+    """
+    mode = equations.log_sizes_of(noise)
+    root = cholesky(equations.covariance(mode))
+
+    def density(solution: Solution) -> Each:
+        whitened, fitted = _whitened_and_fitted(solution, root)
+        return solution.log_posterior - ((whitened**2).sum((-1, -2)) - (fitted**2).sum((-1, -2))) / 2
+
+    found = over_sizes(equations, mode, expected_information(equations, mode), density)
+    return _averaged(equations, mode, found, lambda _, sizes: _expected_elsewhere(equations, sizes, region))
+
+
+def expected_covariance_at(equations: Equations, noise: RobotNoise, region: Region | None) -> Square:
+    """The covariance of the same at the sizes themselves, as if these were known exactly: for comparisons."""
+    mode = equations.log_sizes_of(noise)
+    return solve(equations, mode).covariance + _expected_elsewhere(equations, mode, region)
+
+
+def _averaged(
+    equations: Equations,
+    mode: Float[ndarray, " c"],
+    found: Weighed,
+    elsewhere: Callable[[Solution, LogSizes], Stack],
+) -> Posterior:
+    """The mixture of the solutions that were `found` with their weights, each wider by `elsewhere`."""
+    groups = [(share, one.step, one.covariance + elsewhere(one, sizes)) for share, sizes, one in found]
+    weight, steps, each = (np.concatenate(part) for part in zip(*groups, strict=True))
+    step = weight @ steps
+    off = steps - step
+    covariance = np.einsum("k,kij->ij", weight, each) + np.einsum("k,ki,kj->ij", weight, off, off)
+    n = UNKNOWNS
+    covariance *= _widening(weight, off[:, :n], each[:, :n, :n], covariance[:n, :n])
+    at_mode = elsewhere(solve(equations, mode), mode)
+    return Posterior(step, covariance, _budget(equations, mode, at_mode, covariance), mode)
+
+
+def _elsewhere(equations: Equations, solution: Solution, log_sizes: LogSizes, region: Region | None) -> Stack:
+    """Covariance of what the systematic part leaves open because the answer is asked for the region, not its poses."""
+    if region is None or equations.systematic is None:
+        return np.zeros_like(solution.information_root)
+    part = equations.variances(log_sizes)[..., 2, None, None] * equations.systematic
+    expected = (part @ solution.weighed_left[..., None])[..., 0]
+    own = _blocks_of_poses(part)
+    for sign, root in zip((-1, 1), _whitened_and_fitted(solution, part), strict=True):
+        columns = np.moveaxis(root.reshape(*root.shape[:-1], -1, 6), -2, -3)
+        own = own + sign * np.swapaxes(columns, -1, -2) @ columns
+    expected = expected.reshape(*expected.shape[:-1], -1, 6)
+    return region.spread(own + expected[..., :, None] * expected[..., None, :])
+
+
+def _expected_elsewhere(equations: Equations, log_sizes: LogSizes, region: Region | None) -> Stack:
+    """`_elsewhere` before there are residuals: what they will show of the systematic part is as large as it is."""
+    if region is None or equations.systematic is None:
+        return np.zeros((*log_sizes.shape[:-1], *equations.prior_information.shape))
+    size = equations.variances(log_sizes)[..., 2, None, None, None]
+    return region.spread(size * _blocks_of_poses(equations.systematic))
+
+
+def _whitened_and_fitted(
+    solution: Solution, matrix: Float[ndarray, "*#k s r"]
+) -> tuple[Float[ndarray, "*k s r"], Float[ndarray, "*k p r"]]:
+    """A and B with AᵀA − BᵀB = MᵀPM, P the projection of the solution."""
+    fitted = lower(solution.information_root, np.swapaxes(solution.weighed, -1, -2) @ matrix)
+    return lower(solution.root, matrix), fitted
+
+
+def _blocks_of_poses(covariance: Float[ndarray, "*k s s"]) -> Float[ndarray, "*k m 6 6"]:
+    """The block of each pose by itself."""
+    m = covariance.shape[-1] // 6
+    each = np.arange(m)
+    return np.moveaxis(covariance.reshape(*covariance.shape[:-2], m, 6, m, 6)[..., each, :, each, :], 0, -3)
+
+
+def _widening(
+    weight: Float[ndarray, " k"],
+    off: Float[ndarray, "k p"],
+    each: Float[ndarray, "k p p"],
+    covariance: Square,
+) -> float:
+    """Factor on the covariance of a mixture of normal distributions, after which its 99 % ellipsoid holds 99 %.
+
+    Squared Mahalanobis distances under each are matched by a scaled χ² of the same mean and variance (Satterthwaite,
+    Biometrics Bulletin 2, 1946).
+    """
+    std = np.sqrt(np.diag(covariance))
+    scaled, shift = covariance / np.outer(std, std), off / std
+    relative = np.linalg.solve(scaled, each / np.outer(std, std))
+    towards = np.linalg.solve(scaled, shift.T).T
+    mean = np.trace(relative, axis1=1, axis2=2) + (shift * towards).sum(1)
+    variance = 2 * np.einsum("kij,kji->k", relative, relative)
+    variance += 4 * np.einsum("ki,kij,kj->k", shift, relative, towards)
+    unit = variance / (2 * mean)
+
+    normal = float(chi2.ppf(COVERED, len(covariance)))
+    least, most = np.log([1e-3, 1e4 * normal])
+    for _ in range(HALVINGS):
+        middle = (least + most) / 2
+        if weight @ chi2.cdf(np.exp(middle) / unit, mean / unit) < COVERED:
+            least = middle
+        else:
+            most = middle
+    return max(1.0, float(np.exp(most)) / normal)
+
+
+def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covariance: Square) -> Budget:
+    """The covariance of X and scale by its causes, which share what the averaging over sizes added.
+
+    What intrinsics add is what would go if they were known; the rest is divided as if they were.
+    """
+    exact = replace(
+        equations,
+        jacobian=equations.jacobian[:, :UNKNOWNS],
+        prior_information=equations.prior_information[:UNKNOWNS, :UNKNOWNS],
+        prior_gradient=equations.prior_gradient[:UNKNOWNS],
+    )
+    solution = solve(exact, log_sizes)
+    gain = solution.gain
+    random = (gain * exact.random(log_sizes)) @ gain.T
+    systematic = elsewhere[:UNKNOWNS, :UNKNOWNS]
+    if exact.systematic is not None:
+        systematic = systematic + exact.variances(log_sizes)[2] * gain @ exact.systematic @ gain.T
+    if exact.bent is not None:
+        systematic = systematic + gain @ exact.bent @ gain.T
+    # What neither robot nor cameras show.
+    images = solution.covariance @ exact.prior_information @ solution.covariance
+    if exact.known is not None:
+        images = images + gain @ exact.known @ gain.T
+    intrinsics = solve(equations, log_sizes).covariance[:UNKNOWNS, :UNKNOWNS] - solution.covariance
+    parts = [part[:7, :7] for part in (random, systematic, intrinsics, images)]
+    to_whole = _between(sum(parts[1:], parts[0]), covariance[:7, :7])
+    random, systematic, intrinsics, _ = (to_whole @ part @ to_whole.T for part in parts)
+    return Budget(
+        robot_random=random,
+        robot_systematic=systematic,
+        intrinsics=intrinsics,
+        # What is unobservable is among it, and the rounding of its large numbers.
+        images=covariance[:7, :7] - random - systematic - intrinsics,
+        faults=np.zeros((7, 7)),
+    )
+
+
+def _between(one: Square, other: Square) -> Square:
+    """The linear map of least displacement that takes errors of one covariance to those of the other.
+
+    Symmetric, where lengths are counted in standard deviations (Knott and Smith, J. Optim. Theory Appl. 43, 1984).
+    """
+    std = np.sqrt(np.diag(one))
+    values, vectors = np.linalg.eigh(one / np.outer(std, std))
+    values = np.sqrt(np.maximum(values, np.finfo(float).eps * values[-1]))
+    root, inverse = (vectors * values @ vectors.T, vectors / values @ vectors.T)
+    squared, axes = np.linalg.eigh(root @ (other / np.outer(std, std)) @ root)
+    by = inverse @ (axes * np.sqrt(np.maximum(squared, 0.0)) @ axes.T) @ inverse
+    return std[:, None] * by / std

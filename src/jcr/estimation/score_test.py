@@ -1,0 +1,347 @@
+"""What else the images could show: parameters beside those that were adjusted, tested where the adjustment ended.
+
+The mixed model is written once more with columns for what was fixed: every parameter of a camera, a focal length, a
+shear and an offset for each of its images by itself, and a thin prism. A hypothesis is a few combinations of these
+columns. How much freeing them would lower the cost, at one Gauss-Newton step, over the dispersion of the residuals, is
+Rao's score test (Rao, Proc. Cambridge Phil. Soc. 44, 1948), here beside F, for the robot pose noise was estimated from
+few residuals. The same step shows how large they are and how far the camera's place would move; the adjustment with them
+free (`freed`) is what they come to.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from jcr.camera import parameter_names, parameters
+from jcr.distributions import f as f_distribution
+from jcr.estimation.cholesky import cholesky, over
+from jcr.estimation.image_robots import Adjusted, Placed, equations_of
+from jcr.estimation.images import ImageEvidence, evidence
+from jcr.estimation.intrinsics_prior import IntrinsicsPrior
+from jcr.estimation.mixed_model import solve
+from jcr.estimation.scene import OF_IMAGE, PRISM, Freedom, NuisancePrior
+from jcr.geometry import Transform
+from jcr.records import Intrinsics
+
+WEAK = {"fx": 0.3, "fy": 0.3, "cx": 0.2, "cy": 0.2}
+"""Standard deviations that only keep finite what the images cannot see: focal lengths relative, centre per width."""
+WEAK_DISTORTION, WEAK_SHEAR, WEAK_FOCAL, WEAK_OFFSET, WEAK_PRISM = 1.0, 0.3, 0.05, 0.1, 0.3
+
+
+OfImage = Literal["focal", "shear", "x", "y"]
+"""What NuisancePrior has of each image, in its order."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Alternatives:
+    """The equations of every column that may be freed; what was adjusted is eliminated.
+
+    The columns are the parameters of one camera in `units`, then the nuisances of its images in the order of
+    NuisancePrior.
+    """
+
+    hessian: Float[ndarray, "e e"]
+    right: Float[ndarray, " e"]
+    place_by_column: Float[ndarray, "6 e"]
+    """How far the camera's place moves with each column."""
+    images: int
+    """Of the camera."""
+    freedom: int
+    """Of the robots' residuals, by which their noise was estimated: fewer than the images have by far."""
+    dispersion: float
+    """Variance of what pulls at a parameter, over what the weights state."""
+    names: tuple[str, ...]
+    """Of the camera's parameters."""
+    units: Float[ndarray, " q"]
+    """What each of them counts in: focal lengths in themselves, the centre in widths."""
+    distance: Float[ndarray, " m"]
+    """Median depth of the points of each image (m)."""
+    down_in_camera: Float[ndarray, "m 3"]
+    """Of each image, the direction against the base's z axis."""
+
+    @property
+    def columns(self) -> int:
+        """That may be freed."""
+        return len(self.right)
+
+    def of_camera(self, names: tuple[str, ...]) -> Float[ndarray, "e p"]:
+        """Combinations: these parameters of the camera."""
+        return np.eye(self.columns)[:, [self.names.index(name) for name in names]]
+
+    def of_images(self, nuisance: OfImage, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
+        """Combinations: this nuisance of each image moves by its share."""
+        out = np.zeros((self.columns, shares.shape[1]))
+        first = len(self.names) + get_args(OfImage).index(nuisance) * self.images
+        out[first : first + self.images] = shares
+        return out
+
+
+@dataclass(frozen=True)
+class Tested:
+    """What freeing some combinations would do."""
+
+    log_p: float
+    """Of a gain like this or larger where there is nothing."""
+    covariance: Float[ndarray, "p p"]
+    """Of the combinations."""
+    shift: Float[ndarray, "6"]
+    """The step of the camera's place that comes with it, axes of its parent."""
+
+
+def first_x(placed: Placed) -> Transform:
+    """The place of a wrist camera that is the first of its arm."""
+    return placed.x[0]
+
+
+def alternatives(
+    adjusted: Adjusted,
+    prior: IntrinsicsPrior,
+    camera: int = 0,
+    place: Callable[[Placed], Transform] = first_x,
+    model_error_std: float | None = None,
+) -> Alternatives:
+    """The columns and equations of one camera about an adjustment.
+
+    `prior` is what was known of its intrinsics; what was freed beyond it is among the columns. `place` is where the
+    camera is on its parent. `model_error_std` is how large, in widths of the image, what the cameras' models leave may
+    be; None: as large as it was estimated.
+    """
+    given = adjusted.given
+    problem, own = given.evidence.problem, len(prior.std)
+    mine = np.flatnonzero(problem.observations.camera == camera)
+    wider = _with_all_free(adjusted, prior, camera, mine, model_error_std)
+    placed = replace(adjusted.most_likely, scene=wider.scene)
+    equations, _ = equations_of(placed, replace(given, evidence=wider))
+    solution = solve(equations, adjusted.log_sizes)
+    hessian = equations.jacobian.T @ solution.weighed + equations.prior_information
+    right = -(solution.weighed.T @ equations.residual + equations.prior_gradient)
+    # What was adjusted: the arms, the cameras as far as they were free, and what their models leave.
+    all_free, begin = wider.problem.freedom, adjusted.first_camera_column
+    of_camera, of_images = all_free.intrinsics_columns[camera], all_free.nuisance_columns
+    rest = begin + np.r_[of_camera.start + own : of_camera.stop, of_images]
+    kept = np.setdiff1d(np.arange(len(hessian)), rest)
+    coupling = hessian[np.ix_(kept, rest)]
+    by_column = over(cholesky(hessian[np.ix_(kept, kept)]), coupling)
+    start = given.evidence.scene.cameras[camera]
+    now, rig = adjusted.placed.scene, problem.observations.rig[mine]
+    return Alternatives(
+        hessian=hessian[np.ix_(rest, rest)] - coupling.T @ by_column,
+        right=right[rest] - by_column.T @ right[kept],
+        place_by_column=-_place_by_kept(adjusted, place, len(hessian), kept) @ by_column,
+        images=len(mine),
+        freedom=max(len(equations.residual) - begin, 1),
+        dispersion=_dispersion(given.evidence),
+        names=parameter_names(start),
+        units=units_of(start),
+        distance=_distances(wider, mine),
+        down_in_camera=-(adjusted.placed.z[0] @ now.world_from_rig[rig] @ now.rig_from_camera[camera])[
+            :, 2, :3
+        ],
+    )
+
+
+def nuisances_of(images: Int[ndarray, " m"], count: int) -> Int[ndarray, " r"]:
+    """Of these images among the nuisances of `count`, and what all share."""
+    return np.r_[(count * np.arange(OF_IMAGE)[:, None] + images).ravel(), OF_IMAGE * count + np.arange(PRISM)]
+
+
+def _with_all_free(
+    adjusted: Adjusted,
+    prior: IntrinsicsPrior,
+    camera: int,
+    images: Int[ndarray, " m"],
+    model_error_std: float | None,
+) -> ImageEvidence:
+    """What the images show where every parameter of a camera and of its images is free."""
+    found = adjusted.given.evidence
+    problem, scene, own = found.problem, found.scene, len(prior.std)
+    freedom, m = problem.freedom, len(images)
+    start = scene.cameras[camera]
+    units = units_of(start)
+    wider = IntrinsicsPrior(
+        np.column_stack([prior.directions, np.diag(units)]), np.r_[prior.std, weak_of(start)]
+    )
+    rows = nuisances_of(images, len(problem.observations.rig))
+    left = freedom.model_error_std
+    all_free = replace(
+        freedom,
+        intrinsics=with_intrinsics(freedom, wider, camera).intrinsics,
+        nuisance=NuisancePrior(np.eye(len(freedom.nuisance.directions))[:, rows], _weak_nuisances(m)),
+        model_error_std=left if model_error_std is None else np.full_like(left, model_error_std),
+    )
+    steps = scene.camera_steps
+    columns = freedom.intrinsics_columns[camera]
+    wider_steps = np.r_[
+        steps[: columns.start + own],
+        beyond_prior(adjusted, prior, camera) / units,
+        steps[columns.stop : freedom.nuisance_columns.start],
+        scene.nuisances(freedom)[rows],
+        steps[freedom.model_error_columns.start : freedom.board_columns.stop],
+    ]
+    return evidence(replace(scene, camera_steps=wider_steps), replace(problem, freedom=all_free), found.noise)
+
+
+def _place_by_kept(
+    adjusted: Adjusted, place: Callable[[Placed], Transform], columns: int, kept: Int[ndarray, " k"]
+) -> Float[ndarray, "6 k"]:
+    """How far a camera's place moves with each of the kept columns; with no parameter of a camera it does."""
+    derivative = adjusted.derivative(place)
+    arms = adjusted.first_camera_column
+    after = derivative.shape[1] - arms - adjusted.given.evidence.problem.freedom.model_error_columns.stop
+    wide = np.zeros((6, columns))
+    wide[:, :arms] = derivative[:, :arms]
+    if after:
+        wide[:, -after:] = derivative[:, -after:]
+    return wide[:, kept]
+
+
+def _distances(images: ImageEvidence, mine: Int[ndarray, " m"]) -> Float[ndarray, " m"]:
+    """Median depth of the points of each image; of one without points that of the others."""
+    depth, image = images.view.depth, images.problem.observations.image
+    distance = np.array([np.median(depth[image == k]) if (image == k).any() else np.nan for k in mine])
+    return np.where(np.isfinite(distance), distance, np.nanmedian(distance))
+
+
+def freed_intrinsics(
+    adjusted: Adjusted, prior: IntrinsicsPrior, camera: int = 0
+) -> tuple[Float[ndarray, " q"], Float[ndarray, "q q"]]:
+    """The parameters of a camera one Gauss-Newton step on, with another prior about where they started, and their
+    covariance."""
+    given = adjusted.given
+    problem, scene = given.evidence.problem, given.evidence.scene
+    freedom, now = problem.freedom, parameters(scene.cameras[camera])
+    columns = freedom.intrinsics_columns[camera]
+    off = now - parameters(freedom.start[camera])
+    steps = np.r_[
+        scene.camera_steps[: columns.start],
+        np.linalg.pinv(prior.directions) @ off,
+        scene.camera_steps[columns.stop :],
+    ]
+    wider = evidence(
+        replace(scene, camera_steps=steps),
+        replace(problem, freedom=with_intrinsics(freedom, prior, camera)),
+        given.evidence.noise,
+    )
+    equations, _ = equations_of(adjusted.most_likely, replace(given, evidence=wider))
+    solution = solve(equations, adjusted.log_sizes)
+    begin = adjusted.first_camera_column + columns.start
+    own = slice(begin, begin + len(prior.std))
+    covariance = solution.covariance[own, own]
+    return now + prior.directions @ solution.step[own], prior.directions @ covariance @ prior.directions.T
+
+
+def with_intrinsics(freedom: Freedom, prior: IntrinsicsPrior, camera: int = 0) -> Freedom:
+    """The freedom with another prior of a camera's intrinsics."""
+    priors = freedom.intrinsics
+    return replace(freedom, intrinsics=(*priors[:camera], prior, *priors[camera + 1 :]))
+
+
+def beyond_prior(adjusted: Adjusted, prior: IntrinsicsPrior, camera: int = 0) -> Float[ndarray, " q"]:
+    """How far the parameters of a camera went by what was freed beside its prior, from where they started."""
+    found, own = adjusted.given.evidence, len(prior.std)
+    freedom = found.problem.freedom
+    steps = found.scene.camera_steps[freedom.intrinsics_columns[camera]]
+    return freedom.intrinsics[camera].directions[:, own:] @ steps[own:]
+
+
+def units_of(camera: Intrinsics) -> Float[ndarray, " q"]:
+    """What its parameters count in: focal lengths in themselves, the centre in widths."""
+    distortion = [1.0] * (len(parameter_names(camera)) - 4)
+    return np.array([camera.fx, camera.fy, camera.width, camera.width, *distortion])
+
+
+def weak_of(camera: Intrinsics) -> Float[ndarray, " q"]:
+    """Standard deviations of its parameters, in their units, that only keep finite what the images cannot see."""
+    return np.array([WEAK.get(name, WEAK_DISTORTION) for name in parameter_names(camera)])
+
+
+def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
+    """The combinations of columns of `Alternatives` that give every image a focal length of its own."""
+    q = len(parameter_names(camera))
+    out = np.zeros((q + OF_IMAGE * images + PRISM, images))
+    out[:2, 0] = 1.0
+    out[q : q + images, 1:] = differences(images)
+    return out
+
+
+def differences(count: int) -> Float[ndarray, "n d"]:
+    """An orthonormal basis of what differs between this many, whose sum is 0."""
+    return np.linalg.svd(np.eye(count) - 1 / count)[0][:, : count - 1]
+
+
+def freed(
+    freedom: Freedom, combinations: Float[ndarray, "e p"], images: Int[ndarray, " m"], camera: int = 0
+) -> Freedom:
+    """A freedom with combinations of the columns of one camera's `Alternatives` free too.
+
+    Parameters of the camera, in units of where it starts, and of its `images` are freed each by themselves.
+    """
+    start, own = freedom.start[camera], freedom.intrinsics[camera]
+    q, m = len(parameter_names(start)), len(images)
+    of_camera, of_images = spanned(combinations[:q]), spanned(combinations[q:])
+    wider = IntrinsicsPrior(
+        np.column_stack([own.directions, units_of(start)[:, None] * of_camera]),
+        np.r_[own.std, _std(of_camera, weak_of(start))],
+    )
+    all_rows = len(freedom.nuisance.directions)
+    directions = np.zeros((all_rows, of_images.shape[1]))
+    directions[nuisances_of(images, (all_rows - PRISM) // OF_IMAGE)] = of_images
+    std = _std(of_images, _weak_nuisances(m))
+    return replace(with_intrinsics(freedom, wider, camera), nuisance=NuisancePrior(directions, std))
+
+
+def _weak_nuisances(images: int) -> Float[ndarray, " r"]:
+    """Standard deviations of nuisances that only keep finite what the images cannot see."""
+    of_images = np.repeat([WEAK_FOCAL, WEAK_SHEAR, WEAK_OFFSET, WEAK_OFFSET], images)
+    return np.r_[of_images, np.full(PRISM, WEAK_PRISM)]
+
+
+def _std(combinations: Float[ndarray, "n p"], of_each: Float[ndarray, " n"]) -> Float[ndarray, " p"]:
+    """Of combinations, where each of what they combine has one."""
+    return 1 / np.sqrt(((combinations / of_each[:, None]) ** 2).sum(0))
+
+
+def spanned(combinations: Float[ndarray, "e p"]) -> Float[ndarray, "e r"]:
+    """An orthonormal basis of what the combinations free; some may free the same."""
+    u, size, _ = np.linalg.svd(combinations, full_matrices=False)
+    return u[:, size > 1e-9 * size.max(initial=1e-300)]
+
+
+def tested(equations: Alternatives, free: Float[ndarray, "e p"], beside: Float[ndarray, "e q"]) -> Tested:
+    """The test of freeing the combinations `free`, with those of `beside` free under both hypotheses."""
+    q, both = beside.shape[1], np.concatenate([beside, free], axis=1)
+    fewer, more = spanned(beside), spanned(both)
+    without, gain_without, _ = _step(equations, fewer)
+    step, gain, covariance = _step(equations, more)
+    spread, p = equations.dispersion, max(more.shape[1] - fewer.shape[1], 1)
+    to_value = np.linalg.pinv(both)[q:] @ more
+    return Tested(
+        float(f_distribution.logsf(max(gain - gain_without, 0.0) / spread / p, p, equations.freedom)),
+        spread * to_value @ covariance @ to_value.T,
+        equations.place_by_column @ (more @ step - fewer @ without),
+    )
+
+
+def _step(
+    equations: Alternatives, free: Float[ndarray, "e r"]
+) -> tuple[Float[ndarray, " r"], float, Float[ndarray, "r r"]]:
+    """How far these combinations go where they are free, what it gains, and the covariance."""
+    covariance = np.linalg.inv(free.T @ equations.hessian @ free)
+    right = free.T @ equations.right
+    step = covariance @ right
+    return step, float(right @ step), covariance
+
+
+def _dispersion(images: ImageEvidence) -> float:
+    """Of the weighted residuals, and no less than that of their sums over cells of the images (cluster sampling;
+    Liang and Zeger, Biometrika 73, 1986)."""
+    problem, weight = images.problem, images.weight
+    pull = weight[:, None] * images.view.residual_px
+    taken = 3 * len(problem.points) + 6 * len(problem.seen.rows)
+    share = max(1 - taken / (2 * len(weight)), 0.1)
+    scale = 2 * weight.sum() * share
+    return max(float((pull**2).sum()), problem.layout.squares_of_cells(pull)) / scale

@@ -1,0 +1,126 @@
+"""Each way of writing poses wrongly is named, and sound poses never are."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jcr.calibration import conventions
+from jcr.calibration.conventions import (
+    BY_NUMBER,
+    BY_TEXT,
+    MIRRORED,
+    better_reading,
+    convention_finding,
+)
+from jcr.capture.names import paired_by_name
+from jcr.geometry import inverse, transform
+from jcr.records.words import sentence
+from simulation.problem import hand_eye_problem
+
+
+def with_rotation(poses: np.ndarray, rotation: Rotation) -> np.ndarray:
+    return transform(rotation.as_matrix(), poses[:, :3, 3])
+
+
+def rotations(poses: np.ndarray) -> Rotation:
+    return Rotation.from_matrix(poses[:, :3, :3])
+
+
+def reordered_quaternion(poses: np.ndarray, order: list[int]) -> np.ndarray:
+    return with_rotation(poses, Rotation.from_quat(rotations(poses).as_quat()[:, order]))
+
+
+MISTAKES = {
+    "inverses": (inverse, "inverse"),
+    "reversed": (lambda g: g[::-1].copy(), "reverse order"),
+    "late by one": (lambda g: np.roll(g, 1, 0), "1 ahead of the images"),
+    "early by one": (lambda g: np.roll(g, -1, 0), "1 behind the images"),
+    "left-handed base": (lambda g: np.diag([1, 1, -1, 1.0]) @ g @ np.diag([1, 1, -1, 1.0]), "mirrored ones"),
+    "w first": (lambda g: reordered_quaternion(g, [3, 0, 1, 2]), "quaternions w, x, y, z"),
+    "w last": (lambda g: reordered_quaternion(g, [1, 2, 3, 0]), "quaternions x, y, z, w"),
+    "Euler order": (
+        lambda g: with_rotation(g, Rotation.from_euler("xyz", rotations(g).as_euler("ZYX"))),
+        "Euler angles ZYX that were taken as xyz",
+    ),
+    "vectors, degrees for radians": (
+        lambda g: with_rotation(g, Rotation.from_rotvec(np.degrees(rotations(g).as_rotvec()))),
+        "rotation vectors in degrees that were taken as radians",
+    ),
+    "vectors, radians for degrees": (
+        lambda g: with_rotation(g, Rotation.from_rotvec(np.radians(rotations(g).as_rotvec()))),
+        "rotation vectors in radians that were taken as degrees",
+    ),
+    "angles, degrees for radians": (
+        lambda g: with_rotation(g, Rotation.from_euler("xyz", np.degrees(rotations(g).as_euler("xyz")))),
+        r"Euler angles \(xyz\) in degrees that were taken as radians",
+    ),
+    "angles, radians for degrees": (
+        lambda g: with_rotation(g, Rotation.from_euler("xyz", np.radians(rotations(g).as_euler("xyz")))),
+        r"Euler angles \(xyz\) in radians that were taken as degrees",
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_each_mistake_is_named(mistake: str):
+    write, words = MISTAKES[mistake]
+    problem = hand_eye_problem(
+        np.random.default_rng(1), 9, robot_noise=(2e-4, 5e-4), camera_noise=(1e-4, 1e-4)
+    )
+    found = better_reading(write(problem.base_from_gripper), problem.recon_from_camera)
+    assert found is not None
+    assert re.search(words, sentence(convention_finding(found)))
+    # Where only rotations are misread, positions may still fit to 0.4 mm, with rotations that are tens of degrees off.
+    assert found[0].misfit < 1.0 and found[0].translation_mm < 0.5
+    assert found[1].misfit > 10.0
+
+
+@pytest.mark.slow
+def test_images_that_are_mirrored_are_named():
+    problem = hand_eye_problem(np.random.default_rng(3), 10, robot_noise=(2e-4, 5e-4))
+    mirror = np.diag([-1, 1, 1, 1.0])
+    found = better_reading(problem.base_from_gripper, mirror @ problem.recon_from_camera @ mirror)
+    assert found is not None and found[0].name == MIRRORED and found[0].used == 10
+
+
+@pytest.mark.slow
+def test_rows_in_another_order_of_the_images_names_are_named():
+    problem = hand_eye_problem(np.random.default_rng(2), 12, robot_noise=(2e-4, 5e-4))
+    names, poses = [f"images/{k}.png" for k in range(1, 13)], problem.base_from_gripper
+    by_text = sorted(range(12), key=lambda k: names[k])
+    # Rows of a table in order of the names as text, images paired as people count; and the other way round.
+    for images, rows, order in (
+        (names, poses[by_text], BY_TEXT),
+        ([names[k] for k in by_text], poses, BY_NUMBER),
+    ):
+        cameras = problem.recon_from_camera[[int(Path(name).stem) - 1 for name in images]]
+        # Without the names all readings are tried, in seconds: once is enough.
+        assert order == BY_NUMBER or better_reading(rows, cameras) is None
+        found = better_reading(rows, cameras, paired_by_name(images, rows))
+        assert found is not None and found[0].name == order
+        assert "add a column image" in sentence(convention_finding(found))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [(0.0, 0.0), (5e-4, np.radians(0.1)), (5e-3, np.radians(1.0))])
+def test_sound_poses_are_left_alone(noise):
+    for seed in range(2):
+        problem = hand_eye_problem(np.random.default_rng(seed), 10, robot_noise=noise)
+        assert better_reading(problem.base_from_gripper, problem.recon_from_camera) is None
+
+
+def test_shuffled_poses_are_read_in_few_ways(monkeypatch: pytest.MonkeyPatch):
+    """No reading fits them, and each that is solved takes as long as the calibration itself: of 15 none is now."""
+    solved = []
+    solve = conventions.solve_hand_eye
+    monkeypatch.setattr(conventions, "solve_hand_eye", lambda *poses: solved.append(1) or solve(*poses))
+    rng = np.random.default_rng(0)
+    p = hand_eye_problem(rng, 12)
+    shuffled = p.base_from_gripper[rng.permutation(12)]
+    given = solve(shuffled, p.recon_from_camera)
+    assert better_reading(shuffled, p.recon_from_camera, solved=given) is None
+    assert not solved

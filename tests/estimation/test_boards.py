@@ -1,0 +1,147 @@
+"""Corners of boards in the adjustment: the shape that is known of them, and what it is worth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jcr.estimation.boards import shapes_of
+from jcr.estimation.image_robots import Adjusted
+from jcr.estimation.images import ImageEvidence, adjust_images
+from jcr.estimation.intrinsics_prior import FIXED, prior_of
+from jcr.estimation.projection import derivatives, shape_residuals
+from jcr.estimation.scene import Freedom, Observations, Scene, similarities, stepped
+from jcr.estimation.wrist import adjust_wrist
+from jcr.geometry import inverse, step_between
+from simulation.boards import Sheet, with_sheet
+from simulation.faults import Faults, FaultyCapture, faulty_capture
+
+pytestmark = pytest.mark.slow
+
+
+def adjusted(seed: int, sheet: Sheet | None, images: int = 8) -> Adjusted:
+    rng = np.random.default_rng(seed)
+    found = faulty_capture(rng, images, Faults(robot_noise=(1e-5, 1e-5)))
+    found = found if sheet is None else with_sheet(found, rng, sheet)
+    cameras = found.base_from_camera
+    start = found.gripper_from_camera, 1.0, np.eye(4)
+    prior = prior_of(found.intrinsics, FIXED)
+    return adjust_wrist(found.base_from_gripper, start, cameras, found.intrinsics, found.tracks, prior=prior)
+
+
+def test_the_derivatives_of_corners_are_those_of_their_residuals():
+    given = adjusted(0, Sheet(bend_m=2e-3)).given.evidence
+    scene, problem, boards = given.scene, given.problem, given.problem.observations.boards
+    assert boards is not None
+    freedom, shape = problem.freedom, scene.camera_steps[problem.freedom.board_columns]
+    rows = boards.derivatives(
+        scene.world_from_rig, scene.points_in_world, shape, freedom.board_columns, freedom.first_rig
+    )
+    rng, count = np.random.default_rng(0), freedom.first_rig + 6 * len(scene.world_from_rig)
+    for _ in range(3):
+        step = np.zeros(count)
+        step[freedom.board_columns] = 1e-3 * rng.normal(size=len(shape))
+        step[-6:] = 1e-3 * rng.normal(size=6)
+        off = 1e-3 * rng.normal(size=scene.points_in_world.shape)
+        tiny = 1e-4
+        ends = []
+        for sign in (1, -1):
+            there = stepped(scene, freedom, sign * tiny * step)
+            there = replace(there, points_in_world=scene.points_in_world + sign * tiny * off)
+            ends.append(shape_residuals(there, problem))
+        expected = (ends[0] - ends[1]) / (2 * tiny)
+        found = rows.shared @ step[: freedom.first_rig] + rows.own @ step[-6:]
+        found += (rows.by_point @ np.repeat(off[boards.point], 2, axis=0)[..., None])[..., 0]
+        assert np.allclose(found.reshape(-1, 4)[:, :3], expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_the_shape_of_a_board_is_the_same_at_any_size_and_place_of_the_world():
+    given = adjusted(1, Sheet()).given.evidence
+    problem, scene = given.problem, given.scene
+    weighted = derivatives(scene, given.view, problem, given.weight)
+    by_world = similarities(scene, problem.freedom)
+    first, point = problem.freedom.first_rig, problem.rows_point
+    own = by_world[first:].reshape(-1, 6, 7)[problem.rows_rig]
+    p = scene.points_in_world
+    of_points = np.zeros((len(p), 3, 7))
+    of_points[:, :, 0], of_points[:, :, 1:4] = p, np.eye(3)
+    of_points[:, :, 4:] = np.cross(np.eye(3), p[:, None]).swapaxes(1, 2)
+    moved = weighted.shared @ by_world[:first] + weighted.own @ own + weighted.by_point @ of_points[point]
+    assert np.abs(moved).max() < 1e-8 * np.abs(weighted.by_point).max()
+
+
+@pytest.mark.parametrize("bend_m", [0.0, 3e-3])
+def test_a_sheet_is_found_as_large_and_as_bent_as_it_is(bend_m: float):
+    """A bend of ten times the usual one is the corners' to show."""
+    found = adjusted(2, Sheet(bend_m=bend_m), images=12)
+    given = found.given.evidence
+    boards = given.problem.observations.boards
+    assert boards is not None
+    shape = given.scene.camera_steps[given.problem.freedom.board_columns]
+    size = found.placed.scale * boards.unit * np.exp(shape[0])
+    assert size == pytest.approx(1.0, abs=5e-4)
+    height = boards.bend(shape)
+    assert np.ptp(height) == pytest.approx(bend_m, abs=3e-4)
+
+
+def test_the_unit_of_the_world_is_that_of_the_cameras_with_a_board_too():
+    """A few bad corners show nothing more: transform and scale are as certain as without them, and go together."""
+    alone, with_it = (adjusted(3, one) for one in (None, Sheet(corners=(4, 3), side_m=0.01, noise_px=0.5)))
+    along = np.r_[
+        alone.placed.x[0][:3, 2], np.zeros(3), 0.5
+    ]  # of a point half a metre ahead, where the errors of both nearly cancel
+    for by in (along, np.eye(7)[2], np.eye(7)[6]):
+        expected = by @ alone.covariance[:7, :7] @ by
+        assert by @ with_it.covariance[:7, :7] @ by == pytest.approx(expected, rel=0.05)
+
+
+def test_a_board_makes_cameras_more_certain_and_their_covariance_stays_true():
+    """Images alone, 15 draws: cameras are as far from the true ones, in units of their covariance, as they may be."""
+    squared = []
+    for seed in range(15):
+        rng = np.random.default_rng(seed)
+        bare = faulty_capture(rng, 6, Faults())
+        found = with_sheet(bare, rng, Sheet(bend_m=float(rng.normal(scale=5e-4))))
+        alone, with_it = (images_alone(one) for one in (bare, found))
+        cameras = len(found.base_from_camera)
+        own = slice(6, 6 * cameras)
+        assert np.trace(with_it.rig_covariance()[own, own]) < np.trace(alone.rig_covariance()[own, own])
+        squared.append(squared_distance(with_it, found.base_from_camera))
+    assert 0.6 < np.mean(squared) < 1.5, np.mean(squared)
+
+
+def images_alone(found: FaultyCapture) -> ImageEvidence:
+    """The images adjusted without the robot, from the true cameras."""
+    tracks, each = found.tracks, len(found.base_from_camera)
+    points = tracks.points_in_recon
+    seen = np.bincount(tracks.point, minlength=len(points)) >= 2
+    boards, bodies = shapes_of(tracks.boards, points, seen, each)
+    scene = Scene(
+        world_from_rig=np.concatenate([found.base_from_camera, bodies]),
+        rig_from_camera=np.eye(4)[None],
+        cameras=(found.intrinsics,),
+        points_in_world=points,
+    )
+    freedom = Freedom.of((found.intrinsics,), (prior_of(found.intrinsics, FIXED),), each)
+    return adjust_images(scene, Observations.of_one_camera(tracks, each, boards), freedom)
+
+
+def squared_distance(found: ImageEvidence, cameras: np.ndarray) -> float:
+    """Of the cameras from the true ones, per unknown, in the frame of the first and at one size."""
+    covariance, rigs = found.rig_covariance(), found.scene.world_from_rig
+    own = slice(6, 6 * len(cameras))
+    true = rigs[0] @ inverse(cameras[0]) @ cameras
+    true[:, :3, 3] = rigs[0, :3, 3] + found_size(found) * (true[:, :3, 3] - rigs[0, :3, 3])
+    step = step_between(rigs[: len(cameras)], true).ravel()[own]
+    # The size is that of all rigs together, the board's among them: along it the distance is not counted.
+    ahead = (rigs[:, :3, 3] - rigs[0, :3, 3])[: len(cameras)]
+    along = np.zeros((len(cameras), 6))
+    along[:, :3] = ahead
+    by_size = along.ravel()[own]
+    weight = np.linalg.inv(covariance[own, own] + 1e2 * np.outer(by_size, by_size))
+    return float(step @ weight @ step / (len(step) - 1))
+
+
+def found_size(found: ImageEvidence) -> float:
+    """The world of a sheet that is as large as stated."""
+    return float(np.exp(found.scene.camera_steps[found.problem.freedom.board_columns][0]))

@@ -1,0 +1,146 @@
+"""The closed form in all its gauges: what may change about a problem changes the answer as it must, and no more."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jcr.estimation.closed_form import closed_form, initial_estimate
+from jcr.geometry import inverse, retract, rotation_exp, scale_translation, step_between, transform
+from simulation.problem import hand_eye_problem
+
+repeatable = settings(derandomize=True, deadline=None, max_examples=30)
+seeds = st.integers(0, 2**32 - 1)
+counts = st.integers(3, 9)
+angles = st.sampled_from([0.0, 1e-9, 0.7, np.pi - 1e-9, np.pi]) | st.floats(0, np.pi)
+
+
+def noisy(seed: int, count: int):
+    """Gripper and camera poses that belong together up to the robot pose noise, and the generator for what follows."""
+    rng = np.random.default_rng(seed)
+    problem = hand_eye_problem(rng, count, robot_noise=(1e-4, 2e-4))
+    return problem.base_from_gripper, problem.recon_from_camera, rng
+
+
+def any_rigid(rng: np.random.Generator, angle: float):
+    """A transform that rotates by `angle` about some axis."""
+    axis = rng.normal(size=3)
+    return transform(rotation_exp(angle * axis / np.linalg.norm(axis)), rng.normal(size=3))
+
+
+def assert_same(found, expected, tolerance: float = 1e-7):
+    (x, scale, z), (x_expected, scale_expected, z_expected) = found, expected
+    assert np.abs(step_between(x, x_expected)).max() < tolerance
+    assert scale == pytest.approx(scale_expected, rel=tolerance)
+    assert np.abs(step_between(z, z_expected)).max() < 10 * tolerance
+
+
+@repeatable
+@given(seeds, counts, angles)
+def test_another_base_moves_base_from_recon_alone(seed, count, angle):
+    gripper, camera, rng = noisy(seed, count)
+    x, scale, z = closed_form(gripper, camera)
+    other = any_rigid(rng, angle)
+    assert_same(closed_form(other @ gripper, camera), (x, scale, other @ z))
+
+
+@repeatable
+@given(seeds, counts, angles)
+def test_another_frame_on_the_gripper_moves_x_alone(seed, count, angle):
+    # Without noise: the least squares weigh errors where the gripper's origin is.
+    rng = np.random.default_rng(seed)
+    problem = hand_eye_problem(rng, count)
+    gripper, camera = problem.base_from_gripper, problem.recon_from_camera
+    x, scale, z = closed_form(gripper, camera)
+    tool = any_rigid(rng, angle)
+    assert_same(closed_form(gripper @ tool, camera), (inverse(tool) @ x, scale, z))
+
+
+@repeatable
+@given(seeds, counts, angles, st.floats(1e-3, 1e3))
+def test_a_similarity_of_the_reconstruction_changes_scale_and_base_from_recon_alone(
+    seed, count, angle, factor
+):
+    gripper, camera, rng = noisy(seed, count)
+    x, scale, z = closed_form(gripper, camera)
+    other = any_rigid(rng, angle)
+    again = closed_form(gripper, other @ scale_translation(camera, factor))
+    assert_same(again, (x, scale / factor, z @ inverse(scale_translation(other, scale / factor))))
+
+
+@repeatable
+@given(seeds, counts)
+def test_the_order_of_the_images_does_not_matter(seed, count):
+    gripper, camera, rng = noisy(seed, count)
+    order = rng.permutation(count)
+    weights = rng.uniform(0.5, 2.0, count)
+    again = closed_form(gripper[order], camera[order], weights[order])
+    assert_same(again, closed_form(gripper, camera, weights))
+
+
+@repeatable
+@given(seeds, counts)
+def test_an_image_without_weight_is_as_if_it_were_not_there(seed, count):
+    gripper, camera, _ = noisy(seed, count + 1)
+    gripper[-1, :3, 3] += 1.0
+    weights = np.r_[np.ones(count), 0.0]
+    assert_same(closed_form(gripper, camera, weights), closed_form(gripper[:-1], camera[:-1]))
+
+
+@repeatable
+@given(seeds, st.integers(4, 9), st.sampled_from([0.0, 1e-12, 1e-7, 1e-3]))
+def test_half_rotates_between_images_are_like_any_other_motion(seed, count, short_of):
+    rng = np.random.default_rng(seed)
+    problem = hand_eye_problem(rng, count)
+    gripper, x = problem.base_from_gripper.copy(), problem.gripper_from_camera
+    for k in range(1, count, 2):
+        gripper[k] = gripper[k - 1] @ any_rigid(rng, np.pi - short_of)
+    z = any_rigid(rng, 1.0)
+    camera = scale_translation(inverse(z) @ gripper @ x, 1 / problem.scale)
+    assert_same(closed_form(gripper, camera), (x, problem.scale, z), 1e-6)
+
+
+@repeatable
+@given(seeds)
+def test_half_rotates_alone_are_solved(seed):
+    """About axes at right angles, which makes all motions rotations by 180°: the sines of all vanish together."""
+    rotations = np.pi * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    rng = np.random.default_rng(seed)
+    gripper = any_rigid(rng, 1.0) @ transform(rotation_exp(rotations), rng.normal(size=(3, 3)))
+    x, z = any_rigid(rng, rng.uniform(0, np.pi)), any_rigid(rng, 1.0)
+    camera = inverse(z) @ gripper @ x
+    gripper = retract(gripper, 1e-6 * rng.normal(size=(3, 6)))
+    found, _, base = closed_form(gripper, camera)
+    # A rotation by 180° has an axis without a sign: an answer must explain the rotations, and may be another.
+    assert np.abs((gripper @ found - base @ camera)[:, :3, :3]).max() < 5e-6
+
+
+@repeatable
+@given(seeds, counts, st.lists(st.integers(1, 3), max_size=2))
+def test_problems_of_a_batch_are_solved_as_one_by_one(seed, count, shape):
+    rng = np.random.default_rng(seed)
+    stacks = [noisy(int(rng.integers(2**32)), count)[:2] for _ in range(int(np.prod(shape)))]
+    gripper, camera = (np.stack(of).reshape(*shape, count, 4, 4) for of in zip(*stacks, strict=True))
+    # One of them with 180°, and another way to be solved.
+    gripper[(0,) * len(shape)][0] = gripper[(0,) * len(shape)][1] @ any_rigid(rng, np.pi)
+    x, scale, z = closed_form(gripper, camera)
+    assert np.shape(scale) == tuple(shape)
+    for at in np.ndindex(*shape):
+        one = closed_form(gripper[at], camera[at])
+        assert np.allclose(x[at], one[0], atol=1e-9) and np.allclose(z[at], one[2], atol=1e-8)
+        assert np.asarray(scale)[at] == pytest.approx(one[1], rel=1e-9)
+
+
+def test_small_noise_makes_small_errors():
+    rng = np.random.default_rng(5)
+    problem = hand_eye_problem(rng, 12)
+    noise = 1e-3 * rng.normal(size=(12, 6))
+    x, scale, _ = closed_form(retract(problem.base_from_gripper, noise), problem.recon_from_camera)
+    assert np.abs(step_between(x, problem.gripper_from_camera)).max() < 5e-3
+    assert scale == pytest.approx(problem.scale, rel=1e-2)
+
+
+def test_a_camera_that_only_rotates_has_no_scale_and_gets_one():
+    problem = hand_eye_problem(np.random.default_rng(2), 6, "camera-centre")
+    assert closed_form(problem.base_from_gripper, problem.recon_from_camera)[1] == 0
+    assert initial_estimate(problem.base_from_gripper, problem.recon_from_camera)[1] == 1.0

@@ -1,0 +1,100 @@
+"""Observations that count by what their matches state, as far as the images bear it out."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.estimation.images import ImageEvidence, adjust_images
+from jcr.estimation.intrinsics_prior import FIXED, prior_of
+from jcr.estimation.scene import Freedom, Observations, Scene
+from jcr.geometry import step_between
+from jcr.records import Tracks
+from simulation.observations import INTRINSICS, observed
+from simulation.problem import hand_eye_problem
+
+SEEDS = range(6)
+
+
+@cache
+def adjusted(seed: int, stated: str) -> tuple[ImageEvidence, Float[ndarray, "11 3"]]:
+    """Of 12 images with observations of 0.05 to 0.5 px, and the errors of their rotations from the first (rad).
+
+    `stated` is "nothing", "size" (up to a factor), or "chance": sizes that have nothing to do with the errors.
+    """
+    rng = np.random.default_rng(seed)
+    problem = hand_eye_problem(rng, 12)
+    exact = observed(problem, rng, 300, 0.0)
+    std_px = np.exp(rng.uniform(np.log(0.05), np.log(0.5), len(exact.image)))
+    x_px = exact.x_px + std_px[:, None] * rng.normal(size=exact.x_px.shape)
+    of = {"nothing": None, "size": 3 * std_px, "chance": rng.permutation(std_px)}
+    found = adjust_images(
+        Scene(
+            world_from_rig=problem.recon_from_camera,
+            rig_from_camera=np.eye(4)[None],
+            cameras=(INTRINSICS,),
+            points_in_world=exact.points_in_recon,
+        ),
+        Observations.of_one_camera(
+            Tracks(
+                image=exact.image,
+                x_px=x_px,
+                point=exact.point,
+                points_in_recon=exact.points_in_recon,
+                std_px=of[stated],
+            ),
+            12,
+        ),
+        Freedom.of((INTRINSICS,), (prior_of(INTRINSICS, FIXED),), 12),
+    )
+    return found, step_between(problem.recon_from_camera, found.scene.world_from_rig)[1:, 3:]
+
+
+@pytest.mark.slow
+def test_what_matches_state_is_believed_as_far_as_residuals_show_it():
+    common = {
+        name: [adjusted(seed, name)[0].noise.common for seed in SEEDS]
+        for name in ("nothing", "size", "chance")
+    }
+    assert max(common["size"]) <= 0.06
+    assert common["chance"] == common["nothing"] == [1.0] * len(SEEDS)
+
+
+def test_better_observations_count_more():
+    rms = {
+        name: np.sqrt(np.mean([adjusted(seed, name)[1] ** 2 for seed in SEEDS]))
+        for name in ("nothing", "size")
+    }
+    assert rms["size"] < 0.8 * rms["nothing"]
+
+
+def test_covariance_is_that_of_the_errors():
+    squares = []
+    for seed in SEEDS:
+        found, errors = adjusted(seed, "size")
+        of_rotations = found.rig_covariance().reshape(12, 6, 12, 6)[1:, 3:, 1:, 3:].reshape(33, 33)
+        squares.append(errors.ravel() ** 2 / np.diag(of_rotations))
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.4)
+    assert adjusted(0, "size")[0].noise.sigma_px[0] == pytest.approx(np.sqrt(0.05 * 0.5), rel=0.2)
+
+
+def test_what_no_camera_focuses_on_counts_nothing():
+    found, _ = adjusted(0, "size")
+    depth = found.view.depth.copy()
+    depth[:3] = np.median(depth) * np.array([-1.0, 1e-6, 0.01])
+    weight = found.noise.weights(found.view.residual_px, depth, found.problem.layout)
+    assert (weight[:3] == 0).all() and (weight[3:] > 0).all()
+
+
+def test_stated_sizes_follow_their_observations():
+    tracks = Tracks(
+        image=np.array([0, 1, 1]),
+        x_px=np.arange(6.0).reshape(3, 2),
+        point=np.array([0, 0, 1]),
+        points_in_recon=np.zeros((2, 3)),
+        std_px=np.arange(3.0),
+    )
+    kept = tracks.only(tracks.image == 1)
+    assert kept.std_px is not None and kept.std_px.tolist() == [1, 2] and kept.point.tolist() == [0, 1]

@@ -1,0 +1,360 @@
+"""Arms against other published forms, error Jacobians against finite differences, and inverse kinematics."""
+
+import time
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jcr.capture.urdf_chain import read_chain
+from jcr.errors import InputError
+from jcr.estimation.arms import ROBOT_NAMES, arm_named
+from jcr.estimation.inverse_kinematics import inverse_kinematics, required_posture
+from jcr.estimation.kinematics import (
+    error_jacobian,
+    error_std,
+    forward_kinematics,
+    from_dh,
+    joint_frames,
+    with_tool,
+)
+from jcr.estimation.mounting import LengthError, mounted_arm
+from jcr.geometry import inverse, rotation_exp, step_axes, step_between, transform
+from simulation.bent_arm import BentArm, error_names
+
+H = np.pi / 2
+Z = (0, 0, 1)
+
+# Joint origins (x, y, z, roll, pitch, yaw) and axis as in the makers' URDF files, where arms.py has DH parameters;
+# last the origin of the gripper frame.
+URDF_FORMS = {
+    "ur3e": [
+        ((0, 0, 0.15185, 0, 0, 0), Z),
+        ((0, 0, 0, H, 0, 0), Z),
+        ((-0.24355, 0, 0, 0, 0, 0), Z),
+        ((-0.2132, 0, 0.13105, 0, 0, 0), Z),
+        ((0, -0.08535, 0, H, 0, 0), Z),
+        ((0, 0.0921, 0, H, np.pi, np.pi), Z),
+        ((0, 0, 0, 0, 0, 0), None),
+    ],
+    "ur5e": [
+        ((0, 0, 0.1625, 0, 0, 0), Z),
+        ((0, 0, 0, H, 0, 0), Z),
+        ((-0.425, 0, 0, 0, 0, 0), Z),
+        ((-0.3922, 0, 0.1333, 0, 0, 0), Z),
+        ((0, -0.0997, 0, H, 0, 0), Z),
+        ((0, 0.0996, 0, H, np.pi, np.pi), Z),
+        ((0, 0, 0, 0, 0, 0), None),
+    ],
+    "panda": [
+        ((0, 0, 0.333, 0, 0, 0), Z),
+        ((0, 0, 0, -H, 0, 0), Z),
+        ((0, -0.316, 0, H, 0, 0), Z),
+        ((0.0825, 0, 0, H, 0, 0), Z),
+        ((-0.0825, 0.384, 0, -H, 0, 0), Z),
+        ((0, 0, 0, H, 0, 0), Z),
+        ((0.088, 0, 0, H, 0, 0), Z),
+        ((0, 0, 0.107, 0, 0, 0), None),
+    ],
+    "iiwa7": [
+        ((0, 0, 0.15, 0, 0, 0), Z),
+        ((0, 0, 0.19, H, 0, np.pi), Z),
+        ((0, 0.21, 0, H, 0, np.pi), Z),
+        ((0, 0, 0.19, H, 0, 0), Z),
+        ((0, 0.21, 0, -H, np.pi, 0), Z),
+        ((0, 0.0607, 0.19, H, 0, 0), Z),
+        ((0, 0.081, 0.0607, -H, np.pi, 0), Z),
+        ((0, 0, 0.045, np.pi, np.pi, np.pi), None),
+    ],
+    "iiwa14": [
+        ((0, 0, 0.1575, 0, 0, 0), Z),
+        ((0, 0, 0.2025, H, 0, np.pi), Z),
+        ((0, 0.2045, 0, H, 0, np.pi), Z),
+        ((0, 0, 0.2155, H, 0, 0), Z),
+        ((0, 0.1845, 0, -H, np.pi, 0), Z),
+        ((0, 0, 0.2155, H, 0, 0), Z),
+        ((0, 0.081, 0, -H, np.pi, 0), Z),
+        ((0, 0, 0.045, np.pi, np.pi, np.pi), None),
+    ],
+    "z1": [
+        ((0, 0, 0.0585, 0, 0, 0), Z),
+        ((0, 0, 0.045, 0, 0, 0), (0, 1, 0)),
+        ((-0.35, 0, 0, 0, 0, 0), (0, 1, 0)),
+        ((0.218, 0, 0.057, 0, 0, 0), (0, 1, 0)),
+        ((0.07, 0, 0, 0, 0, 0), Z),
+        ((0.0492, 0, 0, 0, 0, 0), (1, 0, 0)),
+        ((0.051, 0, 0, 0, 0, 0), None),
+    ],
+}
+URDF_FORMS["fr3"] = URDF_FORMS["panda"]
+
+# Rows (a, d, α, θ₀) of standard DH parameters, where arms.py has joint origins: UFACTORY's developer manual.
+T2 = -np.arctan(284.5 / 53.5)
+DH_FORMS = {
+    "xarm6": [
+        (0, 0.267, -H, 0),
+        (np.hypot(0.2845, 0.0535), 0, 0, T2),
+        (0.0775, 0, -H, -T2),
+        (0, 0.3425, H, 0),
+        (0.076, 0, -H, 0),
+        (0, 0.097, 0, 0),
+    ],
+    "xarm7": [
+        (0, 0.267, -H, 0),
+        (0, 0, H, 0),
+        (0.0525, 0.293, H, 0),
+        (0.0775, 0, H, 0),
+        (0, 0.3425, H, 0),
+        (0.076, 0, -H, 0),
+        (0, 0.097, 0, 0),
+    ],
+}
+
+# Body positions, quaternions (w, x, y, z) and joint axes of MuJoCo models: so101_new_calib.xml beside the URDF, and
+# ur10e.xml of mujoco_menagerie, which rounds to millimetres and has a base of its own.
+MUJOCO_FORMS = {
+    "so101": [
+        ((0.0388353, 0, 0.0624), (0, 0, -1, 0), Z),
+        ((-0.0303992, -0.0182778, -0.0542), (0.5, -0.5, -0.5, -0.5), Z),
+        ((-0.11257, -0.028, 0), (0.707107, 0, 0, 0.707107), Z),
+        ((-0.1349, 0.0052, 0), (0.707107, 0, 0, -0.707107), Z),
+        ((0, -0.0611, 0.0181), (0.0172091, -0.0172091, 0.706897, 0.706897), Z),
+        # The site's quaternion has another roll than gripper_frame_link of the URDF: 180° about y there.
+        ((-0.0079, -0.000218121, -0.0981274), (0, 0, 1, 0), None),
+    ],
+    "ur10e": [
+        ((0, 0, 0.181), (1, 0, 0, 0), Z),
+        ((0, 0.176, 0), (1, 0, 1, 0), (0, 1, 0)),
+        ((0, -0.137, 0.613), (1, 0, 0, 0), (0, 1, 0)),
+        ((0, 0, 0.571), (1, 0, 1, 0), (0, 1, 0)),
+        ((0, 0.135, 0), (1, 0, 0, 0), Z),
+        ((0, 0, 0.12), (1, 0, 0, 0), (0, 1, 0)),
+        # Its site for tools lies at 0.1 m, before the flange, which is not checked here.
+        ((0, 0.117, 0), (-1, 1, 0, 0), None),
+    ],
+}
+
+
+def postures(arm, count, seed=0, spread=0.6):
+    rng = np.random.default_rng(seed)
+    return np.clip(arm.rest + spread * rng.normal(size=(count, arm.dof)), *arm.limits.T)
+
+
+def urdf_text(form, limits):
+    text = ['<robot name="r"><link name="base"/>']
+    for k, (origin, axis) in enumerate(form):
+        x, y, z, *rpy = origin
+        kind = "fixed" if axis is None else "revolute"
+        child, parent = f"l{k}", f"l{k - 1}" if k else "base"
+        text.append(f'<link name="{child}"/><joint name="j{k}" type="{kind}">')
+        text.append(f'<parent link="{parent}"/><child link="{child}"/>')
+        text.append(f'<origin xyz="{x} {y} {z}" rpy="{rpy[0]} {rpy[1]} {rpy[2]}"/>')
+        if axis is not None:
+            text.append(f'<axis xyz="{axis[0]} {axis[1]} {axis[2]}"/>')
+            text.append(f'<limit lower="{limits[k][0]}" upper="{limits[k][1]}" effort="1" velocity="1"/>')
+        text.append("</joint>")
+    return "".join(text) + "</robot>"
+
+
+@pytest.mark.parametrize("name", URDF_FORMS)
+def test_arm_agrees_with_its_urdf(name, tmp_path):
+    import yourdfpy
+
+    arm, form = arm_named(name), URDF_FORMS[name]
+    file = tmp_path / "arm.urdf"
+    file.write_text(urdf_text(form, arm.limits))
+    joints = postures(arm, 5, spread=1.0)
+    urdf = yourdfpy.URDF.load(file, load_meshes=False)
+    chain = read_chain(file, arm.dof)
+    for row, pose in zip(joints, forward_kinematics(arm, joints), strict=True):
+        urdf.update_cfg(row)
+        np.testing.assert_allclose(urdf.get_transform(f"l{len(form) - 1}", "base"), pose, atol=1e-9)
+    np.testing.assert_allclose(chain.limits, arm.limits)
+    # Its gripper is the link behind the last joint that moves: what is fixed behind that is a tool.
+    tool = inverse(forward_kinematics(chain, joints)) @ forward_kinematics(arm, joints)
+    np.testing.assert_allclose(tool, np.broadcast_to(tool[0], tool.shape), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", DH_FORMS)
+def test_arm_agrees_with_its_dh_parameters(name):
+    arm = arm_named(name)
+    rows = [tuple(map(float, row)) for row in DH_FORMS[name]]
+    limits = [(low, high) for low, high in arm.limits.tolist()]
+    other = from_dh(name, rows, limits, arm.rest.tolist(), modified=False)
+    joints = postures(arm, 5, spread=1.0)
+    np.testing.assert_allclose(forward_kinematics(arm, joints), forward_kinematics(other, joints), atol=1e-8)
+
+
+@pytest.mark.parametrize(("name", "atol"), [("so101", 5e-6), ("ur10e", 3e-3)])
+def test_arm_agrees_with_its_mujoco_model(name, atol):
+    arm = arm_named(name)
+    joints = postures(arm, 5, spread=1.0)
+    other = []
+    for row in joints:
+        pose, angles = np.eye(4), iter(row)
+        for position, quat_wxyz, axis in MUJOCO_FORMS[name]:
+            body = Rotation.from_quat(np.roll(quat_wxyz, -1)).as_matrix()
+            rotation = np.zeros(3) if axis is None else next(angles) * np.array(axis, float)
+            pose = pose @ transform(body @ rotation_exp(rotation), np.array(position, float))
+        other.append(pose)
+    poses = forward_kinematics(arm, joints)
+    # Bases differ by a rotation about z at most.
+    base = other[0] @ inverse(poses[0])
+    np.testing.assert_allclose(base[[0, 1, 2, 2, 2], [3, 3, 3, 0, 1]], 0, atol=2 * atol)
+    np.testing.assert_allclose(np.stack(other), base @ poses, atol=2 * atol)
+
+
+def test_reaches_of_data_sheets():
+    # Stretched out: from the base axis (UR), from shoulder to wrist (KUKA).
+    for name, reach in (("ur3e", 0.5), ("ur5e", 0.85)):
+        flat = forward_kinematics(arm_named(name), np.zeros((1, 6)))[0, :2, 3]
+        assert np.linalg.norm(flat) == pytest.approx(reach, rel=0.02)
+    for name, reach in (("iiwa7", 0.8), ("iiwa14", 0.82)):
+        frames, _ = joint_frames(arm_named(name), np.zeros((1, 7)))
+        assert np.linalg.norm(frames[0, 5, :3, 3] - frames[0, 1, :3, 3]) == pytest.approx(reach, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["ur5e", "panda", "z1"])
+def test_error_jacobian_is_the_derivative_of_the_bent_arm(name):
+    rng = np.random.default_rng(1)
+    tool = transform(rotation_exp(rng.normal(size=3)), 0.1 * rng.normal(size=3))
+    arm = with_tool(arm_named(name), tool)
+    joints = postures(arm, 10)
+    reported = forward_kinematics(arm, joints)
+    jacobian, names = error_jacobian(arm, joints), error_names(arm)
+    assert jacobian.shape == (10, 6, len(error_std(arm, 1.0, 1.0))) == (10, 6, 5 * arm.dof)
+    assert len(names) == 8 * arm.dof
+    step = 1e-6
+    for k in range(jacobian.shape[2]):
+        error = np.zeros(len(names))
+        error[k] = step
+        ends = [BentArm(arm, sign * error).true(joints) for sign in (1, -1)]
+        there, back = (step_between(reported, end) for end in ends)
+        numeric = (there - back) / (2 * step)
+        np.testing.assert_allclose(jacobian[:, :, k], numeric, atol=2e-9, err_msg=names[k])
+
+
+def test_link_errors_with_joint_offsets_are_complete():
+    """Any small displacement of any link is, up to base and gripper, a combination of the error parameters."""
+    arm = arm_named("ur5e")
+    joints = postures(arm, 40, spread=1.0)
+    _, gripper = joint_frames(arm, joints)
+    constant = step_axes(gripper[:, :3, :3])
+    known = np.concatenate([error_jacobian(arm, joints), constant], axis=2).reshape(240, -1)
+    for link in range(1, arm.dof):
+        for axis in range(6):
+            twist = np.zeros(6)
+            twist[axis] = 1e-6
+            moved = transform(rotation_exp(twist[3:]), twist[:3])
+            frames = arm.parent_from_joint.copy()
+            frames[link] = frames[link] @ moved
+            bent = forward_kinematics(type(arm)(**{**vars(arm), "parent_from_joint": frames}), joints)
+            effect = step_between(gripper, bent).ravel() / 1e-6
+            left = effect - known @ np.linalg.lstsq(known, effect, rcond=1e-10)[0]
+            assert np.abs(left).max() < 1e-5
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_angles_are_found_again(name):
+    arm = arm_named(name)
+    joints = postures(arm, 12, spread=0.4)
+    poses = forward_kinematics(arm, joints)
+    found = inverse_kinematics(arm, poses)
+    assert found.fits
+    np.testing.assert_allclose(forward_kinematics(arm, found.joints), poses, atol=1e-5)
+    assert (found.joints >= arm.limits[:, 0]).all() and (found.joints <= arm.limits[:, 1]).all()
+    if arm.dof <= 6:
+        assert (np.abs(found.joints - joints).max(1) < 1e-3).mean() > 0.7
+
+
+def test_a_known_tool_is_taken_into_account_and_twelve_poses_are_quick():
+    arm = arm_named("ur5e")
+    joints = postures(arm, 12, spread=0.3)
+    tool = transform(rotation_exp(np.array([0.2, -0.3, 1.0])), np.array([0.02, -0.03, 0.15]))
+    poses = forward_kinematics(arm, joints) @ tool
+    began = time.process_time()
+    found = inverse_kinematics(arm, poses, tool)
+    # Seconds of one core, about 0.02.
+    assert time.process_time() - began < 0.3
+    np.testing.assert_allclose(found.joints, joints, atol=1e-5)
+    # A tool of five joints shows: its rotation across the roll axis cannot be taken up by the arm.
+    small = arm_named("so101")
+    poses = forward_kinematics(small, postures(small, 12, spread=0.3)) @ tool
+    assert not inverse_kinematics(small, poses, np.eye(4)).fits
+    assert inverse_kinematics(small, poses).fits
+
+
+@pytest.mark.slow
+def test_poses_of_another_arm_are_refused_in_one_line():
+    large = arm_named("ur10e")
+    poses = forward_kinematics(large, postures(large, 8, spread=0.3))
+    with pytest.raises(InputError, match=r"poses do not fit a so101: \d+ mm, .*° off; name another robot"):
+        required_posture(arm_named("so101"), poses)
+    with pytest.raises(InputError, match="robot ur6: not known; choose one of ur3e, .*so101"):
+        arm_named("ur6")
+
+
+@pytest.mark.parametrize("name", ["ur5e", "panda", "so101"])
+def test_base_and_tool_follow_from_joints_and_poses(name):
+    arm = arm_named(name)
+    joints = postures(arm, 8)
+    rng = np.random.default_rng(2)
+    base = transform(rotation_exp(rng.normal(size=3)), rng.normal(size=3))
+    tool = transform(rotation_exp(rng.normal(size=3)), 0.1 * rng.normal(size=3))
+    poses = base @ forward_kinematics(arm, joints) @ tool
+    np.testing.assert_allclose(forward_kinematics(mounted_arm(arm, joints, poses), joints), poses, atol=1e-9)
+    # Two poses determine neither base nor tool, and still are explained.
+    few = mounted_arm(arm, joints[:2], poses[:2])
+    np.testing.assert_allclose(forward_kinematics(few, joints[:2]), poses[:2], atol=1e-9)
+    with pytest.raises(InputError, match=f"joint angles and gripper poses disagree on a {name}"):
+        mounted_arm(arm, joints[:, ::-1].copy(), poses)
+
+
+@pytest.mark.parametrize("name", ["ur5e", "panda", "so101"])
+def test_joint_angles_contradict_positions_that_are_all_too_long(name):
+    """No image shows it, for the scale comes from the robot."""
+    arm = arm_named(name)
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        joints = postures(arm, 12, spread=0.3, seed=seed)
+        # As a controller whose kinematics was calibrated at the factory: a few mm from the nominal arm.
+        bent = forward_kinematics(arm, joints + rng.normal(0, 1e-3, joints.shape[1]))
+        bent[:, :3, 3] += rng.normal(0, 5e-4, (12, 3))
+        mounted_arm(arm, joints, bent)
+        for factor, said in (
+            (1.05, r"[45]\.\d ± [01]\.\d % too long"),
+            (1 / 1.05, r"[45]\.\d ± [01]\.\d % too short"),
+        ):
+            poses = bent.copy()
+            poses[:, :3, 3] *= factor
+            with pytest.raises(LengthError, match=f"{said} for a {name}"):
+                mounted_arm(arm, joints, poses)
+        # So far off that without the factor nothing agrees.
+        for factor in (0.3048, 1.25, 2.54):
+            poses = bent.copy()
+            poses[:, :3, 3] *= factor
+            with pytest.raises(LengthError, match=f"for a {name}"):
+                mounted_arm(arm, joints, poses)
+
+
+def test_urdf_that_is_no_arm_is_refused(tmp_path):
+    form = URDF_FORMS["ur5e"]
+    file = tmp_path / "arm.urdf"
+    file.write_text(urdf_text(form, arm_named("ur5e").limits))
+    with pytest.raises(InputError, match="no chain with 7 joints"):
+        read_chain(file, 7)
+    file.write_text(file.read_text().replace('"j2" type="revolute"', '"j2" type="prismatic"'))
+    with pytest.raises(InputError, match="joint j2 is prismatic"):
+        read_chain(file, 6)
+    file.write_text("no xml")
+    with pytest.raises(InputError, match="not a readable URDF"):
+        read_chain(file, 6)
+
+
+def test_rest_postures_are_over_a_table():
+    """Every named arm begins above a table, inside its limits."""
+    for name in ROBOT_NAMES:
+        arm = arm_named(name)
+        pose = forward_kinematics(arm, arm.rest[None])[0]
+        assert (arm.rest > arm.limits[:, 0]).all() and (arm.rest < arm.limits[:, 1]).all()
+        assert (pose[:3, :3] @ arm.forward)[2] < -0.75 and pose[0, 3] > 0.1 and pose[2, 3] > 0.1

@@ -1,0 +1,428 @@
+"""The calibration from poses: known answers, invariances, outliers, coverage, degenerate motions."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+import jcr
+from jcr.estimation.closed_form import closed_form
+from jcr.estimation.fit import Cues, PoseProblem, fit_poses
+from jcr.estimation.mixed_model import Equations, left_out, solve
+from jcr.estimation.pose_equations import PRIOR_STD, residuals, residuals_by_camera
+from jcr.estimation.systematic import smooth_errors
+from jcr.geometry import inverse, retract, rotation_between_deg, rotation_exp, scale_translation, transform
+from jcr.records import Kind
+from simulation.problem import error, hand_eye_problem
+
+NOISE = (5e-4, np.radians(0.1))
+
+
+@pytest.mark.parametrize("count", [3, 5, 10])
+@pytest.mark.parametrize("pattern", ["varied"])
+def test_exact_poses_give_the_exact_answer(count, pattern):
+    for seed in range(4):
+        problem = hand_eye_problem(np.random.default_rng(seed), count, pattern)
+        weights = np.ones(count)
+        x, scale, _ = closed_form(problem.base_from_gripper, problem.recon_from_camera, weights)
+        assert np.abs(error(problem, x, scale)).max() < 1e-7
+        solved = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+        assert np.abs(error(problem, solved.gripper_from_camera, solved.scale)).max() < 1e-8
+
+
+def test_half_rotates_do_not_flip_the_answer():
+    rng = np.random.default_rng(3)
+    problem = hand_eye_problem(rng, 8)
+    # Every second view is rotated by 180° (to 1e-9) about a skew axis from its neighbour.
+    rotations = np.pi * rng.normal(size=(8, 3))
+    rotations *= (np.pi - 1e-9) / np.linalg.norm(rotations, axis=1, keepdims=True)
+    gripper = problem.base_from_gripper.copy()
+    gripper[1::2] = gripper[0::2] @ transform(rotation_exp(rotations[1::2]), rng.normal(size=(4, 3)))
+    x = problem.gripper_from_camera
+    camera = scale_translation(gripper @ x, 1 / problem.scale)
+    found, scale, _ = closed_form(gripper, camera, np.ones(8))
+    assert np.abs(error(problem, found, scale)).max() < 1e-8
+
+
+def test_a_similarity_of_the_reconstruction_changes_nothing_but_scale():
+    rng = np.random.default_rng(4)
+    problem = hand_eye_problem(rng, 9, robot_noise=NOISE)
+    before = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    factor = float(np.exp(rng.uniform(-3, 3)))
+    other_from_recon = transform(rotation_exp(rng.normal(size=3)), rng.normal(size=3))
+    moved = inverse(other_from_recon) @ scale_translation(problem.recon_from_camera, factor)
+    after = jcr.solve_hand_eye(problem.base_from_gripper, moved)
+    assert np.allclose(before.gripper_from_camera, after.gripper_from_camera, atol=1e-8)
+    assert after.scale * factor == pytest.approx(before.scale, rel=1e-8)
+    assert np.allclose(before.covariance, after.covariance, rtol=1e-4, atol=1e-12)
+
+
+def test_the_order_of_images_does_not_matter_to_the_last_bit():
+    rng = np.random.default_rng(5)
+    problem = hand_eye_problem(rng, 12, robot_noise=NOISE)
+    problem.base_from_gripper[4, :3, 3] += 0.05
+    before = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    order = rng.permutation(12)
+    after = jcr.solve_hand_eye(problem.base_from_gripper[order], problem.recon_from_camera[order])
+    assert (before.gripper_from_camera == after.gripper_from_camera).all()
+    assert before.scale == after.scale
+    assert (before.inliers[order] == after.inliers).all()
+
+
+def test_agrees_with_opencv_where_scale_is_known():
+    problem = hand_eye_problem(np.random.default_rng(6), 12, robot_noise=NOISE)
+    gripper, camera = problem.base_from_gripper, scale_translation(problem.recon_from_camera, problem.scale)
+    camera_from_recon = np.linalg.inv(camera)
+    rotation, translation = cv2.calibrateHandEye(
+        list(gripper[:, :3, :3]),
+        list(gripper[:, :3, 3]),
+        list(camera_from_recon[:, :3, :3]),
+        list(camera_from_recon[:, :3, 3]),
+        method=cv2.CALIB_HAND_EYE_PARK,
+    )
+    solved = jcr.solve_hand_eye(gripper, camera)
+    assert rotation_between_deg(rotation, solved.gripper_from_camera[:3, :3]) < 0.2
+    assert np.linalg.norm(translation[:, 0] - solved.gripper_from_camera[:3, 3]) < 2e-3
+    assert solved.scale == pytest.approx(1.0, abs=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("count", "wrong"),
+    [(10, 3), pytest.param(15, 4, marks=pytest.mark.slow), pytest.param(20, 6, marks=pytest.mark.slow)],
+)
+@pytest.mark.parametrize("kind", ["shuffled", "stale", "mirrored"])
+def test_wrong_poses_are_named_and_no_others(count, wrong, kind):
+    for seed in range(2):
+        rng = np.random.default_rng([seed, count])
+        problem = hand_eye_problem(rng, count, robot_noise=NOISE)
+        clean = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+        bad = rng.choice(count, wrong, replace=False)
+        gripper = problem.base_from_gripper.copy()
+        if kind == "shuffled":
+            gripper[bad] = problem.base_from_gripper[np.roll(bad, 1)]
+        elif kind == "stale":
+            gripper[bad] = problem.base_from_gripper[(bad - 1) % count]
+        else:
+            mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+            gripper[bad] = mirror @ gripper[bad] @ mirror
+        solved = jcr.solve_hand_eye(gripper, problem.recon_from_camera)
+        assert sorted(np.flatnonzero(~solved.inliers)) == sorted(bad)
+        assert [reason is not None for reason in solved.images.reasons] == list(~solved.inliers)
+        assert solved.converged
+        # Fewer images know less, but the wrong ones must not pull.
+        both = solved.covariance + clean.covariance
+        gap = error(problem, solved.gripper_from_camera, solved.scale) - error(
+            problem, clean.gripper_from_camera, clean.scale
+        )
+        assert gap @ np.linalg.solve(both, gap) < chi2.ppf(0.999, 7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("given", [False, True])
+def test_the_95_percent_ellipsoid_covers_95_percent(given):
+    inside, larger = np.zeros(2), []
+    runs = 100
+    for seed in range(runs):
+        problem = hand_eye_problem(np.random.default_rng([7, seed]), 10, robot_noise=NOISE)
+        solved = jcr.solve_hand_eye(
+            problem.base_from_gripper, problem.recon_from_camera, robot_noise=NOISE if given else None
+        )
+        errors = error(problem, solved.gripper_from_camera, solved.scale)
+        for k, part in enumerate((slice(0, 7), slice(0, 6))):
+            squared = errors[part] @ np.linalg.solve(solved.covariance[part, part], errors[part])
+            inside[k] += squared < chi2.ppf(0.95, part.stop)
+        _, jacobian = residuals(
+            solved.gripper_from_camera,
+            solved.scale,
+            solved.base_from_recon,
+            problem.base_from_gripper,
+            problem.recon_from_camera,
+        )
+        whitened = jacobian.reshape(-1, 13) / np.tile(np.repeat(NOISE, 3), 10)[:, None]
+        straight = np.linalg.inv(whitened.T @ whitened)[:7, :7]
+        larger.append(np.sqrt(np.diag(solved.covariance) / np.diag(straight)))
+    assert (inside / runs >= 0.90).all()
+    if given:
+        # That a robot repeats so well does not say that it is straight: sigma stays larger than that of a straight one.
+        assert np.median(larger) < 1.2
+    else:
+        assert (inside / runs <= 0.98).all()
+
+
+@pytest.mark.slow
+def test_three_images_do_not_promise_too_much():
+    """Few degrees of freedom tell how noisy the robot is, and this one's noises are in no usual relation."""
+    inside, runs = 0, 100
+    for seed in range(runs):
+        problem = hand_eye_problem(np.random.default_rng([7, seed]), 3, robot_noise=(5e-4, np.radians(0.01)))
+        solved = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+        errors = error(problem, solved.gripper_from_camera, solved.scale)
+        inside += errors @ np.linalg.solve(solved.covariance, errors) < chi2.ppf(0.95, 7)
+    # One count of degrees of freedom for both noises gives 70.
+    assert inside >= 93
+
+
+def test_an_image_that_is_given_twice_is_one():
+    problem = hand_eye_problem(np.random.default_rng(13), 5, robot_noise=NOISE)
+    gripper, camera = problem.base_from_gripper, problem.recon_from_camera
+    twice = [0, 1, 2, 3, 4, 2]
+    once, doubled = jcr.solve_hand_eye(gripper, camera), jcr.solve_hand_eye(gripper[twice], camera[twice])
+    assert (doubled.covariance == once.covariance).all()
+    assert (doubled.gripper_from_camera == once.gripper_from_camera).all()
+    assert (doubled.images.translation_residual_m == once.images.translation_residual_m[twice]).all()
+
+
+@pytest.mark.slow
+def test_a_robot_noise_that_the_poses_contradict_is_not_believed():
+    given, inside, runs = (1e-4, np.radians(0.02)), 0, 50
+    for seed in range(runs):
+        problem = hand_eye_problem(np.random.default_rng([8, seed]), 6, "varied", given, NOISE)
+        solved = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera, robot_noise=given)
+        errors = error(problem, solved.gripper_from_camera, solved.scale)
+        inside += errors @ np.linalg.solve(solved.covariance, errors) < chi2.ppf(0.95, 7)
+        # Whether at random or alike, six images hardly tell.
+        assert min(np.divide(solved.robot_noise.together, given)) > 1.5
+        assert any("more than the given robot noise" in warning for warning in solved.warnings)
+    # Binomial: 47.5 ± 1.5; none where the given noise is believed.
+    assert inside >= 42
+
+
+def test_the_equations_jacobians_match_finite_differences():
+    problem = hand_eye_problem(np.random.default_rng(10), 4, robot_noise=NOISE)
+    camera, gripper = problem.recon_from_camera, problem.base_from_gripper
+    x, scale = problem.gripper_from_camera, problem.scale
+    z = problem.true_base_from_gripper[0] @ x @ inverse(scale_translation(camera[0], scale))
+
+    def by_unknowns(step):
+        unknowns = retract(x, step[:6]), scale * np.exp(step[6]), retract(z, step[7:])
+        return residuals(*unknowns, gripper, camera)[0]
+
+    def by_cameras(step):
+        return residuals(x, scale, z, gripper, retract(camera, step))[0]
+
+    jacobian, of_camera = residuals(x, scale, z, gripper, camera)[1], residuals_by_camera(x, scale, z, camera)
+    for analytic, function in ((jacobian, by_unknowns), (of_camera, by_cameras)):
+        for k, step in enumerate(1e-6 * np.eye(analytic.shape[2])):
+            numeric = (function(step) - function(-step)) / 2e-6
+            # The logarithm's derivative is one but for the size of the residuals.
+            assert np.allclose(analytic[:, :, k], numeric, atol=5e-3)
+
+
+@pytest.mark.slow
+def test_covariance_matches_a_jackknife_over_images():
+    problem = hand_eye_problem(np.random.default_rng(8), 30, robot_noise=NOISE)
+    gripper, camera = problem.base_from_gripper, problem.recon_from_camera
+    full = jcr.solve_hand_eye(gripper, camera)
+    start = (full.gripper_from_camera, full.scale, full.base_from_recon)
+    noise = (full.robot_noise.translation, full.robot_noise.rotation)
+    left_out = []
+    for k in range(30):
+        others = PoseProblem(
+            base_from_gripper=gripper,
+            recon_from_camera=camera,
+            used=~np.eye(30, dtype=bool)[k],
+            systematic=smooth_errors(gripper),
+            noise=noise,
+        )
+        fit = fit_poses(others, start)
+        left_out.append(error(problem, fit.gripper_from_camera, fit.scale))
+    jackknife = 29 / 30 * ((np.array(left_out) - np.mean(left_out, 0)) ** 2).sum(0)
+    ratio = np.sqrt(jackknife / np.diag(full.covariance))
+    assert (ratio > 0.6).all() and (ratio < 1.6).all()
+
+
+def test_leave_one_out_error_is_that_of_a_fit_without_the_image():
+    """Of errors that poses near each other share, the others tell a part of the one that is left out."""
+    problem = hand_eye_problem(np.random.default_rng(9), 8, robot_noise=NOISE)
+    gripper, camera = problem.base_from_gripper, problem.recon_from_camera
+    full = jcr.solve_hand_eye(gripper, camera)
+    unknowns = full.gripper_from_camera, full.scale, full.base_from_recon
+    residual, jacobian = (of.reshape(48, -1) for of in residuals(*unknowns, gripper, camera))
+    prior = np.diag(np.r_[PRIOR_STD**-2.0, np.zeros(6)])
+    alike, sizes = smooth_errors(gripper), np.log([4e-4, 2e-3, 2e-3])
+
+    def of_rows(rows):
+        return Equations(
+            residual=residual[rows, 0],
+            jacobian=jacobian[rows],
+            prior_information=prior,
+            prior_gradient=np.zeros(13),
+            systematic=alike[np.ix_(rows, rows)],
+        )
+
+    everything = of_rows(np.arange(48))
+    errors, covariance = left_out(solve(everything, sizes), NOISE)
+    v = everything.covariance(sizes)
+    for k in range(8):
+        mine, others = np.arange(6 * k, 6 * k + 6), np.delete(np.arange(48), np.arange(6 * k, 6 * k + 6))
+        without = solve(of_rows(others), sizes)
+        gain = v[np.ix_(mine, others)] @ np.linalg.inv(v[np.ix_(others, others)])
+        by_unknown = jacobian[mine] - gain @ jacobian[others]
+        expected = residual[mine, 0] - gain @ residual[others, 0] + by_unknown @ without.step
+        own = v[np.ix_(mine, mine)] - gain @ v[np.ix_(others, mine)]
+        spread = own + by_unknown @ without.covariance @ by_unknown.T
+        assert np.allclose(errors[k], expected, rtol=1e-4, atol=1e-9)
+        assert np.allclose(covariance[k], spread, rtol=1e-4, atol=1e-4 * np.abs(spread).max())
+    assert full.leave_one_out is not None
+    assert (
+        0.5 * 1e3 * np.sqrt(3) * NOISE[0]
+        < full.leave_one_out.translation_mm
+        < 4 * 1e3 * np.sqrt(3) * NOISE[0]
+    )
+
+
+UNSEEN = {
+    "two": "two images share",
+    "translation": "pure translation",
+    "one-axis": "one fixed axis",
+    "planar": "planar or SCARA",
+    "orbit": "look-at orbit",
+    # A tool point that happens to lie on the optical axis makes an orbit of the pivot.
+    "pivot": "all views rotate about one",
+    "camera-centre": "its own centre",
+}
+
+
+@pytest.mark.parametrize("pattern", UNSEEN)
+@pytest.mark.parametrize(
+    ("noise", "deviation_deg"),
+    [
+        ((0.0, 0.0), 0.0),
+        (NOISE, 3.0),
+        pytest.param((0.0, 0.0), 3.0, marks=pytest.mark.slow),
+        pytest.param(NOISE, 0.0, marks=pytest.mark.slow),
+    ],
+)
+def test_motions_that_show_too_little_are_named(pattern, deviation_deg, noise):
+    for seed in range(2):
+        problem = hand_eye_problem(
+            np.random.default_rng(seed), 10, pattern, noise, deviation=np.radians(deviation_deg)
+        )
+        solved = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+        assert UNSEEN[pattern] in " ".join(solved.observability.unobservable)
+        assert solved.observability.advice
+        nearly = solved.observability.observable
+        assert nearly == all("nearly" in name for name in solved.observability.unobservable)
+        assert nearly or deviation_deg == 0.0 or pattern == "two"
+        assert solved.verdict == "rejected" or (nearly and solved.verdict == "accepted with warnings")
+        if nearly:
+            std = np.sqrt(np.diag(solved.covariance))
+            too_uncertain = bool((std > [0.02] * 3 + [np.radians(3)] * 3 + [0.05]).any())
+            assert too_uncertain == any(finding.kind is Kind.UNCERTAIN for finding in solved.findings)
+
+
+def test_a_weakly_observed_direction_warns_and_its_uncertainty_rejects():
+    """Three degrees of deviation from planar motion: exact poses are accepted with a warning that names the
+    direction, noisy ones are rejected for the uncertainty, with the motion as the first cause."""
+    verdicts = {}
+    for noise in ((1e-5, 1e-5), (5e-3, np.radians(1.0))):
+        problem = hand_eye_problem(np.random.default_rng(3), 10, "planar", noise, deviation=np.radians(3.0))
+        solved = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+        assert solved.findings[0].kind is Kind.UNOBSERVABLE
+        assert solved.findings[0].severity == ("warns" if solved.converged else "rejects")
+        verdicts[noise] = solved.verdict
+    assert list(verdicts.values()) == ["accepted with warnings", "rejected"]
+
+
+@pytest.mark.slow
+def test_general_motion_is_never_called_degenerate():
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        problem = hand_eye_problem(rng, int(rng.integers(5, 16)), robot_noise=NOISE)
+        solved = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+        assert solved.observability.observable, (seed, solved.observability)
+        assert solved.converged
+
+
+def test_a_known_offset_cures_planar_motion_and_a_known_scale_cures_an_orbit():
+    planar = hand_eye_problem(np.random.default_rng(10), 10, "planar", NOISE)
+    down = planar.true_base_from_gripper[0, 2, :3]  # the base's z axis in the gripper frame
+    height = float(down @ planar.gripper_from_camera[:3, 3])
+    solved = jcr.solve_hand_eye(
+        planar.base_from_gripper, planar.recon_from_camera, cues=Cues(offset=(down, height, 1e-3))
+    )
+    assert solved.converged
+    assert np.linalg.norm(error(planar, solved.gripper_from_camera, solved.scale)[:3]) < 5e-3
+
+    orbit = hand_eye_problem(np.random.default_rng(11), 10, "orbit", NOISE)
+    solved = jcr.solve_hand_eye(
+        orbit.base_from_gripper, orbit.recon_from_camera, cues=Cues(scale=(orbit.scale, 1e-3))
+    )
+    assert solved.converged
+    assert np.linalg.norm(error(orbit, solved.gripper_from_camera, solved.scale)[:3]) < 5e-3
+
+
+def test_poses_that_belong_to_other_images_are_rejected():
+    rng = np.random.default_rng(12)
+    problem = hand_eye_problem(rng, 10)
+    solved = jcr.solve_hand_eye(problem.base_from_gripper[rng.permutation(10)], problem.recon_from_camera)
+    assert not solved.converged
+    assert "jcr check" in " ".join(solved.warnings)
+
+
+@pytest.mark.parametrize(
+    ("gripper", "camera", "words"),
+    [
+        (np.eye(4), np.eye(4), "shape"),
+        (np.tile(np.eye(4), (3, 1, 1)), np.tile(np.eye(4), (4, 1, 1)), "4 camera poses for 3"),
+        (np.tile(np.eye(4), (1, 1, 1)), np.tile(np.eye(4), (1, 1, 1)), "1 pose"),
+        (np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), "0 pose"),
+        (np.full((3, 4, 4), np.nan), np.tile(np.eye(4), (3, 1, 1)), "NaN"),
+        ("poses", "poses", "not numbers"),
+    ],
+)
+def test_what_cannot_be_poses_is_an_input_error(gripper, camera, words):
+    with pytest.raises(jcr.InputError, match=words):
+        jcr.solve_hand_eye(gripper, camera)
+
+
+@pytest.mark.slow
+def test_three_images_ask_for_the_robots_noise_and_are_the_surer_for_it():
+    """The larger half of what three images leave open is how far the robot's poses scatter."""
+    noise = (5e-4, np.radians(0.1))
+    accepted, surer = {"estimated": 0, "given": 0}, []
+    for seed in range(12):
+        problem = hand_eye_problem(np.random.default_rng(seed), 3, robot_noise=noise)
+        poses = problem.base_from_gripper, problem.recon_from_camera
+        estimated, given = jcr.solve_hand_eye(*poses), jcr.solve_hand_eye(*poses, robot_noise=noise)
+        accepted["estimated"] += estimated.converged
+        accepted["given"] += given.converged
+        for answer in (estimated, given):
+            uncertain = [warning for warning in answer.warnings if "is known to ±" in warning]
+            assert all(("--robot-noise" in warning) == (answer is estimated) for warning in uncertain)
+            if answer.converged:
+                off = error(problem, answer.gripper_from_camera, answer.scale)
+                assert (np.abs(off) < 5 * np.sqrt(np.diag(answer.covariance))).all()
+        surer.append(np.sqrt(np.trace(given.covariance[:3, :3]) / np.trace(estimated.covariance[:3, :3])))
+    assert accepted["given"] >= accepted["estimated"] and np.median(surer) < 0.9
+
+
+@pytest.mark.slow
+def test_a_known_scale_makes_few_samples_worth_more():
+    """Metric samples, five of them: the median error of the translation falls, and it is not Park's that is nearer."""
+    off: dict[str, list[float]] = {"known": [], "found": [], "park": []}
+    for seed in range(16):
+        noise = {"robot_noise": (5e-4, np.radians(0.05)), "camera_noise": (1e-3, np.radians(0.2))}
+        problem = hand_eye_problem(np.random.default_rng(seed), 5, **noise)
+        gripper, camera = (
+            problem.base_from_gripper,
+            scale_translation(problem.recon_from_camera, problem.scale),
+        )
+        known, found = jcr.solve_hand_eye(gripper, camera, scale=1.0), jcr.solve_hand_eye(gripper, camera)
+        assert abs(known.scale - 1) < 4 * 0.002
+        marker = inverse(camera)
+        park = cv2.calibrateHandEye(
+            *(list(part) for pose in (gripper, marker) for part in (pose[:, :3, :3], pose[:, :3, 3])),
+            method=cv2.CALIB_HAND_EYE_PARK,
+        )[1][:, 0]
+        truth = problem.gripper_from_camera[:3, 3]
+        for name, place in (
+            ("known", known.gripper_from_camera[:3, 3]),
+            ("found", found.gripper_from_camera[:3, 3]),
+            ("park", park),
+        ):
+            off[name].append(float(np.linalg.norm(place - truth)))
+    median = {name: np.median(values) for name, values in off.items()}
+    assert median["known"] < 0.85 * median["found"] and median["known"] < 0.95 * median["park"]
+    with pytest.raises(jcr.InputError, match="two positive numbers"):
+        jcr.solve_hand_eye(gripper, camera, scale=0.0)
