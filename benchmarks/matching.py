@@ -1,4 +1,4 @@
-"""`benchmarks matching DIR`: SIFT, XFeat and ALIKED on real captures, with the robot's gate and without."""
+"""`benchmarks matching DIR`: SIFT and XFeat on real captures, with the robot's gate and without."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -30,7 +30,6 @@ WAYS: tuple[tuple[FeatureName, bool], ...] = (
     ("sift", False),
     ("xfeat", True),
     ("xfeat", False),
-    ("aliked", True),
 )
 """Features, and whether the robot checks them; all with --long."""
 FEW: tuple[tuple[FeatureName, bool], ...] = (("xfeat", True),)

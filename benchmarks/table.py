@@ -160,11 +160,11 @@ BENCHES = {
     "matching": Bench(
         "Learned features on real captures",
         ROBOTS,
-        "SIFT, XFeat and ALIKED on real captures in DIR, with the robot's gate and without",
+        "SIFT and XFeat on real captures in DIR, with the robot's gate and without",
         of_captures=True,
         of_boards=True,
         measures=(*SOLVER, *FEATURES, *READING),
-        long="all captures, SIFT with and without the gate, XFeat without it, and ALIKED, too",
+        long="all captures, SIFT with and without the gate, and XFeat without it, too",
     ),
     "cameras": Bench(
         "Further cameras",

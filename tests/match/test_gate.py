@@ -7,11 +7,8 @@ from jcr.estimation.closed_form import motions
 from jcr.geometry import inverse, rotation_angle, rotation_exp, transform
 from jcr.match.epipolar import translation_of_x
 from jcr.match.gate import Pair, angle_tolerance, by_quarters, judge, rolls
-from jcr.match.moved import moved_things
 from jcr.match.still import hidden, still_cells
 from jcr.match.two_view import Reading, readings
-from jcr.match.verify import View
-from jcr.records import Intrinsics
 from simulation.problem import HandEyeProblem, hand_eye_problem
 
 N = 8
@@ -155,23 +152,6 @@ def test_what_keeps_its_pixel_while_the_gripper_moves_is_hidden():
     moving = [rng.uniform(0, [640, 480], (300, 2)) for _ in range(6)]
     few = {key: rows[:300] for key, rows in raw.items()}
     assert not still_cells(moving, few, (640, 480), few).any()
-
-
-def test_the_smaller_group_of_images_moved():
-    intrinsics = Intrinsics(FOCAL, FOCAL, 319.5, 239.5, 640, 480)
-    at = np.random.default_rng(0).uniform([100, 200], [150, 260], (20, 2))
-    view = View.of([at] * 8, intrinsics)
-    rows = np.column_stack([np.arange(20)] * 2)
-    second = {(i, j): rows for i in (0, 3) for j in (1, 2, 4, 5)}
-    second = {(min(key), max(key)): value for key, value in second.items()}
-    moved = moved_things(view, second, list(second), 8)
-    assert moved is not None and moved.rows == (0, 3)
-    many = [(i, j) for i in range(8) for j in range(i + 1, 8)]
-    few = {key: rows for key, rows in second.items() if set(key) & {1, 2}}
-    assert len(few) == 4 and moved_things(view, few, many, 8) is None  # as prints that look alike
-    left, top, right, bottom = moved.regions[0]
-    assert 95 < left < right < 155 and 195 < top < bottom < 265
-    assert moved_things(view, dict(list(second.items())[:2]), list(second), 8) is None
 
 
 def test_predicted_epipolar_lines_go_through_the_matches():

@@ -32,12 +32,18 @@ def seen(spec: str, views: int = 3) -> list[ndarray]:
 @pytest.mark.parametrize(
     ("printed", "found"),
     [
-        ("charuco:8x5:0.030:0.022:DICT_4X4_50", "charuco:8x5:SIDE:MARKER:DICT_4X4_50"),
+        ("charuco:8x5:0.030:0.022:DICT_4X4_50", "aruco:SIDE:DICT_4X4_50"),
         ("chessboard:8x5:0.027", "chessboard:8x5:SIDE"),
     ],
 )
 def test_a_board_is_recognised(printed: str, found: str):
-    assert board_in_view(seen(printed)) == found
+    images = seen(printed)
+    assert board_in_view(images) == found
+    finding = proposed(images)
+    assert finding is not None
+    text = sentence(finding)
+    assert f"--board {found}" in text
+    assert ("charuco:COLUMNSxROWS:SIDE:MARKER:DICT_4X4_50" in text) == printed.startswith("charuco")
 
 
 @pytest.mark.slow

@@ -10,7 +10,6 @@ board, and so is a board rotated by 180° (`jcr docs cameras`).
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,10 +18,10 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import project, unproject
+from jcr.extras import xfeat_is_installed
 from jcr.geometry import apply, inverse, step_between, transform
 from jcr.match.sift import matches
 from jcr.match.verify import HALF_PIXEL
-from jcr.match.weights import LIGHTERGLUE, XFEAT
 from jcr.reconstruct.relocate import GATE_PX, MIN_POINTS, Features, features, triangulated
 from jcr.reconstruct.sfm import camera_of
 from jcr.records import Intrinsics
@@ -79,7 +78,7 @@ class Learned:
         from jcr.match.learned import LearnedFeatures
 
         if self._features is None:  # the networks are loaded where they are needed
-            self._features = LearnedFeatures("xfeat", self._images)
+            self._features = LearnedFeatures(self._images)
         features, last = self._features, self._features.add(image)
 
         roll = self._roll(near)
@@ -109,8 +108,7 @@ def known_images(
     recon_from_camera: Float[ndarray, "m 4 4"],
 ) -> Known:
     """Images of one camera, whose poses are known, made ready."""
-    installed = XFEAT.found() and LIGHTERGLUE.found() and find_spec("torch")
-    learned = Learned(images, recon_from_camera) if installed else None
+    learned = Learned(images, recon_from_camera) if xfeat_is_installed() else None
     found = tuple(features(image, intrinsics) for image in images)
     return Known(intrinsics, recon_from_camera, found, learned)
 

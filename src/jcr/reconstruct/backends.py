@@ -11,7 +11,7 @@ from jaxtyping import Int
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.extras import extra, install, is_installed
+from jcr.extras import extra, install, is_installed, xfeat_is_installed
 from jcr.match.order import order_by_pose
 from jcr.progress import Progress
 from jcr.reconstruct.hub import HUB_FILES, HUB_ID, Weights, cached_files
@@ -29,14 +29,14 @@ def _colmap(capture: Capture, options: "ReconstructOptions", progress: Progress 
     features = "sift" if options.features == "auto" else options.features
     if features != "sift":
         extra("torch", "match", f"--features {features}")
-    made = ColmapOptions(seed=options.seed, features=features, memory_gb=options.memory_gb)
+    made = ColmapOptions(seed=options.seed, features=features)
     return reconstruct_colmap(capture, made, progress)
 
 
 def _direct(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
     from jcr.reconstruct.direct.direct import reconstruct_direct
 
-    return reconstruct_direct(capture, progress, memory_gb=options.memory_gb)
+    return reconstruct_direct(capture, progress)
 
 
 def _dust3r(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
@@ -77,7 +77,7 @@ def _marker(capture: Capture, options: "ReconstructOptions", progress: Progress 
 
     if options.board is None:
         raise InputError("--backend marker: name the board with --board, such as chessboard:9x6:0.025")
-    return reconstruct_marker(capture, options.board, progress, memory_gb=options.memory_gb)
+    return reconstruct_marker(capture, options.board, progress)
 
 
 def _predictions(
@@ -98,7 +98,7 @@ def _given(capture: Capture, options: "ReconstructOptions", progress: Progress |
 
     if options.cameras is None:
         raise InputError("--backend given: name the COLMAP model or transforms.json with --cameras PATH")
-    made = ColmapOptions(seed=options.seed, memory_gb=options.memory_gb)
+    made = ColmapOptions(seed=options.seed)
     return reconstruct_given(capture, options.cameras, made, progress)
 
 
@@ -139,13 +139,10 @@ class Backend:
     download_gb: float = 0.0
     commercial: bool = True
     """Whether the licence of its weights allows commercial use."""
+    sees_all_views: bool = False
+    """Whether it is a network that takes all views at once."""
     cost: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """Of an any-view model: views_at_once.Cost, its fields in their order."""
-
-    @property
-    def sees_all_views(self) -> bool:
-        """Whether it is a network that is shown all views at once."""
-        return any(self.cost)
 
     @property
     def predicts_depth(self) -> bool:
@@ -201,7 +198,7 @@ BACKENDS: dict[str, Backend] = {
         Backend(
             name="colmap",
             reconstruct=_colmap,
-            licence="BSD-3-Clause; XFeat and LightGlue Apache-2.0, ALIKED BSD-3-Clause",
+            licence="BSD-3-Clause; XFeat and LightGlue Apache-2.0",
             auto=True,
             options=("features", "board"),
             selected_by="features",
@@ -220,6 +217,7 @@ BACKENDS: dict[str, Backend] = {
             install=INSTALL_DA3,
             parameters=135,
             download_gb=0.5,
+            sees_all_views=True,
             cost=(1.0, 0.15, 5.5, 0.2),
         ),
         Backend(
@@ -235,6 +233,7 @@ BACKENDS: dict[str, Backend] = {
             install=INSTALL_DA3,
             parameters=34,
             download_gb=0.14,
+            sees_all_views=True,
             cost=(0.35, 0.09, 2.4, 0.05),
         ),
         Backend(
@@ -249,6 +248,7 @@ BACKENDS: dict[str, Backend] = {
             revision="00f9c245bbcb60522d1ed7f9e9d88462c6e3f38a",
             package="mapanything",
             install="pip install git+https://github.com/facebookresearch/map-anything",
+            sees_all_views=True,
             cost=(5.0, 0.4, 20.0, 4.0),
         ),
         Backend(
@@ -321,7 +321,7 @@ class ReconstructOptions:
     """The board or tags in view, in metres (SIDE where the side is unknown), used beside the features, or alone where
     these fail (--backend marker: only alone): charuco:7x5:0.030:0.022:DICT_4X4_50, chessboard:9x6:0.025 (inner corners),
     circles:4x11:0.020, aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
-    features: Literal["auto", "sift", "xfeat", "aliked"] = "auto"
+    features: Literal["auto", "sift", "xfeat"] = "auto"
     """Features that are matched between images; selects the back end colmap. SIFT, or learned features for little
     texture (extra match); auto tries sift, then, if the result is rejected and it is installed, xfeat."""
     seed: int = 0
@@ -474,16 +474,14 @@ def tries(options: ReconstructOptions) -> list[ReconstructOptions]:
     made = []
     for one in (for_backend(options, name) for name in asked[: 3 if networks else 2]):
         made.append(one)
-        if one.backend == "colmap" and one.features == "auto" and options.backend == "auto" and _has_xfeat():
+        if (
+            one.backend == "colmap"
+            and one.features == "auto"
+            and options.backend == "auto"
+            and xfeat_is_installed()
+        ):
             made[-1:] = [replace(one, features="sift"), replace(one, features="xfeat")]
     return made
-
-
-def _has_xfeat() -> bool:
-    """Whether the default learned features can run here; nothing is imported."""
-    from jcr.match.weights import LIGHTERGLUE, XFEAT
-
-    return is_installed("torch") and bool(XFEAT.found() and LIGHTERGLUE.found())
 
 
 def for_backend(options: ReconstructOptions, name: BackendName) -> ReconstructOptions:

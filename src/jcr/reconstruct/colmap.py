@@ -8,7 +8,6 @@ from PIL import ExifTags, Image
 from jcr.camera import usable_intrinsics
 from jcr.capture.images import read_image
 from jcr.errors import RejectedError
-from jcr.memory import plan
 from jcr.progress import Progress, silent
 from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.records import Capture, Intrinsics, Reconstruction
@@ -29,14 +28,10 @@ def reconstruct_colmap(
     register: how many did, the likely reason, and what to do instead.
     """
     from jcr.match.kept import KeptFeatures
-    from jcr.match.sift import BYTES_OF_FEATURES
     from jcr.reconstruct.sfm import structure_from_motion
 
     options = options or ColmapOptions()
     report = progress or silent
-    width, height = capture.image_size
-    working_px = int(width * height * min(1.0, options.working_size_px / max(width, height)) ** 2)
-    plan(len(capture), (width, height), options.memory_gb, features=working_px * BYTES_OF_FEATURES)
     images = [read_image(capture.folder / name) for name in capture.images]
     cameras, is_known, warnings = starting_intrinsics(capture)
     try:

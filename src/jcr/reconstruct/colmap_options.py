@@ -15,5 +15,3 @@ class ColmapOptions:
     """Same seed, same result, bit for bit."""
     features: FeatureName = "sift"
     """What is matched between images."""
-    memory_gb: float = 8.0
-    """Peak resident set of the process, the program itself included."""

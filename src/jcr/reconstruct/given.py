@@ -20,7 +20,6 @@ from jcr.errors import InputError, RejectedError
 from jcr.match.matchers import Matcher
 from jcr.match.pairs import all_pairs
 from jcr.match.verify import write_geometries, write_keypoints
-from jcr.memory import plan
 from jcr.progress import Progress, silent
 from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.reconstruct.placed import model_of
@@ -49,7 +48,6 @@ def reconstruct_given(
     rows = [row for k in known if (row := row_of(capture.images[k])) is not None]
     recon_from_camera = recon_from_camera[rows]
     intrinsics = capture.intrinsics or reader.read_intrinsics(cameras, capture.image_size)
-    plan(len(known), capture.image_size, options.memory_gb)
     tracks = _own_tracks(cameras, [names[row] for row in rows], capture.image_size)
     if len(tracks.points_in_recon) < MIN_POINTS:
         images = [read_image(capture.folder / capture.images[k]) for k in known]
@@ -109,7 +107,7 @@ def _triangulated(
     with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
         cameras = enter(database, len(images), [intrinsics], True, options.working_size_px)
-        found = sift_features(images, cameras[0], options.memory_gb, report)
+        found = sift_features(images, cameras[0], report)
         matcher = Matcher(found, np.ones(2), cameras[0], True, options.seed)
         report("matching", 0.0)
         pairs = all_pairs(len(images))

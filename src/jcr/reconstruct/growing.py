@@ -79,7 +79,7 @@ class Growing:
         for name, pose in zip(capture.images, capture.base_from_gripper, strict=True):
             self._kept.append(capture.folder / name, pose)
         cameras = enter(self._database, len(capture), self._all_intrinsics, known, OPTIONS.working_size_px)
-        self._features = sift_features(images, cameras[0], OPTIONS.memory_gb, silent, self._kept)
+        self._features = sift_features(images, cameras[0], silent, self._kept)
         self._matcher = KeepingMatcher(self._features, cameras[0], known, OPTIONS.seed, self._kept)
         poses = capture.base_from_gripper
         matched = matched_pairs(

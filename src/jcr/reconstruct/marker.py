@@ -17,7 +17,6 @@ from jcr.capture.images import read_image
 from jcr.errors import RejectedError
 from jcr.geometry import apply, inverse, retract, rotation_between_deg, rotation_exp, skew, transform
 from jcr.least_squares import minimise
-from jcr.memory import plan
 from jcr.progress import Progress, silent
 from jcr.reconstruct.board import PRINTED, Board, Sighting, boards, is_of_unknown_size, most_seen
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
@@ -39,9 +38,7 @@ class Pose:
     rms_px: float
 
 
-def reconstruct_marker(
-    capture: Capture, look_for: str, progress: Progress | None = None, *, memory_gb: float = 8.0
-) -> Reconstruction:
+def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | None = None) -> Reconstruction:
     """Cameras in metres, or in sides of unknown length; the recon frame is the board's, or that of the tag seen most.
 
     `look_for` names the board as `board.KINDS` has it. Unknown intrinsics are calibrated from the board. Raises
@@ -49,7 +46,6 @@ def reconstruct_marker(
     """
     report = progress or silent
     readings = boards(look_for)
-    plan(len(capture), capture.image_size, memory_gb)
     images = [read_image(capture.folder / name) for name in capture.images]
     report("board", 0.0)
     board, seen = most_seen(readings, images)

@@ -21,17 +21,17 @@ import pycolmap
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
+from jcr.allocator import give_back
 from jcr.camera import HALF_PIXEL, fold_distance_px, resized
 from jcr.errors import RejectedError
 from jcr.geometry import inverse
 from jcr.match.guided import guided
 from jcr.match.kept import KeepingMatcher, KeptFeatures
 from jcr.match.matchers import Matcher
-from jcr.match.sift import BYTES_OF_FEATURES, grey_of
+from jcr.match.sift import grey_of
 from jcr.match.sift_features import SiftFeatures
 from jcr.match.stage import Matched, match_with_robot
 from jcr.match.verify import View, read_geometries, write_geometries, write_keypoints
-from jcr.memory import GB, give_back, resident
 from jcr.progress import Progress
 from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.reconstruct.least_squares_matching import align_tracks
@@ -61,6 +61,8 @@ _ROUGHLY = 1e-3
 """The same of an adjustment that others follow."""
 _MOST_OBSERVATIONS = 60_000
 """Of a map; the robot limits what more could add, and the calibration adjusts no more (calibration/case.py)."""
+_SIFT_THREADS = 8
+"""Largest number of images whose features are found at once; each takes 240 bytes a pixel while it is worked on."""
 _FEW_FEATURES = 1000
 """Per image; textured tabletops give 1500 to 5000, a chessboard before a plain background 400."""
 
@@ -188,7 +190,7 @@ def matcher_of(
 ) -> Matcher:
     """The matcher of some kind of features; SIFT's are found here, those of networks when they are matched."""
     if options.features == "sift":
-        found = sift_features(images, camera, options.memory_gb, report, kept)
+        found = sift_features(images, camera, report, kept)
         if kept is None:
             return Matcher(found, np.ones(2), camera, known, options.seed)
         return KeepingMatcher(found, camera, known, options.seed, kept)
@@ -196,21 +198,19 @@ def matcher_of(
 
     height, width = images[0].shape[:2]
     scale = np.array([camera.width / width, camera.height / height])
-    return Matcher(LearnedFeatures(options.features, images, report), scale, camera, known, options.seed)
+    return Matcher(LearnedFeatures(images, report), scale, camera, known, options.seed)
 
 
 def sift_features(
     images: Sequence[UInt8[ndarray, "h w 3"]],
     camera: pycolmap.Camera,
-    memory_gb: float,
     report: Progress,
     kept: KeptFeatures | None = None,
 ) -> SiftFeatures:
-    """SIFT of images at the size of a camera, by as many threads as the budget, a peak resident set, has room for."""
+    """Return the SIFT features of images at the size of a camera."""
     give_back()
-    size = camera.width, camera.height
-    at_once = int((memory_gb * GB - resident()) // (size[0] * size[1] * BYTES_OF_FEATURES))
-    found = SiftFeatures(images, size, max(1, min(os.cpu_count() or 1, at_once)), report, kept)
+    threads = min(os.cpu_count() or 1, _SIFT_THREADS)
+    found = SiftFeatures(images, (camera.width, camera.height), threads, report, kept)
     give_back()
     return found
 

@@ -463,8 +463,13 @@ def _to_size(finding: Finding) -> str:
 
 
 def _board_lengths(finding: Finding) -> str:
-    lengths = "SIDE of a square and MARKER" if "MARKER" in str(finding.details["board"]) else "SIDE"
-    return _said(f"try --board {{board}} with its {lengths} in metres (jcr docs markers)", finding)
+    kind, *parts = str(finding.details["board"]).split(":")
+    board = (
+        f", or --board charuco:COLUMNSxROWS:SIDE:MARKER:{parts[-1]} for a ChArUco board,"
+        if kind == "aruco"
+        else ""
+    )
+    return _said(f"try --board {{board}}{board} with its SIDE in metres (jcr docs markers)", finding)
 
 
 # Further cameras of a cell.

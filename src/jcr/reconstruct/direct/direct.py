@@ -22,7 +22,6 @@ from jcr.camera import pinhole_inside, project, undistort_image, unproject, usab
 from jcr.capture.images import read_image
 from jcr.errors import InputError, RejectedError
 from jcr.geometry import apply, inverse, step_axes
-from jcr.memory import plan
 from jcr.progress import Progress, silent
 from jcr.reconstruct.direct.coarse_to_fine import (
     Stage,
@@ -66,9 +65,7 @@ REGION = 0.05
 """m. Points within it share their errors: they are pixels of one edge, seen from many sides."""
 
 
-def reconstruct_direct(
-    capture: Capture, progress: Progress | None = None, *, memory_gb: float = 8.0
-) -> Reconstruction:
+def reconstruct_direct(capture: Capture, progress: Progress | None = None) -> Reconstruction:
     """Camera poses by the colours of a capture's images, with the robot's poses to start from.
 
     Known intrinsics stay, else a focal length is estimated. The unit is the robot's metre only roughly, the frame
@@ -78,7 +75,6 @@ def reconstruct_direct(
     if len(capture) < 3:
         raise InputError(f"direct alignment needs 3 images or more, there are {len(capture)}; take more")
     report = progress or silent
-    plan(len(capture), capture.image_size, memory_gb)
     images = [read_image(capture.folder / name) for name in capture.images]
     given, warnings = usable_intrinsics(capture.intrinsics)
     notes: tuple[str, ...] = ()
