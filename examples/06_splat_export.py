@@ -25,7 +25,7 @@ out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/quick_start")
 if not (out / "cloud.ply").exists():
     sys.exit(f"{out}: holds no run; first run examples/01_quick_start.py")
 shutil.rmtree(out / "splat", ignore_errors=True)
-jcr.export_run(out, "nerfstudio", out / "splat")  # where the calibration is rejected, its files say so
+jcr.export_run(out, "nerfstudio", out / "splat")
 
 # What was written, read as nerfstudio does: camera-to-world matrices, the camera looking along its -z.
 dataset = json.loads((out / "splat" / "transforms.json").read_text())

@@ -85,11 +85,6 @@ def test_names_of_the_first_release_still_work_and_warn(tmp_path: Path):
         jcr.add_camera(tmp_path, "overhead", pictures="overhead.png")
     with pytest.raises(jcr.InputError, match="overhead: no images"):
         jcr.add_camera(tmp_path, "overhead")
-    with (
-        pytest.warns(DeprecationWarning, match="ExportOptions"),
-        pytest.raises(jcr.InputError, match="parnt"),
-    ):
-        jcr.export_run(tmp_path, "ros2", parnt_frame="tool0")
 
 
 def test_notebooks_show_records_as_tables(tabletop: Path):

@@ -32,8 +32,10 @@ def test_a_intrinsics_survives_capture_json_camera_info_and_calibration_json(
         json.loads(json.dumps(camera_json.intrinsics_as_json(intrinsics))), SIZE, tmp_path
     )
     assert read == intrinsics
-    mount = ros.camera_mount(np.eye(4), np.eye(7))
-    (tmp_path / "camera_info.yaml").write_text(ros.camera_info(mount, intrinsics))
+    mount = ros.CameraMount(
+        parent="tool0", child="optical", parent_from_child=np.eye(4), intrinsics=intrinsics
+    )
+    (tmp_path / "camera_info.yaml").write_text(ros.camera_info(mount))
     assert camera_info.read_camera_info(tmp_path / "camera_info.yaml", SIZE) == intrinsics
     printed = yaml.safe_load((tmp_path / "camera_info.yaml").read_text())
     assert printed["distortion_model"] in ("plumb_bob", "rational_polynomial", "equidistant")

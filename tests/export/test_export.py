@@ -1,7 +1,6 @@
 """Exports read back by the tools that own the formats, against known transforms and the true scene."""
 
 import json
-import re
 import shutil
 import subprocess
 import sys
@@ -23,13 +22,11 @@ import jcr
 from jcr.calibration.calibration_json import read_calibration
 from jcr.camera import project, unproject
 from jcr.capture.images import read_image
-from jcr.capture.options import ReadOptions
 from jcr.cli import dispatch
 from jcr.errors import InputError, RejectedError
 from jcr.export import ros
 from jcr.export.formats import FORMATS, export_run
 from jcr.export.provenance import Provenance
-from jcr.files import write_bytes
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics, PointCloud, Tracks
 from jcr.represent.cloud_ply import read_cloud
@@ -55,8 +52,7 @@ def scene(done: Path) -> "SceneMap":
 
 
 def mount(doubt: str | None = None) -> ros.CameraMount:
-    root = np.random.default_rng(0).normal(size=(7, 7))
-    return ros.camera_mount(PARENT_FROM_CHILD, root @ root.T, "tool0", "optical", doubt=doubt)
+    return ros.CameraMount(parent="tool0", child="optical", parent_from_child=PARENT_FROM_CHILD, doubt=doubt)
 
 
 def of_quat(x, y, z, qx, qy, qz, qw) -> np.ndarray:
@@ -97,19 +93,13 @@ def of_urdf(path: Path) -> np.ndarray:
     return yourdfpy.URDF.load(path).get_transform("optical", "tool0")
 
 
-def of_xacro(path: Path) -> np.ndarray:
-    """As xacro expands it: the macro's own defaults put in, then read as URDF."""
-    text = path.read_text()
-    for name, value in re.findall(r"(\w+):=(\S+?)[ \"]", text):
-        text = text.replace(f"${{{name}}}", value)
-    root = ElementTree.fromstring(text)
-    (macro,) = root.findall("{http://www.ros.org/wiki/xacro}macro")
-    robot = ElementTree.Element("robot", name="arm")
+def of_snippet(path: Path) -> np.ndarray:
+    """Return the transform of the commented elements, copied into the URDF of an arm."""
+    _, _, snippet = path.read_text().rpartition("robot:")
+    robot = ElementTree.fromstring(f"<robot name='arm'>{snippet.partition('-->')[0]}</robot>")
     ElementTree.SubElement(robot, "link", name="tool0")
-    robot.extend(list(macro))
-    expanded = path.with_name("expanded.urdf")
-    ElementTree.ElementTree(robot).write(expanded)
-    return of_urdf(expanded)
+    ElementTree.ElementTree(robot).write(path.with_name("arm.urdf"))
+    return of_urdf(path.with_name("arm.urdf"))
 
 
 def of_calib(path: Path) -> np.ndarray:
@@ -122,20 +112,12 @@ def of_calib(path: Path) -> np.ndarray:
     return of_quat(*(at[axis] for axis in "xyz"), *(rotation[axis] for axis in "xyzw"))
 
 
-def of_pose(path: Path) -> np.ndarray:
-    content = yaml.safe_load(path.read_text())
-    assert content["header"]["frame_id"] == "tool0"
-    at, rotation = content["pose"]["pose"]["position"], content["pose"]["pose"]["orientation"]
-    return of_quat(*(at[axis] for axis in "xyz"), *(rotation[axis] for axis in "xyzw"))
-
-
 READERS = {
     "hand_eye.launch.xml": (ros.ros2_launch, of_launch_xml),
     "hand_eye.launch.py": (ros.moveit_launch, of_launch_py),
     "hand_eye.urdf": (ros.urdf, of_urdf),
-    "hand_eye.xacro": (ros.xacro, of_xacro),
+    "snippet.urdf": (ros.urdf, of_snippet),
     "hand_eye.calib": (lambda mount: ros.easy_handeye2(mount, "hand_eye"), of_calib),
-    "hand_eye.yaml": (ros.pose_with_covariance, of_pose),
 }
 
 
@@ -165,37 +147,9 @@ def test_root_link_has_the_axes_of_rep_103():
     np.testing.assert_allclose(root.parent_from_child @ ros.ROOT_FROM_OPTICAL, PARENT_FROM_CHILD, atol=1e-12)
 
 
-def test_root_link_of_a_camera_with_an_offset_and_its_covariance():
-    root_from_optical = transform(rotation_exp(np.array([0.1, 0.2, -1.4])), np.array([0.01, -0.06, 0.02]))
-    errors = 1e-6 * np.random.default_rng(1).normal(size=(6, 6))
-    exact = ros.camera_mount(PARENT_FROM_CHILD, np.zeros((7, 7)), "tool0", "optical")
-    moved = np.zeros((6, 6))
-    for k, error in enumerate(errors):
-        true = transform(
-            rotation_exp(error[3:]) @ PARENT_FROM_CHILD[:3, :3], PARENT_FROM_CHILD[:3, 3] + error[:3]
-        )
-        here = ros.on_root(exact, "link", root_from_optical).parent_from_child
-        there = true @ inverse(root_from_optical)
-        np.testing.assert_allclose(here @ root_from_optical, PARENT_FROM_CHILD, atol=1e-12)
-        moved[k, :3] = there[:3, 3] - here[:3, 3]
-        moved[k, 3:] = Rotation.from_matrix(there[:3, :3] @ here[:3, :3].T).as_rotvec()
-    covariance = np.zeros((7, 7))
-    covariance[:6, :6] = errors.T @ errors
-    found = ros.on_root(
-        ros.camera_mount(PARENT_FROM_CHILD, covariance, "tool0", "optical"), "link", root_from_optical
-    )
-    np.testing.assert_allclose(found.covariance, moved.T @ moved, rtol=1e-4, atol=1e-17)
-
-
-def test_covariance_is_six_by_six_in_the_order_of_ros():
-    written = yaml.safe_load(ros.pose_with_covariance(mount()))["pose"]["covariance"]
-    root = np.random.default_rng(0).normal(size=(7, 7))
-    np.testing.assert_allclose(np.reshape(written, (6, 6)), (root @ root.T)[:6, :6], atol=1e-12)
-
-
 def test_camera_info_is_what_image_proc_reads():
     intrinsics = Intrinsics(601.5, 602.5, 318.0, 244.0, 640, 480, (-0.2, 0.05, 1e-3, -2e-3, 0.01))
-    content = yaml.safe_load(ros.camera_info(mount(), intrinsics))
+    content = yaml.safe_load(ros.camera_info(replace(mount(), intrinsics=intrinsics)))
     assert (content["image_width"], content["image_height"]) == (640, 480)
     assert content["distortion_model"] == "plumb_bob"
 
@@ -229,9 +183,9 @@ def test_files_name_the_intrinsics_that_their_transform_belongs_to(done: Path, t
         file = export_run(done, "camera_info", tmp_path / f"{which}.yaml", {"intrinsics": which})
         written = yaml.safe_load(file.read_text())["camera_matrix"]["data"]
         assert written[0] == pytest.approx(intrinsics["fx"]) and written[2] == pytest.approx(intrinsics["cx"])
-        file = export_run(done, "covariance", tmp_path / f"{which}.covariance.yaml", {"intrinsics": which})
+        file = export_run(done, "easy_handeye2", tmp_path / f"{which}.calib", {"intrinsics": which})
         text = file.read_text()
-        position = yaml.safe_load(text)["pose"]["pose"]["position"]
+        position = yaml.safe_load(text)["transform"]["translation"]
         assert [position[axis] for axis in "xyz"] == pytest.approx([row[3] for row in transform_of_pair[:3]])
         assert f"belongs to these intrinsics (640 x 480 px): fx {intrinsics['fx']:.6g}" in text
     del content["with_given_intrinsics"]
@@ -266,15 +220,46 @@ def test_a_run_shows_how_exactly_a_seen_point_is_placed(done: Path):
         assert 1e3 * np.linalg.norm(found_at - true_at) < 1.5 * below["within_95_mm"]
 
 
-@pytest.mark.parametrize("name", ["", "/tool0", "tool 0", 'a"b', "<x>", "ü"])
+def test_urdf_of_wrist_and_fixed_cameras_of_two_arms_is_one_tree(tmp_path: Path):
+    import yourdfpy
+
+    def camera(parent: str, child: str, arm: str = "") -> ros.CameraMount:
+        return ros.CameraMount(
+            parent=arm + parent, child=child, parent_from_child=PARENT_FROM_CHILD, base=f"{arm}base_link"
+        )
+
+    wrist, second = camera("tool0", "wrist"), camera("tool0", "second")
+    path = tmp_path / "cell.urdf"
+    path.write_text(ros.urdf(wrist, second))
+    assert yourdfpy.URDF.load(path).base_link == "tool0"  # no frame that the run does not need
+    right = replace(camera("base_link", "right_base_link"), base="base_link")
+    path.write_text(
+        ros.urdf(wrist, second, camera("base_link", "overhead"), camera("tool0", "eye", "right_"), right)
+    )
+    robot = yourdfpy.URDF.load(path)
+    children = [joint.child for joint in robot.robot.joints]
+    roots = [link.name for link in robot.robot.links if link.name not in children]
+    assert roots == ["base_link"] and len(set(children)) == len(children)
+    for child, parent in (("overhead", "base_link"), ("second", "tool0"), ("eye", "right_tool0")):
+        np.testing.assert_allclose(robot.get_transform(child, parent), PARENT_FROM_CHILD, atol=1e-9)
+
+
+def test_easy_handeye2_of_a_fixed_camera_names_its_base_and_effector():
+    fixed = replace(mount(), parent="arm_base", base="arm_base", effector="flange")
+    named = yaml.safe_load(ros.easy_handeye2(fixed, "x"))["parameters"]
+    assert named["calibration_type"] == "eye_on_base"
+    assert (named["robot_base_frame"], named["robot_effector_frame"]) == ("arm_base", "flange")
+
+
+@pytest.mark.parametrize("name", ["", "/tool0", "tool 0", 'a"b', "<x>", "ü", "a--b"])
 def test_names_that_are_no_frames_are_refused(name: str):
     with pytest.raises(InputError, match="frame"):
-        ros.camera_mount(PARENT_FROM_CHILD, np.eye(7), "tool0", name)
+        ros.CameraMount(parent="tool0", child=name, parent_from_child=PARENT_FROM_CHILD)
 
 
 def test_a_frame_cannot_be_its_own_parent():
     with pytest.raises(InputError, match="different"):
-        ros.camera_mount(PARENT_FROM_CHILD, np.eye(7), "tool0", "tool0")
+        ros.CameraMount(parent="tool0", child="tool0", parent_from_child=PARENT_FROM_CHILD)
     with pytest.raises(InputError, match="root"):
         ros.on_root(mount(), "optical")
 
@@ -401,95 +386,6 @@ def test_nerfstudio_cameras_see_the_points_where_the_images_do(
         np.testing.assert_allclose(seen, x_px + 0.5, atol=1e-6)
     first = trimesh.load(out / content["ply_file_path"])
     np.testing.assert_allclose(np.asarray(first.vertices), views.points_in_base, atol=1e-6)  # pyright: ignore
-
-
-@pytest.fixture
-def with_others(views: "PosedImages", tmp_path: Path) -> "list[PosedImages]":
-    """A fixed camera of two images, and a second one on the gripper at the first and the last image."""
-    from jcr.export.views import PosedImages
-
-    second = transform(rotation_exp(np.array([0.05, 0.1, -0.2])), np.array([0.06, 0.01, 0.0]))
-    poses = (
-        np.repeat(views.base_from_camera[:1] @ second @ second, 2, axis=0),
-        (views.base_from_camera[[0, 2]] @ second),
-    )
-    nothing = Tracks(
-        image=np.zeros(0, int),
-        x_px=np.zeros((0, 2)),
-        point=np.zeros(0, int),
-        points_in_recon=np.zeros((0, 3)),
-    )
-    intrinsics = replace(INTRINSICS, distortion=(0.02, 0.0, 0.0, 0.0, 0.0))
-    images = []
-    for name in ("fixed", "second"):
-        images.append(tuple(f"{name}/{k}.png" for k in range(2)))
-        for image in images[-1]:
-            write_bytes(tmp_path / image, (views.folder / views.images[0]).read_bytes())
-    return [
-        PosedImages(
-            folder=tmp_path,
-            images=of,
-            base_from_camera=pose,
-            intrinsics=intrinsics,
-            tracks=nothing,
-            points_in_base=np.zeros((0, 3)),
-            beside=beside,
-        )
-        for of, pose, beside in zip(images, poses, (None, (0, 2)), strict=True)
-    ]
-
-
-@pytest.mark.parametrize("kind", ["colmap", "nerfstudio"])
-def test_exports_of_several_cameras_come_back(
-    kind: str, views: "PosedImages", with_others: "list[PosedImages]", tmp_path: Path
-):
-    from jcr.capture import transforms_json
-    from jcr.capture.formats import colmap
-    from jcr.export.views import write_colmap, write_nerfstudio
-
-    out, about, n = tmp_path / "out", Provenance("base_link"), len(views.points_in_base)
-    if kind == "colmap":
-        write_colmap(out, views, about, undistorted=False, link=False, others=with_others)
-        names, poses = colmap.read_cameras(out / "sparse" / "0")
-    else:
-        zeros, ones = np.zeros(n, int), np.ones(n)
-        cloud = PointCloud(
-            points_in_base=views.points_in_base,
-            color=np.full((n, 3), 90, np.uint8),
-            confidence=ones,
-            margin=ones,
-            label=zeros,
-            image=zeros,
-            camera_centers_in_base=np.zeros((1, 3)),
-        )
-        write_nerfstudio(out, views, cloud, about, False, link=False, others=with_others)
-        names, poses = transforms_json.read_cameras(out / "transforms.json")
-    of = {"/".join(Path(name).parts[-2:]): pose for name, pose in zip(names, poses, strict=True)}
-    for k, one in enumerate(with_others, start=1):
-        for j, pose in enumerate(one.base_from_camera):
-            np.testing.assert_allclose(of[f"{k}/{j}.png"], pose, atol=1e-9)
-    placed = [image.replace("/", "_") for image in views.images]  # of two folders, alike in name
-    lines = [
-        ",".join(map(str, [name, *pose.ravel()]))
-        for name, pose in zip(placed, views.base_from_camera, strict=True)
-    ]
-    (out / "poses.csv").write_text(
-        "\n".join(["image," + ",".join(f"m{i}{j}" for i in range(4) for j in range(4)), *lines])
-    )
-    got = jcr.read_capture(out, ReadOptions(pose_convention="matrix"))
-    assert (
-        len(got) == 3
-        and got.intrinsics is not None
-        and got.intrinsics.distortion == pytest.approx(INTRINSICS.distortion)
-    )
-    by_mount = {camera.mount: camera for camera in got.others}
-    assert by_mount["base"].intrinsics is not None and len(by_mount["base"].images) == 2
-    assert by_mount["base"].intrinsics.distortion[0] == pytest.approx(0.02)
-    if kind == "colmap":
-        assert by_mount["gripper"].frame is not None and len(by_mount["gripper"].images) == 2
-        assert [got.images[k] for k in by_mount["gripper"].frame] == [f"images/{placed[k]}" for k in (0, 2)]
-    else:
-        assert any("neither of one place nor of a rig" in note for note in got.notes)
 
 
 def test_images_rotated_by_a_tag_are_copied_upright(views: "PosedImages", tmp_path: Path):
@@ -650,6 +546,16 @@ def test_command_gives_the_root_link_asked_for(
     assert "--frame-id flange --child-frame-id camera_link" in capsys.readouterr().out
 
 
+def test_a_file_with_other_frames_is_not_replaced_silently(
+    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    path = export(done, "urdf", tmp_path / "a.urdf")
+    export(done, "urdf", path)
+    assert "replaced" not in capsys.readouterr().err
+    export(done, "urdf", path, "--child-frame", "left_optical")
+    assert f"{path}: replaced a file with other content" in capsys.readouterr().err
+
+
 def test_a_rejected_calibration_is_exported_by_force_alone_with_its_reason_in_every_file(
     done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -663,7 +569,6 @@ def test_a_rejected_calibration_is_exported_by_force_alone_with_its_reason_in_ev
         for severity, words in (("rejects", DOUBT), ("warns", "and another"))
     ]
     content |= {"converged": False, "verdict": "rejected", "findings": findings}
-    content["robot_errors"]["joints"] = 6 * [{"offset_deg": 0.1, "std_deg": 0.05}]
     (run / "calibration.json").write_text(json.dumps(content))
     for row in FORMATS:
         if row.name == "rerun":

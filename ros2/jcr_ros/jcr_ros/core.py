@@ -21,7 +21,7 @@ from jcr.capture.camera_json import intrinsics_as_json
 from jcr.capture.ros_image import image_of
 from jcr.errors import InputError
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
-from jcr.export.ros import CameraMount, camera_mount
+from jcr.export.ros import CameraMount
 from jcr.live.arm_words import ArmWords
 from jcr.live.asks import Answer, Ask
 from jcr.live.calibration import LiveCalibration
@@ -174,13 +174,11 @@ class Session:
             return
         hand_eye, settings = result.hand_eye, self.settings
         reason = None if result.converged else "; ".join(hand_eye.warnings)
-        mount = camera_mount(
-            hand_eye.gripper_from_camera,
-            hand_eye.covariance,
-            settings.parent,
-            settings.child,
-            settings.base,
-            reason,
+        mount = CameraMount(
+            parent=settings.parent,
+            child=settings.child,
+            parent_from_child=hand_eye.gripper_from_camera,
+            base=settings.base,
         )
         std = np.sqrt(np.diag(hand_eye.covariance))
         offset = " ".join(f"{1e3 * value:.1f}" for value in hand_eye.gripper_from_camera[:3, 3])

@@ -42,7 +42,7 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Write the file and print its path; 3 where the calibration is rejected, and nothing was written."""
-    from jcr.export.formats import FORMATS, written
+    from jcr.export.formats import FORMATS, write_run
     from jcr.export.ros import static_transform_publisher
 
     if arguments.format is None:
@@ -52,8 +52,10 @@ def main(arguments: Arguments) -> int:
             {"formats": {row.name: row.about for row in FORMATS}},
         )
         return 0
-    run, row, path = written(arguments.out, arguments.format, arguments.path, arguments.export)
+    run, row, path, replaced = write_run(arguments.out, arguments.format, arguments.path, arguments.export)
     sys.stderr.write(f"wrote {path}: {row.about}\n")
+    if replaced:
+        warn(f"{path}: replaced a file with other content; name another PATH to keep both")
     line, facts = "", {"file": str(path), "format": row.name, "about": row.about}
     if row.name == "ros2":
         mount = run.mount

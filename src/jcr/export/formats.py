@@ -1,6 +1,5 @@
 """The table of formats: a run's calibration and map as other tools read them."""
 
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from jcr.errors import InputError, RejectedError, did_you_mean
@@ -20,7 +21,7 @@ from jcr.options import checked_options
 from jcr.run_folder import RunFolder
 
 if TYPE_CHECKING:
-    from jcr.calibration.calibration_json import CalibrationFile, GivenIntrinsicsKept
+    from jcr.calibration.calibration_json import CalibrationFile
     from jcr.cell.cameras_json import CameraPlaced
     from jcr.export.views import PosedImages
     from jcr.records import Capture, Intrinsics, Reconstruction
@@ -42,26 +43,20 @@ def export_run(
     format: FormatName,
     path: str | Path | None = None,
     options: ExportOptions | Mapping[str, Any] | None = None,
-    **named: Any,
 ) -> Path:
     """Export the run folder `out` in a format of `jcr export` and return the path of the new file or folder.
 
-    `options` are those of the command line; `named` are single ones of them, as 0.1.0 took them, and are removed in
-    0.3.0. Raises InputError as the command does, and RejectedError if the calibration is rejected; with `force` it is
-    exported, and the file contains the reason.
+    `options` are those of the command line. Raises InputError as the command does, and RejectedError if the
+    calibration is rejected; with `force` it is exported, and the file contains the reason.
     """
-    if named:
-        warnings.warn("export_run: give jcr.ExportOptions(...)", DeprecationWarning, stacklevel=2)
-        given = options if isinstance(options, Mapping) else vars(options or ExportOptions())
-        options = {**given, **named}
     file = None if path is None else Path(path)
-    return written(Path(out), format, file, checked_options(options, ExportOptions))[2]
+    return write_run(Path(out), format, file, checked_options(options, ExportOptions))[2]
 
 
-def written(
+def write_run(
     out: Path, format: FormatName, path: Path | None, options: ExportOptions
-) -> "tuple[Run, Format, Path]":
-    """Write a run folder in a format, and return what was exported, the row of the table and the path.
+) -> "tuple[Run, Format, Path, bool]":
+    """Write a run folder in a format; return the run, the row of the table, the path, and whether other content was there.
 
     Raises InputError for a format that does not exist, options that it cannot serve, and a run that lacks what it
     needs; RejectedError for a calibration that is rejected, unless `options` force it.
@@ -83,8 +78,9 @@ def written(
     path = path or out / "export" / row.file
     if path.is_dir() and not row.file.endswith("/"):
         raise InputError(f"{path}: is a folder; name a file for {row.name}")
+    before = path.read_bytes() if path.is_file() else None
     row.write(run, path)
-    return run, row, path
+    return run, row, path, before is not None and path.read_bytes() != before
 
 
 class Run:
@@ -117,20 +113,15 @@ class Run:
 
     @property
     def mount(self) -> ros.CameraMount:
-        """The camera on the gripper, as the user wants its frames."""
+        """Mount of the exported camera, under the frame names of the options."""
         options = self.options
         if options.camera is not None:
             mount = self._mount_of(self._camera(options.camera), options.child_frame)
         else:
             fixed = self.calibration.mount == "base"
-            mount = ros.camera_mount(
-                *self._transform,
-                options.base_frame if fixed else options.parent_frame,
-                options.child_frame,
-                options.base_frame,
-                self.doubt,
-                None if self.calibration.intrinsics is None else self.intrinsics,
-            )
+            parent_from_camera, intrinsics = self._pair
+            parent = options.base_frame if fixed else options.parent_frame
+            mount = self._named(parent_from_camera, parent, options.child_frame, self.doubt, intrinsics)
         if options.to_root is None:
             return mount
         if options.root_from_optical is None:
@@ -145,30 +136,22 @@ class Run:
         return ros.on_root(mount, options.to_root, transform(rotation, np.array([x, y, z])))
 
     @property
-    def _transform(self) -> tuple[np.ndarray, np.ndarray]:
-        """parent_from_camera and its covariance, of the intrinsics that were chosen."""
-        if (kept := self._kept) is not None:
-            return np.array(kept.gripper_from_camera), np.array(kept.covariance)
-        uncertainty = self.calibration.uncertainty
-        assert uncertainty is not None  # wherever there is a transform
-        return np.array(self.calibration.parent_from_camera), np.array(uncertainty.covariance)
-
-    @property
-    def _kept(self) -> "GivenIntrinsicsKept | None":
-        """The pair of the intrinsics that were given; None where the estimated ones are used."""
-        if self.options.intrinsics == "estimated" or self.options.camera is not None:
-            return None
+    def _pair(self) -> "tuple[Float[ndarray, '4 4'], Intrinsics | None]":
+        """parent_from_camera and the intrinsics that it belongs to: the estimated ones, or those of the capture."""
+        if self.options.intrinsics == "estimated":
+            found = self.calibration.intrinsics
+            return np.array(self.calibration.parent_from_camera), None if found is None else found.record()
         kept = self.calibration.with_given_intrinsics
         if kept is None:
             raise InputError(
                 f"--intrinsics given: {self.folder.path} has no transform for given intrinsics: the capture gave "
                 "none, or no others were estimated beside them; leave it out"
             )
-        return kept
+        return np.array(kept.gripper_from_camera), kept.intrinsics.record()
 
     @property
     def others(self) -> list[ros.CameraMount]:
-        """Further cameras that are accepted (all of them by force) and arms; none where one camera is asked for."""
+        """Accepted further cameras (with `force` also rejected ones) and arms; none where one camera is chosen."""
         cameras = self.folder.cameras()
         if cameras is None or self.options.camera is not None:
             return []
@@ -179,17 +162,12 @@ class Run:
         ]
         base = self.options.base_frame
         return mounts + [
-            ros.CameraMount(
-                parent=base,
-                child=f"{arm.name}_{base}",
-                parent_from_child=np.array(arm.base_from_other_base),
-                covariance=np.array(arm.uncertainty.covariance),
-                base=base,
-            )
+            self._named(np.array(arm.base_from_other_base), base, f"{arm.name}_{base}")
             for arm in cameras.arms
         ]
 
     def _camera(self, name: str) -> "CameraPlaced":
+        """Return a further camera by its name; raise InputError where it was not placed."""
         cameras = self.folder.cameras()
         for camera in () if cameras is None else cameras.cameras:
             if camera.name == name and camera.parent_from_camera is not None:
@@ -199,33 +177,33 @@ class Run:
         )
 
     def _mount_of(self, camera: "CameraPlaced", child: str) -> ros.CameraMount:
-        options = self.options
-        assert camera.uncertainty is not None  # wherever there is a transform
-        parent = options.base_frame if camera.mount == "base" else options.parent_frame
-        if camera.arm is not None:
-            parent = f"{camera.arm}_{parent}"
-        return ros.camera_mount(
-            np.array(camera.parent_from_camera),
-            np.array(camera.uncertainty.covariance),
-            parent,
-            child,
-            options.base_frame,
-            camera.doubt,
-            None if camera.intrinsics is None else camera.intrinsics.record(),
+        """Return the mount of a further camera."""
+        parent = self.options.base_frame if camera.mount == "base" else self.options.parent_frame
+        intrinsics = None if camera.intrinsics is None else camera.intrinsics.record()
+        return self._named(
+            np.array(camera.parent_from_camera), parent, child, camera.doubt, intrinsics, camera.arm
         )
 
-    @property
-    def intrinsics(self) -> "Intrinsics":
-        """As estimated, or as given where these are asked for."""
-        found = self.calibration.intrinsics if self._kept is None else self._kept.intrinsics
-        if self.options.camera is not None:
-            found = self._camera(self.options.camera).intrinsics
-        if found is None:
-            raise InputError(
-                f"{self.folder.path}: knows no intrinsics, for camera poses were given and no images; export "
-                "something else"
-            )
-        return found.record()
+    def _named(
+        self,
+        parent_from_child: Float[ndarray, "4 4"],
+        parent: str,
+        child: str,
+        doubt: str | None = None,
+        intrinsics: "Intrinsics | None" = None,
+        arm: str | None = None,
+    ) -> ros.CameraMount:
+        """Return a mount; the frames of another arm have its name in front."""
+        of_arm = "" if arm is None else f"{arm}_"
+        return ros.CameraMount(
+            parent=of_arm + parent,
+            child=child,
+            parent_from_child=parent_from_child,
+            base=of_arm + self.options.base_frame,
+            effector=of_arm + self.options.parent_frame,
+            doubt=doubt,
+            intrinsics=intrinsics,
+        )
 
     @cached_property
     def capture(self) -> "Capture":
@@ -251,19 +229,6 @@ class Run:
         base_from_recon = np.array(self.calibration.base_from_recon)
         return posed_images(self.capture, self.reconstruction, base_from_recon, scale)
 
-    @property
-    def other_views(self) -> "list[PosedImages]":
-        """The images of further cameras that see the scene, in the base frame."""
-        from jcr.cell.added import read_added_cameras
-        from jcr.export.cell_views import posed_cameras
-
-        cameras = self.folder.cameras()
-        if cameras is None:
-            return []
-        others = (*self.capture.others, *read_added_cameras(self.folder.path, self.capture))
-        own = np.array(self.calibration.gripper_from_camera)
-        return posed_cameras(self.capture, others, cameras, self.views, self.reconstruction.image_index, own)
-
 
 def _of_mount(text: Callable[[ros.CameraMount], str]) -> Callable[[Run, Path], None]:
     """The format whose file is that text about the camera on the gripper."""
@@ -283,17 +248,7 @@ def _easy_handeye2(run: Run, path: Path) -> None:
 
 
 def _camera_info(run: Run, path: Path) -> None:
-    write_text(path, ros.camera_info(run.mount, run.intrinsics))
-
-
-def _joint_offsets(run: Run, path: Path) -> None:
-    errors = run.calibration.robot_errors
-    if errors is None or errors.joints is None:
-        raise InputError(
-            f"{run.folder.path}: no joint offsets were estimated; name the arm (--robot, or robot in capture.json)"
-        )
-    offsets = [(joint.offset_deg, joint.std_deg) for joint in errors.joints]
-    write_text(path, ros.joint_offsets(offsets, errors.p, run.doubt))
+    write_text(path, ros.camera_info(run.mount))
 
 
 def _ply(run: Run, path: Path) -> None:
@@ -337,14 +292,14 @@ def _nerfstudio(run: Run, path: Path) -> None:
     from jcr.export.views import write_nerfstudio
 
     images = run.options.undistort, run.options.link_images
-    write_nerfstudio(path, run.views, run.folder.cloud(), run.provenance, *images, others=run.other_views)
+    write_nerfstudio(path, run.views, run.folder.cloud(), run.provenance, *images)
 
 
 def _colmap(run: Run, path: Path) -> None:
     from jcr.export.views import write_colmap
 
     images = run.options.undistort, run.options.link_images
-    write_colmap(path, run.views, run.provenance, *images, others=run.other_views)
+    write_colmap(path, run.views, run.provenance, *images)
 
 
 def _rerun(run: Run, path: Path) -> None:
@@ -364,18 +319,8 @@ FORMATS = (
         _of_mount(ros.moveit_launch),
     ),
     Format("urdf", "hand_eye.urdf", "camera link and fixed joint", _urdf),
-    Format("xacro", "hand_eye.xacro", "macro that adds the camera link and joint", _of_mount(ros.xacro)),
     Format("easy_handeye2", "hand_eye.calib", ".calib for its publisher", _easy_handeye2),
-    Format(
-        "covariance",
-        "hand_eye.yaml",
-        "PoseWithCovarianceStamped, 36 numbers",
-        _of_mount(ros.pose_with_covariance),
-    ),
     Format("camera_info", "camera_info.yaml", "intrinsics for camera_info_manager", _camera_info),
-    Format(
-        "joint_offsets", "joint_offsets.yaml", "by how much each joint of the arm seems off", _joint_offsets
-    ),
     Format("ply", "cloud.ply", "points, colours, labels", _ply),
     Format("glb", "map.glb", "mesh of the seen surface with colours", _glb),
     Format("octomap", "map.bt", "occupied, free and unknown voxels", _octomap),

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 import tyro
 
 FormatName = Literal[
-    "ros2", "moveit", "urdf", "xacro", "easy_handeye2", "covariance", "camera_info", "joint_offsets", "ply", "glb",
-    "octomap", "esdf", "spheres", "nerfstudio", "colmap", "rerun",
+    "ros2", "moveit", "urdf", "easy_handeye2", "camera_info", "ply", "glb", "octomap", "esdf", "spheres",
+    "nerfstudio", "colmap", "rerun",
 ]  # fmt: skip
 
 

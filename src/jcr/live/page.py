@@ -16,11 +16,10 @@ from jcr.live.collect import LiveCapture, Shown
 from jcr.live.folder import LiveFolder
 from jcr.records import Finding, Intrinsics
 from jcr.records.words import reached_in_words, sentence
-from jcr.report.figures import course_figure
+from jcr.report.figures import Figure, course_figure
 from jcr.report.raster import TRACK_COLOR
 from jcr.report.render import Section, render
 from jcr.report.scene3d import TRACK_SIZE, PointLayer, scene_data, scene_view
-from jcr.report.svg import Figure
 from jcr.report.verdict import Tile
 from jcr.rounding import significant
 

@@ -10,20 +10,26 @@ import numpy as np
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.calibration.words import attempt_in_words, budget_in_words
 from jcr.extras import is_installed
-from jcr.records import COEFFICIENTS
+from jcr.records import COEFFICIENTS, Reconstruction
 from jcr.records.words import LENGTHS
+from jcr.report.images import reprojections_px
 from jcr.report.render import Section
-from jcr.rounding import significant
+from jcr.rounding import significant, with_std
 
 Options = Mapping[str, Mapping[str, Any]]
 """A stage's name, and its options by name."""
+CELLS = 16
+"""Cells across the image in which coverage is counted."""
 PACKAGES = ("numpy", "scipy", "torch", "pycolmap")
 
 
 def details_section(
-    calibration: CalibrationFile, options: Options, map_history: Mapping[str, str] | None = None
+    calibration: CalibrationFile,
+    options: Options,
+    reconstruction: Reconstruction | None = None,
+    map_history: Mapping[str, str] | None = None,
 ) -> Section:
-    """Blocks of names and values."""
+    """Return blocks of names and values."""
     uncertainty = calibration.uncertainty
     budget = None if uncertainty is None else uncertainty.budget
     blocks: dict[str, Mapping[str, str]] = {
@@ -33,6 +39,8 @@ def details_section(
         "Lengths": _lengths(calibration),
         "Depth camera": _depth_camera(calibration),
         "Robot": _robot(calibration),
+        "Features": {} if reconstruction is None else _features(reconstruction),
+        "Board": _board(calibration),
         "Map": map_history or {},
     }
     for stage, chosen in options.items():
@@ -101,6 +109,40 @@ def _robot(calibration: CalibrationFile) -> dict[str, str]:
     if (angles := calibration.angle_ratio) is not None:
         items["camera angles over gripper angles"] = f"{angles.ratio:.4f} ± {angles.std:.4f} (1 is right)"
     return items
+
+
+def _features(reconstruction: Reconstruction) -> dict[str, str]:
+    """Return the number of tracked features, their coverage of the image and their reprojection error."""
+    tracks, intrinsics = reconstruction.tracks, reconstruction.intrinsics
+    if len(tracks.image) == 0:
+        return {}
+    side = intrinsics.width / CELLS
+    rows = max(round(intrinsics.height / side), 1)
+    column, row = ((tracks.x_px + 0.5) / [side, intrinsics.height / rows]).astype(int).T
+    cells = np.unique(row.clip(0, rows - 1) * CELLS + column.clip(0, CELLS - 1))
+    median = float(np.median(np.linalg.norm(reprojections_px(reconstruction), axis=1)))
+    return {
+        "observations": f"{len(tracks.image)} of {len(tracks.points_in_recon)} points",
+        "coverage of the image": f"{100 * len(cells) / (rows * CELLS):.0f} % of the cells",
+        "median reprojection error": f"{significant(median)} px",
+    }
+
+
+def _board(calibration: CalibrationFile) -> dict[str, str]:
+    """Return size, place and flatness of a board that took part beside features."""
+    if (board := calibration.board) is None:
+        return {}
+    stated = f", {board.stated_mm:g} mm stated" if board.stated_mm else ""
+    rows = {
+        board.spec: f"{board.corners} corners in {board.images} images, {board.rms_px:.2f} px rms per axis",
+        "side by the robot's positions": f"{with_std(board.side_mm, board.side_std_mm)} mm{stated}",
+        "lowest to highest corner": f"{significant(board.bend_mm)} mm",
+    }
+    for k, (centre, tilt) in enumerate(zip(board.centres_in_base, board.tilts_deg, strict=True), start=1):
+        name = f"place of tag {k}" if board.bodies > 1 else "place"
+        at = ", ".join(f"{x:.3f}" for x in centre)
+        rows[name] = f"({at}) m in the base, {tilt:.1f}° from horizontal"
+    return rows
 
 
 def _value(value: Any) -> str:

@@ -4,29 +4,22 @@ from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 
-from jaxtyping import Float, Int
-from numpy import ndarray
-
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.capture.formats.capture_json import origin
 from jcr.capture.formats.table import TABLES
 from jcr.errors import printable
 from jcr.geometry import scale_translation
-from jcr.records import Capture, HandEye, Intrinsics
-from jcr.report.board import board_section
+from jcr.records import Capture
 from jcr.report.cell_cameras import cameras_section
 from jcr.report.details import Options, details_section
-from jcr.report.features import features_section
-from jcr.report.figures import camera_figure
 from jcr.report.images import images_alone_section, images_section
 from jcr.report.map_samples import sample_surface
-from jcr.report.map_views import map_section, objects_section
 from jcr.report.motion import motion_section
+from jcr.report.objects import objects_section
 from jcr.report.render import Section, render
 from jcr.report.residual_bars import residuals_section
 from jcr.report.scene3d import scene_section
 from jcr.report.seen import seen_section
-from jcr.report.svg import ABOVE, OBLIQUE
 from jcr.report.transform import transform_section
 from jcr.report.verdict import failure_section, head
 from jcr.results import PosesResult, RunResult
@@ -37,8 +30,6 @@ UNNAMED = {
     Path(name).stem for name in (*TABLES, "capture.json", "cal_data.yaml", "transforms.json", "metadata.yaml")
 }
 """Files that are called so in every capture."""
-ANY_CAMERA = Intrinsics(600.0, 600.0, 320.0, 240.0, 640, 480)
-"""Drawn where no intrinsics are known."""
 LINKS = {
     "warnings": "Warnings",
     "notes": "Notes",
@@ -47,12 +38,8 @@ LINKS = {
     "cameras": "Cameras",
     "view": "3D",
     "images": "Images",
-    "features": "Features",
-    "board": "Board",
     "residuals": "Residuals",
     "uncertainty": "Uncertainty",
-    "before-after": "Before and after",
-    "map": "Map",
     "objects": "Objects",
     "details": "Details",
 }
@@ -76,8 +63,8 @@ def report_html(result: RunResult, options: Options | None = None) -> str:
             details_section(calibration, options or {}),
         ]
         return _page(about, origin(capture.folder), calibration, sections)
-    recon_from_camera = result.reconstruction.recon_from_camera
-    base_from_camera = _base_from_camera(result.hand_eye, recon_from_camera)
+    hand_eye, recon_from_camera = result.hand_eye, result.reconstruction.recon_from_camera
+    base_from_camera = hand_eye.base_from_recon @ scale_translation(recon_from_camera, hand_eye.scale)
     surface = None if scene is None else sample_surface(scene, SURFACE_POINTS)
     sections = [
         *head(calibration),
@@ -86,41 +73,29 @@ def report_html(result: RunResult, options: Options | None = None) -> str:
         None if result.cameras is None else cameras_section(result.cameras),
         scene_section(result, base_from_camera, surface),
         images_section(result),
-        features_section(result),
-        board_section(result),
         residuals_section(result),
         motion_section(result),
-        _before_after(
-            capture.base_from_gripper,
-            recon_from_camera,
-            base_from_camera,
-            result.image_index,
-            result.intrinsics,
-        ),
-        None if scene is None or surface is None else map_section(result, scene, surface, base_from_camera),
         None
         if scene is None or result.measured is None
         else objects_section(result.measured, scene.label_names),
-        details_section(calibration, options or {}, None if scene is None else scene.history),
+        details_section(
+            calibration, options or {}, result.reconstruction, None if scene is None else scene.history
+        ),
     ]
     return _page(about, origin(capture.folder), calibration, sections)
 
 
 def poses_report_html(result: PosesResult, options: Options | None = None) -> str:
     """The report of camera poses that were given: as that of a run, without images."""
-    calibration, hand_eye, pairs = result.calibration, result.hand_eye, result.pairs
-    base_from_camera = _base_from_camera(hand_eye, pairs.recon_from_camera)
+    calibration = result.calibration
     sections = [
         *head(calibration),
-        transform_section(hand_eye),
+        transform_section(result.hand_eye),
         residuals_section(result),
         motion_section(result),
-        _before_after(
-            pairs.base_from_gripper, pairs.recon_from_camera, base_from_camera, result.image_index, ANY_CAMERA
-        ),
         details_section(calibration, options or {}),
     ]
-    return _page("poses given, no images", pairs.source, calibration, sections)
+    return _page("poses given, no images", result.pairs.source, calibration, sections)
 
 
 def failed_report_html(capture: Capture, calibration: CalibrationFile, options: Options | None = None) -> str:
@@ -131,12 +106,6 @@ def failed_report_html(capture: Capture, calibration: CalibrationFile, options: 
         details_section(calibration, options or {}),
     ]
     return _page(_about_capture(capture, options or {}), origin(capture.folder), calibration, sections)
-
-
-def _base_from_camera(
-    hand_eye: HandEye, recon_from_camera: Float[ndarray, "m 4 4"]
-) -> Float[ndarray, "m 4 4"]:
-    return hand_eye.base_from_recon @ scale_translation(recon_from_camera, hand_eye.scale)
 
 
 def _about_capture(capture: Capture, options: Options) -> str:
@@ -162,20 +131,3 @@ def _page(about: str, source: Path, calibration: CalibrationFile, sections: Iter
         "links": {one.name: LINKS[one.name] for one in shown if one.name in LINKS},
     }
     return render("report.html", content)
-
-
-def _before_after(
-    grippers: Float[ndarray, "n 4 4"],
-    before: Float[ndarray, "m 4 4"],
-    after: Float[ndarray, "m 4 4"],
-    rows: Int[ndarray, " m"],
-    intrinsics: Intrinsics,
-) -> Section:
-    """Cameras and grippers in the frame and unit of the reconstruction, and in the base frame."""
-    figures = [
-        camera_figure("Before: own frame and unit", grippers, before, None, intrinsics, OBLIQUE),
-        camera_figure("After calibration and rescaling", grippers, after, rows, intrinsics, OBLIQUE),
-        camera_figure("Before, from above", grippers, before, None, intrinsics, ABOVE),
-        camera_figure("After, from above", grippers, after, rows, intrinsics, ABOVE),
-    ]
-    return Section("before-after", {"figures": figures})

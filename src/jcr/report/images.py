@@ -7,11 +7,13 @@ from typing import Any
 
 import cv2
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 
 from jcr.camera import is_distorted, project, resized, undistortion, unproject, without_distortion
 from jcr.capture.images import read_image
-from jcr.records import Capture, ImageVerdict, Intrinsics
-from jcr.report.features import reprojections_px
+from jcr.geometry import apply, inverse
+from jcr.records import Capture, ImageVerdict, Intrinsics, Reconstruction
 from jcr.report.raster import image_url
 from jcr.report.render import Section
 from jcr.results import RunResult
@@ -112,6 +114,17 @@ def _reprojections(result: RunResult) -> dict[int, str]:
     return drawings
 
 
+def reprojections_px(reconstruction: Reconstruction) -> Float[ndarray, "k 2"]:
+    """Return the vector from each feature to the projection of its 3D point (px)."""
+    tracks = reconstruction.tracks
+    errors = np.zeros_like(tracks.x_px)
+    for k, camera_from_recon in enumerate(inverse(reconstruction.recon_from_camera)):
+        seen = tracks.image == k
+        x_in_camera = apply(camera_from_recon, tracks.points_in_recon[tracks.point[seen]])
+        errors[seen] = project(reconstruction.intrinsics, x_in_camera) - tracks.x_px[seen]
+    return errors
+
+
 def thumbnails(capture: Capture, intrinsics: Intrinsics | None) -> list[str]:
     """Every image as a JPEG of the size that its number allows; undistorted, as the 3D view shows it."""
     shape = capture.image_size[1] / capture.image_size[0]
@@ -126,7 +139,7 @@ def thumbnails(capture: Capture, intrinsics: Intrinsics | None) -> list[str]:
 
     def thumbnail(name: str) -> str:
         pixels = cv2.resize(read_image(capture.folder / name), size, interpolation=cv2.INTER_AREA)
-        return image_url(pixels if undistort is None else undistort(pixels), "JPEG")
+        return image_url(pixels if undistort is None else undistort(pixels))
 
     with ThreadPoolExecutor(2) as pool:
         return list(pool.map(thumbnail, capture.images))

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 from scipy.ndimage import binary_dilation
 from scipy.spatial import KDTree
@@ -17,10 +17,6 @@ MAX_CELLS = 700_000
 """Questions that find the surface: well under a second on one core."""
 FIRST_DRAWS, DRAWS = 8, 2
 """Per cell that the surface may cross, and per third (along each axis) of one that it was then found in."""
-LAYER = 0.005
-"""Metres; thickness of the layers among which the support surface is looked for."""
-CLEARANCE = 0.02
-"""Metres above the support surface at which the horizontal slice lies: in the surface itself all is solid."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,24 +26,8 @@ class SurfacePoints:
     points_in_base: Float[ndarray, "n 3"]
     color: UInt8[ndarray, "n 3"]
     label: Int[ndarray, " n"]
-    unknown_share: float
-    """Share of the workspace that no camera has seen."""
     point_size: float
     """Side (m) of the squares that are drawn in place of the points."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Slice:
-    """Occupancy on an axis-aligned rectangle of the base frame; rows run along the second axis, upwards."""
-
-    axes: tuple[int, int]
-    """Which base axes (0 x, 1 y, 2 z) run to the right and upwards."""
-    at: float
-    """Where the plane cuts the remaining axis, in metres."""
-    extent: Float[ndarray, "2 2"]
-    """Lower and upper corner along `axes`, in metres."""
-    occupancy: Float[ndarray, "h w"]
-    unknown: Bool[ndarray, "h w"]
 
 
 def sample_surface(scene: "SceneMap", count: int) -> SurfacePoints:
@@ -85,18 +65,8 @@ def sample_surface(scene: "SceneMap", count: int) -> SurfacePoints:
         points_in_base=x,
         color=color,
         label=answer.label,
-        unknown_share=float(sample.unknown.mean()),
         point_size=point_size(x),
     )
-
-
-def slices(scene: "SceneMap", surface: SurfacePoints) -> tuple[Slice, Slice]:
-    """A horizontal slice just above the support surface, and a vertical one through what stands on it."""
-    x = surface.points_in_base if len(surface.points_in_base) else scene.box.mean(0, keepdims=True)
-    height = _fullest(x[:, 2], LAYER) + CLEARANCE
-    standing = x[x[:, 2] > height]
-    across = _fullest((standing if len(standing) else x)[:, 1], 0.02)
-    return _slice(scene, (0, 1), height), _slice(scene, (0, 2), across)
 
 
 def point_size(points: Float[ndarray, "n 3"]) -> float:
@@ -106,22 +76,3 @@ def point_size(points: Float[ndarray, "n 3"]) -> float:
     tree = KDTree(points, compact_nodes=False, balanced_tree=False)  # made in a third of the time
     nearest = tree.query(points[:: max(len(points) // 1000, 1)], k=2)[0][:, 1]
     return round(2.2 * float(np.median(nearest)), 5)
-
-
-def _slice(scene: "SceneMap", axes: tuple[int, int], at: float) -> Slice:
-    extent = scene.box[:, axes]
-    sides = extent[1] - extent[0]
-    pitch = max(scene.cell / 2, float(sides.max()) / 320)
-    a, b = (np.arange(extent[0, k] + pitch / 2, extent[1, k], pitch) for k in (0, 1))
-    x = np.full((len(b), len(a), 3), at)
-    x[..., axes[0]], x[..., axes[1]] = np.meshgrid(a, b)
-    sample = scene.query(x.reshape(-1, 3))
-    occupancy, unknown = (values.reshape(x.shape[:2]) for values in (sample.occupancy, sample.unknown))
-    return Slice(axes=axes, at=at, extent=extent, occupancy=occupancy, unknown=unknown)
-
-
-def _fullest(values: Float[ndarray, " n"], width: float) -> float:
-    """Middle of the bin of that width which holds most values."""
-    bins = np.floor(values / width).astype(np.int64)
-    numbers, counts = np.unique(bins, return_counts=True)
-    return float((numbers[counts.argmax()] + 0.5) * width)

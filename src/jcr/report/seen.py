@@ -10,9 +10,9 @@ from numpy import ndarray
 from jcr.calibration.seen import within_95
 from jcr.calibration.words import given_in_words, seen_in_words
 from jcr.capture.images import read_image
+from jcr.report.figures import Figure, Shape
 from jcr.report.raster import image_url
 from jcr.report.render import Section
-from jcr.report.svg import Figure, Shape
 from jcr.results import RunResult
 from jcr.rounding import significant
 
@@ -52,7 +52,7 @@ def _figure(result: RunResult, distance_m: float) -> Figure:
     small = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
     field = cv2.resize(_field_mm(result, distance_m), (width, height), interpolation=cv2.INTER_CUBIC)
     least = float(field.min())
-    shapes = [Shape("image", {"href": image_url(small, "JPEG"), "width": width, "height": height})]
+    shapes = [Shape("image", {"href": image_url(small), "width": width, "height": height})]
     for times in LEVELS:
         if times * least < field.max():
             shapes += _contour(field, times * least)
