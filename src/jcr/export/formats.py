@@ -56,7 +56,7 @@ def export_run(
 def write_run(
     out: Path, format: FormatName, path: Path | None, options: ExportOptions
 ) -> "tuple[Run, Format, Path, bool]":
-    """Write a run folder in a format; return the run, the row of the table, the path, and whether other content was there.
+    """Write a run folder in a format; return run, row of the table, path, and whether other content was replaced.
 
     Raises InputError for a format that does not exist, options that it cannot serve, and a run that lacks what it
     needs; RejectedError for a calibration that is rejected, unless `options` force it.
