@@ -55,7 +55,6 @@ READING = ("src/jcr/capture",)
 LIVE = (
     "src/jcr/reconstruct/growing.py",
     "src/jcr/live/calibration.py",
-    "src/jcr/live/calibration_left_out.py",
     "src/jcr/live/next_pose.py",
 )
 WHOLE = (*SOLVER, *FEATURES, *DEPTH, *MAP, *READING, "src/jcr/pipeline.py", "src/jcr/report")

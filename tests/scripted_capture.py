@@ -1,18 +1,21 @@
 """A capture whose calibration is scripted: what `LiveCapture` does with its states, without reconstructing anything."""
 
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy import ndarray
 
 import jcr
+from jcr.capture.images import read_image
 from jcr.geometry import rotation_exp, transform
 from jcr.live.asks import Answer, Ask
-from jcr.live.calibration_progress import LeftOut, Progress, Reached
+from jcr.live.calibration_progress import Progress, Reached
 from jcr.live.camera import Camera, Frame
 from jcr.live.collect import CollectOptions, LiveCapture
 from jcr.live.folder import LiveFolder
@@ -20,7 +23,8 @@ from jcr.live.rest import State
 from jcr.records import Finding, HandEye, Kind, Plan, Requirement
 
 REQUIRED = (2.0, 0.3)
-PROOF = LeftOut(images=9, translation_mm=1.0, rotation_deg=0.1, expected_mm=1.0, expected_deg=0.1, agree=True)
+RATE = 10
+"""Images a second of a video."""
 
 
 def a_hand_eye(met: bool) -> HandEye:
@@ -79,7 +83,6 @@ class Scripted:
             findings=findings,
             hand_eye=a_hand_eye(len(images) >= self.accurate_from) if history else None,
             history=history,
-            left_out=PROOF if len(images) >= self.accurate_from else None,
             points_in_base=np.random.default_rng(0).normal(size=(50, 3)),
         )
         return self.progress
@@ -127,3 +130,26 @@ def asked(poses: list[ndarray], answers: list[Answer], waits: bool = False) -> I
     """A request at each pose."""
     for pose in poses:
         yield Ask(pose, answer=answers.append, waits=waits)
+
+
+def still(tabletop: Path, k: int) -> ndarray:
+    return read_image(tabletop / "images" / f"{k:02d}.jpg")
+
+
+def poses(tabletop: Path) -> list[ndarray]:
+    frames = json.loads((tabletop / "capture.json").read_text())["frames"]
+    return [np.array(frame["base_from_gripper"]) for frame in frames]
+
+
+def video(path: Path, tabletop: Path, images: range, rest_s: int = 1) -> Path:
+    """The arm rests for a while before each image and swings for half a second in between."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), RATE, (640, 480))
+    for k in images:
+        rgb = still(tabletop, k)
+        for step in range(5):
+            shift = np.array([[1, 0, 40.0 * (5 - step)], [0, 1, 0]])
+            writer.write(cv2.warpAffine(rgb, shift, (640, 480), borderMode=cv2.BORDER_WRAP)[..., ::-1])
+        for _ in range(RATE * rest_s):
+            writer.write(np.ascontiguousarray(rgb[..., ::-1]))
+    writer.release()
+    return path

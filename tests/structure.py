@@ -30,7 +30,7 @@ from jcr.capture.read import read_source
 from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError, RejectedError
 from jcr.live.folder import LiveFolder
-from jcr.live.line_server import parsed, pose_of
+from jcr.live.server import sample_pose
 from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Capture
 from jcr.run_folder import RunFolder
@@ -316,6 +316,6 @@ def _of_robots(folder: Path, capture: Capture, in_file: Any, found: dict[str, Do
         sent[:] = [json.dumps(content).replace("Infinity", "1e309").encode()]
 
     def take() -> object:
-        return pose_of(parsed(sent[0]))
+        return sample_pose(sent[0])
 
-    found["a line to `jcr capture`"] = Document(line, send, take)
+    found["a sample for `jcr capture`"] = Document(line, send, take)

@@ -120,9 +120,6 @@ EXAMPLES: dict[Kind, dict] = {
     Kind.FRAME_REPEATED: {"images": ("a.png",), "details": {"mm": 30.0, "deg": 5.0}},
     Kind.SIZE_DIFFERS: {"images": ("a.png",), "details": {"size": "640x480", "before": "320x240"}},
     Kind.CLOCK_JUMPS: {"value": 0.5, "images": ("a.png",)},
-    Kind.LEFT_OUT_DISAGREE: {
-        "details": {"of": 2.0, "mm": 3.0, "deg": 0.3, "expected_mm": 1.0, "expected_deg": 0.1}
-    },
 }
 """What a kind needs to be said; the others a value with its sigma and chance, or words of their own."""
 

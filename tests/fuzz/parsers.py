@@ -25,7 +25,7 @@ READERS += ["jcr.represent", "rosbags", "safetensors", "yaml"]
 with atheris.instrument_imports(include=READERS):
     from fuzz_targets import targets
     from jcr.errors import InputError
-    from jcr.live.line_server import parsed, pose_of
+    from jcr.live.server import sample_pose
 
 
 def main() -> None:
@@ -34,11 +34,11 @@ def main() -> None:
     folder = Path(tempfile.mkdtemp(prefix="jcr-fuzz-"))
     corpus = folder / "corpus"
     corpus.mkdir()
-    if name == "line":
+    if name == "sample":
         (corpus / "valid").write_bytes(b'{"base_from_gripper": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}\n')
 
         def feed(data: bytes) -> None:
-            pose_of(parsed(data))
+            sample_pose(data)
     else:
         target = targets(folder / "targets")[name]
         (corpus / "valid").write_bytes(target.file.read_bytes())

@@ -74,7 +74,7 @@ def test_a_capture_ends_by_itself_when_it_is_accurate(tmp_path: Path, tabletop: 
     assert done is not None and taken.capture.finish() is done
     # The next image may come before the end is known.
     assert len(taken.live.names) in (4, 5)
-    accurate = [answer["calibration"]["accurate"] for answer, _ in heard if "calibration" in answer]
+    accurate = [answer["calibration"]["requirement_met"] for answer, _ in heard if "calibration" in answer]
     assert accurate[:4] == 3 * [False] + [True]
 
 

@@ -20,8 +20,8 @@ from jcr.live.asks import Ask
 from jcr.live.calibration_words import progress_lines
 from jcr.live.collect import LiveCapture
 from jcr.live.commands import Command
-from jcr.live.page_server import PageServer
 from jcr.live.rest import State
+from jcr.live.server import Listen, Server
 from scripted_capture import Scripted, a_capture, still_frames
 from waiting import until
 
@@ -41,7 +41,7 @@ def add(capture: LiveCapture, scripted: Scripted, tabletop: Path, count: int) ->
 
 
 @contextmanager
-def asked(page: PageServer, method: str, path: str, body: str = "", **headers: str) -> Iterator[Any]:
+def asked(page: Server, method: str, path: str, body: str = "", **headers: str) -> Iterator[Any]:
     connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=10)
     names = {name.replace("_", "-"): value for name, value in headers.items()}
     connection.request(method, path, body or None, {"Host": f"127.0.0.1:{page.port}"} | names)
@@ -49,14 +49,14 @@ def asked(page: PageServer, method: str, path: str, body: str = "", **headers: s
     connection.close()
 
 
-def parts(page: PageServer, version: int = -1) -> dict[str, Any]:
+def parts(page: Server, version: int = -1) -> dict[str, Any]:
     with asked(page, "GET", f"/{page.key}/state?version={version}") as answer:
         return json.loads(answer.read())
 
 
 def test_the_page_shows_each_state(capture: tuple[LiveCapture, Scripted], tabletop: Path):
     live, scripted = capture
-    with PageServer(live) as page:
+    with Server(live) as page:
         with asked(page, "GET", f"/{page.key}/") as answer:
             whole = answer.read().decode()
         assert "&lt;c&gt;" in whole and "<c>" not in whole and "http" not in whole.replace("http-equiv", "")
@@ -104,7 +104,7 @@ def test_only_the_page_itself_commands(capture: tuple[LiveCapture, Scripted], ta
     add(live, scripted, tabletop, 2)
     pressed: list[Command] = []
     live.press = pressed.append
-    with PageServer(live) as page:
+    with Server(live) as page:
         press, body = f"/{page.key}/press", json.dumps({"action": "remove", "number": 1})
         own = {"Origin": f"http://127.0.0.1:{page.port}", "Content_Type": "application/json"}
 
@@ -125,16 +125,16 @@ def test_only_the_page_itself_commands(capture: tuple[LiveCapture, Scripted], ta
         assert status() == 204 and pressed == [Command("remove", 1)]
         with asked(page, "GET", f"/{page.key}/") as answer:
             assert "frame-ancestors 'none'" in answer.headers["Content-Security-Policy"]
-    other = PageServer(live)
+    other = Server(live)
     assert other.key != page.key and len(other.key) >= 22
     with pytest.raises(jcr.InputError, match="--page-port"), other:
-        PageServer(live, other.port)
+        Server(live, Listen(port=other.port))
 
 
 def test_the_camera_now_is_shown_with_its_features(capture: tuple[LiveCapture, Scripted], tabletop: Path):
     live, _ = capture
     frame = next(iter(live.camera.frames))
-    with PageServer(live) as page:
+    with Server(live) as page:
         with asked(page, "GET", f"/{page.key}/now.jpg") as answer:
             assert answer.status == 204
         object.__setattr__(live.camera, "latest", lambda: frame)
@@ -177,7 +177,7 @@ def test_the_buttons_take_retake_remove_undo_and_finish_on_a_phone(
 
     asks: queue.SimpleQueue[Ask] = queue.SimpleQueue()
     taking = threading.Thread(target=live.run, args=(iter(asks.get, None),), daemon=True)
-    with PageServer(live) as page:
+    with Server(live) as page:
         taking.start()
         browser.open(page.address, 390, 844, phone=True)
         browser.js("window.confirm = question => { window.asked = question; return true; }")

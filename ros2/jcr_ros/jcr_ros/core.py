@@ -30,8 +30,8 @@ from jcr.live.camera import TIMEOUT_S, Camera, Frame
 from jcr.live.collect import CollectOptions, LiveCapture
 from jcr.live.commands import Command
 from jcr.live.folder import LiveFolder
-from jcr.live.page_server import PageServer
 from jcr.live.rest import State, asks_at_rest
+from jcr.live.server import Server
 from jcr.results import RunResult
 from jcr.run_folder import locked
 
@@ -102,7 +102,7 @@ class Session:
     show: Callable[[str], None]
     """Gets each event in words."""
     publish: Callable[[Answer], None]
-    """Gets the state of the calibration at each event: the fields of the line protocol's answer, and `event`."""
+    """Gets the state of the calibration at each event: the fields of the answer to a sample, and `event`."""
     broadcast: Callable[[CameraMount], None]
     """Gets the camera's frame under the gripper, of an accepted calibration alone."""
     frames: Pushed = field(default_factory=Pushed)
@@ -149,7 +149,7 @@ class Session:
             camera = Camera(self.frames, self.frames.latest)
             words = ArmWords(arm=arm_named(name) if name in ROBOT_NAMES else None)
             self.capture = LiveCapture(calibration, camera, options, self._tell, words, self._state_now)
-            page = opened.enter_context(PageServer(self.capture))
+            page = opened.enter_context(Server(self.capture))
             # The thread closes what is open, from here on.
             self._thread = threading.Thread(
                 target=self._work, args=(self.capture, opened.pop_all()), daemon=True

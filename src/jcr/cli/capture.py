@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from jcr.live.collect import LiveCapture
     from jcr.live.folder import LiveFolder
     from jcr.live.rest import States
+    from jcr.live.server import Listen, Server
     from jcr.results import RunResult
 
 
@@ -42,9 +43,9 @@ class Arguments:
       jcr capture captures/table --camera 0 --poses ur:192.168.0.2 --require 2 0.3 --until-accurate
       jcr capture captures/table --camera realsense --poses franka:172.16.0.2
       jcr capture captures/table --camera 2 --camera-size 1920 1080 --focus 30 --poses xarm:192.168.1.203
-      jcr capture captures/table --camera rtsp://192.168.0.9/stream --poses tcp
+      jcr capture captures/table --camera rtsp://192.168.0.9/stream --poses http --page-port 7464
       jcr capture captures/table --camera 0 --poses typed --pose-convention kuka --pose-units mm-deg
-      JCR_TOKEN=secret jcr capture captures/table --camera 0 --listen 0.0.0.0:7464
+      JCR_TOKEN=secret jcr capture captures/table --camera 0 --listen 192.168.0.5:7464
     """
 
     out: Annotated[Path, tyro.conf.Positional]
@@ -52,23 +53,23 @@ class Arguments:
     camera: Annotated[str, tyro.conf.arg(metavar="DEVICE")] = "0"
     """V4L2 device number, realsense[:SERIAL], URL of a stream (rtsp://…), or a recording (video file, .bag)."""
     optics: CameraOptions = field(default_factory=CameraOptions)
-    poses: Annotated[str, tyro.conf.arg(metavar="SOURCE")] = "tcp"
+    poses: Annotated[str, tyro.conf.arg(metavar="SOURCE")] = "http"
     """Where gripper poses come from: ur:HOST[:PORT] (Universal Robots), franka:HOST, xarm:HOST, typed (by hand),
-    or tcp (a program sends them, jcr docs capture)."""
+    or http (a program sends them, jcr docs capture)."""
     pose_convention: ConventionName = "auto"
     """Notation of typed poses and of the printed next pose; auto: the arm's own."""
     pose_units: UnitsName = "auto"
     """Units of typed and printed poses; auto: those of the convention."""
     robot: Annotated[RobotName | None, tyro.conf.arg(metavar=CHOICES)] = None
     """The arm: the next pose is then also printed as joint angles, within the arm's limits."""
-    listen: Annotated[str, tyro.conf.arg(metavar="HOST:PORT")] = "127.0.0.1:7464"
-    """With tcp: address and port to listen on; any but a loopback address needs a token."""
-    token: str | None = None
-    """With tcp: the token that the client must send first; better set as JCR_TOKEN, which other users cannot see."""
-    timeout: Annotated[float, tyro.conf.arg(metavar="S")] = 600.0
-    """With tcp: stop after this many seconds without a pose."""
     page_port: Annotated[int, tyro.conf.arg(metavar="PORT")] = 0
-    """Port of the live page, on this machine alone; 0: any free one."""
+    """Port of the live page and of samples on this machine alone; 0: any free one."""
+    listen: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
+    """Serve other machines too, at this address and under this host name only; needs a token."""
+    token: str | None = None
+    """Key of the session instead of a random one; better set as JCR_TOKEN, which other users cannot see."""
+    timeout: Annotated[float, tyro.conf.arg(metavar="S")] = 600.0
+    """With --poses http: stop after this many seconds without a pose."""
     intrinsics_from: Path | None = None
     """JSON file with the camera's "intrinsics" (a capture.json or calibration.json); unset: those stored in the camera
     (RealSense), otherwise estimated."""
@@ -81,13 +82,14 @@ def main(arguments: Arguments) -> int:
     from jcr.live.collect import LiveCapture
     from jcr.live.devices import opened
     from jcr.live.folder import LiveFolder
-    from jcr.live.page_server import PageServer
+    from jcr.live.server import Server
     from jcr.run_folder import locked
 
     options = arguments.collect
     if options.until_accurate and options.require is None:
         raise InputError("--until-accurate: needs --require MM DEG, the accuracy that is meant")
     _require_source(arguments.poses)
+    listen = _listen(arguments)
     answers: list[Answer] = []
 
     def tell(answer: "Answer", lines: list[str]) -> None:
@@ -101,14 +103,14 @@ def main(arguments: Arguments) -> int:
         gripper = None if states is None else lambda: next(states())
         capture = LiveCapture(calibration, camera, options, tell, _words(arguments, live), gripper)
         try:
-            with PageServer(capture, arguments.page_port) as page:
-                _print(f"{len(live.names)} images in {arguments.out}; open {page.address} in a browser")
-                capture.run(_asks(arguments, states, _lines(arguments, capture)))
+            with Server(capture, listen) as server:
+                _print(f"{len(live.names)} images in {arguments.out}; open {server.address} in a browser")
+                capture.run(_asks(arguments, states, _lines(arguments, capture), server))
                 result = capture.finish()
         finally:
             calibration.close()
-    is_proven = calibration.progress.is_accurate
-    return _report(arguments, live, answers, result, is_proven)
+    requirement_met = calibration.progress.requirement_met
+    return _report(arguments, live, answers, result, requirement_met)
 
 
 def _calibration(live: "LiveFolder", options: CollectOptions) -> "LiveCalibration":
@@ -123,7 +125,7 @@ def _report(
     live: "LiveFolder",
     answers: "list[Answer]",
     result: "RunResult | None",
-    is_proven: bool,
+    requirement_met: bool,
 ) -> int:
     """Print what was taken and how exact its calibration is; 3 where that is not what `--until-accurate` waits for."""
     from jcr.records.words import reached_in_words, sentence
@@ -141,7 +143,7 @@ def _report(
     facts["verdict"] = None if result is None else result.verdict
     arguments.output.result(text, facts)
     is_accurate = result is not None and result.converged and required is not None and required.met
-    return 3 if arguments.collect.until_accurate and not (is_accurate and is_proven) else 0
+    return 3 if arguments.collect.until_accurate and not (is_accurate and requirement_met) else 0
 
 
 def _lines(arguments: Arguments, capture: "LiveCapture") -> "Iterator[str]":
@@ -164,8 +166,8 @@ def _print(text: str) -> None:
 def _require_source(poses: str) -> None:
     """Raise InputError where `--poses` is no source, before a camera is opened."""
     kind, _, address = poses.partition(":")
-    if poses not in ("typed", "tcp") and not (kind in _SPOKEN and address):
-        raise InputError(f"--poses {poses}: give ur:HOST, franka:HOST, xarm:HOST, typed or tcp")
+    if poses not in ("typed", "http") and not (kind in _SPOKEN and address):
+        raise InputError(f"--poses {poses}: give ur:HOST, franka:HOST, xarm:HOST, typed or http")
 
 
 def _states(arguments: Arguments) -> "States | None":
@@ -182,23 +184,31 @@ def _states(arguments: Arguments) -> "States | None":
     return lambda: module.states(address)
 
 
-def _asks(arguments: Arguments, states: "States | None", lines: "Iterator[str]") -> "Iterator[Ask]":
-    from jcr.live.line_server import Listen, bound, served_poses
+def _asks(
+    arguments: Arguments, states: "States | None", lines: "Iterator[str]", server: "Server"
+) -> "Iterator[Ask]":
+    """Yield the requests for images of the source that `--poses` names."""
     from jcr.live.rest import asks_at_rest
     from jcr.live.typed import typed_poses
 
     if states is not None:
         _print(f"move the arm; an image is taken whenever it rests ({arguments.poses.partition(':')[2]})")
-        yield from asks_at_rest(states)
-    elif arguments.poses == "typed":
-        yield from typed_poses(lines, _print, arguments.pose_convention, arguments.pose_units)
-    else:
-        host, port = _address(arguments.listen, 7464, "--listen ")
-        token = arguments.token or os.environ.get("JCR_TOKEN")
-        listen = Listen(host, port, token, arguments.timeout)
-        with bound(listen) as server:
-            _print("waiting for poses on {}:{}".format(*server.getsockname()[:2]))
-            yield from served_poses(server, listen)
+        return asks_at_rest(states)
+    if arguments.poses == "typed":
+        return typed_poses(lines, _print, arguments.pose_convention, arguments.pose_units)
+    _print(f"waiting for POST http://{server.hosts[0]}/sample with the key {server.key}")
+    return server.sampled_poses(arguments.timeout)
+
+
+def _listen(arguments: Arguments) -> "Listen":
+    """Return the address of the server; raise InputError where it is open to others without a token."""
+    from jcr.live.server import LOOPBACK, Listen, checked_listen
+
+    token = arguments.token or os.environ.get("JCR_TOKEN") or None
+    if arguments.listen is None:
+        return checked_listen(Listen(LOOPBACK, arguments.page_port, token, "--page-port"))
+    host, port = _address(arguments.listen, 7464, "--listen ")
+    return checked_listen(Listen(host, port, token, "--listen"))
 
 
 _SPOKEN: dict[str, ConventionName] = {"ur": "ur", "franka": "franka", "xarm": "xarm"}

@@ -25,8 +25,7 @@ from jcr.estimation.arms import arm_named
 from jcr.files import read_bytes, write_text
 from jcr.geometry import apply, largest_motion
 from jcr.least_squares import one_blas_thread
-from jcr.live.calibration_left_out import left_out
-from jcr.live.calibration_progress import LeftOut, Progress, Reached
+from jcr.live.calibration_progress import Progress, Reached
 from jcr.live.folder import LiveFolder
 from jcr.live.look import STILL, grid
 from jcr.live.next_pose import Reach, Tried, before_calibration, proposed
@@ -285,11 +284,7 @@ class LiveCalibration:
         hand_eye = advised(
             case.hand_eye, case.base_from_gripper, self._options, robot, assumptions, case.scene_in_base
         )
-        proof = None
-        required = hand_eye.requirement
-        if hand_eye.converged and required is not None and required.asked and required.met:
-            proof = left_out(capture, made, hand_eye.inliers, robot, self._options)
-        findings = [*of_images, *_contradicting(case, hand_eye), *hand_eye.findings, *_disagreeing(proof)]
+        findings = [*of_images, *_contradicting(case, hand_eye), *hand_eye.findings]
         self._remember(len(names), hand_eye)
         self._next_pose = lambda: proposed(
             case, hand_eye, robot, assumptions, self._reach, self._tried(capture, rows)
@@ -299,7 +294,6 @@ class LiveCalibration:
             hand_eye=hand_eye,
             findings=strongest_first(findings),
             history=self._history,
-            left_out=proof,
             points_in_base=_points(case, hand_eye),
             **self._next_pose(),
         )
@@ -383,25 +377,6 @@ def _contradicting(case: Case, hand_eye: HandEye) -> list[Finding]:
         )
         for row in np.flatnonzero(~images.inliers)
         if images.translation_residual_m[row] > SAME[0] or images.rotation_residual_rad[row] > SAME[1]
-    ]
-
-
-def _disagreeing(proof: LeftOut | None) -> list[Finding]:
-    if proof is None or proof.agree:
-        return []
-    return [
-        Finding(
-            kind=Kind.LEFT_OUT_DISAGREE,
-            severity="warns",
-            mend="images",
-            value=1e-3 * proof.translation_mm,
-            details={
-                "of": float(proof.images),
-                "rotation": float(np.radians(proof.rotation_deg)),
-                "expected_mm": proof.expected_mm,
-                "expected_deg": proof.expected_deg,
-            },
-        )
     ]
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.records import Finding, HandEye, NextPose
+from jcr.records import Finding, HandEye, LeaveOneOut, NextPose
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,19 +19,8 @@ class Reached:
     accepted: bool
 
 
-@dataclass(frozen=True, kw_only=True)
-class LeftOut:
-    """Points that images see which take no part, against where calibrations without these images place them."""
-
-    images: int
-    translation_mm: float
-    """Distance between the two, root mean square; the error of the left-out gripper pose is in it."""
-    rotation_deg: float
-    expected_mm: float
-    """The same as the calibrations claim it, for themselves and for the robot's poses."""
-    expected_deg: float
-    agree: bool
-    """Whether the distances are what is expected, within chance."""
+CONFIRMING_IMAGES = 8
+"""Least number of used images with which the leave-one-out error can confirm an accuracy."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,18 +49,28 @@ class Progress:
     """The image whose pose is nearest to it."""
     points_in_base: Float[ndarray, "p 3"] | None = None
     """Points of the scene that are seen so far (m); None without a calibration."""
-    left_out: LeftOut | None = None
-    """Made when the calibration claims what is required; None before."""
 
     @property
     def now(self) -> Reached | None:
-        """How exact the calibration is; None where there is none with these images."""
+        """Accuracy of the calibration; None where there is none with these images."""
         return self.history[-1] if self.hand_eye is not None and self.history else None
 
     @property
-    def is_accurate(self) -> bool:
-        """Whether the calibration is accepted, claims what is required, and images that take no part agree."""
+    def leave_one_out(self) -> LeaveOneOut | None:
+        """Mean error of each image's gripper pose predicted by the others; None where too few images are used."""
         found = self.hand_eye
-        if found is None or not found.converged or found.requirement is None or self.left_out is None:
+        if found is None or found.inliers.sum() < CONFIRMING_IMAGES:
+            return None
+        return found.leave_one_out
+
+    @property
+    def requirement_met(self) -> bool:
+        """Whether the calibration is accepted, estimated as exact as required, and its leave-one-out error agrees."""
+        found, error = self.hand_eye, self.leave_one_out
+        if found is None or not found.converged or found.requirement is None or error is None:
             return False
-        return found.requirement.met and self.left_out.agree
+        required = found.requirement
+        is_within = (
+            error.translation_mm <= required.translation_mm and error.rotation_deg <= required.rotation_deg
+        )
+        return required.met and is_within

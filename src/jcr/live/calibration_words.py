@@ -25,11 +25,9 @@ def progress_lines(state: Progress, require: tuple[float, float] | None, words: 
         course = " → ".join(significant(one.translation_mm) for one in (*earlier, state.now))
         angles = " → ".join(significant(one.rotation_deg) for one in (*earlier, state.now))
         lines.append(f"  image by image: {course} mm, {angles}°")
-    if (proof := state.left_out) is not None:
-        verdict = "as expected" if proof.agree else "more than expected"
+    if (error := state.leave_one_out) is not None:
         lines.append(
-            f"  {proof.images} images that take no part are off by {significant(proof.translation_mm)} mm and "
-            f"{significant(proof.rotation_deg)}° (rms), {verdict}"
+            f"  leave-one-out error {significant(error.translation_mm)} mm and {significant(error.rotation_deg)}°"
         )
     for one in faults(state):
         number = number_of(one, state.images)
@@ -94,7 +92,7 @@ def _pair(reached: Reached) -> str:
 
 def progress_answer(state: Progress) -> Answer:
     """The same for a program."""
-    pose, now, proof = state.next_pose, state.now, state.left_out
+    pose, now, error = state.next_pose, state.now, state.leave_one_out
     return {
         "images": list(state.images),
         "registered": list(state.registered),
@@ -112,8 +110,8 @@ def progress_answer(state: Progress) -> Answer:
             }
             for one in state.findings
         ],
-        "left_out": None if proof is None else vars(proof),
-        "accurate": state.is_accurate,
+        "leave_one_out": None if error is None else [error.translation_mm, error.rotation_deg],
+        "requirement_met": state.requirement_met,
         "next_base_from_gripper": None if pose is None else pose.base_from_gripper.tolist(),
         "next_joints": None if state.next_joints is None else state.next_joints.tolist(),
         "next_expected": None if pose is None else [pose.within_95_mm, pose.rotation_95_deg],

@@ -96,7 +96,7 @@ class CalibrationWorker:
             progress = self._calibration.update()
             self._calibrated = progress.images
             self._heard(progress)
-            if self._until_accurate and progress.is_accurate:
+            if self._until_accurate and progress.requirement_met:
                 self._heard(self._calibration.finish())
         while not self._refused.empty():
             self._heard(self._calibration.propose_elsewhere(self._refused.get()))

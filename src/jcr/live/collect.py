@@ -314,7 +314,7 @@ class LiveCapture:
         lines = progress_lines(state, self.options.require, self.words)
         self._tell({"calibration": progress_answer(state)}, lines)
         # Whether an accurate calibration ends the capture is known when it is finished.
-        self._answer_waiting(with_kept=not (self.options.until_accurate and state.is_accurate))
+        self._answer_waiting(with_kept=not (self.options.until_accurate and state.requirement_met))
 
     def _end_if_accurate(self, result: "RunResult") -> None:
         required = result.hand_eye.requirement

@@ -162,15 +162,18 @@ def _verdict(shown: Shown, required: tuple[float, float]) -> tuple[str, str, lis
 def _accuracy(progress: Progress, required: tuple[float, float]) -> tuple[str, str, list[str]]:
     """Of a calibration against which nothing is found."""
     assert progress.now is not None
-    if progress.is_accurate and progress.left_out is not None:
-        proof = f"{progress.left_out.images} images that take no part confirm it."
-        return "good", "As accurate as required", [f"{proof} Finish, or go on."]
+    if progress.requirement_met:
+        return (
+            "good",
+            "Requirement met, press Finish",
+            ["The leave-one-out error confirms it. More images are possible."],
+        )
     mm, deg = progress.now.translation_mm, progress.now.rotation_deg
     if mm > required[0] or deg > required[1]:
         return "", "Not accurate enough yet: go on to the next pose", []
-    if progress.left_out is None:
-        return "", "Accurate by its own claim: more images are needed to confirm it", []
-    return "fair", "Accurate by its own claim, which the images do not confirm", []
+    if progress.leave_one_out is None:
+        return "", "Accurate by its own estimate: more images are needed to confirm it", []
+    return "fair", "Accurate by its own estimate, which the leave-one-out error exceeds", []
 
 
 def _capitalised(words: str) -> str:
@@ -189,10 +192,9 @@ def _tiles(shown: Shown, required: tuple[float, float]) -> list[Tile]:
     ]
     count = f"{len(progress.registered)} of {len(shown.images)}"
     tiles.append(("Images registered", count, "", False))
-    if (proof := progress.left_out) is not None:
-        off = f"{significant(proof.translation_mm)} mm · {significant(proof.rotation_deg)}°"
-        expected = f"expected {significant(proof.expected_mm)} mm · {significant(proof.expected_deg)}°"
-        tiles.append((f"{proof.images} images left out, rms", off, expected, False))
+    if (error := progress.leave_one_out) is not None:
+        off = f"{significant(error.translation_mm)} mm · {significant(error.rotation_deg)}°"
+        tiles.append(("Leave-one-out error", off, "", False))
     return tiles
 
 

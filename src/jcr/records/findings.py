@@ -85,7 +85,6 @@ class Kind(StrEnum):
     FRAME_REPEATED = "image repeats another"
     SIZE_DIFFERS = "image size differs"
     CLOCK_JUMPS = "clock jumps back"
-    LEFT_OUT_DISAGREE = "left-out images contradict the accuracy"
 
 
 @dataclass(frozen=True, kw_only=True)

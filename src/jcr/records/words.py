@@ -641,10 +641,6 @@ _TEXT: dict[Kind, Words] = {
     ),
     Kind.SIZE_DIFFERS: "the image has {size} pixels, the others {before}: not kept",
     Kind.CLOCK_JUMPS: "the time of {images[0]} is {value:.3g} s before that of the image before it",
-    Kind.LEFT_OUT_DISAGREE: (
-        "{of:.0f} images that take no part show points {mm:.1f} mm and {deg:.2g}° (rms) from where the others place "
-        "them, where {expected_mm:.1f} mm and {expected_deg:.2g}° are expected"
-    ),
 }
 _REMEDY: dict[Kind, Words] = {
     Kind.UNOBSERVABLE: _to_observe,
@@ -705,6 +701,5 @@ _REMEDY: dict[Kind, Words] = {
     Kind.FRAME_REPEATED: "check that the camera's stream is live",
     Kind.SIZE_DIFFERS: "set the camera's old resolution, or name a new folder",
     Kind.CLOCK_JUMPS: "check that images and poses are stamped by one clock",
-    Kind.LEFT_OUT_DISAGREE: "add images at other poses until both agree",
 }
 """The remedy of each kind that has one."""
