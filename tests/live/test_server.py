@@ -207,7 +207,8 @@ def test_an_interrupted_command_goes_on_and_the_example_client_talks_to_it(tmp_p
     connection = http.client.HTTPConnection(address.removeprefix("http://"), timeout=60)
     sample = json.dumps({"base_from_gripper": poses(tabletop)[0].tolist()})
     connection.request("POST", "/sample", sample, {"Authorization": "Bearer sesame"})
-    assert json.loads(connection.getresponse().read())["image"] == "images/000.png"
+    answer = json.loads(connection.getresponse().read())
+    assert answer["accepted"] and answer["image"] == "images/000.png", answer
     second = [sys.executable, "-m", "jcr", "capture", str(out), "--camera", str(tmp_path / "a.avi")]
     refused = subprocess.run(second, capture_output=True, text=True, timeout=60)
     assert refused.returncode == 2 and "another jcr is writing there" in refused.stderr.splitlines()[-1]

@@ -196,8 +196,9 @@ def _asks(
         return asks_at_rest(states)
     if arguments.poses == "typed":
         return typed_poses(lines, _print, arguments.pose_convention, arguments.pose_units)
+    samples = server.sampled_poses(arguments.timeout)
     _print(f"waiting for POST http://{server.hosts[0]}/sample with the key {server.key}")
-    return server.sampled_poses(arguments.timeout)
+    return samples
 
 
 def _listen(arguments: Arguments) -> "Listen":

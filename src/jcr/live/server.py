@@ -114,8 +114,12 @@ class Server:
         return tuple(f"{name}:{self.port}" for name in names)
 
     def sampled_poses(self, timeout_s: float) -> Iterator[Ask]:
-        """Yield a request per sample until a client is done; raise InputError after `timeout_s` without one."""
+        """Return a request per sample until a client is done; raise InputError after `timeout_s` without one."""
         self.takes_samples = True
+        return self._sampled_poses(timeout_s)
+
+    def _sampled_poses(self, timeout_s: float) -> Iterator[Ask]:
+        """Yield the samples of `sampled_poses`."""
         try:
             while (ask := self.samples.get(timeout=timeout_s)) is not None:
                 yield ask
