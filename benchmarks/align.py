@@ -41,8 +41,7 @@ class Draws:
     hand_eye: int
 
 
-FEW, MANY = Draws(1, 1, 4), Draws(3, 2, 10)
-"""MANY with --long."""
+DRAWS = Draws(1, 1, 4)
 FEW_STEPS = 3
 """Of adam at the large size, whose 300 take a quarter of an hour."""
 ERRORS = {
@@ -71,11 +70,10 @@ class Score:
     seconds: float
 
 
-def run(long: bool = False) -> str:
+def run() -> str:
     """Markdown tables: time and memory, accuracy over images, kinds of error, hand-eye from few images."""
-    draws = MANY if long else FEW
     return (
-        "\n\n".join([_cost(), _images(draws.images), _kinds(draws.kinds), _hand_eye(draws.hand_eye)]) + "\n"
+        "\n\n".join([_cost(), _images(DRAWS.images), _kinds(DRAWS.kinds), _hand_eye(DRAWS.hand_eye)]) + "\n"
     )
 
 

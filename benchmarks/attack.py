@@ -22,8 +22,7 @@ from jcr.records import Capture, HandEye, Kind, Reconstruction
 from simulation.faults import INTRINSICS, Faults, FaultyCapture, faulty_capture
 
 DRAWS, FEW, CLEAN = 7, 2, 70
-LONG_TIMES = 3
-"""Of what is random by itself, of what only the noise makes random, and of nothing wrong; with --long times this."""
+"""Of what is random by itself, of what only the noise makes random, and of nothing wrong."""
 IMAGES = 12
 LOOSE = (3.0, 3.0)
 """m, rad: gripper poses by which structure from motion is hardly held."""
@@ -157,11 +156,10 @@ def outcome(found: FaultyCapture, hand_eye: HandEye) -> Outcome:
     return Outcome(hand_eye.converged, said, *mm_deg(step), float(np.abs(step / std).max()))
 
 
-def run(long: bool = False) -> str:
+def run() -> str:
     """Markdown: the claim, the table of faults, and false alarms."""
-    times = LONG_TIMES if long else 1
-    rows = {case: [_one(case, seed) for seed in range(times * case.draws)] for case in CASES}
-    clean = [_clean(seed) for seed in range(times * CLEAN)]
+    rows = {case: [_one(case, seed) for seed in range(case.draws)] for case in CASES}
+    clean = [_clean(seed) for seed in range(CLEAN)]
     return page(rows, clean)
 
 

@@ -30,7 +30,7 @@ from jcr.results import RunOptions, RunResult
 from simulation.boards import Sheet, with_sheet
 from simulation.faults import Faults, FaultyCapture, faulty_capture
 
-DRAWS, LONG_DRAWS = 2, 40
+DRAWS = 2
 POSE_SCALES = (1.0, 1.01, 1.02, 1.05)
 BENDS_M = (0.0, 2e-3)
 IMAGES = (8, 15)
@@ -70,7 +70,7 @@ class Row:
     seconds: float | None = None
 
 
-def run(captures: Path, boards: Sequence[str] = (), runs: Path | None = None, long: bool = False) -> str:
+def run(captures: Path, boards: Sequence[str] = (), runs: Path | None = None) -> str:
     """Markdown: the captures below `captures` that `boards` names as CAPTURE=BOARD, and the simulated table.
 
     Simulated draws are kept in the folder `runs` as they are made, and those that are there are used.
@@ -81,9 +81,8 @@ def run(captures: Path, boards: Sequence[str] = (), runs: Path | None = None, lo
     if unknown := named.keys() - folders.keys():
         raise InputError(f"--boards {', '.join(sorted(unknown))}: no such capture in {captures}")
     rows = [row for name, board in named.items() for row in _rows(read_capture(folders[name]), board)]
-    draws = LONG_DRAWS if long else DRAWS
-    table = _table(draws, None if runs is None else runs / "draws.jsonl")
-    return "\n".join([_claim(table), "", *_real_table(rows), "", *_simulated_table(table, draws), ""])
+    table = _table(DRAWS, None if runs is None else runs / "draws.jsonl")
+    return "\n".join([_claim(table), "", *_real_table(rows), "", *_simulated_table(table, DRAWS), ""])
 
 
 # Real captures.

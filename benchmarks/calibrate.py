@@ -28,8 +28,7 @@ VISION = (2e-4, np.radians(0.02))
 """m, rad per axis of the camera poses, as structure from motion leaves them."""
 SCALE = 2.0
 """Inside the only range that the paper's grid search covers."""
-TRIALS, MANY_TRIALS = 4, 15
-"""With --long."""
+TRIALS = 4
 MANY = 15
 """Images among which some have a wrong pose."""
 WRONG = (0, 1, 2, 3, 4, 5)
@@ -42,9 +41,9 @@ Spoilt = dict[tuple[str, int], Float[ndarray, "t 3"]]
 """By method and number of wrong images."""
 
 
-def run(out: Path | None = None, long: bool = False) -> str:
+def run(out: Path | None = None) -> str:
     """Markdown tables: accuracy over noise and image count, with outliers, and time; a figure goes to `out`."""
-    trials, image = (MANY_TRIALS, "calibrate_long.png") if long else (TRIALS, "calibrate.png")
+    trials, image = TRIALS, "calibrate.png"
     distances = {
         (name, noise, count): _all_errors(solver, noise, count, 0, trials)
         for noise in NOISES

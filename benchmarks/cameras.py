@@ -26,8 +26,8 @@ from jcr.records import Capture, CellCamera
 from simulation.arm_errors import PresetName
 from simulation.cell import BOX, CellProblem, Kind, cell_problem
 
-DRAWS, MANY_DRAWS = 10, 40
-"""Of each kind of cell; with --long."""
+DRAWS = 10
+"""Of each kind of cell."""
 COUNT = 10
 """Poses of each arm."""
 PRESET_NAMES: tuple[PresetName, ...] = ("white", "typical")
@@ -81,18 +81,17 @@ class Draw:
         return float((np.abs(self.error) / np.sqrt(np.diag(self.covariance))).max())
 
 
-def run(captures: Path, long: bool = False) -> str:
+def run(captures: Path) -> str:
     """Markdown: simulated draws of each kind, and withheld images of every capture below `captures`.
 
     Raises InputError where there is no capture.
     """
     folders = folders_with(captures, "capture.json")
-    draws = MANY_DRAWS if long else DRAWS
     drawn: dict[tuple[Kind, PresetName], dict[str, list[Draw]]] = {
-        (kind, preset): _drawn(kind, preset, draws) for kind in get_args(Kind) for preset in PRESET_NAMES
+        (kind, preset): _drawn(kind, preset) for kind in get_args(Kind) for preset in PRESET_NAMES
     }
     real = [line for folder in folders for line in _withheld(folder)]
-    return _page(drawn, real, draws)
+    return _page(drawn, real, DRAWS)
 
 
 def answered(problem: CellProblem, seed: int) -> Adjusted:
@@ -115,9 +114,9 @@ def answered(problem: CellProblem, seed: int) -> Adjusted:
     return adjust(scene, problem.observations, freedom, problem.arms)
 
 
-def _drawn(kind: Kind, preset: PresetName, draws: int) -> dict[str, list[Draw]]:
+def _drawn(kind: Kind, preset: PresetName) -> dict[str, list[Draw]]:
     out: dict[str, list[Draw]] = {}
-    for seed in range(draws):
+    for seed in range(DRAWS):
         problem = cell_problem(kind, preset, COUNT, seed)
         answer = answered(problem, seed)
         for name, of in wanted(problem).items():

@@ -51,11 +51,11 @@ class Shown:
     """0 plain, 1 weak, 2 textured."""
 
 
-def run(long: bool = False) -> str:
+def run() -> str:
     """Markdown tables."""
     lines, claims = [], []
     scenes = list(SCENES.items())
-    for name, (backend, options) in scenes if long else scenes[:-1]:
+    for name, (backend, options) in scenes:
         with tempfile.TemporaryDirectory() as folder:
             made = simulate(Path(folder) / "capture", options)
             capture = read_capture(made)

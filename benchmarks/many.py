@@ -17,16 +17,16 @@ from jcr.capture.read import read_capture
 from jcr.reconstruct.colmap import reconstruct_colmap
 from simulation.capture import SimulateOptions, simulate
 
-SIZES, LONG_SIZES = (8, 16, 32), (8, 16, 32, 50, 64, 128, 200)
+SIZES = (8, 16, 32)
 
 
-def run(long: bool = False) -> str:
+def run() -> str:
     """Markdown: a process for every number of images, SIFT, the robot's gate on, without dense depth."""
-    found, sizes = [], LONG_SIZES if long else SIZES
+    found = []
     with tempfile.TemporaryDirectory() as folder:
         capture = Path(folder) / "capture"
-        simulate(capture, SimulateOptions(images=max(sizes), robot_noise=(0.2, 0.05), truth="scene"))
-        for count in sizes:
+        simulate(capture, SimulateOptions(images=max(SIZES), robot_noise=(0.2, 0.05), truth="scene"))
+        for count in SIZES:
             command = [
                 sys.executable,
                 "-c",

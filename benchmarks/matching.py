@@ -25,17 +25,10 @@ from jcr.reconstruct.colmap import reconstruct_colmap
 from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.records import HandEye, Intrinsics
 
-WAYS: tuple[tuple[FeatureName, bool], ...] = (
-    ("sift", True),
-    ("sift", False),
-    ("xfeat", True),
-    ("xfeat", False),
-)
-"""Features, and whether the robot checks them; all with --long."""
-FEW: tuple[tuple[FeatureName, bool], ...] = (("xfeat", True),)
+WAYS: tuple[tuple[FeatureName, bool], ...] = (("xfeat", True),)
 """SIFT with the gate is what `real` measures."""
 EVERY = 4
-"""One capture in this many, without --long."""
+"""One capture in this many."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +50,8 @@ class Row:
     message: str = ""
 
 
-def run(captures: Path, boards: Sequence[str] = (), long: bool = False) -> str:
-    """Markdown: every capture below `captures` that has a reference.json, matched in a few ways, or all.
+def run(captures: Path, boards: Sequence[str] = ()) -> str:
+    """Markdown: every capture below `captures` that has a reference.json, matched in a few ways.
 
     `boards` are CAPTURE=BOARD for those whose reference is the marker back end's with that board, where it accepts it,
     for one that is stored may be of a wrong size. Raises InputError where no capture has a reference, and for a board
@@ -67,14 +60,14 @@ def run(captures: Path, boards: Sequence[str] = (), long: bool = False) -> str:
     folders = folders_with(captures, "reference.json")
     board_of = boards_of(boards, folders, captures)
     rows, remade = [], {}
-    for folder in folders if long else folders[::EVERY]:
+    for folder in folders[::EVERY]:
         reference = stored = reference_of(folder)
         if (board := board_of.get(folder.name)) is not None and (made := by_board(folder, board)) is not None:
             reference, remade[folder.name] = (
                 made,
                 f"`{board}`, {_apart_in_words(made, stored)} from that stored",
             )
-        rows += [row_of(folder, features, gate, reference) for features, gate in (WAYS if long else FEW)]
+        rows += [row_of(folder, features, gate, reference) for features, gate in WAYS]
     return page(rows, remade)
 
 

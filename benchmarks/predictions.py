@@ -19,8 +19,7 @@ from simulation.problem import HandEyeProblem, error
 from simulation.surface import truth_points
 from simulation.truth import read_truth
 
-SEEDS, MANY_SEEDS = 1, 3
-"""MANY_SEEDS with --long."""
+SEEDS = 1
 IMAGES = (3, 5, 10)
 NOISES = ((0.0, 0.0), (0.5, 0.1))
 """Of the robot, mm and degrees per axis."""
@@ -40,18 +39,17 @@ class EndToEnd:
     seconds: float
 
 
-def run(long: bool = False) -> str:
+def run() -> str:
     """Markdown: median errors and times over seeds, by robot pose noise and number of images."""
-    seeds = MANY_SEEDS if long else SEEDS
     about = (
         f"Simulated tabletop; true pointmaps at 128x96 with a network's errors (white 0.3 %, smooth distance 1 %, "
-        f"2 % outliers, a unit per pair); `--backend predictions`, median of {seeds} draws. The last but one "
+        f"2 % outliers, a unit per pair); `--backend predictions`, median of {SEEDS} draws. The last but one "
         "column is the true error over the reported one sigma: about 1 where the uncertainty is honest.\n"
     )
     claim, rows = "", []
     for noise in NOISES:
         for images in IMAGES:
-            runs = [end_to_end(images, seed, noise) for seed in range(seeds)]
+            runs = [end_to_end(images, seed, noise) for seed in range(SEEDS)]
             mm, deg, percent, surface, sigmas, seconds = np.median(
                 [list(vars(r).values()) for r in runs], axis=0
             )

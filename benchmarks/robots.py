@@ -23,8 +23,8 @@ from simulation.problem import error
 ARMS = ROBOT_NAMES
 PRESETS: tuple[PresetName, ...] = get_args(PresetName)
 COUNTS = (8, 12, 30)
-DRAWS, MANY_DRAWS = 1, 8
-"""Of each arm; with --long."""
+DRAWS = 1
+"""Of each arm."""
 
 Solve = Callable[[BentProblem], HandEye]
 
@@ -131,13 +131,12 @@ def _lengths(off: Float[ndarray, "k 6"]) -> tuple[float, float]:
     return 1e3 * float(metres), float(np.degrees(radians))
 
 
-def run(out: Path | None = None, long: bool = False) -> str:
+def run(out: Path | None = None) -> str:
     """Markdown: the claims, then tables; an image in `out` shows the shares beyond three sigma."""
-    draws, image = (MANY_DRAWS, "robots_long.png") if long else (DRAWS, "robots.png")
-    rows = measure(draws=draws)
+    rows = measure()
     if out is not None:
-        write_bytes(out / image, _figure(rows))
-    return page(rows, draws, image)
+        write_bytes(out / "robots.png", _figure(rows))
+    return page(rows, DRAWS)
 
 
 def _figure(rows: list[Row]) -> bytes:
@@ -160,7 +159,7 @@ def _figure(rows: list[Row]) -> bytes:
     return png(figure, 110)
 
 
-def page(rows: list[Row], draws: int, image: str = "robots.png") -> str:
+def page(rows: list[Row], draws: int) -> str:
     """Markdown of measured rows; `draws` is how many of each arm."""
     fixed = [row for row in rows if row.known in KNOWN and row.known != WHITE and row.accepted > 0]
     white = [row for row in rows if row.known == WHITE and row.preset != "white" and row.accepted > 0]
@@ -174,7 +173,7 @@ def page(rows: list[Row], draws: int, image: str = "robots.png") -> str:
         "0.05 mm and 0.005°. OpenCV's method is given the scale and has no σ. White alone: independent errors of both "
         "sizes estimated, as HALCON's published model has them.",
         "",
-        f"![share of results beyond three sigma]({image})",
+        "![share of results beyond three sigma](robots.png)",
         "",
         *table(
             "errors | images | known | median error | accepted | > 3 σ | > 5 σ | squared distance / 6 | σ per axis",

@@ -15,19 +15,17 @@ from jcr.calibration.known_transform import read_hand_eye
 from jcr.capture.read import read_capture
 from jcr.errors import InputError
 
-REPEATS, MANY_REPEATS = 1, 3
-"""With --long."""
+REPEATS = 1
 CAPTURE = Path("examples/tabletop")
 
 
-def run(long: bool = False) -> str:
+def run() -> str:
     """Markdown: error, median seconds of each stage and of the whole, and peak memory of the process."""
     if not (CAPTURE / "capture.json").is_file():
         raise InputError(f"bench run: {CAPTURE} is not here; run it in the root of the project")
     true = read_hand_eye(CAPTURE).gripper_from_camera
     whole, peak, stages, found = [], [], [], true
-    repeats = MANY_REPEATS if long else REPEATS
-    for _ in range(repeats):
+    for _ in range(REPEATS):
         with tempfile.TemporaryDirectory() as out:
             seconds, mib = _measured("run", str(CAPTURE), out, "--quiet")
             whole.append(seconds)
@@ -43,7 +41,7 @@ def run(long: bool = False) -> str:
         f"> Bundled capture, exact robot poses, {images} images: {off_mm:.2f} mm and {off_deg:.3f}° off the truth, "
         f"report and map included in {np.median(whole):.0f} s and {np.median(peak) / 1024:.1f} GiB.",
         "",
-        f"`jcr run {CAPTURE} OUT`, median of {repeats} runs",
+        f"`jcr run {CAPTURE} OUT`, median of {REPEATS} runs",
         "",
         *table("stage | s", [[name, f"{seconds:.1f}"] for name, seconds in medians.items()]),
         "",

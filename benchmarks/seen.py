@@ -23,8 +23,8 @@ from simulation.observations import INTRINSICS, observed
 
 PRESETS: tuple[PresetName, ...] = ("white", "typical")
 COUNTS = (8, 12, 30)
-DRAWS, MANY_DRAWS = 10, 40
-"""Of each row; with --long."""
+DRAWS = 10
+"""Of each row."""
 POINTS, PIXEL_STD = 400, 0.3
 DISTANCE_M = 0.45
 OFF = 0.005
@@ -108,9 +108,9 @@ def measure(
     return [_row(preset, count, known, draws) for preset in presets for count in counts for known in ways]
 
 
-def run(long: bool = False) -> str:
+def run() -> str:
     """Markdown: the claim, then the table."""
-    return page(measure(draws=MANY_DRAWS if long else DRAWS))
+    return page(measure())
 
 
 def page(rows: Sequence[Row]) -> str:

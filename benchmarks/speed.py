@@ -16,11 +16,8 @@ import numpy as np
 from jcr.errors import InputError
 
 CAPTURE = Path("examples/tabletop")
-REPEATS, MANY_REPEATS = 3, 5
-"""With --long."""
+REPEATS = 3
 IMAGES = (15, 36, 50, 100)
-MANY_IMAGES = (*IMAGES, 200)
-"""Of simulated observations that are calibrated; with --long."""
 ALONE, ALL_OF_IT, CALIBRATED, KEPT, STARTED = (
     "COLMAP alone",
     "`jcr run`",
@@ -41,27 +38,25 @@ class Spent:
     peak_mib: float
 
 
-def run(long: bool = False) -> str:
+def run() -> str:
     """Markdown: medians of a few rounds in which every job runs once, a process each."""
     if not (CAPTURE / "capture.json").is_file():
         raise InputError(f"bench speed: {CAPTURE} is not here; run it in the root of the project")
-    repeats = MANY_REPEATS if long else REPEATS
     spent: dict[str, list[Spent]] = {}
     stages: list[dict[str, float]] = []
-    for _ in range(repeats):
+    for _ in range(REPEATS):
         with tempfile.TemporaryDirectory() as place:
             for name, one in _jobs(Path(place)):
                 spent.setdefault(name, []).append(one)
             stages.append(json.loads((Path(place) / "stages.json").read_text()))
-    grown = [_calibration(count, repeats) for count in (MANY_IMAGES if long else IMAGES)]
-    return page(spent, stages, grown, repeats)
+    grown = [_calibration(count) for count in IMAGES]
+    return page(spent, stages, grown)
 
 
 def page(
     spent: Mapping[str, list[Spent]],
     stages: list[dict[str, float]],
     grown: list[tuple[int, int, float]],
-    repeats: int,
 ) -> str:
     """Markdown of what was measured."""
     of = {name: _median(each) for name, each in spent.items()}
@@ -71,7 +66,7 @@ def page(
         f"> `jcr run` on {CAPTURE} takes {of[ALL_OF_IT].processor_s:.1f} s of processor, {times[ALL_OF_IT]:.1f} times "
         f"COLMAP alone on the same images; `jcr calibrate` {times[CALIBRATED]:.1f} times.",
         "",
-        f"Medians of {repeats} rounds in which every job ran once, a process each. Processor seconds: of all threads, "
+        f"Medians of {REPEATS} rounds in which every job ran once, a process each. Processor seconds: of all threads, "
         "in the program and in the system. *COLMAP alone*: features, exhaustive matching and mapping, with its options.",
         "",
         "| job | processor, s | times COLMAP | wall, s | peak, MiB |",
@@ -172,14 +167,14 @@ def _timed(function: Callable, spent: dict[str, float], name: str) -> Callable:
     return timed
 
 
-def _calibration(images: int, repeats: int) -> tuple[int, int, float]:
+def _calibration(images: int) -> tuple[int, int, float]:
     """Images, observations, and the processor seconds of their calibration."""
     from benchmarks.attack import reconstructed
     from jcr.calibration.stage import calibrate
     from simulation.faults import faulty_capture
 
     seconds, count = [], 0
-    for seed in range(repeats):
+    for seed in range(REPEATS):
         made = reconstructed(faulty_capture(np.random.default_rng([seed, images]), images), False)
         count = len(made[1].tracks.image)
         begun = time.process_time()

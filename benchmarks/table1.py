@@ -28,8 +28,8 @@ from simulation.truth import Truth, read_truth
 SCENES: tuple[SceneName, ...] = ("light8", "light7", "dark")
 COUNTS = (10, 12, 15)
 FEW = (3, 4, 5, 6, 8)
-SEEDS, MANY_SEEDS = 1, 2
-"""Captures behind each line, and with --long; no two scenes share one, for the poses and the robot's errors follow from
+SEEDS = 1
+"""Captures behind each line; no two scenes share one, for the poses and the robot's errors follow from
 it, too."""
 WEBCAM = {"noise": 3.0, "blur": 0.7, "vignetting": 0.35, "jpeg_quality": 75, "robot_noise": (0.5, 0.1)}
 """Grey levels, pixels, share, percent; mm and degrees per axis."""
@@ -80,19 +80,18 @@ Row = tuple[SceneName, int, str]
 """Scene, number of images, method."""
 
 
-def run(long: bool = False) -> str:
+def run() -> str:
     """Markdown: the paper's table with the truth beside its residuals, then fewer images than it tried."""
     cells: dict[Row, list[Cell]] = {}
-    seeds = MANY_SEEDS if long else SEEDS
     for number, scene in enumerate(SCENES):
-        for k in range(seeds):
+        for k in range(SEEDS):
             for row, cell in _capture_cells(scene, len(SCENES) * k + number).items():
                 cells.setdefault(row, []).append(cell)
     degraded = ", ".join(f"{key} {value}" for key, value in WEBCAM.items())
     lines = [
         *_claims(cells),
         "",
-        f"Simulated scenes, {seeds} captures each (seeds 0 to {seeds * len(SCENES) - 1}, no two scenes share one; "
+        f"Simulated scenes, {SEEDS} captures each (seeds 0 to {SEEDS * len(SCENES) - 1}, no two scenes share one; "
         f"{degraded}; intrinsics given), medians; the same images for every method. Converged: within {RIGHT[0]:g} mm "
         f"and {RIGHT[1]:g}° of the truth. δ_t (m) and δ_R are the paper's residuals over consecutive images; they hold "
         "the robot pose noise, and are no smaller where the result is exact. σ: the largest error "

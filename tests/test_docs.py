@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 import yaml
-
 from benchmarks.freshness import OLD
+
 from jcr.cli import COMMANDS, dispatch
 from jcr.cli.usage import parsed
 from jcr.errors import InputError

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
 from benchmarks.freshness import (
     COMMIT,
     changed_since_measured,
@@ -19,6 +18,7 @@ from benchmarks.freshness import (
     is_marked_old,
     marked,
 )
+
 from benchmarks.peers import grid_search
 from benchmarks.suite import CLAIM, MARKS, Outcome, claims, run, with_claims, write_index
 from benchmarks.table import BENCHES, LONG, paths_of

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks import check_points
-from benchmarks.check_points import predicted
-from benchmarks.corners import Corners, WristCamera, measure, pixels_of
+from benchmarks.check_points import Corners, WristCamera, measure, pixels_of, predicted
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.records import Intrinsics
 from simulation.problem import TARGET_IN_BASE, HandEyeProblem, hand_eye_problem
