@@ -50,11 +50,11 @@ lint: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
+	$(BIN)/lint-imports
 
-# Warnings are errors, and so are links inside the site that lead nowhere.
+# Warnings are errors: links and anchors that lead nowhere, too.
 docs: .venv-docs/ready
 	OMP_NUM_THREADS=1 .venv-docs/bin/python -m sphinx -b html -W --keep-going -q docs docs/_site
-	.venv-docs/bin/python docs/links.py docs/_site
 
 .venv-docs/ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv-docs

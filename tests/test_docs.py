@@ -1,117 +1,97 @@
-"""What the documents name exists: files, links, imports."""
+"""Files, imports and commands that the documents name exist; links and anchors are Sphinx's (`make docs`)."""
 
 import ast
 import json
 import re
-import runpy
 import shlex
 import tomllib
-from html import unescape
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
 import pytest
+import tyro
 import yaml
-from benchmarks.freshness import OLD
 
+from benchmarks.__main__ import Arguments as BenchArguments
 from jcr.cli import COMMANDS, dispatch
 from jcr.cli.usage import parsed
 from jcr.errors import InputError
 from jcr.pages import page as page_named
 from jcr.pages import pages
 from places import ROOT
+from simulation.__main__ import Arguments as SimulationArguments
 
 SOURCE = ROOT / "src" / "jcr"
-ARCHITECTURE = ROOT / "docs" / "explanation" / "architecture.md"
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-MORE_PAGES = [
-    ROOT / "CHANGELOG.md",
-    ROOT / "CONTRIBUTING.md",
-    ROOT / "SECURITY.md",
-    ROOT / "examples" / "README.md",
+# Pages of results show the command of the day on which they were measured.
+MANUAL = [page for page in sorted((ROOT / "docs").rglob("*.md")) if page.parent.name != "results"]
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "examples/README.md")),
+    *MANUAL,
 ]
+MODULES = {"simulation": SimulationArguments, "benchmarks": BenchArguments}
 
 
-def without_code(page: Path) -> str:
-    return re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+def commands(page: Path) -> list[tuple[str, bool]]:
+    """Return the commands of jcr, `simulation` and `benchmarks` on a page, and whether each is complete.
+
+    Those in code blocks are complete; comments, redirections and further commands on the line are cut off, continued
+    lines are joined. Those in inline code may leave arguments out.
+    """
+    text = page.read_text().replace("\\\n", " ")
+    blocks = re.findall(r"^ *```(?:bash|text|console)?\n(.*?)^ *```", text, flags=re.DOTALL | re.MULTILINE)
+    lines = [line.strip() for block in blocks for line in block.splitlines()]
+    calls = [line for line in lines if re.match(r"jcr [a-z]|python -m (?:simulation|benchmarks)", line)]
+    inline = re.findall(r"`(jcr [a-z][^`\n]*|python -m (?:simulation|benchmarks) [^`\n]*)`", text)
+    complete = [(re.split(r"\s+#|\s+&&|\s+>", line)[0], True) for line in calls]
+    return complete + [(line, False) for line in inline]
 
 
-def without_old(page: Path) -> str:
-    """Without the files that a page of results says have changed, or gone."""
-    return "\n".join(line for line in page.read_text().splitlines() if not line.startswith(OLD))
+def understand(line: str, is_complete: bool) -> None:
+    """Raise InputError or SystemExit unless the command exists and takes its arguments, if it is complete."""
+    program, name, *rest = shlex.split(line)
+    if program == "jcr" and name not in COMMANDS:
+        raise InputError("no such command")
+    if is_complete and program == "jcr":
+        parsed(import_module(f"jcr.cli.{name.replace('-', '_')}").Arguments, f"jcr {name}", rest)
+    elif is_complete:
+        tyro.cli(MODULES[rest[0]], args=rest[1:])
 
 
-def anchors(page: Path) -> set[str]:
-    """The headings of a page as GitHub makes anchors of them."""
-    headings = re.findall(r"^#+ (.+)$", without_code(page), flags=re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
-
-
-def stages() -> set[str]:
-    """Packages as `name/` and modules as `name.py`, of the top of the source."""
-    packages = {f"{path.parent.name}/" for path in SOURCE.glob("*/__init__.py")}
-    modules = {path.name for path in SOURCE.glob("*.py") if not path.name.startswith("__")}
-    return packages | modules
-
-
-@pytest.mark.parametrize("page", [*PAGES, *MORE_PAGES], ids=lambda page: str(page.relative_to(ROOT)))
-def test_relative_links_resolve(page):
-    broken = []
-    for link in re.findall(r"\]\(([^)\s]+)\)", without_code(page)):
-        if re.match(r"[a-z]+:", link):
-            continue
-        path, _, anchor = link.partition("#")
-        target = (page.parent / path).resolve() if path else page
-        if not target.exists() or (anchor and anchor not in anchors(target)):
-            broken.append(link)
-    assert not broken
-
-
-@pytest.mark.parametrize("page", [*PAGES, *MORE_PAGES], ids=lambda page: str(page.relative_to(ROOT)))
-def test_named_files_of_the_project_exist(page):
-    named = re.findall(r"`(?:python )?((?:src|tests|benchmarks|examples|docs)/[\w/.-]+)", without_old(page))
-    assert not [path for path in named if not (ROOT / path).exists()]
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_imports_of_the_examples_on_a_page_exist(page):
-    """Read from the source, so that nothing heavy is imported."""
-    missing = []
-    for code in re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL):
-        for module, names in re.findall(r"^from (jcr[\w.]*) import (.+)$", code, flags=re.MULTILINE):
-            file = SOURCE.joinpath(*module.split(".")[1:]).with_suffix(".py")
-            defined = {
-                node.name
-                for node in (ast.parse(file.read_text()).body if file.is_file() else ())
-                if isinstance(node, ast.FunctionDef | ast.ClassDef)
-            }
-            missing += [f"{module}.{name}" for name in names.split(", ") if name not in defined]
-    assert not missing
-
-
-def commands(page: Path) -> list[str]:
-    """The lines of a page's code blocks that call jcr, without comments; continued lines are one."""
-    blocks = re.findall(
-        r"^ *```(?:bash|text)?\n(.*?)^ *```", page.read_text(), flags=re.DOTALL | re.MULTILINE
-    )
-    lines = [line.strip() for block in blocks for line in block.replace("\\\n", " ").splitlines()]
-    return [re.split(r"\s+#|\s+&&|\s+>", line)[0] for line in lines if re.match(r"jcr [a-z]", line)]
-
-
-@pytest.mark.parametrize("page", [*PAGES, *MORE_PAGES], ids=lambda page: str(page.relative_to(ROOT)))
-def test_commands_on_a_page_are_understood(page):
-    if page.parent.name == "results":
-        return  # what was typed when it was measured, mistakes included
-    for line in commands(page):
-        _, name, *rest = shlex.split(line)
-        assert name in COMMANDS, line
-        command = import_module(f"jcr.cli.{name.replace('-', '_')}")
+def test_commands_in_the_documents_exist_and_take_their_arguments():
+    found = {(page, *command) for page in PAGES for command in commands(page)}
+    wrong = []
+    for page, line, is_complete in sorted(found):
         try:
-            parsed(command.Arguments, f"jcr {name}", rest)
-        except InputError as error:
-            pytest.fail(f"{line}\n{error}")
+            understand(line, is_complete)
+        except (InputError, SystemExit, ValueError) as error:
+            wrong.append(f"{page.relative_to(ROOT)}: {line}: {error}")
+    assert len(found) > 100 and wrong == []
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_a_command_is_printed(name: str, capsys: pytest.CaptureFixture[str]):
+    assert dispatch([name, "--help"]) == 0
+    assert f"jcr {name}" in capsys.readouterr().out
+
+
+def test_files_of_the_project_that_the_documents_name_exist():
+    pattern = r"`(?:python )?((?:src|tests|simulation|benchmarks|examples|docs)/[\w/.-]+)"
+    named = {(page.name, path) for page in PAGES for path in re.findall(pattern, page.read_text())}
+    assert sorted(one for one in named if not (ROOT / one[1]).exists()) == []
+
+
+def test_imports_of_the_examples_in_the_documents_exist():
+    missing = []
+    for page in PAGES:
+        for code in re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL):
+            for module, names in re.findall(r"^from (jcr[\w.]*) import (.+)$", code, flags=re.MULTILINE):
+                there = vars(import_module(module))
+                missing += [
+                    f"{page.name}: {module}.{name}" for name in names.split(", ") if name not in there
+                ]
+    assert missing == []
 
 
 def test_pages_that_messages_name_exist():
@@ -167,10 +147,6 @@ def test_every_page_that_a_checkout_has_is_installed():
     assert set(pages().values()) <= shipped
 
 
-def test_the_readme_is_short_before_its_limits():
-    assert len((ROOT / "README.md").read_text().split("## Limits")[0].split()) <= 600
-
-
 def test_the_schema_of_captures_takes_ours_and_knows_every_key_that_is_read():
     jsonschema = pytest.importorskip("jsonschema")
     schema = json.loads((ROOT / "docs" / "reference" / "schemas" / "capture.schema.json").read_text())
@@ -191,33 +167,6 @@ def test_the_schema_of_captures_takes_ours_and_knows_every_key_that_is_read():
         *(part.get("properties", {}) for part in schema["$defs"].values())
     )
     assert len(read) > 10 and read <= known
-
-
-def test_architecture_names_what_there_is():
-    """A bare file name belongs to the package that its paragraph is about, or to the top of the source."""
-    missing, seen = [], set()
-    for paragraph in re.split(r"\n(?=- )|\n\n", ARCHITECTURE.read_text()):
-        about = re.match(r"- \*\*(.*?)\*\*", paragraph)
-        packages = re.findall(r"`([\w/]+/)`", about[1]) if about else []
-        places = [SOURCE, ROOT, *(SOURCE / package for package in packages)]
-        for name in re.findall(r"`([\w/]+(?:\.py|/))`", paragraph):
-            if not any((place / name).exists() for place in places):
-                missing.append(name)
-            seen.add(name)
-    assert not missing
-    assert not stages() - seen
-
-
-def test_image_shows_what_there_is():
-    drawn = (ROOT / "docs" / "explanation" / "packages.svg").read_text()
-    assert drawn == runpy.run_path(str(ROOT / "docs" / "explanation" / "packages.py"))["drawing"]()
-    names = re.findall(r'<text class="name"[^>]*>([^<]*)<', drawn)
-    shown = {
-        name if name.endswith(("/", ".py")) else f"{name}.py"
-        for text in names
-        for name in unescape(text).split(", ")
-    }
-    assert not stages() - shown
 
 
 def test_version_and_date_of_the_release_are_the_same_everywhere():
