@@ -1,8 +1,7 @@
 """Writes the pages of the reference that are read from the source: cli.md, api.md, formats.md and their schemas, and
 the table of backends.md.
 
-`docs/conf.py` calls it before the site is built; `python docs/generated.py` does the same. The pages are committed, for
-those who read them in the repository or by `jcr docs`; a test holds them to the source.
+`docs/conf.py` calls it before the site is built; `python docs/generated.py` does the same.
 """
 
 import ast
