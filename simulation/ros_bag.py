@@ -47,8 +47,7 @@ def write_bag(
 ) -> Path:
     """A bag in which the arm stops at every view of a capture and moves smoothly between them.
 
-    Depth images of the capture, those of the nearest view, are on /camera/aligned_depth_to_color/image_raw; further
-    cameras NAME, on tool0 or fixed in base_link, on /NAME/image_raw/compressed. Topics:
+    Depth images of the capture, those of the nearest view, are on /camera/aligned_depth_to_color/image_raw. Topics:
     /camera/image_raw or /camera/image_raw/compressed, /camera/camera_info, /tf (base_link to tool0) and
     /tf_static (world to base_link).
     """
@@ -120,11 +119,6 @@ def _messages(
 
     yield START_NS, "/tf_static", tf(START_NS, "world", "base_link", np.eye(4))
     yield START_NS, "/camera/camera_info", _camera_info(types, header(START_NS, "camera"), capture)
-    if capture.others:  # tf tells which is which
-        yield START_NS, "/tf_static", tf(START_NS, "tool0", "camera", np.eye(4))
-    for camera in capture.others:
-        parent = "tool0" if camera.mount == "gripper" else "base_link"
-        yield START_NS, "/tf_static", tf(START_NS, parent, camera.name, np.eye(4))
     images = [read_image(capture.folder / name) for name in capture.images]
     rng = np.random.default_rng(0)
     events = [(k / tf_hz, "tf") for k in range(round(seconds * tf_hz))]
@@ -136,7 +130,7 @@ def _messages(
             poses = disturbed(poses, (jitter, jitter / ARM), rng)
             yield at, "/tf", tf(at, "base_link", "tool0", poses[0])
             continue
-        yield from _other_images(types, header, capture, at, float(rows[0]))
+        yield from _depth_images(types, header, capture, at, float(rows[0]))
         image = _blurred(images[round(float(rows[0]))], float(speeds[0]), rng)
         if compressed:
             data = np.asarray(cv2.imencode(".jpg", image[:, :, ::-1])[1]).ravel()
@@ -148,22 +142,15 @@ def _messages(
             yield at, "/camera/image_raw", types["sensor_msgs/msg/Image"](header(at, "camera"), *fields)
 
 
-def _other_images(
+def _depth_images(
     types: dict[str, Any], header: Callable[[int, str], Any], capture: Capture, at: int, row: float
 ) -> Iterator[tuple[int, str, Any]]:
-    """Depth and the images of further cameras, a little later than the image at `row` of the capture."""
+    """Depth, a little later than the image at `row` of the capture."""
     if capture.depths is not None and (name := capture.depths[round(row)]) is not None:
         depth = (1000 * read_depth(capture.folder / name, capture.image_size)).round().astype("<u2")
         fields = (*depth.shape, "16UC1", 0, 2 * depth.shape[1], depth.view(np.uint8).ravel())
         message = types["sensor_msgs/msg/Image"](header(at + DEPTH_LATER_NS, "camera"), *fields)
         yield at, "/camera/aligned_depth_to_color/image_raw", message
-    for camera in capture.others:
-        k = 0 if camera.frame is None else int(np.abs(camera.frame - row).argmin())
-        data = np.frombuffer((capture.folder / camera.images[k]).read_bytes(), np.uint8)
-        message = types["sensor_msgs/msg/CompressedImage"](
-            header(at + DEPTH_LATER_NS, camera.name), "png", data
-        )
-        yield at, f"/{camera.name}/image_raw/compressed", message
 
 
 def _blurred(

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from jcr.capture.images import encode_png
 from jcr.capture.options import ReadOptions
-from jcr.capture.transforms_json import OPENGL_FROM_OPENCV
 from jcr.capture.urdf_chain import read_chain
 from jcr.estimation.kinematics import forward_kinematics
 from jcr.geometry import inverse
@@ -117,48 +116,6 @@ def write_tum(
     return folder
 
 
-def write_industrial(folder: Path, capture: Capture) -> Path:
-    copy_images(capture, folder)
-    write_camera_info(capture, folder)
-    data = []
-    rows = rows_as("quat-xyzw", capture.base_from_gripper).tolist()
-    for k, (name, row) in enumerate(zip(capture.images, rows, strict=True)):
-        pose = dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), row, strict=True))
-        (folder / f"pose_{k}.yaml").write_text(yaml.safe_dump(pose))
-        data.append({"image": name, "pose": f"pose_{k}.yaml"})
-    (folder / "cal_data.yaml").write_text(yaml.safe_dump({"data": data}))
-    return folder
-
-
-def write_transforms(folder: Path, capture: Capture, recon_from_camera: np.ndarray) -> Path:
-    copy_images(capture, folder)
-    intrinsics = capture.intrinsics
-    k1, k2, p1, p2, k3 = intrinsics.distortion
-    frames = [
-        {"file_path": f"./{name}", "transform_matrix": (pose @ OPENGL_FROM_OPENCV).tolist()}
-        for name, pose in zip(capture.images, recon_from_camera, strict=True)
-    ]
-    numbers = {
-        "fl_x": intrinsics.fx,
-        "fl_y": intrinsics.fy,
-        "cx": intrinsics.cx + HALF_PIXEL,
-        "cy": intrinsics.cy + HALF_PIXEL,
-    }
-    numbers |= {
-        "w": intrinsics.width,
-        "h": intrinsics.height,
-        "k1": k1,
-        "k2": k2,
-        "p1": p1,
-        "p2": p2,
-        "k3": k3,
-    }
-    content = {"camera_model": "OPENCV", **numbers, "aabb_scale": 4, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(content))
-    np.save(folder / "poses.npy", capture.base_from_gripper)
-    return folder
-
-
 def write_colmap(folder: Path, capture: Capture, recon_from_camera: np.ndarray) -> Path:
     """A model without points in sparse/0, its images in images/, and a table with their names."""
     import pycolmap
@@ -232,7 +189,6 @@ IMAGE_FORMATS: dict[str, tuple[Callable[[Path, Capture], Path], ReadOptions]] = 
         lambda folder, capture: write_tum(folder, capture, "# t, x, y, z, q_x, q_y, q_z, q_w"),
         ReadOptions(),
     ),
-    "industrial": (write_industrial, ReadOptions()),
 }
 
 
@@ -299,11 +255,10 @@ def write_lerobot(
     names: list[str],
     fps: int = 10,
     codec: str | None = "libsvtav1",
-    further: dict[str, list[np.ndarray]] | None = None,
 ) -> Path:
     """A data set of episodes (images, states), with one camera; v3.0 keeps them all in one table and video.
 
-    Without a codec the images are in the table, as PNG files; there may then be `further` cameras, for all frames.
+    Without a codec the images are in the table, as PNG files.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -318,7 +273,6 @@ def write_lerobot(
         key: {"dtype": "float32", "shape": [len(names)], "names": {"axes": names}},
         "timestamp": {"dtype": "float32", "shape": [1], "names": None},
     }
-    features |= {name: features[camera] for name in further or {}}
     info = {"codebase_version": version, "robot_type": "arm", "fps": fps, "features": features}
     info |= {"total_episodes": len(episodes), "chunks_size": 1000}
     v3 = version.startswith("v3")
@@ -343,10 +297,6 @@ def write_lerobot(
                 {"bytes": encode_png(image), "path": f"{index}_{k}.png"}
                 for index, _ in rows
                 for k, image in enumerate(episodes[index][0])
-            ]
-        for name, images in (further or {}).items():
-            columns[name] = [
-                {"bytes": encode_png(np.ascontiguousarray(image)), "path": "x.png"} for image in images
             ]
         return pa.table(columns)
 

@@ -19,8 +19,8 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_poses
 from jcr.capture.camera_info import read_camera_info
 from jcr.capture.formats import capture_json
+from jcr.capture.formats.lerobot import Info, read_episode
 from jcr.capture.images import read_image
-from jcr.capture.lerobot_files import Info, read_episode
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_source
 from jcr.cli.query import read_points
@@ -91,14 +91,10 @@ def targets(folder: Path) -> dict[str, Target]:
         ),
         ("poses.npy", lambda place: writers.write_npy(place, capture)),
         ("poses.txt", lambda place: writers.write_tum(place, capture)),
-        ("cal_data.yaml", lambda place: writers.write_industrial(place, capture)),
-        ("transforms.json", lambda place: writers.write_transforms(place, capture, cameras)),
     ):
         write(folder / name.replace(".", "-"))
         place = folder / name.replace(".", "-")
         found[name] = Target(place / name, whole(place))
-    place = folder / "cal_data-yaml"
-    found["pose.yaml"] = Target(place / "pose_0.yaml", whole(place))
     for name, write in (
         ("samples.yaml", writers.write_moveit),
         ("wrist.samples", writers.write_easy_handeye2),

@@ -183,13 +183,8 @@ def gone_on(folder: Path) -> object:
 
 
 def _of_others(folder: Path, capture: Capture, cameras: np.ndarray, in_file: Any, source: Any) -> None:
-    place = folder / "transforms"
-    writers.write_transforms(place, capture, cameras)
-    in_file("transforms.json", place / "transforms.json", source(place))
-    place = folder / "industrial"
-    writers.write_industrial(place, capture)
-    in_file("cal_data.yaml", place / "cal_data.yaml", source(place), as_yaml)
-    in_file("pose.yaml", place / "pose_0.yaml", source(place), as_yaml)
+    place = folder / "table"
+    writers.write_table(place, capture)
     in_file("camera_info.yaml", place / "camera_info.yaml", source(place), as_yaml)
     alone = folder / "camera_info"
     alone.mkdir()

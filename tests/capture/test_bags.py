@@ -20,7 +20,7 @@ from jcr.capture.pose_track import NEVER, pose_track
 from jcr.capture.ros_image import depth_of, image_of
 from jcr.files import write_bytes
 from jcr.geometry import rotation_exp, transform
-from jcr.records import Capture, CellCamera
+from jcr.records import Capture
 from simulation.problem import hand_eye_problem
 from simulation.ros_bag import nearest_view, write_bag
 
@@ -78,51 +78,6 @@ def test_depth_that_is_aligned_comes_with_the_frames(tmp_path: Path, capture: Ca
         depth = read_depth(got.folder / str(name), got.image_size)
         assert depth[0, -1] == pytest.approx((500 + k) / 1000) and (depth == 0).sum() == 10 * k * height
     assert jcr.read_capture(tmp_path / "frames").depths == got.depths
-
-
-@pytest.mark.slow
-def test_further_cameras_of_a_bag_are_named_by_tf_or_by_name(tmp_path: Path, capture: Capture):
-    """Four stops; a fixed camera's image, and one of a second camera on the gripper for each stop."""
-    for k, name in enumerate(capture.images[:9]):
-        small = cv2.resize(cv2.imread(str(capture.folder / name)), (80, 60))
-        cv2.imwrite(str(tmp_path / f"{k}.png"), small)
-        write_bytes(tmp_path / name, (capture.folder / name).read_bytes())
-    size = (80, 60)
-    top = CellCamera(name="top", mount="base", images=("8.png",), image_size=size)
-    second = CellCamera(
-        name="second",
-        mount="gripper",
-        images=tuple(f"{k}.png" for k in range(4)),
-        image_size=size,
-        frame=np.arange(4),
-    )
-    few = replace(
-        capture, folder=tmp_path, images=capture.images[:4], base_from_gripper=capture.base_from_gripper[:4]
-    )
-    bag = write_bag(tmp_path / "scan", replace(few, others=(top, second)), "mcap", 4.0, fps=5.0, tf_hz=50.0)
-    with pytest.raises(
-        jcr.InputError, match=r"choose one .*/second/\S+ \(moves with .*/top/\S+ \(stands still"
-    ):
-        jcr.read_capture(bag, FRAMES, into=tmp_path / "frames")
-    own, other, fixed = (f"/{name}/image_raw/compressed" for name in ("camera", "second", "top"))
-    named = replace(FRAMES, camera_topic=own, further_cameras=(other, f"{fixed}=base"))
-    got = jcr.read_capture(bag, named, into=tmp_path / "frames")
-    assert [(camera.name, camera.mount) for camera in got.others] == [("second", "gripper"), ("top", "base")]
-    assert got.others[0].frame is not None and got.others[0].frame.tolist() == list(range(len(got)))
-    _, _, view = nearest_view(got.base_from_gripper, few.base_from_gripper)
-    for image, k in zip(got.others[0].images, view, strict=True):
-        assert (got.folder / image).read_bytes() == (tmp_path / f"{k}.png").read_bytes()
-    # Of two topics tf tells which is the wrist's, and the fixed one comes with it.
-    bag = write_bag(tmp_path / "two", replace(few, others=(top,)), "mcap", 4.0, fps=5.0, tf_hz=50.0)
-    got = jcr.read_capture(bag, FRAMES, into=tmp_path / "more")
-    assert got.camera_name == "camera" and [(c.name, c.mount) for c in got.others] == [("top", "base")]
-    for cameras, words in (
-        ((f"{fixed}=lid",), "write /top/image_raw/compressed=gripper for a camera on"),
-        (("/nose",), "no images on /nose"),
-        ((own, fixed), "all are named by --further-cameras"),
-    ):
-        with pytest.raises(jcr.InputError, match=words):
-            jcr.read_capture(bag, replace(FRAMES, further_cameras=cameras), into=tmp_path / "none")
 
 
 def test_depth_messages_are_read_in_every_encoding():
@@ -237,7 +192,7 @@ def test_a_bag_is_read_once(tmp_path: Path, mcap: Path):
         ),
         (
             {"camera_topic": "/nowhere"},
-            "no images on /nowhere; topics with images: /camera/image_raw/compressed",
+            "no images on /nowhere; choose the wrist camera's topic .*: /camera/image_raw/compressed",
         ),
         ({"urdf": Path("arm.urdf")}, "choose the joint states with --joint-topic: there are none"),
         ({"frames": 2}, "--frames 2: at least 3"),

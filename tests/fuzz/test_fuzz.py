@@ -68,12 +68,12 @@ def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
 
 
 NAMES = [
-    "calibration.json", "camera_info.yaml", "cal_data.yaml", "cameras.bin", "capture.json", "cloud.ply",
+    "calibration.json", "camera_info.yaml", "cameras.bin", "capture.json", "cloud.ply",
     "depth.npz", "episode.parquet", "images.bin", "map.safetensors", "pairs.npz", "picture.bmp", "picture.gif",
-    "picture.jpg", "picture.png", "picture.tif", "picture.webp", "points.csv", "points.npy", "points.ply", "pose.yaml",
+    "picture.jpg", "picture.png", "picture.tif", "picture.webp", "points.csv", "points.npy", "points.ply", 
     "poses.csv",
     "poses.npy", "poses.tsv", "poses.txt", "reconstruction.npz", "reference.json", "samples.yaml", "scan.bag",
-    "scan.mcap", "transforms.json", "weights.pth", "wrist.samples",
+    "scan.mcap", "weights.pth", "wrist.samples",
 ]  # fmt: skip
 
 

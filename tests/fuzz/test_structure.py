@@ -14,7 +14,7 @@ from PIL import Image
 
 import jcr
 from fuzz_targets import SIZE
-from jcr.capture.lerobot_files import Info
+from jcr.capture.formats.lerobot import Info
 from jcr.capture.read import read_source
 from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError
@@ -78,15 +78,6 @@ MANY = {
         "capture.json",
         {"frames": [FRAME | {"image": f"l{k}.png"} for k in range(1001)]},
         "1001 frames; choose 1000 at most",
-    ),
-    "frames of a model": (
-        "transforms.json",
-        {
-            "frames": [
-                {"file_path": f"{k}", "transform_matrix": FRAME["base_from_gripper"]} for k in range(30_000)
-            ]
-        },
-        "30000 frames; choose 1000 at most",
     ),
     "samples": (
         "samples.yaml",

@@ -1,8 +1,6 @@
 """One image: read from whatever a camera or a phone wrote, written without loss, judged for sharpness."""
 
-import struct
 import warnings
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +10,6 @@ from jaxtyping import Float32, UInt8, UInt16
 from numpy import ndarray
 from PIL import Image, ImageOps
 
-from jcr import deflate
 from jcr.errors import InputError
 from jcr.files import require_file
 
@@ -194,32 +191,9 @@ def exposure_fault(brightness: float) -> str | None:
 
 
 def encode_png(pixels: UInt8[ndarray, "h w *rgb"] | UInt16[ndarray, "h w"]) -> bytes:
-    """A PNG of grey (h,w) or RGB (h,w,3) pixels, without loss; not compressed where that is not safe (`deflate`)."""
-    if not deflate.WORKS:
-        return _uncompressed_png(pixels)
+    """Return the lossless PNG of grey (h,w) or RGB (h,w,3) pixels."""
     bgr = np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels)
     return cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes()
-
-
-def _uncompressed_png(pixels: UInt8[ndarray, "h w *rgb"] | UInt16[ndarray, "h w"]) -> bytes:
-    """The PNG specification's own way to do without a compressor: stored blocks, no filter."""
-    height, width = pixels.shape[:2]
-    big_endian = pixels.astype(pixels.dtype.newbyteorder(">")).reshape(height, -1).view(np.uint8)
-    rows = np.pad(big_endian, ((0, 0), (1, 0))).tobytes()  # each begins with the number of its filter
-    blocks = b""
-    for start in range(0, len(rows), 0xFFFF):
-        block = rows[start : start + 0xFFFF]
-        last = start + len(block) == len(rows)
-        blocks += struct.pack("<BHH", last, len(block), 0xFFFF - len(block)) + block
-    header = struct.pack(
-        ">IIBBBBB", width, height, 8 * pixels.itemsize, 2 if pixels.ndim == 3 else 0, 0, 0, 0
-    )
-    content = b"\x78\x01" + blocks + struct.pack(">I", zlib.adler32(rows))
-    chunks = ((b"IHDR", header), (b"IDAT", content), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-        for name, data in chunks
-    )
 
 
 def sharpness(image: bytes | UInt8[ndarray, "h w 3"]) -> float:

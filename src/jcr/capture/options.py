@@ -12,7 +12,7 @@ MAX_FRAMES = 1000
 """More is a video: every image is compared with others, and every pose's errors with all the others'."""
 
 FormatName = Literal[
-    "auto", "capture", "table", "industrial", "moveit", "easy_handeye2", "transforms", "colmap", "bag", "lerobot",
+    "auto", "capture", "table", "moveit", "easy_handeye2", "colmap", "bag", "lerobot",
 ]  # fmt: skip
 ConventionName = Literal[
     "auto", "matrix", "quat-xyzw", "quat-wxyz", "rotation-vector", "rpy", "ur", "franka", "xarm", "xarm-axis-angle",
@@ -45,9 +45,6 @@ class ReadOptions:
     """Recordings: tf frame or URDF link on which the camera is mounted."""
     camera_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
     """Bags: topic of the images. LeRobot: key of the camera, such as observation.images.wrist."""
-    further_cameras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="TOPIC[=base|=gripper] ...")] = ()
-    """Recordings: topics or keys of further cameras, fixed (=base) or on the same gripper (=gripper); by default a
-    bag's tf decides which."""
     joint_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
     """Bags: topic of the joint states, read when --urdf is given. LeRobot: key of the state."""
     urdf: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None

@@ -41,10 +41,8 @@ FORMATS = {
     for row in (
         Format("capture", "a folder with capture.json", "formats.capture_json:read"),
         Format("table", "images and a table of gripper poses", "formats.table:read"),
-        Format("industrial", "industrial_calibration's cal_data.yaml", "industrial:read"),
         Format("moveit", "samples of MoveIt Calibration", "formats.samples:read_moveit"),
         Format("easy_handeye2", "samples of easy_handeye2", "formats.samples:read_easy_handeye2"),
-        Format("transforms", "transforms.json and gripper poses", "transforms_json:read"),
         Format("colmap", "a COLMAP model and gripper poses", "formats.colmap:read"),
         Format("bag", "a ROS 1 or ROS 2 bag", "formats.bag:read", recording=True),
         Format("lerobot", "a LeRobot dataset", "formats.lerobot:read", recording=True),
@@ -146,8 +144,6 @@ def _of_folder(folder: Path, options: ReadOptions) -> str:
         ("capture", "capture.json"),
         ("bag", "metadata.yaml"),
         ("lerobot", "meta/info.json"),
-        ("industrial", "cal_data.yaml"),
-        ("transforms", "transforms.json"),
     ):
         if (folder / sign).is_file():
             return name
@@ -171,7 +167,7 @@ def _of_folder(folder: Path, options: ReadOptions) -> str:
 def _of_file(file: Path) -> str:
     suffix = file.suffix.lower()
     if suffix == ".json":
-        return "transforms" if file.name.startswith("transforms") else "capture"
+        return "capture"
     if suffix in BAGS:
         return "bag"
     if suffix in SUFFIXES:
@@ -182,8 +178,6 @@ def _of_file(file: Path) -> str:
             return "moveit"
         if isinstance(content, dict) and "samples" in content:
             return "easy_handeye2"
-        if isinstance(content, dict) and "data" in content:
-            return "industrial"
     raise InputError(
         f"{file}: not recognised by its name or content; give its format with --format "
         f"({', '.join(FORMATS)}), see jcr docs captures"

@@ -1,11 +1,11 @@
 """From a recording to a capture: the best frames are chosen, and put in a folder with a capture.json."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt16
+from jaxtyping import Bool, Float, Int, UInt8, UInt16
 from numpy import ndarray
 
 from jcr.capture.best_frames import best_frames
@@ -13,12 +13,15 @@ from jcr.capture.checks import checked_capture
 from jcr.capture.depth_images import FOLDER as DEPTH
 from jcr.capture.images import encode_png, sharpness
 from jcr.capture.options import ReadOptions
-from jcr.capture.recorded_cameras import ImagesOfRows, IntrinsicsOfSize, RecordedCamera, further_cameras
 from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.progress import Progress
-from jcr.records import Capture
+from jcr.records import Capture, Intrinsics
 
+ImagesOfRows = Callable[[Int[ndarray, " k"]], Iterator[tuple[int, bytes | UInt8[ndarray, "h w 3"], str]]]
+"""Frames of ascending rows, one by one: row, an encoded file's bytes or RGB pixels, and the file's ending."""
+IntrinsicsOfSize = Callable[[tuple[int, int]], Intrinsics | None]
+"""Intrinsics of images of a size (width, height)."""
 BESIDE_ALL_POSES_NS = 1e15
 """A gap that is none: the frame is before the first pose or after the last."""
 
@@ -42,9 +45,6 @@ class Recording:
     """rad, of the arm in `options.urdf`, where they are known."""
     depth_at: Callable[[int], UInt16[ndarray, "h w"] | None] | None = None
     """Depth (mm) aligned with the frame of a row."""
-    camera_name: str | None = None
-    others: Sequence[RecordedCamera] = ()
-    """Further cameras, for whose sake this one may need a name."""
 
     @property
     def fresh(self) -> Bool[ndarray, " n"]:
@@ -72,9 +72,6 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
         capture = replace(capture, joints=recording.joints[rows], urdf=recording.options.urdf)
     if any(depths):
         capture = replace(capture, depths=tuple(depths))
-    if recording.others:
-        further = further_cameras(recording.others, rows, recording.names, into, source)
-        capture = replace(capture, camera_name=recording.camera_name or capture.camera_name, others=further)
     return replace(
         capture,
         intrinsics=recording.intrinsics_of_size(capture.image_size),

@@ -8,14 +8,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.capture.pose_track import NEVER, PosesAt, PoseTrack, Stamps, pose_track
+from jcr.capture.pose_track import PosesAt, PoseTrack, Stamps, pose_track
 from jcr.capture.robot_poses import poses_from_numbers
 from jcr.errors import InputError
-from jcr.geometry import inverse, motion_length
-from jcr.records import Mount
-
-RIGID = 2e-3
-"""m, rotation counted at ARM: a frame that moves less beside another is bolted to it."""
+from jcr.geometry import inverse
 
 
 class TfTree:
@@ -69,23 +65,6 @@ class TfTree:
             return inverse(joint_from_base) @ joint_from_gripper, np.maximum(gap_base, gap_gripper)
 
         return poses_at
-
-    def mount_of(
-        self, frame: str, base: str | None, gripper: str | None, stamp_ns: Stamps, source: Path
-    ) -> Mount | None:
-        """What carries a frame, by what stands still beside it at those stamps; None where tf does not tell."""
-        known = self.frames()
-        if frame not in known or base not in known or gripper not in known:
-            return None
-        pairs: tuple[tuple[Mount, str | None], ...] = (("gripper", gripper), ("base", base))
-        for mount, parent in pairs:
-            if parent is None or self._to_root(parent)[-1] != self._to_root(frame)[-1]:
-                continue
-            poses, gap = self.poses_at(parent, frame, source)(stamp_ns)
-            poses = poses[gap < NEVER]
-            if len(poses) and (motion_length(inverse(poses[0]) @ poses) < RIGID).all():
-                return mount
-        return None
 
     def _to_root(self, frame: str) -> list[str]:
         """The frame and all above it."""

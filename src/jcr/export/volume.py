@@ -11,7 +11,6 @@ import trimesh
 from jaxtyping import Bool, Float, Integer
 from numpy import ndarray
 
-from jcr import deflate
 from jcr.errors import InputError
 from jcr.export.provenance import Provenance
 from jcr.extras import extra
@@ -20,7 +19,6 @@ from jcr.represent.scene import FREE, OCCUPIED, SceneMap
 from jcr.represent.surface import surface_mesh
 
 MAX_VOXELS = 50_000_000
-_savez = np.savez_compressed if deflate.WORKS else np.savez
 _SIGN = "positive outside of what is solid, negative inside, metres (cuRobo wants the negative)"
 
 
@@ -79,7 +77,9 @@ def write_esdf(
 
 def _write_npz(path: Path, provenance: Provenance, **arrays: object) -> None:
     with written_whole(path) as temporary, open(temporary, "wb") as stream:
-        _savez(stream, allow_pickle=False, **{k: np.array(v) for k, v in (arrays | provenance.notes).items()})
+        np.savez_compressed(
+            stream, allow_pickle=False, **{k: np.array(v) for k, v in (arrays | provenance.notes).items()}
+        )
 
 
 def write_spheres(

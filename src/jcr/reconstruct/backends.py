@@ -97,7 +97,7 @@ def _given(capture: Capture, options: "ReconstructOptions", progress: Progress |
     from jcr.reconstruct.given import reconstruct_given
 
     if options.cameras is None:
-        raise InputError("--backend given: name the COLMAP model or transforms.json with --cameras PATH")
+        raise InputError("--backend given: name the COLMAP model with --cameras PATH")
     made = ColmapOptions(seed=options.seed)
     return reconstruct_given(capture, options.cameras, made, progress)
 
@@ -337,7 +337,7 @@ class ReconstructOptions:
     predictions: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A network's output as an npz file (jcr docs predictions); selects the back end predictions."""
     cameras: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
-    """Camera poses from another tool, a COLMAP model or transforms.json; selects the back end given."""
+    """Camera poses from another tool, a COLMAP model; selects the back end given."""
     pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
     """Pairs of images that dust3r and mast3r process; robot leaves out pairs without a common view."""
 

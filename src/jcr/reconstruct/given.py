@@ -1,7 +1,6 @@
-"""The `given` back end: camera poses that somebody else found, a COLMAP model or a transforms.json.
+"""The `given` back end: camera poses of a COLMAP model.
 
-The model's own points are its tracks; where it has none (transforms.json), features are matched and triangulated
-with the cameras fixed.
+The model's own points are its tracks; where it has none, features are matched and triangulated with the cameras fixed.
 """
 
 import tempfile
@@ -13,7 +12,6 @@ import pycolmap
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from jcr.capture import transforms_json
 from jcr.capture.formats import colmap
 from jcr.capture.images import read_image
 from jcr.errors import InputError, RejectedError
@@ -37,8 +35,7 @@ def reconstruct_given(
     Raises InputError when the model knows fewer than three, RejectedError when nothing can be triangulated.
     """
     report = progress or silent
-    reader = colmap if cameras.is_dir() else transforms_json
-    names, recon_from_camera = reader.read_cameras(cameras)
+    names, recon_from_camera = colmap.read_cameras(cameras)
     row_of = _rows(names)
     known = [k for k, name in enumerate(capture.images) if row_of(name) is not None]
     if len(known) < 3:
@@ -47,7 +44,7 @@ def reconstruct_given(
         )
     rows = [row for k in known if (row := row_of(capture.images[k])) is not None]
     recon_from_camera = recon_from_camera[rows]
-    intrinsics = capture.intrinsics or reader.read_intrinsics(cameras, capture.image_size)
+    intrinsics = capture.intrinsics or colmap.read_intrinsics(cameras, capture.image_size)
     tracks = _own_tracks(cameras, [names[row] for row in rows], capture.image_size)
     if len(tracks.points_in_recon) < MIN_POINTS:
         images = [read_image(capture.folder / capture.images[k]) for k in known]
@@ -83,14 +80,7 @@ def _rows(names: Sequence[str]) -> Callable[[str], int | None]:
 
 
 def _own_tracks(cameras: Path, names: Sequence[str], size: tuple[int, int]) -> Tracks:
-    """The observations that a COLMAP model holds; none for a transforms.json."""
-    if not cameras.is_dir():
-        return Tracks(
-            image=np.zeros(0, int),
-            x_px=np.zeros((0, 2)),
-            point=np.zeros(0, int),
-            points_in_recon=np.zeros((0, 3)),
-        )
+    """Return the observations that a COLMAP model holds."""
     model = colmap.read_model(cameras)
     id_of = {model.image(image_id).name: image_id for image_id in model.reg_image_ids()}
     return tracks_of(model, [id_of[name] for name in names], size)

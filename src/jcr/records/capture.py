@@ -98,7 +98,7 @@ class Capture:
     source: Path | None = None
     """What it was read from, where that is not a capture.json in `folder`."""
     cameras: Path | None = None
-    """A COLMAP model or transforms.json that holds the cameras' poses already."""
+    """A COLMAP model that holds the cameras' poses already."""
     notes: tuple[str, ...] = ()
     """What reading found that the user should know: how files were paired, frames left out."""
     joints: Float[ndarray, "n dof"] | None = None

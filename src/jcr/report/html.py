@@ -26,9 +26,7 @@ from jcr.results import PosesResult, RunResult
 
 SURFACE_POINTS = 80_000
 """Sampled from the map, at most."""
-UNNAMED = {
-    Path(name).stem for name in (*TABLES, "capture.json", "cal_data.yaml", "transforms.json", "metadata.yaml")
-}
+UNNAMED = {Path(name).stem for name in (*TABLES, "capture.json", "metadata.yaml")}
 """Files that are called so in every capture."""
 LINKS = {
     "warnings": "Warnings",

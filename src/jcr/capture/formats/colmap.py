@@ -4,7 +4,7 @@ COLMAP has the centre of the top-left pixel at (0.5, 0.5) and stores camera from
 """
 
 import struct
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,8 +13,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.camera import HALF_PIXEL
-from jcr.capture.checks import checked_intrinsics
-from jcr.capture.model_cameras import ModelCamera, capture_of_cameras, one_each
+from jcr.capture.checks import checked_capture, checked_intrinsics
+from jcr.capture.formats.table import gripper_poses
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained
 from jcr.errors import InputError
@@ -47,57 +47,21 @@ def find_model(path: Path) -> Path | None:
 
 
 def read(path: Path, options: ReadOptions) -> Capture:
-    """The images that a COLMAP model and a table of gripper poses both know."""
+    """Read the images that a COLMAP model and a table of gripper poses both know."""
     folder = find_model(path)
     if folder is None:
         raise InputError(f"{path}: holds no COLMAP model (cameras.bin or .txt, images, points3D)")
     root = next((parent for parent in (path, *folder.parents[:3]) if (parent / "images").is_dir()), path)
-    return capture_of_cameras(root, _cameras(folder, root), options, folder)
-
-
-def _cameras(folder: Path, root: Path) -> list[ModelCamera]:
-    """The cameras of a model, first those that others of their rig refer to, those with most images before others."""
     model = read_model(folder)
-    names, poses = _posed(model, folder)
-    pose_of = dict(zip(names, poses, strict=True))
-    of_camera: dict[int, list[pycolmap.Image]] = {}
-    images = sorted((model.image(k) for k in model.reg_image_ids()), key=lambda image: image.name)
-    for image in images:
-        of_camera.setdefault(image.camera_id, []).append(image)
-    if one_each([len(images) for images in of_camera.values()]) and all(map(_is_ref, images)):
-        # COLMAP without --ImageReader.single_camera: they must be alike.
-        first = model.camera(images[0].camera_id)
-        read_intrinsics(folder, (first.width, first.height))
-        of_camera = {images[0].camera_id: images}
-
-    def rank(number: int) -> tuple[bool, int, int]:
-        images = of_camera[number]
-        return not _is_ref(images[0]), -len(images), number
-
-    out = []
-    for number in sorted(of_camera, key=rank):
-        images = of_camera[number]
-        located = []
-        for image in images:
-            beside = f"images/{image.name}"
-            located.append(beside if contained(root, beside, str(folder)).is_file() else image.name)
-        parents = {Path(image.name).parent.name for image in images}
-        name = parents.pop() if len(parents) == 1 else ""
-        out.append(
-            ModelCamera(
-                name=name or f"camera_{number}",
-                images=tuple(located),
-                recon_from_camera=np.stack([pose_of[image.name] for image in images]),
-                moment=tuple(image.frame_id for image in images),
-                intrinsics_of_size=partial(_intrinsics, model.camera(number), folder),
-            )
-        )
-    return out
-
-
-def _is_ref(image: "pycolmap.Image") -> bool:
-    """Whether its camera is the one to which the others of the rig refer; a camera without a rig is."""
-    return image.is_ref_in_frame()
+    names, _ = _posed(model, folder)
+    located = []
+    for name in names:
+        beside = f"images/{name}"
+        located.append(beside if contained(root, beside, str(folder)).is_file() else name)
+    known, poses, notes = gripper_poses(root, located, options)
+    capture = checked_capture(root, [located[k] for k in known], poses, str(folder))
+    intrinsics = _common_intrinsics(model, {names[k] for k in known}, folder, capture.image_size)
+    return replace(capture, intrinsics=intrinsics, source=folder, cameras=folder, notes=notes)
 
 
 def read_model(folder: Path) -> "pycolmap.Reconstruction":
@@ -162,10 +126,16 @@ def _posed(model: "pycolmap.Reconstruction", folder: Path) -> tuple[list[str], F
 
 
 def read_intrinsics(folder: Path, size: tuple[int, int]) -> Intrinsics:
-    """The one set of intrinsics of all images, of the given size; InputError when there are several, or a strange
-    one."""
-    found = read_model(folder)
-    cameras = [found.camera(found.image(k).camera_id) for k in found.reg_image_ids()]
+    """Read the intrinsics of all images of the given size; InputError when there are several, or unknown ones."""
+    model = read_model(folder)
+    return _common_intrinsics(model, set(_posed(model, folder)[0]), folder, size)
+
+
+def _common_intrinsics(
+    model: "pycolmap.Reconstruction", names: set[str], folder: Path, size: tuple[int, int]
+) -> Intrinsics:
+    images = [image for k in model.reg_image_ids() if (image := model.image(k)).name in names]
+    cameras = [model.camera(image.camera_id) for image in images]
     kinds = {
         (camera.model.name, camera.width, camera.height, *map(float, camera.params)) for camera in cameras
     }

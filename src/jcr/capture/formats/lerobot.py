@@ -1,122 +1,290 @@
 """LeRobot data sets v2.1 and v3.0: videos or images of a wrist camera, with poses or joint angles frame by frame."""
 
+import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from string import Formatter
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from jcr.capture.camera_info import read_camera_info
 from jcr.capture.joints import read_arm
-from jcr.capture.lerobot_files import Episode, Feature, images_in_table, read_episode, read_info
 from jcr.capture.options import ReadOptions
+from jcr.capture.plain_files import contained, first_fault, read_json
 from jcr.capture.pose_table import poses_of_columns
 from jcr.capture.pose_track import pose_track, speed
-from jcr.capture.recorded_cameras import ImagesOfRows, RecordedCamera, asked_cameras, camera_names
 from jcr.capture.recording import Recording, capture_of_recording
 from jcr.capture.robot_poses import CONVENTIONS
-from jcr.capture.video import frames_at
 from jcr.errors import InputError
+from jcr.extras import extra
 from jcr.progress import Progress
 from jcr.records import Capture
 
+INFO = "meta/info.json"
 CARTESIAN = "observation.state.cartesian_position"
-"""DROID's: x, y, z (m), roll, pitch, yaw (rad) of the gripper in the robot's base."""
+"""Key of DROID: x, y, z (m), roll, pitch, yaw (rad) of the gripper in the robot's base."""
 STATE = "observation.state"
+FIELDS = ("video_key", "episode_chunk", "episode_index", "chunk_index", "file_index")
+"""Fields of the templates of paths."""
+
+
+def _template(text: str) -> str:
+    """Return a path template with plain fields and digits at most two wide: format() takes attributes, and any width."""
+    for _, name, form, conversion in Formatter().parse(text):
+        if name is None:
+            continue
+        if name not in FIELDS or conversion or not re.fullmatch(r"(0?\d?\d?d)?", form or ""):
+            raise ValueError(f"no path of the fields {', '.join(FIELDS)}")
+    return text
+
+
+Template = Annotated[str, Field(max_length=1000), AfterValidator(_template)]
+
+
+class Feature(BaseModel):
+    """Kind of number or image that the set records."""
+
+    dtype: str = ""
+    names: Any = None
+    """A list of texts, or one below {"motors": …} or {"axes": …}."""
+
+    def numbers(self) -> list[str]:
+        """Return the names of the feature's numbers, in lower case; empty where it has none."""
+        names = self.names
+        while isinstance(names, dict):
+            names = next(iter(names.values()), None)
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            return []
+        return [name.removesuffix(".pos").lower() for name in names]
+
+
+class Info(BaseModel):
+    """Content of meta/info.json."""
+
+    model_config = ConfigDict(allow_inf_nan=False)
+    features: dict[str, Feature]
+    fps: Annotated[float, Field(gt=0, le=1e6)]
+    codebase_version: str = ""
+    chunks_size: Annotated[int, Field(ge=1)] = 1000
+    data_path: Template
+    video_path: Template | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episode:
+    """Rows of one recording of the set, and the files of its images."""
+
+    index: int
+    frame: Int[ndarray, " n"]
+    """Number of each row in the table."""
+    time_s: Float[ndarray, " n"]
+    """Time from the episode's start."""
+    state: Float[ndarray, "n k"]
+    table: Path
+    video: Path | None
+    """None where the images are in the table."""
+    video_start_s: float
 
 
 def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
-    """The best frames of the chosen episodes in the folder `into`.
+    """Read the best frames of the chosen episodes into the folder `into`.
 
-    Raises InputError listing the cameras, states or episodes that there are where those of the options are not.
+    Raises InputError that lists the existing cameras, states or episodes where the options name others.
     """
-    info, asked = read_info(path), asked_cameras(options)
-    camera = _camera(info.features, options, list(asked), path)
-    key = _state_key(info.features, options, path)
+    info = read_info(path)
+    camera, key = _camera(info.features, options, path), _state_key(info.features, options, path)
     episodes = [read_episode(path, info, camera, key, index) for index in options.episode]
-    state = np.concatenate([episode.state for episode in episodes])
+    try:
+        state = np.concatenate([episode.state for episode in episodes])
+    except ValueError:
+        raise InputError(f"{path}: {key} has another length in another episode; read one episode") from None
     poses, joints = _poses(state, key, info.features[key], options, path)
-    motion = np.concatenate(
-        [_speed(episode, poses[part]) for episode, part in zip(episodes, _rows(episodes), strict=True)]
-    )
-
-    names = [
-        f"episode_{episode.index:06d}_frame_{k:06d}"
-        for episode in episodes
-        for k in range(len(episode.time_s))
-    ]
-    own, *further = camera_names([camera, *asked])
-    others = []
-    for name, (other, mount) in zip(further, asked.items(), strict=True):
-        if mount is None:
-            raise InputError(
-                f"{path}: a data set does not tell what carries {other}; write --further-cameras {other}=base for a "
-                f"fixed camera, {other}=gripper for one on the gripper"
-            )
-        theirs = [read_episode(path, info, other, key, index) for index in options.episode]
-        others.append(RecordedCamera(name, mount, _images_of(theirs, other, info.fps), lambda _: None))
+    ends = np.cumsum([len(episode.time_s) for episode in episodes])
+    rows = np.split(np.arange(ends[-1]), ends[:-1])
     recording = Recording(
         source=path,
         options=options,
-        names=names,
+        names=[f"episode_{e.index:06d}_frame_{k:06d}" for e in episodes for k in range(len(e.time_s))],
         base_from_gripper=poses,
-        speed=motion,
+        speed=np.concatenate([_speed(e, poses[part]) for e, part in zip(episodes, rows, strict=True)]),
         gap_ns=np.zeros(len(state), np.int64),  # a row is one instant
-        images_of_rows=_images_of(episodes, camera, info.fps),
+        images_of_rows=lambda wanted: _images(episodes, rows, wanted, camera, info.fps),
         intrinsics_of_size=lambda size: (
             None if options.camera_info is None else read_camera_info(options.camera_info, size)
         ),
         joints=joints,
-        camera_name=own,
-        others=others,
     )
     return capture_of_recording(recording, into, report)
 
 
-def _rows(episodes: list[Episode]) -> list[Int[ndarray, " k"]]:
-    """Of each episode among the frames of all."""
-    ends = np.cumsum([len(episode.time_s) for episode in episodes])
-    return np.split(np.arange(ends[-1]), ends[:-1])
+def read_info(path: Path) -> Info:
+    """Read meta/info.json of the set in the folder `path`; InputError where it is none."""
+    file = path / INFO
+    content = read_json(file)
+    if not isinstance(content, dict) or not {"features", "fps"} <= content.keys():
+        raise InputError(f"{file}: no LeRobot data set; it has no features or fps")
+    try:
+        return Info.model_validate(content, strict=True)
+    except ValidationError as error:
+        raise InputError(f"{file}: {first_fault(error)}; correct it there or download it again") from None
 
 
-def _images_of(episodes: list[Episode], key: str, fps: float) -> ImagesOfRows:
-    """Of the camera of a key."""
+def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> Episode:
+    """Read episode `index` with the state of `key`; InputError when it is not there or damaged."""
+    has_video = info.features[camera].dtype == "video"
+    fields: dict[str, Any] = {"episode_chunk": index // info.chunks_size, "episode_index": index}
+    video_fields, start_s = fields, 0.0
+    if info.codebase_version.startswith("v3"):
+        # Version 3.0 has many episodes in one table and one video; meta/episodes lists them.
+        of_video = [f"videos/{camera}/{n}" for n in ("chunk_index", "file_index", "from_timestamp")]
+        columns = ["data/chunk_index", "data/file_index", *(of_video if has_video else [])]
+        listed = _read_table(path / "meta" / "episodes", columns, index)
+        if not listed["data/chunk_index"]:
+            raise InputError(f"{path}: no episode {index} in meta/episodes; they are counted from 0")
+        chunk, number, *video = (listed[name][0] for name in columns)
+        fields = {"chunk_index": chunk, "file_index": number}
+        if video:
+            video_fields, start_s = {"chunk_index": video[0], "file_index": video[1]}, float(video[2])
+    table = _file(path, info.data_path, fields)
+    if not table.is_file():
+        raise InputError(f"{table}: not there, so there is no episode {index}; they are counted from 0")
+    video_file = _file(path, info.video_path, video_fields | {"video_key": camera}) if has_video else None
+    rows = _read_table(table, ["frame_index", "timestamp", key], index)
+    time_s, state = (_numbers(rows[name], f"{table}: {name}") for name in ("timestamp", key))
+    if len(time_s) == 0 or time_s.ndim != 1 or state.ndim != 2:
+        raise InputError(f"{table}: {key} of episode {index} is empty or no list; choose another episode")
+    frame = np.array(rows["frame_index"])
+    return Episode(
+        index=index,
+        frame=frame,
+        time_s=time_s,
+        state=state,
+        table=table,
+        video=video_file,
+        video_start_s=start_s,
+    )
 
-    def images(rows: Int[ndarray, " k"]) -> Iterator[tuple[int, bytes | UInt8[ndarray, "h w 3"], str]]:
-        for episode, part in zip(episodes, _rows(episodes), strict=True):
-            mine = rows[np.isin(rows, part)]
-            if len(mine) == 0:
-                continue
-            if episode.video is None:
-                files = images_in_table(episode, key, mine - part[0])
-                for row, file in zip(mine.tolist(), files, strict=True):
-                    yield row, file, ".jpg" if file.startswith(b"\xff\xd8") else ".png"
-                continue
-            times = episode.video_start_s + episode.time_s[mine - part[0]]
-            frames = frames_at(episode.video, times, 0.5 / fps)
-            for row, rgb in zip(mine.tolist(), frames, strict=True):
-                yield row, rgb, ".png"
 
-    return images
+def _numbers(values: list[Any], where: str) -> Float[ndarray, "n *k"]:
+    """Return a column as finite numbers; InputError where rows have different lengths or no numbers."""
+    try:
+        numbers = np.array(values, np.float64)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"{where}: rows of different lengths, or no numbers; choose another episode"
+        ) from None
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{where}: holds NaN or infinity; choose another episode")
+    return numbers
 
 
-def _camera(features: dict[str, Feature], options: ReadOptions, asked: list[str], path: Path) -> str:
-    """The key of the wrist's camera, where there are others too or not; InputError with the keys that there are."""
+def _read_table(
+    path: Path, columns: list[str], episode: int, rows: list[int] | None = None
+) -> dict[str, list]:
+    """Return columns of one episode, of some of its frames where `rows` are given; other rows are never loaded."""
+    parquet = extra("pyarrow.parquet", "lerobot", "a LeRobot data set")
+    filters: list[tuple[str, str, Any]] = [("episode_index", "==", episode)]
+    if rows is not None:
+        filters.append(("frame_index", "in", rows))
+    try:
+        table = parquet.read_table(path, columns=columns, filters=filters, partitioning=None)
+        return dict(zip(columns, (table[name].to_pylist() for name in columns), strict=True))
+    except Exception as error:  # Arrow's own errors have no common base
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{path}: not a readable table of the set ({reason}); download it again") from None
+
+
+def _file(path: Path, template: str | None, fields: dict[str, Any]) -> Path:
+    if template is None:
+        raise InputError(f"{path / INFO}: has videos and no video_path; download it again")
+    try:
+        name = template.format(**fields)
+    except (KeyError, ValueError) as error:
+        raise InputError(
+            f"{path / INFO}: {template} cannot be filled in ({error}); download it again"
+        ) from None
+    return contained(path, name, str(path / INFO))
+
+
+def _images(
+    episodes: list[Episode], rows: list[Int[ndarray, " _"]], wanted: Int[ndarray, " k"], key: str, fps: float
+) -> Iterator[tuple[int, bytes | UInt8[ndarray, "h w 3"], str]]:
+    """Yield row, image and file ending of the wanted rows among the frames of all episodes."""
+    for episode, part in zip(episodes, rows, strict=True):
+        mine = wanted[np.isin(wanted, part)]
+        if len(mine) == 0:
+            continue
+        local = mine - part[0]
+        if episode.video is None:
+            for row, file in zip(mine.tolist(), _embedded(episode, key, local), strict=True):
+                yield row, file, ".jpg" if file.startswith(b"\xff\xd8") else ".png"
+            continue
+        times = episode.video_start_s + episode.time_s[local]
+        frames = _video_frames(episode.video, times, 0.5 / fps)
+        for row, rgb in zip(mine.tolist(), frames, strict=True):
+            yield row, rgb, ".png"
+
+
+def _embedded(episode: Episode, camera: str, rows: Int[ndarray, " k"]) -> Iterator[bytes]:
+    """Yield the image files that an episode's table holds in the given rows."""
+    frames = episode.frame[rows].tolist()
+    found = _read_table(episode.table, ["frame_index", camera], episode.index, frames)
+    images = dict(zip(found["frame_index"], found[camera], strict=True))
+    for frame in frames:
+        image = images[frame]
+        if not isinstance(image, dict) or not image.get("bytes"):
+            raise InputError(
+                f"{episode.table}: holds no {camera} of frame {frame}; write the data set again with its images "
+                "embedded"
+            )
+        yield image["bytes"]
+
+
+def _video_frames(
+    file: Path, time_s: Float[ndarray, " n"], tolerance_s: float
+) -> Iterator[UInt8[ndarray, "h w 3"]]:
+    """Yield RGB frames nearest to ascending times; InputError beyond the tolerance, or where the video is damaged."""
+    av = extra("av", "lerobot", "a video")
+    try:
+        with av.open(str(file)) as container:
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            container.seek(max(int((time_s[0] - tolerance_s) / stream.time_base), 0), stream=stream)
+            wanted = iter(time_s.tolist())
+            due = next(wanted, None)
+            for frame in container.decode(stream):
+                if due is None:
+                    return
+                if frame.time is None or frame.time < due - tolerance_s:
+                    continue
+                while due is not None and abs(frame.time - due) <= tolerance_s:
+                    yield np.asarray(frame.to_ndarray(format="rgb24"))
+                    due = next(wanted, None)
+                if due is not None and frame.time > due + tolerance_s:
+                    raise InputError(
+                        f"{file}: no frame at {due:.3f} s, the next is at {frame.time:.3f} s; damaged"
+                    )
+            if due is not None:
+                raise InputError(f"{file}: ends before {due:.3f} s; it is shorter than the data set says")
+    except (av.FFmpegError, IndexError) as error:
+        raise InputError(f"{file}: not a readable video ({error}); download it again") from None
+
+
+def _camera(features: dict[str, Feature], options: ReadOptions, path: Path) -> str:
+    """Return the key of the wrist camera; InputError with the keys that there are."""
     cameras = [key for key, feature in features.items() if feature.dtype in ("video", "image")]
-    listed = ", ".join(cameras) or "no videos or images"
-    if unknown := [key for key in asked if key not in cameras]:
-        raise InputError(f"{path}: --further-cameras {unknown[0]}: there are {listed}")
-    if options.camera_topic in asked:
-        raise InputError(f"{path}: --further-cameras {options.camera_topic}: is the wrist's camera already")
-    left = [key for key in cameras if key not in asked]
     if options.camera_topic in cameras:
         return str(options.camera_topic)
-    if options.camera_topic is not None or len(left) != 1:
-        raise InputError(
-            f"{path}: choose the wrist's camera with --camera-topic, further ones with --further-cameras: {listed}"
-        )
-    return left[0]
+    if options.camera_topic is None and len(cameras) == 1:
+        return cameras[0]
+    raise InputError(
+        f"{path}: choose the wrist camera with --camera-topic: {', '.join(cameras) or 'there are no videos or images'}"
+    )
 
 
 def _state_key(features: dict[str, Feature], options: ReadOptions, path: Path) -> str:
@@ -132,15 +300,15 @@ def _state_key(features: dict[str, Feature], options: ReadOptions, path: Path) -
 def _poses(
     state: Float[ndarray, "n k"], key: str, feature: Feature, options: ReadOptions, path: Path
 ) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, "n j"] | None]:
-    """Gripper poses from the state: a pose by the names of its numbers or the convention asked for, or joints.
-
-    The joint angles (rad) too, where the state has those of a chain of rotating joints.
-    """
+    """Return gripper poses from poses or joint angles, and the joint angles (rad) of a chain of rotating joints."""
     where = f"{path}: {key}"
     names = feature.numbers()
     if options.urdf is not None:
         arm = read_arm(options)
-        recorded = state[:, arm.columns(names, where)]
+        columns = arm.columns(names, where)
+        if max(columns) >= state.shape[1]:
+            raise InputError(f"{where}: {len(names)} names for {state.shape[1]} numbers; correct {INFO}")
+        recorded = state[:, columns]
         return arm.poses(recorded), arm.angles(recorded)
     wanted = CONVENTIONS["rpy" if options.pose_convention == "auto" else options.pose_convention].columns
     if key == CARTESIAN or options.pose_convention != "auto":
@@ -152,8 +320,8 @@ def _poses(
         )
     if state.shape[1] < len(names):
         raise InputError(f"{where}: {state.shape[1]} numbers, a pose of this convention has {len(names)}")
-    columns = {name: tuple(repr(float(value)) for value in state[:, k]) for k, name in enumerate(names)}
-    return poses_of_columns(columns, frozenset(), options, where), None
+    texts = {name: tuple(repr(float(value)) for value in state[:, k]) for k, name in enumerate(names)}
+    return poses_of_columns(texts, frozenset(), options, where), None
 
 
 def _speed(episode: Episode, poses: Float[ndarray, "n 4 4"]) -> Float[ndarray, " n"]:
