@@ -34,11 +34,11 @@ test-fast: .venv/ready
 # where it asks for 1 mm and 0.2°.
 test-lowest: .venv-lowest/ready
 	OMP_NUM_THREADS=1 .venv-lowest/bin/python -m pytest $(TWO_WORKERS) -o addopts='--import-mode=importlib -ra' \
-		--deselect tests/reconstruct/test_marker.py::test_lines_that_a_detector_drew_over_a_board_are_no_hindrance \
-		--deselect tests/reconstruct/test_marker.py::test_real_boards_reproduce_their_references \
-		--deselect "tests/reconstruct/test_marker.py::test_calibrates_from_every_kind_of_board[charuco:7x6:0.030:0.022:DICT_4X4_50]" \
+		--deselect tests/boards/test_marker.py::test_lines_that_a_detector_drew_over_a_board_are_no_hindrance \
+		--deselect tests/boards/test_marker.py::test_real_boards_reproduce_their_references \
+		--deselect "tests/boards/test_marker.py::test_calibrates_from_every_kind_of_board[charuco:7x6:0.030:0.022:DICT_4X4_50]" \
 		tests/test_without_torch.py tests/test_api.py tests/test_extras.py tests/test_geometry.py tests/test_camera.py \
-		tests/handeye tests/calibration tests/capture tests/reconstruct/test_marker.py tests/reconstruct/test_preprocess.py
+		tests/handeye tests/calibration tests/capture tests/boards/test_marker.py tests/reconstruct/test_preprocess.py
 
 .venv-lowest/ready: pyproject.toml constraints-lowest.txt
 	$(PYTHON) -m venv .venv-lowest

@@ -15,6 +15,8 @@ from numpy import ndarray
 
 from benchmarks import page
 from benchmarks.attack import reconstructed
+from jcr.boards.detection import PRINTED, Sighting
+from jcr.boards.marker import pose_of_body
 from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.stage import calibrate as calibrate_stage
 from jcr.camera import project, unproject
@@ -23,8 +25,6 @@ from jcr.errors import InputError, RejectedError
 from jcr.geometry import apply, inverse, nearest_to_lines, rotation_between_deg, step_between
 from jcr.pipeline import calibrate
 from jcr.reconstruct.backends import ReconstructOptions
-from jcr.reconstruct.board import PRINTED, Sighting
-from jcr.reconstruct.marker import pose_of_body
 from jcr.records import Capture, HandEye, Intrinsics, Kind, Reconstruction, Tracks
 from jcr.results import RunOptions, RunResult
 from simulation.boards import Sheet, with_sheet

@@ -11,6 +11,9 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from benchmarks.page import boards_of, folders_with, number, table
+from jcr.boards.detection import Sighting, boards, most_seen
+from jcr.boards.marker import WORST_PX
+from jcr.boards.proposal import board_in_view
 from jcr.calibration.seen import joint_covariance
 from jcr.camera import by_point, parameters, project, unproject, with_parameters
 from jcr.capture.images import read_image
@@ -18,9 +21,6 @@ from jcr.capture.read import read_capture
 from jcr.errors import InputError, RejectedError
 from jcr.geometry import inverse, nearest_to_lines, retract, skew
 from jcr.pipeline import calibrate
-from jcr.reconstruct.board import Sighting, boards, most_seen
-from jcr.reconstruct.board_in_view import board_in_view
-from jcr.reconstruct.marker import WORST_PX
 from jcr.records import Capture, HandEye, Intrinsics
 from jcr.results import RunResult
 

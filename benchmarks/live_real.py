@@ -16,9 +16,9 @@ from benchmarks.live import cell_of
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, RejectedError
+from jcr.features.kept import FOLDER
 from jcr.geometry import step_between
 from jcr.live.calibration import LiveCalibration
-from jcr.match.kept import FOLDER
 from jcr.pipeline import calibrate
 from jcr.records import Capture
 from jcr.results import RunResult

@@ -14,7 +14,7 @@ from benchmarks.page import apart
 from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
-from jcr.reconstruct.colmap import reconstruct_colmap
+from jcr.sfm.colmap import reconstruct_colmap
 from simulation.capture import SimulateOptions, simulate
 
 SIZES = (8, 16, 32)

@@ -12,18 +12,19 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from benchmarks.page import apart, boards_of, folders_with, number, table
+from jcr.boards import marker
 from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
+from jcr.features.matchers import FeatureName, Matcher
+from jcr.features.pairs import all_pairs
+from jcr.features.stage import Matched
 from jcr.geometry import rotation_log
-from jcr.match.matchers import FeatureName, Matcher
-from jcr.match.pairs import all_pairs
-from jcr.match.stage import Matched
-from jcr.reconstruct import marker, sfm
-from jcr.reconstruct.colmap import reconstruct_colmap
-from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.records import HandEye, Intrinsics
+from jcr.sfm import mapping
+from jcr.sfm.colmap import reconstruct_colmap
+from jcr.sfm.options import ColmapOptions
 
 WAYS: tuple[tuple[FeatureName, bool], ...] = (("xfeat", True),)
 """SIFT with the gate is what `real` measures."""
@@ -182,7 +183,7 @@ def images_alone() -> AbstractContextManager[object]:
     def place_none(database: Path, model: object, matcher: Matcher, matched: Matched, *_: object) -> object:
         return model, matched
 
-    return patch.multiple(sfm, match_with_robot=match_all, _with_predicted_images=place_none)
+    return patch.multiple(mapping, match_with_robot=match_all, _with_predicted_images=place_none)
 
 
 def sigmas(

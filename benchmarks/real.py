@@ -14,6 +14,7 @@ from PIL import Image
 
 from benchmarks.page import apart, boards_of, folders_with, number, table
 from benchmarks.peers import opencv
+from jcr.boards.marker import reconstruct_marker
 from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.stage import calibrate as calibrate_stage
 from jcr.camera import unproject
@@ -29,7 +30,6 @@ from jcr.geometry import (
 )
 from jcr.pipeline import RunOptions, calibrate
 from jcr.reconstruct.backends import ReconstructOptions
-from jcr.reconstruct.marker import reconstruct_marker
 from jcr.records import Capture, HandEye, Intrinsics, LeaveOneOut, coefficients_of
 
 

@@ -17,10 +17,10 @@ from jcr.errors import RejectedError
 from jcr.estimation.residuals import paper_residuals
 from jcr.geometry import Transforms, fit_similarity, rotation_log, scale_translation
 from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, candidates, reconstruct
-from jcr.reconstruct.colmap import reconstruct_colmap
-from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.reconstruct.global_alignment.pairs import ARRAYS, write_pairs
 from jcr.records import Capture, Reconstruction
+from jcr.sfm.colmap import reconstruct_colmap
+from jcr.sfm.options import ColmapOptions
 from simulation.capture import SimulateOptions, simulate
 from simulation.scenes import SceneName
 from simulation.truth import Truth, read_truth

@@ -7,12 +7,12 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.camera import project
+from jcr.features.gate import Key
+from jcr.features.matchers import Matcher
+from jcr.features.stage import Matched, match_with_robot
 from jcr.geometry import Transforms, apply, inverse, rotation_exp, transform
-from jcr.match.gate import Key
-from jcr.match.matchers import Matcher
-from jcr.match.stage import Matched, match_with_robot
-from jcr.reconstruct.sfm import camera_of
 from jcr.records import Intrinsics
+from jcr.sfm.mapping import camera_of
 
 INTRINSICS = Intrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
 IMAGES, STEP_M, HEIGHT_M = 30, 0.1, 0.5

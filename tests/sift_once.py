@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jcr.match import sift
+from jcr.features import sift
 
 MOST = {"detect": 64, "matches": 4000}
 """Answers that are kept, the newest; features of an image are up to 4 MB."""

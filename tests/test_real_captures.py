@@ -9,8 +9,8 @@ import pytest
 import jcr
 from jcr.calibration.stage import calibrate
 from jcr.geometry import apply_similarity, fit_similarity, rotation_between_deg
-from jcr.reconstruct.colmap import reconstruct_colmap
 from jcr.records import Kind
+from jcr.sfm.colmap import reconstruct_colmap
 
 
 @pytest.mark.slow

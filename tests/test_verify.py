@@ -23,9 +23,9 @@ from jcr.estimation.fit import PoseProblem, fit_poses
 from jcr.estimation.systematic import arm_errors, posed, smooth_errors
 from jcr.geometry import inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.reconstruct.backends import ReconstructOptions
-from jcr.reconstruct.relocate import Located, relocate
 from jcr.records import Capture, Reconstruction, Tracks
 from jcr.run_folder import MadeWith, RunFolder, state_of
+from jcr.sfm.relocate import Located, relocate
 from simulation.bent import bent_problem
 from simulation.taken import with_robot_noise
 

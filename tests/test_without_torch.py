@@ -16,7 +16,7 @@ from places import ROOT
 pytestmark = pytest.mark.slow
 
 MAY_NEED_TORCH = (
-    "match/learned", "match/xfeat",
+    "features/learned", "features/xfeat",
     "reconstruct/dust3r/", "reconstruct/global_alignment/adam",
     "reconstruct/views_at_once/", "reconstruct/predictions", "represent/", "segment/sam",
     "export/rrd", "export/volume", "view/",

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from jcr.boards.proposal import proposed
 from jcr.calibration.adjust import adjusted
 from jcr.calibration.case import Case
 from jcr.calibration.checks.left_out import left_out_poses
@@ -39,9 +40,6 @@ from jcr.estimation.observability import observability
 from jcr.estimation.residuals import angle_ratio
 from jcr.geometry import largest_motion
 from jcr.progress import Progress
-from jcr.reconstruct.board_in_view import proposed
-from jcr.reconstruct.colmap import reconstruct_colmap
-from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.records import (
     Capture,
     Finding,
@@ -55,6 +53,8 @@ from jcr.records import (
 )
 from jcr.records.findings import CAMERA, without_consequences
 from jcr.records.words import remedy, sentence, unobservable
+from jcr.sfm.colmap import reconstruct_colmap
+from jcr.sfm.options import ColmapOptions
 
 QUICK, QUICK_SIZE_PX = 8, 800
 """Images that tell in seconds whether the poses are theirs, and the long side at which they do."""

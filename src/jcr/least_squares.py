@@ -3,7 +3,7 @@
 Unknowns are whatever the caller has (a pose, a tuple); they move by steps in a tangent space, as geometry.retract moves
 poses. The loops that eliminate points or depths by a Schur complement, or that estimate variances between their steps,
 are problems of their own and stand where those are: estimation/fit.py, estimation/together.py, calibration/drift.py,
-reconstruct/direct/ and reconstruct/global_alignment/.
+photometric/ and reconstruct/global_alignment/.
 """
 
 from collections.abc import Callable

@@ -7,13 +7,13 @@ from dataclasses import replace
 from jcr import __version__
 from jcr.allocator import give_back
 from jcr.attempts import NothingFoundError, Tried, again, choose, timings_of
+from jcr.boards.proposal import proposed_for
 from jcr.calibration.calibration_json import calibration_file, failed_file
 from jcr.capture.added import write_added
 from jcr.cell.added import read_added_cameras
 from jcr.cell.cameras_json import CamerasFile, cameras_file
 from jcr.depth.densify import densify
 from jcr.progress import Progress
-from jcr.reconstruct.board_in_view import proposed_for
 from jcr.records import Attempt, Capture, CellCamera
 from jcr.records.words import sentence
 from jcr.results import RunOptions, RunResult

@@ -25,10 +25,10 @@ from jcr.geometry import step_between
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
-from jcr.reconstruct.relocate import Located, relocate
 from jcr.records import Capture, PosePairs, Reconstruction, Verdict
 from jcr.records.words import sentence
 from jcr.run_folder import RunFolder
+from jcr.sfm.relocate import Located, relocate
 
 ROUNDING = 1e-9
 """Largest change of a number of a pose that is written and read again."""

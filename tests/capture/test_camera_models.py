@@ -47,7 +47,7 @@ def test_a_intrinsics_survives_capture_json_camera_info_and_calibration_json(
 def test_a_intrinsics_survives_colmap(intrinsics: Intrinsics, tmp_path: Path):
     import pycolmap
 
-    from jcr.reconstruct.sfm import camera_of
+    from jcr.sfm.mapping import camera_of
 
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(camera_of(intrinsics, known=True))

@@ -35,9 +35,9 @@ from jcr.estimation.together import adjust
 from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.progress import silent
 from jcr.reconstruct.backends import ReconstructOptions
-from jcr.reconstruct.relocate import Features
 from jcr.records import Capture, CellCamera, Finding, HandEye, Intrinsics, Reconstruction, Tracks
 from jcr.records import Kind as FindingKind
+from jcr.sfm.relocate import Features
 from simulation.cell import CellProblem, Kind, cell_problem
 
 COUNT = 8

@@ -10,8 +10,8 @@ from numpy import ndarray
 
 import jcr
 from in_process import run_jcr
+from jcr.boards.detection import boards
 from jcr.export.board_sheet import board_sheet
-from jcr.reconstruct.board import boards
 
 
 def mm_of_page(data: bytes) -> tuple[ndarray, ndarray]:

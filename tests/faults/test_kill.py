@@ -28,7 +28,7 @@ WRITES = 11
 PROCESSES = multiprocessing.get_context("forkserver")
 # What a run imports is imported once: what is killed before it works has done nothing.
 PROCESSES.set_forkserver_preload(
-    ["jcr.cli.run", "jcr.pipeline", "jcr.reconstruct.colmap", "jcr.reconstruct.sfm", "jcr.report.html"]
+    ["jcr.cli.run", "jcr.pipeline", "jcr.sfm.colmap", "jcr.sfm.mapping", "jcr.report.html"]
 )
 
 

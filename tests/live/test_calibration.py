@@ -81,7 +81,7 @@ def test_a_requirement_that_holds_is_confirmed_by_the_leave_one_out_error(grown)
 def test_the_end_is_the_batch_calibration_without_finding_features_again(
     grown, done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    from jcr.match import sift_features
+    from jcr.features import sift_features
 
     folder = shutil.copytree(grown[0], tmp_path / "capture")
     found: list[str] = []

@@ -25,7 +25,7 @@ KILLS = int(os.environ.get("JCR_TEST_KILLS", "2"))
 IMAGES = 5
 PROCESSES = multiprocessing.get_context("forkserver")
 PROCESSES.set_forkserver_preload(
-    ["jcr.pipeline", "jcr.live.calibration", "jcr.reconstruct.growing", "jcr.report.html"]
+    ["jcr.pipeline", "jcr.live.calibration", "jcr.sfm.growing", "jcr.report.html"]
 )
 
 

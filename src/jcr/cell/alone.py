@@ -16,7 +16,6 @@ from jcr.errors import RejectedError
 from jcr.geometry import apply, inverse
 from jcr.progress import Progress
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
-from jcr.reconstruct.relocate import MIN_POINTS
 from jcr.records import (
     Capture,
     CellCamera,
@@ -27,6 +26,7 @@ from jcr.records import (
     no_reconstruction,
     strongest_first,
 )
+from jcr.sfm.relocate import MIN_POINTS
 
 LEAST_POSES = 3
 """Fewer images than this are not reconstructed."""

@@ -16,8 +16,8 @@ from jcr.estimation.intrinsics_prior import IntrinsicsPrior, prior_about
 from jcr.estimation.scene import Freedom, Observations, RigInformation, Scene
 from jcr.estimation.score_test import freed, with_intrinsics
 from jcr.estimation.together import adjust
-from jcr.reconstruct.least_squares_matching import KEYPOINT_STD_PX
 from jcr.records import Capture, HandEye, Intrinsics, Kind, Reconstruction
+from jcr.sfm.track_refinement import KEYPOINT_STD_PX
 
 EXACT = 1e-6
 """m, rad: of poses that were given, beside what is known of their errors."""

@@ -19,15 +19,15 @@ from numpy import ndarray
 
 from jcr.camera import project, unproject
 from jcr.extras import xfeat_is_installed
+from jcr.features.sift import matches
+from jcr.features.verify import HALF_PIXEL
 from jcr.geometry import apply, inverse, step_between, transform
-from jcr.match.sift import matches
-from jcr.match.verify import HALF_PIXEL
-from jcr.reconstruct.relocate import GATE_PX, MIN_POINTS, Features, features, triangulated
-from jcr.reconstruct.sfm import camera_of
 from jcr.records import Intrinsics
+from jcr.sfm.mapping import camera_of
+from jcr.sfm.relocate import GATE_PX, MIN_POINTS, Features, features, triangulated
 
 if TYPE_CHECKING:
-    from jcr.match.learned import LearnedFeatures
+    from jcr.features.learned import LearnedFeatures
 
 FOCAL_OF_WIDTH = 0.9
 """Of a camera without known intrinsics: where the search for its focal length starts."""
@@ -75,7 +75,7 @@ class Learned:
 
         `near` is about its recon_from_camera.
         """
-        from jcr.match.learned import LearnedFeatures
+        from jcr.features.learned import LearnedFeatures
 
         if self._features is None:  # the networks are loaded where they are needed
             self._features = LearnedFeatures(self._images)

@@ -9,8 +9,8 @@ from jaxtyping import UInt8
 from numpy import ndarray
 from PIL import Image, ImageDraw, ImageFont
 
+from jcr.boards.detection import boards
 from jcr.errors import InputError
-from jcr.reconstruct.board import boards
 
 PAPERS_MM = {"a4": (297.0, 210.0), "a3": (420.0, 297.0), "a2": (594.0, 420.0), "letter": (279.4, 215.9)}
 """Width and height, the long side across."""

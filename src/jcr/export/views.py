@@ -19,9 +19,9 @@ from jcr.capture.images import encode_png, read_image
 from jcr.errors import InputError
 from jcr.export.provenance import Provenance
 from jcr.geometry import apply_similarity, inverse, scale_translation
-from jcr.reconstruct.sfm import camera_of
 from jcr.records import COEFFICIENTS, Capture, Intrinsics, PointCloud, Reconstruction, Tracks
 from jcr.represent.cloud_ply import write_cloud
+from jcr.sfm.mapping import camera_of
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _ORIENTATION = 0x0112

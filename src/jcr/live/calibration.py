@@ -30,8 +30,8 @@ from jcr.live.folder import LiveFolder
 from jcr.live.look import STILL, grid
 from jcr.live.next_pose import Reach, Tried, before_calibration, proposed
 from jcr.options import checked_options
-from jcr.reconstruct.growing import Growing
 from jcr.records import Capture, Finding, HandEye, Intrinsics, Kind, Tracks, strongest_first
+from jcr.sfm.growing import Growing
 
 if TYPE_CHECKING:
     from jcr.results import RunResult

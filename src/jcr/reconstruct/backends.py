@@ -12,7 +12,7 @@ from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.extras import extra, install, is_installed, xfeat_is_installed
-from jcr.match.order import order_by_pose
+from jcr.features.order import order_by_pose
 from jcr.progress import Progress
 from jcr.reconstruct.hub import HUB_FILES, HUB_ID, Weights, cached_files
 from jcr.records import Boards, CameraEvidence, Capture, Reconstruction
@@ -23,8 +23,8 @@ INSTALL_DA3 = "pip install omegaconf addict einops && pip install --no-deps dept
 
 
 def _colmap(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.colmap import reconstruct_colmap
-    from jcr.reconstruct.colmap_options import ColmapOptions
+    from jcr.sfm.colmap import reconstruct_colmap
+    from jcr.sfm.options import ColmapOptions
 
     features = "sift" if options.features == "auto" else options.features
     if features != "sift":
@@ -34,7 +34,7 @@ def _colmap(capture: Capture, options: "ReconstructOptions", progress: Progress 
 
 
 def _direct(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.direct.direct import reconstruct_direct
+    from jcr.photometric.direct import reconstruct_direct
 
     return reconstruct_direct(capture, progress)
 
@@ -73,7 +73,7 @@ def _views_at_once(
 
 
 def _marker(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.marker import reconstruct_marker
+    from jcr.boards.marker import reconstruct_marker
 
     if options.board is None:
         raise InputError("--backend marker: name the board with --board, such as chessboard:9x6:0.025")
@@ -93,8 +93,8 @@ def _predictions(
 
 
 def _given(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.colmap_options import ColmapOptions
-    from jcr.reconstruct.given import reconstruct_given
+    from jcr.sfm.given import reconstruct_given
+    from jcr.sfm.options import ColmapOptions
 
     if options.cameras is None:
         raise InputError("--backend given: name the COLMAP model with --cameras PATH")
@@ -355,7 +355,7 @@ class ReconstructOptions:
 def check_board(options: ReconstructOptions) -> None:
     """Raise InputError, before any work, for a --board that names none."""
     if options.board is not None:
-        from jcr.reconstruct.board import boards
+        from jcr.boards.detection import boards
 
         boards(options.board)
 
@@ -386,7 +386,7 @@ def reconstruct(
     )
     made = row.reconstruct(in_order, replace(options, backend=row.name), progress)
     if options.board is not None and row.name != MARKER:
-        from jcr.reconstruct.board_corners import with_boards
+        from jcr.boards.corners import with_boards
 
         made = with_boards(in_order, made, options.board, progress)
     return _of_capture(made, order)

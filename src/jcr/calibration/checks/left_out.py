@@ -7,8 +7,8 @@ from numpy import ndarray
 from jcr.capture.images import read_image
 from jcr.estimation.pose_equations import predict
 from jcr.geometry import step_between
-from jcr.reconstruct.relocate import Located, relocate
 from jcr.records import Capture, Finding, HandEye, Kind, Reconstruction
+from jcr.sfm.relocate import Located, relocate
 
 SAME = (10e-3, np.radians(1.0))
 """m, rad: nearer than this a pose is that of the image."""

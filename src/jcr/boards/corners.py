@@ -1,0 +1,171 @@
+"""Corners of a board or of tags among the tracks of a reconstruction that features made.
+
+The cameras are known up to one similarity, so that corners are triangulated as any other points. What the board shows
+beside that, its shape and its size, the adjustment takes as a prior (estimation/boards.py). Where a body is not at one
+place in all images, the place that most images agree on counts.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from jcr.boards.detection import PRINTED, Sighting, boards, is_of_unknown_size, most_seen, side_of
+from jcr.boards.proposal import board_in_view
+from jcr.camera import project, unproject
+from jcr.capture.images import read_image
+from jcr.geometry import apply, inverse, nearest_to_lines
+from jcr.progress import Progress, silent
+from jcr.records import Boards, Body, Capture, Intrinsics, Reconstruction, Tracks
+
+FEWEST_POINTS = 4
+"""Fewest points of a body in an image."""
+FEWEST_IMAGES = 2
+"""Fewest images of a body."""
+SAME_PLACE = 0.006
+"""Of the image's width: rms distance of corners from where those of other images, triangulated, are projected."""
+MOST_PAIRS = 100
+"""Of images from which a body's place is triangulated to see which others agree."""
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """The corners of one body in the images, by image and by corner; not a number where one does not show it."""
+
+    number: int
+    x_px: Float[ndarray, "m c 2"]
+    x_in_body: Float[ndarray, "c 3"]
+
+    @property
+    def images(self) -> Int[ndarray, " i"]:
+        """Those that show enough of its corners."""
+        return np.flatnonzero(np.isfinite(self.x_px[..., 0]).sum(1) >= FEWEST_POINTS)
+
+
+def with_boards(
+    capture: Capture, reconstruction: Reconstruction, spec: str, progress: Progress | None = None
+) -> Reconstruction:
+    """A reconstruction with the corners of what `--board` names among its tracks.
+
+    Raises InputError for a board that is none.
+    """
+    report = progress or silent
+    readings = boards(spec)
+    report("board", 0.0)
+    images = [read_image(capture.folder / capture.images[row]) for row in reconstruction.image_index]
+    board, sightings = most_seen(readings, images)
+    report("board", 1.0)
+    bodies, elsewhere = [], set[int]()
+    tracks, cameras = reconstruction.tracks, reconstruction.recon_from_camera
+    for seen in _bodies(sightings):
+        agreeing = _at_one_place(seen, cameras, reconstruction.intrinsics)
+        elsewhere |= set(seen.images.tolist()) - set(agreeing.tolist())
+        if len(agreeing) >= FEWEST_IMAGES:
+            tracks, body = _with_corners(tracks, seen, agreeing, cameras, reconstruction.intrinsics)
+            bodies.append(body)
+    found = Boards(
+        spec=spec if board is readings[0] else board.name,
+        side=side_of(spec),
+        size_std=None if is_of_unknown_size(spec) else PRINTED,
+        bodies=tuple(bodies),
+        elsewhere=tuple(sorted(elsewhere)),
+        proposed=None if bodies else board_in_view(images),
+    )
+    notes = reconstruction.notes
+    if board is not readings[0]:
+        notes = (*notes, f"the board is read as {board.name}")
+    return replace(reconstruction, tracks=replace(tracks, boards=found), notes=notes)
+
+
+def _bodies(sightings: Sequence[Sequence[Sighting]]) -> Iterator[_Seen]:
+    """Each body that any image shows."""
+    for number in sorted({s.body for shown in sightings for s in shown}):
+        own = [(k, s) for k, shown in enumerate(sightings) for s in shown if s.body == number]
+        x_in_body = {i: x for _, s in own for i, x in zip(s.index, s.x_in_body, strict=True)}
+        corner = {i: c for c, i in enumerate(sorted(x_in_body))}
+        x_px = np.full((len(sightings), len(corner), 2), np.nan)
+        for k, s in own:
+            x_px[k, [corner[i] for i in s.index]] = s.x_px
+        yield _Seen(number, x_px, np.stack([x_in_body[i] for i in corner]))
+
+
+def _at_one_place(
+    seen: _Seen, cameras: Float[ndarray, "m 4 4"], intrinsics: Intrinsics
+) -> Int[ndarray, " a"]:
+    """The most images that agree on where the body is; none where no two do."""
+    images = seen.images
+    pairs = list(combinations(images.tolist(), 2))
+    if len(pairs) > MOST_PAIRS:
+        chosen = np.random.default_rng(0).permutation(len(pairs))[:MOST_PAIRS]
+        pairs = [pairs[k] for k in chosen]
+    best = np.zeros(0, int)
+    for pair in pairs:
+        agreeing = _agreeing(seen, np.array(pair), cameras, intrinsics)
+        if len(agreeing) > len(best):
+            best = agreeing
+        if len(best) == len(images):
+            return best
+    return _agreeing(seen, best, cameras, intrinsics) if len(best) else best
+
+
+def _agreeing(
+    seen: _Seen, by: Int[ndarray, " b"], cameras: Float[ndarray, "m 4 4"], intrinsics: Intrinsics
+) -> Int[ndarray, " a"]:
+    """Images in which the corners are where these images, together, place them."""
+    points = _triangulated(seen.x_px[by], cameras[by], intrinsics)
+    limit_px, agreeing = SAME_PLACE * intrinsics.width, list[int]()
+    for k in seen.images:
+        x_in_camera = apply(inverse(cameras[k]), points)
+        off = ((project(intrinsics, x_in_camera) - seen.x_px[k]) ** 2).sum(1)
+        shared = np.isfinite(off)
+        ahead = (x_in_camera[shared, 2] > 0).all()
+        if shared.sum() >= FEWEST_POINTS and ahead and off[shared].mean() < limit_px**2:
+            agreeing.append(int(k))
+    return np.array(agreeing, dtype=int)
+
+
+def _triangulated(
+    x_px: Float[ndarray, "b c 2"], cameras: Float[ndarray, "b 4 4"], intrinsics: Intrinsics
+) -> Float[ndarray, "c 3"]:
+    """Corners that two or more of these images show; not a number where fewer do."""
+    points = np.full((x_px.shape[1], 3), np.nan)
+    shown = np.isfinite(x_px[..., 0])
+    for c in np.flatnonzero(shown.sum(0) >= FEWEST_IMAGES):
+        own = shown[:, c]
+        ray = np.einsum("bij,bj->bi", cameras[own, :3, :3], unproject(intrinsics, x_px[own, c]))
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        points[c] = nearest_to_lines(cameras[own, :3, 3], ray)
+    return points
+
+
+def _with_corners(
+    tracks: Tracks,
+    seen: _Seen,
+    images: Int[ndarray, " a"],
+    cameras: Float[ndarray, "m 4 4"],
+    intrinsics: Intrinsics,
+) -> tuple[Tracks, Body]:
+    """The tracks with what these images show of a body; its corners are further points."""
+    points = _triangulated(seen.x_px[images], cameras[images], intrinsics)
+    shown = np.isfinite(seen.x_px[images, :, 0]) & np.isfinite(points[:, 0])
+    kept = np.flatnonzero(shown.any(0))
+    row = np.zeros(len(points), int)
+    row[kept] = len(tracks.points_in_recon) + np.arange(len(kept))
+    image, corner = np.nonzero(shown)
+    std = tracks.std_px
+    if std is not None:
+        std = np.concatenate([std, np.full(len(image), np.median(std))])
+    longer = replace(
+        tracks,
+        image=np.concatenate([tracks.image, images[image]]),
+        x_px=np.concatenate([tracks.x_px, seen.x_px[images[image], corner]]),
+        point=np.concatenate([tracks.point, row[corner]]),
+        points_in_recon=np.concatenate(
+            [tracks.points_in_recon, points[kept].astype(tracks.points_in_recon.dtype)]
+        ),
+        std_px=std,
+    )
+    return longer, Body(seen.number, row[kept], seen.x_in_body[kept])

@@ -1,0 +1,235 @@
+"""The marker back end: metric camera poses from a board or tags of known size, for those who have one.
+
+Pose of a plane from its points: IPPE (Collins and Bartoli, IJCV 2014), then least squares in pixels.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.boards.detection import PRINTED, Board, Sighting, boards, is_of_unknown_size, most_seen
+from jcr.camera import WITHIN_FOLD, by_point, fold_distance_px, project, unproject, without_distortion
+from jcr.capture.images import read_image
+from jcr.errors import RejectedError
+from jcr.geometry import apply, inverse, retract, rotation_between_deg, rotation_exp, skew, transform
+from jcr.least_squares import minimise
+from jcr.progress import Progress, silent
+from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
+
+FEWEST_POINTS = 4
+WORST_PX = 3.0
+"""A board whose points miss by more (rms) is bent, or no such board."""
+AMBIGUOUS = 1.5
+"""A small or distant plane may be tilted either way: two poses whose errors differ by less than this factor."""
+FEWEST_FOR_INTRINSICS = 4
+"""Fewest images of a board that determine intrinsics."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Of one body in one image."""
+
+    camera_from_body: Float[ndarray, "4 4"]
+    rms_px: float
+
+
+def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | None = None) -> Reconstruction:
+    """Cameras in metres, or in sides of unknown length; the recon frame is the board's, or that of the tag seen most.
+
+    `look_for` names the board as `board.KINDS` has it. Unknown intrinsics are calibrated from the board. Raises
+    InputError for a board that is none, and RejectedError when fewer than three images show it.
+    """
+    report = progress or silent
+    readings = boards(look_for)
+    images = [read_image(capture.folder / name) for name in capture.images]
+    report("board", 0.0)
+    board, seen = most_seen(readings, images)
+    report("board", 1.0)
+    seen = [[s for s in sightings if len(s.index) >= FEWEST_POINTS] for sightings in seen]
+    notes = [] if board is readings[0] else [f"the board is read as {board.name}"]
+    intrinsics, intrinsics_notes = _intrinsics(capture, board, seen)
+    notes += intrinsics_notes
+    if (fold_px := fold_distance_px(intrinsics)) is not None:
+        centre, limit_px = np.array([intrinsics.cx, intrinsics.cy]), WITHIN_FOLD * fold_px
+        seen = [
+            [s for s in sightings if np.linalg.norm(s.x_px - centre, axis=1).max() < limit_px]
+            for sightings in seen
+        ]
+        notes.append(f"the distortion folds over at {fold_px:.0f} px from the centre: nothing beyond is used")
+    poses = [{s.body: pose for s in sightings if (pose := pose_of_body(s, intrinsics))} for sightings in seen]
+    recon_from_camera, recon_from_body = locate_cameras_and_bodies(poses)
+    rows = np.array(sorted(recon_from_camera), dtype=int)
+    if len(rows) < 3:
+        raise RejectedError(
+            f"{len(rows)} of {len(capture)} images show {look_for} well enough",
+            "check its size and kind, that it lies flat and wholly in view, or use a back end that needs no marker",
+        )
+    if missing := [name for row, name in enumerate(capture.images) if row not in recon_from_camera]:
+        notes.append(f"the board is not seen, or not sharply, in {', '.join(missing)}")
+    sightings = [[s for s in seen[row] if s.body in recon_from_body and s.body in poses[row]] for row in rows]
+    cameras = np.stack([recon_from_camera[row] for row in rows])
+    if len(recon_from_body) > 1:
+        cameras, recon_from_body = adjust_bodies(cameras, recon_from_body, sightings, intrinsics)
+    tracks = _tracks(sightings, recon_from_body)
+    return Reconstruction(
+        image_index=rows,
+        recon_from_camera=cameras,
+        intrinsics=intrinsics,
+        tracks=tracks,
+        backend="marker",
+        is_metric=not is_of_unknown_size(look_for),
+        metric_std=None if is_of_unknown_size(look_for) else PRINTED,
+        notes=tuple(notes),
+    )
+
+
+def _intrinsics(
+    capture: Capture, board: Board, seen: Sequence[Sequence[Sighting]]
+) -> tuple[Intrinsics, list[str]]:
+    """The given intrinsics, or a focal length, centre and two radial coefficients from the board's points."""
+    if capture.intrinsics is not None:
+        return capture.intrinsics, []
+    shown = [s for sightings in seen for s in sightings]
+    images = sum(map(bool, seen))
+    if images < FEWEST_FOR_INTRINSICS:
+        raise RejectedError(
+            f"{images} of {len(capture)} images show {board.name}, {FEWEST_FOR_INTRINSICS} are needed to find the "
+            "unknown intrinsics from it",
+            "check the board's kind and size, or give the intrinsics",
+        )
+    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_ASPECT_RATIO
+    rms_px, matrix, distortion, _, _, std, *_ = cv2.calibrateCameraExtended(
+        [s.x_in_body.astype(np.float32) for s in shown],
+        [s.x_px.astype(np.float32) for s in shown],
+        capture.image_size,
+        np.eye(3),
+        np.zeros(5),
+        flags=flags,
+    )
+    (fx, _, cx), (_, fy, cy) = matrix[0], matrix[1]
+    k1, k2 = (float(k) for k in distortion.ravel()[:2])
+    intrinsics = Intrinsics(
+        float(fx), float(fy), float(cx), float(cy), *capture.image_size, (k1, k2, 0.0, 0.0, 0.0)
+    )
+    return intrinsics, [
+        f"the intrinsics come from the board: f = {fx:.1f} ± {std[0, 0]:.1f} px, {rms_px:.2f} px rms"
+    ]
+
+
+def pose_of_body(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:
+    """The body's pose, unless its points lie on a line, miss, or leave open which way it is tilted."""
+    x, x_px = sighting.x_in_body, sighting.x_px
+    seen, camera = x_px, (intrinsics.matrix, np.array(intrinsics.distortion))
+    if intrinsics.model == "fisheye":
+        # OpenCV's solvers know the other two: they get a pinhole's image of the same rays.
+        straight = without_distortion(intrinsics)
+        seen, camera = (
+            project(straight, unproject(intrinsics, x_px)),
+            (straight.matrix, np.array(straight.distortion)),
+        )
+    if np.linalg.svd(x - x.mean(0), compute_uv=False)[1] < 1e-6:
+        return None
+    count, rotations, translations, _ = cv2.solvePnPGeneric(x, seen, *camera, flags=cv2.SOLVEPNP_IPPE)
+    found = []
+    for k in range(count):
+        rotation, shift = cv2.solvePnPRefineLM(x, seen, *camera, rotations[k], translations[k])
+        pose = transform(rotation_exp(rotation.ravel()), shift.ravel())
+        residual_px = project(intrinsics, apply(pose, x)) - x_px
+        found.append(Pose(pose, float(np.sqrt((residual_px**2).sum(1).mean()))))
+    found.sort(key=lambda pose: pose.rms_px)
+    if not found or found[0].rms_px > WORST_PX:
+        return None
+    for other in found[1:]:
+        apart_deg = float(
+            rotation_between_deg(found[0].camera_from_body[:3, :3], other.camera_from_body[:3, :3])
+        )
+        if apart_deg > 5 and other.rms_px < AMBIGUOUS * found[0].rms_px + 0.05:
+            return None
+    return found[0]
+
+
+def locate_cameras_and_bodies(
+    poses: Sequence[dict[int, Pose]],
+) -> tuple[dict[int, Float[ndarray, "4 4"]], dict[int, Float[ndarray, "4 4"]]]:
+    """Cameras by row and bodies by number in one frame, chained from the body seen most often.
+
+    A camera is placed by the body that it sees best, a body by the camera that sees it best.
+    """
+    counts = Counter(body for bodies in poses for body in bodies)
+    cameras: dict[int, Float[ndarray, "4 4"]] = {}
+    if not counts:
+        return cameras, {}
+    placed = {max(sorted(counts), key=counts.__getitem__): np.eye(4)}
+    while True:
+        new = [
+            row for row, bodies in enumerate(poses) if row not in cameras and bodies.keys() & placed.keys()
+        ]
+        if not new:
+            return cameras, placed
+        for row in new:
+            body = min(poses[row].keys() & placed.keys(), key=lambda b: poses[row][b].rms_px)
+            cameras[row] = placed[body] @ inverse(poses[row][body].camera_from_body)
+        for body in counts.keys() - placed.keys():
+            seers = [row for row in cameras if body in poses[row]]
+            if seers:
+                row = min(seers, key=lambda r: poses[r][body].rms_px)
+                placed[body] = cameras[row] @ poses[row][body].camera_from_body
+
+
+def adjust_bodies(
+    cameras: Float[ndarray, "m 4 4"],
+    bodies: dict[int, Float[ndarray, "4 4"]],
+    sightings: Sequence[Sequence[Sighting]],
+    intrinsics: Intrinsics,
+) -> tuple[Float[ndarray, "m 4 4"], dict[int, Float[ndarray, "4 4"]]]:
+    """All cameras and bodies adjusted to all points at once; the first body stays."""
+    numbers = list(bodies)
+    count, of_body = len(cameras), {body: k for k, body in enumerate(numbers)}
+    start = np.concatenate([cameras, np.stack([bodies[body] for body in numbers])])
+    seen = [(row, count + of_body[s.body], s) for row, shown in enumerate(sightings) for s in shown]
+
+    def linearised(poses: Float[ndarray, "p 4 4"]) -> tuple[Float[ndarray, "k 1"], Float[ndarray, "k 1 u"]]:
+        residuals, jacobians = [], []
+        for row, place, s in seen:
+            arm = s.x_in_body @ poses[place, :3, :3].T
+            in_recon = arm + poses[place, :3, 3]
+            from_camera = in_recon - poses[row, :3, 3]
+            x_in_camera = from_camera @ poses[row, :3, :3]
+            in_image = by_point(intrinsics, x_in_camera) @ poses[row, :3, :3].T
+            jacobian = np.zeros((len(arm), 2, 6 * len(poses)))
+            jacobian[:, :, 6 * row : 6 * row + 6] = np.concatenate(
+                [-in_image, in_image @ skew(from_camera)], axis=2
+            )
+            jacobian[:, :, 6 * place : 6 * place + 6] = np.concatenate(
+                [in_image, -in_image @ skew(arm)], axis=2
+            )
+            residuals.append((project(intrinsics, x_in_camera) - s.x_px).reshape(-1, 1))
+            jacobians.append(jacobian.reshape(-1, 1, 6 * len(poses)))
+        first_body = slice(6 * count, 6 * count + 6)
+        return np.concatenate(residuals), np.delete(np.concatenate(jacobians), first_body, axis=2)
+
+    def retracted(poses: Float[ndarray, "p 4 4"], step: Float[ndarray, " u"]) -> Float[ndarray, "p 4 4"]:
+        return retract(poses, np.insert(step, 6 * count, np.zeros(6)).reshape(-1, 6))
+
+    poses = minimise(linearised, start, retracted, "soft_l1").unknowns
+    return poses[:count], dict(zip(numbers, poses[count:], strict=True))
+
+
+def _tracks(sightings: Sequence[Sequence[Sighting]], bodies: dict[int, Float[ndarray, "4 4"]]) -> Tracks:
+    seen = [(row, s) for row, shown in enumerate(sightings) for s in shown]
+    names = [(s.body, index) for _, s in seen for index in s.index]
+    place = {name: k for k, name in enumerate(dict.fromkeys(names))}
+    point = np.array([place[name] for name in names])
+    x_in_recon = np.concatenate([apply(bodies[s.body], s.x_in_body) for _, s in seen])
+    return Tracks(
+        image=np.repeat([row for row, _ in seen], [len(s.index) for _, s in seen]),
+        x_px=np.concatenate([s.x_px for _, s in seen]),
+        point=point,
+        points_in_recon=x_in_recon[np.unique(point, return_index=True)[1]],
+        from_board=True,
+    )

@@ -1,0 +1,72 @@
+"""SIFT features of all images of a capture, found once, and matched in memory."""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+from numpy import ndarray
+
+from jcr.features.gate import Key
+from jcr.features.kept import KeptFeatures
+from jcr.features.sift import Sift, detect, grey_of, matches
+from jcr.progress import Progress, steps
+
+
+class SiftFeatures:
+    """SIFT of a capture's images at a working size; how images are rotated against each other is no matter."""
+
+    minds_roll = False
+    every_pair = 24
+
+    def __init__(
+        self,
+        images: Sequence[UInt8[ndarray, "h w 3"]],
+        size: tuple[int, int],
+        threads: int,
+        report: Progress,
+        kept: KeptFeatures | None = None,
+    ) -> None:
+        """Features that are kept are not found again."""
+        self.x_px: list[Float[ndarray, "_ 2"]] = []
+        """Keypoints of every image, in pixels of images of `size`."""
+        self._descriptors: list[Float32[ndarray, "_ 128"]] = []
+        self._size, self._kept = size, kept
+        with ThreadPoolExecutor(threads) as pool:
+            found = pool.map(self._of_image, range(len(images)), images)
+            for _, one in zip(steps(report, "features", images), found, strict=True):
+                self._append(one)
+
+    def add(self, image: UInt8[ndarray, "h w 3"]) -> None:
+        """Find the features of one more image."""
+        self._append(self._of_image(len(self.x_px), image))
+
+    def _append(self, found: Sift) -> None:
+        self.x_px.append(found[0])
+        self._descriptors.append(found[1])
+
+    def _of_image(self, row: int, image: UInt8[ndarray, "h w 3"]) -> Sift:
+        kept = self._kept
+        if kept is not None and (there := kept.features(row, self._size)) is not None:
+            return there
+        found = detect(grey_of(image, self._size))
+        if kept is not None and kept.is_written:
+            kept.keep_features(row, self._size, found)
+        return found
+
+    def matches(
+        self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], coarse: bool = False
+    ) -> list[Int[ndarray, "_ 2"]]:
+        """Rows of the keypoints that match, of each pair; neither the rotations of the images (rad) nor `coarse` change
+        them."""
+
+        def of_pair(key: Key) -> Int[ndarray, "_ 2"]:
+            return np.stack(matches(self._descriptors[key[0]], self._descriptors[key[1]]), 1)
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            return list(pool.map(of_pair, pairs))
+
+    def descriptors(self, row: int, roll: float) -> tuple[int, Float[ndarray, "k 128"]]:
+        """0, and the unit descriptors of all keypoints; the rotation changes nothing."""
+        return 0, self._descriptors[row]

@@ -1,0 +1,142 @@
+"""Cameras and depths brought to agree in colour at one size of the images: search along rays, and Gauss-Newton."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.linalg import null_space
+
+from jcr.geometry import nearest_to_lines, retract, step_axes
+from jcr.photometric.residuals import Cameras, Level, Points, energy, equations, on_rays, strongest
+
+DEPTHS = 40
+"""Tried along a ray, evenly spaced in inverse depth."""
+DEPTH_RANGE = (0.55, 1.8)
+"""Nearest and farthest depth, as shares of the distance at which the cameras' axes meet."""
+MEET_WITHIN = (0.1, 2.0)
+"""m. Distance at which they may."""
+AGREED = 0.5
+"""Cost of a point beyond which its depth is not used."""
+IMAGES_AT_FULL = 10
+"""Most images that each get all points; with more each has fewer, as each point is seen more often."""
+SETTLED = 0.995
+"""A round that leaves more of the cost than this was the last."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One level of the pyramid."""
+
+    height: int
+    """Height of the images in pixels."""
+    per_image: int
+    """Points."""
+    rounds: int
+    """At most, of a search along all rays and Gauss-Newton, until the search finds nothing better."""
+    sigma: float
+    """Difference of colours (0 to 1) that counts half."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """Cameras on the robot's poses, and how badly the colours fit."""
+
+    cameras: Cameras
+    cost: float
+
+
+def axes_meet(base_from_camera: Float[ndarray, "*batch n 4 4"]) -> Float[ndarray, "*batch 3"]:
+    """The point nearest to all optical axes."""
+    return nearest_to_lines(base_from_camera[..., :3, 3], base_from_camera[..., :3, 2])
+
+
+def with_cost(level: Level, cameras: Cameras, stage: Stage) -> Found:
+    """The cameras with the cost of their colours' differences, at the best depth of each point."""
+    host, x_px = strongest(level, _per_image(level, stage))
+    return Found(cameras, on_rays(level, cameras, host, x_px, _depths(cameras), stage.sigma, AGREED)[1])
+
+
+def _per_image(level: Level, stage: Stage) -> int:
+    return max(10, stage.per_image * IMAGES_AT_FULL // max(level.count, IMAGES_AT_FULL))
+
+
+def _depths(cameras: Cameras) -> Float[ndarray, "d n"]:
+    """Depths to try in every image."""
+    pose = cameras.base_from_camera
+    depth = ((axes_meet(pose) - pose[:, :3, 3]) * pose[:, :3, 2]).sum(1)
+    middle = np.clip(depth, *MEET_WITHIN)
+    return middle / np.linspace(1 / DEPTH_RANGE[0], 1 / DEPTH_RANGE[1], DEPTHS)[:, None]
+
+
+def tied_directions(intrinsics_known: bool) -> Float[ndarray, "7 q"]:
+    """Directions in which cameras on a robot's gripper, all alike, and their intrinsics may move."""
+    return np.eye(7)[:, : 6 if intrinsics_known else 7]
+
+
+def free_directions(cameras: Cameras, intrinsics_known: bool) -> Float[ndarray, "p q"]:
+    """Directions in which cameras may move one by one: the first stays, and so does their common scale."""
+    pose = cameras.base_from_camera
+    grown = np.zeros((len(pose), 6))
+    grown[:, :3] = np.einsum("nji,nj->ni", pose[:, :3, :3], pose[:, :3, 3] - pose[0, :3, 3])
+    fixed = np.zeros((8, 6 * len(pose) + 1))
+    fixed[:6, :6] = np.eye(6)
+    fixed[6, :-1] = grown.ravel()
+    fixed[7, -1] = intrinsics_known
+    return null_space(fixed)
+
+
+def align_photometrically(
+    level: Level, cameras: Cameras, stage: Stage, directions: Float[ndarray, "p q"]
+) -> tuple[Cameras, Points]:
+    """Search along the rays and Gauss-Newton, alternately."""
+    host, x_px = strongest(level, _per_image(level, stage))
+    before, points = np.inf, None
+    for _ in range(stage.rounds):
+        points, cost = on_rays(level, cameras, host, x_px, _depths(cameras), stage.sigma, AGREED)
+        if cost > SETTLED * before:
+            break
+        cameras, points = after_descent(level, cameras, points, stage.sigma, directions)
+        before = cost
+    assert points is not None
+    return cameras, points
+
+
+def after_descent(
+    level: Level, cameras: Cameras, points: Points, sigma: float, directions: Float[ndarray, "p q"]
+) -> tuple[Cameras, Points]:
+    """A few steps of Levenberg and Marquardt; the cameras move together where there are 7 parameters.
+
+    Not least_squares.py: thousands of depths are eliminated, and steps cost so much more than the energy that a
+    thousandth of it is not worth another one.
+    """
+    damping, best = 1e-3, energy(level, cameras, points, sigma)
+    for _ in range(6):
+        system = equations(level, cameras, points, sigma, tied=len(directions) == 7)
+        normal = directions.T @ system.normal @ directions
+        gradient = directions.T @ system.gradient.sum(0)
+        for _ in range(5):
+            damped = normal + np.diag(damping * np.diag(normal) + 1e-9)
+            step = -directions @ np.linalg.solve(damped, gradient)
+            depth = points.depth * np.exp(np.clip(system.depth_step(step), -0.05, 0.05))
+            tried = after_step(cameras, step), replace(points, depth=depth)
+            cost = energy(level, *tried, sigma)
+            if cost < best:
+                break
+            damping *= 6
+        else:
+            return cameras, points
+        settled = best - cost < 3e-4 * best
+        (cameras, points), best, damping = tried, cost, damping / 6
+        if settled:
+            break
+    return cameras, points
+
+
+def after_step(cameras: Cameras, step: Float[ndarray, " p"]) -> Cameras:
+    """Cameras after twists (v, ω) in camera axes, one for all or one for each, and a step of the log focal length."""
+    pose, twist = cameras.base_from_camera, step[:-1].reshape(-1, 6, 1)
+    return Cameras(
+        retract(pose, (step_axes(pose[:, :3, :3]) @ twist)[..., 0]),
+        cameras.zoom * float(np.exp(np.clip(step[-1], -0.1, 0.1))),
+    )

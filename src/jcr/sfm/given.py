@@ -1,0 +1,108 @@
+"""The `given` back end: camera poses of a COLMAP model.
+
+The model's own points are its tracks; where it has none, features are matched and triangulated with the cameras fixed.
+"""
+
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+
+from jcr.capture.formats import colmap
+from jcr.capture.images import read_image
+from jcr.errors import InputError, RejectedError
+from jcr.features.matchers import Matcher
+from jcr.features.pairs import all_pairs
+from jcr.features.verify import write_geometries, write_keypoints
+from jcr.progress import Progress, silent
+from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
+from jcr.sfm.mapping import enter, quiet_colmap, sift_features, tracks_of
+from jcr.sfm.options import ColmapOptions
+from jcr.sfm.placed import model_of
+
+MIN_POINTS = 50
+
+
+def reconstruct_given(
+    capture: Capture, cameras: Path, options: ColmapOptions, progress: Progress | None = None
+) -> Reconstruction:
+    """The capture's images that the model at `cameras` knows, with its poses fixed.
+
+    Raises InputError when the model knows fewer than three, RejectedError when nothing can be triangulated.
+    """
+    report = progress or silent
+    names, recon_from_camera = colmap.read_cameras(cameras)
+    row_of = _rows(names)
+    known = [k for k, name in enumerate(capture.images) if row_of(name) is not None]
+    if len(known) < 3:
+        raise InputError(
+            f"{cameras}: knows {len(known)} of the capture's images by name; at least 3 are needed"
+        )
+    rows = [row for k in known if (row := row_of(capture.images[k])) is not None]
+    recon_from_camera = recon_from_camera[rows]
+    intrinsics = capture.intrinsics or colmap.read_intrinsics(cameras, capture.image_size)
+    tracks = _own_tracks(cameras, [names[row] for row in rows], capture.image_size)
+    if len(tracks.points_in_recon) < MIN_POINTS:
+        images = [read_image(capture.folder / capture.images[k]) for k in known]
+        tracks = _triangulated(images, intrinsics, recon_from_camera, options, report)
+    if len(tracks.points_in_recon) < MIN_POINTS:
+        raise RejectedError(
+            f"{cameras}: with its camera poses only {len(tracks.points_in_recon)} points can be triangulated",
+            "check that it belongs to these images, or leave it out (--backend colmap)",
+        )
+    missing = [name for k, name in enumerate(capture.images) if k not in known]
+    notes = (f"no camera pose is given for {', '.join(missing)}",) if missing else ()
+    return Reconstruction(
+        image_index=np.array(known),
+        recon_from_camera=recon_from_camera,
+        intrinsics=intrinsics,
+        tracks=tracks,
+        backend="given",
+        notes=notes,
+    )
+
+
+def _rows(names: Sequence[str]) -> Callable[[str], int | None]:
+    """Of an image the row of that name, with as much of its folder as the model tells; None where there is none."""
+    by_path = {Path(name).parts: row for row, name in enumerate(names)}
+    by_name = {Path(name).name: row for row, name in enumerate(names)}
+
+    def row_of(image: str) -> int | None:
+        parts = Path(image).parts
+        exact = (by_path[parts[k:]] for k in range(len(parts)) if parts[k:] in by_path)
+        return next(exact, by_name.get(parts[-1]))
+
+    return row_of
+
+
+def _own_tracks(cameras: Path, names: Sequence[str], size: tuple[int, int]) -> Tracks:
+    """Return the observations that a COLMAP model holds."""
+    model = colmap.read_model(cameras)
+    id_of = {model.image(image_id).name: image_id for image_id in model.reg_image_ids()}
+    return tracks_of(model, [id_of[name] for name in names], size)
+
+
+def _triangulated(
+    images: Sequence[UInt8[ndarray, "h w 3"]],
+    intrinsics: Intrinsics,
+    recon_from_camera: Float[ndarray, "m 4 4"],
+    options: ColmapOptions,
+    report: Progress,
+) -> Tracks:
+    """Points of matched features, with intrinsics and cameras fixed."""
+    with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
+        database = Path(folder) / "database.db"
+        cameras = enter(database, len(images), [intrinsics], True, options.working_size_px)
+        found = sift_features(images, cameras[0], report)
+        matcher = Matcher(found, np.ones(2), cameras[0], True, options.seed)
+        report("matching", 0.0)
+        pairs = all_pairs(len(images))
+        write_keypoints(database, matcher.x_px)
+        write_geometries(database, matcher.geometries(pairs, np.zeros((len(pairs), 2))))
+        model = model_of(database, cameras[0], dict(enumerate(recon_from_camera)))
+        model = pycolmap.triangulate_points(model, database, folder, Path(folder))
+        return tracks_of(model, range(1, len(images) + 1), (intrinsics.width, intrinsics.height))

@@ -1,0 +1,565 @@
+"""Structure from motion with pycolmap: features, matches that the robot checks, incremental mapping, bundle adjustment,
+and the observations aligned to a tenth of a pixel (least_squares_matching.py).
+
+COLMAP has the centre of the top-left pixel at (0.5, 0.5); this file is the border where that half pixel,
+the working size and COLMAP's camera models are converted.
+Method: Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016.
+"""
+
+import math
+import os
+import signal
+import tempfile
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+
+from jcr.allocator import give_back
+from jcr.camera import HALF_PIXEL, fold_distance_px, resized
+from jcr.errors import RejectedError
+from jcr.features.guided import guided
+from jcr.features.kept import KeepingMatcher, KeptFeatures
+from jcr.features.matchers import Matcher
+from jcr.features.sift import grey_of
+from jcr.features.sift_features import SiftFeatures
+from jcr.features.stage import Matched, match_with_robot
+from jcr.features.verify import View, read_geometries, write_geometries, write_keypoints
+from jcr.geometry import inverse
+from jcr.progress import Progress
+from jcr.records import Intrinsics, Reconstruction, Tracks
+from jcr.sfm.options import ColmapOptions
+from jcr.sfm.placed import (
+    LEAST_SHARED,
+    joined,
+    poses_of,
+    predicted_cameras,
+    resectioned,
+    retriangulated,
+    shared_points,
+)
+from jcr.sfm.primed import primed
+from jcr.sfm.track_refinement import align_tracks
+
+_MIN_REGISTERED = 3
+_GUIDED_PARTNERS = 6
+"""Images with which one that was left out is matched along epipolar lines."""
+_PREDICTED_STD = 0.008
+"""rad, of directions predicted by X and the robot."""
+_MANY, _GROWN = 40, 1.3
+"""Of more images than the first, COLMAP adjusts all only when the map has grown by the second (its default: 1.1)."""
+_ENOUGH = 1e-6
+"""Relative change of a cost that ends an adjustment: with COLMAP's 0 it takes three times as long, and cameras come out
+1e-5 of their distance elsewhere."""
+_ROUGHLY = 1e-3
+"""The same of an adjustment that others follow."""
+_MOST_OBSERVATIONS = 60_000
+"""Of a map; the robot limits what more could add, and the calibration adjusts no more (calibration/case.py)."""
+_SIFT_THREADS = 8
+"""Largest number of images whose features are found at once; each takes 240 bytes a pixel while it is worked on."""
+_FEW_FEATURES = 1000
+"""Per image; textured tabletops give 1500 to 5000, a chessboard before a plain background 400."""
+
+
+def structure_from_motion(
+    images: Sequence[UInt8[ndarray, "h w 3"]],
+    all_intrinsics: Sequence[Intrinsics],
+    known: bool,
+    options: ColmapOptions,
+    report: Progress,
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    names: Sequence[str],
+    kept: KeptFeatures | None,
+) -> Reconstruction:
+    """Camera poses and tracks of images of one camera; the same, bit for bit, for the same seed.
+
+    The gripper poses check the matches (`match.stage`); `names` are those of the images, for notes. SIFT features and
+    pairs that are `kept` are not found again.
+
+    `known` intrinsics are the only ones of `all_intrinsics`, do not fold over, and stay fixed; unknown ones are starting
+    points, tried in turn, for a focal length and two radial coefficients. Raises RejectedError when fewer than three
+    images register.
+    """
+    seed = options.seed
+    with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
+        database = Path(folder) / "database.db"
+        cameras = enter(database, len(images), all_intrinsics, known, options.working_size_px)
+        matcher = matcher_of(options, images, cameras[0], known, report, kept)
+        matched = matched_pairs(
+            database, matcher, base_from_gripper, all_intrinsics[0], cameras, known, names, report
+        )
+        model, matched = _map_of_pairs(
+            database, matcher, matched, cameras, base_from_gripper, names, known, seed, report
+        )
+        if model is None or model.num_reg_images() < _MIN_REGISTERED:
+            raise _not_registered(database, len(images), model)
+        _thin(model, seed)
+        adjust_robustly(model, known, _ROUGHLY)
+        std_px = _align_observations(
+            model, images, all_intrinsics[0] if known else intrinsics_of(model.camera(1), all_intrinsics[0])
+        )
+        adjust_robustly(model, fix_intrinsics=known)
+        intrinsics, notes = (
+            (all_intrinsics[0] if known else intrinsics_of(model.camera(1), all_intrinsics[0])),
+            list(matched.notes),
+        )
+        if not known and fold_distance_px(intrinsics) is not None:
+            notes.append("the views do not determine the distortion: it is taken as zero")
+            model.camera(1).params = [*model.camera(1).params[:3], 0.0, 0.0]
+            adjust_robustly(model, fix_intrinsics=True)
+            intrinsics = intrinsics_of(model.camera(1), intrinsics)
+    report("mapping", 1.0)
+    rows = sorted(image_id - 1 for image_id in model.reg_image_ids())
+    tracks = tracks_of(model, [row + 1 for row in rows], (intrinsics.width, intrinsics.height))
+    return Reconstruction(
+        image_index=np.array(rows),
+        recon_from_camera=poses_of(model, rows),
+        intrinsics=intrinsics,
+        tracks=replace(tracks, std_px=std_px),
+        backend="colmap",
+        notes=tuple(notes),
+        warnings=matched.warnings,
+    )
+
+
+def _map_of_pairs(
+    database: Path,
+    matcher: Matcher,
+    matched: Matched,
+    cameras: list[pycolmap.Camera],
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    names: Sequence[str],
+    known: bool,
+    seed: int,
+    report: Progress,
+) -> tuple[pycolmap.Reconstruction | None, Matched]:
+    """The map of the matched pairs, of many images from the robot's poses, and the pairs with those added that place
+    images which COLMAP's mapper left out."""
+    count, model = len(matcher.x_px), None
+    if known and matched.gate is not None and count > _MANY:
+        model = primed(
+            database,
+            cameras[0],
+            matched.gate,
+            matched.geometries,
+            base_from_gripper,
+            lambda made: adjust_robustly(made, True, _ROUGHLY),
+        )
+    if model is None or model.num_reg_images() < count:
+        model = map_incrementally(database, count, cameras, known, seed, report, model)
+    if model is not None and model.num_reg_images() < count:
+        return _with_predicted_images(database, model, matcher, matched, base_from_gripper, names)
+    return model, matched
+
+
+def enter(
+    database: Path, count: int, all_intrinsics: Sequence[Intrinsics], known: bool, working_size_px: int
+) -> list[pycolmap.Camera]:
+    """A new database of `count` images without features; the intrinsics, at the working size, as COLMAP's cameras."""
+    width, height = all_intrinsics[0].width, all_intrinsics[0].height
+    scale = min(1.0, working_size_px / max(width, height))
+    size = round(width * scale), round(height * scale)
+    cameras = [camera_of(resized(intrinsics, *size), known) for intrinsics in all_intrinsics]
+    with closing(pycolmap.Database.open(database)) as db:
+        db.write_camera(cameras[0], use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=1)
+        rig.add_ref_sensor(cameras[0].sensor_id)
+        db.write_rig(rig, use_rig_id=True)
+        for row in range(count):
+            image = pycolmap.Image(name=f"{row:05d}", camera_id=1, image_id=row + 1)
+            db.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame(frame_id=row + 1, rig_id=1)
+            frame.add_data_id(image.data_id)
+            db.write_frame(frame, use_frame_id=True)
+    return cameras
+
+
+def matcher_of(
+    options: ColmapOptions,
+    images: Sequence[UInt8[ndarray, "h w 3"]],
+    camera: pycolmap.Camera,
+    known: bool,
+    report: Progress,
+    kept: KeptFeatures | None = None,
+) -> Matcher:
+    """The matcher of some kind of features; SIFT's are found here, those of networks when they are matched."""
+    if options.features == "sift":
+        found = sift_features(images, camera, report, kept)
+        if kept is None:
+            return Matcher(found, np.ones(2), camera, known, options.seed)
+        return KeepingMatcher(found, camera, known, options.seed, kept)
+    from jcr.features.learned import LearnedFeatures
+
+    height, width = images[0].shape[:2]
+    scale = np.array([camera.width / width, camera.height / height])
+    return Matcher(LearnedFeatures(images, report), scale, camera, known, options.seed)
+
+
+def sift_features(
+    images: Sequence[UInt8[ndarray, "h w 3"]],
+    camera: pycolmap.Camera,
+    report: Progress,
+    kept: KeptFeatures | None = None,
+) -> SiftFeatures:
+    """Return the SIFT features of images at the size of a camera."""
+    give_back()
+    threads = min(os.cpu_count() or 1, _SIFT_THREADS)
+    found = SiftFeatures(images, (camera.width, camera.height), threads, report, kept)
+    give_back()
+    return found
+
+
+def matched_pairs(
+    database: Path,
+    matcher: Matcher,
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    intrinsics: Intrinsics,
+    cameras: list[pycolmap.Camera],
+    known: bool,
+    names: Sequence[str],
+    report: Progress,
+) -> Matched:
+    """The pairs that a mapper may believe, written into the database; intrinsics that the robot found come first."""
+    report("matching", 0.0)
+    working = resized(intrinsics, cameras[0].width, cameras[0].height)
+    matched = match_with_robot(
+        matcher,
+        base_from_gripper,
+        working,
+        known,
+        names,
+        (intrinsics.width, intrinsics.height),
+        lambda fraction: report("matching", fraction),
+    )
+    write_keypoints(database, matcher.x_px)
+    write_geometries(database, matched.geometries)
+    if not known and matched.intrinsics != working:
+        cameras.insert(0, camera_of(matched.intrinsics, known))
+    report("matching", 1.0)
+    return matched
+
+
+def map_incrementally(
+    database: Path,
+    n_images: int,
+    cameras: list[pycolmap.Camera],
+    known: bool,
+    seed: int,
+    report: Progress,
+    begun: pycolmap.Reconstruction | None = None,
+) -> pycolmap.Reconstruction | None:
+    """The model with most images over all starting cameras; with relaxed demands if that is below three.
+
+    A model that is `begun` is resumed with the images that it lacks. The share of images in the model is reported; it
+    falls back where another start is tried.
+    """
+    pipeline = pipeline_options(known, seed)
+    if n_images > _MANY:
+        pipeline.ba_global_frames_ratio = pipeline.ba_global_points_ratio = _GROWN
+    mapper = pipeline.mapper
+    best, registered = None, 0
+    for init_inliers, init_angle_deg, inliers in ((100, 16.0, 30), (50, 8.0, 15)):
+        mapper.init_min_num_inliers, mapper.init_min_tri_angle = init_inliers, init_angle_deg
+        mapper.abs_pose_min_num_inliers = inliers
+        for camera in cameras:
+            with closing(pycolmap.Database.open(database)) as db:
+                db.update_camera(camera)
+            models = _models(database, n_images, pipeline, report, begun)
+            for model in models.values():
+                if model.num_reg_images() > registered:
+                    best, registered = model, model.num_reg_images()
+            if registered == n_images:
+                return best
+        if registered >= _MIN_REGISTERED:
+            return best
+    return best
+
+
+def _with_predicted_images(
+    database: Path,
+    model: pycolmap.Reconstruction,
+    matcher: Matcher,
+    matched: Matched,
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    names: Sequence[str],
+) -> tuple[pycolmap.Reconstruction, Matched]:
+    """The model with images that the mapper left out and the robot helps to place, which `matched` then names, too."""
+    predicted = predicted_cameras(model, base_from_gripper)
+    if predicted is None:
+        return model, matched
+    rows = sorted(image_id - 1 for image_id in model.reg_image_ids())
+    left = [row for row in range(len(base_from_gripper)) if row not in rows]
+    camera = model.camera(1)
+    intrinsics = matched.intrinsics if matcher.known else intrinsics_of(camera, matched.intrinsics)
+    _match_guided(database, matcher, View.of(matcher.x_px, intrinsics), camera, matched, predicted, left)
+    poses = dict(zip(rows, poses_of(model, rows), strict=True))
+    apart = _second_model(database, left, camera, matcher.known, matcher.seed)
+    together = joined(apart, predicted) if apart is not None else {}
+    for row in left:
+        if (pose := resectioned(database, model, row, predicted[row])) is not None:
+            together.pop(row, None)
+            poses[row] = pose
+    resected = poses.keys() - set(rows)
+    if not resected and not together:
+        return model, matched
+    larger = retriangulated(database, camera, poses | together, lambda made: adjust_robustly(made, True))
+    notes, warnings = list(matched.notes), list(matched.warnings)
+    if together and shared_points(larger, set(together)) < LEAST_SHARED:
+        listed = ", ".join(names[row] for row in sorted(together))
+        warnings.append(
+            f"{listed} make a model of their own that nothing in the images ties to the rest: left out; add images "
+            "between them"
+        )
+        if not resected:
+            return model, replace(matched, warnings=tuple(warnings))
+        larger = retriangulated(database, camera, poses, lambda made: adjust_robustly(made, True))
+    elif together:
+        listed = ", ".join(names[row] for row in sorted(together))
+        notes.append(f"{listed} were mapped apart, and joined through the robot's motion")
+    if resected:
+        listed = ", ".join(names[row] for row in sorted(resected))
+        notes.append(f"{listed} were placed near the pose that the robot predicts")
+    return larger, replace(matched, notes=tuple(notes), warnings=tuple(warnings))
+
+
+def _match_guided(
+    database: Path,
+    matcher: Matcher,
+    view: View,
+    camera: pycolmap.Camera,
+    matched: Matched,
+    predicted: Float[ndarray, "n 4 4"],
+    left: Sequence[int],
+) -> None:
+    """Further verified pairs of images that are not mapped, along predicted epipolar lines, into the database."""
+    found = read_geometries(database)
+    upright = np.zeros(len(predicted)) if matched.upright is None else matched.upright
+    toward = predicted[:, :3, 2]
+    for row in left:
+        near = np.argsort(-(toward @ toward[row]), kind="stable")
+        for other in [int(k) for k in near if k != row][:_GUIDED_PARTNERS]:
+            i, j = min(row, other), max(row, other)
+            if (i, j) in found:
+                continue
+            i_from_j = inverse(predicted[i]) @ predicted[j]
+            geometry = guided(matcher, view, camera, (i, j), i_from_j, upright, _PREDICTED_STD)
+            if geometry is not None:
+                found[i, j] = geometry
+    write_geometries(database, found)
+
+
+def _second_model(
+    database: Path, left: Sequence[int], camera: pycolmap.Camera, known: bool, seed: int
+) -> pycolmap.Reconstruction | None:
+    """What the mapper makes of the images that are left, its intrinsics those of the map; None where it makes
+    nothing."""
+    if len(left) < 2:
+        return None
+    with closing(pycolmap.Database.open(database)) as db:
+        db.update_camera(camera)
+    pipeline = pipeline_options(known, seed)
+    pipeline.image_names = [f"{row:05d}" for row in left]
+    pipeline.mapper.init_min_num_inliers, pipeline.mapper.init_min_tri_angle = 50, 8.0
+    pipeline.mapper.abs_pose_min_num_inliers = 15
+    models = pycolmap.incremental_mapping(database, database.parent, database.parent, pipeline)
+    largest = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+    return largest if largest is not None and largest.num_reg_images() >= 2 else None
+
+
+def pipeline_options(known: bool, seed: int) -> pycolmap.IncrementalPipelineOptions:
+    """COLMAP's incremental mapping, the same for the same seed."""
+    pipeline = pycolmap.IncrementalPipelineOptions()
+    mapper = pipeline.mapper
+    pipeline.min_model_size = 2
+    pipeline.extract_colors = False
+    # A first pair may bend unknown intrinsics until no third image fits: others are tried, the largest model counts.
+    pipeline.multiple_models, pipeline.max_num_models = not known, 3
+    pipeline.random_seed = mapper.random_seed = pipeline.triangulation.random_seed = seed
+    pipeline.num_threads = mapper.num_threads = 1  # sums over threads differ in the last bits
+    pipeline.ba_global_function_tolerance = pipeline.ba_local_function_tolerance = _ENOUGH
+    if known:
+        pipeline.ba_refine_focal_length = pipeline.ba_refine_extra_params = False
+        mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = False
+    return pipeline
+
+
+def _models(
+    database: Path,
+    n_images: int,
+    pipeline: pycolmap.IncrementalPipelineOptions,
+    report: Progress,
+    begun: pycolmap.Reconstruction | None,
+) -> dict[int, pycolmap.Reconstruction]:
+    """COLMAP's models from one start, or from a model; the share of images registered so far reported."""
+    registered, folder = 0, database.parent
+    if begun is not None:
+        registered, folder = begun.num_reg_images(), database.parent / "begun"
+        folder.mkdir(exist_ok=True)
+        begun.write(folder)
+
+    def add(count: int) -> None:
+        nonlocal registered
+        registered += count
+        report("mapping", min(registered / n_images, 1.0))  # COLMAP may begin again with another pair
+
+    add(0)
+    return pycolmap.incremental_mapping(
+        database,
+        database.parent,
+        database.parent,
+        pipeline,
+        "" if begun is None else folder,
+        initial_image_pair_callback=lambda: add(2),
+        next_image_callback=lambda: add(1),
+    )
+
+
+def adjust_robustly(model: pycolmap.Reconstruction, fix_intrinsics: bool, enough: float = _ENOUGH) -> None:
+    """One more bundle adjustment under a Cauchy loss, for COLMAP's least squares lets mismatches pull.
+
+    It halves the error of the camera centres (0.20 to 0.11 mm rms over 12 simulated views). A relative change of the
+    cost of less than `enough` ends it.
+    """
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length = options.refine_extra_params = not fix_intrinsics
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = 0.5
+    options.ceres.solver_options.num_threads = 1
+    options.ceres.solver_options.function_tolerance = enough
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # pycolmap.bundle_adjustment() does the same, but enables the log again.
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+
+
+def _thin(model: pycolmap.Reconstruction, seed: int) -> None:
+    """Leave a random choice of the points of a model with more observations than add something."""
+    points = sorted(model.point3D_ids())
+    if model.compute_num_observations() <= _MOST_OBSERVATIONS:
+        return
+    order = np.random.default_rng(seed).permutation(points)
+    count = np.cumsum([model.point3D(int(point)).track.length() for point in order])
+    for point in order[count > _MOST_OBSERVATIONS]:
+        model.delete_point3D(int(point))
+
+
+def _align_observations(
+    model: pycolmap.Reconstruction, images: Sequence[UInt8[ndarray, "h w 3"]], intrinsics: Intrinsics
+) -> Float[ndarray, " k"] | None:
+    """Least-squares matching of the model's observations, in the images that features were found in.
+
+    The standard deviation of each is returned in pixels of the original images, in the order of `tracks_of`.
+    """
+    camera, image_ids = model.camera(1), sorted(model.reg_image_ids())
+    size = camera.width, camera.height
+    poses = poses_of(model, [image_id - 1 for image_id in image_ids])
+    greys = np.stack([grey_of(images[image_id - 1], size) for image_id in image_ids])
+    aligned = align_tracks(greys, tracks_of(model, image_ids, size), poses, resized(intrinsics, *size))
+    for (row, index, _), x_px in zip(_observations(model, image_ids), aligned.x_px, strict=True):
+        model.image(image_ids[row]).point2D(index).xy = x_px + HALF_PIXEL
+    return None if aligned.std_px is None else intrinsics.width / camera.width * aligned.std_px
+
+
+def _not_registered(database: Path, n_images: int, model: pycolmap.Reconstruction | None) -> RejectedError:
+    """How many registered, the likely reason, what to do instead."""
+    with closing(pycolmap.Database.open(database)) as db:
+        features = int(np.median([db.num_keypoints_for_image(row + 1) for row in range(n_images)]))
+        matched = db.num_verified_image_pairs()
+    if features < _FEW_FEATURES:
+        reason = f"too little texture, {features} features in the median image where {_FEW_FEATURES} are few"
+    elif matched < n_images - 1:
+        reason = f"only {matched} of {math.comb(n_images, 2)} pairs of images share features"
+    else:
+        reason = (
+            "the matches agree on no common scene: a repeated pattern, things that moved, or wrong intrinsics"
+        )
+    return RejectedError(
+        f"structure from motion registered {model.num_reg_images() if model else 0} of {n_images} images ({reason})",
+        "put textured objects or a newspaper on the table, let the views overlap more, or use a foundation-model back "
+        "end or a marker",
+        despite_texture=features >= _FEW_FEATURES,
+    )
+
+
+def tracks_of(model: pycolmap.Reconstruction, image_ids: Sequence[int], size: tuple[int, int]) -> Tracks:
+    """Every observation of every triangulated point by images `image_ids`, in pixels of images of `size`."""
+    camera = model.camera(model.image(image_ids[0]).camera_id)
+    original_from_working = np.array([size[0] / camera.width, size[1] / camera.height])
+    seen = _observations(model, image_ids)
+    image, _, point = zip(*seen, strict=True) if seen else ((), (), ())
+    x_px = [model.image(image_ids[row]).point2D(index).xy for row, index, _ in seen]
+    return Tracks(
+        image=np.array(image, dtype=int),
+        x_px=np.reshape(x_px, (-1, 2)) * original_from_working - HALF_PIXEL,
+        point=np.array(point, dtype=int),
+        points_in_recon=np.reshape(
+            [model.point3D(point_id).xyz for point_id in sorted(model.point3D_ids())], (-1, 3)
+        ),
+    )
+
+
+def _observations(model: pycolmap.Reconstruction, image_ids: Sequence[int]) -> list[tuple[int, int, int]]:
+    """Row of `image_ids`, row of the image's keypoints and row of the points in the order of their ids."""
+    row_of = {image_id: row for row, image_id in enumerate(image_ids)}
+    return [
+        (row_of[element.image_id], element.point2D_idx, point)
+        for point, point_id in enumerate(sorted(model.point3D_ids()))
+        for element in model.point3D(point_id).track.elements
+        if element.image_id in row_of
+    ]
+
+
+def camera_of(intrinsics: Intrinsics, known: bool) -> pycolmap.Camera:
+    """COLMAP's one camera: the given intrinsics, or a focal length and two radial coefficients to refine."""
+    centre = [intrinsics.cx + HALF_PIXEL, intrinsics.cy + HALF_PIXEL]
+    if not known:
+        name, params = "RADIAL", [intrinsics.fx, *centre, 0.0, 0.0]
+    elif intrinsics.model == "fisheye":
+        name, params = "OPENCV_FISHEYE", [intrinsics.fx, intrinsics.fy, *centre, *intrinsics.distortion]
+    elif any(intrinsics.distortion):
+        eight = [*intrinsics.distortion, 0.0, 0.0, 0.0][:8]
+        name, params = "FULL_OPENCV", [intrinsics.fx, intrinsics.fy, *centre, *eight]
+    else:
+        name, params = "PINHOLE", [intrinsics.fx, intrinsics.fy, *centre]
+    camera = pycolmap.Camera(
+        model=name, width=intrinsics.width, height=intrinsics.height, params=params, camera_id=1
+    )
+    camera.has_prior_focal_length = known
+    return camera
+
+
+def intrinsics_of(camera: pycolmap.Camera, like: Intrinsics) -> Intrinsics:
+    """Of a camera that `camera_of` made for unknown intrinsics; in images of the size of `like`."""
+    focal, cx, cy, k1, k2 = (float(p) for p in camera.params)
+    distortion = (k1, k2, 0.0, 0.0, 0.0)
+    centre = cx - HALF_PIXEL, cy - HALF_PIXEL
+    intrinsics = Intrinsics(focal, focal, *centre, camera.width, camera.height, distortion)
+    return resized(intrinsics, like.width, like.height)
+
+
+@contextmanager
+def quiet_colmap() -> Iterator[None]:
+    """COLMAP writes its log to stderr through glog: within, only fatal errors.
+
+    Importing pycolmap replaces what SIGTERM does by glog's handler, which prints a page of C++ frames. Python does not
+    know of it: what Python has for the signal is set again, and glog's handler is gone for good.
+    """
+    on_termination = signal.getsignal(signal.SIGTERM)
+    # Python sets signals in its main thread alone, and none that a host program in C handled before it.
+    if on_termination is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, on_termination)
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before

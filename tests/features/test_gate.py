@@ -1,0 +1,166 @@
+"""What the robot says of pairs of images: right ones pass, wrong ones do not, planar ones get their second reading."""
+
+import numpy as np
+import pytest
+
+from jcr.estimation.closed_form import motions
+from jcr.features.epipolar import translation_of_x
+from jcr.features.gate import Pair, angle_tolerance, by_quarters, judge, rolls
+from jcr.features.still import hidden, still_cells
+from jcr.features.two_view import Reading, readings
+from jcr.geometry import inverse, rotation_angle, rotation_exp, transform
+from simulation.problem import HandEyeProblem, hand_eye_problem
+
+N = 8
+FOCAL = 600.0
+NORMAL = np.array([-0.48, 0.36, 0.8])
+DISTANCE = 0.4
+"""Of the plane in camera i, m."""
+
+
+def seen(
+    i_from_j: np.ndarray, plane: bool, rng: np.random.Generator, noise_px: float = 0.5
+) -> tuple[np.ndarray, np.ndarray]:
+    """Directions of points half a metre ahead in two cameras."""
+    x_in_i = np.column_stack([rng.uniform(-0.1, 0.1, (200, 2)), np.zeros(200)])
+    x_in_i[:, 2] = (DISTANCE - x_in_i[:, :2] @ NORMAL[:2]) / NORMAL[2]
+    if not plane:
+        x_in_i[:, 2] += rng.uniform(-0.1, 0.2, 200)
+    x_in_j = (x_in_i - i_from_j[:3, 3]) @ i_from_j[:3, :3]
+    noise = noise_px / FOCAL
+    rays = [x[:, :2] / x[:, 2:] + rng.normal(scale=noise, size=(200, 2)) for x in (x_in_i, x_in_j)]
+    return rays[0], rays[1]
+
+
+def homography(i_from_j: np.ndarray) -> np.ndarray:
+    """j from i, of the plane."""
+    r, t = i_from_j[:3, :3].T, -i_from_j[:3, :3].T @ i_from_j[:3, 3]
+    return r + np.outer(t, NORMAL) / DISTANCE
+
+
+def essential(i_from_j: np.ndarray) -> np.ndarray:
+    r, t = i_from_j[:3, :3].T, -i_from_j[:3, :3].T @ i_from_j[:3, 3]
+    return np.cross(np.eye(3), -t / np.linalg.norm(t)) @ r
+
+
+MOTION = transform(rotation_exp(np.array([0.1, -0.3, 0.2])), np.array([0.15, 0.02, 0.03]))
+
+
+def test_a_reading_is_the_motion_as_surely_as_it_shows():
+    errors, stds = [], []
+    for seed in range(25):
+        ray_i, ray_j = seen(MOTION, False, np.random.default_rng(seed))
+        best = readings(ray_i, ray_j, FOCAL, essential(MOTION), None)[0]
+        errors.append(float(rotation_angle(best.rotation) - rotation_angle(MOTION[:3, :3])))
+        stds.append(best.angle_std())
+    # Half of 200 matches are counted as independent, so that it promises less than these have.
+    assert 0.4 < np.std(errors) / np.mean(stds) < 1.2
+
+
+def test_a_plane_has_two_readings_and_one_is_right():
+    toward = transform(MOTION[:3, :3], np.array([0.05, 0.02, 0.12]))
+    ray_i, ray_j = seen(toward, True, np.random.default_rng(0))
+    found = readings(ray_i, ray_j, FOCAL, None, homography(toward))
+    gaps = [np.degrees(rotation_angle(r.rotation.T @ toward[:3, :3])) for r in found]
+    assert len(found) == 2
+    assert min(gaps) < 1 and max(gaps) > 5
+
+
+def problem_and_pairs(seed: int) -> tuple[HandEyeProblem, list[Pair]]:
+    problem = hand_eye_problem(np.random.default_rng(seed), N)
+    camera = motions(problem.base_from_gripper @ problem.gripper_from_camera)
+    sure = np.diag([1e-5] * 3 + [1e-4] * 2)
+    rows = np.zeros((30, 2), dtype=int)
+
+    def unit(v: np.ndarray) -> np.ndarray:
+        return v / np.linalg.norm(v)
+
+    return problem, [
+        Pair(i, j, rows, (Reading(camera[i, j, :3, :3], unit(camera[i, j, :3, 3]), sure, 0.5),))
+        for i in range(N)
+        for j in range(i + 1, N)
+    ]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_wrong_pairs_are_contradicted_and_right_ones_are_not(seed: int):
+    rng = np.random.default_rng(seed)
+    problem, pairs = problem_and_pairs(seed)
+    wrong = set(rng.permutation(len(pairs))[:12].tolist())
+    for k in wrong:
+        reading = pairs[k].readings[0]
+        bad = Reading(rotation_exp(rng.normal(size=3)), reading.direction, reading.covariance, 0.5)
+        pairs[k] = Pair(pairs[k].i, pairs[k].j, pairs[k].rows, (bad,))
+    gate = judge(pairs, motions(problem.base_from_gripper))
+    assert gate.of_x is not None
+    assert rotation_angle(gate.of_x.rotation.T @ problem.gripper_from_camera[:3, :3]) < 0.01
+    assert {pair.key for pair in gate.contradicted} == {pairs[k].key for k in wrong}
+    x = translation_of_x(gate, motions(problem.base_from_gripper))
+    assert x is not None
+    assert np.linalg.norm(x.gripper_from_camera[:3, 3] - problem.gripper_from_camera[:3, 3]) < 5e-3
+
+
+def test_the_second_reading_of_a_plane_is_tried():
+    problem, pairs = problem_and_pairs(0)
+    right = pairs[3].readings[0]
+    other = Reading(
+        rotation_exp(np.array([0.5, 0.0, 0.0])) @ right.rotation, right.direction, right.covariance, 0.4
+    )
+    pairs[3] = Pair(pairs[3].i, pairs[3].j, pairs[3].rows, (other, right))
+    gate = judge(pairs, motions(problem.base_from_gripper))
+    assert not gate.contradicted
+    assert next(pair for pair in gate.confirmed if pair.key == pairs[3].key).readings[0] is right
+
+
+def test_unsure_pairs_are_not_judged():
+    problem, pairs = problem_and_pairs(0)
+    unsure = Reading(np.eye(3), np.array([1.0, 0, 0]), np.eye(5), 0.5)
+    pairs[0] = Pair(pairs[0].i, pairs[0].j, pairs[0].rows, (unsure,))
+    gate = judge(pairs, motions(problem.base_from_gripper))
+    assert [pair.key for pair in gate.undecided] == [pairs[0].key] and not gate.contradicted
+
+
+def test_a_less_certain_pair_may_differ_more():
+    assert angle_tolerance(0.5, 0.05) > 2 * angle_tolerance(0.5, 0.01)
+
+
+def test_rotated_upright_no_image_is_rotated_against_another():
+    rng = np.random.default_rng(0)
+    base_from_first = rotation_exp(np.array([np.pi, 0.0, 0.0]))  # looking down
+    rotation = rng.uniform(-np.pi, np.pi, 12)
+    about_axis = rotation_exp(np.outer(rotation, [0.0, 0.0, 1.0]))
+    upright = rolls(base_from_first @ about_axis)
+    back = rotation_exp(np.outer(upright, [0.0, 0.0, 1.0]))
+    # What image 0, rotated, sees at an angle, every other one, rotated, sees at the same.
+    relative = back[0] @ about_axis[0].T @ about_axis @ np.swapaxes(back, 1, 2)
+    assert np.degrees(np.asarray(rotation_angle(relative)).max()) < 1e-6
+
+
+@pytest.mark.parametrize(("roll_deg", "used_deg"), [(-10, 0), (80, 90), (184, 180), (40, 40), (-40, 320)])
+def test_quarters_are_rotated_without_resampling(roll_deg: float, used_deg: float):
+    assert np.degrees(by_quarters(np.radians(roll_deg))) == pytest.approx(used_deg)
+
+
+def test_what_keeps_its_pixel_while_the_gripper_moves_is_hidden():
+    rng = np.random.default_rng(0)
+    fixed = rng.uniform([200, 300], [280, 470], (60, 2))
+    images = [np.concatenate([fixed, rng.uniform(0, [640, 480], (300, 2))]) for _ in range(6)]
+    raw = {(i, j): np.column_stack([np.arange(360)] * 2) for i in range(6) for j in range(i + 1, 6)}
+    still = still_cells(images, raw, (640, 480), raw)
+    assert hidden(fixed, still).mean() > 0.9
+    assert still.mean() < 0.12
+    moving = [rng.uniform(0, [640, 480], (300, 2)) for _ in range(6)]
+    few = {key: rows[:300] for key, rows in raw.items()}
+    assert not still_cells(moving, few, (640, 480), few).any()
+
+
+def test_predicted_epipolar_lines_go_through_the_matches():
+    problem, _ = problem_and_pairs(0)
+    camera = problem.base_from_gripper @ problem.gripper_from_camera
+    i_from_j = inverse(camera[0]) @ camera[1]
+    ray_i, ray_j = seen(i_from_j, False, np.random.default_rng(0), 0.0)
+    from jcr.features.two_view import sampson_px
+
+    length = np.linalg.norm(i_from_j[:3, 3])
+    off = sampson_px(i_from_j[:3, :3], i_from_j[:3, 3] / length, ray_i, ray_j, FOCAL)
+    assert np.abs(off).max() < 1e-6

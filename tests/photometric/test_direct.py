@@ -1,0 +1,194 @@
+"""Direct alignment finds the camera on plain tables, says how surely, and refuses what it cannot tell."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from jcr.calibration.stage import calibrate
+from jcr.camera import rays
+from jcr.capture.images import read_image
+from jcr.capture.read import read_capture
+from jcr.errors import InputError, RejectedError
+from jcr.geometry import apply, inverse, rotation_between_deg, rotation_exp, transform
+from jcr.photometric.coarse_to_fine import after_step, axes_meet, free_directions
+from jcr.photometric.direct import exposure_gains, pyramid, reconstruct_direct
+from jcr.photometric.residuals import (
+    Cameras,
+    Level,
+    energy,
+    equations,
+    make_level,
+    on_rays,
+    strongest,
+)
+from jcr.photometric.search import starting_hand_eyes
+from jcr.records import Intrinsics
+from simulation.capture import SimulateOptions, simulate
+from simulation.truth import read_truth
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """A capture without any texture, and its truth."""
+    folder = tmp_path_factory.mktemp("direct") / "plain"
+    simulate(
+        folder, SimulateOptions(images=6, seed=315, texture=False, truth="scene", unknown_intrinsics=True)
+    )
+    return read_capture(folder), read_truth(folder)
+
+
+def test_a_plain_table_calibrates_the_camera_from_nothing(plain):
+    capture, truth = plain
+    reconstruction = reconstruct_direct(capture)
+    hand_eye = calibrate(capture, reconstruction)
+    assert hand_eye.converged and hand_eye.inliers.all()
+    errors = hand_eye.gripper_from_camera[:3, 3] - truth.gripper_from_camera[:3, 3]
+    assert np.linalg.norm(errors) < 3e-3
+    assert rotation_between_deg(hand_eye.gripper_from_camera[:3, :3], truth.gripper_from_camera[:3, :3]) < 0.3
+    assert (np.abs(errors) < 4 * np.sqrt(np.diag(hand_eye.covariance)[:3])).all()
+    assert reconstruction.intrinsics.fx == pytest.approx(truth.intrinsics.fx, rel=0.01)
+    # The tracks are points of the table and the objects, in the unit that the calibration found.
+    x = hand_eye.scale * reconstruction.tracks.points_in_recon
+    height = apply(truth.base_from_camera[0], x)[:, 2] - truth.table_height
+    assert np.mean((height > -0.01) & (height < 0.25)) > 0.8
+
+
+def test_a_image_of_another_pose_is_left_out_and_named(plain):
+    capture, truth = plain
+    poses = capture.base_from_gripper.copy()
+    poses[4] = poses[0]
+    reconstruction = reconstruct_direct(replace(capture, base_from_gripper=poses))
+    assert reconstruction.image_index.tolist() == [0, 1, 2, 3, 5]
+    assert f"fit nowhere near their poses: {capture.images[4]}" in " ".join(reconstruction.notes)
+    x = calibrate(replace(capture, base_from_gripper=poses), reconstruction).gripper_from_camera
+    assert np.linalg.norm(x[:3, 3] - truth.gripper_from_camera[:3, 3]) < 5e-3
+
+
+def test_images_of_other_poses_are_refused(plain):
+    capture, truth = plain
+    mixed = replace(
+        capture,
+        base_from_gripper=np.roll(capture.base_from_gripper, 2, axis=0),
+        intrinsics=truth.intrinsics,
+    )
+    with pytest.raises(RejectedError, match="direct alignment"):
+        reconstruct_direct(mixed)
+
+
+def test_images_of_different_exposure_are_evened(plain):
+    capture, truth = plain
+    images = [read_image(capture.folder / name) for name in capture.images]
+    level = pyramid(images, truth.intrinsics)[60]
+    cameras = Cameras(truth.base_from_camera)
+    np.testing.assert_array_equal(exposure_gains(level, cameras), 1)  # what differs is shading
+    factor = np.array([0.75, 1.3, 1.0, 0.9, 1.1, 1.0])
+    found = exposure_gains(level.times(factor), cameras) * factor
+    left = np.abs(np.log(found) - np.log(found).mean()).max()
+    assert left < 0.1 < 0.25 < np.abs(np.log(factor)).max()
+
+
+def test_images_of_nothing_are_refused(plain, tmp_path):
+    capture, _ = plain
+    for name in capture.images:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        Image.new("RGB", capture.image_size, (120, 110, 100)).save(tmp_path / name)
+    with pytest.raises(RejectedError, match="one colour"):
+        reconstruct_direct(replace(capture, folder=tmp_path))
+
+
+def test_two_images_are_too_few(plain):
+    capture, _ = plain
+    two = replace(capture, images=capture.images[:2], base_from_gripper=capture.base_from_gripper[:2])
+    with pytest.raises(InputError, match="3 images or more"):
+        reconstruct_direct(two)
+
+
+def test_one_start_looks_where_the_camera_does(plain):
+    capture, truth = plain
+    starts = starting_hand_eyes(capture.base_from_gripper)
+    assert rotation_between_deg(starts[:, :3, :3], truth.gripper_from_camera[:3, :3]).min() < 15
+
+
+def test_axes_meet_where_all_look():
+    rng = np.random.default_rng(0)
+    rotation = rotation_exp(rng.normal(size=(5, 3)))
+    target = np.array([0.4, -0.1, 0.2])
+    cameras = transform(rotation, target - rng.uniform(0.3, 0.8, (5, 1)) * rotation[..., 2])
+    np.testing.assert_allclose(axes_meet(cameras), target, atol=1e-5)
+
+
+GRID = Intrinsics(70.0, 70.0, 39.5, 29.5, 80, 60)
+
+
+def cameras_over_a_plane() -> Cameras:
+    """Four cameras half a metre above z = 0, which look at the origin."""
+    rng = np.random.default_rng(1)
+    rotation = rotation_exp(rng.normal(0, 0.15, (4, 3))) @ np.diag([1.0, -1.0, -1.0])
+    return Cameras(transform(rotation, -0.5 * rotation[..., 2]))
+
+
+def painted(cameras: Cameras) -> Level:
+    """What they see of a smooth painting on that plane."""
+    pose = cameras.base_from_camera
+    ray = np.einsum("nij,hwj->nhwi", pose[:, :3, :3], rays(GRID))
+    center = pose[:, None, None, :3, 3]
+    x = center - center[..., 2:] / ray[..., 2:] * ray
+    wave = np.stack(
+        [np.sin(30 * x[..., 0]), np.sin(25 * x[..., 1] + 1), np.cos(20 * (x[..., 0] + x[..., 1]))], -1
+    )
+    return make_level((0.5 + 0.3 * wave).astype(np.float32), GRID, GRID.height)
+
+
+def test_search_along_rays_finds_the_plane():
+    cameras = cameras_over_a_plane()
+    level = painted(cameras)
+    host, x_px = strongest(level, 50)
+    depths = 1 / np.linspace(1 / 0.35, 1 / 0.8, 60)[:, None] * np.ones(4)
+    points, cost = on_rays(level, cameras, host, x_px, depths, 0.1, 0.5)
+    pose = cameras.base_from_camera[host]
+    ray = np.einsum("kij,kj->ki", pose[:, :3, :3], rays(GRID)[x_px[:, 1], x_px[:, 0]])
+    true_depth = -pose[:, 2, 3] / ray[:, 2]
+    assert points.agreed.mean() > 0.95 and cost < 0.1
+    assert np.median(np.abs(points.depth / true_depth - 1)) < 0.02
+
+
+@pytest.mark.parametrize("tied", [True, False])
+def test_gradient_is_that_of_the_energy(tied):
+    cameras = cameras_over_a_plane()
+    level = painted(cameras)
+    rng = np.random.default_rng(2)
+    off = Cameras(
+        cameras.base_from_camera @ transform(rotation_exp(rng.normal(0, 0.01, (4, 3))), np.zeros(3)), 1.02
+    )
+    host, x_px = strongest(level, 50)
+    points, _ = on_rays(level, off, host, x_px, np.full((1, 4), 0.5), 0.2, 2.0)
+    system = equations(level, off, points, 0.2, tied)
+    # Without the depths' elimination.
+    gradient = (
+        system.gradient + system.by_depth * (system.depth_gradient / system.depth_information)[:, None]
+    ).sum(0)
+    step = 1e-3
+    slope = np.zeros_like(gradient)
+    for k, direction in enumerate(step * np.eye(len(gradient))):
+        ahead, behind = (energy(level, after_step(off, sign * direction), points, 0.2) for sign in (1, -1))
+        slope[k] = (ahead - behind) / (2 * step)
+    cosine = slope @ gradient / (np.linalg.norm(slope) * np.linalg.norm(gradient))
+    assert cosine > 0.99
+
+
+def test_free_cameras_keep_the_first_and_the_scale():
+    cameras = cameras_over_a_plane()
+    directions = free_directions(cameras, intrinsics_known=True)
+    assert directions.shape == (25, 6 * 3 - 1)
+    after = after_step(cameras, 1e-6 * directions.sum(1))
+    np.testing.assert_allclose(after.base_from_camera[0], cameras.base_from_camera[0])
+    assert after.zoom == cameras.zoom
+    before = inverse(cameras.base_from_camera[0]) @ cameras.base_from_camera
+    moved_to = inverse(cameras.base_from_camera[0]) @ after.base_from_camera
+    # What is left is of second order.
+    size = [np.square(c[:, :3, 3]).sum() for c in (before, moved_to)]
+    assert size[1] == pytest.approx(size[0], rel=1e-8)

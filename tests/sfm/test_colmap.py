@@ -1,0 +1,209 @@
+"""The COLMAP back end on the bundled capture, against its truth, and on captures it must refuse or fix."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from jaxtyping import Float
+from numpy import ndarray
+from PIL import Image
+
+from jcr.camera import project
+from jcr.capture.read import read_capture
+from jcr.depth.densify import densify, undistorted
+from jcr.depth.options import DepthOptions
+from jcr.errors import RejectedError
+from jcr.features.sift_features import SiftFeatures
+from jcr.geometry import apply_similarity, fit_similarity, inverse, rotation_between_deg
+from jcr.progress import silent
+from jcr.records import Capture, Reconstruction
+from jcr.sfm.colmap import reconstruct_colmap
+from jcr.sfm.options import ColmapOptions
+from simulation.truth import read_truth
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def capture(tabletop: Path) -> Capture:
+    return read_capture(tabletop)
+
+
+@pytest.fixture(scope="module")
+def found(capture: Capture) -> Reconstruction:
+    first = _first(capture, 7)
+    return densify(first, reconstruct_colmap(first), DepthOptions(pointmap_size_px=240))
+
+
+@pytest.fixture(scope="module")
+def four(capture: Capture) -> Reconstruction:
+    return reconstruct_colmap(_first(capture, 4))
+
+
+def _first(capture: Capture, count: int) -> Capture:
+    return replace(
+        capture, images=capture.images[:count], base_from_gripper=capture.base_from_gripper[:count]
+    )
+
+
+def _true_base_from_camera(capture: Capture, result: Reconstruction) -> Float[ndarray, "m 4 4"]:
+    reference = json.loads((capture.folder / "reference.json").read_text())
+    return capture.base_from_gripper[result.image_index] @ np.array(reference["gripper_from_camera"])
+
+
+def _center_errors(capture: Capture, result: Reconstruction) -> Float[ndarray, " m"]:
+    """Distances (m) of the camera centres from where gripper pose and reference put them."""
+    centers = _true_base_from_camera(capture, result)[:, :3, 3]
+    base_from_recon, scale = fit_similarity(centers, result.recon_from_camera[:, :3, 3])
+    fitted = apply_similarity(base_from_recon, scale, result.recon_from_camera[:, :3, 3])
+    return np.linalg.norm(fitted - centers, axis=1)
+
+
+def _reprojection_errors(result: Reconstruction) -> Float[ndarray, "k 2"]:
+    tracks = result.tracks
+    camera_from_recon = inverse(result.recon_from_camera)[tracks.image]
+    x = np.einsum("kij,kj->ki", camera_from_recon[:, :3, :3], tracks.points_in_recon[tracks.point])
+    x += camera_from_recon[:, :3, 3]
+    return project(result.intrinsics, x) - tracks.x_px
+
+
+def test_cameras_are_where_they_were(capture: Capture, found: Reconstruction) -> None:
+    assert found.image_index.tolist() == list(range(7))
+    assert found.intrinsics == capture.intrinsics
+    assert found.notes == found.warnings == ()
+    assert np.sqrt((_center_errors(capture, found) ** 2).mean()) < 2e-4
+    true = _true_base_from_camera(capture, found)[:, :3, :3]
+    relative = np.swapaxes(true[:1], -1, -2) @ true
+    measured = np.swapaxes(found.recon_from_camera[:1, :3, :3], -1, -2) @ found.recon_from_camera[:, :3, :3]
+    assert rotation_between_deg(relative, measured).max() < 0.1
+
+
+def test_tracks_reproject_without_half_a_pixel(found: Reconstruction) -> None:
+    error = _reprojection_errors(found)
+    assert np.median(np.linalg.norm(error, axis=1)) < 0.4
+    assert np.abs(np.median(error, axis=0)).max() < 0.05
+    assert np.bincount(found.tracks.point).min() >= 2
+    assert len(found.tracks.points_in_recon) > 500
+
+
+def test_observations_agree_within_a_tenth_of_a_pixel(found: Reconstruction) -> None:
+    errors = np.linalg.norm(_reprojection_errors(found), axis=1)
+    assert np.median(errors) < 0.06  # keypoints: 0.15
+
+
+def test_pointmaps_show_the_table_at_its_height(capture: Capture, found: Reconstruction) -> None:
+    assert np.isfinite(found.dense.points_in_recon).all()
+    assert (found.dense.confidence > 0).mean() > 0.5
+    centers = _true_base_from_camera(capture, found)[:, :3, 3]
+    base_from_recon, scale = fit_similarity(centers, found.recon_from_camera[:, :3, 3])
+    x_in_base = apply_similarity(
+        base_from_recon, scale, found.dense.points_in_recon[found.dense.confidence > 0]
+    )
+    truth = read_truth(capture.folder)
+    low, high = truth.workspace_in_base
+    inside = ((x_in_base > low) & (x_in_base < high))[:, :2].all(-1)
+    height = x_in_base[inside, 2] - truth.table_height
+    assert (np.abs(height) < 1e-3).mean() > 0.4  # most of what the views show is bare table
+    assert (height < -5e-3).mean() < 0.005
+    assert (height > max(thing.height for thing in truth.objects) + 5e-3).mean() < 0.005
+
+
+def test_same_pixels_same_result(capture: Capture, four: Reconstruction, tmp_path: Path) -> None:
+    """Bit for bit, also when the images lie on their side with an EXIF tag that says so."""
+    rotated = _first(capture, 4)
+    names = []
+    for name in rotated.images:
+        exif = Image.Exif()
+        exif[0x0112] = 6  # to be rotated by 90° clockwise for viewing
+        names.append(f"{Path(name).stem}.png")
+        with Image.open(capture.folder / name) as upright:
+            on_its_side = upright.convert("RGB").transpose(Image.Transpose.ROTATE_90)
+            on_its_side.save(tmp_path / names[-1], exif=exif)
+    shares = []
+    again = reconstruct_colmap(
+        replace(rotated, folder=tmp_path, images=tuple(names)),
+        progress=lambda stage, share: shares.append(share) if stage == "mapping" else None,
+    )
+    assert shares == [0.0, 0.5, 0.75, 1.0, 1.0]  # a pair first, then image by image
+    np.testing.assert_array_equal(again.recon_from_camera, four.recon_from_camera)
+    np.testing.assert_array_equal(again.tracks.x_px, four.tracks.x_px)
+    np.testing.assert_array_equal(again.tracks.points_in_recon, four.tracks.points_in_recon)
+    _, upright = undistorted(capture.folder, rotated.images, four.intrinsics)
+    np.testing.assert_array_equal(undistorted(tmp_path, names, again.intrinsics)[1], upright)
+
+
+def test_distortion_that_folds_over_is_not_used(capture: Capture, four: Reconstruction) -> None:
+    assert capture.intrinsics is not None
+    folding = replace(capture.intrinsics, distortion=(0.01, 0.7, 0.0, 0.0, -9.0))
+    result = reconstruct_colmap(replace(_first(capture, 4), intrinsics=folding))
+    (warning,) = result.warnings
+    assert "folds over at" in warning and "not used" in warning and not result.notes
+    assert result.intrinsics == capture.intrinsics
+    np.testing.assert_array_equal(result.recon_from_camera, four.recon_from_camera)
+
+
+def test_unknown_intrinsics_is_found(capture: Capture) -> None:
+    assert capture.intrinsics is not None
+    result = reconstruct_colmap(replace(_first(capture, 5), intrinsics=None))
+    assert result.intrinsics.fx == pytest.approx(capture.intrinsics.fx, rel=0.01)
+    corner = np.array([[0.4, 0.3, 1.0]])
+    np.testing.assert_allclose(
+        project(result.intrinsics, corner), project(capture.intrinsics, corner), atol=3
+    )
+    assert _center_errors(capture, result).max() < 1e-3
+
+
+def test_tracks_are_in_pixels_of_the_original(capture: Capture) -> None:
+    result = reconstruct_colmap(_first(capture, 4), ColmapOptions(working_size_px=480))
+    assert result.intrinsics == capture.intrinsics
+    error = _reprojection_errors(result)
+    assert np.abs(np.median(error, axis=0)).max() < 0.1
+    assert _center_errors(capture, result).max() < 1e-3
+
+
+def test_image_that_shows_something_else_is_named(capture: Capture, tmp_path: Path) -> None:
+    three = _first(capture, 4)
+    for name in three.images[:3]:
+        shutil.copy(capture.folder / name, tmp_path / Path(name).name)
+    noise = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(tmp_path / "elsewhere.png")
+    images = (*(Path(name).name for name in three.images[:2]), "elsewhere.png", Path(three.images[2]).name)
+    result = reconstruct_colmap(replace(three, folder=tmp_path, images=images))
+    assert result.image_index.tolist() == [0, 1, 3]
+    assert result.notes == ("3 of 4 images registered; not elsewhere.png",)
+    assert result.tracks.image.max() == 2
+
+
+def test_images_without_texture_are_refused_in_one_line(capture: Capture, tmp_path: Path) -> None:
+    bare = _first(capture, 4)
+    for k, name in enumerate(bare.images):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        shade = np.linspace(90, 150 + k, 640)[None, :, None] * np.ones((480, 1, 3))
+        Image.fromarray(shade.astype(np.uint8)).save(tmp_path / name)
+    with pytest.raises(RejectedError) as refusal:
+        reconstruct_colmap(replace(bare, folder=tmp_path))
+    message = str(refusal.value)
+    assert "\n" not in message
+    assert "0 of 4 images" in message and "0 features" in message and "textured objects" in message
+
+
+def test_features_of_reduced_images_are_at_the_truth_on_average():
+    rng = np.random.default_rng(0)
+    height, width = 450, 600
+    true = np.stack(np.meshgrid(np.arange(50, 560, 50.0), np.arange(50, 410, 50.0)), -1).reshape(-1, 2)
+    true += rng.uniform(-5, 5, true.shape)
+    v, u = np.indices((height, width))
+    image = np.full((height, width), 128.0)
+    for (x, y), sigma, sign in zip(
+        true, rng.uniform(3, 6, len(true)), rng.choice([-90, 90], len(true)), strict=True
+    ):
+        image += sign * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * sigma**2))
+    pixels = np.repeat(np.rint(image).clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
+    (found,) = SiftFeatures([pixels], (400, 300), 1, silent).x_px
+    x_px = (found + 0.5) * 1.5 - 0.5
+    nearest = true[np.linalg.norm(x_px[:, None] - true, axis=2).argmin(1)]
+    errors = (x_px - nearest)[np.linalg.norm(x_px - nearest, axis=1) < 2]
+    assert len(errors) > 50 and np.abs(errors.mean(0)).max() < 0.03
