@@ -16,7 +16,6 @@ from jcr.errors import InputError
 from jcr.progress import Progress, silent
 from jcr.records import PointCloud
 from jcr.represent.carve import carve
-from jcr.represent.clear import with_clear_cells
 from jcr.represent.fields import Field, Fields, FieldShape, Lattice
 from jcr.represent.options import MapOptions
 from jcr.represent.rays import NEAR, Rays, workspace_box, workspace_rays
@@ -60,7 +59,7 @@ def build_scene(
         seen = carve(*ends, box, cell / 2, cloud.cleared, device)
         carved = time.perf_counter()
         lattices = feature_lattices(seen) if recipe.grids else []
-        shapes = _field_shapes(rays, len(cloud.label_names), recipe, options.joint)
+        shapes = _field_shapes(rays, len(cloud.label_names), recipe)
         fields = Fields(shapes, seen.box, lattices).to(device)
         steps = list(pool.map(fit, fields.of))
         history = {
@@ -69,9 +68,7 @@ def build_scene(
             "carving_s": f"{carved - start:.3f}",
             "training_s": f"{time.perf_counter() - carved:.3f}",
         }
-        scene = SceneMap(fields, without_doubts(seen), cloud.label_names, history)
-        scene.seen = with_clear_cells(scene.seen, fields.field_of("occupancy"))
-    return scene
+    return SceneMap(fields, without_doubts(seen), cloud.label_names, history)
 
 
 def _workspace(cloud: PointCloud, options: MapOptions) -> tuple[Float[ndarray, "2 3"], float]:
@@ -82,22 +79,14 @@ def _workspace(cloud: PointCloud, options: MapOptions) -> tuple[Float[ndarray, "
     return box, cell
 
 
-def _field_shapes(rays: Rays, labels: int, recipe: Recipe, joint: bool) -> list[FieldShape]:
-    """The networks to train: one for all properties where they are `joint`, else occupancy and all others apart."""
-    heads = {"occupancy": 1} | {
-        name: target.shape[-1] for name, target in rays.targets.items() if name != "label"
-    }
+def _field_shapes(rays: Rays, labels: int, recipe: Recipe) -> list[FieldShape]:
+    """Return the networks to train: occupancy in one, all properties of surfaces in another."""
+    heads = {name: target.shape[-1] for name, target in rays.targets.items() if name != "label"}
     if "label" in rays.targets:
         heads["label"] = labels
-    groups = [heads] if joint else [{"occupancy": heads.pop("occupancy")}, heads]
     return [
-        FieldShape(
-            group,
-            recipe.hidden,
-            recipe.frequencies,
-            recipe.grids if "occupancy" in group else recipe.surface_grids,
-        )
-        for group in groups
+        FieldShape(group, recipe.hidden, recipe.frequencies, grids)
+        for group, grids in (({"occupancy": 1}, recipe.grids), (heads, recipe.surface_grids))
     ]
 
 

@@ -27,8 +27,6 @@ class MapOptions:
     preset: Literal["default", "paper"] = "default"
     """default: feature grids, free space learnt along the rays; paper: the paper's sinusoidal network with uniform
     negatives, slower and coarser."""
-    joint: bool = False
-    """One network for all properties instead of one for each."""
     workspace: Annotated[
         tuple[float, float, float, float, float, float] | None,
         tyro.conf.arg(metavar="XMIN YMIN ZMIN XMAX YMAX ZMAX"),

@@ -12,7 +12,7 @@ from torch import Tensor
 from jcr.represent.chunks import in_chunks
 from jcr.represent.distance import DistanceGrid
 from jcr.represent.fields import Fields
-from jcr.represent.seen import CLEAR, CROSSED, SeenGrid
+from jcr.represent.seen import CROSSED, SeenGrid
 
 
 class Sample:
@@ -35,10 +35,7 @@ class Sample:
 
     @property
     def occupancy(self) -> Any:
-        """Probability (n,) that the place is solid; one half where nobody has looked, unless given otherwise.
-
-        Where it is below 0.0009 in a whole cell, arrays are answered with 0.
-        """
+        """Probability (n,) that the place is solid; one half where nobody has looked, unless given otherwise."""
         return self._occupancy_unknown[0]
 
     @property
@@ -84,11 +81,10 @@ class Sample:
 
         def occupancy_unknown(x: Tensor) -> tuple[Tensor, Tensor]:
             state = self._seen.at(x)
-            # Most of a workspace is unseen or clear, where the field need not be asked, but for gradients.
+            # Most of a workspace is unseen, where the field need not be evaluated.
             unknown = state == 0
             occupancy = torch.where(unknown, unseen, 0.0)
-            asked = ~unknown if x.requires_grad else ~unknown & ((state & CLEAR) == 0)
-            (seen,) = asked.nonzero(as_tuple=True)
+            (seen,) = (~unknown).nonzero(as_tuple=True)
             if len(seen) == 0:
                 return occupancy, unknown
             inner = self._fields(x[seen], ("occupancy",))["occupancy"][:, 0].sigmoid()

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-CROSSED, HIT, CLEAR = 1, 2, 4
-"""Bits of a cell's state; 0 = unseen. CLEAR: crossed, and the map's field is sure that the whole cell is free."""
+CROSSED, HIT = 1, 2
+"""Bits of a cell's state; 0 = unseen."""
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ class Recipe:
     hidden: int
     frequencies: int
     grids: tuple[tuple[int, int], ...]
-    """(lattice of `feature_lattices`, features) that occupancy, or a joint network, interpolates in."""
+    """(lattice of `feature_lattices`, features) that occupancy interpolates in."""
     surface_grids: tuple[tuple[int, int], ...]
     """The same for what is known on surfaces only."""
     rays: bool

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.ndimage import binary_closing, binary_erosion, gaussian_filter, gaussian_filter1d
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import PointCloud
@@ -22,13 +22,6 @@ EDGE_SHARE = 0.4
 """Of the median density seen from above below which a cell holds the fringe of wrong depths beside an outline."""
 SIDE_SHARE = 0.005
 """Of the area seen from above that lies beyond each side, where noise has put it."""
-RIM = 0.006
-"""Width (m) of the band along a top's outline in which a rim is looked for that stands above the rest."""
-SECTORS, FEWEST_IN_SECTOR = 24, 8
-"""Directions from a top's middle in which a rim shows, and the points that a direction needs to count."""
-STEP = 1.4
-"""Times the fineness of heights that a rim's middle direction stands above what it encloses: of simulated things with a
-flat top at most 1.2 times, of mugs and cans 1.3 to 2.5."""
 SAME_TOP = 0.05
 """Of the height by which images left out may move the top (jackknife) when it is the same top they show."""
 
@@ -68,8 +61,6 @@ class _Shape:
     """Size and place of one object, in the support's frame."""
 
     top: float
-    top_std: float
-    """How far below the top a rim may lie that is narrower than what depth resolves."""
     spread: float
     """One-sigma spread of the points about the top."""
     rotation_rad: float
@@ -85,8 +76,8 @@ def measure(cloud: PointCloud, scale_std: float = 0.0, support: Support | None =
     The support plane's own label, and label 0, are no objects. `scale_std` is the relative uncertainty (one
     sigma) of the calibration's scale. Standard deviations are the jackknife's over images (Efron and Stein
     1981): depth errors go together within an image, so the number of points does not count. To it add the scale,
-    the spread of the top over the root of the number of images, how narrow the top is and how bent the table, and
-    at the sides half a cell. Raises InputError when no plane carries the scene.
+    the spread of the top over the root of the number of images and how bent the table is, and at the sides half a
+    cell. Raises InputError when no plane carries the scene.
     """
     support = support or support_plane(cloud)
     x_in_support = apply(inverse(support.base_from_support), cloud.points_in_base)
@@ -124,8 +115,7 @@ def _size(
 ) -> ObjectSize:
     size = np.array([*shape.sides, shape.top])
     bent = np.sqrt(max(support.noise**2 - support.roughness**2, 0.0))
-    own = np.array([CELL / 2, CELL / 2, np.hypot(shape.top_std, bent)])
-    own[2] = np.hypot(own[2], shape.spread / np.sqrt(max(len(parts), 1)))
+    own = np.array([CELL / 2, CELL / 2, np.hypot(bent, shape.spread / np.sqrt(max(len(parts), 1)))])
     jackknife = np.zeros(3)
     if len(parts) > 1:
         jackknife = np.sqrt((len(parts) - 1) * parts[:, [1, 2, 0]].var(0))
@@ -158,7 +148,7 @@ def _without_each(values: Float[ndarray, " n"], image: Int[ndarray, " n"]) -> di
 def _shape(
     x_in_support: Float[ndarray, "n 3"], roughness: float, rotation_rad: float | None = None
 ) -> _Shape:
-    top, top_std, spread = _top(x_in_support, roughness)
+    top, spread = _top(x_in_support[:, 2], roughness)
     xy, area = _dense(x_in_support[:, :2])
     middle = xy.mean(0)
     rotation_rad = _rotation_to_longer_side(_outline(xy - middle)) if rotation_rad is None else rotation_rad
@@ -169,7 +159,6 @@ def _shape(
     center = middle + (low + high) / 2 @ _axes(rotation_rad)
     return _Shape(
         top=top,
-        top_std=top_std,
         spread=spread,
         rotation_rad=rotation_rad,
         center=center,
@@ -190,15 +179,13 @@ def _rotation_to_longer_side(hull: Float[ndarray, "k 2"]) -> float:
     return rotation_rad + np.pi / 2 * (length < width)
 
 
-def _top(x_in_support: Float[ndarray, "n 3"], roughness: float) -> tuple[float, float, float]:
-    """Height of the top, how far below the truth a narrow one may lie, and the spread of its points.
+def _top(height: Float[ndarray, " n"], roughness: float) -> tuple[float, float]:
+    """Return the height of the top and the spread of its points.
 
     Over the heights a flat top is a peak of the density and a round one a step. The highest peak that is no
     scatter is taken, and the median of the heights around it. (A high quantile instead is lifted by the points
-    that stray above narrow tops, by 2 % and more.) Where the outline stands above that peak all around, as of a can
-    whose lid is sunk, the top is the rim's.
+    that stray above narrow tops, by 2 % and more.)
     """
-    height = x_in_support[:, 2]
     width = max(2 * roughness, SHARPEST)
     step = width / 4
     low = height.min()
@@ -211,48 +198,7 @@ def _top(x_in_support: Float[ndarray, "n 3"], roughness: float) -> tuple[float, 
     around = np.abs(height - (low + (peak + 0.5) * step)) < 2.5 * width
     middle = float(np.median(height[around]))
     spread = 1.4826 * float(np.median(np.abs(height[around] - middle)))
-    # Where matching windows straddle a rim, depth is drawn down. The median of a wide top does not suffer; that of
-    # a top that is all rim does, by a cell at most. The cube was fitted to scenes 3 to 5 of the bench table2.
-    top = binary_closing(_counted(x_in_support[around, :2]) > 0, np.ones((3, 3)))
-    narrow = 1 - binary_erosion(top, np.ones((3, 3))).sum() / max(top.sum(), 1)
-    rim, above_lid = _rim(x_in_support[height > middle - 2.5 * width])
-    if len(rim) > SECTORS / 2 and np.median(above_lid) > STEP * width:
-        # It is as narrow as a pixel, and drawn down towards the lid by an unknown part of the step.
-        edge = float(np.median(rim))
-        return edge, (edge - middle) / 2, float(rim.std())
-    return middle, float(CELL * narrow**3), spread
-
-
-def _rim(x_in_support: Float[ndarray, "n 3"]) -> tuple[Float[ndarray, " s"], Float[ndarray, " s"]]:
-    """Height of a top's outline in every direction that shows enough of it, and how far its median is above the rest's.
-
-    The first is what a tenth of the points exceeds. Medians are compared, for what single images have too high by their
-    errors is as much within as at the outline.
-    """
-    xy, height = x_in_support[:, :2], x_in_support[:, 2]
-    from_middle = xy - (xy.min(0) + xy.max(0)) / 2
-    sector = ((np.arctan2(*from_middle.T) / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
-    distance = np.linalg.norm(from_middle, axis=1)
-    within, rim, middle = np.zeros(len(xy), bool), [], []
-    order = np.argsort(sector, kind="stable")
-    for rows in np.split(order, np.searchsorted(sector[order], np.arange(1, SECTORS))):
-        if len(rows) >= FEWEST_IN_SECTOR:
-            far = distance[rows]
-            outline = _quantile(far, 0.98)
-            band = height[rows[far > outline - RIM]]
-            rim.append(_quantile(band, 0.9))
-            middle.append(_quantile(band, 0.5))
-            within[rows[far < outline - 2 * RIM]] = True
-    lid = np.median(height[within]) if within.any() else np.inf
-    return np.array(rim), np.array(middle) - lid
-
-
-def _quantile(values: Float[ndarray, " n"], share: float) -> float:
-    """As NumPy's, which takes ten times as long for a few values; it is asked for thousands of sectors."""
-    ordered, at = np.sort(values), share * (len(values) - 1)
-    low = int(at)
-    high = min(low + 1, len(values) - 1)
-    return float(ordered[low] + (at - low) * (ordered[high] - ordered[low]))
+    return middle, spread
 
 
 def _counted(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "c r"]:
