@@ -20,8 +20,8 @@ from jcr.depth.densify import densify
 from jcr.geometry import apply, inverse
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.records import BOTH, MATCHED, PRIOR, HandEye, Intrinsics, Reconstruction
-from jcr.represent.build import build_scene
-from jcr.represent.cloud import point_cloud
+from jcr.scene.build import build_scene
+from jcr.scene.cloud import point_cloud
 from simulation.capture import SimulateOptions, simulate
 from simulation.truth import read_truth, true_depth, true_labels
 

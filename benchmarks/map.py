@@ -27,11 +27,11 @@ from jcr.export.volume import write_octomap
 from jcr.geometry import apply, inverse
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.records import PointCloud
-from jcr.represent.build import build_scene
-from jcr.represent.cloud import point_cloud
-from jcr.represent.options import MapOptions
-from jcr.represent.scene import SceneMap
-from jcr.segment.tabletop import label_tabletop
+from jcr.scene.build import build_scene
+from jcr.scene.cloud import point_cloud
+from jcr.scene.options import MapOptions
+from jcr.scene.scene_map import SceneMap
+from jcr.segments.tabletop import label_tabletop
 from simulation.capture import SimulateOptions, simulate
 from simulation.scenes import make_scene
 from simulation.surface import solid_labels

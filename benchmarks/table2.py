@@ -15,10 +15,10 @@ from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.depth.densify import densify
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
-from jcr.represent.cloud import point_cloud
-from jcr.segment.labels import read_labels
-from jcr.segment.measure import ObjectSize, measure
-from jcr.segment.tabletop import label_tabletop
+from jcr.scene.cloud import point_cloud
+from jcr.segments.labels import read_labels
+from jcr.segments.measure import ObjectSize, measure
+from jcr.segments.tabletop import label_tabletop
 from simulation.capture import SimulateOptions, simulate
 from simulation.truth import TrueObject, read_truth
 

@@ -59,7 +59,7 @@ SLOW_FIXTURES = {"done", "small_done", "opengl", "real_captures", "tiny_sam", "g
 
 FIRST = (
     "faults/test_faults.py", "calibration/test_faults.py",
-    "view/test_view.py", "test_real_captures.py", "test_without_torch.py", "test_examples.py", "test_verify.py",
+    "viewer/test_view.py", "test_real_captures.py", "test_without_torch.py", "test_examples.py", "test_verify.py",
 )  # fmt: skip
 """Files that the two workers begin with: one makes the run of `done`, the other takes longer and does without it; then
 those that take long and would come last, when one worker has nothing left."""

@@ -30,9 +30,9 @@ from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.global_alignment.pairs import pairs_from_arrays, read_arrays
 from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Attempt, Capture, Intrinsics, PointCloud, Pointmaps, PosePairs, Reconstruction, Tracks
-from jcr.represent.cloud_ply import read_cloud, write_cloud
-from jcr.represent.map_file import load_map
-from jcr.represent.options import MapOptions
+from jcr.scene.cloud_ply import read_cloud, write_cloud
+from jcr.scene.map_file import load_map
+from jcr.scene.options import MapOptions
 from simulation.problem import hand_eye_problem
 from simulation.ros_bag import write_bag
 
@@ -127,7 +127,7 @@ def images(folder: Path) -> dict[str, Target]:
 
 def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Target]:
     """The files of a run folder that are read again."""
-    from jcr.represent.build import build_scene
+    from jcr.scene.build import build_scene
 
     folder.mkdir()
     draw = np.random.default_rng(3)

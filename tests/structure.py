@@ -34,7 +34,7 @@ from jcr.live.server import sample_pose
 from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Capture
 from jcr.run_folder import RunFolder
-from jcr.segment.labels import _read_names
+from jcr.segments.labels import _read_names
 from simulation.problem import hand_eye_problem
 from simulation.ros_bag import write_bag
 

@@ -15,7 +15,7 @@ NOT_NEEDED = (
     "trimesh",
     "skimage",
     "scipy.stats",
-    "jcr.represent.build",
+    "jcr.scene.build",
 )
 
 

@@ -18,11 +18,11 @@ pytestmark = pytest.mark.slow
 MAY_NEED_TORCH = (
     "features/learned", "features/xfeat",
     "reconstruct/dust3r/", "reconstruct/global_alignment/adam",
-    "reconstruct/views_at_once/", "reconstruct/predictions", "represent/", "segment/sam",
-    "export/rrd", "export/volume", "view/",
+    "reconstruct/views_at_once/", "reconstruct/predictions", "scene/", "segments/sam",
+    "export/rrd", "export/volume", "viewer/",
 )  # fmt: skip
 """Modules in src/jcr that may import torch (or viser) when they are imported themselves."""
-NEED_NONE = {"represent/cloud", "represent/map_file", "represent/options", "represent/robot"}
+NEED_NONE = {"scene/cloud", "scene/map_file", "scene/options", "scene/robot"}
 """Among these, what a run without a map imports all the same."""
 
 
@@ -152,7 +152,7 @@ for name in sys.argv[1:]:
     done = without_torch(code, *names)
     assert done.returncode == 0, done.stderr
     need = set(done.stdout.split())
-    assert "represent/scene" in need
+    assert "scene/scene_map" in need
     assert not {name for name in need if not name.startswith(MAY_NEED_TORCH)} | (need & NEED_NONE)
 
 

@@ -49,15 +49,15 @@ if TYPE_CHECKING:
         RobotNoise,
     )
     from jcr.records import Kind as FindingKind
-    from jcr.represent.distance import DistanceGrid
-    from jcr.represent.map_file import load_map
-    from jcr.represent.options import CloudOptions, MapOptions
-    from jcr.represent.robot import RobotSpheres, load_robot
-    from jcr.represent.sample import Sample
-    from jcr.represent.scene import SceneMap
     from jcr.results import RunOptions, RunResult, SavedRun, load_run
-    from jcr.segment.measure import Measured
-    from jcr.segment.options import SegmentOptions, TabletopOptions
+    from jcr.scene.distance import DistanceGrid
+    from jcr.scene.map_file import load_map
+    from jcr.scene.options import CloudOptions, MapOptions
+    from jcr.scene.robot import RobotSpheres, load_robot
+    from jcr.scene.sample import Sample
+    from jcr.scene.scene_map import SceneMap
+    from jcr.segments.measure import Measured
+    from jcr.segments.options import SegmentOptions, TabletopOptions
     from jcr.touch_test import Touched, touch
     from jcr.verify import Verification, VerifyOptions
     from jcr.verify import verify as verify_run
@@ -68,10 +68,10 @@ _MODULE_OF = {
     "ReadOptions": "jcr.capture.options",
     "CalibrateOptions": "jcr.calibration.options",
     "ReconstructOptions": "jcr.reconstruct.backends",
-    "CloudOptions": "jcr.represent.options",
-    "MapOptions": "jcr.represent.options",
-    "SegmentOptions": "jcr.segment.options",
-    "TabletopOptions": "jcr.segment.options",
+    "CloudOptions": "jcr.scene.options",
+    "MapOptions": "jcr.scene.options",
+    "SegmentOptions": "jcr.segments.options",
+    "TabletopOptions": "jcr.segments.options",
     "DepthOptions": "jcr.depth.options",
     "ExportOptions": "jcr.export.options",
     "VerifyOptions": "jcr.verify",
@@ -100,11 +100,11 @@ _MODULE_OF = {
     "Examination": "jcr.check",
     "Touched": "jcr.touch_test",
     "Verification": "jcr.verify",
-    "SceneMap": "jcr.represent.scene",
-    "DistanceGrid": "jcr.represent.distance",
-    "RobotSpheres": "jcr.represent.robot",
-    "Measured": "jcr.segment.measure",
-    "Sample": "jcr.represent.sample",
+    "SceneMap": "jcr.scene.scene_map",
+    "DistanceGrid": "jcr.scene.distance",
+    "RobotSpheres": "jcr.scene.robot",
+    "Measured": "jcr.segments.measure",
+    "Sample": "jcr.scene.sample",
     "CalibrationFile": "jcr.calibration.calibration_json",
     "CamerasFile": "jcr.cell.cameras_json",
     "compare": "jcr.calibration.difference",
@@ -123,8 +123,8 @@ _MODULE_OF = {
     "calibrate": "jcr.pipeline",
     "build_map": "jcr.pipeline",
     "measure": "jcr.pipeline",
-    "load_map": "jcr.represent.map_file",
-    "load_robot": "jcr.represent.robot",
+    "load_map": "jcr.scene.map_file",
+    "load_robot": "jcr.scene.robot",
 }
 """Of each name that is imported when it is asked for, and its name there where that differs."""
 

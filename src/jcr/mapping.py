@@ -11,16 +11,16 @@ from jcr.errors import InputError
 from jcr.progress import Progress
 from jcr.reconstruct.backends import device_of
 from jcr.records import Capture, PointCloud
-from jcr.represent.cloud import point_cloud
-from jcr.represent.map_file import require_packages
-from jcr.represent.measured_depth import with_measured_depth
 from jcr.results import RunOptions, RunResult
-from jcr.segment.measure import Measured, measure
-from jcr.segment.segments import image_labels, label_cloud
-from jcr.segment.tabletop import Support, support_plane
+from jcr.scene.cloud import point_cloud
+from jcr.scene.map_file import require_packages
+from jcr.scene.measured_depth import with_measured_depth
+from jcr.segments.measure import Measured, measure
+from jcr.segments.segments import image_labels, label_cloud
+from jcr.segments.tabletop import Support, support_plane
 
 if TYPE_CHECKING:
-    from jcr.represent.scene import SceneMap
+    from jcr.scene.scene_map import SceneMap
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def make_map(result: RunResult, added: Capture, options: RunOptions, progress: P
 
     Raises InputError where no point is confident enough, or the options leave nothing to map.
     """
-    from jcr.represent.build import build_scene  # torch takes seconds, and is asked for by maps alone
+    from jcr.scene.build import build_scene  # torch takes seconds, and is asked for by maps alone
 
     assert options.map is not None  # or this stage is left out
     device = device_of(options.reconstruct)

@@ -26,13 +26,13 @@ from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import BackendName, check_board
 from jcr.records import Capture, PosePairs
-from jcr.represent.options import CloudOptions, MapOptions
 from jcr.results import PosesResult, RunOptions, RunResult, SavedRun, load_run
 from jcr.run_folder import CAPTURE, REPORT, RunFolder, locked
-from jcr.segment.options import SegmentOptions
+from jcr.scene.options import CloudOptions, MapOptions
+from jcr.segments.options import SegmentOptions
 
 if TYPE_CHECKING:
-    from jcr.segment.measure import Measured
+    from jcr.segments.measure import Measured
 
 
 def run(
@@ -90,7 +90,7 @@ def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, str | 
     if options.map is None or capture.mount == "base":
         return replace(options, map=None), None
     from jcr.mapping import require_dense
-    from jcr.represent.map_file import PACKAGES
+    from jcr.scene.map_file import PACKAGES
 
     require_dense(options.depth)
     if all(map(is_installed, PACKAGES)):
@@ -100,7 +100,7 @@ def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, str | 
 
 def _why_no_map(estimate_depth: bool = False) -> str | None:
     """What to install before a map can be made; None where all that makes one is imported, its loops compiled."""
-    from jcr.represent.map_file import require_packages
+    from jcr.scene.map_file import require_packages
 
     if estimate_depth:
         from jcr.depth.compile_loops import compile_loops
@@ -110,7 +110,7 @@ def _why_no_map(estimate_depth: bool = False) -> str | None:
         require_packages("the map", ", then `jcr map`")
     except InputError as error:
         return f"no map was made: {error}"
-    import jcr.represent.build  # noqa: F401
+    import jcr.scene.build  # noqa: F401
 
     return None
 

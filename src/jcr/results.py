@@ -26,14 +26,14 @@ from jcr.records import (
     Verdict,
     verdict_of,
 )
-from jcr.represent.options import CloudOptions, MapOptions
 from jcr.run_folder import MadeWith, RunFolder
-from jcr.segment.options import SegmentOptions
+from jcr.scene.options import CloudOptions, MapOptions
+from jcr.segments.options import SegmentOptions
 
 if TYPE_CHECKING:
     from jcr.calibration.seen import SeenInBase
-    from jcr.represent.scene import SceneMap
-    from jcr.segment.measure import Measured
+    from jcr.scene.scene_map import SceneMap
+    from jcr.segments.measure import Measured
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -38,12 +38,12 @@ from jcr.files import read_bytes, remove_unfinished, write_text
 from jcr.reconstruct.backends import ReconstructOptions, candidates
 from jcr.reconstruct.reconstruction_npz import FORMAT, read_reconstruction, write_reconstruction
 from jcr.records import Attempt, Capture, PointCloud, Reconstruction
-from jcr.represent.cloud_ply import read_cloud, write_cloud
-from jcr.represent.map_file import FILE as MAP
-from jcr.represent.map_file import load_map
+from jcr.scene.cloud_ply import read_cloud, write_cloud
+from jcr.scene.map_file import FILE as MAP
+from jcr.scene.map_file import load_map
 
 if TYPE_CHECKING:
-    from jcr.represent.scene import SceneMap
+    from jcr.scene.scene_map import SceneMap
 
 LOCK = ".lock"
 """Locked by the run that writes there."""

@@ -30,7 +30,7 @@ from jcr.records import (
     ScaleEvidence,
     Tracks,
 )
-from jcr.represent.measured_depth import with_measured_depth
+from jcr.scene.measured_depth import with_measured_depth
 
 INTRINSICS = Intrinsics(FOCAL_PX, FOCAL_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
 OFF, NOISE_PER_M, SCALE = 1.03, 0.004, 0.1

@@ -20,8 +20,8 @@ from jcr.cli.arguments import groups
 from jcr.cli.help import COMMON, MANY
 from jcr.cli.query import read_points
 from jcr.errors import InputError
-from jcr.represent.cloud_ply import read_cloud
-from jcr.represent.options import MapOptions
+from jcr.scene.cloud_ply import read_cloud
+from jcr.scene.options import MapOptions
 
 pytestmark = pytest.mark.slow
 
@@ -117,7 +117,7 @@ def test_a_map_of_a_folder_without_depth_adds_the_depth_of_a_whole_run(
 
 def result_points(done: Path) -> np.ndarray:
     """A few hundred points of a run's cloud."""
-    from jcr.represent.cloud_ply import read_cloud
+    from jcr.scene.cloud_ply import read_cloud
 
     return read_cloud(done / "cloud.ply").points_in_base[::500]
 

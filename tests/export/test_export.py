@@ -29,7 +29,7 @@ from jcr.export.formats import FORMATS, export_run
 from jcr.export.provenance import Provenance
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics, PointCloud, Tracks
-from jcr.represent.cloud_ply import read_cloud
+from jcr.scene.cloud_ply import read_cloud
 from places import ROOT
 from simulation.scenes import make_scene
 from simulation.surface import solid_labels
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     import trimesh
 
     from jcr.export.views import PosedImages
-    from jcr.represent.scene import SceneMap
+    from jcr.scene.scene_map import SceneMap
 
 DOUBT = "scale: every view rotates about <one> point -- vary the distance"
 """With what ends an XML comment in it."""
@@ -449,7 +449,7 @@ def test_octomap_tells_free_from_occupied_from_unknown(
 ):
     import pyoctomap
 
-    from jcr.represent.scene import FREE, OCCUPIED
+    from jcr.scene.scene_map import FREE, OCCUPIED
 
     path = export(done, "octomap", tmp_path / "map.bt", "--voxel-size", 0.02)
     assert b"# frame: base_link\n# unit: m\n" in path.read_bytes()[:200]

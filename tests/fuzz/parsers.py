@@ -17,11 +17,11 @@ READERS = [
     "jcr.capture",
     "jcr.calibration.calibration_json",
     "jcr.cli.query",
-    "jcr.represent.cloud_ply",
+    "jcr.scene.cloud_ply",
     "jcr.live",
     "jcr.reconstruct",
 ]
-READERS += ["jcr.represent", "rosbags", "safetensors", "yaml"]
+READERS += ["jcr.scene", "rosbags", "safetensors", "yaml"]
 with atheris.instrument_imports(include=READERS):
     from fuzz_targets import targets
     from jcr.errors import InputError

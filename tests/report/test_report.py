@@ -49,10 +49,10 @@ from jcr.report.html import failed_report_html, report_html
 from jcr.report.images import MAGNIFIED, reprojections_px
 from jcr.report.map_samples import sample_surface
 from jcr.report.motion import excitation_bars
-from jcr.represent.cloud import point_cloud
-from jcr.represent.options import MapOptions
 from jcr.results import RunResult
 from jcr.rounding import decimals_of, significant
+from jcr.scene.cloud import point_cloud
+from jcr.scene.options import MapOptions
 from simulation.truth import Truth, read_truth
 
 pytestmark = pytest.mark.slow
@@ -67,7 +67,7 @@ CELL = 0.02
 @pytest.fixture(scope="module")
 def run(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     """A run on the bundled images whose pointmaps are cast against the true table and boxes."""
-    from jcr.represent.build import build_scene
+    from jcr.scene.build import build_scene
 
     truth = read_truth(tabletop)
     folder = tmp_path_factory.mktemp("report") / "a & <b>"

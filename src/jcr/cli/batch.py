@@ -13,7 +13,7 @@ from jcr.cli.output import Output
 from jcr.cli.source import run_options
 from jcr.depth.options import DepthOptions
 from jcr.reconstruct.backends import ReconstructOptions
-from jcr.represent.options import CloudOptions, MapOptions
+from jcr.scene.options import CloudOptions, MapOptions
 
 if TYPE_CHECKING:
     from jcr.batch import Row

@@ -7,8 +7,8 @@ from typing import Annotated
 import tyro
 
 from jcr.cli.output import Output
-from jcr.represent.options import CloudOptions, MapOptions
-from jcr.segment.options import SegmentOptions
+from jcr.scene.options import CloudOptions, MapOptions
+from jcr.segments.options import SegmentOptions
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ import tyro
 from jcr.cli.output import Output, plain
 
 if TYPE_CHECKING:
-    from jcr.segment.measure import Measured
+    from jcr.segments.measure import Measured
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Answer for every point, in the order of the input."""
-    from jcr.represent.map_file import load_map
+    from jcr.scene.map_file import load_map
 
     scene = load_map(arguments.out)
     x_in_base = read_points(arguments.points)

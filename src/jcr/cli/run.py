@@ -14,8 +14,8 @@ from jcr.cli.result import show, show_calibration
 from jcr.cli.source import run_options, source, with_images
 from jcr.depth.options import DepthOptions
 from jcr.reconstruct.backends import ReconstructOptions
-from jcr.represent.options import CloudOptions, MapOptions
-from jcr.segment.options import SegmentOptions
+from jcr.scene.options import CloudOptions, MapOptions
+from jcr.segments.options import SegmentOptions
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -53,10 +53,10 @@ def main(arguments: Arguments) -> int:
     RunFolder(arguments.out).calibration()  # raises at once where there is none
     for package in ("viser", "matplotlib", "torch"):
         extra(package, "view", "jcr view")
-    from jcr.view.robot import read_joints, read_urdf, solve_joints
-    from jcr.view.run import read_run
-    from jcr.view.server import open_server
-    from jcr.view.viewer import Viewer
+    from jcr.viewer.robot import read_joints, read_urdf, solve_joints
+    from jcr.viewer.run import read_run
+    from jcr.viewer.server import open_server
+    from jcr.viewer.viewer import Viewer
 
     run = read_run(arguments.out)
     robot = values = None

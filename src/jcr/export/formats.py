@@ -252,7 +252,7 @@ def _camera_info(run: Run, path: Path) -> None:
 
 
 def _ply(run: Run, path: Path) -> None:
-    from jcr.represent.cloud_ply import write_cloud
+    from jcr.scene.cloud_ply import write_cloud
 
     write_cloud(path, run.folder.cloud(), run.provenance.notes)
 

@@ -11,8 +11,8 @@ from jcr.export.views import PosedImages
 from jcr.extras import extra
 from jcr.files import written_whole
 from jcr.records import PointCloud
-from jcr.represent.scene import SceneMap
-from jcr.represent.surface import surface_mesh
+from jcr.scene.scene_map import SceneMap
+from jcr.scene.surface import surface_mesh
 
 _GRIPPER_AXES_M = 0.05
 

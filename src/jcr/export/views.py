@@ -20,7 +20,7 @@ from jcr.errors import InputError
 from jcr.export.provenance import Provenance
 from jcr.geometry import apply_similarity, inverse, scale_translation
 from jcr.records import COEFFICIENTS, Capture, Intrinsics, PointCloud, Reconstruction, Tracks
-from jcr.represent.cloud_ply import write_cloud
+from jcr.scene.cloud_ply import write_cloud
 from jcr.sfm.mapping import camera_of
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])

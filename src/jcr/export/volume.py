@@ -15,8 +15,8 @@ from jcr.errors import InputError
 from jcr.export.provenance import Provenance
 from jcr.extras import extra
 from jcr.files import write_bytes, written_whole
-from jcr.represent.scene import FREE, OCCUPIED, SceneMap
-from jcr.represent.surface import surface_mesh
+from jcr.scene.scene_map import FREE, OCCUPIED, SceneMap
+from jcr.scene.surface import surface_mesh
 
 MAX_VOXELS = 50_000_000
 _SIGN = "positive outside of what is solid, negative inside, metres (cuRobo wants the negative)"
@@ -102,7 +102,7 @@ def spheres_of_map(
     By default the excess is two of the map's cells; space is looked at in steps of a quarter of it. As the distance
     d changes by no more than one goes, a sphere about c of radius excess - d(c) reaches no farther, and every
     solid place lies in the voxel, of half diagonal h, of a point with d ≤ h. The deepest of those points that are
-    not yet covered become centres first; a point is covered where its whole voxel is. (represent/robot.py takes the
+    not yet covered become centres first; a point is covered where its whole voxel is. (scene/robot.py takes the
     sphere that covers most instead: on millions of points that took 98 s in place of 7 and 1.6 times as many spheres, as
     candidates must be few; on a link of a robot, where it can weigh many, it needs down to a quarter.)
     """

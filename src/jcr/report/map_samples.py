@@ -10,7 +10,7 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial import KDTree
 
 if TYPE_CHECKING:
-    from jcr.represent.scene import SceneMap
+    from jcr.scene.scene_map import SceneMap
 
 
 MAX_CELLS = 700_000

@@ -2,7 +2,7 @@
 
 from jcr.report.raster import label_colors
 from jcr.report.render import Section
-from jcr.segment.measure import Measured
+from jcr.segments.measure import Measured
 
 
 def objects_section(measured: Measured, label_names: tuple[str, ...]) -> Section:

@@ -3,9 +3,9 @@
 from jcr.errors import InputError
 from jcr.progress import Progress
 from jcr.records import Capture, HandEye, PointCloud, Reconstruction
-from jcr.segment.labels import LabelImages, read_labels
-from jcr.segment.options import SegmentOptions
-from jcr.segment.tabletop import Support, label_tabletop
+from jcr.segments.labels import LabelImages, read_labels
+from jcr.segments.options import SegmentOptions
+from jcr.segments.tabletop import Support, label_tabletop
 
 
 def image_labels(
@@ -28,7 +28,7 @@ def image_labels(
             )
         return labels
     if options.segments == "sam":
-        from jcr.segment.sam import load_sam, sam_labels
+        from jcr.segments.sam import load_sam, sam_labels
 
         return sam_labels(load_sam(options.sam_weights), reconstruction, hand_eye, progress)
     return None

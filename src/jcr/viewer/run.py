@@ -14,8 +14,8 @@ from jcr.depth.options import DepthOptions
 from jcr.errors import InputError
 from jcr.geometry import apply_similarity, inverse, scale_translation
 from jcr.records import Capture, Intrinsics, PointCloud, Reconstruction
-from jcr.represent.scene import SceneMap
 from jcr.run_folder import RunFolder
+from jcr.scene.scene_map import SceneMap
 
 CLOUD_POINTS = 200_000
 """Most points that are drawn of pointmaps without a map."""

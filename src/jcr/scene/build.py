@@ -15,13 +15,13 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.progress import Progress, silent
 from jcr.records import PointCloud
-from jcr.represent.carve import carve
-from jcr.represent.fields import Field, Fields, FieldShape, Lattice
-from jcr.represent.options import MapOptions
-from jcr.represent.rays import NEAR, Rays, workspace_box, workspace_rays
-from jcr.represent.scene import SceneMap
-from jcr.represent.seen import HIT, SeenGrid, dilate, halve, without_doubts
-from jcr.represent.train import RECIPES, Recipe, train
+from jcr.scene.carve import carve
+from jcr.scene.fields import Field, Fields, FieldShape, Lattice
+from jcr.scene.options import MapOptions
+from jcr.scene.rays import NEAR, Rays, workspace_box, workspace_rays
+from jcr.scene.scene_map import SceneMap
+from jcr.scene.seen import HIT, SeenGrid, dilate, halve, without_doubts
+from jcr.scene.train import RECIPES, Recipe, train
 
 
 def build_scene(

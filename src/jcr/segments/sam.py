@@ -22,7 +22,7 @@ from jcr.geometry import apply_similarity
 from jcr.progress import Progress
 from jcr.reconstruct.hub import cached_files
 from jcr.records import HandEye, Reconstruction
-from jcr.segment.labels import LabelImages
+from jcr.segments.labels import LabelImages
 
 if TYPE_CHECKING:
     from transformers import Sam2Model

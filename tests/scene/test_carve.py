@@ -7,8 +7,8 @@ pytestmark = pytest.mark.slow  # torch
 
 
 def test_rays_cross_what_is_before_a_wall_and_hit_the_wall() -> None:
-    from jcr.represent.carve import carve
-    from jcr.represent.seen import CROSSED, HIT
+    from jcr.scene.carve import carve
+    from jcr.scene.seen import CROSSED, HIT
 
     side = np.linspace(-0.05, 0.05, 101)
     wall = np.stack([*np.meshgrid(side, side), np.full((101, 101), 0.002)], -1).reshape(-1, 3)

@@ -8,7 +8,7 @@ from jcr.errors import InputError
 from jcr.extras import extra
 
 if TYPE_CHECKING:
-    from jcr.represent.scene import SceneMap
+    from jcr.scene.scene_map import SceneMap
 
 FILE = "map.safetensors"
 PACKAGES = "torch", "safetensors", "skimage"
@@ -29,7 +29,7 @@ def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
     require_packages("a map")
     from safetensors import SafetensorError, safe_open
 
-    from jcr.represent.scene import FORMAT, digest, scene_of
+    from jcr.scene.scene_map import FORMAT, digest, scene_of
 
     try:
         with safe_open(path, "pt") as file:

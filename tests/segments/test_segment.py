@@ -31,11 +31,11 @@ from jcr.records import (
     RobotNoise,
     Tracks,
 )
-from jcr.segment.labels import read_labels
-from jcr.segment.measure import measure
-from jcr.segment.options import SegmentOptions, TabletopOptions
-from jcr.segment.segments import image_labels, label_cloud
-from jcr.segment.tabletop import label_tabletop, support_plane
+from jcr.segments.labels import read_labels
+from jcr.segments.measure import measure
+from jcr.segments.options import SegmentOptions, TabletopOptions
+from jcr.segments.segments import image_labels, label_cloud
+from jcr.segments.tabletop import label_tabletop, support_plane
 
 NOISE = 5e-4
 UPRIGHT = np.eye(4)
@@ -413,7 +413,7 @@ def test_labels_are_asked_for_only_where_they_are_wanted(tmp_path: Path):
 
 def test_masks_of_different_images_become_objects_by_where_they_lie():
     """Two images see one plane from opposite sides; a third mask is seen by one image alone."""
-    from jcr.segment.sam import merged
+    from jcr.segments.sam import merged
 
     grid = np.stack(np.meshgrid(np.linspace(0, 0.4, 40), np.linspace(0, 0.3, 30)), -1)
     plane = np.concatenate([grid, np.zeros((30, 40, 1))], -1)
@@ -477,14 +477,14 @@ def test_segment_anything_gives_distinct_masks_of_the_image(
     tiny_sam: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ):
     """A random network is sure of nothing: its masks pass once the thresholds are gone."""
-    from jcr.segment.sam import image_masks, load_sam, sam_labels
+    from jcr.segments.sam import image_masks, load_sam, sam_labels
 
     model = load_sam(str(tiny_sam))
     assert capfd.readouterr() == ("", "")
     image = np.random.default_rng(0).integers(0, 255, (30, 40, 3), dtype=np.uint8)
     assert len(image_masks(model, image)) == 0
-    monkeypatch.setattr("jcr.segment.sam.LEAST_QUALITY", -np.inf)
-    monkeypatch.setattr("jcr.segment.sam.LEAST_STABILITY", -np.inf)
+    monkeypatch.setattr("jcr.segments.sam.LEAST_QUALITY", -np.inf)
+    monkeypatch.setattr("jcr.segments.sam.LEAST_STABILITY", -np.inf)
     masks = image_masks(model, image)
     assert masks.shape[1:] == (30, 40) and masks.dtype == bool and len(masks) > 0
     flat = masks.reshape(len(masks), -1).astype(float)
@@ -505,7 +505,7 @@ def test_segment_anything_gives_distinct_masks_of_the_image(
 
 @pytest.mark.slow
 def test_segment_anything_that_is_not_there_shows_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from jcr.segment.sam import load_sam
+    from jcr.segments.sam import load_sam
 
     pytest.importorskip("transformers", reason="the extra `sam` is not installed")
     with pytest.raises(InputError, match="config.json and model.safetensors"):

@@ -19,12 +19,12 @@ from chromium import Chromium
 from jcr.camera import project
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse
-from jcr.view.robot import read_joints, read_urdf, solve_joints
+from jcr.viewer.robot import read_joints, read_urdf, solve_joints
 from simulation.truth import Truth, read_truth
 from waiting import until
 
 if TYPE_CHECKING:
-    from jcr.view.viewer import Viewer
+    from jcr.viewer.viewer import Viewer
 
 AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
 
@@ -54,10 +54,10 @@ def gantry(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def viewer(done: Path, gantry: Path) -> "Iterator[Viewer]":
-    from jcr.view import layers
-    from jcr.view.run import read_run
-    from jcr.view.server import open_server
-    from jcr.view.viewer import Viewer
+    from jcr.viewer import layers
+    from jcr.viewer.run import read_run
+    from jcr.viewer.server import open_server
+    from jcr.viewer.viewer import Viewer
 
     run, robot = read_run(done), read_urdf(gantry)
     values = solve_joints(robot, "revolute_x", run.base_from_gripper)
@@ -69,7 +69,7 @@ def viewer(done: Path, gantry: Path) -> "Iterator[Viewer]":
 
 
 def test_a_higher_threshold_leaves_fewer_points_all_of_them_over_it(viewer: "Viewer"):
-    from jcr.view.viewer import CLOUD
+    from jcr.viewer.viewer import CLOUD
 
     counts = []
     for threshold in (0.02, 0.5, 0.98):
@@ -87,7 +87,7 @@ def test_a_higher_threshold_leaves_fewer_points_all_of_them_over_it(viewer: "Vie
 
 
 def test_sphere_rotates_red_in_an_object_and_where_nobody_looked(viewer: "Viewer", truth: Truth):
-    from jcr.view.viewer import COLLIDES, FREE
+    from jcr.viewer.viewer import COLLIDES, FREE
 
     book = next(thing for thing in truth.objects if thing.name == "book")
     top = book.base_from_box[2, 3] + book.box_size[2] / 2
@@ -115,7 +115,7 @@ def test_sphere_rotates_red_in_an_object_and_where_nobody_looked(viewer: "Viewer
 
 
 def test_click_finds_the_first_point_and_shows_what_is_there(viewer: "Viewer", truth: Truth):
-    from jcr.view.viewer import CLOUD
+    from jcr.viewer.viewer import CLOUD
 
     book = next(thing for thing in truth.objects if thing.name == "book")
     x, y, z = book.base_from_box[:3, 3]
@@ -166,7 +166,7 @@ def test_colours_have_their_bar(viewer: "Viewer"):
 
 
 def test_slice_has_the_base_frames_y_upwards(viewer: "Viewer", truth: Truth):
-    from jcr.view.layers import level_slice
+    from jcr.viewer.layers import level_slice
 
     can = next(thing for thing in truth.objects if thing.name == "can")
     scene, (x, y, z) = viewer.run.scene, can.base_from_box[:3, 3]
@@ -180,7 +180,7 @@ def test_slice_has_the_base_frames_y_upwards(viewer: "Viewer", truth: Truth):
 
 
 def test_robot_and_chosen_camera_follow_the_image(viewer: "Viewer"):
-    from jcr.view.viewer import CHOSEN
+    from jcr.viewer.viewer import CHOSEN
 
     for row in (7, 2):
         viewer.image.value = row
@@ -208,9 +208,9 @@ def test_joint_values_are_read_and_doubted(gantry: Path, tmp_path: Path):
 
 
 def test_without_map_or_capture_cameras_and_points_remain(done: Path, tmp_path: Path, viewer: "Viewer"):
-    from jcr.view.run import read_run
-    from jcr.view.server import open_server
-    from jcr.view.viewer import REJECTED, Viewer
+    from jcr.viewer.run import read_run
+    from jcr.viewer.server import open_server
+    from jcr.viewer.viewer import REJECTED, Viewer
 
     for name in ("calibration.json", "reconstruction.npz", "depth.npz"):
         shutil.copy(done / name, tmp_path / name)
@@ -233,7 +233,7 @@ def test_without_map_or_capture_cameras_and_points_remain(done: Path, tmp_path: 
 
 
 def test_a_port_is_taken_or_refused():
-    from jcr.view.server import open_server
+    from jcr.viewer.server import open_server
 
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -8,9 +8,9 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 
 from jcr.errors import InputError
-from jcr.represent.chunks import in_chunks
-from jcr.represent.scene import SceneMap
-from jcr.represent.seen import HIT, SeenGrid, dilate
+from jcr.scene.chunks import in_chunks
+from jcr.scene.scene_map import SceneMap
+from jcr.scene.seen import HIT, SeenGrid, dilate
 
 
 def surface_mesh(

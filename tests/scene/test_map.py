@@ -13,11 +13,11 @@ import analytic_scene
 from analytic_scene import BALL_CENTER, BALL_RADIUS, BOX_CENTER, BOX_HALF, WORKSPACE, signed_distance
 from jcr.errors import InputError
 from jcr.records import PointCloud
-from jcr.represent.map_file import load_map
-from jcr.represent.options import MapOptions
+from jcr.scene.map_file import load_map
+from jcr.scene.options import MapOptions
 
 if TYPE_CHECKING:
-    from jcr.represent.scene import SceneMap
+    from jcr.scene.scene_map import SceneMap
 
 pytestmark = pytest.mark.slow
 
@@ -41,7 +41,7 @@ def warmth(cloud: PointCloud) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def scene(cloud: PointCloud) -> "SceneMap":
-    from jcr.represent.build import build_scene
+    from jcr.scene.build import build_scene
 
     return build_scene(cloud, OPTIONS, values={"warmth": warmth(cloud)})
 
@@ -89,7 +89,7 @@ def test_the_box_is_no_wall_and_nothing_is_clamped_into_it(scene: "SceneMap"):
 
 
 def test_the_planner_chooses_how_unknown_counts(scene: "SceneMap"):
-    from jcr.represent.scene import FREE, OCCUPIED, UNKNOWN
+    from jcr.scene.scene_map import FREE, OCCUPIED, UNKNOWN
 
     centers = np.stack([FREE_SPOT, UNDER_TABLE, BOX_CENTER + [0, 0, BOX_HALF[2]], OUTSIDE])
     radii = np.array([0.05, 0.01, 0.02, 0.05])
@@ -170,7 +170,7 @@ def test_spheres_come_in_any_batch(scene: "SceneMap"):
 
 
 def test_a_segment_touches_where_its_middle_does(scene: "SceneMap"):
-    from jcr.represent.scene import FREE, OCCUPIED, UNKNOWN
+    from jcr.scene.scene_map import FREE, OCCUPIED, UNKNOWN
 
     start, end = BALL_CENTER + [0, -0.12, 0.02], BALL_CENTER + [0, 0.12, 0.02]
     above = np.array([0, 0, BALL_RADIUS + 0.05])
@@ -196,7 +196,7 @@ def test_colours_labels_and_further_values_are_learnt(scene: "SceneMap", cloud: 
 
 
 def test_the_papers_networks_learn_all_three(cloud: PointCloud):
-    from jcr.represent.build import build_scene
+    from jcr.scene.build import build_scene
 
     scene = build_scene(cloud, replace(OPTIONS, preset="paper", max_seconds=6.0))
     x = uniform(100_000)
@@ -210,7 +210,7 @@ def test_the_papers_networks_learn_all_three(cloud: PointCloud):
 
 
 def test_reliable_points_weigh_more(cloud: PointCloud):
-    from jcr.represent.rays import workspace_rays
+    from jcr.scene.rays import workspace_rays
 
     n = len(cloud.points_in_base)
     half = np.arange(n) < n // 2
@@ -223,7 +223,7 @@ def test_reliable_points_weigh_more(cloud: PointCloud):
 
 
 def test_a_wrong_colour_that_nobody_trusts_does_not_stain_the_map(cloud: PointCloud):
-    from jcr.represent.build import build_scene
+    from jcr.scene.build import build_scene
 
     wrong = np.random.default_rng(0).random(len(cloud.color)) < 0.4
     stained = replace(
@@ -309,7 +309,7 @@ def test_a_loaded_map_answers_as_the_saved_one(scene: "SceneMap", tmp_path: Path
 
 
 def test_the_same_seed_gives_the_same_map():
-    from jcr.represent.build import build_scene
+    from jcr.scene.build import build_scene
 
     cloud, coarse = analytic_scene.cloud(5000), replace(OPTIONS, cell=0.03)
     x = uniform(20_000)
@@ -320,7 +320,7 @@ def test_the_same_seed_gives_the_same_map():
 
 
 def test_moving_scene_and_workspace_moves_the_answers(cloud: PointCloud, scene: "SceneMap"):
-    from jcr.represent.build import build_scene
+    from jcr.scene.build import build_scene
 
     shift = np.array([0.5, -0.25, 1.0])
     moved = replace(
@@ -365,7 +365,7 @@ def test_questions_that_make_no_sense_are_refused(scene: "SceneMap"):
 
 
 def test_clouds_that_make_no_map_are_refused(cloud: PointCloud):
-    from jcr.represent.build import build_scene
+    from jcr.scene.build import build_scene
 
     broken = cloud.points_in_base.copy()
     broken[7, 1] = np.nan

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from jcr.errors import InputError
 from jcr.records import PointCloud
-from jcr.represent.seen import CROSSED, HIT, SeenGrid
+from jcr.scene.seen import CROSSED, HIT, SeenGrid
 
 BEHIND = 2.0
 """Cells behind a surface that still count as occupied."""

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Integer
 from numpy import ndarray
 
 from jcr.compiled import compiled
-from jcr.represent.seen import CROSSED, HIT, SeenGrid
+from jcr.scene.seen import CROSSED, HIT, SeenGrid
 
 NEAR = 0.06
 """Metres before each point in which its own ray is followed; farther off, the camera's depth image is asked."""

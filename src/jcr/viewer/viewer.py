@@ -16,8 +16,8 @@ from jcr.records import verdict_of
 from jcr.records.words import reached_in_words, sentence
 from jcr.report.raster import TRACK_COLOR, label_colors
 from jcr.report.render import render
-from jcr.represent.scene import Unknown
-from jcr.view.layers import (
+from jcr.scene.scene_map import Unknown
+from jcr.viewer.layers import (
     LEAST,
     PACKAGE,
     SLICE_LEGENDS,
@@ -28,7 +28,7 @@ from jcr.view.layers import (
     map_points,
     unknown_edge,
 )
-from jcr.view.run import ViewedRun
+from jcr.viewer.run import ViewedRun
 
 CAMERA, CHOSEN, REJECTED = (200, 110, 30), (37, 99, 235), (200, 50, 43)
 FREE, COLLIDES = (40, 160, 90), (220, 40, 40)

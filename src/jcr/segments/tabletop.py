@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull, Delaunay, KDTree
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, transform
 from jcr.records import PRIOR, PointCloud
-from jcr.segment.options import TabletopOptions
+from jcr.segments.options import TabletopOptions
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ pytestmark = pytest.mark.slow
 
 
 def test_priors_make_surfaces_and_nothing_free() -> None:
-    from jcr.represent.build import build_scene
-    from jcr.represent.carve import carve
-    from jcr.represent.options import MapOptions
-    from jcr.represent.seen import CROSSED, HIT
+    from jcr.scene.build import build_scene
+    from jcr.scene.carve import carve
+    from jcr.scene.options import MapOptions
+    from jcr.scene.seen import CROSSED, HIT
 
     whole = analytic_scene.cloud(20_000)
     left = whole.points_in_base[:, 0] < 0
@@ -42,7 +42,7 @@ def test_priors_make_surfaces_and_nothing_free() -> None:
 
 
 def test_a_cloud_keeps_reasons_and_sigmas_on_disk(tmp_path: Path) -> None:
-    from jcr.represent.cloud_ply import read_cloud, write_cloud
+    from jcr.scene.cloud_ply import read_cloud, write_cloud
 
     plain = analytic_scene.cloud(300)
     draw = np.random.default_rng(0)

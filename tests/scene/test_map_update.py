@@ -31,15 +31,15 @@ from jcr.records import (
     RobotNoise,
     Tracks,
 )
-from jcr.represent.cloud import LEAST_SURE, point_cloud
-from jcr.represent.options import CloudOptions, MapOptions
+from jcr.scene.cloud import LEAST_SURE, point_cloud
+from jcr.scene.options import CloudOptions, MapOptions
 from simulation.capture import SimulateOptions, simulate
 from simulation.render import View, render
 from simulation.scenes import Scene, make_scene
 from simulation.truth import Truth, read_truth, true_depth
 
 if TYPE_CHECKING:
-    from jcr.represent.scene import SceneMap
+    from jcr.scene.scene_map import SceneMap
 
 pytestmark = pytest.mark.gl
 
@@ -156,7 +156,7 @@ def added_views(
 
 
 def mapped(truth: Truth, capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye) -> "SceneMap":
-    from jcr.represent.build import build_scene
+    from jcr.scene.build import build_scene
 
     box = tuple(truth.workspace_in_base.ravel().tolist())
     cloud = point_cloud(capture, reconstruction, hand_eye, options=CloudOptions(confidence_percentile=0.0))

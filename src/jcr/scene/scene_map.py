@@ -18,12 +18,12 @@ from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.geometry import apply, require_rigid
 from jcr.records.notebook import table
-from jcr.represent.chunks import in_chunks
-from jcr.represent.distance import DistanceGrid, distance_grid
-from jcr.represent.fields import Fields, FieldShape, Lattice
-from jcr.represent.robot import JointValues, RobotSpheres, load_robot
-from jcr.represent.sample import Sample
-from jcr.represent.seen import CROSSED, HIT, SeenGrid, dilate, halve
+from jcr.scene.chunks import in_chunks
+from jcr.scene.distance import DistanceGrid, distance_grid
+from jcr.scene.fields import Fields, FieldShape, Lattice
+from jcr.scene.robot import JointValues, RobotSpheres, load_robot
+from jcr.scene.sample import Sample
+from jcr.scene.seen import CROSSED, HIT, SeenGrid, dilate, halve
 
 FREE, OCCUPIED, UNKNOWN = 0, 1, 2
 """What is answered to `unknown="report"`."""
@@ -162,7 +162,7 @@ class SceneMap:
     ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
         """Whether a robot touches something at joint values (…,dof); answers as `check_spheres`.
 
-        `robot` is a URDF file, or what `jcr.represent.robot.load_robot` made of it: spheres that cover the
+        `robot` is a URDF file, or what `jcr.scene.robot.load_robot` made of it: spheres that cover the
         collision shapes. Joint values (rad, m) are in the order of `RobotSpheres.joint_names` (as in the URDF),
         or a mapping from these names. `base_from_robot` maps the URDF's root link to the map's base frame;
         `ignore_links` names links that may touch, e.g. the one that stands on the table. The robot's own

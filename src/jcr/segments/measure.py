@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import PointCloud
-from jcr.segment.tabletop import FEWEST, Support, support_plane
+from jcr.segments.tabletop import FEWEST, Support, support_plane
 
 SHARPEST = 0.0005
 """Metres; heights are separated no finer than this, nor than twice the roughness of the plane."""

@@ -12,14 +12,14 @@ import analytic_scene
 from analytic_scene import BALL_CENTER, WORKSPACE
 from jcr.errors import InputError
 from jcr.geometry import apply, transform
-from jcr.represent.cloud_ply import write_cloud
-from jcr.represent.options import MapOptions
+from jcr.scene.cloud_ply import write_cloud
+from jcr.scene.options import MapOptions
 from places import ROOT
 
 if TYPE_CHECKING:
     import trimesh
 
-    from jcr.represent.scene import SceneMap
+    from jcr.scene.scene_map import SceneMap
 
 pytestmark = pytest.mark.slow
 
@@ -61,7 +61,7 @@ def urdf(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def scene() -> "SceneMap":
-    from jcr.represent.build import build_scene
+    from jcr.scene.build import build_scene
 
     return build_scene(analytic_scene.cloud(), MapOptions(workspace=WORKSPACE))
 
@@ -87,7 +87,7 @@ def shape_named(name: str) -> "trimesh.Trimesh":
 def test_spheres_hold_the_shape_and_little_else(name: str):
     import trimesh
 
-    from jcr.represent.robot import spheres_of_shape
+    from jcr.scene.robot import spheres_of_shape
 
     shape = shape_named(name)
     link_from_shape = transform(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), np.array([0.1, 0.2, 0.3]))
@@ -106,7 +106,7 @@ def test_spheres_hold_the_shape_and_little_else(name: str):
 
 
 def test_joints_move_the_spheres_as_the_urdf_shows(urdf: Path):
-    from jcr.represent.robot import load_robot
+    from jcr.scene.robot import load_robot
 
     robot = load_robot(urdf)
     assert robot.joint_names == ("turn", "bend", "push")
@@ -126,7 +126,7 @@ def test_joints_move_the_spheres_as_the_urdf_shows(urdf: Path):
 def test_yourdfpy_puts_the_links_at_the_same_places(urdf: Path):
     import yourdfpy
 
-    from jcr.represent.robot import load_robot
+    from jcr.scene.robot import load_robot
 
     peer, robot = yourdfpy.URDF.load(str(urdf), load_meshes=False), load_robot(urdf)
     q = np.array([0.7, -1.1, 0.03])
@@ -138,8 +138,8 @@ def test_yourdfpy_puts_the_links_at_the_same_places(urdf: Path):
 
 
 def test_the_arm_touches_the_ball_where_it_bends_into_it(scene: "SceneMap", urdf: Path):
-    from jcr.represent.robot import load_robot
-    from jcr.represent.scene import FREE, OCCUPIED, UNKNOWN
+    from jcr.scene.robot import load_robot
+    from jcr.scene.scene_map import FREE, OCCUPIED, UNKNOWN
 
     # The foot stands on the table, behind the ball as seen along x.
     base_from_robot = transform(np.eye(3), BALL_CENTER * [1, 1, 0] + [-0.13, 0, 0.01])
@@ -161,7 +161,7 @@ def test_the_arm_touches_the_ball_where_it_bends_into_it(scene: "SceneMap", urdf
 
 
 def test_robots_and_joints_that_make_no_sense_are_refused(scene: "SceneMap", urdf: Path, tmp_path: Path):
-    from jcr.represent.robot import load_robot
+    from jcr.scene.robot import load_robot
 
     robot = load_robot(urdf)
     with pytest.raises(InputError, match="no such URDF"):

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from jcr.represent.chunks import in_chunks
-from jcr.represent.distance import DistanceGrid
-from jcr.represent.fields import Fields
-from jcr.represent.seen import CROSSED, SeenGrid
+from jcr.scene.chunks import in_chunks
+from jcr.scene.distance import DistanceGrid
+from jcr.scene.fields import Fields
+from jcr.scene.seen import CROSSED, SeenGrid
 
 
 class Sample:

@@ -7,7 +7,7 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.geometry import apply, apply_similarity, by_similarity, inverse, scale_translation
 from jcr.records import MATCHED, PRIOR, Capture, HandEye, PointCloud, Reconstruction
-from jcr.represent.options import CloudOptions
+from jcr.scene.options import CloudOptions
 
 LEAST_SURE = 40.0
 """Percent of the points that rest on matching alone, the least confident, to which the way counts as seen by no one:

@@ -9,9 +9,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.optim.adam import adam
 
-from jcr.represent.fields import Field
-from jcr.represent.rays import Rays, Samples, draw_samples, on_surface
-from jcr.represent.seen import SeenGrid
+from jcr.scene.fields import Field
+from jcr.scene.rays import Rays, Samples, draw_samples, on_surface
+from jcr.scene.seen import SeenGrid
 
 
 @dataclass(frozen=True, kw_only=True)

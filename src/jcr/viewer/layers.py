@@ -12,12 +12,12 @@ from scipy.ndimage import binary_dilation
 from skimage.measure import marching_cubes
 
 from jcr.report.render import render
-from jcr.represent.scene import SceneMap, Unknown
-from jcr.represent.seen import HIT
+from jcr.scene.scene_map import SceneMap, Unknown
+from jcr.scene.seen import HIT
 
 LEAST = 0.02
 """Occupancy of the most doubtful points that a threshold can bring to sight."""
-PACKAGE = "jcr.view"
+PACKAGE = "jcr.viewer"
 """The package of the templates."""
 MAP_POINTS = 150_000
 UNKNOWN_CELLS = 300_000
