@@ -75,13 +75,7 @@ def test_help_of_run_names_the_back_ends():
     assert all(repr(name) in str(inspect.signature(jcr.run)) for name in ("auto", *BACKENDS))
 
 
-def test_names_of_the_first_release_still_work_and_warn(tmp_path: Path):
-    assert jcr.NotTrustedError is jcr.RejectedError
-    with (
-        pytest.warns(DeprecationWarning, match="images"),
-        pytest.raises(jcr.InputError, match="holds no run"),
-    ):
-        jcr.add_camera(tmp_path, "overhead", pictures="overhead.png")
+def test_a_camera_without_images_is_refused(tmp_path: Path):
     with pytest.raises(jcr.InputError, match="overhead: no images"):
         jcr.add_camera(tmp_path, "overhead")
 

@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from jcr import deflate  # noqa: F401
-from jcr.errors import InputError, NotTrustedError, RejectedError
+from jcr.errors import InputError, RejectedError
 
 if TYPE_CHECKING:
     from jcr.calibration.calibration_json import CalibrationFile
@@ -151,7 +151,6 @@ __all__ = [
     "MapOptions",
     "Measured",
     "NextPose",
-    "NotTrustedError",
     "Observability",
     "PointCloud",
     "Pointmaps",

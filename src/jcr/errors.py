@@ -38,7 +38,3 @@ class RejectedError(RuntimeError):
         return RejectedError(
             self.what, *self.remedies, also=(*self.also, *also), despite_texture=self.despite_texture
         )
-
-
-NotTrustedError = RejectedError
-"""Another name of RejectedError, for programs that catch it."""

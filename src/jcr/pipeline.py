@@ -4,7 +4,6 @@ capture -> reconstruct -> calibrate -> densify -> map -> report
 """
 
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
@@ -195,18 +194,14 @@ def add_camera(
     intrinsics: str | Path | None = None,
     *,
     progress: Progress | None = None,
-    pictures: Sequence[str | Path] | str | Path | None = None,
 ) -> RunResult:
     """Locate a fixed camera from its images of the scene of the run folder `out`.
 
-    `images` are one file or more (`pictures`, their name in 0.1.0, is removed in 0.3.0). `intrinsics` is a JSON file in
-    the form of capture.json; None: they are estimated. The camera becomes part of the run, of cameras.json and of the
-    report. Raises InputError if the images are not from one camera or do not fit the intrinsics, and RejectedError,
-    writing nothing, if they do not determine the camera's pose or the run is rejected.
+    `images` are one file or more. `intrinsics` is a JSON file in the form of capture.json; None: they are estimated. The
+    camera becomes part of the run, of cameras.json and of the report. Raises InputError if the images are not from one
+    camera or do not fit the intrinsics, and RejectedError, writing nothing, if they do not determine the camera's pose
+    or the run is rejected.
     """
-    if pictures is not None:
-        warnings.warn("add_camera: `pictures` is called `images` now", DeprecationWarning, stacklevel=2)
-        images = pictures
     files = [Path(image) for image in ([images] if isinstance(images, str | Path) else images)]
     if not files:
         raise InputError(f"{name}: no images; give one or more that the camera took")

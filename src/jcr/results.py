@@ -142,11 +142,6 @@ class RunResult:
         return self.hand_eye.intrinsics or self.reconstruction.intrinsics
 
     @property
-    def lens(self) -> Intrinsics:
-        """The former name of `intrinsics`."""
-        return self.intrinsics
-
-    @property
     def gripper_from_camera(self) -> Float[ndarray, "4 4"]:
         """The hand-eye transform."""
         return self.hand_eye.gripper_from_camera

@@ -107,7 +107,7 @@ class RunFolder:
         """run.json; InputError where there is no run, or its file was damaged."""
         file = self.path / STATE
         try:
-            return State.model_validate_json(_with_depth_apart(read_bytes(file)), strict=True)
+            return State.model_validate_json(read_bytes(file), strict=True)
         except ValidationError as error:
             raise InputError(
                 f"{file}: {first_fault(error)}; run `jcr calibrate` or `jcr run` again"
@@ -338,18 +338,6 @@ def locked(path: Path) -> Iterator[RunFolder]:
         finally:
             if new and os.listdir(path) == [LOCK]:
                 shutil.rmtree(path)
-
-
-def _with_depth_apart(content: bytes) -> bytes:
-    """A run.json of version 0.1, in which reconstruct had the options of the depth, as it is written now."""
-    try:
-        state = json.loads(content)
-        old = state["options"]["reconstruct"]
-        del old["dense"]  # which was set by the command
-        state["options"]["depth"] = {"priors": old.pop("priors")}
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        return content  # as it is written now, or damaged, and refused by the model
-    return json.dumps(state).encode()
 
 
 def state_of(capture: Capture, options: MadeWith) -> State:

@@ -9,16 +9,13 @@ import numpy as np
 import pytest
 
 from jcr.calibration.calibration_json import (
-    CalibrationFile,
     calibration_file,
     read_calibration,
 )
-from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.poses import calibrate_poses
 from jcr.calibration.stage import calibrate
 from jcr.calibration.verdict import with_findings
 from jcr.calibration.words import summary
-from jcr.cell.cameras_json import in_words, read_cameras
 from jcr.errors import InputError
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.geometry import rotation_exp, transform
@@ -32,7 +29,6 @@ from jcr.records import (
     PosePairs,
     Reconstruction,
     Tracks,
-    verdict_of,
 )
 from jcr.records.words import remedy, sentence, text
 from places import ROOT
@@ -270,30 +266,3 @@ def test_findings_are_in_the_file_and_come_back(tmp_path: Path):
     file.write_text(json.dumps(written | {"converged": False}))
     with pytest.raises(InputError, match="contradict one another"):
         read_calibration(file)
-
-
-@pytest.mark.parametrize("name", ["accepted", "rejected"])
-def test_files_of_the_version_before_findings_are_read(name: str, tmp_path: Path):
-    file = GOLDEN / f"calibration_{name}.json"
-    old, found = json.loads(file.read_text()), read_calibration(file)
-    assert found.verdict == name == verdict_of(found.findings)
-    assert (found.warnings, found.notes) == (old["warnings"], old["notes"])
-    assert found.doubt == (old["warnings"][0] if name == "rejected" else None)
-    assert found.uncertainty is not None and found.uncertainty.budget is not None
-    assert found.uncertainty.covariance == old["uncertainty"]["covariance"]
-    assert read_hand_eye(file).covariance is not None
-    again = tmp_path / "calibration.json"
-    again.write_text(json.dumps(found.model_dump()))
-    assert read_calibration(again) == found == CalibrationFile.model_validate(found)
-
-
-def test_cameras_of_the_version_before_findings_are_read():
-    old, found = json.loads((GOLDEN / "cameras.json").read_text()), read_cameras(GOLDEN)
-    assert found is not None and [camera.name for camera in found.cameras] == [
-        c["name"] for c in old["cameras"]
-    ]
-    assert (
-        found.cameras[0].converged
-        and found.cameras[0].base_from_camera == old["cameras"][0]["base_from_camera"]
-    )
-    assert in_words(found)

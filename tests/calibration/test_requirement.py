@@ -28,7 +28,7 @@ from jcr.results import PosesResult, RunOptions
 from simulation.problem import HandEyeProblem, disturbed, hand_eye_problem
 
 DISAGREE = Finding(
-    kind=Kind.EARLIER_VERSION, severity="rejects", details={"text": "the images disagree", "remedy": ""}
+    kind=Kind.RECONSTRUCTION, severity="rejects", details={"text": "the images disagree", "remedy": ""}
 )
 NOISE = (5e-4, np.radians(0.1))
 

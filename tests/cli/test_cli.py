@@ -282,7 +282,6 @@ def test_help_names_units_and_gives_defaults_only_where_they_are_values(capsys: 
     text = " ".join(capsys.readouterr().out.split()).partition("read options")[2]
     assert "--require MM DEG" in text and "--robot-noise MM DEG" in text and "(default: 8.0)" in text
     assert not re.search(r"\(default:\s+(None|True|False)\)", text)
-    assert "--no-bundle-adjustment Use camera poses only" in text
     assert text.index("--pose-convention") < text.index("--require") < text.index("--backend")
 
 

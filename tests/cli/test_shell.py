@@ -128,7 +128,6 @@ TYPED = {
     "jcr map out --segments ta": {"tabletop"},
     "jcr export out octo": {"octomap"},
     "jcr run --pos": {"--poses", "--pose-convention", "--pose-inverted", "--pose-units"},
-    "jcr run --no-b": {"--no-bundle-adjustment"},
     "jcr check ima": {"images/"},
     "jcr check --poses ima": {"images/"},
 }

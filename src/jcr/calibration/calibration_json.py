@@ -9,8 +9,7 @@ import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from jcr.arrays_json import Covariance7, Matrix, Numbers7, Part, Spread
-from jcr.calibration.findings_json import FindingJson, derived, findings_of_words, require_one_verdict
-from jcr.calibration.requirement import not_exact_enough
+from jcr.calibration.findings_json import FindingJson, derived, require_one_verdict
 from jcr.calibration.uncertainty_json import SeenJson, Uncertainty, mm_and_deg
 from jcr.capture.plain_files import first_fault, read_json, shown
 from jcr.errors import InputError
@@ -116,7 +115,7 @@ class Proposal(Part):
     expected_std: Numbers7
     """One standard deviation of each unknown once this pose is added, in the order of `uncertainty`."""
     within_95_mm: Spread | None = None
-    """Of a point seen as in `uncertainty.seen`; null in files of earlier versions."""
+    """Of a point seen as in `uncertainty.seen`."""
     rotation_95_deg: Spread | None = None
 
 
@@ -136,10 +135,10 @@ class CalibrationFile(Part):
     observability: Observed
     robot_noise: Noise | None
     intrinsics: IntrinsicsAndStd | None
-    findings: list[FindingJson] = []
-    """Strongest first."""
-    verdict: Verdict | None = None
-    """That of the worst finding; null as long as a file of an earlier version is read."""
+    findings: list[FindingJson]
+    """Findings of the checks, strongest first."""
+    verdict: Verdict
+    """Severity of the worst finding."""
     warnings: list[str]
     """Findings in words: what rejects first; then what the user must act on."""
     timings_s: dict[str, float]
@@ -152,9 +151,9 @@ class CalibrationFile(Part):
     lengths: list[LengthCheck] = []
     """Every length that was compared with the robot's positions."""
     board: BoardFound | None = None
-    """Null where no board took part beside features, and in files of earlier versions."""
+    """Null where no board took part beside features."""
     requirement: Requirement | None = None
-    """None of files of earlier versions, and where nothing was found."""
+    """Null where nothing was found."""
     attempts: list[Attempt] = []
     """The back ends that were tried, in order; empty where camera poses were given."""
     notes: list[str] = []
@@ -182,7 +181,7 @@ class CalibrationFile(Part):
             raise ValueError(f"{other} of a camera whose mount is {self.mount}")
         if self.converged and not found:
             raise ValueError(f"converged without a {name_found}")
-        require_one_verdict(self.findings, self.verdict, self.converged, self.warnings)
+        require_one_verdict(self.findings, self.verdict, self.converged)
         return self
 
     @property
@@ -335,7 +334,7 @@ def write_calibration(path: Path, content: CalibrationFile) -> None:
 
 
 def read_calibration(path: Path) -> CalibrationFile:
-    """A calibration.json (or the one in a run folder); InputError when it is none, or of a newer format."""
+    """A calibration.json (or the one in a run folder); InputError when it is none, or of another format."""
     file = path / "calibration.json" if path.is_dir() else path
     if not file.is_file():
         raise InputError(f"{file}: no such file; run `jcr calibrate` or `jcr run` first")
@@ -355,21 +354,14 @@ def read_content(file: Path) -> dict[str, object]:
 
 
 def validated(content: dict[str, object], file: Path) -> CalibrationFile:
-    """A calibration of its file's content; InputError when it is none, or of a newer format."""
+    """A calibration of its file's content; InputError when it is none, or of another format."""
     kind = content.get("format")
     if kind != FORMAT:
         raise InputError(
-            f"{file}: format {shown(kind)}, this version reads {FORMAT!r}; use the version of jcr that wrote it"
+            f"{file}: format {shown(kind)}, this version reads {FORMAT!r}; run the calibration again"
         )
     try:
         # As JSON again: there, and not among Python's values, a list may stand for a record of numbers.
-        found = CalibrationFile.model_validate_json(json.dumps(content), strict=True)
+        return CalibrationFile.model_validate_json(json.dumps(content), strict=True)
     except ValidationError as error:
         raise InputError(f"{file}: {first_fault(error)}; run the calibration again") from None
-    if found.verdict is not None:
-        return found
-    findings = findings_of_words(found.warnings, found.converged)
-    if found.converged and found.requirement is not None:
-        short = not_exact_enough(found.requirement, found.mostly_systematic)
-        findings += [] if short is None else [short]
-    return found.model_copy(update=_derived(strongest_first(findings), found.notes))

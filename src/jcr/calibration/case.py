@@ -103,8 +103,7 @@ class Case:
         robot alone.
         """
         return (
-            self.options.bundle_adjustment
-            and self.reconstruction.evidence is None
+            self.reconstruction.evidence is None
             and self.cues is None
             and len(self.tracks.image) >= MIN_OBSERVATIONS
             and len(self.used) >= MIN_IMAGES

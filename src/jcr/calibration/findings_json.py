@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, PlainSerializer, TypeAdapter, ValidationError
 
 from jcr.capture.plain_files import first_fault
-from jcr.records import Finding, Kind, Severity, Verdict, verdict_of
+from jcr.records import Finding, Verdict, verdict_of
 from jcr.records.words import remedy, text, warnings_of
 
 
@@ -32,7 +32,7 @@ FindingJson = Annotated[Finding, BeforeValidator(_without_words), PlainSerialize
 
 
 def derived(findings: Sequence[Finding]) -> dict[str, Any]:
-    """Findings, strongest first, as the fields of a file that every version reads."""
+    """Return the fields of a file that hold findings, strongest first."""
     verdict = verdict_of(findings)
     return {
         "findings": list(findings),
@@ -42,21 +42,7 @@ def derived(findings: Sequence[Finding]) -> dict[str, Any]:
     }
 
 
-def require_one_verdict(
-    findings: Sequence[Finding], verdict: Verdict | None, converged: bool, warnings: Sequence[str]
-) -> None:
-    """ValueError where a part of a file is rejected without a reason, or contradicts its findings."""
-    if verdict is None:
-        if not converged and not warnings:
-            raise ValueError("not converged, and no warning says why")
-    elif verdict != verdict_of(findings) or converged is (verdict == "rejected"):
+def require_one_verdict(findings: Sequence[Finding], verdict: Verdict, converged: bool) -> None:
+    """Raise ValueError where the verdict contradicts the findings."""
+    if verdict != verdict_of(findings) or converged is (verdict == "rejected"):
         raise ValueError("converged, verdict and findings contradict one another")
-
-
-def findings_of_words(warnings: Sequence[str], converged: bool) -> list[Finding]:
-    """Warnings of a file of an earlier version, whose words alone are known; the first says why it is rejected."""
-    first: Severity = "warns" if converged else "rejects"
-    return [
-        Finding.of(Kind.EARLIER_VERSION, "warns" if k else first, text=said, remedy="")
-        for k, said in enumerate(warnings)
-    ]

@@ -32,7 +32,7 @@ def fitted(
         )
     gripper = capture.base_from_gripper[reconstruction.image_index]
     cues, contradiction = _measured(capture, reconstruction, options), None
-    if cues is not None and cues.offset is None and options.bundle_adjustment:
+    if cues is not None and cues.offset is None:
         # Where the motions determine the scale, it is compared with the length beside others (checks/lengths.py).
         cues = None if _solved(gripper, reconstruction, options, robot, None).converged else cues
     if cues is None and (metric_std := reconstruction.metric_std) is not None:

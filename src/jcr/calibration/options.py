@@ -37,10 +37,6 @@ class CalibrateOptions:
     """A known length, for a scale that the motion does not determine: two pixels of one image, and their distance."""
     focus: Literal["fixed", "varies"] = "fixed"
     """varies: estimate a focal length for each image, for a camera whose focus changed during the capture."""
-    bundle_adjustment: Annotated[
-        bool, tyro.conf.arg(help="Use camera poses only; skip the refinement with image points.")
-    ] = True
-    """Refine by the points that images share."""
 
     @property
     def robot_noise_m_rad(self) -> tuple[float, float] | None:

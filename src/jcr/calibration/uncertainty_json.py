@@ -49,7 +49,7 @@ class UncertaintyBudget(Part):
     intrinsics: Share
     images: Share
     faults: Share | None = None
-    """What findings add; null in files of earlier versions."""
+    """Share of the findings."""
 
     @classmethod
     def of(cls, budget: Budget | None) -> "UncertaintyBudget | None":
@@ -116,11 +116,11 @@ class Uncertainty(Part):
     """The least certain direction of the translation in words, and its size."""
     budget: UncertaintyBudget | None = None
     seen: Annotated[SeenAndCorners, AfterValidator(_sizes)] | None = None
-    """Null in files of earlier versions."""
+    """Point uncertainty at the working distance."""
     scene_95_mm: Spread | None = None
     """95 % of the errors of points of the reconstruction in the base frame are smaller, at the median point."""
     joint: Joint | None = None
-    """Null in files of earlier versions, and where the intrinsics were not estimated."""
+    """Null where the intrinsics were not estimated."""
 
     @classmethod
     def of(cls, estimate: Estimate, in_use: InUse | None) -> "Uncertainty":

@@ -10,7 +10,7 @@ from numpy import ndarray
 from pydantic import Field, ValidationError, model_validator
 
 from jcr.arrays_json import Covariance6, Matrix, Part, Spread, Spread3
-from jcr.calibration.findings_json import FindingJson, derived, findings_of_words, require_one_verdict
+from jcr.calibration.findings_json import FindingJson, derived, require_one_verdict
 from jcr.capture.plain_files import first_fault, is_written, read_json
 from jcr.cell.found import CameraFound, CellFound, ImageFound
 from jcr.errors import InputError
@@ -50,10 +50,10 @@ class CameraPlaced(Part):
     uncertainty: TransformUncertainty | None = None
     intrinsics: IntrinsicsAndStd | None = None
     images: list[ImageFound] = Field(alias="pictures")
-    findings: list[FindingJson] = []
-    """Strongest first."""
-    verdict: Verdict | None = None
-    """That of the worst finding; null as long as a file of an earlier version is read."""
+    findings: list[FindingJson]
+    """Findings of the checks, strongest first."""
+    verdict: Verdict
+    """Severity of the worst finding."""
     converged: bool
     warnings: list[str]
     """Findings in words: what rejects first; then what the user must act on."""
@@ -66,7 +66,7 @@ class CameraPlaced(Part):
             raise ValueError("base_from_camera of a camera that moves with the gripper")
         if self.converged and self.parent_from_camera is None:
             raise ValueError("converged without a transform")
-        require_one_verdict(self.findings, self.verdict, self.converged, self.warnings)
+        require_one_verdict(self.findings, self.verdict, self.converged)
         return self
 
     @property
@@ -159,17 +159,11 @@ def read_cameras(folder: Path) -> CamerasFile | None:
         return None
     read_json(file)  # raises InputError with the place of a fault
     try:
-        content = CamerasFile.model_validate_json(file.read_bytes(), strict=True)
+        return CamerasFile.model_validate_json(file.read_bytes(), strict=True)
     except ValidationError as error:
         raise InputError(
             f"{file}: {first_fault(error)}; place the cameras again (jcr run, jcr add-camera)"
         ) from None
-    cameras = list(content.cameras)
-    for k, camera in enumerate(cameras):
-        if camera.verdict is None:  # an earlier version wrote it
-            findings = findings_of_words(camera.warnings, camera.converged)
-            cameras[k] = camera.model_copy(update=derived(findings))
-    return content.model_copy(update={"cameras": cameras})
 
 
 def in_words(content: CamerasFile) -> list[str]:

@@ -35,7 +35,7 @@ def read_depth(path: Path, images: int, made_from: str | None = None) -> Pointma
 
     Raises InputError when the file is damaged, of a newer format, or of other images.
     """
-    with read_npz(path, (FORMAT,)) as (text, file):
+    with read_npz(path, FORMAT) as (text, file):
         about = About.model_validate_json(text, strict=True)
         if made_from not in (None, about.made_from):
             return None

@@ -1,7 +1,7 @@
 """reconstruction.npz: a Reconstruction on disk, from which calibration and map can be made again."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -20,9 +20,6 @@ from jcr.records import Boards, Body, CameraEvidence, Pointmaps, Reconstruction,
 
 FORMAT = "jcr.reconstruction/8"
 """Changes with what the file holds."""
-WITH_DEPTH = "jcr.reconstruction/5"
-"""Version 0.1's, read as well: it holds estimated depth, or none as pointmaps without confidence, and no standard
-deviations of observations."""
 OF_TRACKS = ("image", "x_px", "point", "points_in_recon", "std_px")
 OF_POINTMAPS = ("points_in_recon", "confidence", "colors", "reason", "depth_std")
 
@@ -123,8 +120,8 @@ def write_npz(path: Path, about: Mapping[str, Any], arrays: Mapping[str, np.ndar
 
 
 @contextmanager
-def read_npz(path: Path, formats: Sequence[str]) -> Iterator[tuple[str, Mapping[str, np.ndarray]]]:
-    """What `write_npz` wrote: the JSON, whose `format` is one of `formats`, and the arrays.
+def read_npz(path: Path, expected: str) -> Iterator[tuple[str, Mapping[str, np.ndarray]]]:
+    """Read the JSON, whose `format` is `expected`, and the arrays that `write_npz` wrote.
 
     What goes wrong in reading them raises InputError: no such file, damaged, or of another format.
     """
@@ -136,8 +133,8 @@ def read_npz(path: Path, formats: Sequence[str]) -> Iterator[tuple[str, Mapping[
                 require_memory(sum(member.file_size for member in file.zip.infolist()), str(path))
             text = str(file["about"])
             kind = json.loads(text)["format"]
-            if kind not in formats:
-                raise InputError(f"{path}: format {shown(kind)}, not {formats[0]!r}; delete it and run again")
+            if kind != expected:
+                raise InputError(f"{path}: format {shown(kind)}, not {expected!r}; delete it and run again")
             yield text, file
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; run `jcr calibrate` or `jcr run` first") from None
@@ -151,7 +148,7 @@ def read_npz(path: Path, formats: Sequence[str]) -> Iterator[tuple[str, Mapping[
 
 def read_reconstruction(path: Path) -> Reconstruction:
     """The record in a reconstruction.npz; InputError when it is damaged or of a newer format."""
-    with read_npz(path, (FORMAT, WITH_DEPTH)) as (text, file):
+    with read_npz(path, FORMAT) as (text, file):
         about = About.model_validate_json(text, strict=True)
         found = Reconstruction(
             image_index=file["image_index"],
@@ -160,9 +157,7 @@ def read_reconstruction(path: Path) -> Reconstruction:
             tracks=Tracks(
                 **{name: file[f"track_{name}"] for name in OF_TRACKS if name != "std_px"},
                 from_pointmaps=bool(file["tracks_from_pointmaps"]),
-                from_board=bool(file["tracks_from_board"])
-                if about.format == FORMAT
-                else about.backend == "marker",
+                from_board=bool(file["tracks_from_board"]),
                 std_px=file.get("track_std_px"),
                 boards=None if about.boards is None else _boards(file, about.boards),
             ),
@@ -208,7 +203,7 @@ def _boards(file: Mapping[str, np.ndarray], about: BoardsJson) -> Boards:
 
 
 def _pointmaps(file: Mapping[str, np.ndarray], about: About) -> Pointmaps | None:
-    if about.pointmap_intrinsics is None or (about.format == WITH_DEPTH and not file["confidence"].any()):
+    if about.pointmap_intrinsics is None:
         return None
     return pointmaps_in(file, about.pointmap_intrinsics, len(file["image_index"]))
 

@@ -401,8 +401,7 @@ class BoardFound:
     tilts_deg: tuple[float, ...]
     """Angles of the bodies from the base's horizontal plane."""
     shape_mm: tuple[tuple[float, float, float], ...] = ()
-    """Of the body that bends most, each corner's x and y on it and its height above its plane, by the robot's positions;
-    empty in files of earlier versions."""
+    """Corners of the body that bends most: x and y on the body, and height above its plane, by the robot's positions."""
 
 
 @dataclass(frozen=True)

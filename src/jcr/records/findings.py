@@ -61,7 +61,6 @@ class Kind(StrEnum):
     BOARD_IN_VIEW = "board in view"
     RECONSTRUCTION = "reconstruction"
     NO_RECONSTRUCTION = "no reconstruction"
-    EARLIER_VERSION = "from a file of an earlier version"
     OWN_REJECTED = "the capture's own camera is rejected"
     FEW_POINTS_SHARED = "few points shared with the scene"
     FEW_LOCALISED = "few images localised"

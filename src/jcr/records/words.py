@@ -73,9 +73,7 @@ def reached_in_words(required: Requirement) -> str:
 
 
 def _reached(required: Mapping[str, Any]) -> str:
-    # Findings of earlier versions do not say of what: of the camera, or of a point ahead of it.
-    far = required["distance_mm"]
-    at = required.get("at", "seen" if far else "camera")
+    far, at = required["distance_mm"], required["at"]
     asked = "asked for" if required["asked"] else "needed to grasp"
     mm, degrees = significant(required["reached_mm"]), significant(required["reached_deg"])
     reached = {
@@ -599,7 +597,6 @@ _TEXT: dict[Kind, Words] = {
     Kind.BOARD_IN_VIEW: "a calibration board is in view",
     Kind.RECONSTRUCTION: "{text}",
     Kind.NO_RECONSTRUCTION: "{text}",
-    Kind.EARLIER_VERSION: "{text}",
     Kind.OWN_REJECTED: "the {camera} camera's own calibration is rejected",
     Kind.FEW_POINTS_SHARED: "{images[0]} shares {value:.0f} points with the mapped scene, too few",
     Kind.FEW_LOCALISED: "{value:.0f} of its images share enough of the mapped scene; {needed:.0f} are needed",
@@ -682,7 +679,6 @@ _REMEDY: dict[Kind, Words] = {
     Kind.BOARD_IN_VIEW: _board_lengths,
     Kind.RECONSTRUCTION: _given_remedy,
     Kind.NO_RECONSTRUCTION: _given_remedy,
-    Kind.EARLIER_VERSION: _given_remedy,
     Kind.FEW_POINTS_SHARED: "it must see the same scene, unchanged, from a direction not too different",
     Kind.FEW_LOCALISED: "add images of the mapped scene",
     Kind.ONE_GRIPPER_POSE: ("add an image at another gripper pose, or write mount base for a fixed camera"),

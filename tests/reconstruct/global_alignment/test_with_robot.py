@@ -9,7 +9,6 @@ import pytest
 from benchmarks.align import camera_errors
 from benchmarks.synthetic_pairs import PairErrors, synthetic_pairs
 from jcr.calibration.calibration_json import calibration_file
-from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
 from jcr.reconstruct.dust3r.pair_graph import complete_pairs
@@ -134,20 +133,6 @@ def test_reported_sigmas_are_those_of_the_errors(noise: tuple[float, float]):
     # widened for an estimated noise stay below.
     assert 2.0 < np.mean(squared) < 11.1
     assert np.sum(np.array(squared) > 14.07) <= 2
-
-
-@pytest.mark.slow
-def test_bundle_adjustment_of_pointmap_tracks_does_not_spoil_what_the_poses_show():
-    # Errors that neighbouring pixels share look like signal to an adjustment of independent observations.
-    refined, poses = [], []
-    for seed in range(4):
-        made = case(6, seed, errors=PairErrors(bend=0.005))
-        # As pointmaps in one frame come: without a covariance of the cameras.
-        found = replace(made.reconstruction(), evidence=None)
-        for bundle_adjustment, errors in ((True, refined), (False, poses)):
-            solved = calibrate(made.capture, found, CalibrateOptions(bundle_adjustment=bundle_adjustment))
-            errors.append(np.linalg.norm(made.error(solved)[:3]))
-    assert np.mean(refined) < 1.1 * np.mean(poses)
 
 
 @pytest.mark.slow
