@@ -73,7 +73,8 @@ def reached_in_words(required: Requirement) -> str:
 
 
 def _reached(required: Mapping[str, Any]) -> str:
-    far, at = required["distance_mm"], required["at"]
+    far = required["distance_mm"]
+    at = required.get("at", "seen" if far else "camera")
     asked = "asked for" if required["asked"] else "needed to grasp"
     mm, degrees = significant(required["reached_mm"]), significant(required["reached_deg"])
     reached = {
