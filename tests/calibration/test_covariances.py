@@ -10,7 +10,7 @@ import pytest
 from jcr.cli import dispatch
 from places import ROOT
 
-GOLDEN = ROOT / "tests" / "golden" / "calibration_accepted.json"
+ACCEPTED = ROOT / "tests" / "calibrations" / "accepted.json"
 CHANGES: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
     "zeroed": (np.zeros_like, "has no variance"),
     "one error zeroed": (lambda c: c * np.outer(np.arange(7) != 2, np.arange(7) != 2), "has no variance"),
@@ -29,13 +29,13 @@ def _std(covariance: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("change", CHANGES)
 def test_what_is_no_covariance_is_refused(change: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     made, words = CHANGES[change]
-    content = json.loads(GOLDEN.read_text())
+    content = json.loads(ACCEPTED.read_text())
     covariance = np.array(content["uncertainty"]["covariance"])
     content["uncertainty"]["covariance"] = made(covariance).tolist()
     (tmp_path / "calibration.json").write_text(json.dumps(content))
     for command in (
-        ["compare", tmp_path, GOLDEN],
-        ["compare", GOLDEN, tmp_path],
+        ["compare", tmp_path, ACCEPTED],
+        ["compare", ACCEPTED, tmp_path],
         ["export", tmp_path, "urdf"],
     ):
         assert dispatch([str(word) for word in command]) == 2
@@ -45,14 +45,14 @@ def test_what_is_no_covariance_is_refused(change: str, tmp_path: Path, capsys: p
 
 def test_parts_that_are_not_the_whole_decide_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """The whole is the covariance; what its parts leave has no name."""
-    content = json.loads(GOLDEN.read_text())
+    content = json.loads(ACCEPTED.read_text())
     for part in content["uncertainty"]["budget"].values():
         part["covariance"] = np.zeros((7, 7)).tolist()
     content["gripper_from_camera"][0][3] += 1e-3
     (tmp_path / "calibration.json").write_text(json.dumps(content))
     assert dispatch(["compare", str(tmp_path), str(tmp_path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["chi2"] == 0
-    assert dispatch(["compare", str(tmp_path), str(GOLDEN), "--json"]) == 0
+    assert dispatch(["compare", str(tmp_path), str(ACCEPTED), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["chi2"] > 0 and found["explained_by"]["reference"] == pytest.approx(0.5, abs=0.01)
     assert sum(found["explained_by"].values()) == pytest.approx(1.0)

@@ -34,7 +34,6 @@ from jcr.records.words import remedy, sentence, text
 from places import ROOT
 from simulation.problem import hand_eye_problem
 
-GOLDEN = ROOT / "tests" / "golden"
 """Files as the version before findings wrote them."""
 AT = {"frame": "gripper", "x": 0.0, "y": 0.6, "z": 0.8}
 INTRINSICS = {
