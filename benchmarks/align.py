@@ -27,7 +27,7 @@ from jcr.reconstruct.dust3r.pair_graph import complete_pairs
 from jcr.reconstruct.global_alignment.align import align, align_with_robot
 from jcr.reconstruct.global_alignment.alignment import AlignOptions
 from jcr.reconstruct.global_alignment.pairs import PairPredictions, write_pairs
-from simulation.problem import HandEyeProblem, disturbed, error
+from simulation.problems import HandEyeProblem, disturbed, error
 
 SMALL, MIDDLE, LARGE = (64, 48), (128, 96), (512, 384)
 

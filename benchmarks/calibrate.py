@@ -18,8 +18,7 @@ from jcr.estimation.wrist import adjust_wrist, recon_frame
 from jcr.files import write_bytes
 from jcr.geometry import scale_translation
 from jcr.records import HandEye
-from simulation.observations import INTRINSICS, observed
-from simulation.problem import HandEyeProblem, error, hand_eye_problem
+from simulation.problems import INTRINSICS, HandEyeProblem, error, hand_eye_problem, observed
 
 COUNTS = (3, 5, 8, 10, 12, 15)
 NOISES = ((0.0, 0.0), (5e-4, np.radians(0.1)), (2e-3, np.radians(0.5)))

@@ -23,8 +23,8 @@ from jcr.estimation.together import adjust
 from jcr.geometry import inverse, scale_translation, skew, step_between
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.records import Capture, CellCamera
-from simulation.arm_errors import PresetName
-from simulation.cell import BOX, CellProblem, Kind, cell_problem
+from simulation.arms import PresetName
+from simulation.cells import BOX, CellProblem, Kind, cell_problem
 
 DRAWS = 10
 """Of each kind of cell."""

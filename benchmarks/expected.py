@@ -23,9 +23,8 @@ from jcr.errors import RejectedError
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.pipeline import calibrate as run_calibrate
 from jcr.records import Capture, HandEye, Reconstruction
-from simulation.arm_errors import PresetName
-from simulation.bent import bent_problem
-from simulation.observations import observed
+from simulation.arms import PresetName
+from simulation.problems import bent_problem, observed
 
 ROBOTS: tuple[PresetName, ...] = ("typical", "white", "typical", "typical", "white")
 COUNTS = (6, 8, 12, 20)

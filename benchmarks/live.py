@@ -18,19 +18,20 @@ from jcr.geometry import apply, inverse, retract, rotation_angle, transform
 from jcr.live.calibration import LiveCalibration
 from jcr.live.calibration_progress import Progress
 from jcr.records import Intrinsics
-from simulation.arm_errors import PRESETS
-from simulation.bent_arm import BentArm, bend
-from simulation.poses import looking_at
-from simulation.render import render
-from simulation.robots import (
+from simulation.arms import (
     EFFECTIVE_NOISE,
     EFFECTIVE_POSES,
+    PRESETS,
+    BentArm,
     about_posture,
+    bend,
     hand_eye_on,
     table_center,
     view_size,
     views,
 )
+from simulation.poses import looking_at
+from simulation.render import render
 from simulation.scenes import Scene, make_scene, moved
 from simulation.taken import pinhole
 

@@ -15,7 +15,7 @@ from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.global_alignment.pairs import write_pairs
 from jcr.results import RunResult
 from simulation.capture import SimulateOptions, simulate
-from simulation.problem import HandEyeProblem, error
+from simulation.problems import HandEyeProblem, error
 from simulation.surface import truth_points
 from simulation.truth import read_truth
 

@@ -16,9 +16,8 @@ from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.files import write_bytes
 from jcr.records import HandEye
-from simulation.arm_errors import PresetName
-from simulation.bent import BentProblem, bent_problem
-from simulation.problem import error
+from simulation.arms import PresetName
+from simulation.problems import BentProblem, bent_problem, error
 
 ARMS = ROBOT_NAMES
 PRESETS: tuple[PresetName, ...] = get_args(PresetName)

@@ -17,9 +17,8 @@ from jcr.estimation.intrinsics_prior import ESTIMATED, IntrinsicsPrior, prior_of
 from jcr.estimation.wrist import adjust_wrist
 from jcr.geometry import apply, step_between
 from jcr.records import Estimate, Intrinsics
-from simulation.arm_errors import PresetName
-from simulation.bent import BentProblem, bent_problem
-from simulation.observations import INTRINSICS, observed
+from simulation.arms import PresetName
+from simulation.problems import INTRINSICS, BentProblem, bent_problem, observed
 
 PRESETS: tuple[PresetName, ...] = ("white", "typical")
 COUNTS = (8, 12, 30)

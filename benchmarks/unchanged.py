@@ -22,11 +22,10 @@ from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.geometry import step_between
 from jcr.records import HandEye
 from jcr.run_folder import RunFolder
-from simulation.bent import bent_problem
 from simulation.boards import Sheet, with_sheet
-from simulation.cell import Kind, cell_problem
+from simulation.cells import Kind, cell_problem
 from simulation.faults import Faults, faulty_capture
-from simulation.problem import hand_eye_problem
+from simulation.problems import bent_problem, hand_eye_problem
 
 Record = dict[str, Any]
 COUNTED = (("jcr.estimation.images", "without_points"), ("jcr.estimation.fit", "linearised"))

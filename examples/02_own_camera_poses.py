@@ -16,7 +16,7 @@ import jcr
 from jcr.geometry import rotation_between_deg
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))  # of the checkout, for what is simulated
-from simulation.problem import hand_eye_problem
+from simulation.problems import hand_eye_problem
 
 # Ten poses of an arm that reports them with 0.5 mm and 0.1° of noise.
 noise = (0.0005, np.radians(0.1))

@@ -15,9 +15,9 @@ from jcr.camera import NO_DISTORTION, parameter_names, parameters, project, with
 from jcr.estimation.known_scale import fit_known_scale
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics, Tracks
+from simulation.arms import EFFECTIVE_NOISE, EFFECTIVE_POSES
 from simulation.poses import gripper_poses, random_hand_eye
-from simulation.problem import TARGET_IN_BASE, disturbed
-from simulation.robots import EFFECTIVE_NOISE, EFFECTIVE_POSES
+from simulation.problems import TARGET_IN_BASE, disturbed
 
 INTRINSICS = Intrinsics(620.0, 620.0, 319.5, 239.5, 640, 480, NO_DISTORTION)
 """What the user believes the camera to be."""

@@ -19,7 +19,7 @@ from jcr.files import write_bytes
 from jcr.geometry import inverse, rotation_exp, transform
 from jcr.records import Capture, Intrinsics
 from simulation.faults import late
-from simulation.problem import disturbed
+from simulation.problems import disturbed
 from simulation.rendered import Rendered
 from simulation.taken import encoded
 

@@ -11,11 +11,9 @@ from numpy import ndarray
 from jcr.estimation.arms import RobotName, arm_named
 from jcr.geometry import transform
 from jcr.records import Intrinsics
-from simulation.arm_errors import PRESETS
-from simulation.bent_arm import bend
+from simulation.arms import PRESETS, bend, effective_about, hand_eye_on, patterned, table_center
 from simulation.poses import gripper_poses, random_hand_eye
 from simulation.render import render
-from simulation.robots import effective_about, hand_eye_on, patterned, table_center
 from simulation.scenes import Scene, make_scene, moved
 
 SIZE, WIDE = (640, 480), (960, 720)

@@ -15,7 +15,7 @@ from jcr.capture.images import read_image
 from jcr.extras import extra
 from jcr.geometry import ARM, rotation_between_deg, transform
 from jcr.records import Capture
-from simulation.problem import disturbed
+from simulation.problems import disturbed
 
 FPS, TF_HZ = 30.0, 100.0
 START_NS = 1_700_000_000_123_456_789

@@ -13,7 +13,7 @@ from jcr.capture.images import encode_png
 from jcr.files import write_bytes, write_text
 from jcr.intrinsics_json import IntrinsicsJson
 from jcr.records import Intrinsics
-from simulation.bent_arm import BentArm
+from simulation.arms import BentArm
 
 DEPTH_UNIT_M = 1e-4
 """Metres per count of the 16-bit depth images."""

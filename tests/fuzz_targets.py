@@ -33,7 +33,7 @@ from jcr.records import Attempt, Capture, Intrinsics, PointCloud, Pointmaps, Pos
 from jcr.scene.cloud_ply import read_cloud, write_cloud
 from jcr.scene.map_file import load_map
 from jcr.scene.options import MapOptions
-from simulation.problem import hand_eye_problem
+from simulation.problems import hand_eye_problem
 from simulation.ros_bag import write_bag
 
 SIZE = (16, 12)

@@ -35,7 +35,7 @@ from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_recons
 from jcr.records import Capture
 from jcr.run_folder import RunFolder
 from jcr.segments.labels import _read_names
-from simulation.problem import hand_eye_problem
+from simulation.problems import hand_eye_problem
 from simulation.ros_bag import write_bag
 
 TOO_LONG_S = 5.0

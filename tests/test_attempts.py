@@ -21,7 +21,7 @@ from jcr.geometry import rotation_exp, transform
 from jcr.reconstruct import backends
 from jcr.reconstruct.backends import Backend, ReconstructOptions
 from jcr.records import Capture, Finding, HandEye, Intrinsics, Kind, Pointmaps, Reconstruction, Tracks
-from simulation.problem import HandEyeProblem, hand_eye_problem
+from simulation.problems import HandEyeProblem, hand_eye_problem
 
 GARBAGE = {
     "enc_embed_dim": 32,

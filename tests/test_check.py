@@ -17,7 +17,7 @@ from jcr.capture.images import BLURRED_EDGE, edge_width, read_image, show_one_vi
 from jcr.cli import dispatch
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.records import Capture, Intrinsics, Kind, Reconstruction, Tracks
-from simulation.problem import hand_eye_problem
+from simulation.problems import hand_eye_problem
 
 RNG = np.random.default_rng(0)
 INTRINSICS = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480)

@@ -8,7 +8,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from jcr.estimation import hand_eye
 from jcr.geometry import apply, retract, rotation_exp, skew, step_between, transform
 from jcr.least_squares import loss_weight, minimise
-from simulation.problem import hand_eye_problem
+from simulation.problems import hand_eye_problem
 
 TIME = np.linspace(0, 4, 60)
 

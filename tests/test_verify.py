@@ -26,7 +26,7 @@ from jcr.reconstruct.backends import ReconstructOptions
 from jcr.records import Capture, Reconstruction, Tracks
 from jcr.run_folder import MadeWith, RunFolder, state_of
 from jcr.sfm.relocate import Located, relocate
-from simulation.bent import bent_problem
+from simulation.problems import bent_problem
 from simulation.taken import with_robot_noise
 
 pytestmark = pytest.mark.slow

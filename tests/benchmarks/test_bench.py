@@ -16,7 +16,7 @@ from benchmarks.table import BENCHES
 from jcr.errors import InputError
 from jcr.geometry import rotation_between_deg, scale_translation
 from places import ROOT
-from simulation.problem import hand_eye_problem
+from simulation.problems import hand_eye_problem
 
 RESULTS = ROOT / "docs" / "results"
 MEASURED = re.compile(r"(\d[\d,.]*\d|\d)\s?(mm|cm|°|%|ms|s|dB|GiB|GB|MiB|M|minutes|times)(?![\w])")

@@ -9,7 +9,7 @@ from benchmarks import check_points
 from benchmarks.check_points import Corners, WristCamera, measure, pixels_of, predicted
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.records import Intrinsics
-from simulation.problem import TARGET_IN_BASE, HandEyeProblem, hand_eye_problem
+from simulation.problems import TARGET_IN_BASE, HandEyeProblem, hand_eye_problem
 
 CAMERA = Intrinsics(620.0, 620.0, 322.0, 236.0, 640, 480, (-0.08, 0.03, 0.0, 0.0, 0.0))
 NOISE_PX = 0.1

@@ -22,7 +22,7 @@ from jcr.geometry import rotation_between_deg
 from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Intrinsics, Kind
 from places import SHARED
-from simulation.problem import TARGET_IN_BASE, HandEyeProblem, hand_eye_problem
+from simulation.problems import TARGET_IN_BASE, HandEyeProblem, hand_eye_problem
 
 pytestmark = pytest.mark.slow
 

@@ -11,8 +11,7 @@ from jcr.estimation.fit import Cues
 from jcr.estimation.intrinsics_prior import prior_of
 from jcr.estimation.systematic import smooth_errors
 from jcr.geometry import inverse, transform
-from simulation.observations import INTRINSICS, observed
-from simulation.problem import error, hand_eye_problem
+from simulation.problems import INTRINSICS, error, hand_eye_problem, observed
 
 
 @pytest.mark.slow

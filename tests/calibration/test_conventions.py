@@ -18,7 +18,7 @@ from jcr.calibration.conventions import (
 from jcr.capture.names import paired_by_name
 from jcr.geometry import inverse, transform
 from jcr.records.words import sentence
-from simulation.problem import hand_eye_problem
+from simulation.problems import hand_eye_problem
 
 
 def with_rotation(poses: np.ndarray, rotation: Rotation) -> np.ndarray:

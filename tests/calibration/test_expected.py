@@ -19,7 +19,7 @@ from jcr.check import check
 from jcr.estimation.next_poses import assumed_camera
 from jcr.geometry import transform
 from jcr.records import Intrinsics, NextPose, PosePairs
-from simulation.problem import HandEyeProblem, hand_eye_problem
+from simulation.problems import HandEyeProblem, hand_eye_problem
 
 WITHIN = np.log(FACTOR)
 

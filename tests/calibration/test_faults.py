@@ -20,12 +20,10 @@ from jcr.estimation.systematic import smooth_errors
 from jcr.geometry import inverse, retract, step_between
 from jcr.records import BENT, Capture, Finding, Kind, Reconstruction
 from jcr.records.words import sentence
-from simulation.arm_errors import PresetName
-from simulation.bent import bent_problem
+from simulation.arms import PresetName
 from simulation.faults import INTRINSICS, Faults, faulty_capture
-from simulation.observations import INTRINSICS as OBSERVED_BY
-from simulation.observations import observed
-from simulation.problem import hand_eye_problem
+from simulation.problems import INTRINSICS as OBSERVED_BY
+from simulation.problems import bent_problem, hand_eye_problem, observed
 
 pytestmark = pytest.mark.slow
 

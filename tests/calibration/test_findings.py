@@ -32,7 +32,7 @@ from jcr.records import (
 )
 from jcr.records.words import remedy, sentence, text
 from places import ROOT
-from simulation.problem import hand_eye_problem
+from simulation.problems import hand_eye_problem
 
 """Files as the version before findings wrote them."""
 AT = {"frame": "gripper", "x": 0.0, "y": 0.6, "z": 0.8}

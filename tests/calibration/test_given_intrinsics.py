@@ -11,8 +11,7 @@ from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.records import Capture, HandEye, Intrinsics, Reconstruction
-from simulation.observations import INTRINSICS, observed
-from simulation.problem import HandEyeProblem, error, hand_eye_problem
+from simulation.problems import INTRINSICS, HandEyeProblem, error, hand_eye_problem, observed
 
 
 def pictured(

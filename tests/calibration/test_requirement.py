@@ -25,7 +25,7 @@ from jcr.records import Finding, HandEye, Kind, PosePairs
 from jcr.records.words import sentence
 from jcr.report.html import poses_report_html
 from jcr.results import PosesResult, RunOptions
-from simulation.problem import HandEyeProblem, disturbed, hand_eye_problem
+from simulation.problems import HandEyeProblem, disturbed, hand_eye_problem
 
 DISAGREE = Finding(
     kind=Kind.RECONSTRUCTION, severity="rejects", details={"text": "the images disagree", "remedy": ""}

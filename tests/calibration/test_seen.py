@@ -26,8 +26,7 @@ from jcr.estimation.points import points_in_base
 from jcr.estimation.wrist import adjust_wrist
 from jcr.geometry import apply, inverse, retract
 from jcr.records import Estimate, HandEye, Intrinsics, Tracks
-from simulation.observations import INTRINSICS, observed
-from simulation.problem import HandEyeProblem, hand_eye_problem
+from simulation.problems import INTRINSICS, HandEyeProblem, hand_eye_problem, observed
 
 X_PX = np.array([[319.5, 239.5], [40.0, 30.0], [600.0, 450.0]])
 DISTANCE_M = 0.45

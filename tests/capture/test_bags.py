@@ -21,7 +21,7 @@ from jcr.capture.ros_image import depth_of, image_of
 from jcr.files import write_bytes
 from jcr.geometry import rotation_exp, transform
 from jcr.records import Capture
-from simulation.problem import hand_eye_problem
+from simulation.problems import hand_eye_problem
 from simulation.ros_bag import nearest_view, write_bag
 
 pytest.importorskip("rosbags", reason="rosbags is not installed (extra ros)")

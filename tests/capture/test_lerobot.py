@@ -14,7 +14,7 @@ from jcr.capture.images import read_image
 from jcr.capture.joints import read_arm
 from jcr.capture.options import ReadOptions
 from jcr.records import Capture
-from simulation.problem import HandEyeProblem, hand_eye_problem
+from simulation.problems import HandEyeProblem, hand_eye_problem
 
 pytestmark = [
     pytest.mark.skipif(find_spec(name) is None, reason=f"{name} is not installed (extra lerobot)")

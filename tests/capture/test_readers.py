@@ -20,7 +20,7 @@ from jcr.capture.robot_poses import CONVENTIONS, poses_from_numbers
 from jcr.cli.query import read_points
 from jcr.geometry import scale_translation
 from jcr.records import Capture, PosePairs
-from simulation.problem import HandEyeProblem, hand_eye_problem
+from simulation.problems import HandEyeProblem, hand_eye_problem
 
 
 @pytest.fixture(scope="module")

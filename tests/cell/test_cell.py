@@ -38,7 +38,7 @@ from jcr.reconstruct.backends import ReconstructOptions
 from jcr.records import Capture, CellCamera, Finding, HandEye, Intrinsics, Reconstruction, Tracks
 from jcr.records import Kind as FindingKind
 from jcr.sfm.relocate import Features
-from simulation.cell import CellProblem, Kind, cell_problem
+from simulation.cells import CellProblem, Kind, cell_problem
 
 COUNT = 8
 OLD = 9

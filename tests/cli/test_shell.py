@@ -25,7 +25,7 @@ from jcr.export.formats import FORMATS
 from jcr.export.options import FormatName
 from jcr.geometry import scale_translation
 from places import ROOT
-from simulation.problem import hand_eye_problem
+from simulation.problems import hand_eye_problem
 
 
 @pytest.fixture(scope="module")

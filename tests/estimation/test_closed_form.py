@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from jcr.estimation.closed_form import closed_form, initial_estimate
 from jcr.geometry import inverse, retract, rotation_exp, scale_translation, step_between, transform
-from simulation.problem import hand_eye_problem
+from simulation.problems import hand_eye_problem
 
 repeatable = settings(derandomize=True, deadline=None, max_examples=30)
 seeds = st.integers(0, 2**32 - 1)

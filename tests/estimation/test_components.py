@@ -16,7 +16,7 @@ from jcr.estimation.robust import robust_fit
 from jcr.estimation.systematic import Region, arm_errors, smooth_errors
 from jcr.geometry import retract, rotation_exp, step_between, transform
 from jcr.records import RobotNoise
-from simulation.problem import error, hand_eye_problem
+from simulation.problems import error, hand_eye_problem
 
 WHITE = (2e-4, np.radians(0.03))
 
@@ -123,7 +123,7 @@ def test_constant_errors_of_base_and_gripper_are_part_of_the_answer():
 def test_answers_of_a_bent_arm_are_within_their_sigma(joints_known: bool):
     """More images of an arm with joint offsets made answers of white noise alone worse: 12 of 24 beyond 3 sigma."""
     from jcr.estimation.arms import arm_named
-    from simulation.bent import bent_problem
+    from simulation.problems import bent_problem
 
     arm, worst = arm_named("ur5e"), []
     for seed in range(12):
@@ -147,7 +147,7 @@ def test_a_matrix_without_full_rank_still_has_a_factor():
 
 def test_a_named_arm_whose_joints_are_known_is_used_and_budgeted():
     from jcr.estimation.arms import arm_named
-    from simulation.bent import bent_problem
+    from simulation.problems import bent_problem
 
     problem = bent_problem(arm_named("panda"), "typical", 12, 1)
     poses = problem.base_from_gripper, problem.recon_from_camera

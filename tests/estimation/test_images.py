@@ -9,7 +9,7 @@ from jcr.estimation.intrinsics_prior import MEASURED, prior_of
 from jcr.estimation.projection import ImageProblem, derivatives, view_of
 from jcr.estimation.scene import OF_IMAGE, PRISM, Freedom, NuisancePrior, Scene, at_start, stepped
 from jcr.estimation.together import adjust
-from simulation.cell import CellProblem, cell_problem
+from simulation.cells import CellProblem, cell_problem
 
 COUNT = 6
 

@@ -9,8 +9,8 @@ from jcr.estimation.joint_offsets import joint_offsets, systematic_p_value
 from jcr.estimation.residuals import angle_ratio
 from jcr.estimation.systematic import arm_errors, posed
 from jcr.geometry import rotation_exp, transform
-from simulation.arm_errors import PresetName
-from simulation.bent import bent_problem
+from simulation.arms import PresetName
+from simulation.problems import bent_problem
 
 
 def examined(preset: PresetName, seed: int):

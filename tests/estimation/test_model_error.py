@@ -13,8 +13,7 @@ from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, prior_of
 from jcr.estimation.model_error import TYPICAL, displacements
 from jcr.estimation.wrist import adjust_wrist
 from jcr.records import Intrinsics
-from simulation.observations import INTRINSICS, observed
-from simulation.problem import hand_eye_problem
+from simulation.problems import INTRINSICS, hand_eye_problem, observed
 
 
 @cache

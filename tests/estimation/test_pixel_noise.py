@@ -12,8 +12,7 @@ from jcr.estimation.intrinsics_prior import FIXED, prior_of
 from jcr.estimation.scene import Freedom, Observations, Scene
 from jcr.geometry import step_between
 from jcr.records import Tracks
-from simulation.observations import INTRINSICS, observed
-from simulation.problem import hand_eye_problem
+from simulation.problems import INTRINSICS, hand_eye_problem, observed
 
 SEEDS = range(6)
 

@@ -20,7 +20,7 @@ from jcr.estimation.kinematics import (
 )
 from jcr.estimation.mounting import LengthError, mounted_arm
 from jcr.geometry import inverse, rotation_exp, step_axes, step_between, transform
-from simulation.bent_arm import BentArm, error_names
+from simulation.arms import BentArm, error_names
 
 H = np.pi / 2
 Z = (0, 0, 1)

@@ -13,7 +13,7 @@ from jcr.estimation.pose_equations import PRIOR_STD, residuals, residuals_by_cam
 from jcr.estimation.systematic import smooth_errors
 from jcr.geometry import inverse, retract, rotation_between_deg, rotation_exp, scale_translation, transform
 from jcr.records import Kind
-from simulation.problem import error, hand_eye_problem
+from simulation.problems import error, hand_eye_problem
 
 NOISE = (5e-4, np.radians(0.1))
 

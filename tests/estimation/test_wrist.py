@@ -13,8 +13,7 @@ from jcr.estimation.intrinsics_prior import ESTIMATED, MEASURED, prior_of
 from jcr.estimation.wrist import WristOptions, adjust_wrist, recon_frame
 from jcr.geometry import step_between
 from jcr.records import Intrinsics, Tracks
-from simulation.observations import INTRINSICS, observed
-from simulation.problem import HandEyeProblem, error, hand_eye_problem
+from simulation.problems import INTRINSICS, HandEyeProblem, error, hand_eye_problem, observed
 
 
 def solved(

@@ -35,7 +35,7 @@ from jcr.geometry import inverse, rotation_exp, rotation_log, transform
 from jcr.records import Capture, Reconstruction
 from jcr.run_folder import RunFolder
 from simulation.faults import Faults, faulty_capture
-from simulation.problem import hand_eye_problem
+from simulation.problems import hand_eye_problem
 
 SIZE = (96, 72)
 COUNT = 6

@@ -18,7 +18,7 @@ from jcr.calibration.calibration_json import read_calibration
 from jcr.errors import InputError
 from jcr.geometry import scale_translation
 from jcr.reconstruct.reconstruction_npz import read_reconstruction
-from simulation.problem import hand_eye_problem
+from simulation.problems import hand_eye_problem
 from waiting import until
 
 pytestmark = pytest.mark.slow

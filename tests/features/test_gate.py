@@ -9,7 +9,7 @@ from jcr.features.gate import Pair, angle_tolerance, by_quarters, judge, rolls
 from jcr.features.still import hidden, still_cells
 from jcr.features.two_view import Reading, readings
 from jcr.geometry import inverse, rotation_angle, rotation_exp, transform
-from simulation.problem import HandEyeProblem, hand_eye_problem
+from simulation.problems import HandEyeProblem, hand_eye_problem
 
 N = 8
 FOCAL = 600.0

@@ -6,7 +6,7 @@ import pytest
 from jcr.estimation.closed_form import motions
 from jcr.features.rotation import rotation_of_x
 from jcr.geometry import inverse, rotation_angle, rotation_exp
-from simulation.problem import hand_eye_problem
+from simulation.problems import hand_eye_problem
 
 
 def pairs(seed: int, n: int = 8) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -17,7 +17,7 @@ from fuzz_targets import Target, targets
 from jcr.errors import InputError
 from jcr.geometry import rotation_exp, transform
 from simulation.poses import Pattern
-from simulation.problem import HandEyeProblem, error, hand_eye_problem
+from simulation.problems import HandEyeProblem, error, hand_eye_problem
 
 pytestmark = pytest.mark.slow
 

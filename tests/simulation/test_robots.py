@@ -13,18 +13,22 @@ from jcr.estimation.kinematics import error_std, forward_kinematics
 from jcr.estimation.known_scale import fit_known_scale
 from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, rotation_log, transform
 from jcr.records import Intrinsics
-from simulation.arm_errors import PRESETS, ArmErrors
-from simulation.bent import bent_problem
-from simulation.bent_arm import BentArm, ErrorSizes, bend, error_names
-from simulation.capture import SimulateOptions, simulate
-from simulation.robots import (
+from simulation.arms import (
+    PRESETS,
+    ArmErrors,
+    BentArm,
+    ErrorSizes,
     about_posture,
+    bend,
     effective_about,
+    error_names,
     hand_eye_on,
     patterned,
     table_center,
     views,
 )
+from simulation.capture import SimulateOptions, simulate
+from simulation.problems import bent_problem
 from simulation.taken import with_intrinsics_error
 from simulation.truth import read_truth, true_depth, true_labels
 
@@ -199,9 +203,9 @@ def test_a_capture_of_a_bent_arm(tmp_path):
 def test_options_of_a_robot_that_mean_nothing_are_refused(tmp_path):
     for options, message in (
         (SimulateOptions(joint_offsets=0.1), "--joint-offsets 0.1: errors of an arm; name it with --robot"),
-        (SimulateOptions(robot="ur5e", link_errors=-1.0), "sigmas; give 0 or more"),
-        (SimulateOptions(intrinsics_error=-1.0), "sigmas; give 0 or more"),
-        (SimulateOptions(intrinsics_error=0.5, unknown_intrinsics=True), "no intrinsics are given"),
+        (SimulateOptions(robot="ur5e", link_errors=-1.0), "give 0 or more"),
+        (SimulateOptions(intrinsics_error=-1.0), "give 0 or more"),
+        (SimulateOptions(intrinsics_error=0.5, unknown_intrinsics=True), "exclude each other"),
     ):
         with pytest.raises(InputError, match=message):
             simulate(tmp_path / "out", options)

@@ -1,9 +1,17 @@
-"""Simulated arms: where a camera on them looks, and the truth for one whose reported poses are bent.
+"""Simulated arms with systematic errors, the views that they reach, and their effective hand-eye transform.
 
-The truth for a hand-eye calibration of such an arm is the *effective* transform: of all hand-eye transforms and
-bases, the one that best predicts the camera from the reported poses over the workspace of the capture. The physical
-transform differs from it by a constant that no pose shows.
+Joint offsets and link errors are those of estimation/kinematics.py. Light and low-cost arms have two kinds more:
+
+- sag: elastic deflection under gravity, φ times the horizontal lever of the gripper about the joint's axis, divided by
+  the arm's reach (rad at full stretch);
+- an eccentric encoder or gear, q + φ₁ sin q + φ₂ cos q (rad).
+
+The truth for a hand-eye calibration of such an arm is the effective transform: of all hand-eye transforms and bases,
+the one that best predicts the camera from the reported poses over the workspace of the capture.
 """
+
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -11,10 +19,19 @@ from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.estimation.inverse_kinematics import inverse_kinematics, reach_toward
-from jcr.estimation.kinematics import Arm, Joints, forward_kinematics, kinematic_jacobian
+from jcr.estimation.kinematics import (
+    LINK_ERRORS,
+    Arm,
+    Joints,
+    axis_twists,
+    error_std,
+    forward_kinematics,
+    joint_frames,
+    kinematic_jacobian,
+    perpendicular,
+)
 from jcr.estimation.known_scale import Fit, fit_known_scale
 from jcr.geometry import inverse, rotation_exp, skew, transform
-from simulation.bent_arm import BentArm
 from simulation.poses import Pattern, gripper_poses, random_hand_eye
 
 EFFECTIVE_POSES = 120
@@ -39,6 +56,98 @@ STRIDE = 0.4
 """rad by which joints move about a posture while what the gripper carries is watched."""
 NEAREST, FARTHEST = 0.6, 1.5
 """Accepted distance to the aim, over that of the wished view."""
+NAMES = (
+    ("joint {}",),
+    ("link {} shift 1", "link {} shift 2", "link {} tilt 1", "link {} tilt 2"),
+    ("joint {} sag",),
+    ("joint {} gear sine", "joint {} gear cosine"),
+)
+"""Of the errors of each joint, counted from 1: those of all joints of the first kind, then of the second."""
+
+
+@dataclass(frozen=True)
+class ErrorSizes:
+    """One-sigma sizes of an arm's errors."""
+
+    joint_offset: float = 0.0
+    """rad, of each joint."""
+    link: float = 0.0
+    """m, of each translation of a link; its rotations go with it (robots.error_std)."""
+    sag: float = 0.0
+    """rad, of each joint with the arm stretched out."""
+    gear: float = 0.0
+    """rad, of sine and cosine each."""
+
+
+@dataclass(frozen=True)
+class BentArm:
+    """An arm with drawn errors."""
+
+    arm: Arm
+    errors: Float[ndarray, " p"]
+    """The errors in the order of `error_names`; m and rad."""
+
+    def reported(self, joints: Joints) -> Float[ndarray, "n 4 4"]:
+        """base_from_gripper (n,4,4) as the controller computes it."""
+        return forward_kinematics(self.arm, joints)
+
+    def true(self, joints: Joints) -> Float[ndarray, "n 4 4"]:
+        """base_from_gripper (n,4,4) of the bent arm; exact, except that the lever of sag is that of the nominal arm."""
+        dof, arm = self.arm.dof, self.arm
+        offset, link, sag, gear = np.split(self.errors, dof * np.cumsum([1, LINK_ERRORS, 1]))
+        sine, cosine = gear.reshape(dof, 2).T
+        lever = axis_twists(arm, *joint_frames(arm, joints))[..., 2]
+        angles = joints + offset + np.sin(joints) * sine + np.cos(joints) * cosine + lever / arm.reach * sag
+        sideways, link = perpendicular(arm.axes), link.reshape(dof, 2, 2, 1)
+        shift, tilt = (sideways @ link[:, part] for part in range(2))
+        moved = transform(rotation_exp(tilt[..., 0]), shift[..., 0])
+        return forward_kinematics(replace(arm, parent_from_joint=arm.parent_from_joint @ moved), angles)
+
+    def named_errors(self) -> dict[str, float]:
+        """The errors that are not zero, by name (m, rad)."""
+        names = error_names(self.arm)
+        return {name: float(value) for name, value in zip(names, self.errors, strict=True) if value}
+
+
+def error_names(arm: Arm) -> tuple[str, ...]:
+    """Names of an arm's errors in their order: "joint 3", "link 2 tilt 1"."""
+    return tuple(text.format(i + 1) for texts in NAMES for i in range(arm.dof) for text in texts)
+
+
+def bend(arm: Arm, sizes: ErrorSizes, rng: np.random.Generator) -> BentArm:
+    """The arm with random errors of the given sizes."""
+    std = np.r_[
+        error_std(arm, sizes.joint_offset, sizes.link),
+        np.repeat([sizes.sag, sizes.gear], [arm.dof, 2 * arm.dof]),
+    ]
+    return BentArm(arm, std * rng.normal(size=len(std)))
+
+
+@dataclass(frozen=True)
+class ArmErrors:
+    """One-sigma errors of an arm's reported poses."""
+
+    white: tuple[float, float] = (0.0, 0.0)
+    """m, rad per axis, independent at each pose."""
+    sizes: ErrorSizes = ErrorSizes()
+    """Systematic errors, the same for all poses."""
+
+
+PresetName = Literal["white", "factory-calibrated", "typical", "poor", "low-cost"]
+
+
+def _bent(joint_offset_deg: float, link_mm: float) -> ArmErrors:
+    return ArmErrors((5e-5, np.radians(0.01)), ErrorSizes(np.radians(joint_offset_deg), 1e-3 * link_mm))
+
+
+PRESETS: dict[PresetName, ArmErrors] = {
+    "white": ArmErrors((5e-4, np.radians(0.1))),
+    "factory-calibrated": _bent(0.03, 0.1),
+    "typical": _bent(0.1, 0.3),
+    "poor": _bent(0.3, 1.0),
+    "low-cost": _bent(1.0, 1.0),
+}
+"""Random noise alone, or systematic errors beside a small repeatability (0.05 mm, 0.01°)."""
 
 
 def hand_eye_on(arm: Arm, rng: np.random.Generator) -> Float[ndarray, "4 4"]:
@@ -186,35 +295,32 @@ def effective_about(
     rng: np.random.Generator,
     target_in_base: Float[ndarray, "3"] | None = None,
 ) -> Fit:
-    """The effective gripper_from_camera of a bent arm over the workspace of a capture of `count` `views`.
+    """Fit the effective gripper_from_camera and base of a bent arm over the workspace of `count` `views`.
 
-    With it comes the effective base, from the one in which the true poses are.
-
-    Other poses of the same views: a capture of few does not reach where the pattern's later ones are.
+    Other poses of the same views are used, since few poses do not reach where the pattern's later ones are.
     """
     captures = -(-EFFECTIVE_POSES // count)
     others = [views(bent.arm, count, gripper_from_camera, rng, target_in_base) for _ in range(captures)]
-    joints = np.concatenate(others)
-    cameras = bent.true(joints) @ gripper_from_camera
-    start = gripper_from_camera, np.eye(4)
-    return fit_known_scale(bent.reported(joints), cameras, start, EFFECTIVE_NOISE)
+    return effective_fit(bent, np.concatenate(others), (gripper_from_camera, np.eye(4)))
+
+
+def effective_fit(
+    bent: BentArm,
+    joints: Joints,
+    start: tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]],
+    exchanged: bool = False,
+) -> Fit:
+    """Fit the pair of transforms by which reported poses best predict the camera, from the true pair `start`.
+
+    The pair is gripper_from_camera and base_from_recon; exchanged, base_from_camera and gripper_from_object.
+    """
+    x, z = start
+    true = bent.true(joints)
+    cameras = inverse(true @ z) @ x if exchanged else inverse(z) @ true @ x
+    return fit_known_scale(bent.reported(joints), cameras, start, EFFECTIVE_NOISE, exchanged=exchanged)
 
 
 def about_posture(arm: Arm, posture: Float[ndarray, " dof"], count: int, rng: np.random.Generator) -> Joints:
-    """Joint angles (count,dof) about those of a posture; the wrist moves most."""
+    """Draw joint angles (count,dof) about those of a posture; the wrist moves most."""
     width = STRIDE * np.array([0.5] * (arm.dof - 3) + [1.5, 1.5, 2.0])
     return posture + width * rng.uniform(-1, 1, (count, arm.dof))
-
-
-def effective_exchanged(
-    bent: BentArm,
-    joints: Joints,
-    base_from_camera: Float[ndarray, "4 4"],
-    gripper_from_object: Float[ndarray, "4 4"],
-) -> tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]]:
-    """The pair that from reported poses best predicts where the camera sees the object; as effective_about."""
-    reported, true = bent.reported(joints), bent.true(joints)
-    object_from_camera = inverse(true @ gripper_from_object) @ base_from_camera
-    start = base_from_camera, gripper_from_object
-    found = fit_known_scale(reported, object_from_camera, start, EFFECTIVE_NOISE, exchanged=True)
-    return found.gripper_from_camera, found.base_from_recon

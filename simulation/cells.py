@@ -2,7 +2,7 @@
 
 Four kinds: `fixed`, a camera beside the table that a wrist camera maps; `wrists`, two cameras on one wrist; `arms`, two
 arms with a wrist camera each before one table; `carried`, a fixed camera that watches a box in the gripper. Poses are
-those of arms that bend of bent_arm.py, and the truth is the effective transform.
+those of arms with systematic errors, and the truth is the effective transform.
 """
 
 from dataclasses import dataclass, field
@@ -15,7 +15,6 @@ from numpy import ndarray
 from jcr.camera import project
 from jcr.estimation.arms import arm_named
 from jcr.estimation.image_robots import ArmPoses
-from jcr.estimation.known_scale import Fit, fit_known_scale
 from jcr.estimation.scene import Observations
 from jcr.estimation.systematic import smooth_errors
 from jcr.geometry import (
@@ -27,20 +26,16 @@ from jcr.geometry import (
     transform,
 )
 from jcr.records import Intrinsics
-from simulation.arm_errors import PRESETS, PresetName
-from simulation.bent_arm import BentArm, bend
-from simulation.observations import INTRINSICS
-from simulation.poses import looking_at, random_hand_eye
-from simulation.problem import disturbed
-from simulation.robots import (
-    EFFECTIVE_NOISE,
-    EFFECTIVE_POSES,
-    about_posture,
-    effective_exchanged,
-    hand_eye_on,
-    table_center,
-    views,
+from simulation.arms import PRESETS, PresetName, bend
+from simulation.motion import (
+    base_across_table,
+    base_from_other_base,
+    carried_motion,
+    fixed_camera,
+    motion_over_table,
+    second_on_wrist,
 )
+from simulation.problems import INTRINSICS, disturbed
 
 Kind = Literal["fixed", "wrists", "arms", "carried"]
 FIXED_CAMERA = Intrinsics(905.0, 903.0, 645.0, 355.0, 1280, 720, (0.06, -0.1, 5e-4, 3e-4, 0.02))
@@ -91,113 +86,93 @@ class CellProblem:
 def cell_problem(
     kind: Kind, preset: PresetName, count: int, seed: int, noise_px: float = 0.5, points: int = 400
 ) -> CellProblem:
-    """A random cell of that kind, of UR5e arms with errors of `preset`, and `count` poses of each."""
-    make = _carried if kind == "carried" else _before_table
-    return make(kind, preset, count, np.random.default_rng([seed, 13]), noise_px, points)
+    """Draw a cell of that kind, of UR5e arms with errors of `preset`, and `count` poses of each."""
+    rng = np.random.default_rng([seed, 13])
+    cell = _Cell(kind=kind)
+    bent = bend(arm_named("ur5e"), PRESETS[preset].sizes, rng)
+    white = PRESETS[preset].white
+    if kind == "carried":
+        motion = carried_motion(bent, count, np.zeros(3), BOX_AHEAD, 0.75, rng)
+        cell.add_arm(
+            inverse(motion.base_from_gripper @ motion.gripper_from_object) @ motion.base_from_camera,
+            disturbed(motion.reported, white, rng),
+            (motion.base_from_camera, motion.gripper_from_object),
+            FIXED_CAMERA,
+        )
+        cell.truth = dict(zip(("base_from_camera", "gripper_from_object"), motion.effective, strict=True))
+        x_in_object, normal = _box(points, rng)
+        return _seen(cell, x_in_object, normal, noise_px, rng)
+    own = motion_over_table(bent, "varied", count, np.zeros(3), (rng, rng))
+    target = own.target_in_base
+    cell.add_arm(
+        own.base_from_gripper @ own.physical,
+        disturbed(own.reported, white, rng),
+        (own.physical, np.eye(4)),
+        INTRINSICS,
+    )
+    cell.truth["gripper_from_camera"] = own.effective
+    if kind == "wrists":
+        mount = second_on_wrist(rng)
+        cell.mounts.append(mount)
+        cell.cameras.append(FIXED_CAMERA)
+        cell.images += [(k, 1) for k in range(count)]
+        cell.truth["gripper_from_second"] = own.effective @ mount
+    elif kind == "fixed":
+        place = fixed_camera(target, 0.75, rng)
+        cell.add_camera(place[None], FIXED_CAMERA)
+        cell.truth["base_from_camera"] = own.base_from_true_base @ place
+    else:
+        second = bend(arm_named("ur5e"), PRESETS[preset].sizes, rng)
+        other = motion_over_table(second, "varied", count, np.zeros(3), (rng, rng))
+        base_from_other = base_across_table(target, other.target_in_base, rng)
+        cell.add_arm(
+            base_from_other @ other.base_from_gripper @ other.physical,
+            disturbed(other.reported, white, rng),
+            (other.physical, inverse(base_from_other)),
+            FIXED_CAMERA,
+        )
+        cell.truth["gripper_from_second"] = other.effective
+        cell.truth["base1_from_base2"] = base_from_other_base(own, other, base_from_other)
+    x_in_base = target + rng.uniform(TABLE[0], TABLE[1], (points, 3))
+    return _seen(cell, x_in_base, None, noise_px, rng)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _Cell:
-    """A cell as it is, in the base of its first arm."""
+    """Cell under construction, in the base of its first arm."""
 
     kind: Kind
     reported: list[Float[ndarray, "n 4 4"]] = field(default_factory=list)
     """base_from_gripper of each arm, with its errors."""
     rigs: list[Float[ndarray, "m 4 4"]] = field(default_factory=list)
     """base_from_rig of each arm, then of fixed cameras."""
-    mounts: list[Float[ndarray, "4 4"]] = field(default_factory=lambda: [np.eye(4)])
+    mounts: list[Float[ndarray, "4 4"]] = field(default_factory=list)
     """rig_from_camera of each camera."""
-    cameras: list[Intrinsics] = field(default_factory=lambda: [INTRINSICS])
+    cameras: list[Intrinsics] = field(default_factory=list)
     images: list[tuple[int, int]] = field(default_factory=list)
-    """Row of the rig and of the camera that took each."""
+    """Row of the rig and of the camera of each image."""
     truth: dict[str, Float[ndarray, "4 4"]] = field(default_factory=dict)
     starts: list[tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]]] = field(default_factory=list)
 
+    def add_camera(self, rigs: Float[ndarray, "m 4 4"], camera: Intrinsics) -> None:
+        """Add a camera with rigs of its own."""
+        first = sum(map(len, self.rigs))
+        self.images += [(first + k, len(self.cameras)) for k in range(len(rigs))]
+        self.rigs.append(rigs)
+        self.mounts.append(np.eye(4))
+        self.cameras.append(camera)
 
-def _before_table(
-    kind: Kind, preset: PresetName, count: int, rng: np.random.Generator, noise_px: float, points: int
-) -> CellProblem:
-    arms = [_drawn(preset, rng) for _ in range(2 if kind == "arms" else 1)]
-    base_from_second = transform(
-        rotation_exp(np.array([0.0, 0.0, np.pi + rng.uniform(-0.3, 0.3)])), np.zeros(3)
-    )
-    target = table_center(arms[0].arm)
-    base_from_second[:3, 3] = target - base_from_second[:3, :3] @ target + 0.03 * rng.normal(size=3)
-    cell, fits = _Cell(kind, images=[(k, 0) for k in range(count)]), []
-    for bent, world_from_base in zip(arms, [np.eye(4), base_from_second], strict=False):
-        x = hand_eye_on(bent.arm, rng)
-        joints = views(bent.arm, count, x, rng)
-        others = np.concatenate([views(bent.arm, count, x, rng) for _ in range(-(-EFFECTIVE_POSES // count))])
-        cameras = world_from_base @ bent.true(others) @ x
-        start = x, inverse(world_from_base)
-        fits.append(fit_known_scale(bent.reported(others), cameras, start, EFFECTIVE_NOISE))
-        cell.rigs.append(world_from_base @ bent.true(joints) @ x)
-        cell.reported.append(disturbed(bent.reported(joints), PRESETS[preset].white, rng))
-        cell.starts.append(start)
-    cell.truth["gripper_from_camera"] = fits[0].gripper_from_camera
-    _add_second_camera(cell, fits, target, count, rng)
-    x_in_base = target + rng.uniform(TABLE[0], TABLE[1], (points, 3))
-    return _seen(cell, x_in_base, None, noise_px, rng)
-
-
-def _add_second_camera(
-    cell: _Cell, fits: list[Fit], target: Float[ndarray, "3"], count: int, rng: np.random.Generator
-) -> None:
-    """Add the second wrist camera, the other arm's or the fixed one to a cell whose arms have their poses."""
-    mount = np.eye(4)
-    if cell.kind == "wrists":
-        mount = transform(rotation_exp(0.05 * rng.normal(size=3)), np.array([0.055, 0.0, 0.0]))
-        cell.images += [(k, 1) for k in range(count)]
-        cell.truth["gripper_from_second"] = fits[0].gripper_from_camera @ mount
-    if cell.kind == "arms":
-        cell.images += [(count + k, 1) for k in range(count)]
-        cell.truth["gripper_from_second"] = fits[1].gripper_from_camera
-        cell.truth["base1_from_base2"] = fits[0].base_from_recon @ inverse(fits[1].base_from_recon)
-    if cell.kind == "fixed":
-        azimuth = rng.uniform(-2.5, 2.5)
-        away = np.array([0.75 * np.cos(azimuth), 0.75 * np.sin(azimuth), rng.uniform(0.6, 1.1)])
-        base_from_camera = looking_at(target + away, target, rng)
-        cell.rigs.append(base_from_camera[None])
-        cell.images.append((count, 1))
-        cell.truth["base_from_camera"] = fits[0].base_from_recon @ base_from_camera
-    cell.mounts.append(mount)
-    cell.cameras.append(FIXED_CAMERA)
-
-
-def _carried(
-    kind: Kind, preset: PresetName, count: int, rng: np.random.Generator, noise_px: float, points: int
-) -> CellProblem:
-    bent = _drawn(preset, rng)
-    posture = bent.arm.rest.copy()
-    posture[0] += rng.uniform(-1, 1)
-    joints = about_posture(bent.arm, posture, count, rng)
-    true = bent.true(joints)
-    gripper_from_object = random_hand_eye(rng)
-    gripper_from_object[:3, 3] = BOX_AHEAD * bent.arm.forward
-    middle = (true @ gripper_from_object)[:, :3, 3].mean(0)
-    away = rng.normal(size=3)
-    away[2] = abs(away[2])
-    base_from_camera = looking_at(middle + 0.75 * away / np.linalg.norm(away), middle, rng)
-    others = about_posture(bent.arm, posture, EFFECTIVE_POSES, rng)
-    start = base_from_camera, gripper_from_object
-    effective = effective_exchanged(bent, others, *start)
-    x_in_object, normal = _box(points, rng)
-    rigs = inverse(true @ gripper_from_object) @ base_from_camera
-    truth = {"base_from_camera": effective[0], "gripper_from_object": effective[1]}
-    cell = _Cell(
-        kind,
-        reported=[disturbed(bent.reported(joints), PRESETS[preset].white, rng)],
-        rigs=[rigs],
-        cameras=[FIXED_CAMERA],
-        images=[(k, 0) for k in range(count)],
-        truth=truth,
-        starts=[start],
-    )
-    return _seen(cell, x_in_object, normal, noise_px, rng)
-
-
-def _drawn(preset: PresetName, rng: np.random.Generator) -> BentArm:
-    return bend(arm_named("ur5e"), PRESETS[preset].sizes, rng)
+    def add_arm(
+        self,
+        rigs: Float[ndarray, "m 4 4"],
+        reported: Float[ndarray, "m 4 4"],
+        start: tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]],
+        camera: Intrinsics,
+    ) -> None:
+        """Add an arm with its camera; `start` is the true pair of transforms."""
+        self.add_camera(rigs, camera)
+        self.reported.append(reported)
+        self.starts.append(start)
 
 
 def _box(points: int, rng: np.random.Generator) -> tuple[Float[ndarray, "p 3"], Float[ndarray, "p 3"]]:
