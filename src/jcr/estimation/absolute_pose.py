@@ -1,0 +1,209 @@
+"""Absolute camera pose from points and their pixels (PnP): RANSAC with SQPNP or planar IPPE, then robust least squares.
+
+Terzakis and Lourakis, "A Consistently Fast and Globally Optimal Solution to the Perspective-n-Point Problem", ECCV 2020;
+Collins and Bartoli, "Infinitesimal Plane-Based Pose Estimation", IJCV 2014.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from jcr.camera import by_point, project, unproject
+from jcr.geometry import apply, inverse, retract, rotation_angle, rotation_exp, skew, step_between, transform
+from jcr.least_squares import minimise
+from jcr.records import Intrinsics
+
+FOCAL_FACTORS = np.geomspace(0.4, 2.5, 14)
+"""Factors of the focal length from which the search starts where the focal length is free."""
+LOSS_SCALE = 2.0
+"""Scale of the Cauchy loss, standard deviations."""
+MEDIAN = 2 * np.log(2.0)
+"""Median of the squared length of a whitened residual of two components."""
+INEFFICIENCY = 1.09
+"""Variance of the estimate under that loss over that of least squares, for normal errors (Huber 1981, section 3.2)."""
+LEAST_STD_PX = 0.05
+"""Lower bound of the estimated noise of the pixels."""
+ROUNDS, SETTLED = 10, 1e-2
+"""Largest number of estimates of the noise, each followed by least squares; a step (in σ) that ends them."""
+BEHIND_PX = 1e4
+"""Residual of a point behind the camera."""
+AMBIGUOUS = 1.5
+"""Largest ratio of the rms errors of the two poses of a plane that the pixels do not tell apart."""
+APART = np.radians(5.0)
+"""Smallest rotation between the two poses of a plane that counts as an ambiguity."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraPose:
+    """Pose of a camera in the frame of the points, called a."""
+
+    a_from_camera: Float[ndarray, "4 4"]
+    covariance: Float[ndarray, "p p"]
+    """Covariance of a step of the pose (geometry.retract; unit of the points, rad), and of log focal length if free."""
+    camera: Intrinsics
+    """Intrinsics, with the estimated focal length if free."""
+    inlier: Bool[ndarray, " k"]
+    std_px: float
+    """Estimated standard deviation of the pixels' coordinates."""
+    rms_px: float
+    """Root mean square distance of the inliers from their pixels."""
+    rival: Float[ndarray, "4 4"] | None = None
+    """Second pose of a plane that fits nearly as well; None without."""
+
+
+def absolute_pose(
+    x_px: Float[ndarray, "k 2"],
+    points: Float[ndarray, "k 3"],
+    camera: Intrinsics,
+    point_covariance: Float[ndarray, "k 3 3"] | None = None,
+    gate_px: float = 2.0,
+    focal: Literal["given", "free"] = "given",
+    planar: bool = False,
+) -> CameraPose | None:
+    """Return the pose that most points agree on within `gate_px`; None where fewer than six (planar: four) agree.
+
+    `planar` states that the points lie in a plane; then both poses of the plane are refined and the better one is
+    returned. The standard deviation of the pixels is estimated from the residuals beside `point_covariance`.
+    """
+    least = 4 if planar else 6
+    spread = np.zeros((len(points), 3, 3)) if point_covariance is None else point_covariance
+    if len(points) < least:
+        return None
+    factors = FOCAL_FACTORS if focal == "free" else (1.0,)
+    starts = [
+        start
+        for factor in factors
+        for start in _initial_poses(x_px, points, _scaled(camera, factor), gate_px, planar)
+    ]
+    most = max((int(inlier.sum()) for _, _, inlier in starts), default=0)
+    found = [
+        one
+        for start in starts
+        if start[2].sum() == most >= least
+        and (one := _refined(x_px, points, spread, start, gate_px, 7 if focal == "free" else 6))
+    ]
+    if not found:
+        return None
+    best, *others = sorted(found, key=lambda one: one.rms_px)
+    for other in others:
+        apart = float(rotation_angle(best.a_from_camera[:3, :3].T @ other.a_from_camera[:3, :3]))
+        if planar and apart > APART and other.rms_px < AMBIGUOUS * best.rms_px + 0.05:
+            return replace(best, rival=other.a_from_camera)
+    return best
+
+
+_Start = tuple[Float[ndarray, "4 4"], Intrinsics, Bool[ndarray, " k"]]
+"""Pose a_from_camera, intrinsics and the points that agree."""
+
+
+def _scaled(camera: Intrinsics, factor: float) -> Intrinsics:
+    """Return the intrinsics with the focal lengths times a factor."""
+    return replace(camera, fx=float(factor * camera.fx), fy=float(factor * camera.fy))
+
+
+def _initial_poses(
+    x_px: Float[ndarray, "k 2"],
+    points: Float[ndarray, "k 3"],
+    camera: Intrinsics,
+    gate_px: float,
+    planar: bool,
+) -> list[_Start]:
+    """Return the two poses of a plane, with all points, or the one on which RANSAC finds that most points agree."""
+    pixels, matrix = camera.fx * unproject(camera, x_px)[:, :2], np.diag([camera.fx, camera.fx, 1.0])
+    if planar:
+        _, rotations, shifts, _ = cv2.solvePnPGeneric(points, pixels, matrix, None, flags=cv2.SOLVEPNP_IPPE)
+        every = np.ones(len(points), bool)
+        poses = [
+            transform(rotation_exp(r.ravel()), s.ravel()) for r, s in zip(rotations, shifts, strict=True)
+        ]
+        return [(inverse(pose), camera, every) for pose in poses if (apply(pose, points)[:, 2] > 0).all()]
+    done, rotation, shift, rows = cv2.solvePnPRansac(
+        points, pixels, matrix, None,
+        iterationsCount=2000, reprojectionError=gate_px, confidence=0.9999, flags=cv2.SOLVEPNP_SQPNP,
+    )  # fmt: skip
+    if not done or rows is None:
+        return []
+    inlier = np.isin(np.arange(len(points)), np.ravel(rows))
+    return [(inverse(transform(rotation_exp(rotation.ravel()), shift.ravel())), camera, inlier)]
+
+
+def _refined(
+    x_px: Float[ndarray, "k 2"],
+    points: Float[ndarray, "k 3"],
+    spread: Float[ndarray, "k 3 3"],
+    start: _Start,
+    gate_px: float,
+    p: int,
+) -> CameraPose | None:
+    """Return the pose of least reprojection error under a Cauchy loss; noise and inliers are estimated in turn."""
+    (pose, camera, inlier), found = start, None
+    for _ in range(ROUNDS):
+        residual, jacobian = _reprojection(x_px, points, pose, camera, p)
+        # A point moves the residual as the camera's translation does, with the other sign.
+        added = jacobian[..., :3] @ spread @ np.swapaxes(jacobian[..., :3], 1, 2)
+        std_px = _noise(residual[inlier], added[inlier], p)
+        root = np.linalg.inv(np.linalg.cholesky(std_px**2 * np.eye(2) + added))
+        agreed, inlier = inlier, std_px * np.linalg.norm(root @ residual[..., None], axis=(1, 2)) < gate_px
+        if inlier.sum() < p:
+            return None
+        white, seen = root[inlier], (x_px[inlier], points[inlier])
+
+        def whitened(
+            state: tuple[ndarray, Intrinsics], white: ndarray = white, seen: tuple[ndarray, ndarray] = seen
+        ) -> tuple[ndarray, ndarray]:
+            residual, jacobian = _reprojection(*seen, *state, p)
+            return (white @ residual[..., None])[..., 0] / LOSS_SCALE, white @ jacobian / LOSS_SCALE
+
+        def moved(state: tuple[ndarray, Intrinsics], step: ndarray) -> tuple[ndarray, Intrinsics]:
+            return retract(state[0], step[:6]), _scaled(state[1], np.exp(step[6:].sum()))
+
+        before = pose
+        pose, camera = minimise(whitened, (pose, camera), moved, "cauchy").unknowns
+        residual, jacobian = _reprojection(*seen, pose, camera, p)
+        rows = (white @ jacobian).reshape(-1, p)
+        found = CameraPose(
+            a_from_camera=pose,
+            covariance=INEFFICIENCY * np.linalg.inv(rows.T @ rows),
+            camera=camera,
+            inlier=inlier,
+            std_px=std_px,
+            rms_px=float(np.sqrt((residual**2).sum(1).mean())),
+        )
+        moved_by = step_between(before, pose) / np.sqrt(found.covariance.diagonal()[:6])
+        if (inlier == agreed).all() and np.abs(moved_by).max() < SETTLED:
+            break
+    return found
+
+
+def _noise(residual: Float[ndarray, "k 2"], added: Float[ndarray, "k 2 2"], p: int) -> float:
+    """Return the standard deviation (px) at which the whitened residuals have the median length of normal ones."""
+    values, axes = np.linalg.eigh(added)
+    squared = np.einsum("kij,ki->kj", axes, residual) ** 2
+    low, high = LEAST_STD_PX, max(float(np.sqrt(squared.sum(1).max())), 2 * LEAST_STD_PX)
+    for _ in range(30):
+        middle = np.sqrt(low * high)
+        is_small = np.median((squared / (middle**2 + np.maximum(values, 0))).sum(1)) > MEDIAN
+        low, high = (middle, high) if is_small else (low, middle)
+    # The pose has taken p of the 2k components of the residuals.
+    return float(high * np.sqrt(2 * len(residual) / max(2 * len(residual) - p, 1)))
+
+
+def _reprojection(
+    x_px: Float[ndarray, "k 2"],
+    points: Float[ndarray, "k 3"],
+    pose: Float[ndarray, "4 4"],
+    camera: Intrinsics,
+    p: int,
+) -> tuple[Float[ndarray, "k 2"], Float[ndarray, "k 2 p"]]:
+    """Return the distances of projected points from their pixels, and the derivative by pose and log focal length."""
+    arm = points - pose[:3, 3]
+    x_in_camera = arm @ pose[:3, :3]
+    x_in_camera[x_in_camera[:, 2] <= 0] = np.nan  # a point behind the camera has no pixel
+    projected, rotated = project(camera, x_in_camera), by_point(camera, x_in_camera) @ pose[:3, :3].T
+    by_focal = (projected - [camera.cx, camera.cy])[..., None]
+    jacobian = np.concatenate([-rotated, rotated @ skew(arm), by_focal], axis=2)
+    return np.nan_to_num(projected - x_px, nan=BEHIND_PX), np.nan_to_num(jacobian[..., :p])
