@@ -36,6 +36,7 @@ class Arguments:
       python -m benchmarks run --out docs/results
       python -m benchmarks real captures --boards bench=charuco:7x5:0.030:0.022:DICT_4X4_50
       python -m benchmarks all captures --out docs/results
+      python -m benchmarks align PAIRS.npz OUT.npz --method adam
     """
 
     name: Annotated[BenchName, tyro.conf.Positional]
@@ -110,6 +111,9 @@ def _machine() -> str:
 
 if __name__ == "__main__":
     try:
+        if sys.argv[1:2] == ["align"] and any(argument.endswith(".npz") for argument in sys.argv[2:]):
+            align_pairs = import_module("benchmarks.align_pairs")
+            sys.exit(align_pairs.main(sys.argv[2:]))
         sys.exit(main(tyro.cli(Arguments, prog="python -m benchmarks")))
     except InputError as error:
         sys.stderr.write(f"error: {error}\n")

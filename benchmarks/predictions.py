@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.page import mm_deg, table
-from benchmarks.synthetic_pairs import pairs_of_capture
+from benchmarks.synthetic_pairs import pairs_of_capture, write_pairs
 from jcr.capture.read import read_capture
 from jcr.pipeline import RunOptions
 from jcr.pipeline import run as run_all
 from jcr.reconstruct.backends import ReconstructOptions
-from jcr.reconstruct.global_alignment.pairs import write_pairs
 from jcr.results import RunResult
 from simulation.capture import SimulateOptions, simulate
 from simulation.problems import HandEyeProblem, error

@@ -1,6 +1,6 @@
 """Pairwise pointmaps of a known tabletop scene with the errors a network makes, and the truth beside them."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import cv2
@@ -12,7 +12,7 @@ from jcr.camera import rays
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, transform
 from jcr.reconstruct.dust3r.pair_graph import complete_pairs
-from jcr.reconstruct.global_alignment.pairs import PairPredictions
+from jcr.reconstruct.global_alignment.pairs import ARRAYS, PairPredictions
 from jcr.records import Intrinsics
 from simulation.truth import read_truth, true_depth
 
@@ -214,3 +214,17 @@ def _depth(base_from_camera: Float[ndarray, "4 4"], ray: Float[ndarray, "h w 3"]
 def _smooth(rng: np.random.Generator, height: int, width: int) -> Float[ndarray, "h w"]:
     """Unit normals on a 4x5 grid, interpolated."""
     return cv2.resize(rng.normal(size=(4, 5)), (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def write_pairs(path: Path, predictions: PairPredictions) -> None:
+    """Write predictions as the npz file that jcr reads."""
+    arrays: dict[str, object] = {name: getattr(predictions, name) for name in ARRAYS}
+    arrays |= {"images": np.array(predictions.images, dtype=str), "is_metric": predictions.is_metric}
+    if predictions.colors is not None:
+        arrays["colors"] = predictions.colors
+    if predictions.intrinsics is not None:
+        k = predictions.intrinsics
+        arrays["intrinsics"] = np.array([k.fx, k.fy, k.cx, k.cy])
+    if predictions.grid is not None:
+        arrays["grid"] = np.array(list(asdict(predictions.grid).values()), dtype=np.int64)
+    np.savez(path, **arrays)  # type: ignore[arg-type]

@@ -127,7 +127,7 @@ BENCHES = {
     "align": Bench(
         "Global alignment",
         OTHERS,
-        "global alignment: fast against adam, kinematic against free, in error, time and memory",
+        "global alignment: fast against adam, in error, time and memory",
         True,
     ),
     "live": Bench(

@@ -10,14 +10,14 @@ from scipy.stats import norm
 
 from benchmarks.page import apart, table
 from benchmarks.peers import grid_search
-from benchmarks.synthetic_pairs import PairErrors, pairs_of_capture
+from benchmarks.synthetic_pairs import PairErrors, pairs_of_capture, write_pairs
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
 from jcr.estimation.residuals import paper_residuals
 from jcr.geometry import Transforms, fit_similarity, rotation_log, scale_translation
 from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, candidates, reconstruct
-from jcr.reconstruct.global_alignment.pairs import ARRAYS, write_pairs
+from jcr.reconstruct.global_alignment.pairs import ARRAYS
 from jcr.records import Capture, Reconstruction
 from jcr.sfm.colmap import reconstruct_colmap
 from jcr.sfm.options import ColmapOptions

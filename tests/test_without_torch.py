@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 
 MAY_NEED_TORCH = (
     "features/learned", "features/xfeat",
-    "reconstruct/dust3r/", "reconstruct/global_alignment/adam",
+    "reconstruct/dust3r/",
     "reconstruct/views_at_once/", "reconstruct/predictions", "scene/", "segments/sam",
     "export/rrd", "export/volume", "viewer/",
 )  # fmt: skip
@@ -95,13 +95,13 @@ def test_what_needs_torch_shows_what_to_install_before_any_work(
         "map": ["map", str(calibrated)],
         "glb": ["export", str(mapped), "glb"],
         "octomap": ["export", str(mapped), "octomap"],
-        "predict": ["predict", str(capture), "pairs.npz"],
+        "dust3r": ["run", str(capture), str(tmp_path / "out"), "--backend", "dust3r"],
     }
     code = "import json; from jcr.cli import dispatch\nfor words in json.loads(sys.argv[1]): print(dispatch(words))"
     done = without_torch(code, json.dumps(list(commands.values())))
     assert done.stdout.split() == ["2"] * len(commands), done.stderr
     for name, line in zip(commands, done.stderr.splitlines(), strict=True):
-        extra = "networks" if name == "predict" else "map"
+        extra = "networks" if name == "dust3r" else "map"
         assert line.startswith("error: ")
         assert f"needs torch, which is not installed: pip install '{DISTRIBUTION}[{extra}]'" in line
         assert ("`jcr run` and `jcr calibrate`" in line) == (name == "map")

@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     from jcr.live.calibration_progress import Progress, Reached
     from jcr.pipeline import add_camera, build_map, calibrate, measure, run
     from jcr.reconstruct.backends import ReconstructOptions
+    from jcr.reconstruct.global_alignment.align import global_align
+    from jcr.reconstruct.global_alignment.alignment import Alignment, AlignOptions
+    from jcr.reconstruct.global_alignment.pairs import PairPredictions
     from jcr.records import (
         Budget,
         Capture,
@@ -115,6 +118,10 @@ _MODULE_OF = {
     "export_run": "jcr.export.formats",
     "read_capture": "jcr.capture.read",
     "solve_hand_eye": "jcr.estimation.hand_eye",
+    "Alignment": "jcr.reconstruct.global_alignment.alignment",
+    "AlignOptions": "jcr.reconstruct.global_alignment.alignment",
+    "PairPredictions": "jcr.reconstruct.global_alignment.pairs",
+    "global_align": "jcr.reconstruct.global_alignment.align",
     "LiveCalibration": "jcr.live.calibration",
     "Progress": "jcr.live.calibration_progress",
     "Reached": "jcr.live.calibration_progress",
@@ -129,6 +136,8 @@ _MODULE_OF = {
 """Of each name that is imported when it is asked for, and its name there where that differs."""
 
 __all__ = [
+    "AlignOptions",
+    "Alignment",
     "Arm",
     "Budget",
     "CalibrateOptions",
@@ -152,6 +161,7 @@ __all__ = [
     "Measured",
     "NextPose",
     "Observability",
+    "PairPredictions",
     "PointCloud",
     "Pointmaps",
     "PosePairs",
@@ -179,6 +189,7 @@ __all__ = [
     "check_capture",
     "compare",
     "export_run",
+    "global_align",
     "load_map",
     "load_robot",
     "load_run",

@@ -35,17 +35,9 @@ def commands(done: Path, tabletop: Path, tmp_path_factory: pytest.TempPathFactor
     run = scratch / "run"
     shutil.copytree(done, run)
     np.save(scratch / "points.npy", np.zeros((2, 3)))
-    edges = np.array([[0, 1], [1, 0]], np.int32)
-    x, y = np.meshgrid(np.linspace(-0.4, 0.4, 8), np.linspace(-0.3, 0.3, 6))
-    points = np.stack([x, y, np.ones_like(x)], -1)[None].repeat(2, 0).astype(np.float32)
-    ones = np.full((2, 6, 8), 2, np.float32)
-    np.savez(
-        scratch / "pairs.npz", edges=edges, pts3d=points, pts3d_in_other_view=points, conf=ones, conf2=ones
-    )
     lines = {
         "calibrate": ["calibrate", tabletop, run],
         "check": ["check", tabletop, "--poses-only"],
-        "align": ["align", scratch / "pairs.npz", scratch / "aligned.npz"],
         "query": ["query", run, scratch / "points.npy"],
         "export": ["export", run, "ros2"],
         "measure": ["measure", run],

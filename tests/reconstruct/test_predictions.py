@@ -230,7 +230,7 @@ def test_a_network_gives_the_same_record(
 
     made = pairs_from_arrays(pair_arrays(truth), "synthetic")
 
-    def predict(capture: Capture, options: object, progress: object, *, aligned: bool) -> tuple:
+    def predict(capture: Capture, options: object, progress: object) -> tuple:
         images = predictions._images(capture, np.arange(COUNT), {}, (WIDTH, HEIGHT), "synthetic")
         return images, made, ("weights X: licence Y",)
 
@@ -289,14 +289,13 @@ def test_an_any_view_model_is_given_our_intrinsics(capture: Capture, truth: dict
     from functools import partial
 
     from jcr.reconstruct.views_at_once import mapanything
-    from jcr.reconstruct.views_at_once.views_at_once import Cost, ViewsOptions, reconstruct_views_at_once
+    from jcr.reconstruct.views_at_once.views_at_once import ViewsOptions, reconstruct_views_at_once
 
     model = FakeMapAnything(truth)
     options = ViewsOptions(
         backend="mapanything",
         load=lambda weights, device: partial(mapanything.predict, model),
         weights=Weights(Path("X"), "X", "Apache-2.0"),
-        cost=Cost(0.0, 0.0, 0.0, 0.0),
     )
     result = reconstruct_views_at_once(capture, options)
     view = model.views[0]

@@ -47,8 +47,6 @@ GROUPS = {
     },
     "more": {
         "models": "list back ends with their licences; download weights",
-        "predict": "write a network's pairwise pointmaps to a file",
-        "align": "align pairwise pointmaps globally, nothing else",
         "docs": "print the pages of the manual",
     },
 }

@@ -43,11 +43,12 @@ def _dust3r(capture: Capture, options: "ReconstructOptions", progress: Progress 
     """MASt3R, too: its files bring one more head, which is left out, and points in metres."""
     extra("torch", "networks", f"--backend {options.backend}")
     from jcr.reconstruct.dust3r.dust3r import Dust3rOptions, reconstruct_dust3r
-    from jcr.reconstruct.dust3r.pair_graph import PairOptions
 
-    pairs = PairOptions(pair_graph=options.pair_graph, memory_gb=options.memory_gb)
     made = Dust3rOptions(
-        weights=weights_of(options), device=device_of(options), pairs=pairs, backend=options.backend
+        weights=weights_of(options),
+        device=device_of(options),
+        pair_graph=options.pair_graph,
+        backend=options.backend,
     )
     return reconstruct_dust3r(capture, made, progress)
 
@@ -58,16 +59,14 @@ def _views_at_once(
     """All models that see every view at once: their rows name the adapter."""
     extra("torch", "networks", f"--backend {options.backend}")
     from jcr.reconstruct.views_at_once import da3, mapanything
-    from jcr.reconstruct.views_at_once.views_at_once import Cost, ViewsOptions, reconstruct_views_at_once
+    from jcr.reconstruct.views_at_once.views_at_once import ViewsOptions, reconstruct_views_at_once
 
     row = BACKENDS[options.backend]
     made = ViewsOptions(
         backend=row.name,
         load=mapanything.load if row.name == "mapanything" else da3.load,
         weights=weights_of(options),
-        cost=Cost(*row.cost),
         device=device_of(options),
-        memory_gb=options.memory_gb,
     )
     return reconstruct_views_at_once(capture, made, progress)
 
@@ -89,7 +88,7 @@ def _predictions(
         raise InputError(
             "--backend predictions: name the file with --predictions FILE.npz (jcr docs predictions)"
         )
-    return reconstruct_predictions(capture, options.predictions, progress, memory_gb=options.memory_gb)
+    return reconstruct_predictions(capture, options.predictions, progress)
 
 
 def _given(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
@@ -140,9 +139,7 @@ class Backend:
     commercial: bool = True
     """Whether the licence of its weights allows commercial use."""
     sees_all_views: bool = False
-    """Whether it is a network that takes all views at once."""
-    cost: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """Of an any-view model: views_at_once.Cost, its fields in their order."""
+    """Whether it is a network that processes all views at once."""
 
     @property
     def predicts_depth(self) -> bool:
@@ -218,7 +215,6 @@ BACKENDS: dict[str, Backend] = {
             parameters=135,
             download_gb=0.5,
             sees_all_views=True,
-            cost=(1.0, 0.15, 5.5, 0.2),
         ),
         Backend(
             name="da3-small",
@@ -234,7 +230,6 @@ BACKENDS: dict[str, Backend] = {
             parameters=34,
             download_gb=0.14,
             sees_all_views=True,
-            cost=(0.35, 0.09, 2.4, 0.05),
         ),
         Backend(
             name="mapanything",
@@ -249,7 +244,6 @@ BACKENDS: dict[str, Backend] = {
             package="mapanything",
             install="pip install git+https://github.com/facebookresearch/map-anything",
             sees_all_views=True,
-            cost=(5.0, 0.4, 20.0, 4.0),
         ),
         Backend(
             name="direct",
@@ -301,12 +295,11 @@ MARKER = "marker"
 PATHS = ("predictions", "cameras")
 """Options that name files."""
 
-# The choices of --backend, and of `jcr predict`, whose networks are shown pairs of images.
+# The choices of --backend.
 if TYPE_CHECKING:
-    BackendName = PairBackendName = str
+    BackendName = str
 else:
     BackendName = Literal[("auto", *BACKENDS)]
-    PairBackendName = Literal[tuple(row.name for row in BACKENDS.values() if "pair_graph" in row.options)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -328,9 +321,6 @@ class ReconstructOptions:
     """Same seed, same result on the same machine."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Device on which networks run and the map is trained."""
-    memory_gb: Annotated[float, tyro.conf.arg(metavar="GB")] = 8.0
-    """Memory limit of the process (peak resident set, the program included), and of a network on a GPU. The expected
-    use is printed beforehand; what does not fit is done in smaller parts, or refused."""
     weights: Annotated[str | None, tyro.conf.arg(metavar="PATH_OR_HUB_ID")] = None
     """A network's weights, as path or hub id; unset: the published ones. With --backend auto they must be DUSt3R's or
     MASt3R's."""

@@ -1,46 +1,32 @@
-"""From pairwise pointmaps, whoever predicted them, to camera poses, pointmaps in one frame and tracks."""
+"""Reconstruction from pairwise pointmaps: global alignment, then tracks by reciprocal nearest neighbours."""
 
 from dataclasses import replace
 
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from numpy import ndarray
 
-from jcr.memory import MAP
 from jcr.progress import Progress, silent
-from jcr.reconstruct.global_alignment.align import align_with_robot
+from jcr.reconstruct.global_alignment.align import global_align
 from jcr.reconstruct.global_alignment.alignment import AlignOptions
 from jcr.reconstruct.global_alignment.pairs import PairPredictions
 from jcr.reconstruct.pointmap_matches import tracks_from_pairs
 from jcr.reconstruct.preprocess import PreparedImages
-from jcr.records import Intrinsics, Pointmaps, Reconstruction
-
-OBSERVED, RECORDED = 80, 60
-"""Bytes per pixel, when the network has gone: of a pointmap in alignment, and of an image in the reconstruction."""
-
-
-def memory_after(images: int, pairs: int, pixels: int) -> int:
-    """Bytes that aligning, matching and mapping pairs of `pixels` pixels take beside their pointmaps."""
-    observed = min(AlignOptions.pixels, pixels)
-    return max(MAP, 2 * pairs * observed * OBSERVED) + images * pixels * RECORDED
+from jcr.records import CameraEvidence, Intrinsics, Pointmaps, Reconstruction
 
 
 def reconstruction_from_pairs(
     images: PreparedImages,
     image_index: Int[ndarray, " m"],
     predictions: PairPredictions,
-    base_from_gripper: Float[ndarray, "m 4 4"],
-    options: AlignOptions,
+    options: AlignOptions | None = None,
     *,
     backend: str,
     notes: tuple[str, ...] = (),
     progress: Progress | None = None,
 ) -> Reconstruction:
-    """Align pairwise pointmaps and match them; `images` says where their pixels lie in the capture."""
+    """Align pairwise pointmaps and match them; `images` maps their pixels to the capture's images."""
     report = progress or silent
-    aligned = align_with_robot(
-        replace(predictions, intrinsics=images.intrinsics), base_from_gripper, options, progress
-    )
-    alignment = aligned.alignment
+    alignment = global_align(replace(predictions, intrinsics=images.intrinsics), options, progress)
     height, width = predictions.conf.shape[1:]
     fx, fy = alignment.focal_px.mean(0).tolist()
     cx, cy = alignment.principal_point_px
@@ -64,5 +50,5 @@ def reconstruction_from_pairs(
         is_metric=predictions.is_metric,
         notes=(*notes, *alignment.notes),
         warnings=(*images.warnings, *alignment.warnings),
-        evidence=aligned.evidence,
+        evidence=CameraEvidence(alignment.recon_from_camera, alignment.covariance),
     )

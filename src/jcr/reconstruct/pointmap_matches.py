@@ -62,12 +62,10 @@ def tracks_from_pairs(
     for e, (n, m) in enumerate(p.edges):
         confidence[n] += p.conf[e]
         confidence[m] += p.conf2[e]
-        p.release()
 
     def pairs() -> Iterator[tuple[int, int, Pointmap, Pointmap]]:
         for e, (n, m) in enumerate(p.edges.tolist()):
             yield n, m, (p.pts3d[e], p.conf[e]), (p.pts3d_in_other_view[e], p.conf2[e])
-            p.release()
 
     return _tracks(pairs(), confidence, points_in_recon, original_px)
 

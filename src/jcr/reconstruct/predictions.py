@@ -13,43 +13,30 @@ from numpy import ndarray
 from jcr.camera import is_distorted, usable_intrinsics
 from jcr.errors import InputError
 from jcr.geometry import require_rigid
-from jcr.memory import ALLOWANCE, GB, MAP, announce, require, resident
 from jcr.progress import Progress
-from jcr.reconstruct.from_pairs import memory_after, reconstruction_from_pairs
-from jcr.reconstruct.global_alignment.alignment import AlignOptions
+from jcr.reconstruct.from_pairs import reconstruction_from_pairs
 from jcr.reconstruct.global_alignment.pairs import camera_of_arrays, pairs_from_arrays, read_arrays
 from jcr.reconstruct.pointmaps import PosedPointmaps, reconstruction_from_pointmaps
 from jcr.reconstruct.preprocess import ImageGrid, PreparedImages, image_grid, read_colors
 from jcr.records import Capture, Reconstruction
 
 
-def reconstruct_predictions(
-    capture: Capture, path: Path, progress: Progress | None = None, *, memory_gb: float = 8.0
-) -> Reconstruction:
-    """Camera poses, pointmaps and tracks from predictions in an npz file.
+def reconstruct_predictions(capture: Capture, path: Path, progress: Progress | None = None) -> Reconstruction:
+    """Return camera poses, pointmaps and tracks from predictions in an npz file.
 
-    `memory_gb` is the peak resident set of the process: a large file of pairs is mapped, page by page. Raises
-    InputError for a file that is missing, damaged, or does not fit the capture.
+    Raises InputError for a file that is missing, damaged, or does not fit the capture.
     """
-    budget, program = memory_gb * GB, resident() + ALLOWANCE
-    in_memory = max(budget - program - MAP, 0) / 2
-    arrays, source = read_arrays(path, in_memory), str(path)
+    arrays, source = read_arrays(path), str(path)
     if "edges" in arrays:
         predictions = pairs_from_arrays(arrays, source)
         rows = _rows(predictions.images, predictions.image_count, capture, source)
         rank = np.argsort(np.argsort(rows))
         # Rows of a reconstruction ascend; the file's images are renumbered to that order.
         predictions = replace(predictions, edges=rank[predictions.edges], images=())
-        count, height, width = predictions.conf.shape
-        size = path.stat().st_size
-        needed = program + memory_after(len(rows), count, height * width) + (size if size <= in_memory else 0)
-        require(needed, budget, f"aligning {count} pairs, with the program itself,")
-        announce(needed, budget, "" if size <= in_memory else f", and {size / GB:.2g} GB left in {source}")
+        height, width = predictions.conf.shape[1:]
         images = _images(capture, rows, arrays, (width, height), source)
-        rows = np.sort(rows)
-        poses = capture.base_from_gripper[rows]
         return reconstruction_from_pairs(
-            images, rows, predictions, poses, AlignOptions(), backend="predictions", progress=progress
+            images, np.sort(rows), predictions, backend="predictions", progress=progress
         )
     if "recon_from_camera" in arrays:
         return _from_pointmaps(capture, arrays, source)

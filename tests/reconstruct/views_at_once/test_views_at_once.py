@@ -11,7 +11,6 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from jcr.camera import rays
-from jcr.errors import InputError
 from jcr.geometry import (
     apply_similarity,
     fit_similarity,
@@ -118,13 +117,12 @@ class Fake:
 
 
 def options(predict, **changes):
-    from jcr.reconstruct.views_at_once.views_at_once import Cost, ViewsOptions
+    from jcr.reconstruct.views_at_once.views_at_once import ViewsOptions
 
     made = ViewsOptions(
         backend="da3",
         load=lambda weights, device: predict,
         weights=Weights(Path("weights"), "weights", "Apache-2.0"),
-        cost=Cost(0.1, 0.1, 1.0, 0.1),
     )
     return replace(made, **changes)
 
@@ -185,10 +183,3 @@ def test_an_unknown_focal_length_is_adjusted(capture: Capture) -> None:
     refined = refine(predicted, images, guess)
     assert refined is not None
     assert refined.pinhole.fx == pytest.approx(INTRINSICS.fx, rel=0.01)
-
-
-def test_what_does_not_fit_the_memory_is_refused_before_it_is_begun(capture: Capture) -> None:
-    from jcr.reconstruct.views_at_once.views_at_once import reconstruct_views_at_once
-
-    with pytest.raises(InputError, match=r"--backend da3 with 6 images needs .* raise --memory-gb"):
-        reconstruct_views_at_once(capture, options(Fake(), memory_gb=0.3))

@@ -1,55 +1,45 @@
-"""The DUSt3R and MASt3R back ends: pairs of images, global alignment, correspondences."""
+"""The DUSt3R and MASt3R back ends: pairwise pointmaps, global alignment, tracks."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
+from jcr.allocator import give_back
 from jcr.errors import RejectedError
-from jcr.memory import give_back, resident
 from jcr.progress import Progress
-from jcr.reconstruct.dust3r.pair_graph import PairOptions
+from jcr.reconstruct.dust3r.pair_graph import PairGraph
 from jcr.reconstruct.dust3r.predictor import predict_pairs
 from jcr.reconstruct.dust3r.weights import load_weights
 from jcr.reconstruct.from_pairs import reconstruction_from_pairs
-from jcr.reconstruct.global_alignment.alignment import AlignOptions
 from jcr.reconstruct.global_alignment.pairs import PairPredictions
 from jcr.reconstruct.hub import Weights
-from jcr.reconstruct.preprocess import PreparedImages, image_grid, prepare_images
+from jcr.reconstruct.preprocess import PreparedImages, prepare_images
 from jcr.records import Capture, Reconstruction
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dust3rOptions:
-    """Pairwise pointmaps of a network, aligned."""
+    """Options of the DUSt3R and MASt3R back ends."""
 
     weights: Weights
     device: str = "cpu"
-    """Where the network runs: cpu or cuda."""
-    pairs: PairOptions = field(default_factory=PairOptions)
+    """Device of the network: cpu or cuda."""
+    pair_graph: PairGraph = "auto"
     backend: str = "dust3r"
-    """Its row of the table of back ends."""
+    """Name of the row in the table of back ends."""
 
 
 def predict(
-    capture: Capture, options: Dust3rOptions, progress: Progress | None = None, *, aligned: bool = False
+    capture: Capture, options: Dust3rOptions, progress: Progress | None = None
 ) -> tuple[PreparedImages, PairPredictions, tuple[str, ...]]:
-    """The images as the network saw them, its pointmaps of pairs, and notes for the user.
+    """Return the images as the network sees them, its pairwise pointmaps, and notes for the user.
 
-    `aligned` says that alignment and map follow, within the same memory. Raises InputError for images or weights
-    that cannot be used, or a memory budget that is too small.
+    Raises InputError for images or weights that cannot be used.
     """
-    program = resident()
     loaded = load_weights(options.weights, options.device)
-    images = prepare_images(capture, lambda size: image_grid(size, options.pairs.image_size))
+    images = prepare_images(capture)
     predictions, notes = predict_pairs(
-        loaded,
-        images,
-        capture.images,
-        capture.base_from_gripper,
-        options.pairs,
-        progress,
-        program=program,
-        aligned=aligned,
+        loaded, images, capture.images, capture.base_from_gripper, options.pair_graph, progress
     )
     return images, predictions, (options.weights.note, *notes)
 
@@ -57,24 +47,16 @@ def predict(
 def reconstruct_dust3r(
     capture: Capture, options: Dust3rOptions, progress: Progress | None = None
 ) -> Reconstruction:
-    """Camera poses, pointmaps and tracks of a capture, up to one similarity, or in metres with MASt3R.
+    """Return camera poses, pointmaps and tracks of a capture, up to one similarity, or in metres with MASt3R.
 
     Raises InputError as `predict` does.
     """
-    images, predictions, notes = predict(capture, options, progress, aligned=True)
-    give_back()  # the network
+    images, predictions, notes = predict(capture, options, progress)
+    give_back()  # the network's memory
     rows = np.arange(len(capture))
-    poses = capture.base_from_gripper
     try:
         return reconstruction_from_pairs(
-            images,
-            rows,
-            predictions,
-            poses,
-            AlignOptions(),
-            backend=options.backend,
-            notes=notes,
-            progress=progress,
+            images, rows, predictions, backend=options.backend, notes=notes, progress=progress
         )
-    except RejectedError as error:  # what was used, and its licence, are worth knowing all the same
+    except RejectedError as error:  # the weights and their licence belong to a rejection, too
         raise error.with_more(*notes) from None

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from itertools import accumulate
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -13,33 +12,19 @@ from jcr.estimation.closed_form import rotations
 from jcr.geometry import apply, fit_similarity, inverse, rotation_angle, transform
 from jcr.reconstruct.global_alignment.pairs import PairPredictions
 
+PairGraph = Literal["auto", "complete", "window", "robot"]
+"""complete: all pairs; window: images near each other in the capture's order; robot: all pairs but those that by the
+robot's poses have no view in common; auto: complete up to FEW_IMAGES images, robot beyond."""
 FEW_IMAGES = 12
 """Up to here "auto" predicts every pair (132); a chain that is wrong costs more than it saves."""
+
+WINDOW = 3
+"""Distance in the capture's order up to which two images make a pair of the window graph."""
 
 LEAST_OVERLAP, WIDER = 0.02, 1.5
 """Share of an image's points that the other one of a pair must see, in a field of view half again as wide as its own."""
 SAMPLES = 1000
 """Points of an image, about."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PairOptions:
-    """Which pairs of images the network sees, and within what memory."""
-
-    pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
-    """complete: all pairs; window: images near each other in the capture's order; robot: all but the pairs
-    that by the robot's poses have no view in common; auto: complete up to 12 images, robot beyond."""
-    window: int = 3
-    """How far apart in the capture's order two images of a pair may be (window only)."""
-    image_size: Literal[512, 224] = 512
-    """Long edge that the network sees, in pixels; 224 has a quarter of the pixels to compute."""
-    memory_gb: float = 8.0
-    """Peak resident set of the process, the program itself included; on a GPU, what the network takes there, too.
-    Pointmaps that do not fit lie in a file."""
-    cache: Path | None = None
-    """Folder of predictions already made; unset: jcr/pairs in the user's cache folder."""
-    cache_gb: float = 4.0
-    """Size at which the oldest predictions in the cache are deleted; 0 switches it off."""
 
 
 def complete_pairs(count: int) -> Int[ndarray, "e 2"]:
@@ -146,7 +131,6 @@ def _chain_views(chain: PairPredictions, count: int) -> list[_ChainView]:
         own = np.argsort(chain.conf[there].ravel())[-len(confidence) // 2 :][:: max(1, len(best) // SAMPLES)]
         points = chain.pts3d[there].reshape(-1, 3)[own].astype(np.float64)
         views.append(_ChainView(camera_from_next, points, scale * in_next))
-        chain.release()
     return views
 
 

@@ -12,7 +12,6 @@ import math
 import re
 import sys
 from dataclasses import dataclass
-from hashlib import blake2b
 from pathlib import Path
 
 import torch
@@ -55,16 +54,6 @@ def load_weights(weights: Weights, device: str = "cpu") -> LoadedNetwork:
         raise InputError(f"device {device}: {_line(error)}; use --device cpu") from None
     _announce(weights.note)
     return LoadedNetwork(network, is_metric=bool(mast3r))
-
-
-def fingerprint(network: Dust3r) -> str:
-    """A hash that tells weights apart: 64 values spread over each tensor, whatever file they came from."""
-    digest = blake2b(digest_size=16)
-    for key, tensor in network.state_dict().items():
-        spread = torch.linspace(0, tensor.numel() - 1, 64, dtype=torch.float64).long()
-        values = tensor.flatten()[spread.to(tensor.device)].float().cpu().numpy()
-        digest.update(f"{key}{tuple(tensor.shape)}".encode() + values.tobytes())
-    return digest.hexdigest()
 
 
 def _file_in(folder: Path) -> Path:

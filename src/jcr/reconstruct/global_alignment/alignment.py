@@ -1,4 +1,4 @@
-"""What global alignment is asked and what it answers."""
+"""Options and result of global alignment."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -18,10 +18,8 @@ LEAST_PIXELS = 50
 
 @dataclass(frozen=True, kw_only=True)
 class AlignOptions:
-    """How pairwise pointmaps become one reconstruction."""
+    """Options of global alignment."""
 
-    method: Literal["fast", "adam"] = "fast"
-    """fast: Gauss-Newton on chosen pixels; adam: gradient descent on every pixel, as published (slow)."""
     focal: Literal["auto", "shared", "own", "given"] = "auto"
     """shared: one for all images; own: one per image; given: fixed at the predictions' intrinsics; auto: given
     where the predictions carry intrinsics, else shared."""
@@ -29,11 +27,7 @@ class AlignOptions:
     """x, y on the pointmaps' grid, pixel (0, 0) being a centre; unset: the predictions' intrinsics where they
     carry them, else (W/2, H/2), where DUSt3R puts it (half a pixel right and down of the image's middle)."""
     pixels: int = 2048
-    """fast: pixels per image, the most confident of as many equal cells."""
-    steps: int = 300
-    """adam: number of steps."""
-    learning_rate: float = 0.01
-    """adam: of the first step, falling to 0 along a cosine."""
+    """Pixels per image, the most confident of as many equal cells."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +48,7 @@ class Alignment:
     """One reconstruction from pairwise pointmaps: a camera and a depth map per image, a scale per pair.
 
     The recon frame is the camera frame of image 0; its unit is the geometric mean of the pairs' own units, so
-    metric predictions give metres. (Kinematic alignment puts the base frame and metres in their place.)
+    metric predictions give metres.
     """
 
     recon_from_camera: Float[ndarray, "n 4 4"]
@@ -69,12 +63,12 @@ class Alignment:
     """σ_e: recon units per unit of the pair's pointmaps (paper eq. 1)."""
     pair_residual: Float[ndarray, " e"]
     """Typical distance of a pair's points from the reconstruction, relative to that from the camera."""
-    seconds: float
-    method: str
+    covariance: Float[ndarray, "r r"]
+    """Covariance of the steps of all cameras (translation, rotation), r = 6n; zero for image 0."""
     notes: tuple[str, ...] = ()
-    """What was done: pairs that contradict the others count little."""
+    """Pairs that contradict the others and count little."""
     warnings: tuple[str, ...] = ()
-    """What the user must act on: pairs that agree on nothing, gripper poses that they contradict."""
+    """Faults of the alignment that the user must act on, such as pairs that agree on nothing."""
 
     def points_in_recon(self) -> Float[ndarray, "n h w 3"]:
         """The pointmaps, float32."""
@@ -114,10 +108,8 @@ def check_options(options: AlignOptions) -> None:
     """Raise InputError for numbers that no alignment can work with."""
     if options.pixels < LEAST_PIXELS:
         raise InputError(
-            f"{options.pixels} pixels per image are too few; --pixels needs {LEAST_PIXELS} or more"
+            f"{options.pixels} pixels per image are too few; alignment needs {LEAST_PIXELS} or more"
         )
-    if options.steps < 0 or options.learning_rate <= 0:
-        raise InputError("--steps must be 0 or more and --learning-rate more than 0")
 
 
 def check_connected(predictions: PairPredictions) -> None:

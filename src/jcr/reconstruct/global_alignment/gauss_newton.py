@@ -8,10 +8,8 @@ firmly.
 """
 
 import os
-import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -64,54 +62,6 @@ USELESS = 0.2
 UNDETERMINED = "the pointmaps of the pairs have too little in common to be aligned"
 
 
-@runtime_checkable
-class Cameras(Protocol):
-    """What is free about the cameras: each way of tying them takes its own step."""
-
-    @property
-    def recon_from_camera(self) -> Float[ndarray, "n 4 4"]:
-        """Where they stand now."""
-        ...
-
-    def step(
-        self, layout: Layout, hessian: Float[ndarray, "p p"], gradient: Float[ndarray, " p"]
-    ) -> Float[ndarray, " p"]:
-        """Solve the reduced normal equations, move the cameras, and return the step of all unknowns."""
-        ...
-
-    def covariance(self) -> Float[ndarray, "r r"]:
-        """Of the cameras' steps, r = 6n, from the equations of the last one."""
-        ...
-
-
-class FreeCameras:
-    """Cameras that may stand anywhere; the first one and the product of the pair scales are fixed (gauge)."""
-
-    def __init__(self, recon_from_camera: Float[ndarray, "n 4 4"]) -> None:
-        self.recon_from_camera = recon_from_camera
-        self.normal = np.zeros((0, 0))
-
-    def step(
-        self, layout: Layout, hessian: Float[ndarray, "p p"], gradient: Float[ndarray, " p"]
-    ) -> Float[ndarray, " p"]:
-        """Solve the reduced normal equations, move the cameras, and return the step of all unknowns."""
-        scales = layout.scales
-        fixed = hessian.copy()
-        fixed[np.ix_(scales, scales)] += GAUGE_WEIGHT * hessian.diagonal()[scales].mean()
-        self.normal = fixed[6:, 6:]
-        step = np.zeros(layout.size)
-        step[6:] = -np.linalg.solve(self.normal, gradient[6:])
-        self.recon_from_camera = retract(self.recon_from_camera, step[: 6 * layout.images].reshape(-1, 6))
-        return step
-
-    def covariance(self) -> Float[ndarray, "r r"]:
-        """Of the cameras' steps, r = 6n, from the equations of the last one; the first camera's is 0."""
-        size = 6 * len(self.recon_from_camera)
-        out = np.zeros((size, size))
-        out[6:, 6:] = np.linalg.inv(self.normal)[: size - 6, : size - 6]
-        return out
-
-
 @dataclass(frozen=True)
 class Problem:
     """Predictions with all that is settled about them before anything is estimated."""
@@ -146,7 +96,8 @@ class Solution:
     """The result of Gauss-Newton."""
 
     state: State
-    cameras: Cameras
+    covariance: Float[ndarray, "r r"]
+    """Covariance of the cameras' steps, r = 6n, from the equations of the last step; zero for the first camera."""
     images: list[ImageObservations]
     noise: list[Noise]
     """Per image, of its pointmaps."""
@@ -156,26 +107,16 @@ class Solution:
     """Whether the last step was small enough."""
 
 
-def align_fast(
-    predictions: PairPredictions, options: AlignOptions, progress: Progress | None = None
-) -> Alignment:
-    """Align from a start in closed form, on few pixels, then on many, and settle the depth of every pixel."""
-    begin = time.perf_counter()
-    problem = Problem.of(predictions, options)
-    return dense_alignment(problem, solve_free(problem, options), begin, progress)
-
-
-def solve_free(problem: Problem, options: AlignOptions) -> Solution:
+def solve(problem: Problem, options: AlignOptions) -> Solution:
     """Cameras, focal lengths, pair scales and the depths of `options.pixels` pixels per image."""
     images = problem.observe_all(min(COARSE_PIXELS, options.pixels))
     state = initial_state(images, problem.predictions.edges, problem.pinhole)
-    cameras = FreeCameras(state.recon_from_camera)
     pair_spread = START_SPREAD * np.repeat([np.exp(np.median(np.concatenate(state.log_depth))), 1.0], 3)
-    coarse = gauss_newton(images, state, problem.layout, cameras, pair_spread, COARSE_TOLERANCE)
+    coarse = gauss_newton(images, state, problem.layout, pair_spread, COARSE_TOLERANCE)
     images = problem.observe_all(options.pixels)
     depth = [fused_depth(o, coarse.state, noise)[0] for o, noise in zip(images, coarse.noise, strict=True)]
     state = replace(coarse.state, log_depth=[np.log(z) for z in depth])
-    return gauss_newton(images, state, problem.layout, cameras, coarse.pair_spread, FINE_TOLERANCE)
+    return gauss_newton(images, state, problem.layout, coarse.pair_spread, FINE_TOLERANCE)
 
 
 @one_blas_thread
@@ -183,7 +124,6 @@ def gauss_newton(
     images: list[ImageObservations],
     state: State,
     layout: Layout,
-    cameras: Cameras,
     pair_spread: Float[ndarray, "6"],
     tolerance: float,
 ) -> Solution:
@@ -195,14 +135,14 @@ def gauss_newton(
     """
     for iteration in range(1, ITERATIONS + 1):
         noise, linearised = _linearised(images, state, layout, pair_spread)
-        step = _step(linearised, layout, cameras)
-        state, variance = _after_step(images, state, layout, cameras, linearised, step)
+        step, normal = _step(linearised, layout)
+        state, variance = _after_step(images, state, layout, linearised, step)
         pair_spread = _spread(state.pair_error, variance, pair_spread)
         settled = bool(np.abs(step).max() < tolerance)
         if settled or iteration == ITERATIONS:
             return Solution(
                 state=state,
-                cameras=cameras,
+                covariance=_camera_covariance(normal, layout),
                 images=images,
                 noise=noise,
                 pair_spread=pair_spread,
@@ -244,8 +184,14 @@ def _linearised(
     return noise, found
 
 
-def _step(linearised: list[_Linearised], layout: Layout, cameras: Cameras) -> Float[ndarray, " p"]:
-    """The step of all unknowns that are not eliminated; the cameras take theirs. RejectedError where it is none."""
+def _step(
+    linearised: list[_Linearised], layout: Layout
+) -> tuple[Float[ndarray, " p"], Float[ndarray, "q q"]]:
+    """Solve for the step of all unknowns that are not eliminated, and return it with the normal matrix.
+
+    The first camera and the product of the pair scales are fixed (gauge): the matrix lacks the first camera, q = p - 6.
+    Raises RejectedError where the equations are singular.
+    """
     hessian, gradient = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
     for image in linearised:
         hessian += image.selection.T @ (image.selection.T @ image.reduced.hessian).T
@@ -253,20 +199,29 @@ def _step(linearised: list[_Linearised], layout: Layout, cameras: Cameras) -> Fl
     # A pair without weight keeps its scale.
     scales = layout.scales
     hessian[scales, scales] += 1e-9 * hessian.diagonal()[scales].max()
+    hessian[np.ix_(scales, scales)] += GAUGE_WEIGHT * hessian.diagonal()[scales].mean()
+    normal, step = hessian[6:, 6:], np.zeros(layout.size)
     try:
-        step = cameras.step(layout, hessian, gradient)
+        step[6:] = -np.linalg.solve(normal, gradient[6:])
     except np.linalg.LinAlgError:
-        step = np.full(layout.size, np.nan)
+        raise RejectedError(UNDETERMINED) from None
     if not np.isfinite(step).all():
         raise RejectedError(UNDETERMINED)
-    return step
+    return step, normal
+
+
+def _camera_covariance(normal: Float[ndarray, "q q"], layout: Layout) -> Float[ndarray, "r r"]:
+    """Return the covariance of the cameras' steps, r = 6n, zero for the first camera."""
+    size = 6 * layout.images
+    covariance = np.zeros((size, size))
+    covariance[6:, 6:] = np.linalg.inv(normal)[: size - 6, : size - 6]
+    return covariance
 
 
 def _after_step(
     images: list[ImageObservations],
     state: State,
     layout: Layout,
-    cameras: Cameras,
     linearised: list[_Linearised],
     step: Float[ndarray, " p"],
 ) -> tuple[State, Float[ndarray, "e 6"]]:
@@ -285,7 +240,7 @@ def _after_step(
         variance[o.second_pairs] = image.reduced.error_variance
     focals = [layout.focal(k) for k in range(layout.images)]
     after = State(
-        recon_from_camera=cameras.recon_from_camera,
+        recon_from_camera=retract(state.recon_from_camera, step[: 6 * layout.images].reshape(-1, 6)),
         log_focal=state.log_focal + np.array([0.0 if c is None else step[c] for c in focals]),
         log_pair_scale=state.log_pair_scale + step[layout.scales],
         pair_error=pair_error,
@@ -307,9 +262,7 @@ def _spread(
     return np.repeat(np.maximum(np.sqrt(squared / np.maximum(determined, 0.01)), LEAST_SPREAD), 3)
 
 
-def dense_alignment(
-    problem: Problem, solution: Solution, begin: float, progress: Progress | None = None
-) -> Alignment:
+def dense_alignment(problem: Problem, solution: Solution, progress: Progress | None = None) -> Alignment:
     """The record of a solution, in its own recon frame, with the depth of every pixel."""
     predictions, state = problem.predictions, solution.state
     count, (height, width) = predictions.image_count, predictions.conf.shape[1:]
@@ -338,8 +291,7 @@ def dense_alignment(
         confidence=(np.exp(confidence) if problem.log_weight else confidence).reshape(count, height, width),
         pair_scale=np.exp(state.log_pair_scale),
         pair_residual=residual,
-        seconds=time.perf_counter() - begin,
-        method="fast",
+        covariance=solution.covariance,
         notes=_notes(predictions, residual),
         warnings=_warnings(residual, solution.settled),
     )

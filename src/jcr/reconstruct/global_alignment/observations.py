@@ -76,7 +76,6 @@ def choose_pixels(predictions: PairPredictions, count: int) -> list[Int[ndarray,
     ):
         total[first] += conf.ravel()
         total[second] += conf2.ravel()
-        predictions.release()
     shown = np.bincount(predictions.edges.ravel(), minlength=len(total)).astype(np.float32)
     chosen = []
     for k, weight in enumerate(weigh(total / shown[:, None], weight_is_log(predictions))):
@@ -98,7 +97,6 @@ def weigh(confidence: Float[ndarray, "*k"], log_weight: bool) -> Float[ndarray, 
 def weight_is_log(predictions: PairPredictions) -> bool:
     """Whether confidences follow DUSt3R, from 1 up and weighing log C as published; else they are weights."""
     largest = max(float(conf.max()) for conf in predictions.conf)
-    predictions.release()
     return largest > 1.0
 
 
@@ -119,7 +117,6 @@ def observe(
     )
     points = np.stack([view[e].reshape(-1, 3)[pixels].T for edges, view, _ in sources for e in edges])
     confidence = np.stack([conf[e].ravel()[pixels] for edges, _, conf in sources for e in edges])
-    predictions.release()
     distance = np.sqrt(np.einsum("kcm,kcm->km", points, points))
     usable = distance > 1e-12
     distance[~usable] = 1.0

@@ -1,18 +1,14 @@
 """Pointmaps of pairs of images, as a record and a file: what global alignment reads, whoever predicted them."""
 
-import math
-import mmap
-import struct
-import zipfile
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
+from jcr.allocator import require_memory
 from jcr.errors import InputError
-from jcr.files import written_whole
 from jcr.reconstruct.preprocess import ImageGrid
 from jcr.records import Intrinsics
 
@@ -60,48 +56,6 @@ class PairPredictions:
         """Points and confidences of the first views, and of the second ones."""
         return self.pts3d, self.conf, self.pts3d_in_other_view, self.conf2
 
-    def release(self) -> None:
-        """Take pointmaps that lie in a file out of the resident set; they come back page by page when read."""
-        for array in self.pointmaps:
-            _release(array)
-
-
-def _release(array: ndarray) -> None:
-    if isinstance(array, np.memmap) and isinstance(array.base, mmap.mmap):
-        array.base.madvise(mmap.MADV_DONTNEED)
-
-
-def write_pairs(path: Path, predictions: PairPredictions) -> None:
-    """Write predictions as npz (uncompressed: pointmaps do not compress), whole or not at all."""
-    extra: dict[str, object] = {"images": np.array(predictions.images, dtype=str)}
-    extra["is_metric"] = predictions.is_metric
-    if predictions.colors is not None:
-        extra["colors"] = predictions.colors
-    if predictions.intrinsics is not None:
-        k = predictions.intrinsics
-        extra["intrinsics"] = np.array([k.fx, k.fy, k.cx, k.cy])
-    if predictions.grid is not None:
-        extra["grid"] = np.array(list(asdict(predictions.grid).values()), dtype=np.int64)
-    with (
-        written_whole(path) as temporary,
-        open(temporary, "wb") as stream,
-        zipfile.ZipFile(stream, "w") as archive,
-    ):
-        for name in ARRAYS:
-            _write_rows(archive, name, getattr(predictions, name))
-        for name, value in extra.items():
-            _write_rows(archive, name, np.asanyarray(value))
-
-
-def _write_rows(archive: zipfile.ZipFile, name: str, array: ndarray) -> None:
-    """An array of an npz file as numpy.savez writes it, but row by row: it may be larger than the memory."""
-    array = np.asanyarray(array, order="C")
-    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-        np.lib.format.write_array_header_1_0(member, np.lib.format.header_data_from_array_1_0(array))
-        for row in array.reshape(max(len(array), 1) if array.ndim else 1, -1):
-            member.write(row.tobytes())
-            _release(array)
-
 
 def read_pairs(path: Path) -> PairPredictions:
     """Read predictions from npz and check them.
@@ -111,53 +65,26 @@ def read_pairs(path: Path) -> PairPredictions:
     return pairs_from_arrays(read_arrays(path), str(path))
 
 
-def read_arrays(path: Path, in_memory: float = math.inf) -> dict[str, ndarray]:
-    """All arrays of an npz file; of one with more than `in_memory` bytes, what is not compressed stays there, mapped.
+def read_arrays(path: Path) -> dict[str, ndarray]:
+    """Read all arrays of an npz file.
 
-    Raises InputError where the file is missing or damaged.
+    Raises InputError where the file is missing or damaged, or unpacks to more than the machine's memory.
     """
     if not path.is_file():
-        raise InputError(f"{path}: no such file; `jcr predict CAPTURE {path.name}` writes one")
+        raise InputError(f"{path}: no such file; give predictions as npz (jcr docs predictions)")
     try:
-        if path.stat().st_size > in_memory:
-            return _map_arrays(path)
         with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
+            if file.zip is not None:
+                require_memory(sum(member.file_size for member in file.zip.infolist()), str(path))
             arrays = dict(file)
         # NumPy hands out the bytes of what does not begin as an array does.
         if strangers := [name for name, array in arrays.items() if not isinstance(array, ndarray)]:
             raise ValueError(f"{strangers[0]} in it is not an array")
         return arrays
+    except InputError:
+        raise
     except Exception as error:  # zipfile, zlib and NumPy's parser of headers have errors of their own
         raise InputError(f"{path}: no readable npz file ({error}); write it again with numpy.savez") from None
-
-
-def _map_arrays(path: Path) -> dict[str, ndarray]:
-    """Every array of an npz file, read-only, in the file itself where it lies there plainly."""
-    arrays = {}
-    with open(path, "rb") as stream, zipfile.ZipFile(stream) as archive:
-        for info in archive.infolist():
-            name = info.filename.removesuffix(".npy")
-            with archive.open(info) as member:
-                version = np.lib.format.read_magic(member)
-                read = np.lib.format.read_array_header_1_0
-                shape, by_columns, dtype = (
-                    read if version == (1, 0) else np.lib.format.read_array_header_2_0
-                )(member)
-                start = member.tell()
-                while member.read(1 << 20):  # to the end, where its checksum is compared
-                    pass
-            plain = info.compress_type == zipfile.ZIP_STORED and not by_columns and math.prod(shape)
-            if (
-                not plain or dtype.hasobject
-            ):  # objects in a file are addresses: mapped, they would be followed
-                with archive.open(info) as member:
-                    arrays[name] = np.lib.format.read_array(member, allow_pickle=False)
-                continue
-            # What stands before the data: 30 bytes, two of them the length of the name, two that of further fields.
-            stream.seek(info.header_offset + 26)
-            start += info.header_offset + 30 + sum(struct.unpack("<HH", stream.read(4)))
-            arrays[name] = np.memmap(path, dtype, "r", start, shape)
-    return arrays
 
 
 def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPredictions:
@@ -216,9 +143,8 @@ def _check_edges(edges: ndarray, names: int, source: str) -> int:
 
 def _check_values(name: str, array: ndarray, source: str) -> None:
     """InputError for points or confidences of a pair that are not finite, or confidences below 0."""
-    # One edge at a time: a mask of the whole would cost as much memory again as a quarter of the file.
+    # One edge at a time: a mask of all pairs would take a quarter of the pairs' memory.
     for edge, values in enumerate(array):
-        _release(array)
         if not np.isfinite(values).all():
             raise InputError(
                 f"{source}: {name}[{edge}] is not finite everywhere; put 0 there, with confidence 0"

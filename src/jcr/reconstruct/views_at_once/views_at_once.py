@@ -20,7 +20,6 @@ from jcr.camera import rays
 from jcr.errors import InputError
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.geometry import apply
-from jcr.memory import ALLOWANCE, GB, announce, require, resident
 from jcr.progress import Progress, silent
 from jcr.reconstruct.hub import Weights
 from jcr.reconstruct.pointmaps import PosedPointmaps, fit_pinhole, reconstruction_from_pointmaps
@@ -34,34 +33,6 @@ PREDICTED_STD = (0.02, np.radians(1.5))
 Anything 3's largest model has on 7-Scenes (27 % of pairs within an average threshold of 3°, its benchmark page)."""
 
 
-@dataclass(frozen=True)
-class Cost:
-    """Linear in the number of views for memory, quadratic for time: attention over all views at once."""
-
-    base_gb: float
-    """Weights, in main memory, and what their library takes."""
-    view_gb: float
-    """Memory of each view."""
-    view_s: float
-    """Seconds for each view on one core of a desktop's processor."""
-    pair_s: float
-    """Seconds for each pair of views on that core."""
-
-    def bytes(self, views: int) -> float:
-        """Peak of main memory on a CPU, over what the program takes without it."""
-        return GB * (self.base_gb + self.view_gb * views)
-
-    def seconds(self, views: int) -> float:
-        """On one core of a CPU."""
-        return self.view_s * views + self.pair_s * views * (views - 1) / 2
-
-    def sentence(self, views: int, device: str) -> str:
-        """For the line that announces the work."""
-        if device != "cpu":
-            return f", and {self.bytes(views) / GB:.1f} GB of the GPU's"
-        return f", and about {self.seconds(views):.0f} s on one core"
-
-
 @dataclass(frozen=True, kw_only=True)
 class ViewsOptions:
     """One model and where it runs."""
@@ -71,9 +42,7 @@ class ViewsOptions:
     load: Callable[[Path, str], Predict]
     """Loads the model from the folder of its weights, on the device."""
     weights: Weights
-    cost: Cost
     device: str = "cpu"
-    memory_gb: float = 8.0
 
 
 @dataclass(frozen=True)
@@ -113,10 +82,9 @@ def reconstruct_views_at_once(
 ) -> Reconstruction:
     """Camera poses with their covariance, pointmaps and tracks; in the model's own unit.
 
-    Raises InputError for weights that are missing or damaged, or where the memory does not suffice.
+    Raises InputError for weights that are missing or damaged.
     """
     report = progress or silent
-    _require_memory(capture, options)
     images = prepare_images(capture, lambda size: ImageGrid.uncropped(size, size))
     predict = loaded(options.load, options.weights.path, options.device)
     report("reconstruct", 0.0)
@@ -138,17 +106,6 @@ def loaded(load: Callable[[Path, str], Predict], weights: Path, device: str) -> 
             return predict(views)
 
     return predict_quietly
-
-
-def _require_memory(capture: Capture, options: ViewsOptions) -> None:
-    """Say what it will take, before it is begun."""
-    width, height = capture.image_size
-    colors = len(capture) * width * height * (3 + 4)
-    needed = (
-        resident() + ALLOWANCE + colors + (options.cost.bytes(len(capture)) if options.device == "cpu" else 0)
-    )
-    require(int(needed), options.memory_gb * GB, f"--backend {options.backend} with {len(capture)} images")
-    announce(int(needed), options.memory_gb * GB, options.cost.sentence(len(capture), options.device))
 
 
 def with_known_rays(predicted: Predicted, images: PreparedImages) -> Predicted:

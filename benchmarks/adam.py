@@ -6,7 +6,7 @@ spanning tree of the pairs. It is the baseline that Gauss-Newton is measured aga
 """
 
 import math
-import time
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from jcr.geometry import inverse, transform
-from jcr.progress import Progress
 from jcr.reconstruct.global_alignment.alignment import Alignment, AlignOptions, Pinhole, pinhole_of
 from jcr.reconstruct.global_alignment.depths import initial_depth
 from jcr.reconstruct.global_alignment.initial_estimate import initial_state
@@ -31,11 +30,21 @@ PAIRS_AT_ONCE = 16
 """Bounds the memory of one forward and backward pass."""
 
 
+@dataclass(frozen=True)
+class AdamOptions:
+    """Options of the gradient descent."""
+
+    steps: int = 300
+    """Number of steps."""
+    learning_rate: float = 0.01
+    """Learning rate of the first step; it falls to 0 along a cosine."""
+
+
 def align_adam(
-    predictions: PairPredictions, options: AlignOptions, progress: Progress | None = None
+    predictions: PairPredictions, options: AlignOptions | None = None, adam: AdamOptions | None = None
 ) -> Alignment:
-    """Align by `options.steps` Adam steps over all pixels of all pairs."""
-    begin = time.perf_counter()
+    """Align by Adam steps over all pixels of all pairs; the result has no covariance (NaN)."""
+    options, adam = options or AlignOptions(), adam or AdamOptions()
     pinhole = pinhole_of(predictions, options)
     log_weight = weight_is_log(predictions)
     count, height, width = predictions.image_count, *predictions.conf.shape[1:]
@@ -46,7 +55,7 @@ def align_adam(
     depth = np.stack([initial_depth(o, start) for o in everything])
     model = PointmapModel(start, depth, predictions, pinhole)
     groups = [slice(e, e + PAIRS_AT_ONCE) for e in range(0, len(predictions.edges), PAIRS_AT_ONCE)]
-    _descend(model, predictions, groups, options, log_weight, progress)
+    _descend(model, predictions, groups, adam, log_weight)
     with torch.no_grad():
         points = model.points()
         residual = [
@@ -70,8 +79,7 @@ def align_adam(
             confidence=_mean_confidence(predictions, log_weight),
             pair_scale=model.scale().double().numpy(),
             pair_residual=torch.cat(residual).double().numpy(),
-            seconds=time.perf_counter() - begin,
-            method="adam",
+            covariance=np.full((6 * count, 6 * count), np.nan),
         )
 
 
@@ -79,11 +87,10 @@ def _descend(
     model: "PointmapModel",
     predictions: PairPredictions,
     groups: list[slice],
-    options: AlignOptions,
+    options: AdamOptions,
     log_weight: bool,
-    progress: Progress | None,
 ) -> None:
-    """Adam on eq. 1, its rate falling to 0 along a cosine; the pairs are taken in `groups` to bound the memory."""
+    """Minimise eq. 1 by Adam, the pairs taken in `groups` to bound the memory."""
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     optimizer = torch.optim.Adam(parameters, lr=options.learning_rate, betas=(0.9, 0.9))
     for step in range(options.steps):
@@ -101,8 +108,6 @@ def _descend(
             loss.backward()
         points.backward(gathered.grad)
         optimizer.step()
-        if progress is not None:
-            progress("align pairs", (step + 1) / options.steps)
 
 
 class PointmapModel(torch.nn.Module):
