@@ -12,6 +12,7 @@ from jcr.calibration.calibration_json import calibration_file, failed_file
 from jcr.capture.added import write_added
 from jcr.cell.added import read_added_cameras
 from jcr.cell.cameras_json import CamerasFile, cameras_file
+from jcr.cell.carried import carried_scene, refined
 from jcr.depth.densify import densify
 from jcr.progress import Progress
 from jcr.records import Attempt, Capture, CellCamera
@@ -26,7 +27,7 @@ def calibrated(capture: Capture, folder: RunFolder, options: RunOptions, progres
     Where the camera watches the gripper, what the gripper carries is the scene.
     """
     watches = capture.mount == "base"
-    seen = _carried_scene(capture, folder) if watches else capture
+    seen = carried_scene(capture, folder.path / MOVING) if watches else capture
     state = state_of(seen, options.made_with).model_copy(update={"capture": str(capture.folder.resolve())})
     try:
         tried, attempts = _reused(seen, folder, options, state, progress) or _chosen(
@@ -39,8 +40,6 @@ def calibrated(capture: Capture, folder: RunFolder, options: RunOptions, progres
     folder.keep_depth(tried.reconstruction, state)
     hand_eye = tried.hand_eye
     if watches:
-        from jcr.cell.carried import refined
-
         hand_eye = refined(capture, tried.reconstruction, hand_eye, options.calibrate)
     content = calibration_file(
         capture, tried.reconstruction, hand_eye, tried.timings_s, __version__, attempts
@@ -56,12 +55,6 @@ def calibrated(capture: Capture, folder: RunFolder, options: RunOptions, progres
         hand_eye=hand_eye,
         reconstruction=tried.reconstruction,
     )
-
-
-def _carried_scene(capture: Capture, folder: RunFolder) -> Capture:
-    from jcr.cell.locate import carried_scene
-
-    return carried_scene(capture, folder.path / MOVING)
 
 
 def located(result: RunResult, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
@@ -87,17 +80,10 @@ def cameras(
     others = (*result.capture.others, *added)
     if not others:
         return None
-    from jcr.cell.locate import locate_cameras
+    from jcr.cell.stage import place_cameras
 
-    found = locate_cameras(
-        result.capture,
-        others,
-        result.reconstruction,
-        result.hand_eye,
-        folder.path / MOVING,
-        options.reconstruct,
-        options.calibrate,
-        progress,
+    found = place_cameras(
+        result.capture, others, result.reconstruction, result.hand_eye, options.calibrate, progress
     )
     return cameras_file(found, __version__)
 

@@ -232,7 +232,6 @@ def verify_camera(
         one.name: one.intrinsics.record()
         for one in ([] if cameras is None else cameras.cameras)
         if one.converged and one.mount == "base" and one.intrinsics is not None and one.name in others
-        if not others[one.name].watches_gripper
     }
     if name not in placed:
         there = ", ".join(placed) or "none"

@@ -105,7 +105,6 @@ EXAMPLES: dict[Kind, dict] = {
     Kind.IMAGE_MISSES: {"value": 9.0, "images": ("a.png",), "details": {"mount": "base"}},
     Kind.PLACE_UNCERTAIN: {"value": 0.1, "details": SIZE | {"focal_std": 0.1}, "mend": "intrinsics"},
     Kind.AT_ANOTHER_CAMERA: {"images": ("a.png",), "details": {"camera": "wrist"}},
-    Kind.ANOTHER_SCENE: {"value": 9.0, "details": {"camera": "wrist"}},
     Kind.BLURRED: {"value": 14.0, "images": ("a.png", "b.png"), "details": {"of": 4.0}},
     Kind.FEW_USED: {"value": 4.0, "details": {"of": 12.0}},
     Kind.STATIC_IMAGES: {"value": 0.2, "details": SIZE},

@@ -4,7 +4,6 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,19 +12,16 @@ import pytest
 import jcr
 from jcr.calibration.checks.camera import camera_faults
 from jcr.calibration.checks.imaged import Imaged
-from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
-from jcr.camera import parameters, project, unproject, with_parameters
+from jcr.camera import parameters, with_parameters
 from jcr.capture.added import read_added
 from jcr.capture.formats.capture_json import read, write
-from jcr.cell import alone, carried, localise
 from jcr.cell.added import camera_of, read_added_cameras
 from jcr.cell.cameras_json import cameras_file, read_cameras, write_cameras
-from jcr.cell.found import CameraFound, CellFound, ImageFound
+from jcr.cell.found import CameraFound, CellFound
 from jcr.cell.images import CellImages
 from jcr.cell.place_checks import far_from_gripper
 from jcr.cell.stage import place_cameras
-from jcr.errors import RejectedError
 from jcr.estimation.image_robots import Adjusted
 from jcr.estimation.images import evidence, noise_of
 from jcr.estimation.intrinsics_prior import FIXED, prior_of
@@ -33,11 +29,8 @@ from jcr.estimation.projection import ImageProblem, view_of
 from jcr.estimation.scene import Freedom, Scene, at_start, similarities
 from jcr.estimation.together import adjust
 from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
-from jcr.progress import silent
-from jcr.reconstruct.backends import ReconstructOptions
-from jcr.records import Capture, CellCamera, Finding, HandEye, Intrinsics, Reconstruction, Tracks
+from jcr.records import Capture, CellCamera, Finding, HandEye, Reconstruction, Tracks
 from jcr.records import Kind as FindingKind
-from jcr.sfm.relocate import Features
 from simulation.cells import CellProblem, Kind, cell_problem
 
 COUNT = 8
@@ -340,148 +333,18 @@ def test_a_camera_that_moves_or_sees_another_scene_is_refused_with_the_reason(ca
     uncertain = Finding(kind=FindingKind.UNCERTAIN, severity="rejects", value=0.1, details={"part": "scale"})
     untrusted = place_cameras(old, [moving], reconstruction, hand_eye.with_findings(uncertain))
     assert "rejected" in untrusted.cameras[0].warnings[0]
-
-
-def test_a_second_camera_that_sees_another_scene_is_calibrated_by_its_own_images(
-    calibrated, monkeypatch, tabletop: Path, tmp_path: Path
-):
-    """Its reconstruction has a frame and a unit of its own; two of its images were left out."""
-    old, reconstruction, hand_eye = calibrated
-    frame = np.array([0, 1, 3, 4, 5, 7, 8])
-    second = CellCamera(
-        name="second",
-        mount="gripper",
-        images=tuple(old.images[k] for k in frame),
-        image_size=old.image_size,
-        intrinsics=old.intrinsics,
-        frame=frame,
-    )
-    move = transform(rotation_exp(np.array([1.0, 0.2, -0.4])), np.array([0.5, 0.0, 2.0]))
-    its_own = scale_translation(move @ reconstruction.recon_from_camera[frame], 2.5)
-    whole = replace(
-        reconstruction,
-        image_index=np.arange(len(frame)),
-        recon_from_camera=its_own,
-        tracks=replace(reconstruction.tracks, points_in_recon=apply(its_own[0], np.eye(3) + 1.0)),
-    )
-    asked: list[Capture] = []
-
-    def reconstruct(capture: Capture, *_: object) -> Reconstruction:
-        asked.append(capture)
-        return whole
-
-    monkeypatch.setattr(alone, "reconstruct", reconstruct)
-    few = Finding(kind=FindingKind.FEW_POINTS_SHARED, severity="rejects", value=3.0, images=second.images[:1])
-    nothing = CameraFound(
-        name="second",
-        mount="gripper",
-        arm=None,
-        images=tuple(
-            ImageFound(image=i, used=False, points=3, reprojection_px=None, reason="few")
-            for i in second.images
-        ),
-        findings=(few,),
-    )
-    assert alone.sees_another_scene(second, nothing)
-    assert not alone.sees_another_scene(replace(second, mount="base"), nothing)
-    found = alone.calibrated_elsewhere(old, second, nothing, ReconstructOptions(), CalibrateOptions(), silent)
-    x = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
-    assert (asked[0].base_from_gripper == old.base_from_gripper[frame]).all() and asked[0].mount == "gripper"
-    assert found.converged and found.parent_from_camera is not None
-    assert np.abs(step_between(found.parent_from_camera, x)).max() < 1e-3
-    assert "shares nothing with the wrist camera" in found.warnings[-1] and len(found.images) == len(frame)
-
-    def refuse(*_: object) -> Reconstruction:
-        raise RejectedError("2 of 7 images could be registered")
-
-    monkeypatch.setattr(alone, "reconstruct", refuse)
-    refused = alone.calibrated_elsewhere(
-        old, second, nothing, ReconstructOptions(), CalibrateOptions(), silent
-    )
-    assert not refused.converged and refused.warnings[0].endswith("2 of 7 images could be registered")
-    kinds = [one.kind for one in refused.findings]
-    assert kinds == [FindingKind.NO_RECONSTRUCTION, FindingKind.ANOTHER_SCENE]
-    # The file has the findings, and what older versions read.
-    content = cameras_file(CellFound((found, refused), (), None), "0")
+    placed = place_cameras(old, [fixed(old, old.images[3])], reconstruction, hand_eye)
+    content = cameras_file(CellFound((*found.cameras, *placed.cameras), (), None), "0")
     write_cameras(tmp_path, content)
     assert read_cameras(tmp_path) == content
     written = json.loads((tmp_path / "cameras.json").read_text())["cameras"]
-    assert [one["verdict"] for one in written] == ["accepted with warnings", "rejected"]
-    assert [one["kind"] for one in written[1]["findings"]] == kinds
-    assert written[1]["warnings"] == list(refused.warnings) and not written[1]["converged"]
-    assert [image["image"] for image in written[0]["pictures"]] == list(second.images)
-    written[0]["converged"] = False
+    assert [one["verdict"] for one in written] == ["rejected"] * 3 + ["accepted with warnings"]
+    assert [one["findings"][0]["kind"] for one in written[:3]] == [kind.value for kind in kinds]
+    assert written[0]["warnings"] == list(found.cameras[0].warnings) and not written[0]["converged"]
+    written[3]["converged"] = False
     (tmp_path / "cameras.json").write_text(json.dumps({"cameras": written, "arms": [], "version": "0"}))
     with pytest.raises(jcr.InputError, match="contradict one another"):
         read_cameras(tmp_path)
-
-
-def test_a_fixed_camera_that_watches_the_gripper_is_placed_beside_a_wrist_camera(
-    calibrated, monkeypatch, tmp_path: Path
-):
-    """One capture has both: of eight of its nine poses there is an image of what the gripper carries."""
-    old, reconstruction, _ = calibrated
-    frame = np.array([0, 1, 2, 3, 5, 6, 7, 8])
-    front = CellCamera(
-        name="front",
-        mount="base",
-        images=tuple(old.images[k] for k in frame),
-        image_size=old.image_size,
-        intrinsics=old.intrinsics,
-        frame=frame,
-    )
-    base_from_camera = transform(rotation_exp(np.array([-1.9, 0.2, 0.3])), np.array([1.2, 0.1, 0.5]))
-    gripper_from_object = transform(rotation_exp(np.array([0.2, 0.5, 1.0])), np.array([0.0, 0.02, 0.15]))
-    seen_from = inverse(old.base_from_gripper[frame] @ gripper_from_object) @ base_from_camera
-    whole = replace(
-        reconstruction,
-        image_index=np.arange(len(frame)),
-        recon_from_camera=scale_translation(seen_from, 1 / SCALE),
-        tracks=replace(reconstruction.tracks, points_in_recon=0.05 * np.eye(3)),
-    )
-    monkeypatch.setattr(carried, "reconstruct", lambda *_: whole)
-    monkeypatch.setattr(carried, "write_moving_parts", lambda *_: None)
-    found = carried.calibrated_alone(old, front, tmp_path, ReconstructOptions(), CalibrateOptions(), silent)
-    assert found.converged and found.mount == "base" and found.parent_from_camera is not None
-    assert np.abs(step_between(found.parent_from_camera, base_from_camera)).max() < 1e-3
-    away = np.linalg.norm(old.base_from_gripper[frame, :3, 3] - base_from_camera[:3, 3], axis=1)
-    assert found.scene_distance is not None and 0 < found.scene_distance < away.max() + 0.3
-    assert [image.image for image in found.images] == list(front.images)
-
-
-@pytest.mark.parametrize("rotated", [False, True])
-def test_learned_features_refine_a_place_and_never_make_another(monkeypatch, rotated: bool):
-    """Of an image 40 points by SIFT are shared; a network finds 60 more, or the board rotated by 180°."""
-    rng = np.random.default_rng(3)
-    intrinsics = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480)
-    ahead = rng.uniform([-0.2, -0.15, 0.7], [0.2, 0.15, 0.9], (100, 3))
-    poses = np.stack([np.eye(4), transform(rotation_exp(np.array([0, 0.1, 0])), np.array([-0.1, 0, 0]))])
-    place = transform(rotation_exp(np.array([0.0, -0.1, 0.3])), np.array([0.1, 0.02, 0.05]))
-    shown = project(intrinsics, apply(inverse(place), ahead))
-    in_rows = [project(intrinsics, apply(inverse(pose), ahead)) for pose in poses]
-
-    def by_sift(x_px: np.ndarray) -> Features:
-        return Features(
-            x_px[:40], unproject(intrinsics, x_px[:40])[:, :2], np.eye(128, dtype=np.float32)[:40]
-        )
-
-    half_rotation = [intrinsics.cx, intrinsics.cy] - (shown[40:] - [intrinsics.cx, intrinsics.cy])
-    learned = SimpleNamespace(
-        matched=lambda *_: (
-            half_rotation if rotated else shown[40:],
-            [(np.arange(60), x_px[40:]) for x_px in in_rows],
-        )
-    )
-    monkeypatch.setattr(localise, "features", lambda *_: by_sift(shown))
-    known = localise.Known(intrinsics, poses, tuple(map(by_sift, in_rows)), learned)  # type: ignore[arg-type]
-    found = localise.localised(known, np.zeros((480, 640, 3), np.uint8), intrinsics, True)
-    assert isinstance(found, localise.Shared) and len(found.x_px) == (40 if rotated else 100)
-    assert np.abs(step_between(found.recon_from_camera, place)).max() < 1e-6
-    # Without a place by SIFT there is none, whatever the network finds.
-    few = replace(
-        known, found=tuple(Features(f.x_px[:9], f.rays[:9], f.descriptors[:9]) for f in known.found)
-    )
-    assert localise.localised(few, np.zeros((480, 640, 3), np.uint8), intrinsics, True) == 9
 
 
 @pytest.fixture
@@ -528,7 +391,7 @@ def test_cameras_of_a_capture_are_read_and_written_alike(folder: Path):
         "right",
     ]
     overhead, second, right = capture.others
-    assert overhead.intrinsics is not None and overhead.frame is None and not overhead.watches_gripper
+    assert overhead.intrinsics is not None and overhead.frame is None
     assert second.frame is not None and second.frame.tolist() == [0, 2]
     assert right.arm == "right" and right.base_from_gripper is not None and len(right.base_from_gripper) == 1
     write(folder, capture)
@@ -552,6 +415,7 @@ def test_cameras_of_a_capture_are_read_and_written_alike(folder: Path):
         ({"mount": "base", "images": ["7.png"], "intrinsics": INTRINSICS}, "another resolution"),
         ({"mount": "base", "images": ["3.png"], "arm": "right"}, "frames of its own"),
         ({"mount": "base", "watches": "scene"}, "what the gripper carries"),
+        ({"mount": "base", "images": ["3.png"], "watches": "gripper"}, "a capture of their own"),
         ({"mount": "base", "imagse": ["3.png"], "images": ["3.png"]}, "imagse is not known"),
     ],
 )

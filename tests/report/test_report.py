@@ -47,12 +47,12 @@ from jcr.records.words import worst_direction
 from jcr.report.details import details_section
 from jcr.report.html import failed_report_html, report_html
 from jcr.report.images import MAGNIFIED, reprojections_px
-from jcr.report.map_samples import sample_surface
 from jcr.report.motion import excitation_bars
 from jcr.results import RunResult
 from jcr.rounding import decimals_of, significant
 from jcr.scene.cloud import point_cloud
 from jcr.scene.options import MapOptions
+from jcr.scene.samples import sample_surface
 from simulation.truth import Truth, read_truth
 
 pytestmark = pytest.mark.slow

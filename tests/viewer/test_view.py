@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +20,9 @@ from chromium import Chromium
 from jcr.camera import project
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse
-from jcr.viewer.robot import read_joints, read_urdf, solve_joints
+from jcr.records import Capture
+from jcr.run_folder import RunFolder
+from jcr.viewer.robot import read_robot
 from simulation.truth import Truth, read_truth
 from waiting import until
 
@@ -53,40 +56,41 @@ def gantry(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def viewer(done: Path, gantry: Path) -> "Iterator[Viewer]":
-    from jcr.viewer import layers
-    from jcr.viewer.run import read_run
-    from jcr.viewer.server import open_server
-    from jcr.viewer.viewer import Viewer
+def capture(done: Path) -> Capture:
+    """The bundled capture with the joint values that bring the gantry's tool to each gripper pose."""
+    read = RunFolder(done).capture()
+    poses = read.base_from_gripper
+    angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler("ZYX")
+    return replace(read, joints=np.hstack([poses[:, :3, 3], angles]))
 
-    run, robot = read_run(done), read_urdf(gantry)
-    values = solve_joints(robot, "revolute_x", run.base_from_gripper)
+
+@pytest.fixture(scope="module")
+def viewer(done: Path, capture: Capture, gantry: Path) -> "Iterator[Viewer]":
+    from jcr.viewer import viewer as module
+    from jcr.viewer.server import open_server
+
     server = open_server(0, "test")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(layers, "MAP_POINTS", 15_000)  # drawn without a graphics card
-        yield Viewer(server, run, robot, values)
+        patch.setattr(module, "MAP_POINTS", 15_000)  # drawn without a graphics card
+        patch.setattr(RunFolder, "capture", lambda _: capture)
+        yield module.Viewer(server, RunFolder(done), gantry)
     server.stop()
 
 
-def test_a_higher_threshold_leaves_fewer_points_all_of_them_over_it(viewer: "Viewer"):
+def test_points_are_those_of_the_map_or_of_the_cloud(viewer: "Viewer"):
     from jcr.viewer.viewer import CLOUD
 
-    counts = []
-    for threshold in (0.02, 0.5, 0.98):
-        viewer.threshold.value = threshold
-        viewer.show_points()
-        occupancy = viewer.run.scene.query(viewer.points).occupancy
-        assert (occupancy >= threshold).all()
-        counts.append(len(viewer.points))
-    assert counts[0] > counts[1] > counts[2] > 1000
+    assert viewer.scene is not None and viewer.cloud is not None
+    assert 5000 < len(viewer.points) <= 15_000
+    assert (viewer.scene.query(viewer.points).occupancy >= 0.5).all()
     viewer.shown.value = CLOUD
     viewer.show_points()
-    assert len(viewer.points) == len(viewer.run.cloud.points_in_base)
-    viewer.shown.value, viewer.threshold.value = "map", 0.5
+    assert len(viewer.points) == len(viewer.cloud.points_in_base)
+    viewer.shown.value = "map"
     viewer.show_points()
 
 
-def test_sphere_rotates_red_in_an_object_and_where_nobody_looked(viewer: "Viewer", truth: Truth):
+def test_sphere_becomes_red_in_an_object_and_where_nobody_looked(viewer: "Viewer", truth: Truth):
     from jcr.viewer.viewer import COLLIDES, FREE
 
     book = next(thing for thing in truth.objects if thing.name == "book")
@@ -104,7 +108,7 @@ def test_sphere_rotates_red_in_an_object_and_where_nobody_looked(viewer: "Viewer
     viewer.radius.value = 150.0
     assert color(*over) == COLLIDES
     viewer.radius.value = 30.0
-    under = (*over[:2], viewer.run.scene.box[0, 2] + 1e-3)
+    under = (*over[:2], viewer.scene.box[0, 2] + 1e-3)
     assert color(*under) == COLLIDES
     far = (*over[:2], 5.0)
     assert color(*far) == COLLIDES and "outside of the workspace" in viewer.answer.content
@@ -124,7 +128,7 @@ def test_click_finds_the_first_point_and_shows_what_is_there(viewer: "Viewer", t
     said = viewer.click(np.array([x, y, z + 0.4]), np.array([0.0, 0.0, -1.0]))
     found = np.asarray(viewer._mark.position)
     assert abs(found[2] - (z + book.box_size[2] / 2)) < 0.01
-    at = viewer.run.scene.query(found[None].astype(float))
+    at = viewer.scene.query(found[None].astype(float))
     assert f"| occupancy | {at.occupancy[0]:.2f} |" in said and "images/" in said and "margin" in said
     assert "No point" in viewer.click(np.array([x, y, z + 0.4]), np.array([0.0, 0.0, 1.0]))
     viewer.shown.value = "map"
@@ -134,14 +138,14 @@ def test_click_finds_the_first_point_and_shows_what_is_there(viewer: "Viewer", t
 def test_the_photograph_lies_where_its_camera_sees_it(viewer: "Viewer"):
     viewer.image.value, viewer.photo.value = 3, 40
     viewer.choose_image()
-    camera, photo, intrinsics = viewer._camera_of_image(), viewer._photo, viewer.run.intrinsics
+    camera, photo, intrinsics = viewer._camera_of_image(), viewer._photo, viewer.intrinsics
     assert camera is not None and photo.visible and photo.image.shape[2] == 4
-    assert (photo.image[..., 3] == 102).all() and (photo.image[..., :3] == viewer.run.pixels[camera]).all()
+    assert (photo.image[..., 3] == 102).all() and (photo.image[..., :3] == viewer.pixels[camera]).all()
     half = np.array([photo.render_width, photo.render_height]) / 2
     axes = Rotation.from_quat(np.asarray(photo.wxyz)[[1, 2, 3, 0]]).as_matrix()
     for sign in ((-1, -1), (1, 1)):
         corner = np.asarray(photo.position) + axes @ np.array([*(sign * half), 0])
-        seen = project(intrinsics, apply(inverse(viewer.run.base_from_camera[camera]), corner))
+        seen = project(intrinsics, apply(inverse(viewer.base_from_camera[camera]), corner))
         assert seen == pytest.approx(
             (np.array(sign) + 1) / 2 * [intrinsics.width, intrinsics.height] - 0.5, abs=1e-3
         )
@@ -150,27 +154,33 @@ def test_the_photograph_lies_where_its_camera_sees_it(viewer: "Viewer"):
     assert not photo.visible and all(frustum.visible for frustum in viewer.frusta)
 
 
-def test_colours_have_their_bar(viewer: "Viewer"):
-    viewer.colored.value = "occupancy"
+def test_colours_have_their_legend(viewer: "Viewer"):
+    viewer.by_label.value = True
     viewer.show_points()
-    assert "rgb(37, 99, 235)" in viewer._legend.content
-    viewer.colored.value = "color"
+    assert "table" in viewer._legend.content and "rgb(" in viewer._legend.content
+    viewer.by_label.value = False
     viewer.show_points()
     assert not viewer._legend.content
-    viewer.slice_of.value = "distance"
-    viewer.show_slice()
-    assert "20 cm and more" in viewer._slice_legend.content
+    for of, words in (
+        ("distance", "20 cm and more"),
+        ("occupancy", "rgb(37, 99, 235)"),
+        ("unknown", "unseen"),
+    ):
+        viewer.slice_of.value = of
+        viewer.show_slice()
+        assert words in viewer._slice_legend.content and viewer._slice.visible
     viewer.slice_of.value = "none"
     viewer.show_slice()
-    assert not viewer._slice_legend.content and viewer._grid.visible
+    assert not viewer._slice_legend.content and not viewer._slice.visible
 
 
 def test_slice_has_the_base_frames_y_upwards(viewer: "Viewer", truth: Truth):
-    from jcr.viewer.layers import level_slice
+    from jcr.scene.samples import level_slice
+    from jcr.viewer.viewer import slice_colors
 
     can = next(thing for thing in truth.objects if thing.name == "can")
-    scene, (x, y, z) = viewer.run.scene, can.base_from_box[:3, 3]
-    pixels = level_slice(scene, z, "distance", "occupied")
+    scene, (x, y, z) = viewer.scene, can.base_from_box[:3, 3]
+    pixels = slice_colors(level_slice(scene, z, "occupied"), "distance")
     low, high = scene.box[:, :2]
     column, row = ([x, high[1]] - np.array([low[0], y])) / (high - low) * pixels.shape[1::-1]
     assert pixels[int(row), int(column)].tolist() == [200, 30, 30, 230]
@@ -187,46 +197,35 @@ def test_robot_and_chosen_camera_follow_the_image(viewer: "Viewer"):
         viewer.choose_image()
         assert [tuple(f.color) == CHOSEN for f in viewer.frusta] == [k == row for k in range(12)]
         stands = viewer.robot._urdf.get_transform("revolute_x", "floor")
-        np.testing.assert_allclose(stands, viewer.run.base_from_gripper[row], atol=3e-3)
+        np.testing.assert_allclose(stands, viewer.capture.base_from_gripper[row], atol=1e-9)
         assert f"images/{row:02d}.jpg" in viewer._about_image.content
 
 
-def test_joint_values_are_read_and_doubted(gantry: Path, tmp_path: Path):
-    robot = read_urdf(gantry)
-    values = np.random.default_rng(0).uniform(-1, 1, (5, 6))
-    names = ",".join(robot.actuated_joint_names)
-    np.savetxt(tmp_path / "joints.csv", values, delimiter=",", header=names, comments="", fmt="%.12f")
-    np.testing.assert_allclose(read_joints(tmp_path / "joints.csv", robot, 5), values, atol=1e-9)
-    with pytest.raises(InputError, match=r"\(4, 6\).*a row an image"):
-        read_joints(tmp_path / "joints.csv", robot, 4)
-    with pytest.raises(InputError, match="no such link"):
-        solve_joints(robot, "hand", np.eye(4)[None])
-    away = np.eye(4)
-    away[0, 3] = 2.5
-    with pytest.raises(InputError, match="gripper pose 0 .* 500 mm off"):
-        solve_joints(robot, "revolute_x", away[None])
+def test_a_robot_without_joint_values_or_with_too_few_joints_is_refused(
+    capture: Capture, gantry: Path, tmp_path: Path
+):
+    robot, configurations = read_robot(gantry, replace(capture, joints=np.ones((12, 4))))
+    assert configurations.shape == (12, len(robot.actuated_joint_names)) and configurations[:, 4:].max() == 0
+    with pytest.raises(InputError, match="no joint values"):
+        read_robot(gantry, replace(capture, joints=None))
+    with pytest.raises(InputError, match="moves 6 joints, but the capture has 7"):
+        read_robot(gantry, replace(capture, joints=np.zeros((12, 7))))
+    with pytest.raises(InputError, match="no such URDF"):
+        read_robot(tmp_path / "none.urdf", capture)
 
 
-def test_without_map_or_capture_cameras_and_points_remain(done: Path, tmp_path: Path, viewer: "Viewer"):
-    from jcr.viewer.run import read_run
+def test_without_a_map_cameras_and_features_remain(done: Path, tmp_path: Path):
     from jcr.viewer.server import open_server
     from jcr.viewer.viewer import REJECTED, Viewer
 
-    for name in ("calibration.json", "reconstruction.npz", "depth.npz"):
+    for name in ("calibration.json", "reconstruction.npz", "run.json"):
         shutil.copy(done / name, tmp_path / name)
-    run = read_run(tmp_path)
-    assert run.scene is None and len(run.notes) == 2 and "jcr map" in run.notes[1]
-    near = np.linalg.norm(
-        np.median(run.cloud.points_in_base, 0) - np.median(viewer.run.cloud.points_in_base, 0)
-    )
-    assert near < 0.05
-    moved = run.base_from_gripper[:, :3, 3] - viewer.run.base_from_gripper[:, :3, 3]
-    assert np.abs(moved).max() < 2e-3
     server = open_server(0, "bare")
     try:
-        bare = Viewer(server, run)
-        assert len(bare.points) and len(bare.frusta) == 12
-        assert "from images/" in bare.click(run.base_from_camera[0, :3, 3], run.base_from_camera[0, :3, 2])
+        bare = Viewer(server, RunFolder(tmp_path))
+        assert bare.scene is None and "jcr map" in bare._verdict(RunFolder(tmp_path))
+        assert bare.show_tracks.value and len(bare.tracks_in_base) > 100 and len(bare.frusta) == 12
+        assert bare.robot is None and not bare.show_robot.visible
         assert tuple(bare.frusta[3].color) != REJECTED
     finally:
         server.stop()
@@ -237,7 +236,7 @@ def test_a_port_is_taken_or_refused():
 
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(InputError, match=f"port {port} of 127.0.0.1 .*--port"):
+        with pytest.raises(InputError, match=f"port {port} of 127.0.0.1; .*--port"):
             open_server(port, "")
     with pytest.raises(InputError, match="70000"):
         open_server(70000, "")
@@ -281,7 +280,7 @@ def test_in_a_browser(viewer: "Viewer", tmp_path: Path):
             rows, columns = np.nonzero(
                 minimum_filter(drawn, 3)[200:, 320:450]
             )  # of the table, left of the panel
-        assert "occupancy over" in chromium.js("document.body.innerText")
+        assert "coloured by label" in chromium.js("document.body.innerText")
 
         viewer.clicked.content = "not yet"
         middle = len(rows) // 2
@@ -302,7 +301,7 @@ def test_in_a_browser(viewer: "Viewer", tmp_path: Path):
         viewer.move_sphere()
         before = red(image)
         while red(chromium.image("canvas")) < before + 500:
-            assert time.monotonic() < deadline, "the sphere does not rotate red"
+            assert time.monotonic() < deadline, "the sphere does not become red"
         bad = [
             event["params"]
             for event in chromium.events

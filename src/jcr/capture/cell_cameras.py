@@ -1,7 +1,7 @@
 """Further cameras of a capture: "cameras" of a capture.json, by name.
 
-A camera bolted to the gripper or watching it has one image for each frame, or null; a fixed one that sees the scene
-has any number; one on another arm has frames of its own. The entry without images names the camera of the capture's
+A camera bolted to the gripper has one image for each frame, or null; a fixed one that sees the scene has any number;
+one on another arm has frames of its own. The entry without images names the camera of the capture's
 own frames and what it is bolted to.
 """
 
@@ -70,8 +70,10 @@ def _check(name: str, camera: dict[str, Any], where: str) -> None:
         raise InputError(f"{where}: mount is {shown(camera.get('mount'))}; write {' or '.join(MOUNTS)}")
     if camera.get("watches", "scene") not in ("scene", "gripper"):
         raise InputError(f"{where}: watches {shown(camera['watches'])}; write scene or gripper")
-    if camera["mount"] == "gripper" and camera.get("watches") == "gripper":
-        raise InputError(f"{where}: it is on the gripper, and what that carries stands still before it")
+    if "images" in camera and camera.get("watches") == "gripper":
+        raise InputError(
+            f"{where}: watches the gripper; give its images a capture of their own, whose camera has mount base"
+        )
     if (camera.get("arm") is None) is not ("frames" not in camera) or (
         camera.get("arm") and camera["mount"] == "base"
     ):
@@ -91,7 +93,7 @@ def _camera(name: str, camera: dict[str, Any], capture: Capture, where: str) -> 
         ):
             raise InputError(f"{where}: images must be a list of paths")
         images = [image for image in listed if image is not None]
-        if camera["mount"] == "gripper" or camera.get("watches") == "gripper":
+        if camera["mount"] == "gripper":
             if len(listed) != len(capture):
                 raise InputError(
                     f"{where}: {len(listed)} images for {len(capture)} frames; give one for each, or null"
@@ -150,8 +152,6 @@ def cameras_as_json(capture: Capture) -> dict[str, Any]:
     out: dict[str, Any] = {capture.camera_name: {"mount": capture.mount}}
     for camera in capture.others:
         entry: dict[str, Any] = {"mount": camera.mount}
-        if camera.watches_gripper:
-            entry["watches"] = "gripper"
         if camera.base_from_gripper is not None:
             entry["arm"] = camera.arm
             entry["frames"] = [

@@ -15,16 +15,10 @@ from jcr.calibration.adjust import adjust_case, estimate_of
 from jcr.calibration.case import MIN_OBSERVATIONS, Case
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
-from jcr.calibration.stage import calibrate
-from jcr.cell.alone import found_alone, not_registered, of_camera
 from jcr.cell.background import write_moving_parts
-from jcr.cell.found import CameraFound
-from jcr.errors import RejectedError
 from jcr.estimation.hand_eye import judged, solve_hand_eye
 from jcr.geometry import inverse
-from jcr.progress import Progress
-from jcr.reconstruct.backends import ReconstructOptions, reconstruct
-from jcr.records import Capture, CellCamera, Finding, HandEye, Kind, Reconstruction
+from jcr.records import Capture, Finding, HandEye, Kind, Reconstruction
 
 
 def exchanged(capture: Capture) -> Capture:
@@ -43,29 +37,13 @@ def exchanged(capture: Capture) -> Capture:
     )
 
 
-def calibrated_alone(
-    capture: Capture,
-    camera: CellCamera,
-    moving: Path,
-    reconstruct_options: ReconstructOptions,
-    options: CalibrateOptions,
-    progress: Progress,
-) -> CameraFound:
-    """A further camera that watches the gripper of a capture; `moving` is a folder for images of what moves."""
-    own = of_camera(capture, camera)
-    write_moving_parts(own.folder, own.images, moving)
-    seen = replace(exchanged(own), folder=moving)
-    try:
-        reconstruction = reconstruct(seen, replace(reconstruct_options, backend="auto"), progress)
-        found = refined(own, reconstruction, calibrate(seen, reconstruction, options), options)
-    except RejectedError as error:
-        return not_registered(camera, error)
-    middle = found.base_from_recon[:3, 3] + found.base_from_recon[:3, :3] @ (
-        found.scale * np.median(reconstruction.tracks.points_in_recon, axis=0)
-    )
-    in_base = own.base_from_gripper[:, :3, :3] @ middle + own.base_from_gripper[:, :3, 3]
-    away = float(np.median((in_base - found.gripper_from_camera[:3, 3]) @ found.gripper_from_camera[:3, 2]))
-    return found_alone(own, camera, reconstruction, found, away)
+def carried_scene(capture: Capture, moving: Path) -> Capture:
+    """Return the capture of a fixed camera as that of a camera that moves about the carried object.
+
+    Images without the static background are written to the folder `moving`.
+    """
+    write_moving_parts(capture.folder, capture.images, moving)
+    return replace(exchanged(capture), folder=moving)
 
 
 def refined(

@@ -2,15 +2,11 @@
 
 Features that it shares with two or more images of known pose become points; the image's place follows from those that
 agree (P3P in RANSAC, with a focal length where none is given). Points and all their observations are kept, for the
-bundle adjustment of all images. With given intrinsics a place that rests on few points by SIFT is refined with learned
-features, where these are installed. They alone place nothing: to a network another board of the same kind is the same
-board, and so is a board rotated by 180° (`jcr docs cameras`).
+bundle adjustment of all images.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pycolmap
@@ -18,28 +14,20 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import project, unproject
-from jcr.extras import xfeat_is_installed
 from jcr.features.sift import matches
 from jcr.features.verify import HALF_PIXEL
-from jcr.geometry import apply, inverse, step_between, transform
+from jcr.geometry import apply, inverse, transform
 from jcr.records import Intrinsics
 from jcr.sfm.mapping import camera_of
 from jcr.sfm.relocate import GATE_PX, MIN_POINTS, Features, features, triangulated
-
-if TYPE_CHECKING:
-    from jcr.features.learned import LearnedFeatures
 
 FOCAL_OF_WIDTH = 0.9
 """Of a camera without known intrinsics: where the search for its focal length starts."""
 LEAST_SPREAD = 0.05
 """Of the image's area that the points must span; crowded ones determine the place badly."""
 TRIALS = 20_000
-FEW = 120
-"""Points by SIFT below which networks look for more."""
 CLEARLY_MORE = 1.1
 """Times the points that agree with given intrinsics: more are no chance of RANSAC."""
-SAME_VIEW = np.radians(5.0)
-"""Largest rotation between the place with these and the place without."""
 
 
 @dataclass(frozen=True)
@@ -49,42 +37,6 @@ class Known:
     intrinsics: Intrinsics
     recon_from_camera: Float[ndarray, "m 4 4"]
     found: tuple[Features, ...]
-    learned: "Learned | None" = None
-
-
-class Learned:
-    """Matches by a network between the images of known pose, rotated alike, and an image."""
-
-    def __init__(
-        self, images: Sequence[UInt8[ndarray, "h w 3"]], recon_from_camera: Float[ndarray, "m 4 4"]
-    ) -> None:
-        self._images = images
-        # The networks take little rotation: one direction of the scene points to the right in all of them.
-        self._right = recon_from_camera[0, :3, 0]
-        self._rolls = [self._roll(pose) for pose in recon_from_camera]
-        self._features: LearnedFeatures | None = None
-
-    def _roll(self, recon_from_camera: Float[ndarray, "4 4"]) -> float:
-        x, y, _ = recon_from_camera[:3, :3].T @ self._right
-        return -math.atan2(y, x)
-
-    def matched(
-        self, image: UInt8[ndarray, "h w 3"], near: Float[ndarray, "4 4"]
-    ) -> tuple[Float[ndarray, "k 2"], list[tuple[Int[ndarray, " c"], Float[ndarray, "c 2"]]]]:
-        """Keypoints of an image (px), and for each image of known pose which of them it shows, and where.
-
-        `near` is about its recon_from_camera.
-        """
-        from jcr.features.learned import LearnedFeatures
-
-        if self._features is None:  # the networks are loaded where they are needed
-            self._features = LearnedFeatures(self._images)
-        features, last = self._features, self._features.add(image)
-
-        roll = self._roll(near)
-        rows = [features.match(k, last, self._rolls[k], roll) for k in range(len(self._images))]
-        pairs = [(theirs[:, 1], features.x_px[k][theirs[:, 0]]) for k, theirs in enumerate(rows)]
-        return features.x_px[last], pairs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,9 +60,8 @@ def known_images(
     recon_from_camera: Float[ndarray, "m 4 4"],
 ) -> Known:
     """Images of one camera, whose poses are known, made ready."""
-    learned = Learned(images, recon_from_camera) if xfeat_is_installed() else None
     found = tuple(features(image, intrinsics) for image in images)
-    return Known(intrinsics, recon_from_camera, found, learned)
+    return Known(intrinsics, recon_from_camera, found)
 
 
 def guessed_intrinsics(size: tuple[int, int]) -> Intrinsics:
@@ -132,17 +83,7 @@ def localised(
         np.repeat(np.arange(len(of_image)), [len(mine) for mine, _ in of_image]),
         np.concatenate([known.found[k].x_px[theirs] for k, (_, theirs) in enumerate(of_image)]),
     )
-    best = _located(known, seen, intrinsics, is_given)
-    # One image's focal length and place bend to each other, and to the networks' errors, which are larger than SIFT's
-    # and alike side by side: with them places came out up to 6.4 of their sigmas off, without at most 2.3.
-    if isinstance(best, int) or len(best.x_px) >= FEW or known.learned is None or not is_given:
-        return best
-    seen = seen.and_those(*known.learned.matched(image, best.recon_from_camera))
-    more = _located(known, seen, intrinsics, is_given)
-    if isinstance(more, int) or len(more.x_px) <= len(best.x_px):
-        return best
-    rotated = np.linalg.norm(step_between(best.recon_from_camera, more.recon_from_camera)[3:])
-    return more if rotated < SAME_VIEW else best
+    return _located(known, seen, intrinsics, is_given)
 
 
 @dataclass(frozen=True)
@@ -153,17 +94,6 @@ class _Matched:
     feature: Int[ndarray, " c"]
     row: Int[ndarray, " c"]
     row_x_px: Float[ndarray, "c 2"]
-
-    def and_those(
-        self, x_px: Float[ndarray, "k 2"], pairs: Sequence[tuple[Int[ndarray, " _"], Float[ndarray, "_ 2"]]]
-    ) -> "_Matched":
-        """With the keypoints and matches of another kind of features."""
-        return _Matched(
-            np.concatenate([self.x_px, x_px]),
-            np.concatenate([self.feature, *(len(self.x_px) + mine for mine, _ in pairs)]),
-            np.concatenate([self.row, *(np.full(len(mine), k) for k, (mine, _) in enumerate(pairs))]),
-            np.concatenate([self.row_x_px, *(theirs for _, theirs in pairs)]),
-        )
 
 
 def _located(known: Known, seen: _Matched, intrinsics: Intrinsics, is_given: bool) -> Shared | int:

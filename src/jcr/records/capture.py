@@ -68,17 +68,11 @@ class CellCamera:
     folder: Path | None = None
     """None: the capture's."""
     frame: Int[ndarray, " k"] | None = None
-    """Rows of the capture at whose gripper poses the images were taken: of a camera on the same gripper, or of a fixed
-    one that watches what this gripper carries. None of others."""
+    """Rows of the capture at whose gripper poses the images of a camera on the same gripper were taken; else None."""
     arm: str | None = None
     """The other arm that carries it; None: the capture's own, or none."""
     base_from_gripper: Float[ndarray, "k 4 4"] | None = None
     """Gripper poses of the other arm in its own base, one for each image."""
-
-    @property
-    def watches_gripper(self) -> bool:
-        """Whether it is fixed and sees what the gripper carries instead of the scene."""
-        return self.mount == "base" and self.frame is not None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -74,7 +74,6 @@ class Kind(StrEnum):
     PLACE_UNCERTAIN = "camera's place too uncertain"
     AT_ANOTHER_CAMERA = "camera stands where another was"
     POINTS_CROWDED = "points crowded"
-    ANOTHER_SCENE = "camera sees another scene"
     STATIC_IMAGES = "images show no motion"
     BLURRED = "images blurred"
     FEW_USED = "few images used"

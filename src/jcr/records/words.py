@@ -497,14 +497,6 @@ def _to_place(finding: Finding) -> str:
     return "let it see more of the mapped scene, or add images to the wrist camera's capture"
 
 
-def _another_scene(finding: Finding) -> str:
-    alone = ": calibrated by its own {value:.0f} images, and what it sees is not in the map"
-    return _said(
-        f"it shares nothing with the {{camera}} camera's images{'' if finding.value is None else alone}",
-        finding,
-    )
-
-
 _TEXT: dict[Kind, Words] = {
     Kind.UNOBSERVABLE: _unobservable_text,
     Kind.FEW_IMAGES: "with {value:.0f} images a wrong one cannot be identified",
@@ -621,7 +613,6 @@ _TEXT: dict[Kind, Words] = {
         "it stands where the {camera} camera was at {images[0]}: if its image is one of that camera, it is not fixed"
     ),
     Kind.POINTS_CROWDED: "its points lie in {percent:.0f} % of the image",
-    Kind.ANOTHER_SCENE: _another_scene,
     Kind.STATIC_IMAGES: (
         "all images show the same view but for noise, while the gripper moves by {mm:.0f} mm and rotates by {deg:.0f}°"
     ),

@@ -13,7 +13,6 @@ from jcr.records import Capture
 from jcr.report.cell_cameras import cameras_section
 from jcr.report.details import Options, details_section
 from jcr.report.images import images_alone_section, images_section
-from jcr.report.map_samples import sample_surface
 from jcr.report.motion import motion_section
 from jcr.report.objects import objects_section
 from jcr.report.render import Section, render
@@ -23,6 +22,7 @@ from jcr.report.seen import seen_section
 from jcr.report.transform import transform_section
 from jcr.report.verdict import failure_section, head
 from jcr.results import PosesResult, RunResult
+from jcr.scene.samples import sample_surface
 
 SURFACE_POINTS = 80_000
 """Sampled from the map, at most."""

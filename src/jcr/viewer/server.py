@@ -1,7 +1,6 @@
-"""The web server of the viewer: viser on this machine and one port alone, its sharing through others' machines off."""
+"""Web server of the viewer: viser on one port of this machine, without its sharing through other machines."""
 
 import io
-import socket
 from contextlib import redirect_stdout
 
 import viser
@@ -9,34 +8,32 @@ import viser
 from jcr.errors import InputError
 
 HOST = "127.0.0.1"
-"""viser has no password and no encryption, so that no other machine may reach it."""
+"""Other machines must not reach viser, which has no password and no encryption."""
 
 
 class LocalServer(viser.ViserServer):
-    """A viser server that never opens a tunnel: what a page asks for must not send a workplace to the internet."""
+    """viser server that never opens a tunnel to the internet."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """No address: sharing is off."""
+        """Return no address: sharing is disabled."""
         return None
 
     def stop(self) -> None:
-        """Stop without a word; standard output is the command's."""
+        """Stop without printing: standard output belongs to the command."""
         with redirect_stdout(io.StringIO()):
             super().stop()
 
 
 def open_server(port: int, title: str) -> LocalServer:
-    """A running server at a port of 127.0.0.1 (0: any free one); InputError where it cannot listen there."""
+    """Return a running server at a port of 127.0.0.1 (0: any free one); raise InputError where the port is taken."""
     if not 0 <= port <= 65535:
         raise InputError(f"--port {port}: no such port; take one from 1024 to 65535, or 0 for any free one")
-    # viser would silently take the next port.
-    try:
-        with socket.create_server((HOST, port)):
-            pass
-    except OSError as error:
-        remedy = "choose another with --port (0 takes any free one)"
-        raise InputError(f"cannot listen on port {port} of {HOST} ({error.strerror}); {remedy}") from None
     with redirect_stdout(io.StringIO()):
         server = LocalServer(host=HOST, port=port, label=title, verbose=False)
+    if port not in (0, server.get_port()):  # viser takes the next free port silently
+        server.stop()
+        raise InputError(
+            f"cannot listen on port {port} of {HOST}; choose another with --port (0 takes any free one)"
+        )
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     return server

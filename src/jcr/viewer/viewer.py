@@ -1,87 +1,103 @@
-"""The viewer: a run in 3D in the browser, with switches, a sphere to drag and values to click for."""
+"""3D view of a run in the browser: points, cameras, robot, slices of the map, a sphere to test."""
 
 import threading
-from typing import Any, get_args
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, get_args
 
+import cv2
 import numpy as np
 import viser
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Integer, UInt8
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
+from skimage.measure import marching_cubes
 from viser.extras import ViserUrdf
 
-from jcr.geometry import apply
+from jcr.camera import pinhole_inside, undistortion
+from jcr.capture.images import read_image
+from jcr.geometry import apply, apply_similarity, scale_translation
 from jcr.progress import Progress, silent
 from jcr.records import verdict_of
 from jcr.records.words import reached_in_words, sentence
 from jcr.report.raster import TRACK_COLOR, label_colors
 from jcr.report.render import render
-from jcr.scene.scene_map import Unknown
-from jcr.viewer.layers import (
-    LEAST,
-    PACKAGE,
-    SLICE_LEGENDS,
-    MapPoints,
-    SliceOf,
-    colour_bar,
-    level_slice,
-    map_points,
-    unknown_edge,
-)
-from jcr.viewer.run import ViewedRun
+from jcr.run_folder import RunFolder
+from jcr.scene.samples import Slice, level_slice, sample_surface
+from jcr.scene.scene_map import SceneMap, Unknown
+from jcr.viewer.robot import read_robot
 
 CAMERA, CHOSEN, REJECTED = (200, 110, 30), (37, 99, 235), (200, 50, 43)
-FREE, COLLIDES = (40, 160, 90), (220, 40, 40)
+FREE, COLLIDES, OCCUPIED = (40, 160, 90), (220, 40, 40), (37, 99, 235)
+GREY = (110, 110, 110)
 CLOUD, MAP = "points as measured", "map"
-REACH = 0.05
-"""Metres from a drawn camera to its image plane."""
-BEFORE = 0.1
-"""Metres from a camera to the photograph that is laid over the map."""
-CLICK = 0.006
-"""Radians about a click's ray within which a point is meant."""
+MAP_POINTS = 150_000
+UNKNOWN_CELLS = 300_000
+"""Cells queried to find the border of unknown space."""
+IMAGE_PX = 512
+"""Longer side of the photographs."""
+FRUSTUM_M, PHOTO_M = 0.05, 0.1
+"""Distances from a camera to its drawn image plane, and to the photograph laid over the map (m)."""
+CLICK_RAD = 0.006
+"""Angle about a click's ray within which points are found."""
+FAR_M = 0.2
+"""Distance at which the colours of a slice end."""
 Value = Float[ndarray, "3"]
+SliceOf = Literal["distance", "occupancy", "unknown"]
 
 
 class Viewer:
-    """A run shown by a viser server; its methods answer what the reader does, and may be called directly."""
+    """Scene and controls of a viser server that shows a run."""
 
     def __init__(
         self,
         server: viser.ViserServer,
-        run: ViewedRun,
-        robot: Any = None,
-        joint_values: Float[ndarray, "n dof"] | None = None,
+        folder: RunFolder,
+        urdf: Path | None = None,
         progress: Progress | None = None,
     ) -> None:
-        """Fill the server; `robot` is a yourdfpy.URDF and `joint_values` a row for each of the run's grippers."""
+        """Fill the server; `urdf` replaces the one of the capture."""
         report = progress or silent
-        self.server, self.run, self.scene, self._lock = server, run, run.scene, threading.Lock()
-        self.joint_values = joint_values
+        self.server, self._lock = server, threading.Lock()
+        self.calibration, self.reconstruction = folder.calibrated()
+        self.capture, self.cloud, self.scene = folder.capture(), None, None
+        if folder.has_map():
+            self.cloud, self.scene = folder.cloud(), folder.scene()
+        assert self.calibration.scale is not None  # wherever there is a transform
+        base_from_recon, scale = np.array(self.calibration.base_from_recon), self.calibration.scale
+        self.image_index = self.reconstruction.image_index
+        self.base_from_camera = base_from_recon @ scale_translation(
+            self.reconstruction.recon_from_camera, scale
+        )
+        tracked = self.reconstruction.tracks.points_in_recon
+        self.tracks_in_base = apply_similarity(base_from_recon, scale, tracked)
         server.scene.set_up_direction("+z")
-        server.gui.add_markdown(self._verdict())
+        server.gui.add_markdown(self._verdict(folder))
         report("view", 0.1)
         self._add_capture()
         self.robot = None
-        if robot is not None and joint_values is not None:
+        if (urdf := urdf or (self.capture.urdf if self.capture.joints is not None else None)) is not None:
+            robot, self._configurations = read_robot(urdf, self.capture)
             server.scene.add_frame("/robot", show_axes=False)
             self.robot = ViserUrdf(server, robot, root_node_name="/robot")
+        self.show_robot.visible = self.robot is not None
         report("view", 0.3)
         self._add_points()
-        if run.scene is not None:
-            self._points = map_points(run.scene)
-            self._palette = label_colors(len(run.scene.label_names))
+        if self.scene is not None:
+            self._surface = sample_surface(self.scene, MAP_POINTS)
+            self._palette = label_colors(len(self.scene.label_names))
             report("view", 0.6)
-            self._add_map()
-            report("view", 0.8)
-            self._add_sphere()
-            self.move_sphere()
+            self._add_map(self.scene)
+            self._add_sphere(self.scene)
+        self.show_points()
         self._add_click()
         self.choose_image()
         self._place_eye()
         report("view", 1.0)
 
-    def _verdict(self) -> str:
-        calibration, held_out = self.run.calibration, self.run.calibration.held_out
+    def _verdict(self, folder: RunFolder) -> str:
+        """Return the verdict with its reason, the leave-one-out error, and the remedy for a missing map."""
+        calibration, held_out = self.calibration, self.calibration.held_out
         verdict, lines = verdict_of(calibration.findings).capitalize(), []
         if not calibration.converged:
             lines.append(f"**{verdict}:** {calibration.doubt}")
@@ -92,12 +108,15 @@ class Viewer:
         if calibration.converged and held_out is not None:
             lines.append(
                 f"Leave-one-out error {held_out.translation_mm:.2f} mm, {held_out.rotation_deg:.3f}°; "
-                f"{len(self.run.image)} cameras."
+                f"{len(self.image_index)} cameras."
             )
-        return "\n\n".join([*lines, *self.run.notes])
+        if self.scene is None:
+            lines.append(f"No map yet: make one with `jcr map {folder.path}`.")
+        return "\n\n".join(lines)
 
     def _add_capture(self) -> None:
-        server, run, intrinsics = self.server, self.run, self.run.intrinsics
+        """Add base, cameras with their images, grippers, and the controls of the chosen image."""
+        server, gui, intrinsics = self.server, self.server.gui, self.reconstruction.intrinsics
         server.scene.add_frame("/base", axes_length=0.1, axes_radius=0.003)
         server.scene.add_label("/base/name", "base")
         self._grid = server.scene.add_grid(
@@ -108,114 +127,113 @@ class Viewer:
             fade_distance=6.0,
             fade_from="origin",
         )
-        self.frusta, self.grippers = [], []
-        fov, aspect = (
-            2 * float(np.arctan2(intrinsics.height / 2, intrinsics.fy)),
-            intrinsics.width / intrinsics.height,
+        self.intrinsics = pinhole = pinhole_inside(intrinsics, IMAGE_PX)
+        undistort, names = (
+            undistortion(intrinsics, pinhole),
+            [self.capture.images[k] for k in self.image_index],
         )
-        step = max(1, intrinsics.width // 160)
-        for k, pose in enumerate(run.base_from_camera):
+        self.pixels = np.stack([undistort(read_image(self.capture.folder / name)) for name in names])
+        self._fov = 2 * float(np.arctan2(pinhole.height / 2, pinhole.fy))
+        self.frusta, step = [], max(1, pinhole.width // 160)
+        for k, pose in enumerate(self.base_from_camera):
             frustum = server.scene.add_camera_frustum(
                 f"/cameras/{k}",
-                fov,
-                aspect,
-                scale=REACH,
+                self._fov,
+                pinhole.width / pinhole.height,
+                scale=FRUSTUM_M,
                 thickness=2.0,
                 thickness_units="screen",
-                image=run.pixels[k, ::step, ::step],
+                image=self.pixels[k, ::step, ::step],
                 wxyz=_wxyz(pose),
                 position=pose[:3, 3],
             )
             frustum.on_click(lambda event, k=k: self.look_from(k, event.client))
             self.frusta.append(frustum)
-        for k, pose in enumerate(run.base_from_gripper):
-            at = {"wxyz": _wxyz(pose), "position": pose[:3, 3]}
-            self.grippers.append(
-                server.scene.add_frame(f"/grippers/{k}", axes_length=0.03, axes_radius=0.001, **at)
+        self.grippers = [
+            server.scene.add_frame(
+                f"/grippers/{k}",
+                axes_length=0.03,
+                axes_radius=0.001,
+                wxyz=_wxyz(pose),
+                position=pose[:3, 3],
             )
+            for k, pose in enumerate(self.capture.base_from_gripper)
+        ]
         self._photo = server.scene.add_image("/photo", np.zeros((2, 2, 4), np.uint8), 0.1, 0.1, visible=False)
-        with server.gui.add_folder("Capture"):
-            self.image = server.gui.add_slider("image", 0, len(run.calibration.images) - 1, 1, 0)
-            self._about_image = server.gui.add_markdown("")
-            look = server.gui.add_button("look from this camera")
-            self.photo = server.gui.add_slider("photograph", 0, 100, 5, 0, hint="laid over the map, %")
-            self.show_cameras = server.gui.add_checkbox("cameras", True)
-            self.show_grippers = server.gui.add_checkbox("grippers", True)
-            self.show_grid = server.gui.add_checkbox("grid", True, hint="0.1 m, base z = 0")
-            self.show_robot = server.gui.add_checkbox("robot", True, visible=self.joint_values is not None)
-        self.image.on_update(lambda _: self.choose_image())
-        for switch in (self.show_cameras, self.show_grippers, self.show_robot, self.show_grid, self.photo):
-            switch.on_update(lambda _: self.choose_image())
+        with gui.add_folder("Capture"):
+            self.image = gui.add_slider("image", 0, len(self.calibration.images) - 1, 1, 0)
+            self._about_image = gui.add_markdown("")
+            look = gui.add_button("look from this camera")
+            self.photo = gui.add_slider("photograph", 0, 100, 5, 0, hint="laid over the map, %")
+            self.show_cameras = gui.add_checkbox("cameras", True)
+            self.show_grippers = gui.add_checkbox("grippers", True)
+            self.show_grid = gui.add_checkbox("grid", True, hint="0.1 m, base z = 0")
+            self.show_robot = gui.add_checkbox("robot", True)
+        switches = (self.show_cameras, self.show_grippers, self.show_robot, self.show_grid, self.photo)
+        for control in (self.image, *switches):
+            control.on_update(lambda _: self.choose_image())
         look.on_click(lambda event: self.look_from(self._camera_of_image(), event.client))
 
     def _add_points(self) -> None:
-        names = (MAP, CLOUD, "none") if self.scene is not None else (CLOUD, "none")
-        with self.server.gui.add_folder("Points"):
-            self.shown = self.server.gui.add_dropdown("show", names, initial_value=names[0])
-            self.show_tracks = self.server.gui.add_checkbox(
-                "features", self.scene is None, hint="tracked, red"
-            )
-            self.size = self.server.gui.add_slider("size (mm)", 1.0, 15.0, 0.5, 5.0)
-        for control in (self.shown, self.show_tracks, self.size):
-            control.on_update(lambda _: self.show_points())
-        if self.scene is None:
-            self.show_points()
-
-    def _add_map(self) -> None:
-        assert self.scene is not None
-        gui, (low, high) = self.server.gui, self.scene.box
-        colors = ("color", "occupancy", "label")[: 3 if len(self.scene.label_names) > 1 else 2]
-        with gui.add_folder("Map"):
-            self.threshold = gui.add_slider("occupancy over", LEAST, 0.98, 0.02, 0.5)
-            self.colored = gui.add_dropdown("coloured by", colors, initial_value="color")
+        """Add the controls of the drawn points."""
+        names = [MAP] * (self.scene is not None) + [CLOUD] * (self.cloud is not None) + ["none"]
+        gui, several = self.server.gui, self.scene is not None and len(self.scene.label_names) > 1
+        with gui.add_folder("Points"):
+            self.shown = gui.add_dropdown("show", names, initial_value=names[0])
+            self.by_label = gui.add_checkbox("coloured by label", False, visible=several)
             self._legend = gui.add_html("")
-            self.show_unknown = gui.add_checkbox("unknown", False, hint="where sight ended")
+            self.show_tracks = gui.add_checkbox("features", len(names) == 1, hint="tracked, red")
+            self.size = gui.add_slider("size (mm)", 1.0, 15.0, 0.5, 5.0)
+        for control in (self.shown, self.by_label, self.show_tracks, self.size):
+            control.on_update(lambda _: self.show_points())
+
+    def _add_map(self, scene: SceneMap) -> None:
+        """Add the border of unknown space and the level slice, with their controls."""
+        gui, (low, high) = self.server.gui, scene.box
+        with gui.add_folder("Map"):
+            self.show_unknown = gui.add_checkbox("unknown", False, hint="border of the seen space")
             self.unknown = gui.add_dropdown("unknown is", ("occupied", "free"), initial_value="occupied")
             self.slice_of = gui.add_dropdown("slice", ("none", *get_args(SliceOf)), initial_value="none")
-            self._slice_legend = gui.add_html("")
-            bottom, top = float(low[2].round(3)), float(high[2].round(3))
             self.slice_at = gui.add_slider(
-                "slice at z (m)", bottom, top, 0.005, round(self._support() + 0.02, 3)
+                "height (m)", float(low[2]), float(high[2]), 0.005, round(float(low[2] + high[2]) / 2, 3)
             )
-        vertices, faces = unknown_edge(self.scene)
+            self._slice_legend = gui.add_html("")
+        vertices, faces = unknown_border(scene)
         self._unknown = None
         if len(faces):
             self._unknown = self.server.scene.add_mesh_simple(
-                "/unknown", vertices, faces, color=(130, 130, 130), opacity=0.3, side="double", visible=False
+                "/unknown", vertices, faces, color=GREY, opacity=0.25, side="double", visible=False
             )
-        for control in (self.threshold, self.colored):
-            control.on_update(lambda _: self.show_points())
-        # Shown once somebody asks for it.
+        size = (high - low)[:2]
         self._slice = self.server.scene.add_image(
-            "/slice",
-            np.zeros((2, 2, 4), np.uint8),
-            float(high[0] - low[0]),
-            float(high[1] - low[1]),
-            # viser's images have y downwards, as the base seen from above has it upwards.
-            wxyz=(0.0, 1.0, 0.0, 0.0),
-            visible=False,
+            "/slice", np.zeros((2, 2, 4), np.uint8), *size.tolist(), wxyz=(0.0, 1.0, 0.0, 0.0), visible=False
         )
         for control in (self.slice_of, self.slice_at, self.show_unknown, self.unknown):
             control.on_update(lambda _: self.show_slice())
-        self.show_points()
 
-    def _add_sphere(self) -> None:
-        assert self.scene is not None
+    def _add_sphere(self, scene: SceneMap) -> None:
+        """Add the sphere that shows collisions, 0.15 m above the most frequent height of the surface."""
         gui = self.server.gui
         with gui.add_folder("Sphere to drag"):
             self.show_sphere = gui.add_checkbox("sphere", True)
             self.radius = gui.add_slider("radius (mm)", 5.0, 150.0, 5.0, 30.0)
             self.answer = gui.add_markdown("")
-        start = [*np.median(self._solid(), axis=0)[:2], self._support() + 0.15]
+        solid = self._solid()
+        counts, edges = np.histogram(solid[:, 2], bins=100)
+        low, high = scene.box[:, 2]
+        support = float(np.clip(edges[counts.argmax()], low, high - 0.02))
+        start = np.array([*np.median(solid, axis=0)[:2], support + 0.15])
         self.gizmo = self.server.scene.add_transform_controls(
-            "/sphere", scale=0.12, disable_rotations=True, position=np.array(start)
+            "/sphere", scale=0.12, disable_rotations=True, position=start
         )
         self.gizmo.on_update(lambda _: self.move_sphere())
+        self.ball = self.server.scene.add_icosphere("/sphere/ball", 0.03, FREE, opacity=0.75)
         for control in (self.show_sphere, self.radius, self.unknown):
             control.on_update(lambda _: self.move_sphere())
-        self.ball = self.server.scene.add_icosphere("/sphere/ball", 0.03, FREE, opacity=0.75)
+        self.move_sphere()
 
     def _add_click(self) -> None:
+        """Add the answer to a click on a point."""
         with self.server.gui.add_folder("Click a point"):
             self.clicked = self.server.gui.add_markdown("Click a point to see its values.")
         self._mark = self.server.scene.add_icosphere("/clicked", 0.004, (255, 220, 0), visible=False)
@@ -225,77 +243,74 @@ class Viewer:
             self.click(np.array(event.ray_origin), np.array(event.ray_direction))
 
     def choose_image(self) -> None:
-        """Tell about the chosen image, mark its camera and put the robot at its pose."""
+        """Show the numbers of the chosen image, mark its camera and move the robot to its pose."""
         with self._lock:
             row = self.image.value
-            image, camera = self.run.calibration.images[row], self._camera_of_image()
+            image, camera = self.calibration.images[row], self._camera_of_image()
             parts = [f"**{image.image}**", "used" if image.used else f"rejected: {image.reason}"]
             if image.translation_residual_mm is not None and image.rotation_residual_deg is not None:
-                residual = f"{image.translation_residual_mm:.2f} mm, {image.rotation_residual_deg:.3f}°"
-                parts.append(f"residual {residual}")
+                parts.append(
+                    f"residual {image.translation_residual_mm:.2f} mm, {image.rotation_residual_deg:.3f}°"
+                )
             self._about_image.content = " · ".join(parts)
             for k, frustum in enumerate(self.frusta):
-                used = self.run.calibration.images[int(self.run.image[k])].used
+                used = self.calibration.images[int(self.image_index[k])].used
                 frustum.color = CHOSEN if k == camera else CAMERA if used else REJECTED
-                frustum.visible = self.show_cameras.value
+                # Their images would hide the photograph.
+                frustum.visible = self.show_cameras.value and self.photo.value == 0
             for gripper in self.grippers:
                 gripper.visible = self.show_grippers.value
             self._grid.visible = self.show_grid.value
             self._show_photo(camera)
-            if self.robot is not None and self.joint_values is not None:
+            if self.robot is not None:
                 self.robot.show_visual = self.show_robot.value
-                pose = np.flatnonzero(self.run.gripper_image == row)
-                if len(pose):
-                    self.robot.update_cfg(self.joint_values[pose[0]])
+                self.robot.update_cfg(self._configurations[row])
 
     def _show_photo(self, camera: int | None) -> None:
-        """The chosen camera's photograph before it, so that from there it lies over the map."""
-        share = self.photo.value / 100
-        self._photo.visible = camera is not None and share > 0
-        if camera is None or share == 0:
+        """Place the chosen camera's photograph before it, so that it covers the map as seen from there."""
+        self._photo.visible = camera is not None and self.photo.value > 0
+        if camera is None or self.photo.value == 0:
             return
-        intrinsics, pose = self.run.intrinsics, self.run.base_from_camera[camera]
-        for frustum in self.frusta:  # theirs would lie before it
-            frustum.visible = False
-        opaque = np.full((*self.run.pixels.shape[1:3], 1), round(255 * share), np.uint8)
-        self._photo.image = np.concatenate([self.run.pixels[camera], opaque], axis=-1)
-        size, focal = (
-            np.array([intrinsics.width, intrinsics.height]),
-            np.array([intrinsics.fx, intrinsics.fy]),
-        )
-        middle = ((size - 1) / 2 - [intrinsics.cx, intrinsics.cy]) / focal
-        self._photo.render_width, self._photo.render_height = (BEFORE * size / focal).tolist()
+        pinhole, pose = self.intrinsics, self.base_from_camera[camera]
+        opaque = np.full((*self.pixels.shape[1:3], 1), round(2.55 * self.photo.value), np.uint8)
+        self._photo.image = np.concatenate([self.pixels[camera], opaque], axis=-1)
+        size, focal = np.array([pinhole.width, pinhole.height]), np.array([pinhole.fx, pinhole.fy])
+        middle = ((size - 1) / 2 - [pinhole.cx, pinhole.cy]) / focal
+        self._photo.render_width, self._photo.render_height = (PHOTO_M * size / focal).tolist()
         self._photo.wxyz = _wxyz(pose)
-        self._photo.position = apply(pose, BEFORE * np.array([*middle, 1.0]))
+        self._photo.position = apply(pose, PHOTO_M * np.array([*middle, 1.0]))
 
     def look_from(self, camera: int | None, client: viser.ClientHandle | None) -> None:
-        """Bring a reader's eye to a registered camera and choose its image; None does nothing."""
+        """Choose the image of a registered camera and move the client's view to it."""
         if camera is None:
             return
-        self.image.value = int(self.run.image[camera])
+        self.image.value = int(self.image_index[camera])
         if client is None:
             return
-        pose = self.run.base_from_camera[camera]
+        pose = self.base_from_camera[camera]
         with client.atomic():
             client.camera.wxyz, client.camera.position = _wxyz(pose), pose[:3, 3]
-            client.camera.fov = 2 * float(np.arctan2(self.run.intrinsics.height / 2, self.run.intrinsics.fy))
+            client.camera.fov = self._fov
 
     def show_points(self) -> None:
-        """Draw the points that are asked for: the cloud, or those of the map over the threshold."""
+        """Draw the chosen points: the surface of the map, the cloud, or none; and the tracked features."""
         with self._lock:
-            x, color = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-            if self.shown.value == CLOUD:
-                x, color = self.run.cloud.points_in_base, self.run.cloud.color
-            elif self.shown.value == MAP:
-                chosen = self._points.occupancy >= self.threshold.value
-                x, color = self._points.points_in_base[chosen], self._map_colors(self._points)[chosen]
-                self._legend.content = self._labels()
-            self.points = x
+            x, color, legend = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), ""
+            if self.shown.value == CLOUD and self.cloud is not None:
+                x, color = self.cloud.points_in_base, self.cloud.color
+            elif self.shown.value == MAP and self.scene is not None:
+                x, color = self._surface.points_in_base, self._surface.color
+                if self.by_label.value:
+                    color = self._palette[self._surface.label]
+                    labels = list(zip(self.scene.label_names, self._palette.tolist(), strict=True))
+                    legend = render("labels.html", {"labels": labels}, "jcr.viewer")
+            self.points, self._legend.content = x, legend
             self._draw("/points", x, color, self.size.value / 1e3)
-            tracks = self.run.tracks_in_base if self.show_tracks.value else np.zeros((0, 3))
+            tracks = self.tracks_in_base if self.show_tracks.value else np.zeros((0, 3))
             self._draw("/tracks", tracks, np.tile(np.array(TRACK_COLOR, np.uint8), (len(tracks), 1)), 0.004)
 
     def _draw(self, name: str, x: Float[ndarray, "n 3"], color: UInt8[ndarray, "n 3"], size: float) -> None:
+        """Replace a point cloud of the view; none for no points."""
         if len(x) == 0:
             self.server.scene.remove_by_name(name)
             return
@@ -303,25 +318,8 @@ class Viewer:
             name, x, color, point_size=size, point_shape="circle", point_shading="flat", precision="float32"
         )
 
-    def _map_colors(self, points: MapPoints) -> UInt8[ndarray, "n 3"]:
-        if self.colored.value == "label":
-            return self._palette[points.label]
-        if self.colored.value == "occupancy":
-            return _by_occupancy(points.occupancy[:, None])
-        return points.color
-
-    def _labels(self) -> str:
-        if self.scene is None or self.colored.value == "color":
-            return ""
-        if self.colored.value == "occupancy":
-            return colour_bar(
-                [_by_occupancy(np.array([share])).tolist() for share in (0.0, 0.5, 1.0)], "occupancy 0", "1"
-            )
-        labels = zip(self.scene.label_names, self._palette.tolist(), strict=True)
-        return render("labels.html", {"labels": list(labels)}, PACKAGE)
-
     def show_slice(self) -> None:
-        """Draw the slice that is asked for, and the edge of the unknown."""
+        """Draw the chosen slice, and the border of unknown space."""
         assert self.scene is not None  # or there would be no such control
         with self._lock:
             if self._unknown is not None:
@@ -329,13 +327,12 @@ class Viewer:
             of, height = self.slice_of.value, self.slice_at.value
             self._slice.visible = of != "none"
             self._slice_legend.content = SLICE_LEGENDS.get(of, "")
-            if of == "none":
-                return
-            self._slice.image = level_slice(self.scene, height, of, self.unknown.value)
-            self._slice.position = np.array([*self.scene.box[:, :2].mean(0), height])
+            if of != "none":
+                self._slice.image = slice_colors(level_slice(self.scene, height, self.unknown.value), of)
+                self._slice.position = np.array([*self.scene.box[:, :2].mean(0), height])
 
     def move_sphere(self) -> None:
-        """Query the map whether the sphere touches something; it becomes red where it does."""
+        """Test the sphere for collision; it becomes red where it touches something."""
         assert self.scene is not None  # or there would be no sphere
         with self._lock:
             center, radius = np.asarray(self.gizmo.position, float)[None], self.radius.value / 1e3
@@ -344,34 +341,33 @@ class Viewer:
             at = self.scene.query(center, unknown)
             self.ball.radius, self.ball.color = radius, COLLIDES if hit else FREE
             self.ball.visible = self.gizmo.visible = self.show_sphere.value
-            x, y, z = center[0]
-            distance = float(at.distance[0])
-            beyond = (
+            distance, (x, y, z) = float(at.distance[0]), center[0]
+            where = (
                 "outside of the workspace" if np.isnan(distance) else f"surface {1e3 * distance:.0f} mm away"
             )
-            seen = "nobody has looked here" if at.unknown[0] else "seen"
+            seen = "unseen space" if at.unknown[0] else "seen space"
             verdict = "collides" if hit else "free"
-            self.answer.content = f"**{verdict}** at ({x:.3f}, {y:.3f}, {z:.3f}) m: centre {beyond}, {seen}"
+            self.answer.content = f"**{verdict}** at ({x:.3f}, {y:.3f}, {z:.3f}) m: centre {where}, {seen}"
 
     def click(self, origin_in_base: Value, direction: Value) -> str:
-        """Tell what is known of the first drawn point along a ray from the eye; the text that is shown."""
+        """Show and return the values of the first drawn point along a ray."""
         with self._lock:
             x = self.points
             along = (x - origin_in_base) @ direction
             aside = np.linalg.norm(x - origin_in_base - along[:, None] * direction, axis=1)
-            near = np.flatnonzero((along > 0.02) & (aside < np.maximum(CLICK * along, self.size.value / 2e3)))
+            reach = np.maximum(CLICK_RAD * along, self.size.value / 2e3)
+            near = np.flatnonzero((along > 0.02) & (aside < reach))
             self._mark.visible = len(near) > 0
             if len(near) == 0:
                 self.clicked.content = "No point there."
-                return self.clicked.content
-            point = x[near[along[near].argmin()]]
-            self._mark.position = point
-            self.clicked.content = self._values(point)
+            else:
+                point = x[near[along[near].argmin()]]
+                self._mark.position, self.clicked.content = point, self._values(point)
             return self.clicked.content
 
     def _values(self, point: Value) -> str:
+        """Return a table of the map's values at a point, and of the nearest measured point."""
         rows = [("x, y, z (m)", ", ".join(f"{value:.4f}" for value in point))]
-        cloud = self.run.cloud
         if self.scene is not None:
             at = self.scene.query(point[None])
             rows.append(("occupancy", f"{at.occupancy[0]:.2f}" + ", unknown" * bool(at.unknown[0])))
@@ -379,47 +375,84 @@ class Viewer:
             rgb = np.nan_to_num(255 * at.color[0]).round().astype(int)
             rows.append(("colour", f"rgb({', '.join(map(str, rgb))})"))
             rows.append(("label", self.scene.label_names[int(at.label[0])]))
-        if len(cloud.points_in_base):
+        if (cloud := self.cloud) is not None and len(cloud.points_in_base):
             nearest = int(np.linalg.norm(cloud.points_in_base - point, axis=1).argmin())
-            image = self.run.calibration.images[int(self.run.image[cloud.image[nearest]])].image
-            rows.append(
-                ("nearest measured point", f"from {image}, confidence {cloud.confidence[nearest]:.2g}")
-            )
+            image = self.calibration.images[int(self.image_index[cloud.image[nearest]])].image
+            rows.append(("measured point", f"from {image}, confidence {cloud.confidence[nearest]:.2g}"))
             if np.isfinite(cloud.margin[nearest]):
                 rows.append(("its margin (1 σ)", f"{1e3 * cloud.margin[nearest]:.2f} mm"))
         return "| | |\n|---|---|\n" + "\n".join(f"| {name} | {value} |" for name, value in rows)
 
     def _camera_of_image(self) -> int | None:
-        """Row of the chosen image among the registered cameras; None where it is none of them."""
-        rows = np.flatnonzero(self.run.image == self.image.value)
+        """Return the row of the chosen image among the registered cameras; None where it is not registered."""
+        rows = np.flatnonzero(self.image_index == self.image.value)
         return int(rows[0]) if len(rows) else None
 
     def _solid(self) -> Float[ndarray, "n 3"]:
-        """Points of the map's surfaces, or of the cloud; the origin where there are none."""
-        points = self.run.cloud.points_in_base
+        """Return points of the map's surface, of the cloud, or of the tracks."""
+        points = self.tracks_in_base if self.cloud is None else self.cloud.points_in_base
         if self.scene is not None:
-            points = self._points.points_in_base[self._points.occupancy >= 0.5]
+            points = self._surface.points_in_base
         return points if len(points) else np.zeros((1, 3))
 
-    def _support(self) -> float:
-        """Height (m) at which the map has most surface, kept inside the workspace."""
-        assert self.scene is not None
-        counts, edges = np.histogram(self._solid()[:, 2], bins=100)
-        low, high = self.scene.box[:, 2]
-        return float(np.clip(edges[counts.argmax()], low, high - 0.02))
-
     def _place_eye(self) -> None:
-        """Where a reader starts: obliquely above, with points and cameras in the image."""
+        """Set the initial view obliquely from above, with points and cameras in it."""
         target = np.median(self._solid(), axis=0)
-        cameras = self.run.base_from_camera[:, :3, 3]
+        cameras = self.base_from_camera[:, :3, 3]
         reach = max(0.3, float(np.linalg.norm(cameras - target, axis=1).max(initial=0.0)))
         eye = target + 1.6 * reach * np.array([0.62, -0.62, 0.6])
         self.server.initial_camera.position, self.server.initial_camera.look_at = eye, target
 
 
-def _by_occupancy(share: Float[ndarray, "*n 1"]) -> UInt8[ndarray, "*n 3"]:
-    return (share * np.array([37, 99, 235]) + (1 - share) * np.array([215, 220, 230])).astype(np.uint8)
+def unknown_border(scene: SceneMap) -> tuple[Float[ndarray, "v 3"], Integer[ndarray, "f 3"]]:
+    """Return vertices (m) and triangles of the surface around unknown space; none where all or nothing was seen."""
+    low, high = scene.box
+    pitch = float(np.prod(high - low) / UNKNOWN_CELLS) ** (1 / 3)
+    axes = [np.arange(a + pitch / 2, b, pitch) for a, b in zip(low, high, strict=True)]
+    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    unknown = scene.query(x.reshape(-1, 3)).unknown.reshape(x.shape[:3])
+    if unknown.all() or not unknown.any():
+        return np.zeros((0, 3)), np.zeros((0, 3), int)
+    vertices, faces, _, _ = marching_cubes(unknown.astype(np.float32), 0.5)
+    return low + pitch * (vertices + 0.5), faces
+
+
+def plasma(share: Float[ndarray, "*shape"]) -> UInt8[ndarray, "*shape 3"]:
+    """Return RGB colours from violet (0) to yellow (1)."""
+    levels = (255 * share.reshape(-1, 1)).clip(0, 255).astype(np.uint8)
+    return cv2.applyColorMap(levels, cv2.COLORMAP_PLASMA)[..., ::-1].reshape(*share.shape, 3)
+
+
+def slice_colors(cut: Slice, of: SliceOf) -> UInt8[ndarray, "h w 4"]:
+    """Return RGBA of a slice in the colours of SLICE_LEGENDS."""
+    rgba = np.zeros((*cut.occupancy.shape, 4), np.uint8)
+    if of == "distance":
+        known = np.isfinite(cut.distance)
+        rgba[known, :3] = plasma(1 - (cut.distance[known] / FAR_M).clip(0, 1))
+        rgba[known, 3] = 217
+        rgba[known & (cut.distance <= 0)] = (200, 30, 30, 230)
+        return rgba
+    if of == "occupancy":
+        rgba[..., :3], rgba[..., 3] = OCCUPIED, 255 * (0.1 + 0.9 * cut.occupancy.clip(0, 1))
+    rgba[cut.unknown] = (*GREY, 160)
+    return rgba
+
+
+def _legend(colors: Sequence[Sequence[int]], low: str, high: str) -> str:
+    """Return a bar of RGB colours from left to right, with a label at both ends, as HTML."""
+    return render("bar.html", {"colors": colors, "low": low, "high": high}, "jcr.viewer")
+
+
+SLICE_LEGENDS: dict[str, str] = {
+    "distance": _legend(
+        plasma(np.linspace(1, 0, 9)).tolist(), "surface (solid: red)", f"{100 * FAR_M:.0f} cm and more"
+    ),
+    "occupancy": _legend([(255, 255, 255), OCCUPIED], "free", "occupied (unknown: grey)"),
+    "unknown": _legend([GREY] * 2, "grey: unseen space", ""),
+}
+"""Legends of the slices."""
 
 
 def _wxyz(a_from_b: Float[ndarray, "4 4"]) -> Float[ndarray, "4"]:
+    """Return the rotation as a quaternion w, x, y, z."""
     return Rotation.from_matrix(a_from_b[:3, :3]).as_quat()[[3, 0, 1, 2]]
