@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,7 @@ from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_source
 from jcr.cli.query import read_points
+from jcr.depth.dense import pointmaps_of
 from jcr.depth.depth_npz import read_depth, write_depth
 from jcr.geometry import inverse
 from jcr.reconstruct.backends import ReconstructOptions
@@ -162,7 +163,16 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
         backend="colmap",
     )
     write_reconstruction(folder / "reconstruction.npz", reconstruction)
-    write_depth(folder / "depth.npz", reconstruction.dense, "y")
+    dense = pointmaps_of(
+        draw.uniform(0.5, 1.0, (COUNT, height, width)).astype(np.float32),
+        np.full((COUNT, height, width), 0.01, np.float16),
+        np.ones((COUNT, height, width), np.float16),
+        np.ones((COUNT, height, width), np.uint8),
+        np.zeros((COUNT, height, width, 3), np.uint8),
+        cameras,
+        capture.intrinsics,
+    )
+    write_depth(folder / "depth.npz", replace(reconstruction, pointmaps=dense), "y")
     ones = np.ones(200)
     cloud = PointCloud(
         points_in_base=draw.random((200, 3)),
@@ -186,7 +196,7 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
     readers: dict[str, Callable[[Path], object]] = {
         "calibration.json": read_calibration,
         "reconstruction.npz": read_reconstruction,
-        "depth.npz": lambda path: read_depth(path, COUNT),
+        "depth.npz": lambda path: read_depth(path, reconstruction, None),
         "cloud.ply": read_cloud,
         "map.safetensors": load_map,
         "reference.json": read_hand_eye,

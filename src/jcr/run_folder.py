@@ -31,7 +31,7 @@ from jcr.cell.cameras_json import FILE as CAMERAS
 from jcr.cell.cameras_json import CamerasFile, read_cameras, write_cameras
 from jcr.depth.depth_npz import FILE as DEPTH
 from jcr.depth.depth_npz import FORMAT as DEPTH_FORMAT
-from jcr.depth.depth_npz import read_depth, write_depth
+from jcr.depth.depth_npz import is_made_from, read_depth, write_depth
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError
 from jcr.files import read_bytes, remove_unfinished, write_text
@@ -141,9 +141,18 @@ class RunFolder:
         InputError where there is no reconstruction, or a file was damaged.
         """
         found = read_reconstruction(self.path / RECONSTRUCTION)
-        if found.pointmaps is None and (self.path / DEPTH).is_file():
-            found = replace(found, pointmaps=read_depth(self.path / DEPTH, len(found.image_index), depth))
+        file = self.path / DEPTH
+        there = file.is_file() if depth is None else is_made_from(file, depth)
+        if found.pointmaps is None and there:
+            found = replace(found, pointmaps=read_depth(file, found, self._capture_if_there()))
         return found
+
+    def _capture_if_there(self) -> Capture | None:
+        """Return the capture that the run was made from; None where it is no longer there."""
+        try:
+            return self.capture()
+        except InputError:
+            return None
 
     def calibrated(self) -> tuple[CalibrationFile, Reconstruction]:
         """A calibration and the reconstruction behind it.
@@ -224,15 +233,14 @@ class RunFolder:
 
     def has_depth(self, reconstruction: Reconstruction, state: State) -> bool:
         """Whether depth.npz was made from this reconstruction with these options."""
-        file = self.path / DEPTH
-        return file.is_file() and read_depth(file, len(reconstruction.image_index), state.depth) is not None
+        return is_made_from(self.path / DEPTH, state.depth)
 
     def keep_depth(self, reconstruction: Reconstruction, state: State) -> None:
         """Write depth.npz, where the reconstruction has estimated pointmaps and they are not there already."""
         pointmaps = reconstruction.pointmaps
         if pointmaps is None or pointmaps.is_predicted or self.has_depth(reconstruction, state):
             return
-        write_depth(self.path / DEPTH, pointmaps, state.depth)
+        write_depth(self.path / DEPTH, reconstruction, state.depth)
 
     def keep_state(self, state: State) -> None:
         """Write run.json."""

@@ -60,22 +60,36 @@ def dense_pointmaps(
         threads=threads,
         report=progress(0.7, 0.3),
     )
-    depth = 1 / found.inverse_depth.astype(np.float64)
-    return Pointmaps(
-        intrinsics=pinhole,
-        points_in_recon=_points(depth, recon_from_camera, pinhole),
-        confidence=found.confidence.astype(np.float64),
-        colors=colors,
-        reason=found.reason,
-        depth_std=(found.std * depth).astype(np.float32),
+    # In the precision of depth.npz, so that a run that reads the file gives the same map.
+    return pointmaps_of(
+        (1 / found.inverse_depth.astype(np.float64)).astype(np.float32),
+        found.std.astype(np.float16),
+        found.confidence.astype(np.float16),
+        found.reason,
+        colors,
+        recon_from_camera,
+        pinhole,
     )
 
 
-def _points(
-    depth: Float[ndarray, "m h w"], recon_from_camera: Float[ndarray, "m 4 4"], pinhole: Intrinsics
-) -> Float[ndarray, "m h w 3"]:
-    """The points of every pixel in the recon frame."""
+def pointmaps_of(
+    depth: Float[ndarray, "m h w"],
+    relative_std: Float[ndarray, "m h w"],
+    confidence: Float[ndarray, "m h w"],
+    reason: UInt8[ndarray, "m h w"],
+    colors: UInt8[ndarray, "m h w 3"],
+    recon_from_camera: Float[ndarray, "m 4 4"],
+    pinhole: Intrinsics,
+) -> Pointmaps:
+    """Return the pointmaps of depths (z, recon units) with their relative standard deviation, on known cameras."""
     points, direction = np.empty((*depth.shape, 3)), rays(pinhole)
     for k, pose in enumerate(recon_from_camera):
-        points[k] = (depth[k, ..., None] * direction) @ pose[:3, :3].T + pose[:3, 3]
-    return points
+        points[k] = (depth[k, ..., None].astype(np.float64) * direction) @ pose[:3, :3].T + pose[:3, 3]
+    return Pointmaps(
+        intrinsics=pinhole,
+        points_in_recon=points,
+        confidence=confidence.astype(np.float64),
+        colors=colors,
+        reason=reason,
+        depth_std=relative_std.astype(np.float32) * depth,
+    )

@@ -1,21 +1,33 @@
-"""depth.npz: the pointmaps that densify estimated on the cameras of reconstruction.npz."""
+"""depth.npz: the depth that densify estimated for the pixels of each image, on the cameras of reconstruction.npz.
+
+Points follow from the depth and the camera, colours from the images of the capture: 8.25 bytes a pixel.
+"""
 
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import UInt8
+from numpy import ndarray
 from pydantic import BaseModel, ConfigDict
 
+from jcr.camera import undistortion
+from jcr.capture.images import read_image
+from jcr.depth.dense import pointmaps_of
+from jcr.geometry import apply, inverse
 from jcr.intrinsics_json import IntrinsicsJson
-from jcr.reconstruct.reconstruction_npz import arrays_of, pointmaps_in, read_npz, write_npz
-from jcr.records import Pointmaps
+from jcr.reconstruct.reconstruction_npz import check_arrays, read_npz, write_npz
+from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction
 
 FILE = "depth.npz"
-FORMAT = "jcr.depth/1"
+FORMAT = "jcr.depth/2"
 """Changes with what the file holds."""
+GREY = 128
+"""Colour where the images are no longer there."""
 
 
 class About(BaseModel):
-    """What is no array."""
+    """JSON part of depth.npz."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
     format: str
@@ -24,19 +36,61 @@ class About(BaseModel):
     intrinsics: IntrinsicsJson
 
 
-def write_depth(path: Path, pointmaps: Pointmaps, made_from: str) -> None:
-    """Write estimated pointmaps whole or not at all."""
-    about = {"format": FORMAT, "made_from": made_from, "intrinsics": asdict(pointmaps.intrinsics)}
-    write_npz(path, about, arrays_of(pointmaps))
+def write_depth(path: Path, reconstruction: Reconstruction, made_from: str) -> None:
+    """Write the estimated pointmaps of a reconstruction whole or not at all."""
+    dense = reconstruction.dense
+    assert dense.reason is not None and dense.depth_std is not None
+    about = {"format": FORMAT, "made_from": made_from, "intrinsics": asdict(dense.intrinsics)}
+    camera_from_recon = inverse(reconstruction.recon_from_camera)
+    depth = np.stack(
+        [apply(pose, x)[..., 2] for pose, x in zip(camera_from_recon, dense.points_in_recon, strict=True)]
+    ).astype(np.float32)
+    arrays = {
+        "depth": depth,
+        "relative_std": (dense.depth_std / depth).astype(np.float16),
+        "confidence": dense.confidence.astype(np.float16),
+        "matched": np.packbits(dense.reason & 1),
+        "filled": np.packbits(dense.reason >> 1),
+    }
+    write_npz(path, about, arrays)
 
 
-def read_depth(path: Path, images: int, made_from: str | None = None) -> Pointmaps | None:
-    """The pointmaps of this many images; None where they were made from something else than `made_from`, if given.
+def is_made_from(path: Path, made_from: str) -> bool:
+    """Test whether a file exists and has this fingerprint; InputError where it is damaged."""
+    if not path.is_file():
+        return False
+    with read_npz(path, FORMAT) as (text, _):
+        return About.model_validate_json(text, strict=True).made_from == made_from
 
-    Raises InputError when the file is damaged, of a newer format, or of other images.
+
+def read_depth(path: Path, reconstruction: Reconstruction, capture: Capture | None) -> Pointmaps:
+    """Return the pointmaps of a reconstruction, with the colours of the capture's images; grey without a capture.
+
+    Raises InputError when the file is damaged, of another format, or of other images.
     """
     with read_npz(path, FORMAT) as (text, file):
-        about = About.model_validate_json(text, strict=True)
-        if made_from not in (None, about.made_from):
-            return None
-        return pointmaps_in(file, about.intrinsics, images)
+        pinhole = About.model_validate_json(text, strict=True).intrinsics.record()
+        shape = len(reconstruction.image_index), pinhole.height, pinhole.width
+        arrays = {name: file[name] for name in ("depth", "relative_std", "confidence")}
+        check_arrays({name: (array, shape) for name, array in arrays.items()})
+        planes = [np.unpackbits(file[name], count=int(np.prod(shape))) for name in ("matched", "filled")]
+        return pointmaps_of(
+            arrays["depth"],
+            arrays["relative_std"],
+            arrays["confidence"],
+            (planes[0] | planes[1] << 1).reshape(shape),
+            np.full((*shape, 3), GREY, np.uint8)
+            if capture is None
+            else _colors(capture, reconstruction, pinhole),
+            reconstruction.recon_from_camera,
+            pinhole,
+        )
+
+
+def _colors(
+    capture: Capture, reconstruction: Reconstruction, pinhole: Intrinsics
+) -> UInt8[ndarray, "m h w 3"]:
+    """Return the registered images on the undistorted grid."""
+    undistort = undistortion(reconstruction.intrinsics, pinhole)
+    names = [capture.images[row] for row in reconstruction.image_index]
+    return np.stack([undistort(read_image(capture.folder / name)) for name in names])

@@ -1,0 +1,66 @@
+"""depth.npz gives back the pointmaps bit for bit, in at most 30 MB for 30 images."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jcr.capture.read import read_capture
+from jcr.depth.dense import pointmaps_of
+from jcr.depth.densify import undistorted
+from jcr.depth.depth_npz import is_made_from, read_depth, write_depth
+from jcr.geometry import rotation_exp, transform
+from jcr.records import Reconstruction, Tracks
+
+
+def made(tabletop: Path, rows: int) -> Reconstruction:
+    """Return a reconstruction of images of the bundled capture with drawn depth and cameras."""
+    capture = read_capture(tabletop)
+    assert capture.intrinsics is not None
+    rng, index = np.random.default_rng(0), np.arange(rows)
+    pinhole, colors = undistorted(capture.folder, [capture.images[k] for k in index], capture.intrinsics)
+    shape = colors.shape[:3]
+    cameras = transform(rotation_exp(rng.normal(size=(rows, 3))), rng.normal(size=(rows, 3)))
+    reason = rng.integers(0, 4, shape).astype(np.uint8)
+    dense = pointmaps_of(
+        rng.uniform(0.1, 50, shape).astype(np.float32),
+        rng.uniform(1e-4, 1e-2, shape).astype(np.float16),
+        np.where(reason > 0, rng.uniform(0, 9, shape), 0).astype(np.float16),
+        reason,
+        colors,
+        cameras,
+        pinhole,
+    )
+    nothing = np.zeros(0, int)
+    tracks = Tracks(image=nothing, x_px=np.zeros((0, 2)), point=nothing, points_in_recon=np.zeros((0, 3)))
+    return Reconstruction(
+        image_index=index,
+        recon_from_camera=cameras,
+        intrinsics=capture.intrinsics,
+        tracks=tracks,
+        backend="colmap",
+        pointmaps=dense,
+    )
+
+
+def test_what_is_read_is_what_was_written(tabletop: Path, tmp_path: Path):
+    reconstruction, file = made(tabletop, 3), tmp_path / "depth.npz"
+    assert not is_made_from(file, "a")
+    write_depth(file, reconstruction, "a")
+    assert is_made_from(file, "a") and not is_made_from(file, "b")
+    capture, dense = read_capture(tabletop), reconstruction.dense
+    found = read_depth(file, replace(reconstruction, pointmaps=None), capture)
+    for name in ("points_in_recon", "confidence", "reason", "depth_std", "colors"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(dense, name))
+    grey = read_depth(file, reconstruction, None)
+    assert (grey.colors == 128).all() and (grey.points_in_recon == dense.points_in_recon).all()
+
+
+@pytest.mark.slow
+def test_thirty_images_take_at_most_30_mb(tabletop: Path, tmp_path: Path):
+    reconstruction = made(tabletop, 6)
+    write_depth(tmp_path / "depth.npz", reconstruction, "a")
+    pixels = reconstruction.dense.confidence[0].size
+    assert pixels >= 400 * 299
+    assert (tmp_path / "depth.npz").stat().st_size * 30 / 6 <= 30e6
