@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from jcr.calibration.checks.sequence import sequence_fault
 
 from benchmarks.attack import calibrated, outcome, reconstructed
 from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.checks.camera import is_material, of_some
-from jcr.calibration.checks.sequence import sequence_fault
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.cell.carried import exchanged, refined

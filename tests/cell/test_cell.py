@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jcr
-from jcr.calibration.checks.camera import camera_faults
+from jcr.calibration.checks.effects import effects
 from jcr.calibration.checks.imaged import Imaged
 from jcr.calibration.stage import calibrate
 from jcr.camera import parameters, with_parameters
@@ -300,7 +300,8 @@ def test_a_zoom_of_a_second_camera_is_named_with_its_size_and_none_where_there_i
     answer, place = images.adjusted(), WANTED["wrists"][1]
     second = Imaged(
         adjusted=answer,
-        adjust=lambda prior, free: images.with_freed(prior, 1, free).adjusted(),
+        adjust=lambda prior, free, bent: images.with_bent(1, bent).with_freed(prior, 1, free).adjusted(),
+        arm=1,
         names=[f"{k}.png" for k in range(COUNT)],
         start=camera,
         is_given=True,
@@ -310,7 +311,7 @@ def test_a_zoom_of_a_second_camera_is_named_with_its_size_and_none_where_there_i
         camera=1,
         place=place,
     )
-    found = camera_faults(second)
+    _, found = effects(second)
     assert [(one.kind, one.images) for one in found] == [(FindingKind.ZOOM, ("3.png", "4.png"))] * (zoom != 1)
     for one in found:
         assert one.value == pytest.approx(zoom - 1, abs=0.004) and one.shift is not None

@@ -49,15 +49,26 @@ class CellImages:
         return adjust(self.scene, self.observations, self.freedom, self.arms, self.noise, self.prior)
 
     def with_freed(
-        self, prior: IntrinsicsPrior, camera: int, combinations: Float[ndarray, "e p"] | None = None
+        self,
+        prior: IntrinsicsPrior,
+        camera: int,
+        combinations: Float[ndarray, "e p"] | None = None,
     ) -> "CellImages":
-        """With another prior of a camera's intrinsics, and combinations of the columns of its score_test.Alternatives
-        free too."""
+        """Return the images with another prior of a camera's intrinsics, and with combinations of the columns of its
+        score_test.Alternatives free too."""
         freedom = with_intrinsics(self.freedom, prior, camera)
         if combinations is not None:
             mine = np.flatnonzero(self.observations.camera == camera)
             freedom = freed(freedom, combinations, mine, camera)
         return replace(self, freedom=freedom)
+
+    def with_bent(self, arm: int | None, bent: Float[ndarray, "s b"] | None) -> "CellImages":
+        """Return the images with errors of one standard deviation each of the poses of an arm."""
+        if arm is None or bent is None:
+            return self
+        arms = list(self.arms)
+        arms[arm] = replace(arms[arm], bent=bent)
+        return replace(self, arms=arms)
 
 
 def cell_images(

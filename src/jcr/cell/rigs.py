@@ -14,9 +14,9 @@ from jcr.calibration.robot_errors import robot_errors
 from jcr.cell.camera_views import CameraViews
 from jcr.cell.found import CameraFound
 from jcr.cell.localise import Shared
-from jcr.estimation.bent import bends
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.estimation.image_robots import ArmPoses
+from jcr.estimation.pose_effects import arm_rows
 from jcr.estimation.systematic import smooth_errors
 from jcr.geometry import inverse, motion_length, step_between
 from jcr.records import BENT, Capture, CellCamera, Finding, HandEye, Kind
@@ -159,11 +159,12 @@ class Rigs:
         robot = robot_errors(self._capture, options).of(self._rows)
         hand_eye = self._hand_eye
         poses = self._capture.base_from_gripper[self._rows]
-        bent = [one.kind for one in hand_eye.findings if one.kind in BENT]
+        found = {one.kind for one in hand_eye.findings if one.kind in BENT}
+        bent = [row.prior_std * row.columns for row in arm_rows(poses) if row.kind in found]
         first = ArmPoses(
             rigs=np.arange(len(self._rows)),
             base_from_gripper=poses,
-            bent=bends(bent, poses) if bent else None,
+            bent=np.concatenate(bent, axis=1) if bent else None,
             systematic=robot.systematic,
             start=(hand_eye.gripper_from_camera, hand_eye.base_from_recon),
         )

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.checks.camera import camera_faults, with_contradiction
+from jcr.calibration.checks.camera import with_contradiction
+from jcr.calibration.checks.effects import effects
 from jcr.calibration.checks.given_intrinsics import contradicted_by
 from jcr.calibration.checks.imaged import Imaged
 from jcr.calibration.options import CalibrateOptions
@@ -129,13 +130,19 @@ def _examined(
     been: of one image the given ones would weigh more than what it shows, and the answer be wrong by many sigmas.
     """
     answer, found = images.adjusted(), list[tuple[Finding, ...]]()
+    tested: set[int | None] = {0}
     for c, (member, place) in enumerate(zip(members, places, strict=True), start=1):
         if not len(images.freedom.intrinsics[c].std):  # exact, as of a camera that is compared with itself
             found.append(())
             continue
         is_given = member.camera.intrinsics is not None
-        imaged = _imaged(images, answer, _found(member, c, answer, place, hand_eye), c, place, is_given)
-        faults = camera_faults(imaged)
+        # The poses of the capture's own arm were tested with its own camera, those of others are with their first one.
+        arm = None if member.arm in tested else member.arm
+        tested.add(arm)
+        imaged = _imaged(
+            images, answer, _found(member, c, answer, place, hand_eye), c, (arm, place), is_given
+        )
+        _, faults = effects(imaged)
         contradiction = None
         if is_given and all(one.kind is Kind.INTRINSICS for one in faults):
             contradiction = contradicted_by(imaged, SURE_OF_INTRINSICS)
@@ -152,14 +159,18 @@ def _imaged(
     answer: Adjusted,
     found: CameraFound,
     c: int,
-    place: Callable[[Placed], Float[ndarray, "4 4"]],
+    arm_and_place: tuple[int | None, Callable[[Placed], Float[ndarray, "4 4"]]],
     is_given: bool,
 ) -> Imaged:
-    """A further camera, the c-th, as its checks take it."""
+    """Return a further camera, the c-th, as its checks take it, with the arm whose poses are tested with it."""
     assert found.covariance is not None
+    arm, place = arm_and_place
     return Imaged(
         adjusted=answer,
-        adjust=lambda prior, combinations: images.with_freed(prior, c, combinations).adjusted(),
+        adjust=lambda prior, combinations, bent: (
+            images.with_bent(arm, bent).with_freed(prior, c, combinations).adjusted()
+        ),
+        arm=arm,
         names=[image.image for image in found.images if image.used],
         start=images.freedom.start[c],
         is_given=is_given,

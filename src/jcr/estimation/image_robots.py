@@ -56,7 +56,7 @@ class ArmPoses:
     exchanged: bool = False
     """The camera stands still and the arm carries what it sees."""
     bent: Float[ndarray, "s b"] | None = None
-    """Errors of one standard deviation each that were found of the poses (estimation/bent.py)."""
+    """Errors of one standard deviation each that were found of the poses (estimation/pose_effects.py)."""
 
 
 @dataclass(frozen=True, kw_only=True)

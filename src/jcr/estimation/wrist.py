@@ -34,7 +34,7 @@ class WristOptions:
     start_noise: tuple[float, float] = START_NOISE
     """m, rad; of the gripper poses, until it is estimated."""
     bent: Float[ndarray, "s b"] | None = None
-    """Errors that were found of the gripper poses (estimation/bent.py), of one standard deviation each."""
+    """Errors that were found of the gripper poses (estimation/pose_effects.py), of one standard deviation each."""
 
 
 def adjust_wrist(

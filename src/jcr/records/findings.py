@@ -40,6 +40,7 @@ class Kind(StrEnum):
     INTRINSICS = "intrinsics contradict the images"
     SLIP = "camera moved on the gripper"
     DRIFT = "camera drifts on the gripper"
+    BASE_MOVED = "robot base moved against the scene"
     DELAY = "gripper poses early or late"
     WRONG_MOUNT = "wrong mount"
     ROBOT_UNUSED = "robot not used"
@@ -165,6 +166,7 @@ LASTING = (
         Kind.SCALES,
         Kind.SLIP,
         Kind.DRIFT,
+        Kind.BASE_MOVED,
         Kind.DELAY,
         Kind.POSE_CONVENTION,
         Kind.WRONG_MOUNT,
@@ -195,7 +197,7 @@ CONSEQUENCES = frozenset(
     {Kind.FEW_AGREE, Kind.POSES_CONTRADICT_IMAGES, Kind.NOISE_ABOVE_GIVEN, Kind.UNCERTAIN, Kind.LEAVE_ONE_OUT}
 )
 """Kinds that are so because of what rejects a calibration, where that is a cause."""
-OF_FEW_IMAGES = frozenset({Kind.UNOBSERVABLE, Kind.SLIP, Kind.DRIFT, Kind.DELAY})
+OF_FEW_IMAGES = frozenset({Kind.UNOBSERVABLE, Kind.SLIP, Kind.DRIFT, Kind.BASE_MOVED, Kind.DELAY})
 """Those that are so, too, where too few of the images could be used."""
 
 

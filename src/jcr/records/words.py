@@ -548,6 +548,10 @@ _TEXT: dict[Kind, Words] = {
         "the camera seems to drift on the gripper by {mm:.1f} mm and {deg:.2f}° from the first image to the last "
         "({chance})"
     ),
+    Kind.BASE_MOVED: (
+        "the robot's base and the scene moved against each other by {mm:.1f} mm and {deg:.2f}° after {images[0]} "
+        "({chance})"
+    ),
     Kind.DELAY: (
         "the gripper poses look as if read {size:.3f} ± {std} of the time from one image to the next too "
         "{way:late|early} ({chance})"
@@ -652,6 +656,7 @@ _REMEDY: dict[Kind, Words] = {
     Kind.INTRINSICS: CALIBRATE_INTRINSICS,
     Kind.SLIP: _one_part,
     Kind.DRIFT: "tighten its mount, let it warm up, and take the images again",
+    Kind.BASE_MOVED: _one_part,
     Kind.DELAY: "stop the arm at each image, or read pose and image by the same clock",
     Kind.WRONG_MOUNT: "write mount gripper for {camera}",
     Kind.LENGTHS: "check that axis (a lift, a rail, a gantry): its gear ratio, its unit",

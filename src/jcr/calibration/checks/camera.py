@@ -1,9 +1,7 @@
-"""Is it one camera in all images? A focus that moves, a zoom, a rolling shutter, intrinsics that are a little wrong.
+"""Effects on one camera: a focal length that varies, a rolling shutter, a thin prism, intrinsics that are wrong.
 
 Each is a hypothesis of estimation/score_test.py, tested beside a focal length that is wrong by one factor in all images.
-The images are adjusted with the one of least p free, which shows its value and what it does to the camera's place; then
-the next is tested beside it. Whether intrinsics that were given can be those of the images at all is asked last. A
-capture's own camera and a further one of a cell are tested alike (imaged.py).
+The images are adjusted with the effect free, which shows its size and the motion of the camera that comes with it.
 """
 
 from collections.abc import Sequence
@@ -16,10 +14,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.adjust import adjust_case, focal_of_each
-from jcr.calibration.case import Case, Checked, of_points
-from jcr.calibration.checks.given_intrinsics import intrinsics_contradiction
-from jcr.calibration.checks.imaged import Imaged, of_case
+from jcr.calibration.case import Case, of_points
+from jcr.calibration.checks.imaged import Imaged
 from jcr.camera import parameter_names, parameters
+from jcr.estimation.hypotheses import Row
 from jcr.estimation.image_robots import Adjusted
 from jcr.estimation.model_error import TYPICAL
 from jcr.estimation.scene import OF_IMAGE, PRISM
@@ -42,8 +40,6 @@ MATERIAL = 0.5
 """Standard deviations by which a fault must move the camera's place on some axis to be reported."""
 OF_FIRST_STEP = 0.2
 """Share of that which the first step towards a fault must go, for the adjustments that follow take long."""
-AT_ONCE = 2
-"""Faults named of one capture."""
 MOST_POINTS, WELL_SEEN = 800, 3
 """Points that take part, first those in this many images: more tell a fault no better, and take time."""
 MOST_BYTES, BYTES_PER_IMAGE = 100_000_000, 16 * OF_IMAGE
@@ -74,21 +70,6 @@ NEARLY_ALL = 0.9
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
-def check_camera(case: Case) -> Checked:
-    """What the used images show against one camera with the intrinsics that they were reconstructed with.
-
-    With `focus` "varies" a focal length of each image is free already and is no finding.
-    """
-    imaged = of_case(_of_fewer_points(case))
-    faults = camera_faults(imaged)
-    if not imaged.is_given:
-        return Checked(faults)
-    if faults and not any(one.kind is Kind.INTRINSICS for one in faults):
-        return Checked(faults)
-    checked = intrinsics_contradiction(case)
-    return replace(checked, findings=with_contradiction(faults, checked.findings))
-
-
 def with_contradiction(
     faults: tuple[Finding, ...], contradiction: tuple[Finding, ...]
 ) -> tuple[Finding, ...]:
@@ -100,7 +81,9 @@ def with_contradiction(
 
 
 @dataclass(frozen=True)
-class _Hypothesis:
+class CameraEffect:
+    """Combinations of the columns of score_test.Alternatives that one effect frees."""
+
     kind: Kind
     free: Float[ndarray, "e p"]
     """The combinations that it is about."""
@@ -119,18 +102,33 @@ class _Hypothesis:
 
 
 @dataclass(frozen=True)
-class _State:
-    """The images adjusted with some hypotheses free."""
+class State:
+    """Adjustment of the images with effects on the camera and on the gripper poses free."""
 
     imaged: Imaged
-    found: tuple[_Hypothesis, ...]
+    found: tuple[CameraEffect, ...]
     adjusted: Adjusted
+    poses: tuple[Row, ...] = ()
+    """Effects on the gripper poses."""
 
     @staticmethod
-    def of(imaged: Imaged, found: tuple[_Hypothesis, ...]) -> "_State":
-        """Adjusted again: while what was found distorted the images, the robot pose noise was another one."""
-        combinations = np.concatenate([one.both for one in found], axis=1)
-        return _State(imaged, found, imaged.adjust(imaged.prior, combinations))
+    def start(imaged: Imaged) -> "State":
+        """Return the adjustment as it is; a focal length of each image is free where the user asked for that."""
+        if (free := imaged.free) is None:
+            return State(imaged, (), imaged.adjusted)
+        varies = CameraEffect(Kind.FOCUS_BY_IMAGE, free, np.zeros((len(free), 0)))
+        return State(imaged, (varies,), imaged.adjusted)
+
+    def with_free(self, found: Sequence[CameraEffect], poses: Sequence[Row]) -> "State":
+        """Adjust again with these effects free: the sizes of all errors change with them.
+
+        Raises LinAlgError where the images then determine nothing any more.
+        """
+        combinations = np.concatenate([one.both for one in found], axis=1) if found else None
+        columns = [one.prior_std * one.columns[self.imaged.rows_of_arm] for one in poses]
+        bent = np.concatenate(columns, axis=1) if columns else None
+        adjusted = self.imaged.adjust(self.imaged.prior, combinations, bent)
+        return replace(self, found=tuple(found), adjusted=adjusted, poses=tuple(poses))
 
     @cached_property
     def equations(self) -> Alternatives:
@@ -156,33 +154,8 @@ class _State:
         return np.r_[of_camera, of_all[nuisances_of(imaged.images, len(evidence.problem.observations.rig))]]
 
 
-def camera_faults(imaged: Imaged) -> tuple[Finding, ...]:
-    """What speaks against one camera in all its images, at most AT_ONCE of it."""
-    if len(imaged.names) < MIN_IMAGES:
-        return ()
-    found = ()
-    if (free := imaged.free) is not None:  # a focal length of each image, as the user asked
-        found = (_Hypothesis(Kind.FOCUS_BY_IMAGE, free, np.zeros((len(free), 0))),)
-    state = _State(imaged, found, imaged.adjusted)
-    named: list[Finding] = []
-    dismissed: list[_Hypothesis] = []
-    while len(named) < AT_ONCE:
-        best = _most_likely(state, dismissed)
-        if best is None:
-            break
-        alone = tested(state.equations, best.both, _all(state))
-        far = (np.abs(alone.shift) > OF_FIRST_STEP * MATERIAL * imaged.std).any()
-        after = _with(state, best) if far else None
-        if after is not None and is_material(found := _finding(after, state, alone), imaged.std):
-            named.append(found)
-            state = after
-        else:
-            dismissed.append(best)
-    return tuple(named)
-
-
-def _of_fewer_points(case: Case) -> Case:
-    """The case as adjusted, of no more points than are needed."""
+def of_fewer_points(case: Case) -> Case:
+    """Return the case adjusted with no more points than the tests need."""
     tracks, most = case.tracks, MOST_BYTES // (BYTES_PER_IMAGE * len(case.used))
     few = len(np.unique(tracks.point)) <= MOST_POINTS and len(tracks.image) <= most
     if len(case.used) < MIN_IMAGES or few:
@@ -192,13 +165,19 @@ def _of_fewer_points(case: Case) -> Case:
     return replace(fewer, adjusted=adjust_case(fewer, combinations=free))
 
 
-def _with(state: _State, best: _Hypothesis) -> _State | None:
-    """Adjusted with one more hypothesis free, or with the simpler one that explains nearly the same; None where the
-    images then show nothing any more."""
+def freed(state: State, best: CameraEffect) -> State | None:
+    """Adjust with one more effect free, or with the simpler one that explains nearly the same.
+
+    Return None where the first step towards the effect moves the camera too little, or where the images then determine
+    nothing.
+    """
+    alone = tested(state.equations, best.both, _all(state))
+    if not (np.abs(alone.shift) > OF_FIRST_STEP * MATERIAL * state.imaged.std).any():
+        return None
     try:
-        after = _State.of(state.imaged, (*state.found, best))
+        after = state.with_free((*state.found, best), state.poses)
         simple = _simpler(after) if best.kind is Kind.FOCUS_BY_IMAGE else None
-        return after if simple is None else _State.of(state.imaged, (*state.found, simple))
+        return after if simple is None else state.with_free((*state.found, simple), state.poses)
     except np.linalg.LinAlgError:
         return None
 
@@ -213,9 +192,10 @@ def is_material(found: Finding, std: Float[ndarray, "6"]) -> bool:
     return bool((np.abs(found.shift[:6]) > MATERIAL * std).any())
 
 
-def _finding(after: _State, before: _State, alone: Tested) -> Finding:
-    """The last hypothesis that was freed, as a finding."""
+def camera_finding(after: State, before: State) -> Finding:
+    """Return the last camera effect that was freed as a finding."""
     best = after.found[-1]
+    alone = tested(before.equations, best.both, _all(before))
     last = tested(after.equations, best.free, np.concatenate([_all(before), best.beside], axis=1))
     p = float(np.exp(max(alone.log_p + np.log(best.places), -700)))
     size = _of_intrinsics(after, last) if best.kind is Kind.INTRINSICS else _size(after, last)
@@ -243,45 +223,47 @@ def of_some(tracks: Tracks, most: int) -> Tracks:
     return of_points(tracks, chosen)
 
 
-def _all(state: _State) -> Float[ndarray, "e r"]:
+def _all(state: State) -> Float[ndarray, "e r"]:
     """The combinations that are free already; of those that are the same, one."""
     nothing = np.zeros((state.equations.columns, 1))
     return spanned(np.concatenate([nothing, *(one.both for one in state.found)], axis=1))
 
 
-def _most_likely(state: _State, dismissed: Sequence[_Hypothesis]) -> _Hypothesis | None:
-    """Of the hypotheses whose p is small enough the one that explains most.
+def best_camera_effect(state: State, dismissed: Sequence[CameraEffect]) -> tuple[CameraEffect | None, float]:
+    """Return the significant camera effect that explains most and the logarithm of its probability by chance.
 
-    What the camera's model leaves grows with whatever is wrong, until every explanation gains as little. Which of them
-    is the right one shows where it may not.
+    The size of the camera-model error absorbs every effect until all of them gain as little: the effects are compared
+    with that size at its typical value.
     """
     likely = [
         one
         for one in _hypotheses(state)
         if not any(_alike(one, other) for other in (*state.found, *dismissed))
-        and _log_p(one, state, state.equations) <= LOG_P
+        and log_p(one, state, state.equations) <= LOG_P
     ]
-    if len(likely) < 2:
-        return likely[0] if likely else None
-    of_a_good_camera = state.equations_with(TYPICAL)
-    return min(likely, key=lambda one: _log_p(one, state, of_a_good_camera))
+    if not likely:
+        return None, 0.0
+    typical = state.equations if len(likely) == 1 else state.equations_with(TYPICAL)
+    best = min(likely, key=lambda one: log_p(one, state, typical))
+    return best, log_p(best, state, state.equations)
 
 
-def _log_p(one: _Hypothesis, state: _State, equations: Alternatives) -> float:
+def log_p(one: CameraEffect, state: State, equations: Alternatives) -> float:
+    """Return the logarithm of the probability of the effect's gain by chance, times the places searched."""
     beside = np.concatenate([_all(state), one.beside], axis=1)
     return tested(equations, one.free, beside).log_p + float(np.log(one.places))
 
 
-def _alike(one: _Hypothesis, other: _Hypothesis) -> bool:
+def _alike(one: CameraEffect, other: CameraEffect) -> bool:
     return one.kind == other.kind or {one.kind, other.kind} <= FOCUS
 
 
-def _simpler(state: _State) -> _Hypothesis | None:
+def _simpler(state: State) -> CameraEffect | None:
     """A focal length that follows distance, or changed once, where that explains nearly all that it scatters."""
     scatter = state.found[-1]
     focal = scatter.free @ _value(scatter, state.total)
 
-    def explained(one: _Hypothesis) -> float:
+    def explained(one: CameraEffect) -> float:
         along = one.free[:, 0]
         return float((along @ focal) ** 2 / ((along @ along) * (focal @ focal)))
 
@@ -289,12 +271,12 @@ def _simpler(state: _State) -> _Hypothesis | None:
     return best if explained(best) > NEARLY_ALL else None
 
 
-def _value(fault: _Hypothesis, total: Float[ndarray, " e"]) -> Float[ndarray, " p"]:
+def _value(fault: CameraEffect, total: Float[ndarray, " e"]) -> Float[ndarray, " p"]:
     """Of the combinations that a hypothesis is about."""
     return np.linalg.lstsq(fault.both, total, rcond=None)[0][fault.beside.shape[1] :]
 
 
-def _hypotheses(state: _State) -> list[_Hypothesis]:
+def _hypotheses(state: State) -> list[CameraEffect]:
     equations = state.equations
     m = equations.images
     far = np.log(equations.distance)
@@ -307,25 +289,25 @@ def _hypotheses(state: _State) -> list[_Hypothesis]:
     x, y = equations.down_in_camera[:, :2].T
     sag = [equations.of_images("x", x[:, None]), equations.of_images("y", y[:, None])]
     found = [
-        _Hypothesis(Kind.FOCUS_BY_DISTANCE, equations.of_images("focal", far[:, None]), common),
-        _Hypothesis(Kind.FOCUS_BY_IMAGE, equations.of_images("focal", differences(m)), common),
-        _Hypothesis(Kind.ROLLING_SHUTTER, equations.of_images("shear", np.ones((m, 1))), common),
-        _Hypothesis(Kind.ROLLING_SHUTTER_BY_IMAGE, equations.of_images("shear", np.eye(m)), common),
+        CameraEffect(Kind.FOCUS_BY_DISTANCE, equations.of_images("focal", far[:, None]), common),
+        CameraEffect(Kind.FOCUS_BY_IMAGE, equations.of_images("focal", differences(m)), common),
+        CameraEffect(Kind.ROLLING_SHUTTER, equations.of_images("shear", np.ones((m, 1))), common),
+        CameraEffect(Kind.ROLLING_SHUTTER_BY_IMAGE, equations.of_images("shear", np.eye(m)), common),
     ]
     for k in steps:
         after = (np.arange(m) >= k) - (m - k) / m
         free = equations.of_images("focal", after[:, None])
-        found.append(_Hypothesis(Kind.ZOOM, free, common, places=len(steps), after=int(k) - 1))
+        found.append(CameraEffect(Kind.ZOOM, free, common, places=len(steps), after=int(k) - 1))
     of_centre = np.concatenate([common, equations.of_camera(("cx", "cy"))], axis=1)
-    found.append(_Hypothesis(Kind.CENTRE_SAGS, np.concatenate(sag, axis=1), of_centre))
+    found.append(CameraEffect(Kind.CENTRE_SAGS, np.concatenate(sag, axis=1), of_centre))
     if len(state.adjusted.given.evidence.scene.cameras) == 1:  # all images share the glass
-        found.append(_Hypothesis(Kind.THIN_PRISM, np.eye(equations.columns)[:, -PRISM:], of_centre))
+        found.append(CameraEffect(Kind.THIN_PRISM, np.eye(equations.columns)[:, -PRISM:], of_centre))
     # Intrinsics that are wrong in all images include the focal length that shows nothing in the others.
-    found.append(_Hypothesis(Kind.INTRINSICS, equations.of_camera(_freed(state)), nothing))
+    found.append(CameraEffect(Kind.INTRINSICS, equations.of_camera(_freed(state)), nothing))
     return found
 
 
-def _of_intrinsics(after: _State, last: Tested) -> dict[str, Any]:
+def _of_intrinsics(after: State, last: Tested) -> dict[str, Any]:
     """The fields of a finding that say which intrinsics the images show."""
     units = dict(zip(after.equations.names, after.equations.units, strict=True))
     std = np.sqrt(np.maximum(np.diag(last.covariance), 0.0))
@@ -338,7 +320,7 @@ def _of_intrinsics(after: _State, last: Tested) -> dict[str, Any]:
     return {"mend": "intrinsics", "details": found}
 
 
-def _size(after: _State, last: Tested) -> dict[str, Any]:
+def _size(after: State, last: Tested) -> dict[str, Any]:
     """The fields of a finding that say what and how large the fault is."""
     fault, equations = after.found[-1], after.equations
     value = _value(fault, after.total)
@@ -365,7 +347,7 @@ def _size(after: _State, last: Tested) -> dict[str, Any]:
 
 
 def _largest_px(
-    after: _State, value: Float[ndarray, "4"], covariance: Float[ndarray, "4 4"]
+    after: State, value: Float[ndarray, "4"], covariance: Float[ndarray, "4 4"]
 ) -> tuple[float, float]:
     """The displacement by a thin prism where it is largest among the points, and its standard deviation."""
     by = after.adjusted.given.evidence.problem.prism
@@ -375,7 +357,7 @@ def _largest_px(
     return float(moved[k]), float(np.sqrt(along @ covariance @ along))
 
 
-def _freed(state: _State) -> tuple[str, ...]:
+def _freed(state: State) -> tuple[str, ...]:
     """Parameters of the intrinsics that are tested, of those that the model has."""
     tested_names = INTRINSICS if state.imaged.is_given else ASPECT
     return tuple(name for name in tested_names if name in state.equations.names)

@@ -38,7 +38,8 @@ def check_convention(case: Case) -> Checked:
     by_name = {by_number: poses[rows] for by_number, poses in by_name.items()}
     # Of other readings neither noise nor cues are known, nor are their camera poses weighed.
     alone = case.cues is None and case.reconstruction.evidence is None
-    solved = case.hand_eye if alone and case.hand_eye.robot_noise.given is None else None
+    fit = case.hand_eye.before or case.hand_eye
+    solved = fit if alone and fit.robot_noise.given is None else None
     found = better_reading(case.base_from_gripper, case.recon_from_camera, by_name, solved)
     if found is None:
         return Checked()

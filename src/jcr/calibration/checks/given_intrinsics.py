@@ -72,7 +72,7 @@ def contradicted_by(imaged: Imaged, sure: float = SURE) -> tuple[Adjusted, Findi
     """
     if not _found_off(imaged, imaged.adjusted, *DOUBT):
         return None
-    freed = imaged.adjust(prior_of(imaged.start, ESTIMATED), None)
+    freed = imaged.adjust(prior_of(imaged.start, ESTIMATED), None, None)
     surely = _found_off(imaged, freed, sure, 1.0)
     found = surely or _found_off(imaged, freed, *DOUBT)
     if not found:

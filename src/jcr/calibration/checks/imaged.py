@@ -23,8 +23,9 @@ class Imaged:
     """One camera, and how its images are adjusted again with more of it free."""
 
     adjusted: Adjusted
-    adjust: Callable[[IntrinsicsPrior, Combinations | None], Adjusted]
-    """All images, with another prior of this camera's intrinsics, and with combinations of its columns free."""
+    adjust: Callable[[IntrinsicsPrior, Combinations | None, Float[ndarray, "s b"] | None], Adjusted]
+    """Adjust all images with another prior of this camera's intrinsics, with combinations of its columns free, and with
+    errors of one standard deviation of the gripper poses."""
     names: Sequence[str]
     """Of its images."""
     start: Intrinsics
@@ -39,8 +40,17 @@ class Imaged:
     """Its number among the adjusted."""
     place: Callable[[Placed], Float[ndarray, "4 4"]] = first_x
     """Where it is on its parent."""
+    arm: int | None = 0
+    """Number of the arm whose gripper poses are tested with the camera; None where another camera's test has them."""
     free: Combinations | None = None
     """That `adjusted` has free."""
+
+    @property
+    def rows_of_arm(self) -> slice:
+        """Rows of the equations of the gripper poses that are those of the arm."""
+        counts = [6 * len(one.rigs) for one in self.adjusted.given.arms]
+        begin = sum(counts[: self.arm])
+        return slice(begin, begin + counts[self.arm or 0])
 
     @property
     def images(self) -> Int[ndarray, " m"]:
@@ -64,7 +74,9 @@ def of_case(case: Case) -> Imaged:
 
     return Imaged(
         adjusted=case.adjusted,
-        adjust=lambda prior, combinations: adjust_case(case, prior=prior, combinations=combinations),
+        adjust=lambda prior, combinations, bent: adjust_case(
+            case, prior=prior, combinations=combinations, bent=bent
+        ),
         names=[case.names[row] for row in case.used],
         start=case.reconstruction.intrinsics,
         is_given=case.capture.intrinsics is not None,

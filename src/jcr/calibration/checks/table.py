@@ -1,8 +1,7 @@
 """The checks of a calibration, a row each, in the order in which they are made.
 
-Causes before consequences. Poses of another convention fit nothing, so they come first where the fit was rejected. What
-is wrong with the camera looks like a bent robot or a slip too: the camera is tested first, then the robot, then the
-order of the images, each only where what comes before is sound. These are tests of rejected calibrations as well, for
+Causes come before consequences. Poses of another convention fit nothing, so the convention is tested first where the
+fit was rejected. Effects on camera and robot compete in one test (effects.py), of rejected calibrations as well, since
 they explain the rejection.
 """
 
@@ -10,9 +9,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 from jcr.calibration.case import Case, Checked
-from jcr.calibration.checks.bent import check_bent
 from jcr.calibration.checks.boards import check_boards
-from jcr.calibration.checks.camera import check_camera
 from jcr.calibration.checks.capture import (
     check_arm,
     check_convention,
@@ -20,10 +17,10 @@ from jcr.calibration.checks.capture import (
     check_reconstruction,
     check_registered,
 )
+from jcr.calibration.checks.effects import check_effects
 from jcr.calibration.checks.lengths import check_lengths
 from jcr.calibration.checks.robot import check_robot
-from jcr.calibration.checks.sequence import MIN_IMAGES, check_sequence
-from jcr.records import BENT, CAMERA, Kind
+from jcr.records import Kind
 
 
 @dataclass(frozen=True)
@@ -39,9 +36,9 @@ def _is_observable(case: Case) -> bool:
 
 
 def _fit_was_rejected(case: Case) -> bool:
-    """By the poses themselves, and not because a board contradicts them."""
-    sized = _has(case, {Kind.BOARD_SIZE})
-    return not case.hand_eye.converged and case.hand_eye.before is None and not sized
+    """Return whether the poses themselves are rejected, with and without the images, and not because of a board."""
+    fit = case.hand_eye.before or case.hand_eye
+    return not case.hand_eye.converged and not fit.converged and not _has(case, {Kind.BOARD_SIZE})
 
 
 def _has(case: Case, kinds: Collection[Kind]) -> bool:
@@ -51,18 +48,11 @@ def _has(case: Case, kinds: Collection[Kind]) -> bool:
 CHECKS = (
     Check(check_registered),
     Check(check_convention, _fit_was_rejected),
-    Check(check_camera, lambda case: case.shows_camera and case.adjusted is not None),
-    Check(
-        check_bent, lambda case: case.shows_camera and case.adjusted is not None and not _has(case, CAMERA)
-    ),
+    Check(check_effects, _is_observable),
     Check(check_boards, lambda case: case.reconstruction.tracks.boards is not None),
     Check(check_lengths),
     Check(check_robot, _is_observable),
     Check(check_arm),
-    Check(
-        check_sequence,
-        lambda case: _is_observable(case) and len(case.names) >= MIN_IMAGES and not _has(case, CAMERA | BENT),
-    ),
     Check(check_images),
     Check(check_reconstruction),
 )

@@ -1,0 +1,357 @@
+"""Tests of additional effects on the camera and on the gripper poses, one after the other, until none is significant.
+
+Effects of both kinds compete (checks/camera.py, estimation/pose_effects.py). Of two significant ones that one is the
+cause beside which the other is no longer significant. What was found is free while the next is tested, and the
+calibration adopts the effects that its model can carry.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from jcr.calibration.adjust import adjust_case, refined_by
+from jcr.calibration.case import Case, Checked
+from jcr.calibration.checks.camera import (
+    LOG_P,
+    CameraEffect,
+    State,
+    best_camera_effect,
+    camera_finding,
+    freed,
+    is_material,
+    log_p,
+    of_fewer_points,
+    with_contradiction,
+)
+from jcr.calibration.checks.given_intrinsics import intrinsics_contradiction
+from jcr.calibration.checks.imaged import Imaged, of_case
+from jcr.estimation.components import most_likely
+from jcr.estimation.fit import Cues, PoseProblem, linearised
+from jcr.estimation.hand_eye import MAX_NOISE, judged
+from jcr.estimation.hypotheses import Row, Test, best_tests, explains_by_order
+from jcr.estimation.image_robots import Adjusted
+from jcr.estimation.mixed_model import Equations, LogSizes, solve
+from jcr.estimation.pose_effects import PLAUSIBLE, STRAINS, arm_rows, order_rows
+from jcr.estimation.pose_equations import SCALE, UNKNOWNS, Poses, columns_of_arm
+from jcr.estimation.systematic import Region
+from jcr.records import BENT, CAMERA, Finding, Kind
+
+AT_ONCE = 3
+"""Largest number of effects that are named of one capture."""
+LOG_ALPHA = {kind: np.log(1e-6) for kind in BENT}
+"""Logarithm of the probability of a false alarm of the effects of the arm. Of 132 simulated captures of 8 to 20 images,
+72 of them by arms with joint offsets of up to 1° and links 1 mm off, none comes below 1e-5."""
+LOG_ALPHA_OF_ORDER = np.log(1e-4)
+"""Logarithm of the probability of a false alarm of the effects that depend on the order of the images."""
+SHARES = frozenset({Kind.SLIP, Kind.BASE_MOVED, Kind.DRIFT})
+"""Effects of a motion that has a share in each image, tested against other orders of the images."""
+MATERIAL = 0.5
+"""Standard deviations by which an effect must move the camera on some axis to be reported."""
+MIN_IMAGES = 6
+"""Fewest images with which the sizes of the errors are known beside an effect."""
+LARGE_MOTION = 3e-3, float(np.radians(0.5))
+"""m, rad: beyond these a motion of the camera or the base rejects; robots whose joints have play show smaller ones."""
+
+
+def check_effects(case: Case) -> Checked:
+    """Return what the used images and gripper poses show against one camera on one straight arm, in any order.
+
+    Given intrinsics that the images contradict as a whole are replaced by those that the images show.
+    """
+    longer = _with_rejected_runs(case)
+    if case.adjusted is None or longer.adjusted is None or not case.shows_camera:
+        return Checked(_effects_of_poses(longer))
+    imaged = of_case(of_fewer_points(longer))
+    state, findings = effects(imaged)
+    if imaged.is_given and all(one.kind is Kind.INTRINSICS for one in findings):
+        checked = intrinsics_contradiction(case)
+        return replace(checked, findings=with_contradiction(findings, checked.findings))
+    return Checked(findings) if longer is not case else _adopted(case, state, findings)
+
+
+def effects(imaged: Imaged) -> tuple[State, tuple[Finding, ...]]:
+    """Return the adjustment with all effects free that one camera's images show, and a finding of each."""
+    state, findings = State.start(imaged), list[Finding]()
+    dismissed, passed = list[CameraEffect](), set[Kind]()
+    while len(findings) < AT_ONCE and len(imaged.names) >= MIN_IMAGES:
+        of_camera, log_chance = best_camera_effect(state, dismissed)
+        test = _best_pose_effect(state, passed)
+        if of_camera is None and test is None:
+            break
+        if test is not None and (of_camera is None or _explains(state, test, of_camera, log_chance)):
+            passed.add(test.row.kind)
+            found = pose_finding(test, _poses_of(state), imaged.names, imaged.std)
+            if found is not None:
+                findings.append(found)
+                state = state.with_free(state.found, (*state.poses, test.row))
+        elif of_camera is not None:
+            after = freed(state, of_camera)
+            found = None if after is None else camera_finding(after, state)
+            if after is None or found is None or not is_material(found, imaged.std):
+                dismissed.append(of_camera)
+                continue
+            state = after
+            findings.append(found)
+    return state, tuple(findings)
+
+
+def _explains(state: State, test: Test, of_camera: CameraEffect, log_chance: float) -> bool:
+    """Return whether an effect on the poses rather than one on the camera is the cause where both are significant."""
+    with_camera = freed(state, of_camera)
+    if with_camera is None:
+        return True
+    left = _best_pose_effect(with_camera, set())
+    poses_remain = left is not None and left.row.kind is test.row.kind
+    with_poses = state.with_free(state.found, (*state.poses, test.row))
+    camera_remains = log_p(of_camera, with_poses, with_poses.equations) <= LOG_P
+    return test.log_p < log_chance if poses_remain == camera_remains else poses_remain
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmEquations:
+    """Equations of the gripper poses, and which rows and columns are those of one arm."""
+
+    equations: Equations
+    log_sizes: LogSizes
+    base_from_gripper: Poses
+    rows: slice
+    columns: Int[ndarray, "12"]
+    """Columns of the arm's hand-eye transform and of its base_from_recon."""
+
+    def rows_of_effects(self) -> list[Row]:
+        """Return all effects on the poses of the arm, with 0 in the rows of other arms."""
+        n, s = len(self.base_from_gripper), len(self.equations.residual)
+        if n < MIN_IMAGES:
+            return []
+        blocks = self.by_motion()
+        found = [*order_rows(self.base_from_gripper, *blocks), *arm_rows(self.base_from_gripper)]
+        if s == 6 * n:
+            return found
+        wide = [np.zeros((s, row.columns.shape[1])) for row in found]
+        for columns, row in zip(wide, found, strict=True):
+            columns[self.rows] = row.columns
+        return [replace(row, columns=columns) for row, columns in zip(found, wide, strict=True)]
+
+    def by_motion(self) -> tuple[Float[ndarray, "n 6 6"], Float[ndarray, "n 6 6"]]:
+        """Return the derivatives of the arm's residuals by its X and by its base_from_recon."""
+        own = self.equations.jacobian[self.rows][:, self.columns].reshape(-1, 6, 12)
+        return own[:, :, :6], own[:, :, 6:]
+
+
+def _poses_of(state: State) -> ArmEquations | None:
+    """Return the equations of the arm whose poses are tested with the camera."""
+    adjusted, arm = state.adjusted, state.imaged.arm
+    if arm is None:
+        return None
+    return ArmEquations(
+        equations=adjusted.equations,
+        log_sizes=adjusted.log_sizes,
+        base_from_gripper=adjusted.given.arms[arm].base_from_gripper,
+        rows=state.imaged.rows_of_arm,
+        columns=columns_of_arm(arm),
+    )
+
+
+def _best_pose_effect(state: State, passed: Collection[Kind]) -> Test | None:
+    """Return the most significant effect on the gripper poses that its cause can produce."""
+    poses = _poses_of(state)
+    return None if poses is None else best_pose_effect(poses, {*passed, *(row.kind for row in state.poses)})
+
+
+def best_pose_effect(poses: ArmEquations, passed: Collection[Kind]) -> Test | None:
+    """Return the most significant effect on the poses of an arm, none of the kinds `passed`.
+
+    Return None where the most significant one is larger than its cause can produce, or leaves poses that contradict the
+    images: the poses then have another fault.
+    """
+    rows = [row for row in poses.rows_of_effects() if row.kind not in passed]
+    for test in best_tests(poses.equations, poses.log_sizes, rows):
+        kind = test.row.kind
+        if test.log_p > LOG_ALPHA.get(kind, LOG_ALPHA_OF_ORDER):
+            continue
+        left = test.noise.together
+        if not test.is_within(PLAUSIBLE[kind]) or left[0] > MAX_NOISE[0] or left[1] > MAX_NOISE[1]:
+            return None
+        if kind in SHARES and not _is_of_the_order(poses, test):
+            continue
+        return test
+    return None
+
+
+def _is_of_the_order(poses: ArmEquations, test: Test) -> bool:
+    """Return whether the images in nearly all other orders show the motion less."""
+    n, place = len(poses.base_from_gripper), test.row.place
+    share = np.linspace(-0.5, 0.5, n) if place == 0 else (np.arange(n) >= place).astype(float)
+    blocks = np.zeros((len(poses.equations.residual) // 6, 6, 6))
+    of_images = np.zeros(len(blocks))
+    own = slice(poses.rows.start // 6, poses.rows.stop // 6)
+    blocks[own], of_images[own] = poses.by_motion()[test.row.kind is Kind.BASE_MOVED], share
+    return explains_by_order(poses.equations, poses.log_sizes, blocks, of_images, own)
+
+
+def pose_finding(
+    test: Test, poses: ArmEquations | None, names: Sequence[str], std: Float[ndarray, "6"]
+) -> Finding | None:
+    """Return a confirmed effect as a finding; None where it moves the camera by less than is material.
+
+    `names` are those of the images in their order, `std` is the uncertainty of the camera's place (m, rad).
+    """
+    assert poses is not None
+    own = test.shift[poses.columns[:6]]
+    kind, p = test.row.kind, float(np.exp(max(test.log_p, -700)))
+    if kind in BENT:
+        columns = test.row.prior_std * test.row.columns
+        straight = straight_shift(poses.equations, poses.log_sizes, columns)[poses.columns[:6]]
+        if not (np.abs([own, straight]) > MATERIAL * std).any():
+            return None
+        return replace(Finding.of(kind, "warns", "robot", p=p), **_size_of_strain(test))
+    moved = own if kind is Kind.DELAY else test.estimate
+    if not (np.abs(moved) > MATERIAL * std).any():
+        return None
+    return replace(Finding.of(kind, "warns", "mount", p=p), **_size_in_order(test, own, names))
+
+
+def _size_in_order(test: Test, shift: Float[ndarray, "6"], names: Sequence[str]) -> dict[str, Any]:
+    """Return the fields of a finding that state how large an effect of the order is."""
+    kind, place = test.row.kind, test.row.place
+    if kind is Kind.DELAY:
+        std = float(np.sqrt(test.covariance[0, 0]))
+        fields = {"value": float(test.estimate[0]), "std": std, "shift": (*shift.tolist(), 0.0)}
+        return {"mend": "poses", "details": {"unit": "interval"}, **fields}
+    metres, radians = np.linalg.norm(test.estimate.reshape(2, 3), axis=1).tolist()
+    if kind is Kind.DRIFT:
+        shift = test.estimate / 2
+        return {"value": metres, "shift": (*shift.tolist(), 0.0), "details": {"rotation": radians}}
+    count, longer = max((place, "before"), (len(names) - place, "after"))
+    # A base that moves takes no part in the hand-eye transform: its shift is what it does to the fit.
+    moved = test.estimate if kind is Kind.SLIP else shift
+    return {
+        "severity": "rejects" if metres > LARGE_MOTION[0] or radians > LARGE_MOTION[1] else "warns",
+        "mend": "mount" if kind is Kind.SLIP else "poses",
+        "images": (names[place - 1], names[place]),
+        "value": metres,
+        "shift": (*moved.tolist(), 0.0),
+        "details": {"rotation": radians, "longer": longer, "count": float(count)},
+    }
+
+
+def _size_of_strain(test: Test) -> dict[str, Any]:
+    """Return the fields of a finding that state how large an effect of the arm is, without its shift."""
+    estimate, covariance = test.estimate, test.covariance
+    if test.row.kind is Kind.BASE_LEANS:
+        return {"value": float(estimate[0]), "std": float(np.sqrt(covariance[0, 0]))}
+    if test.row.kind is Kind.TOOL_SAGS:
+        value = float(np.linalg.norm(estimate))
+        axis, frame = estimate / value, "gripper"
+        std = float(np.sqrt(axis @ covariance @ axis))
+    else:
+        values, vectors = np.linalg.eigh(np.einsum("k,kab->ab", estimate, STRAINS))
+        k = int(np.abs(values).argmax())
+        axis, frame = vectors[:, k] * np.sign(vectors[np.abs(vectors[:, k]).argmax(), k]), "base"
+        by = np.einsum("a,kab,b->k", axis, STRAINS, axis)
+        # The two other axes are shorter by half of the strain each.
+        value, std = 1.5 * float(values[k]), 1.5 * float(np.sqrt(by @ covariance @ by))
+    return {
+        "value": value,
+        "std": std,
+        "details": {"frame": frame} | dict(zip("xyz", axis.tolist(), strict=True)),
+    }
+
+
+def _adopted(case: Case, state: State, findings: tuple[Finding, ...]) -> Checked:
+    """Return the calibration with the effects that its model can carry; one that is rejected stays.
+
+    The calibration stays that of the effective transform, which predicts best from the poses as they are reported. How
+    far it is from that of the true poses, and what the scale may be off by, counts as uncertainty.
+    """
+    strains = [row for row in state.poses if row.kind in BENT]
+    if not strains and not any(one.kind in CAMERA for one in findings):
+        return Checked(findings)
+    combinations = np.concatenate([one.both for one in state.found], axis=1) if state.found else None
+    bent = np.concatenate([row.prior_std * row.columns for row in strains], axis=1) if strains else None
+    adjusted = adjust_case(case, combinations=combinations, bent=bent)
+    refined = judged(refined_by(case, adjusted))
+    if not refined.converged:
+        return Checked(findings)
+    straight = [np.zeros(7)] * len(strains)
+    if bent is not None:
+        straight[0] = straight_shift(adjusted.equations, adjusted.log_sizes, bent)[:7]
+    shifts = dict(zip((row.kind for row in strains), straight, strict=True))
+    adopted = [_as_adopted(one, shifts.get(one.kind), adjusted) for one in findings]
+    return Checked(tuple(adopted), refined, adjusted)
+
+
+def _as_adopted(found: Finding, straight: Float[ndarray, "7"] | None, adjusted: Adjusted) -> Finding:
+    """Return a finding with the uncertainty that remains after the calibration adopted the effect."""
+    if found.kind in CAMERA:
+        return replace(found, shift=None, intrinsics_shift=None)
+    if straight is None:
+        return found
+    return replace(found, shift=tuple(_with_metre(found, straight, adjusted).tolist()))
+
+
+def _with_metre(found: Finding, shift: Float[ndarray, "7"], adjusted: Adjusted) -> Float[ndarray, "7"]:
+    """Add to a shift what the scale may be off by: of three lengths one differs, and no image shows which is a metre."""
+    if found.kind is not Kind.LENGTHS or found.value is None:
+        return shift
+    equations = adjusted.equations
+    region = Region.of_poses(equations.jacobian[:, :UNKNOWNS])
+    metre = np.r_[-(region.fit @ equations.jacobian[:, SCALE])[:6, 0], 1.0]
+    of_metre = abs(found.value) / 3 * metre
+    return shift + of_metre * (1 if shift[:6] @ of_metre[:6] >= 0 else -1)
+
+
+def straight_shift(
+    equations: Equations, log_sizes: LogSizes, columns: Float[ndarray, "s b"]
+) -> Float[ndarray, " p"]:
+    """Return the step from the effective unknowns to those of the true poses; `columns` are errors of the poses."""
+    straight = replace(equations, bent=columns @ columns.T)
+    return solve(straight, log_sizes).step - solve(equations, log_sizes).step
+
+
+def _with_rejected_runs(case: Case) -> Case:
+    """Return the case with images that were rejected in a row: after a slip they are, and one by itself is wrong."""
+    used = case.hand_eye.inliers
+    rejected = np.pad(~used, 1)
+    in_order = used | rejected[:-2] | rejected[2:]
+    if (in_order == used).all():
+        return case
+    images = replace(case.hand_eye.images, inliers=in_order)
+    longer = replace(case, hand_eye=replace(case.hand_eye, images=images), chosen_tracks=None, adjusted=None)
+    if case.adjusted is None:
+        return longer
+    try:
+        return replace(longer, adjusted=adjust_case(longer))
+    except np.linalg.LinAlgError:
+        return case
+
+
+def _effects_of_poses(case: Case) -> tuple[Finding, ...]:
+    """Return the most significant effect on the poses where camera poses alone decide the calibration."""
+    fit, evidence = case.hand_eye.before or case.hand_eye, case.reconstruction.evidence
+    problem = PoseProblem(
+        base_from_gripper=case.base_from_gripper,
+        recon_from_camera=case.recon_from_camera,
+        used=case.hand_eye.inliers,
+        systematic=case.robot.systematic,
+        noise=case.options.robot_noise_m_rad,
+        cues=case.cues or Cues(),
+        camera_covariance=None if evidence is None else evidence.covariance,
+    )
+    equations = linearised(problem, (fit.gripper_from_camera, fit.scale, fit.base_from_recon)).equations
+    poses = ArmEquations(
+        equations=equations,
+        log_sizes=most_likely(equations)[0],
+        base_from_gripper=case.base_from_gripper[case.used],
+        rows=slice(0, 6 * len(case.used)),
+        columns=columns_of_arm(0),
+    )
+    test = best_pose_effect(poses, BENT)
+    std = np.sqrt(np.diag(case.hand_eye.covariance)[:6]) * case.hand_eye.converged
+    names = [case.names[row] for row in case.used]
+    found = None if test is None else pose_finding(test, poses, names, std)
+    return () if found is None else (found,)
