@@ -48,6 +48,10 @@ class Faults:
     """m, rad about random axes: the camera moves on the gripper."""
     slip_after: float = 0.5
     """Share of the images before it."""
+    drift: tuple[float, float] = (0.0, 0.0)
+    """m, rad about random axes: the motion of the camera on the gripper from the first image to the last, evenly."""
+    base_moved: tuple[float, float] = (0.0, 0.0)
+    """m, rad about random axes: the robot's base is pushed midway."""
     pose_scale: float = 1.0
     """Of the reported positions."""
     lengths: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -93,10 +97,18 @@ def faulty_capture(rng: np.random.Generator, images: int = 12, faults: Faults = 
     true = gripper_poses("varied", images, TARGET_IN_BASE, x, rng)
     axes = rng.normal(size=(2, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    slipped = x @ transform(rotation_exp(faults.slip[1] * axes[0]), faults.slip[0] * axes[1])
+    slipped = x @ _motion(faults.slip, axes)
     first = round(faults.slip_after * images)
     mounted = np.stack([x if k < first else slipped for k in range(images)])
+    if any(faults.drift):
+        mounted = np.stack(
+            [x @ _motion(faults.drift, share * axes) for share in np.linspace(-0.5, 0.5, images)]
+        )
+        slipped = mounted[-1]
     cameras = true @ mounted
+    if any(faults.base_moved):
+        pushed = np.arange(images) >= images / 2
+        cameras = np.where(pushed[:, None, None], _motion(faults.base_moved, axes) @ cameras, cameras)
     reported = late(true, faults.delay_s, faults.view_s) if faults.delay_s else true
     reported = disturbed(_bent(reported, faults), faults.robot_noise, rng)
     reported[:, :3, 3] *= faults.pose_scale
@@ -142,6 +154,11 @@ def faulty_capture(rng: np.random.Generator, images: int = 12, faults: Faults = 
         gripper_from_camera_after=slipped,
         intrinsics=INTRINSICS,
     )
+
+
+def _motion(size: tuple[float, float], axes: Float[ndarray, "2 3"]) -> Float[ndarray, "4 4"]:
+    """Return a rotation about the first axis and a translation along the second of this size (m, rad)."""
+    return transform(rotation_exp(size[1] * axes[0]), size[0] * axes[1])
 
 
 def _through_prism(x: Float[ndarray, "p 2"], s: tuple[float, float, float, float]) -> Float[ndarray, "p 2"]:

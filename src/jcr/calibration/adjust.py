@@ -60,7 +60,6 @@ def adjust_case(
     *,
     prior: IntrinsicsPrior | None = None,
     combinations: Float[ndarray, "e p"] | None = None,
-    exchanged: bool = False,
     bent: Float[ndarray, "s b"] | None = None,
 ) -> Adjusted:
     """The used images and gripper poses of a case adjusted, from its fit to poses or from its adjustment.
@@ -79,7 +78,7 @@ def adjust_case(
         options=WristOptions(
             systematic=case.systematic,
             combinations=combinations,
-            exchanged=exchanged,
+            exchanged=case.exchanged,
             near=case.adjusted,
             start_noise=_start_noise(fit),
             bent=bent,

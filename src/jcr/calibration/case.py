@@ -36,6 +36,8 @@ class Case:
     """What is known of scale and height beside the robot's poses."""
     hand_eye: HandEye
     """The calibration as it stands."""
+    exchanged: bool = False
+    """The camera stands still and the gripper carries what it sees."""
     chosen_tracks: Tracks | None = None
     """Observations in the used images that take part, where not all do."""
     adjusted: Adjusted | None = None

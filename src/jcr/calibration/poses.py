@@ -2,15 +2,17 @@
 
 import numpy as np
 
+from jcr.calibration.checks.effects import effects_of_fit, with_rejected_runs
 from jcr.calibration.conventions import better_reading, convention_finding
 from jcr.calibration.cues import height_cue
 from jcr.calibration.expected import assumed_of_poses
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import RobotErrors, errors_of
+from jcr.calibration.verdict import with_findings
 from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
-from jcr.estimation.fit import Cues
+from jcr.estimation.fit import Cues, PoseProblem
 from jcr.estimation.hand_eye import SCALE_STD, solve_hand_eye
 from jcr.records import Finding, HandEye, Kind, PosePairs
 
@@ -27,6 +29,15 @@ def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -
     check_options(options := options or CalibrateOptions())
     robot = errors_of(pairs.base_from_gripper, None if options.robot is None else arm_named(options.robot))
     hand_eye = _calibrated_poses(pairs, options, robot)
+    problem = PoseProblem(
+        base_from_gripper=pairs.base_from_gripper,
+        recon_from_camera=pairs.recon_from_camera,
+        used=with_rejected_runs(hand_eye.inliers),
+        systematic=robot.systematic,
+        noise=options.robot_noise_m_rad,
+    )
+    if hand_eye.observability.observable:
+        hand_eye = with_findings(hand_eye, effects_of_fit(problem, hand_eye, pairs.images))
     is_known = options.scale is not None or (pairs.is_metric and is_one(hand_eye))
     gripper = pairs.base_from_gripper
     assumptions = assumed_of_poses(hand_eye, gripper[hand_eye.inliers], SCALE_STD if is_known else None)

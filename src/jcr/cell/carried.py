@@ -9,12 +9,14 @@ errors where they are (estimation/image_robots.py).
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from jcr.calibration.adjust import adjust_case, estimate_of
 from jcr.calibration.case import MIN_OBSERVATIONS, Case
+from jcr.calibration.checks.camera import of_fewer_points
+from jcr.calibration.checks.effects import EFFECTS, effects, with_effects
+from jcr.calibration.checks.imaged import of_case
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
+from jcr.calibration.verdict import with_findings
 from jcr.cell.background import write_moving_parts
 from jcr.estimation.hand_eye import judged, solve_hand_eye
 from jcr.geometry import inverse
@@ -65,19 +67,23 @@ def refined(
         robot=robot,
         cues=None,
         hand_eye=found,
+        exchanged=True,
     )
     if found.before is None or case.tracks.from_pointmaps or len(case.tracks.image) < MIN_OBSERVATIONS:
         return found
-    answer = adjust_case(case, exchanged=True)
-    faults = np.zeros((7, 7)) if found.budget is None else found.budget.faults
-    return judged(
-        replace(
-            found,
-            estimate=estimate_of(answer, case.tracks).with_fault(faults),
-            robot=replace(found.robot, noise=answer.noise),
-            plan=replace(found.plan, next_poses=()),
-        )
+    case = replace(case, adjusted=adjust_case(case))
+    state, effects_found = effects(of_case(of_fewer_points(case)))
+    adjusted, effects_found = with_effects(case, state, effects_found)
+    answer = adjusted or case.adjusted
+    assert answer is not None
+    again = replace(
+        found,
+        estimate=estimate_of(answer, case.tracks),
+        robot=replace(found.robot, noise=answer.noise),
+        plan=replace(found.plan, next_poses=()),
+        findings=tuple(one for one in found.findings if one.kind not in EFFECTS),
     )
+    return judged(with_findings(judged(again), effects_found))
 
 
 def _explained(capture: Capture, reconstruction: Reconstruction, found: HandEye) -> HandEye:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.calibration.adjust import adjust_case, refined_by
@@ -38,7 +38,7 @@ from jcr.estimation.mixed_model import Equations, LogSizes, solve
 from jcr.estimation.pose_effects import PLAUSIBLE, STRAINS, arm_rows, order_rows
 from jcr.estimation.pose_equations import SCALE, UNKNOWNS, Poses, columns_of_arm
 from jcr.estimation.systematic import Region
-from jcr.records import BENT, CAMERA, Finding, Kind
+from jcr.records import BENT, CAMERA, Finding, HandEye, Kind
 
 AT_ONCE = 3
 """Largest number of effects that are named of one capture."""
@@ -49,6 +49,8 @@ LOG_ALPHA_OF_ORDER = np.log(1e-4)
 """Logarithm of the probability of a false alarm of the effects that depend on the order of the images."""
 SHARES = frozenset({Kind.SLIP, Kind.BASE_MOVED, Kind.DRIFT})
 """Effects of a motion that has a share in each image, tested against other orders of the images."""
+EFFECTS = CAMERA | BENT | SHARES | {Kind.DELAY}
+"""Kinds of findings that these tests make."""
 MATERIAL = 0.5
 """Standard deviations by which an effect must move the camera on some axis to be reported."""
 MIN_IMAGES = 6
@@ -263,26 +265,34 @@ def _size_of_strain(test: Test) -> dict[str, Any]:
 
 
 def _adopted(case: Case, state: State, findings: tuple[Finding, ...]) -> Checked:
-    """Return the calibration with the effects that its model can carry; one that is rejected stays.
+    """Return the calibration with the effects that its model can carry; one that is rejected stays."""
+    adjusted, adopted = with_effects(case, state, findings)
+    if adjusted is None:
+        return Checked(findings)
+    refined = judged(refined_by(case, adjusted))
+    return Checked(adopted, refined, adjusted) if refined.converged else Checked(findings)
+
+
+def with_effects(
+    case: Case, state: State, findings: tuple[Finding, ...]
+) -> tuple[Adjusted | None, tuple[Finding, ...]]:
+    """Adjust a case with the effects on camera and arm free, and return the findings with the shifts that remain.
 
     The calibration stays that of the effective transform, which predicts best from the poses as they are reported. How
-    far it is from that of the true poses, and what the scale may be off by, counts as uncertainty.
+    far it is from that of the true poses, and what the scale may be off by, counts as uncertainty. Return None where
+    there is no effect that the model can carry.
     """
     strains = [row for row in state.poses if row.kind in BENT]
     if not strains and not any(one.kind in CAMERA for one in findings):
-        return Checked(findings)
+        return None, findings
     combinations = np.concatenate([one.both for one in state.found], axis=1) if state.found else None
     bent = np.concatenate([row.prior_std * row.columns for row in strains], axis=1) if strains else None
     adjusted = adjust_case(case, combinations=combinations, bent=bent)
-    refined = judged(refined_by(case, adjusted))
-    if not refined.converged:
-        return Checked(findings)
     straight = [np.zeros(7)] * len(strains)
     if bent is not None:
         straight[0] = straight_shift(adjusted.equations, adjusted.log_sizes, bent)[:7]
     shifts = dict(zip((row.kind for row in strains), straight, strict=True))
-    adopted = [_as_adopted(one, shifts.get(one.kind), adjusted) for one in findings]
-    return Checked(tuple(adopted), refined, adjusted)
+    return adjusted, tuple(_as_adopted(one, shifts.get(one.kind), adjusted) for one in findings)
 
 
 def _as_adopted(found: Finding, straight: Float[ndarray, "7"] | None, adjusted: Adjusted) -> Finding:
@@ -315,10 +325,8 @@ def straight_shift(
 
 def _with_rejected_runs(case: Case) -> Case:
     """Return the case with images that were rejected in a row: after a slip they are, and one by itself is wrong."""
-    used = case.hand_eye.inliers
-    rejected = np.pad(~used, 1)
-    in_order = used | rejected[:-2] | rejected[2:]
-    if (in_order == used).all():
+    in_order = with_rejected_runs(case.hand_eye.inliers)
+    if (in_order == case.hand_eye.inliers).all():
         return case
     images = replace(case.hand_eye.images, inliers=in_order)
     longer = replace(case, hand_eye=replace(case.hand_eye, images=images), chosen_tracks=None, adjusted=None)
@@ -330,9 +338,15 @@ def _with_rejected_runs(case: Case) -> Case:
         return case
 
 
+def with_rejected_runs(used: Bool[ndarray, " n"]) -> Bool[ndarray, " n"]:
+    """Return the used images and those that were rejected in a row."""
+    rejected = np.pad(~used, 1)
+    return used | rejected[:-2] | rejected[2:]
+
+
 def _effects_of_poses(case: Case) -> tuple[Finding, ...]:
-    """Return the most significant effect on the poses where camera poses alone decide the calibration."""
-    fit, evidence = case.hand_eye.before or case.hand_eye, case.reconstruction.evidence
+    """Return the most significant effect of the order where camera poses alone decide the calibration."""
+    evidence = case.reconstruction.evidence
     problem = PoseProblem(
         base_from_gripper=case.base_from_gripper,
         recon_from_camera=case.recon_from_camera,
@@ -342,16 +356,23 @@ def _effects_of_poses(case: Case) -> tuple[Finding, ...]:
         cues=case.cues or Cues(),
         camera_covariance=None if evidence is None else evidence.covariance,
     )
+    return effects_of_fit(problem, case.hand_eye, case.names)
+
+
+def effects_of_fit(problem: PoseProblem, hand_eye: HandEye, names: Sequence[str]) -> tuple[Finding, ...]:
+    """Return the most significant effect of the order on a fit to camera poses; `names` are those of its poses."""
+    fit = hand_eye.before or hand_eye
     equations = linearised(problem, (fit.gripper_from_camera, fit.scale, fit.base_from_recon)).equations
+    used = np.flatnonzero(problem.used)
     poses = ArmEquations(
         equations=equations,
         log_sizes=most_likely(equations)[0],
-        base_from_gripper=case.base_from_gripper[case.used],
-        rows=slice(0, 6 * len(case.used)),
+        base_from_gripper=problem.base_from_gripper[used],
+        rows=slice(0, 6 * len(used)),
         columns=columns_of_arm(0),
     )
+    # Errors of camera poses that come from features look like a strained arm; only the adjustment separates them.
     test = best_pose_effect(poses, BENT)
-    std = np.sqrt(np.diag(case.hand_eye.covariance)[:6]) * case.hand_eye.converged
-    names = [case.names[row] for row in case.used]
-    found = None if test is None else pose_finding(test, poses, names, std)
+    std = np.sqrt(np.diag(hand_eye.covariance)[:6]) * hand_eye.converged
+    found = None if test is None else pose_finding(test, poses, [names[row] for row in used.tolist()], std)
     return () if found is None else (found,)
