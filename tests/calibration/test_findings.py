@@ -81,6 +81,12 @@ EXAMPLES: dict[Kind, dict] = {
         "images": ("a.png", "b.png"),
         "details": SIZE | {"longer": "after", "count": 5.0},
     },
+    Kind.BASE_MOVED: {
+        "value": 0.01,
+        "p": 1e-9,
+        "images": ("a.png", "b.png"),
+        "details": SIZE | {"longer": "after", "count": 5.0},
+    },
     Kind.DRIFT: {"value": 0.01, "p": 1e-9, "details": SIZE},
     Kind.DELAY: {"value": 0.41, "std": 0.03, "p": 1e-9, "details": {"unit": "interval"}},
     Kind.WRONG_MOUNT: {"details": {"camera": "overhead"}},

@@ -300,8 +300,8 @@ def test_a_zoom_of_a_second_camera_is_named_with_its_size_and_none_where_there_i
     answer, place = images.adjusted(), WANTED["wrists"][1]
     second = Imaged(
         adjusted=answer,
-        adjust=lambda prior, free, bent: images.with_bent(1, bent).with_freed(prior, 1, free).adjusted(),
-        arm=1,
+        adjust=lambda prior, free, bent: images.with_freed(prior, 1, free).adjusted(),
+        arm=None,
         names=[f"{k}.png" for k in range(COUNT)],
         start=camera,
         is_given=True,
