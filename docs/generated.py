@@ -5,22 +5,22 @@ the table of backends.md.
 """
 
 import ast
+import contextlib
 import inspect
+import io
 import json
 import re
 import sys
 import textwrap
 from collections.abc import Collection, Iterator
 from dataclasses import MISSING, Field, fields, is_dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import jcr
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.cell.cameras_json import CamerasFile
-from jcr.cli import COMMANDS
-from jcr.cli.arguments import Argument, groups
+from jcr.cli import COMMANDS, dispatch
 from jcr.cli.models import SCALES
 from jcr.depth.depth_npz import About as DepthAbout
 from jcr.pages import pages
@@ -68,18 +68,11 @@ def cli_page() -> str:
         *(f"| [`jcr {name}`](#jcr-{name}) | {about} |" for name, about in COMMANDS.items()),
     ]
     for name in COMMANDS:
-        command = import_module(f"jcr.cli.{name.replace('-', '_')}")
-        parts += ["", f"## jcr {name}", "", _text(command.Arguments.__doc__ or "")]
-        for group in groups(command.Arguments, f"jcr {name}"):
-            title = {"positional arguments": "Arguments", "options": "Options"}.get(group.title, group.title)
-            parts += ["", f"**{title.capitalize()}**" + (f": {group.about}" if group.about else "")]
-            parts += ["", "| | |", "|---|---|", *map(_argument, group.arguments)]
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            dispatch([name, "--help"])
+        parts += ["", f"## jcr {name}", "", "```text", printed.getvalue().strip(), "```"]
     return "\n".join(parts) + "\n"
-
-
-def _argument(argument: Argument) -> str:
-    named = " ".join(filter(None, (argument.flag, argument.value.replace(",", ", "))))
-    return f"| {_cell(f'`{named}`')} | {_cell(_escaped(argument.text))} |"
 
 
 def _cell(text: str) -> str:

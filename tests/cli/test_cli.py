@@ -7,7 +7,6 @@ import re
 import shutil
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +15,6 @@ import pytest
 import jcr
 from in_process import run_jcr
 from jcr.cli import COMMANDS, dispatch
-from jcr.cli.arguments import groups
-from jcr.cli.help import COMMON, MANY
 from jcr.cli.query import read_points
 from jcr.errors import InputError
 from jcr.scene.cloud_ply import read_cloud
@@ -189,28 +186,26 @@ def test_check_finds_the_bundled_capture_good_and_a_planted_mistake_bad(tabletop
 
 def test_every_command_has_help_with_examples(capsys: pytest.CaptureFixture[str]):
     overview = run_jcr("--help").stdout
-    assert all(name in overview for name in COMMANDS)
+    assert all(name in overview for name in COMMANDS) and overview.count("\n") < 50
     for name in COMMANDS:
         assert dispatch([name, "--help"]) == 0
-        text = capsys.readouterr().out
-        assert "examples:" in text and not re.search(r"[│╭╰]", text), name
-        assert len(re.findall(r"^  --", text, re.MULTILINE)) <= MANY, name
+        assert "examples:" in capsys.readouterr().out, name
 
 
-def test_every_option_that_help_puts_first_is_one_of_some_command():
-    records = [import_module(f"jcr.cli.{name.replace('-', '_')}").Arguments for name in COMMANDS]
-    known = {one.flag for record in records for group in groups(record, "jcr") for one in group.arguments}
-    assert set(COMMON) <= known
-
-
-def test_help_lists_what_users_set_and_shows_where_the_rest_is(capsys: pytest.CaptureFixture[str]):
+def test_help_puts_what_most_users_set_before_the_rest(capsys: pytest.CaptureFixture[str]):
     assert dispatch(["run", "--help"]) == 0
-    few = capsys.readouterr().out
-    assert dispatch(["run", "--help-all"]) == 0
-    everything = capsys.readouterr().out
-    options = [re.findall(r"^  (--[a-z-]+)", text, re.MULTILINE) for text in (few, everything)]
-    assert set(options[0]) < set(options[1]) and "--robot" in options[0] and "--seed" not in options[0]
-    assert f"{len(options[1]) - len(options[0])} more options: jcr run --help-all" in few
+    options = re.findall(r"^(?:│| ) (--[a-z][a-z-]+)", capsys.readouterr().out, re.MULTILINE)
+    common = {
+        "--json",
+        "--quiet",
+        "--no-map",
+        "--require",
+        "--robot",
+        "--robot-noise",
+        "--backend",
+        "--board",
+    }
+    assert common <= set(options[:15]) and len(options) > 30
 
 
 def test_sizes_of_nothing_are_refused(tmp_path: Path):
@@ -276,12 +271,11 @@ def test_images_without_features_are_rejected_and_show_what_to_do(tmp_path: Path
     assert all(html.escape(attempt["why_not"]) in report for attempt in content["attempts"])
 
 
-def test_help_names_units_and_gives_defaults_only_where_they_are_values(capsys: pytest.CaptureFixture[str]):
-    assert dispatch(["calibrate", "--help-all"]) == 0
-    text = " ".join(capsys.readouterr().out.split()).partition("read options")[2]
-    assert "--require MM DEG" in text and "--robot-noise MM DEG" in text and "(default: 8.0)" in text
-    assert not re.search(r"\(default:\s+(None|True|False)\)", text)
-    assert text.index("--pose-convention") < text.index("--require") < text.index("--backend")
+def test_help_names_units_and_defaults(capsys: pytest.CaptureFixture[str]):
+    assert dispatch(["calibrate", "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split()).partition("calibrate options")[2]
+    assert "--require MM DEG" in text and "--robot-noise MM DEG" in text and "(default: 100.0)" in text
+    assert text.index("--require") < text.index("--backend") < text.index("--pose-convention")
 
 
 def test_wrong_input_is_refused_before_a_camera_is_opened_or_a_map_read(tmp_path: Path):

@@ -60,9 +60,9 @@ base frame, from images of a wrist camera and the gripper pose at each.
 
 {commands}
 
-jcr COMMAND --help     arguments and examples of a command; --help-all: every option
+jcr COMMAND --help     arguments, options and examples of a command
 jcr --version          the version
-jcr --completion bash  a script that completes commands, options and files; also zsh, fish
+jcr --tyro-write-completion bash FILE  a script that completes commands, options and files; also zsh, fish
 
 examples:
   jcr run captures/table out/table
@@ -143,21 +143,25 @@ def dispatch(arguments: Sequence[str]) -> int:
 
         sys.stdout.write(f"jcr {__version__}\n")
         return 0
-    if name == "--completion":
-        return _guarded(lambda: _complete(" ".join(rest)))
+    if name == "--tyro-write-completion":
+        return _guarded(lambda: _completion(arguments))
     if name not in COMMANDS:
         like = did_you_mean(name, COMMANDS)
         return _fail(
             2, f"{name!r} is not a jcr command{like}; choose from {', '.join(COMMANDS)} (jcr --help)"
         )
-    return call(lambda: import_module(f"jcr.cli.{name.replace('-', '_')}"), f"jcr {name}", rest)
+    return call(lambda: import_module(_module_of(name)), f"jcr {name}", rest)
 
 
-def _complete(shell: str) -> int:
-    from jcr.cli.completion import script
+def _completion(arguments: Sequence[str]) -> int:
+    from jcr.cli.usage import write_completion
 
-    sys.stdout.write(script(shell, COMMANDS))
+    write_completion({name: import_module(_module_of(name)).Arguments for name in COMMANDS}, arguments)
     return 0
+
+
+def _module_of(command: str) -> str:
+    return f"jcr.cli.{command.replace('-', '_')}"
 
 
 def _listed(group: str) -> str:
@@ -214,13 +218,12 @@ def _interrupted(error: BaseException | None) -> bool:
 
 
 def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
-    from jcr.cli.help import EVERYTHING, help_text
     from jcr.cli.usage import parsed
 
-    if asked := {"-h", "--help", EVERYTHING}.intersection(arguments):
-        sys.stdout.write(help_text(command, program, EVERYTHING in asked))
-        return 0
-    record = parsed(command.Arguments, program, arguments)
+    try:
+        record = parsed(command.Arguments, program, arguments)
+    except SystemExit as end:  # after --help
+        return int(end.code or 0)
     require_address_space()
     with contextlib.ExitStack() as silence:
         if record.output.quiet:

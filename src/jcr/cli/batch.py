@@ -34,14 +34,14 @@ class Arguments:
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURES... OUT")]
     """Folders of the captures, then the folder for the results."""
-    read: ReadOptions = field(default_factory=ReadOptions)
-    batch: BatchOptions = field(default_factory=BatchOptions)
+    output: Output = field(default_factory=Output)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
+    read: ReadOptions = field(default_factory=ReadOptions)
+    batch: BatchOptions = field(default_factory=BatchOptions)
     depth: DepthOptions = field(default_factory=DepthOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
-    output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:

@@ -31,11 +31,11 @@ class Arguments:
     """Folder of the capture, or another format (jcr docs captures)."""
     out: Annotated[Path, tyro.conf.Positional]
     """Folder for the results."""
-    read: ReadOptions = field(default_factory=ReadOptions)
+    output: Output = field(default_factory=Output)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
+    read: ReadOptions = field(default_factory=ReadOptions)
     depth: DepthOptions = field(default_factory=DepthOptions)
-    output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:

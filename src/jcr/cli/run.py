@@ -38,16 +38,16 @@ class Arguments:
     """Folder of the capture, or another format (jcr docs captures)."""
     out: Annotated[Path, tyro.conf.Positional]
     """Folder for the results."""
-    read: ReadOptions = field(default_factory=ReadOptions)
+    output: Output = field(default_factory=Output)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
+    read: ReadOptions = field(default_factory=ReadOptions)
     depth: DepthOptions = field(default_factory=DepthOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
     segment: SegmentOptions = field(default_factory=SegmentOptions)
     no_map: bool = False
     """Calibration and report only: no dense depth, cloud or map; so without torch, too."""
-    output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:

@@ -1,65 +1,97 @@
-"""The arguments of a command as its record; wrong ones as an InputError, made of what the parser reports as data.
+"""Parse the arguments of a command with tyro; a wrong one is an InputError of one line.
 
 The hook of tyro for parse errors is in its module `_errors`, which pyproject.toml bounds by the minor version.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import fields, is_dataclass
 from itertools import takewhile
 from pathlib import Path
 from types import NoneType
-from typing import Any, get_args
+from typing import Annotated, Any, Union, get_args, get_type_hints
 
 import tyro
 from tyro import _errors
 
-from jcr.cli.arguments import CONFIGURATION, groups
 from jcr.errors import InputError, did_you_mean
 
+CONFIGURATION = (
+    tyro.conf.OmitArgPrefixes,
+    tyro.conf.FlagCreatePairsOff,
+    tyro.conf.PositionalMetavarFromFieldName,
+    tyro.conf.DisallowNone,
+)
+"""Conversion of the fields of a command's `Arguments` to options."""
+SHELLS = ("bash", "zsh", "tcsh", "fish")
+"""Shells that tyro writes a completion script for."""
 VALUES = {float: "number", int: "whole number", str: "text", Path: "path"}
-"""Types of values, for people."""
+"""Types of values in messages."""
 
 
-def parsed(record: type, program: str, arguments: Sequence[str]) -> Any:
-    """The record that a command line makes; InputError in one line where it makes none."""
+def parsed(record: Any, program: str, arguments: Sequence[str]) -> Any:
+    """Return the record that a command line makes; raise InputError of one line where it makes none."""
 
     def refuse(event: _errors.ParseErrorEvent) -> None:
         raise InputError(f"{_complaint(event, record, program, arguments)} ({program} --help)")
 
     with _errors.on_parse_error(refuse):
-        return tyro.cli(record, prog=program, args=list(arguments), config=CONFIGURATION, add_help=False)
+        return tyro.cli(record, prog=program, args=list(arguments), config=CONFIGURATION)
+
+
+def write_completion(records: Mapping[str, type], arguments: Sequence[str]) -> None:
+    """Write the script that completes all commands: `--tyro-write-completion SHELL FILE`.
+
+    Raises InputError for another shell, or without a file.
+    """
+    if len(arguments) != 3 or arguments[1] not in SHELLS:
+        raise InputError(f"{arguments[0]}: give a shell ({', '.join(SHELLS)}) and the file of the script")
+    commands = tuple(Annotated[record, tyro.conf.subcommand(name)] for name, record in records.items())
+    with suppress(SystemExit):
+        parsed(Union[commands], "jcr", arguments)  # noqa: UP007
+    script = Path(arguments[2])
+    # tyro 1.0 keeps a line break of a docstring, which the shell then takes for another completion.
+    lines = script.read_text("utf-8").split("\n")
+    whole = (line.replace("\\n", " ") if line.startswith("COMPLETION_SPEC") else line for line in lines)
+    script.write_text("\n".join(whole), "utf-8")
 
 
 def _complaint(event: _errors.ParseErrorEvent, record: type, program: str, arguments: Sequence[str]) -> str:
-    listed = [argument for group in groups(record, program) for argument in group.arguments]
-    flags = [argument.flag for argument in listed]
-    known = {*flags, *(alias for argument in listed for alias in argument.aliases)}
-    options = (word.partition("=")[0] for word in arguments if word.startswith("--"))
-    if unknown := next((word for word in options if word.replace("_", "-") not in known), None):
-        return f"{program} has no option {unknown}{did_you_mean(unknown, filter(None, flags))}"
+    known = {*_flags(record), "--help"}
+    options = (word.partition("=")[0].replace("_", "-") for word in arguments if word.startswith("--"))
+    if unknown := next((word for word in options if word not in known), None):
+        return f"{program} has no option {unknown}{did_you_mean(unknown, known)}"
     match event:
-        case _errors.UnrecognizedArgs(tokens=[first, *_]):
-            return f"{first!r}: one argument too many for {program}"
         case _errors.MissingArgs(missing_arguments=missing):
             return f"{', '.join(str(one.arg.lowered.metavar) for one in missing)}: required, and not given"
+        case _errors.UnrecognizedArgs(tokens=[first, *_]):
+            return f"{first!r}: one argument too many for {program}"
         case _errors.InvalidChoice(argument=argument, value=value):
-            known = sorted(set(event.choices) - {"None"})  # which stands for none given
-            like = did_you_mean(value, known)
-            return f"invalid choice {value!r} for {argument.display_name()}{like}; choose from {', '.join(known)}"
+            choices = sorted(set(event.choices) - {"None"})  # which stands for none given
+            like = did_you_mean(value, choices)
+            return f"invalid choice {value!r} for {argument.display_name()}{like}; choose from {', '.join(choices)}"
         case _errors.BadValue(argument=argument) | _errors.InstantiationFailure(argument=argument) if (
             argument
         ):
-            given = ", ".join(map(repr, _values_of(argument.display_name(), arguments)))
-            return f"{argument.display_name()} takes {_wanted(argument.field.type)}, not {given or 'none'}"
+            name = argument.display_name()
+            words = [part for word in arguments for part in (word.split("=", 1) if "=" in word else [word])]
+            after = words[words.index(name) + 1 :] if name in words else []
+            given = ", ".join(map(repr, takewhile(lambda word: not word.startswith("--"), after)))
+            return f"{name} takes {_wanted(argument.field.type)}, not {given or 'none'}"
         case _errors.InstantiationFailure(message=message):
             return message
     return "the arguments cannot be understood"
 
 
-def _values_of(flag: str, arguments: Sequence[str]) -> list[str]:
-    """What follows an option on the command line."""
-    words = [part for word in arguments for part in (word.split("=", 1) if word.startswith(flag) else [word])]
-    after = words[words.index(flag) + 1 :] if flag in words else []
-    return list(takewhile(lambda word: not word.startswith("--"), after))
+def _flags(record: Any) -> Iterator[str]:
+    """Yield the options of a record of arguments, those of nested records included."""
+    if is_dataclass(record):
+        hints = get_type_hints(record)
+        for field in fields(record):
+            if is_dataclass(hints[field.name]):
+                yield from _flags(hints[field.name])
+            else:
+                yield f"--{'no-' * (field.default is True)}{field.name.replace('_', '-')}"
 
 
 def _wanted(kind: object) -> str:
@@ -68,7 +100,7 @@ def _wanted(kind: object) -> str:
 
 
 def _leaves(kind: Any) -> Iterator[Any]:
-    """The types that unions, tuples and annotated types are made of."""
+    """Yield the types that a union, a tuple or an annotated type is made of."""
     if hasattr(kind, "__metadata__"):
         yield from _leaves(get_args(kind)[0])
     elif parts := get_args(kind):
