@@ -17,6 +17,7 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
 from jcr.cli import dispatch
+from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.arms import arm_named
 from jcr.estimation.closed_form import initial_estimate
 from jcr.estimation.fit import PoseProblem, fit_poses
@@ -25,7 +26,7 @@ from jcr.geometry import inverse, rotation_exp, scale_translation, step_between,
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.records import Capture, Reconstruction, Tracks
 from jcr.run_folder import MadeWith, RunFolder, state_of
-from jcr.sfm.relocate import Located, relocate
+from jcr.sfm.register import register
 from simulation.problems import bent_problem
 from simulation.taken import with_robot_noise
 
@@ -75,27 +76,27 @@ def reconstruction(capture: Capture, x: np.ndarray) -> Reconstruction:
 
 
 @pytest.fixture(scope="module")
-def located(capture: Capture, reconstruction: Reconstruction) -> list[Located]:
+def located(capture: Capture, reconstruction: Reconstruction) -> list[CameraPose]:
     images = [read_image(capture.folder / name) for name in capture.images]
-    found = relocate(reconstruction, images[:OLD], images[OLD:])
-    assert all(isinstance(place, Located) for place in found)
+    found = register(reconstruction, images[:OLD], images[OLD:])
+    assert all(isinstance(place, CameraPose) for place in found)
     return found  # type: ignore[return-value]
 
 
 def test_new_images_are_located_to_a_fraction_of_a_millimetre(
-    located: list[Located], capture: Capture, x: np.ndarray
+    located: list[CameraPose], capture: Capture, x: np.ndarray
 ):
     for place, truth in zip(located, cameras(capture, x)[OLD:], strict=True):
-        error = step_between(place.recon_from_camera, truth)
+        error = step_between(place.a_from_camera, truth)
         assert 1e3 * SCALE * np.linalg.norm(error[:3]) < 1.0
         assert error @ np.linalg.solve(place.covariance, error) < 25
-        assert place.sigma_px < 0.6
+        assert place.std_px < 0.6
 
 
 def test_a_image_of_something_else_is_not_located(reconstruction: Reconstruction, capture: Capture):
     images = [read_image(capture.folder / name) for name in capture.images]
     noise = np.random.default_rng(0).integers(0, 255, images[0].shape, dtype=np.uint8)
-    other, plain = relocate(reconstruction, images[:OLD], [noise, np.full_like(noise, 90)])
+    other, plain = register(reconstruction, images[:OLD], [noise, np.full_like(noise, 90)])
     assert other == 0 or (isinstance(other, int) and other < 30)
     assert plain == 0
 

@@ -19,6 +19,7 @@ from jcr.capture.read import read_source
 from jcr.cell.added import camera_of, read_added_cameras
 from jcr.distributions import chi2
 from jcr.errors import InputError, RejectedError
+from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.fit import PoseFit, PoseProblem, fit_poses
 from jcr.estimation.pose_equations import Poses
 from jcr.geometry import step_between
@@ -28,7 +29,7 @@ from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.records import Capture, PosePairs, Reconstruction, Verdict
 from jcr.records.words import sentence
 from jcr.run_folder import RunFolder
-from jcr.sfm.relocate import Located, relocate
+from jcr.sfm.register import register
 
 ROUNDING = 1e-9
 """Largest change of a number of a pose that is written and read again."""
@@ -132,14 +133,14 @@ def verify(
     taken_then, taken_now = _images(capture.folder, capture.images), _images(new.folder, new.images)
     _require_new(taken_now, taken_then)
     report("find the old scene", 0.0)
-    located = relocate(
+    located = register(
         reconstruction,
         [taken_then[capture.images[row]] for row in reconstruction.image_index],
         [*taken_now.values()],
     )
     report("find the old scene", 1.0)
     lost = [f"{name} shares {place} points with the calibrated scene"
-            for name, place in zip(new.images, located, strict=True) if not isinstance(place, Located)]  # fmt: skip
+            for name, place in zip(new.images, located, strict=True) if not isinstance(place, CameraPose)]  # fmt: skip
     options_then = folder.options()
     if len(lost) < len(new):
         return _in_old_scene(
@@ -184,21 +185,21 @@ def _calibrated_on(folder: RunFolder, calibration: CalibrationFile, new: Capture
 def _in_old_scene(
     then: tuple[CalibrationFile, Capture, Reconstruction, CalibrateOptions],
     new: Capture,
-    located: Sequence[Located | int],
+    located: Sequence[CameraPose | int],
     lost: Sequence[str],
     options: VerifyOptions,
 ) -> Verification:
     """By the images that show where in the calibrated scene they were taken."""
     calibration, capture, reconstruction, calibrate_options = then
-    shared = [k for k, place in enumerate(located) if isinstance(place, Located)]
-    places = [place for place in located if isinstance(place, Located)]
+    shared = [k for k, place in enumerate(located) if isinstance(place, CameraPose)]
+    places = [place for place in located if isinstance(place, CameraPose)]
     used = reconstruction.image_index[_used(calibration, reconstruction)]
     robot = robot_errors(capture, calibrate_options, new)
     found = drift(
         *fitted(*then, of_poses(robot.systematic, used)),
         (
             new.base_from_gripper[shared],
-            np.stack([place.recon_from_camera for place in places]),
+            np.stack([place.a_from_camera for place in places]),
             np.stack([place.covariance for place in places]),
         ),
         of_poses(robot.systematic, np.r_[used, len(capture) + np.array(shared)]),

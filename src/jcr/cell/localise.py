@@ -19,7 +19,7 @@ from jcr.features.verify import HALF_PIXEL
 from jcr.geometry import apply, inverse, transform
 from jcr.records import Intrinsics
 from jcr.sfm.mapping import camera_of
-from jcr.sfm.relocate import GATE_PX, MIN_POINTS, Features, features, triangulated
+from jcr.sfm.register import GATE_PX, MIN_POINTS, Features, features, triangulated
 
 FOCAL_OF_WIDTH = 0.9
 """Of a camera without known intrinsics: where the search for its focal length starts."""

@@ -5,10 +5,11 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.capture.images import read_image
+from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.pose_equations import predict
 from jcr.geometry import step_between
 from jcr.records import Capture, Finding, HandEye, Kind, Reconstruction
-from jcr.sfm.relocate import Located, relocate
+from jcr.sfm.register import register
 
 SAME = (10e-3, np.radians(1.0))
 """m, rad: nearer than this a pose is that of the image."""
@@ -56,7 +57,7 @@ def _shown_poses(
             [read_image(capture.folder / capture.images[row]) for row in rows]
             for rows in (made.image_index, unseen)
         )
-        places = zip(unseen, relocate(made, older, new), strict=True)
-        camera |= {row: place.recon_from_camera for row, place in places if isinstance(place, Located)}
+        places = zip(unseen, register(made, older, new), strict=True)
+        camera |= {row: place.a_from_camera for row, place in places if isinstance(place, CameraPose)}
     x, scale, z = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon
     return {row: predict(x, scale, z, one[None])[0] for row, one in camera.items() if row not in used}

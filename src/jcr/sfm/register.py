@@ -1,0 +1,130 @@
+"""Registration of new images in a reconstruction: points of matched features, then the absolute pose of each camera.
+
+A feature that a new image shares with two or more older ones is triangulated from these. The cameras of any back
+end will do; the covariance of a new one includes that of the points.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+from numpy import ndarray
+
+from jcr.camera import NORMALIZED, project, resized, unproject
+from jcr.estimation.absolute_pose import CameraPose, absolute_pose
+from jcr.features.sift import detect, grey_of, matches
+from jcr.geometry import across_lines
+from jcr.records import Intrinsics, Reconstruction
+
+WORKING_SIZE_PX = 1600
+"""Larger images are reduced to this long side before features are found."""
+GATE_PX = 3.0
+"""Reprojection error beyond which an observation is a mismatch."""
+MIN_PARALLAX = np.radians(1.5)
+"""Least angle between the rays of a point."""
+MIN_POINTS = 30
+"""Least number of points that agree on a pose; fewer agree by chance on repeated patterns."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """Features of one image."""
+
+    x_px: Float[ndarray, "k 2"]
+    """Pixels of the original image, distorted."""
+    rays: Float[ndarray, "k 2"]
+    """(x/z, y/z), undistorted."""
+    descriptors: Float32[ndarray, "k 128"]
+    """Descriptors of unit length."""
+
+
+def register(
+    reconstruction: Reconstruction,
+    older: Sequence[UInt8[ndarray, "h w 3"]],
+    new: Sequence[UInt8[ndarray, "h w 3"]],
+) -> list[CameraPose | int]:
+    """Return the camera of each new image in the recon frame, or the number of points that it shares where too few.
+
+    `older` are the images of the reconstruction's rows, in their order; all are of one camera.
+    """
+    intrinsics = reconstruction.intrinsics
+    known = [features(image, intrinsics) for image in older]
+    return [
+        _registered(features(image, intrinsics), known, reconstruction.recon_from_camera, intrinsics)
+        for image in new
+    ]
+
+
+def features(image: UInt8[ndarray, "h w 3"], intrinsics: Intrinsics) -> Features:
+    """Return the SIFT features of an image of these intrinsics."""
+    scale = min(1.0, WORKING_SIZE_PX / max(intrinsics.width, intrinsics.height))
+    size = round(intrinsics.width * scale), round(intrinsics.height * scale)
+    found, descriptors = detect(grey_of(image, size))
+    to_original = np.array([intrinsics.width / size[0], intrinsics.height / size[1]])
+    return Features(
+        (found + 0.5) * to_original - 0.5, unproject(resized(intrinsics, *size), found)[:, :2], descriptors
+    )
+
+
+def _registered(
+    new: Features, known: list[Features], recon_from_camera: Float[ndarray, "m 4 4"], camera: Intrinsics
+) -> CameraPose | int:
+    """Return the pose on which the triangulated points agree, or their number where fewer than MIN_POINTS do."""
+    of_row = [matches(new.descriptors, others.descriptors) for others in known]
+    feature = np.concatenate([mine for mine, _ in of_row])
+    row = np.repeat(np.arange(len(known)), [len(mine) for mine, _ in of_row])
+    seen = np.concatenate([known[k].rays[theirs] for k, (_, theirs) in enumerate(of_row)])
+    gate = GATE_PX / camera.fx
+    points, spread, good = triangulated(feature, row, seen, recon_from_camera, gate, len(new.rays))
+    if good.sum() < MIN_POINTS:
+        return int(good.sum())
+    std_px, found = 1.0, None
+    for _ in range(2):  # the older images have the noise that is found in the new one
+        covariance = (std_px / camera.fx) ** 2 * spread[good]
+        found = absolute_pose(new.x_px[good], points[good], camera, covariance, GATE_PX)
+        if found is None or found.inlier.sum() < MIN_POINTS:
+            return 0 if found is None else int(found.inlier.sum())
+        std_px = found.std_px
+    assert found is not None
+    return found
+
+
+def triangulated(
+    feature: Int[ndarray, " c"],
+    row: Int[ndarray, " c"],
+    seen: Float[ndarray, "c 2"],
+    recon_from_camera: Float[ndarray, "m 4 4"],
+    gate: float,
+    n: int,
+) -> tuple[Float[ndarray, "n 3"], Float[ndarray, "n 3 3"], Bool[ndarray, " n"]]:
+    """Return the point of each feature, its covariance for rays of 1 rad noise, and whether two rays agree on it.
+
+    Observation c is ray `seen[c]` (x/z, y/z) of image `row[c]` for `feature[c]` < n; `gate` (rad) excludes mismatches.
+    """
+    rotation, center = recon_from_camera[row, :3, :3], recon_from_camera[row, :3, 3]
+    direction = np.einsum("cij,cj->ci", rotation, np.c_[seen, np.ones(len(seen))])
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    across = across_lines(direction)
+    point, kept, weight = np.zeros((n, 3)), np.ones(len(row), bool), np.ones(len(row))
+    normal = np.zeros((n, 3, 3))
+    for _ in range(3):  # later without those that missed, and by how far each camera was
+        normal, right = np.zeros((n, 3, 3)), np.zeros((n, 3))
+        weighted = weight[kept, None, None] * across[kept]
+        np.add.at(normal, feature[kept], weighted)
+        np.add.at(right, feature[kept], np.einsum("cij,cj->ci", weighted, center[kept]))
+        # With one ray, or parallel ones, the depth is open; the small term keeps it finite.
+        normal += 1e-9 * np.eye(3)
+        point = np.linalg.solve(normal, right[..., None])[..., 0]
+        in_camera = np.einsum("cji,cj->ci", rotation, point[feature] - center)
+        ahead = in_camera[:, 2] > 1e-6
+        miss = project(NORMALIZED, np.where(ahead[:, None], in_camera, [0.0, 0.0, 1.0])) - seen
+        kept = ahead & (np.linalg.norm(miss, axis=1) < gate)
+        squared = (in_camera**2).sum(1)
+        weight = 1 / np.maximum(squared, 1e-2 * np.median(squared)) if len(squared) else weight
+    count = np.bincount(feature[kept], minlength=n)
+    mean = np.zeros((n, 3))
+    np.add.at(mean, feature[kept], direction[kept])
+    # The mean of unit vectors is shorter than one by half their mean squared angle from it.
+    angle = np.sqrt(np.maximum(2 - 2 * np.linalg.norm(mean, axis=1) / np.maximum(count, 1), 0.0))
+    return point, np.linalg.inv(normal), (count >= 2) & (2 * angle > MIN_PARALLAX)
