@@ -8,13 +8,14 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.attack import CASES, IMAGES, calibrated
+from benchmarks.attack import CASES, IMAGES, calibrated, reconstructed
 from benchmarks.cameras import COUNT, answered, wanted
 from jcr.calibration.stage import calibrate
 from jcr.estimation.arms import arm_named
@@ -160,11 +161,10 @@ def _record_cell(kind: Kind) -> Record:
 
 def _with_sheet(sheet: Sheet) -> HandEye:
     """Return the calibration of a simulated capture whose scene contains a printed sheet."""
-    from benchmarks.attack import reconstructed
-
     rng = np.random.default_rng([0, IMAGES])
-    found = with_sheet(faulty_capture(rng, IMAGES), rng, sheet)
-    return calibrate(*reconstructed(found, False))
+    bare = faulty_capture(rng, IMAGES)
+    capture, reconstruction = reconstructed(bare, False)
+    return calibrate(capture, replace(reconstruction, tracks=with_sheet(bare, rng, sheet).tracks))
 
 
 def _arm(arm: str, preset: Any, count: int) -> HandEye:
