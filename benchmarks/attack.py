@@ -14,8 +14,8 @@ import numpy as np
 from benchmarks.page import mm_deg, table
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
-from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, prior_of
-from jcr.estimation.pose_equations import predict
+from jcr.estimation.equation import predict
+from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, camera_with_prior
 from jcr.estimation.wrist import adjust_wrist
 from jcr.geometry import step_between
 from jcr.records import Capture, HandEye, Kind, Reconstruction
@@ -112,10 +112,15 @@ def reconstructed(found: FaultyCapture, estimated: bool) -> tuple[Capture, Recon
     """What structure from motion makes of the observations with the believed intrinsics, or its own."""
     cameras, m = found.base_from_camera, len(found.base_from_camera)
     start = np.eye(4), 1.0, np.eye(4)
-    free = prior_of(found.intrinsics, ESTIMATED) if estimated else prior_of(found.intrinsics, FIXED)
-    sfm = adjust_wrist(cameras, start, cameras, found.intrinsics, found.tracks, noise=LOOSE, prior=free)
-    intrinsics, x = sfm.placed.scene.cameras[0], sfm.placed.x[0]
-    rigs = predict(x, sfm.placed.scale, sfm.placed.z[0], sfm.placed.scene.world_from_rig)
+    free = (
+        camera_with_prior(found.intrinsics, ESTIMATED)
+        if estimated
+        else camera_with_prior(found.intrinsics, FIXED)
+    )
+    sfm = adjust_wrist(cameras, start, cameras, free, found.tracks, noise=LOOSE)
+    state = sfm.state
+    intrinsics, x = sfm.problem.intrinsics(state)[0], state.x[0]
+    rigs = predict(x, state.scale, state.z[0], state.world_from_rig)
     capture = Capture(
         folder=Path("."),
         images=tuple(f"{k:02d}.png" for k in range(m)),

@@ -106,7 +106,7 @@ def _solvers() -> dict[str, Solver]:
             INTRINSICS,
             tracks,
         )
-        return adjusted.placed.x[0], recon_frame(adjusted, tracks)[0]
+        return adjusted.state.x[0], recon_frame(adjusted, tracks)[0]
 
     solvers: dict[str, Solver] = {
         "jcr, poses only": pose_only,

@@ -16,10 +16,9 @@ from jcr.camera import parameters, with_parameters
 from jcr.capture.read import read_capture
 from jcr.cell.stage import place_cameras
 from jcr.errors import RejectedError
-from jcr.estimation.image_robots import Adjusted, Placed
-from jcr.estimation.intrinsics_prior import prior_of
-from jcr.estimation.scene import Freedom, Scene
-from jcr.estimation.together import adjust
+from jcr.estimation.intrinsics_prior import camera_with_prior
+from jcr.estimation.problem import Problem, State, with_observations
+from jcr.estimation.solve import Solution, solve
 from jcr.geometry import inverse, scale_translation, skew, step_between
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.records import Capture, CellCamera
@@ -34,7 +33,7 @@ PRESET_NAMES: tuple[PresetName, ...] = ("white", "typical")
 BOX_MM = "x".join(f"{1e3 * side:.0f}" for side in BOX)
 WITHHELD = 4
 """Every this many of a real capture's images are declared images of fixed cameras, one each."""
-Of = Callable[[Placed], Float[ndarray, "4 4"]]
+Of = Callable[[State], Float[ndarray, "4 4"]]
 
 
 def wanted(problem: CellProblem) -> dict[str, Of]:
@@ -44,7 +43,7 @@ def wanted(problem: CellProblem) -> dict[str, Of]:
     if problem.kind == "wrists":
         return {
             "gripper_from_camera": lambda p: p.x[0],
-            "gripper_from_second": lambda p: p.x[0] @ scale_translation(p.scene.rig_from_camera[1], p.scale),
+            "gripper_from_second": lambda p: p.x[0] @ scale_translation(p.rig_from_camera[1], p.scale),
         }
     if problem.kind == "arms":
         return {
@@ -52,7 +51,7 @@ def wanted(problem: CellProblem) -> dict[str, Of]:
             "gripper_from_second": lambda p: p.x[1],
             "base1_from_base2": lambda p: p.z[0] @ inverse(p.z[1]),
         }
-    return {"base_from_camera": lambda p: p.z[0] @ scale_translation(p.scene.world_from_rig[COUNT], p.scale)}
+    return {"base_from_camera": lambda p: p.z[0] @ scale_translation(p.world_from_rig[COUNT], p.scale)}
 
 
 WORDS: dict[Kind, str] = {
@@ -94,24 +93,25 @@ def run(captures: Path) -> str:
     return _page(drawn, real, DRAWS)
 
 
-def answered(problem: CellProblem, seed: int) -> Adjusted:
+def answered(problem: CellProblem, seed: int) -> Solution:
     """The cell from its images and poses; intrinsics are off by what is usual of given ones."""
     rng = np.random.default_rng([seed, 17])
     cameras = []
-    for camera in problem.cameras:
-        free = prior_of(camera)
+    for k, camera in enumerate(problem.cameras):
+        free = camera_with_prior(camera)
         off = free.directions @ (free.std * rng.normal(size=len(free.std)))
-        cameras.append(with_parameters(camera, parameters(camera) + off))
-    mounts = np.array([False, *[problem.kind == "wrists"] * (len(cameras) - 1)])
-    scene = Scene(
+        free = camera_with_prior(with_parameters(camera, parameters(camera) + off))
+        cameras.append(replace(free, mount_free=problem.kind == "wrists" and k > 0))
+    state = State(
+        x=np.stack([x for x, _ in problem.starts]),
+        scale=1.0,
+        z=np.stack([z for _, z in problem.starts]),
         world_from_rig=problem.world_from_rig,
         rig_from_camera=problem.rig_from_camera,
-        cameras=tuple(cameras),
         points_in_world=problem.points_in_world,
     )
-    images = len(problem.observations.rig)
-    freedom = Freedom.of(cameras, [prior_of(camera) for camera in cameras], images, mounts)
-    return adjust(scene, problem.observations, freedom, problem.arms)
+    cell = Problem(arms=tuple(problem.arms), n_rigs=len(problem.world_from_rig), cameras=tuple(cameras))
+    return solve(*with_observations(cell, state, problem.observations))
 
 
 def _drawn(kind: Kind, preset: PresetName) -> dict[str, list[Draw]]:
@@ -202,21 +202,21 @@ def _of_rows(capture: Capture, rows: list[int]) -> Capture:
     )
 
 
-def _against_robot(answer: Adjusted, rig: int, gripper: Float[ndarray, "4 4"]) -> Draw:
+def _against_robot(answer: Solution, rig: int, gripper: Float[ndarray, "4 4"]) -> Draw:
     """base_from_camera of a rig that no arm moved, against the pose that its arm reported and X, with errors of both."""
 
-    def placed(p: Placed) -> Float[ndarray, "4 4"]:
-        return p.z[0] @ scale_translation(p.scene.world_from_rig[rig], p.scale)
+    def placed(p: State) -> Float[ndarray, "4 4"]:
+        return p.z[0] @ scale_translation(p.world_from_rig[rig], p.scale)
 
-    def carried(p: Placed) -> Float[ndarray, "4 4"]:
+    def carried(p: State) -> Float[ndarray, "4 4"]:
         return gripper @ p.x[0]
 
     j = answer.derivative(placed) - answer.derivative(carried)
     moves = np.eye(6)
-    moves[:3, 3:] = -skew(gripper[:3, :3] @ answer.placed.x[0][:3, 3])
+    moves[:3, 3:] = -skew(gripper[:3, :3] @ answer.state.x[0][:3, 3])
     sizes = answer.noise.together
     robot = moves @ np.diag(np.repeat(sizes, 3) ** 2) @ moves.T
-    error = step_between(placed(answer.placed), carried(answer.placed))
+    error = step_between(placed(answer.state), carried(answer.state))
     return Draw(error, j @ answer.covariance @ j.T + robot)
 
 

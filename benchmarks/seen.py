@@ -13,7 +13,7 @@ from jcr.calibration.seen import seen_uncertainty, within_95
 from jcr.camera import parameters, unproject, with_parameters
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.estimation.hand_eye import solve_hand_eye
-from jcr.estimation.intrinsics_prior import ESTIMATED, IntrinsicsPrior, prior_of
+from jcr.estimation.intrinsics_prior import ESTIMATED, Camera, camera_with_prior
 from jcr.estimation.wrist import adjust_wrist
 from jcr.geometry import apply, step_between
 from jcr.records import Estimate, Intrinsics
@@ -38,7 +38,7 @@ class Knowledge:
 
     name: str
     start: Callable[[np.random.Generator], Intrinsics]
-    prior: Callable[[Intrinsics], IntrinsicsPrior]
+    prior: Callable[[Intrinsics], Camera]
     camera: Intrinsics = INTRINSICS
 
 
@@ -65,13 +65,13 @@ def _guessed(camera: Intrinsics, rng: np.random.Generator) -> Intrinsics:
 
 
 WAYS = (
-    Knowledge("given", lambda rng: INTRINSICS, prior_of),
-    Knowledge("given, 0.5 % and 3 px off", _off, prior_of),
-    Knowledge("not given", _found, lambda found: prior_of(found, ESTIMATED)),
+    Knowledge("given", lambda rng: INTRINSICS, camera_with_prior),
+    Knowledge("given, 0.5 % and 3 px off", _off, camera_with_prior),
+    Knowledge("not given", _found, lambda found: camera_with_prior(found, ESTIMATED)),
     Knowledge(
         "not given, more distortion than the model",
         _found_of_bent,
-        lambda found: prior_of(found, ESTIMATED),
+        lambda found: camera_with_prior(found, ESTIMATED),
         BENT,
     ),
 )
@@ -184,9 +184,8 @@ def _adjusted(problem: BentProblem, known: Knowledge, rng: np.random.Generator) 
         problem.base_from_gripper,
         (solved.gripper_from_camera, solved.scale, solved.base_from_recon),
         problem.recon_from_camera,
-        start,
+        known.prior(start),
         tracks,
-        prior=known.prior(start),
     )
     return estimate_of(found, tracks)
 

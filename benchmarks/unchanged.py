@@ -29,7 +29,7 @@ from simulation.faults import Faults, faulty_capture
 from simulation.problems import bent_problem, hand_eye_problem
 
 Record = dict[str, Any]
-COUNTED = (("jcr.estimation.images", "without_points"), ("jcr.estimation.fit", "linearised"))
+COUNTED = (("jcr.estimation.image_equations", "without_points"), ("jcr.estimation.solve", "pose_equations"))
 """Functions whose calls are counted as linearisations, by module."""
 CELLS: tuple[Kind, ...] = ("fixed", "wrists", "arms", "carried")
 ARMS = (("panda", "typical", 12), ("ur5e", "low-cost", 8), ("iiwa7", "white", 30))

@@ -14,8 +14,8 @@ from numpy import ndarray
 
 from jcr.camera import project
 from jcr.estimation.arms import arm_named
-from jcr.estimation.image_robots import ArmPoses
-from jcr.estimation.scene import Observations
+from jcr.estimation.observations import Observations
+from jcr.estimation.problem import Arm
 from jcr.estimation.systematic import smooth_errors
 from jcr.geometry import (
     apply,
@@ -68,18 +68,17 @@ class CellProblem:
     """True X and base_from_world of each arm, where a search may start."""
 
     @property
-    def arms(self) -> list[ArmPoses]:
-        """As an adjustment takes them, their errors smooth over the poses."""
+    def arms(self) -> list[Arm]:
+        """Arms as an adjustment takes them, their errors smooth over the poses."""
         count = len(self.reported[0])
         return [
-            ArmPoses(
+            Arm(
                 rigs=np.arange(count) + count * k,
                 base_from_gripper=poses,
-                systematic=smooth_errors(poses),
-                start=start,
-                exchanged=self.kind == "carried",
+                error_covariance=smooth_errors(poses),
+                carries="scene" if self.kind == "carried" else "camera",
             )
-            for k, (poses, start) in enumerate(zip(self.reported, self.starts, strict=True))
+            for k, poses in enumerate(self.reported)
         ]
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from jcr.estimation.fit import PoseProblem, fit_poses
 from scipy.spatial.transform import Rotation
 
 import jcr
@@ -20,7 +21,6 @@ from jcr.cli import dispatch
 from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.arms import arm_named
 from jcr.estimation.closed_form import initial_estimate
-from jcr.estimation.fit import PoseProblem, fit_poses
 from jcr.estimation.systematic import arm_errors, posed, smooth_errors
 from jcr.geometry import inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.reconstruct.backends import ReconstructOptions

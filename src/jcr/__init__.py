@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from jcr.check import Examination
     from jcr.check import check as check_capture
     from jcr.depth.options import DepthOptions
-    from jcr.estimation.fit import Cues
     from jcr.estimation.hand_eye import solve_hand_eye
     from jcr.estimation.kinematics import Arm
     from jcr.export.formats import export_run
@@ -95,7 +94,6 @@ _MODULE_OF = {
     "FindingKind": "jcr.records:Kind",
     "NextPose": "jcr.records",
     "Arm": "jcr.estimation.kinematics",
-    "Cues": "jcr.estimation.fit",
     "SeenInBase": "jcr.calibration.seen",
     "RunResult": "jcr.results",
     "SavedRun": "jcr.results",
@@ -146,7 +144,6 @@ __all__ = [
     "Capture",
     "CellCamera",
     "CloudOptions",
-    "Cues",
     "DepthOptions",
     "Difference",
     "Examination",

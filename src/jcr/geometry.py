@@ -19,6 +19,7 @@ from jcr.errors import InputError
 
 Transform = Float[ndarray, "4 4"]
 Transforms = Float[ndarray, "*batch 4 4"]
+Poses = Float[ndarray, "n 4 4"]
 Rotations = Float[ndarray, "*batch 3 3"]
 Vectors = Float[ndarray, "*batch 3"]
 

@@ -1,9 +1,6 @@
-"""The damped, robust Gauss-Newton method for small dense problems, on any manifold: Levenberg and Marquardt's.
+"""Damped Gauss-Newton (Levenberg-Marquardt) on any manifold, dense or with unknowns that a caller eliminates.
 
-Unknowns are whatever the caller has (a pose, a tuple); they move by steps in a tangent space, as geometry.retract moves
-poses. The loops that eliminate points or depths by a Schur complement, or that estimate variances between their steps,
-are problems of their own and stand where those are: estimation/fit.py, estimation/together.py, calibration/drift.py,
-photometric/ and reconstruct/global_alignment/.
+Unknowns are any object (a pose, a tuple); they move by steps in a tangent space, as geometry.retract moves poses.
 """
 
 from collections.abc import Callable
@@ -22,24 +19,60 @@ machine has other work: of 15 images with the other core taken, `solve_hand_eye`
 Unknowns = TypeVar("Unknowns")
 Loss = Literal["linear", "soft_l1", "cauchy"]
 """Of the squared length s of a residual: s, 2(√(1 + s) − 1) or log(1 + s), as scipy.optimize.least_squares has them."""
-START_DAMPING, MOST_DAMPING = 1e-4, 1e12
+START_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e12
+TINY = 1e-300
+"""Cost of exact data, below which nothing can be gained."""
 EXACT = 1e-24
-"""Of the cost at the start: what is left of data without noise is rounding."""
+"""Share of the initial cost below which a cost is rounding."""
 UNSEEN = 1e-12
-"""Of the largest diagonal element: keeps a direction that no residual sees where it is."""
+"""Share of the largest diagonal element that keeps an unobservable direction fixed."""
+System = TypeVar("System")
 
 
 @dataclass(frozen=True)
 class Minimum(Generic[Unknowns]):
-    """Where the sum is least, and how sharply."""
+    """The minimum of a sum of losses."""
 
     unknowns: Unknowns
     cost: float
     """Half the sum of the losses."""
     normal: Float[ndarray, "p p"]
-    """Jᵀ W J there, W the weights that the loss gives: of whitened residuals the inverse covariance."""
+    """Jᵀ W J there, W the weights of the loss: the inverse covariance where residuals are whitened."""
     settled: bool
-    """No step promised more than the tolerance."""
+    """Whether the last step gained less than the tolerance."""
+
+
+def damped_gauss_newton(
+    linearise: Callable[[Unknowns], System],
+    step: Callable[[Unknowns, System, float], Unknowns],
+    cost: Callable[[Unknowns], float],
+    start: Unknowns,
+    *,
+    enough: Callable[[float], float],
+    damping: float = START_DAMPING,
+    iterations: int = 100,
+) -> tuple[Unknowns, float, float, bool]:
+    """Minimise a cost from `start`; return the unknowns, their cost, the damping, and whether the steps settled.
+
+    `step` takes the unknowns, their linearisation and the relative damping of its diagonal. The iteration ends where a
+    step changes the cost by less than `enough` of it.
+    """
+    unknowns, least, settled = start, cost(start), False
+    system: System | None = None
+    for _ in range(iterations):
+        system = linearise(unknowns) if system is None else system
+        tried = step(unknowns, system, damping)
+        tried_cost = cost(tried)
+        gained = least - tried_cost
+        if gained >= 0:
+            unknowns, least, system = tried, tried_cost, None
+            damping = max(damping / 10, LEAST_DAMPING)
+        else:
+            damping *= 10
+        settled = bool(abs(gained) < enough(least))
+        if settled or damping > MOST_DAMPING:
+            break
+    return unknowns, least, damping, settled
 
 
 def minimise(
@@ -50,39 +83,35 @@ def minimise(
     tolerance: float = 1e-12,
     iterations: int = 100,
 ) -> Minimum[Unknowns]:
-    """Minimise ½ Σ ρ(|r|²) over k residuals r of m components each, whose lengths the loss ρ tames.
+    """Minimise ½ Σ ρ(|r|²) over k residuals r of m components each, ρ being the loss.
 
-    `linearised` gives the residuals and their derivatives by a step (p,), `moved` takes the step. It ends where a step
-    promises to lower the cost by less than `tolerance` of it.
+    `linearised` returns the residuals and their derivatives by a step (p,), `moved` takes the step. The iteration ends
+    where a step lowers the cost by less than `tolerance` of it.
     """
-    unknowns, damping, settled = start, START_DAMPING, False
-    residual, jacobian = linearised(unknowns)
-    cost = _cost(loss, residual)
-    exact = EXACT * cost
-    for _ in range(iterations):
-        normal, gradient = _equations(loss, residual, jacobian)
-        diagonal = normal.diagonal()
-        while True:
-            damped = normal + np.diag(damping * diagonal + UNSEEN * diagonal.max(initial=1e-300))
-            step = -np.linalg.solve(damped, gradient)
-            promised = -float(step @ gradient) - 0.5 * float(step @ normal @ step)
-            tried = moved(unknowns, step)
-            tried_residual, tried_jacobian = linearised(tried)
-            tried_cost = _cost(loss, tried_residual)
-            settled = promised <= tolerance * cost + exact
-            if tried_cost <= cost or settled or damping > MOST_DAMPING:
-                break
-            damping *= 10
-        if tried_cost <= cost:
-            unknowns, residual, jacobian, cost = tried, tried_residual, tried_jacobian, tried_cost
-            damping = max(damping / 10, 1e-12)
-        if settled or damping > MOST_DAMPING:
-            break
-    return Minimum(unknowns, cost, _equations(loss, residual, jacobian)[0], settled)
+    Linear = tuple[Unknowns, Float[ndarray, "k m"], Float[ndarray, "k m p"]]
+
+    def step(now: Linear, normal: tuple[ndarray, ndarray], damping: float) -> Linear:
+        hessian, gradient = normal
+        diagonal = hessian.diagonal()
+        damped = hessian + np.diag(damping * diagonal + UNSEEN * diagonal.max(initial=1e-300))
+        tried = moved(now[0], -np.linalg.solve(damped, gradient))
+        return (tried, *linearised(tried))
+
+    begin: Linear = (start, *linearised(start))
+    exact = EXACT * _cost(loss, begin[1])
+    found, cost, _, settled = damped_gauss_newton(
+        lambda now: _equations(loss, *now[1:]),
+        step,
+        lambda now: _cost(loss, now[1]),
+        begin,
+        enough=lambda cost: tolerance * cost + exact + TINY,
+        iterations=iterations,
+    )
+    return Minimum(found[0], cost, _equations(loss, *found[1:])[0], settled)
 
 
 def loss_weight(loss: Loss, squared: Float[ndarray, "*batch"]) -> Float[ndarray, "*batch"]:
-    """ρ'(s): the weight of residuals of squared length s in the equations."""
+    """Return ρ'(s), the weight of residuals of squared length s in the equations."""
     if loss == "linear":
         return np.ones_like(squared)
     return 1 / np.sqrt(1 + squared) if loss == "soft_l1" else 1 / (1 + squared)

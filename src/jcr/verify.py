@@ -20,9 +20,9 @@ from jcr.cell.added import camera_of, read_added_cameras
 from jcr.distributions import chi2
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.absolute_pose import CameraPose
-from jcr.estimation.fit import PoseFit, PoseProblem, fit_poses
-from jcr.estimation.pose_equations import Poses
-from jcr.geometry import step_between
+from jcr.estimation.solve import Solution, solve
+from jcr.estimation.wrist import pose_problem
+from jcr.geometry import Poses, step_between
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
@@ -262,7 +262,7 @@ def verify_camera(
     before, after = found.of[name], found.of[now.name]
     j = found.answer.derivative(after) - found.answer.derivative(before)
     covariance = j @ found.answer.covariance @ j.T
-    offset = step_between(before(found.answer.placed), after(found.answer.placed))
+    offset = step_between(before(found.answer.state), after(found.answer.state))
     notes = tuple(text for camera in found.cameras for text in camera.warnings)
     images = tuple(str(file) for file in files)
     return replace(_of_two(offset, covariance, options, images, notes, "in the mapped scene"), fixed=name)
@@ -305,7 +305,7 @@ def fitted(
     reconstruction: Reconstruction,
     options: CalibrateOptions,
     systematic: Float[ndarray, "s s"],
-) -> tuple[PoseFit, tuple[Poses, Poses]]:
+) -> tuple[Solution, tuple[Poses, Poses]]:
     """The calibration's poses fitted again, for the joint covariance that its file does not keep; and the poses.
 
     Robot and cameras alone, without bundle adjustment: new images are located in the same cameras' frame. `systematic`
@@ -316,15 +316,14 @@ def fitted(
         capture.base_from_gripper[reconstruction.image_index][row_used],
         reconstruction.recon_from_camera[row_used],
     )
-    problem = PoseProblem(
-        base_from_gripper=poses[0],
-        recon_from_camera=poses[1],
-        used=np.ones(len(poses[0]), bool),
-        systematic=systematic,
-        noise=options.robot_noise_m_rad,
-    )
     x, z = np.array(calibration.gripper_from_camera), np.array(calibration.base_from_recon)
-    return fit_poses(problem, (x, calibration.scale or 1.0, z), averaged=False), poses
+    problem, state = pose_problem(
+        *poses,
+        (x, calibration.scale or 1.0, z),
+        error_covariance=systematic,
+        noise_floor=options.robot_noise_m_rad,
+    )
+    return solve(problem, state, averaged=False), poses
 
 
 def _used(calibration: CalibrationFile, reconstruction: Reconstruction) -> Bool[ndarray, " m"]:

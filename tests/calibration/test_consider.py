@@ -3,11 +3,11 @@
 import cv2
 import numpy as np
 import pytest
+from jcr.estimation.fit import Cues
 
 import jcr
 from jcr.calibration.consider import with_intrinsics_considered
 from jcr.camera import parameters, with_parameters
-from jcr.estimation.fit import Cues
 from jcr.estimation.intrinsics_prior import prior_of
 from jcr.estimation.systematic import smooth_errors
 from jcr.geometry import inverse, transform

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from jcr.estimation.image_robots import Adjusted
 
 from benchmarks.seen import BENT, WAYS, measure
 from jcr.calibration.adjust import estimate_of
@@ -20,7 +21,6 @@ from jcr.calibration.seen import (
 )
 from jcr.camera import parameters, unproject, with_parameters
 from jcr.estimation.hand_eye import solve_hand_eye
-from jcr.estimation.image_robots import Adjusted
 from jcr.estimation.intrinsics_prior import ESTIMATED, prior_of
 from jcr.estimation.points import points_in_base
 from jcr.estimation.wrist import adjust_wrist

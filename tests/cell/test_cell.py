@@ -8,6 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from jcr.estimation.image_robots import Adjusted
+from jcr.estimation.images import evidence, noise_of
+from jcr.estimation.scene import Freedom, Scene, at_start, similarities
+from jcr.estimation.together import adjust
 
 import jcr
 from jcr.calibration.checks.effects import effects
@@ -22,12 +26,8 @@ from jcr.cell.found import CameraFound, CellFound
 from jcr.cell.images import CellImages
 from jcr.cell.place_checks import far_from_gripper
 from jcr.cell.stage import place_cameras
-from jcr.estimation.image_robots import Adjusted
-from jcr.estimation.images import evidence, noise_of
 from jcr.estimation.intrinsics_prior import FIXED, prior_of
 from jcr.estimation.projection import ImageProblem, view_of
-from jcr.estimation.scene import Freedom, Scene, at_start, similarities
-from jcr.estimation.together import adjust
 from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.records import Capture, CellCamera, Finding, HandEye, Reconstruction, Tracks
 from jcr.records import Kind as FindingKind

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from jcr.estimation.boards import shapes_of
 from jcr.estimation.image_robots import Adjusted
 from jcr.estimation.images import ImageEvidence, adjust_images
+from jcr.estimation.scene import Freedom, Observations, Scene, similarities, stepped
+
+from jcr.estimation.boards import shapes_of
 from jcr.estimation.intrinsics_prior import FIXED, prior_of
 from jcr.estimation.projection import derivatives, shape_residuals
-from jcr.estimation.scene import Freedom, Observations, Scene, similarities, stepped
 from jcr.estimation.wrist import adjust_wrist
 from jcr.geometry import inverse, step_between
 from simulation.boards import Sheet, with_sheet

@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from jcr.estimation.posterior import expected_posterior, posterior
 from scipy.stats import chi2
 
 import jcr
 from jcr.estimation.cholesky import cholesky
 from jcr.estimation.components import most_likely, over_sizes
+from jcr.estimation.equation import residuals
 from jcr.estimation.mixed_model import Equations, solve
-from jcr.estimation.pose_equations import residuals
-from jcr.estimation.posterior import expected_posterior, posterior
 from jcr.estimation.robust import robust_fit
 from jcr.estimation.systematic import Region, arm_errors, smooth_errors
 from jcr.geometry import retract, rotation_exp, step_between, transform

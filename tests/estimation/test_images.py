@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from jcr.estimation.scene import OF_IMAGE, PRISM, Freedom, NuisancePrior, Scene, at_start, stepped
+from jcr.estimation.together import adjust
 
 from jcr.estimation.intrinsics_prior import MEASURED, prior_of
 from jcr.estimation.projection import ImageProblem, derivatives, view_of
-from jcr.estimation.scene import OF_IMAGE, PRISM, Freedom, NuisancePrior, Scene, at_start, stepped
-from jcr.estimation.together import adjust
 from simulation.cells import CellProblem, cell_problem
 
 COUNT = 6

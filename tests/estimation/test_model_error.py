@@ -5,10 +5,10 @@ from functools import cache
 
 import numpy as np
 import pytest
+from jcr.estimation.image_robots import Adjusted
 
 from jcr.camera import by_parameters, unproject
 from jcr.estimation.hand_eye import solve_hand_eye
-from jcr.estimation.image_robots import Adjusted
 from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, prior_of
 from jcr.estimation.model_error import TYPICAL, displacements
 from jcr.estimation.wrist import adjust_wrist

@@ -5,11 +5,11 @@ from functools import cache
 import numpy as np
 import pytest
 from jaxtyping import Float
+from jcr.estimation.images import ImageEvidence, adjust_images
+from jcr.estimation.scene import Freedom, Observations, Scene
 from numpy import ndarray
 
-from jcr.estimation.images import ImageEvidence, adjust_images
 from jcr.estimation.intrinsics_prior import FIXED, prior_of
-from jcr.estimation.scene import Freedom, Observations, Scene
 from jcr.geometry import step_between
 from jcr.records import Tracks
 from simulation.problems import INTRINSICS, hand_eye_problem, observed

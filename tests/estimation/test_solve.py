@@ -3,13 +3,13 @@
 import cv2
 import numpy as np
 import pytest
+from jcr.estimation.fit import Cues, PoseProblem, fit_poses
 from scipy.stats import chi2
 
 import jcr
 from jcr.estimation.closed_form import closed_form
-from jcr.estimation.fit import Cues, PoseProblem, fit_poses
+from jcr.estimation.equation import PRIOR_STD, residuals, residuals_by_camera
 from jcr.estimation.mixed_model import Equations, left_out, solve
-from jcr.estimation.pose_equations import PRIOR_STD, residuals, residuals_by_camera
 from jcr.estimation.systematic import smooth_errors
 from jcr.geometry import inverse, retract, rotation_between_deg, rotation_exp, scale_translation, transform
 from jcr.records import Kind

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from jcr.estimation.image_robots import Adjusted
+from jcr.estimation.images import median_reprojection_px
 from scipy.stats import chi2
 
 import jcr
 from jcr.camera import parameters, with_parameters
 from jcr.estimation import together
-from jcr.estimation.image_robots import Adjusted
-from jcr.estimation.images import median_reprojection_px
 from jcr.estimation.intrinsics_prior import ESTIMATED, MEASURED, prior_of
 from jcr.estimation.wrist import WristOptions, adjust_wrist, recon_frame
 from jcr.geometry import step_between

@@ -11,16 +11,15 @@ from numpy import ndarray
 
 from jcr.calibration.case import Case
 from jcr.calibration.consider import with_intrinsics_considered
+from jcr.estimation.equation import predict
 from jcr.estimation.hand_eye import judged
-from jcr.estimation.image_robots import Adjusted
-from jcr.estimation.images import median_reprojection_px
-from jcr.estimation.intrinsics_prior import IntrinsicsPrior
-from jcr.estimation.pose_equations import predict
+from jcr.estimation.image_equations import median_reprojection_px
+from jcr.estimation.intrinsics_prior import Camera
 from jcr.estimation.projection import view_of
 from jcr.estimation.residuals import paper_residuals
 from jcr.estimation.score_test import focal_lengths
-from jcr.estimation.together import START_NOISE
-from jcr.estimation.wrist import WristOptions, adjust_wrist, recon_frame
+from jcr.estimation.solve import START_NOISE, Solution
+from jcr.estimation.wrist import adjust_wrist, recon_frame, wrist_arm
 from jcr.geometry import inverse, retract, scale_translation, step_between
 from jcr.records import (
     Estimate,
@@ -58,38 +57,33 @@ def adjusted(case: Case) -> Case:
 def adjust_case(
     case: Case,
     *,
-    prior: IntrinsicsPrior | None = None,
+    prior: Camera | None = None,
     combinations: Float[ndarray, "e p"] | None = None,
-    bent: Float[ndarray, "s b"] | None = None,
-) -> Adjusted:
-    """The used images and gripper poses of a case adjusted, from its fit to poses or from its adjustment.
+    confirmed_errors: Float[ndarray, "s b"] | None = None,
+) -> Solution:
+    """Adjust the used images and gripper poses of a case, from its fit to poses or from its adjustment.
 
-    `prior` takes the place of the case's; the rest is that of WristOptions.
+    `prior` takes the place of the case's camera; the rest is that of Arm and adjust_wrist.
     """
     fit = case.hand_eye.before or case.hand_eye
+    arm = wrist_arm(case.base_from_gripper[case.used], case.systematic)
     return adjust_wrist(
-        case.base_from_gripper[case.used],
+        replace(arm, carries=case.carries, confirmed_errors=confirmed_errors),
         (fit.gripper_from_camera, fit.scale, fit.base_from_recon),
         case.recon_from_camera[case.used],
-        case.reconstruction.intrinsics,
+        case.camera if prior is None else prior,
         case.tracks,
         noise=case.options.robot_noise_m_rad,
-        prior=case.intrinsics_prior if prior is None else prior,
-        options=WristOptions(
-            systematic=case.systematic,
-            combinations=combinations,
-            exchanged=case.exchanged,
-            near=case.adjusted,
-            start_noise=_start_noise(fit),
-            bent=bent,
-        ),
+        combinations=combinations,
+        near=case.adjusted,
+        start_noise=_start_noise(fit),
     )
 
 
 def _start_noise(fit: HandEye) -> tuple[float, float]:
-    """m, rad per axis of gripper poses: what the fit to camera poses left of them, random and systematic.
+    """Return the errors of gripper poses per axis (m, rad) that the fit to camera poses leaves, random and systematic.
 
-    Images that begin bent to poses that contradict them take ten times the steps to come back.
+    Images that are first adjusted to poses that contradict them take ten times the steps.
     """
     metres, radians = fit.robot_noise.together
     return max(START_NOISE[0], metres), max(START_NOISE[1], radians)
@@ -100,20 +94,20 @@ def focal_of_each(case: Case) -> Float[ndarray, "e p"]:
     return focal_lengths(case.reconstruction.intrinsics, len(case.used))
 
 
-def estimate_of(found: Adjusted, tracks: Tracks) -> Estimate:
+def estimate_of(found: Solution, tracks: Tracks) -> Estimate:
     """What an adjustment came to, in the reconstruction whose tracks were adjusted."""
     return estimate_in(found, *recon_frame(found, tracks))
 
 
-def estimate_in(found: Adjusted, scale: float, base_from_recon: Float[ndarray, "4 4"]) -> Estimate:
+def estimate_in(found: Solution, scale: float, base_from_recon: Float[ndarray, "4 4"]) -> Estimate:
     """The same in a reconstruction that is scaled and placed like this."""
     return Estimate(
-        gripper_from_camera=found.placed.x[0],
+        gripper_from_camera=found.state.x[0],
         scale=scale,
         base_from_recon=base_from_recon,
         covariance=found.covariance[:7, :7],
         budget=found.budget,
-        intrinsics=found.placed.scene.cameras[0],
+        intrinsics=found.problem.intrinsics(found.state)[0],
         intrinsics_covariance=found.intrinsics_covariance(0),
         intrinsics_cross=found.intrinsics_cross(0),
         model_error=found.model_error(),
@@ -130,15 +124,14 @@ def _considered(case: Case) -> Case:
         case.base_from_gripper[case.used],
         case.recon_from_camera[case.used],
         case.tracks,
-        case.reconstruction.intrinsics,
-        case.intrinsics_prior,
-        case.cues,
+        case.camera,
+        case.priors,
         case.systematic,
     )
     return replace(case, hand_eye=judged(considered))
 
 
-def refined_by(case: Case, found: Adjusted) -> HandEye:
+def refined_by(case: Case, found: Solution) -> HandEye:
     """The calibration of a case as an adjustment has it; not judged yet."""
     before, used = case.hand_eye.before or case.hand_eye, case.used
     estimate = estimate_of(found, case.tracks)
@@ -146,12 +139,11 @@ def refined_by(case: Case, found: Adjusted) -> HandEye:
     gripper, camera = case.base_from_gripper, case.recon_from_camera
     # Rejected poses are measured against where their cameras show them.
     predicted = estimate.base_from_recon @ scale_translation(camera, estimate.scale) @ inverse(x)
-    placed, rigs = found.placed, found.given.arms[0].rigs
-    predicted[used] = predict(placed.x[0], placed.scale, placed.z[0], placed.scene.world_from_rig[rigs])
+    state, rigs = found.state, found.problem.arms[0].rigs
+    predicted[used] = predict(state.x[0], state.scale, state.z[0], state.world_from_rig[rigs])
     metres, radians = np.linalg.norm(step_between(gripper, predicted).reshape(-1, 2, 3), axis=2).T
     reprojection = np.full(len(gripper), np.nan)
-    evidence = found.given.evidence
-    reprojection[used] = median_reprojection_px(evidence.view, evidence.problem)
+    reprojection[used] = median_reprojection_px(found.problem, found.images.view)
     return replace(
         before,
         estimate=estimate,
@@ -169,24 +161,24 @@ def refined_by(case: Case, found: Adjusted) -> HandEye:
     )
 
 
-def _leave_one_out(found: Adjusted) -> LeaveOneOut | None:
+def _leave_one_out(found: Solution) -> LeaveOneOut | None:
     """Each image's gripper pose predicted by an adjustment that does not use it."""
-    left_out = found.leave_one_out()
+    left_out = found.leave_one_out()[0]
     m = len(left_out)
     if m < 4:
         return None
     metres, radians = np.linalg.norm(left_out.reshape(m, 2, 3), axis=2).mean(0)
-    # The images as they would be with every gripper, and the rig on it, by as much beside its place.
-    placed, evidence = found.most_likely, found.given.evidence
-    x, z = placed.x[0], placed.z[0]
-    own, rigs = found.given.arms[0].rigs, placed.scene.world_from_rig.copy()
-    gripper = predict(x, placed.scale, z, rigs[own])
+    # The images as they would be with every gripper, and the rig on it, displaced by its own leave-one-out residual.
+    likely, images = found.most_likely, found.images
+    x, z = likely.x[0], likely.z[0]
+    own, rigs = found.problem.arms[0].rigs, likely.world_from_rig.copy()
+    gripper = predict(x, likely.scale, z, rigs[own])
     in_metres = inverse(z) @ retract(gripper, -left_out) @ x
-    rigs[own] = scale_translation(in_metres, 1 / placed.scale)
-    moved = view_of(replace(evidence.scene, world_from_rig=rigs), evidence.problem)
+    rigs[own] = scale_translation(in_metres, 1 / likely.scale)
+    moved = view_of(found.problem, replace(images.state, world_from_rig=rigs))
     return LeaveOneOut(
         1e3 * float(metres),
         float(np.degrees(radians)),
-        float(np.median(median_reprojection_px(moved, evidence.problem))),
+        float(np.median(median_reprojection_px(found.problem, moved))),
         "each image's gripper pose predicted by the others",
     )

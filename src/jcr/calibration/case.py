@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -10,10 +11,10 @@ from numpy import ndarray
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import RobotErrors, of_poses
 from jcr.calibration.seen import Scene, scene_uncertainty
-from jcr.estimation.fit import Cues
-from jcr.estimation.image_robots import Adjusted
-from jcr.estimation.intrinsics_prior import IntrinsicsPrior, prior_about
+from jcr.estimation.intrinsics_prior import Camera, camera_about
 from jcr.estimation.points import points_in_base
+from jcr.estimation.problem import LinearPrior
+from jcr.estimation.solve import Solution
 from jcr.records import Capture, Finding, HandEye, Reconstruction, Tracks
 
 MIN_OBSERVATIONS = 200
@@ -32,15 +33,15 @@ class Case:
     options: CalibrateOptions
     robot: RobotErrors
     """Of the registered images' poses."""
-    cues: Cues | None
-    """What is known of scale and height beside the robot's poses."""
+    priors: tuple[LinearPrior, ...]
+    """Measurements of scale and height beside the robot's poses."""
     hand_eye: HandEye
     """The calibration as it stands."""
-    exchanged: bool = False
-    """The camera stands still and the gripper carries what it sees."""
+    carries: Literal["camera", "scene"] = "camera"
+    """What the gripper carries; the camera is fixed where it carries the scene."""
     chosen_tracks: Tracks | None = None
     """Observations in the used images that take part, where not all do."""
-    adjusted: Adjusted | None = None
+    adjusted: Solution | None = None
     """Images and robot together, whether or not `hand_eye` is made of it; None where images could not be adjusted."""
 
     @property
@@ -70,10 +71,10 @@ class Case:
         return of_poses(self.robot.systematic, self.used)
 
     @property
-    def intrinsics_prior(self) -> IntrinsicsPrior:
-        """What is known of the intrinsics before the calibration."""
+    def camera(self) -> Camera:
+        """Camera with the prior of its intrinsics before the calibration."""
         given = self.capture.intrinsics is not None
-        return prior_about(self.reconstruction.intrinsics, given, self.capture.intrinsics_std)
+        return camera_about(self.reconstruction.intrinsics, given, self.capture.intrinsics_std)
 
     @cached_property
     def tracks(self) -> Tracks:
@@ -87,7 +88,7 @@ class Case:
         """Median distance from the camera to what it sees; None where the calibration is not made of images."""
         if self.adjusted is None or self.hand_eye.before is None:
             return None
-        return float(np.median(self.adjusted.given.evidence.view.depth)) * self.adjusted.placed.scale
+        return float(np.median(self.adjusted.images.view.depth)) * self.adjusted.state.scale
 
     @property
     def scene_in_base(self) -> Scene | None:
@@ -106,7 +107,7 @@ class Case:
         """
         return (
             self.reconstruction.evidence is None
-            and self.cues is None
+            and not self.priors
             and len(self.tracks.image) >= MIN_OBSERVATIONS
             and len(self.used) >= MIN_IMAGES
         )
@@ -128,7 +129,7 @@ class Checked:
     """Strongest first."""
     hand_eye: HandEye | None = None
     """The calibration with what was measured in it, or the one to keep in place of the present one; None: it stays."""
-    adjusted: Adjusted | None = None
+    adjusted: Solution | None = None
     """The adjustment that it is made of, where that is another one."""
 
 

@@ -12,10 +12,12 @@ from numpy import ndarray
 
 from jcr.camera import by_parameters, by_point
 from jcr.estimation.closed_form import initial_estimate
-from jcr.estimation.fit import Cues, PoseProblem, fit_poses
-from jcr.estimation.intrinsics_prior import IntrinsicsPrior
+from jcr.estimation.intrinsics_prior import Camera
+from jcr.estimation.problem import LinearPrior
+from jcr.estimation.solve import solve
+from jcr.estimation.wrist import pose_problem
 from jcr.geometry import apply, inverse, rotation_exp, skew, step_between, transform
-from jcr.records import HandEye, Intrinsics, Tracks
+from jcr.records import HandEye, Tracks
 
 FEWEST = 6
 """Observations of an image whose camera's motion with the intrinsics can be found."""
@@ -26,9 +28,8 @@ def with_intrinsics_considered(
     base_from_gripper: Float[ndarray, "m 4 4"],
     recon_from_camera: Float[ndarray, "m 4 4"],
     tracks: Tracks,
-    intrinsics: Intrinsics,
-    prior: IntrinsicsPrior,
-    cues: Cues | None,
+    camera: Camera,
+    priors: tuple[LinearPrior, ...],
     systematic: Float[ndarray, "s s"],
 ) -> HandEye:
     """The calibration with the errors of its intrinsics in its covariance and budget.
@@ -40,26 +41,23 @@ def with_intrinsics_considered(
     if hand_eye.budget is None or min(map(len, seen)) < FEWEST:
         return hand_eye
     each = zip(recon_from_camera, seen, strict=True)
-    moved = np.array(
-        [_camera_with_other_intrinsics(one, tracks, rows, intrinsics, prior) for one, rows in each]
-    )
-    problem = PoseProblem(
-        base_from_gripper=base_from_gripper,
-        recon_from_camera=recon_from_camera,
-        used=np.ones(len(recon_from_camera), dtype=bool),
-        systematic=systematic,
-        noise=hand_eye.robot_noise.given,
-        cues=cues or Cues(),
-    )
+    moved = np.array([_camera_with_other_intrinsics(one, tracks, rows, camera) for one, rows in each])
 
-    def solved(camera: Float[ndarray, "m 4 4"]) -> tuple[Float[ndarray, "4 4"], float]:
-        start = initial_estimate(base_from_gripper, camera)
-        fit = fit_poses(replace(problem, recon_from_camera=camera), start, averaged=False)
-        return fit.gripper_from_camera, fit.scale
+    def solved(recon_from_camera: Float[ndarray, "m 4 4"]) -> tuple[Float[ndarray, "4 4"], float]:
+        problem, state = pose_problem(
+            base_from_gripper,
+            recon_from_camera,
+            initial_estimate(base_from_gripper, recon_from_camera),
+            error_covariance=systematic,
+            noise_floor=hand_eye.robot_noise.given,
+            priors=priors,
+        )
+        found = solve(problem, state, averaged=False).state
+        return found.x[0], found.scale
 
     x, scale = solved(recon_from_camera)
-    shifts = np.zeros((7, len(prior.std)))
-    for k in range(len(prior.std)):
+    shifts = np.zeros((7, len(camera.std)))
+    for k in range(len(camera.std)):
         x_k, scale_k = solved(moved[:, k])
         shifts[:, k] = np.append(step_between(x, x_k), np.log(scale_k / scale))
     considered = shifts @ shifts.T
@@ -75,13 +73,12 @@ def _camera_with_other_intrinsics(
     recon_from_camera: Float[ndarray, "4 4"],
     tracks: Tracks,
     rows: ndarray,
-    intrinsics: Intrinsics,
-    prior: IntrinsicsPrior,
+    camera: Camera,
 ) -> Float[ndarray, "c 4 4"]:
     """The camera as one standard deviation more of each parameter would have placed it, by its own points."""
     x_in_camera = apply(inverse(recon_from_camera), tracks.points_in_recon[tracks.point[rows]].astype(float))
-    by_x = by_point(intrinsics, x_in_camera)
+    by_x = by_point(camera.intrinsics, x_in_camera)
     by_pose = np.concatenate([by_x, -by_x @ skew(x_in_camera)], axis=2).reshape(-1, 6)
-    by_intrinsics = by_parameters(intrinsics, x_in_camera) @ (prior.directions * prior.std)
+    by_intrinsics = by_parameters(camera.intrinsics, x_in_camera) @ (camera.directions * camera.std)
     steps = -np.linalg.lstsq(by_pose, by_intrinsics.reshape(len(by_pose), -1), rcond=None)[0].T
     return recon_from_camera @ inverse(transform(rotation_exp(steps[:, 3:]), steps[:, :3]))

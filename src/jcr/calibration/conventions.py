@@ -15,12 +15,12 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from jcr.estimation.closed_form import closed_form, initial_estimate
-from jcr.estimation.fit import PoseProblem, fit_poses
+from jcr.estimation.equation import Poses
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.estimation.observability import observability
-from jcr.estimation.pose_equations import Poses
 from jcr.estimation.robust import least_trimmed
-from jcr.estimation.systematic import smooth_errors
+from jcr.estimation.solve import solve
+from jcr.estimation.wrist import pose_problem
 from jcr.geometry import Transform, fit_similarity, inverse, retract, rotation_exp, skew, transform
 from jcr.least_squares import minimise
 from jcr.records import Finding, HandEye, Kind, RobotNoise, Severity
@@ -194,11 +194,8 @@ def _least_misfit(candidate: _Candidate, recon_from_camera: Poses, agree: Bool[n
     """Misfit of a candidate in the images that agree best: in a tenth of the time of a whole solution, which uses
     more."""
     gripper, camera = candidate.base_from_gripper[agree], recon_from_camera[candidate.image[agree]]
-    used = np.ones(len(gripper), dtype=bool)
-    problem = PoseProblem(
-        base_from_gripper=gripper, recon_from_camera=camera, used=used, systematic=smooth_errors(gripper)
-    )
-    fit = fit_poses(problem, initial_estimate(gripper, camera), averaged=False)
+    problem, state = pose_problem(gripper, camera, initial_estimate(gripper, camera))
+    fit = solve(problem, state, averaged=False)
     return Reading(candidate.name, *_mm_deg(fit.noise), len(gripper)).misfit
 
 

@@ -7,8 +7,7 @@ from numpy import ndarray
 from jcr.calibration.options import LengthInImage
 from jcr.camera import project, unproject
 from jcr.errors import InputError
-from jcr.estimation.fit import Poses
-from jcr.geometry import rotation_angle
+from jcr.geometry import Poses, rotation_angle
 from jcr.records import Capture, Finding, HandEye, Kind, Reconstruction
 
 LENGTH_STD = 0.01

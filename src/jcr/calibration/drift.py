@@ -21,9 +21,7 @@ from scipy.stats import chi2, ncx2
 
 from jcr.estimation.cholesky import lower
 from jcr.estimation.components import most_likely, over_sizes
-from jcr.estimation.fit import PoseFit, Unknowns
-from jcr.estimation.mixed_model import Equations, Solution, solve
-from jcr.estimation.pose_equations import (
+from jcr.estimation.equation import (
     PRIOR_STD,
     ROTATION,
     SCALE,
@@ -32,7 +30,10 @@ from jcr.estimation.pose_equations import (
     residuals,
     residuals_by_camera,
 )
+from jcr.estimation.mixed_model import Equations, LinearSolution, solve_equations
+from jcr.estimation.solve import Solution
 from jcr.estimation.systematic import Region
+from jcr.estimation.wrist import Start
 from jcr.geometry import retract, step_between
 
 CLEAR = 10.0
@@ -70,7 +71,7 @@ class Drift(Motion):
 
 
 def drift(
-    calibrated: PoseFit,
+    calibrated: Solution,
     old: tuple[Poses, Poses],
     new: tuple[NewPoses, NewPoses, Float[ndarray, "k 6 6"]],
     systematic: Float[ndarray, "s s"],
@@ -99,19 +100,19 @@ def detectable(covariance: Float[ndarray, "6 6"], alpha: float) -> tuple[float, 
 
 
 def _estimate_motion(
-    calibrated: PoseFit,
+    calibrated: Solution,
     old: tuple[Poses, Poses],
     new: tuple[NewPoses, NewPoses, Float[ndarray, "k 6 6"]],
     systematic: Float[ndarray, "s s"],
     columns: slice,
 ) -> Motion:
     """Generalised least squares of old and new images together, in which new ones see a moved X or base_from_recon."""
-    x, scale, z = calibrated.gripper_from_camera, calibrated.scale, calibrated.base_from_recon
+    x, scale, z = calibrated.state.x[0], calibrated.state.scale, calibrated.state.z[0]
     of_x = columns.start == 0
     m, n = 6 * len(old[0]), 6 * len(new[0])
     residual, jacobian = residuals(x, scale, z, *old)
     stacked = jacobian.reshape(m, 13)
-    region = Region.of_poses(stacked)
+    region = Region.of_unknowns(np.delete(stacked, SCALE, axis=1), 13)
     prior = np.diag(np.r_[PRIOR_STD**-2.0, np.zeros(6)])
     alone = Equations(
         residual=residual.ravel(),
@@ -130,7 +131,7 @@ def _estimate_motion(
 
     start = moved = x if of_x else z
     for _ in range(10):
-        step = solve(together(moved), log_sizes).step[13:]
+        step = solve_equations(together(moved), log_sizes).step[13:]
         moved = retract(moved, step)
         if float(np.abs(step).max()) < SETTLED:
             break
@@ -142,7 +143,7 @@ def _estimate_motion(
 def _together(
     alone: Equations,
     region: Region,
-    seen_by_new: Unknowns,
+    seen_by_new: Start,
     new: tuple[NewPoses, NewPoses, Float[ndarray, "k 6 6"]],
     systematic: Float[ndarray, "s s"],
     columns: slice,
@@ -171,7 +172,7 @@ def _together(
 def _averaged(
     alone: Equations,
     joint: Equations,
-    known_sizes: Iterable[tuple[ndarray, ndarray, Solution]],
+    known_sizes: Iterable[tuple[ndarray, ndarray, LinearSolution]],
     begun: Float[ndarray, "6"],
     freedom: int,
 ) -> Motion:
@@ -182,7 +183,7 @@ def _averaged(
     """
     weights, steps, covariances, misfits = [], [], [], []
     for weight, sizes, by_old in known_sizes:
-        solution = solve(joint, sizes)
+        solution = solve_equations(joint, sizes)
         weights.append(weight)
         steps.append(begun + solution.step[:, 13:])
         covariances.append(solution.covariance[:, 13:, 13:])
@@ -200,7 +201,7 @@ def _averaged(
     )
 
 
-def _squares(equations: Equations, solution: Solution) -> Float[ndarray, " k"]:
+def _squares(equations: Equations, solution: LinearSolution) -> Float[ndarray, " k"]:
     """Squared distance of the residuals from the fit."""
     left = equations.residual[:, None] + equations.jacobian @ solution.step[..., None]
     prior = np.einsum("ki,ij,kj->k", solution.step, equations.prior_information, solution.step)

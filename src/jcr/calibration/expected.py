@@ -17,13 +17,13 @@ from jcr.calibration.adjust import estimate_in
 from jcr.calibration.case import Case
 from jcr.calibration.robot_errors import RobotErrors, of_poses
 from jcr.calibration.seen import Scene, in_use, within_95
-from jcr.estimation.fit import Cues, expected_fit
-from jcr.estimation.foreseen import ForeseenCamera, foreseen
-from jcr.estimation.image_robots import ArmPoses
-from jcr.estimation.intrinsics_prior import prior_about
+from jcr.estimation.equation import Poses, point_ahead, uncertainty
+from jcr.estimation.foreseen import ForeseenCamera, expected_pose_covariance, foreseen
+from jcr.estimation.intrinsics_prior import camera_about
 from jcr.estimation.mixed_model import GIVEN_SHARE, TYPICAL
 from jcr.estimation.next_poses import assumed_camera, candidates, looked_at, nearest, next_poses
-from jcr.estimation.pose_equations import Poses, point_ahead, uncertainty
+from jcr.estimation.problem import LinearPrior, scale_prior
+from jcr.estimation.wrist import wrist_arm
 from jcr.geometry import inverse, rotation_angle
 from jcr.least_squares import one_blas_thread
 from jcr.records import Estimate, HandEye, Intrinsics, NextPose, RobotNoise, Seen, Where
@@ -53,9 +53,9 @@ class Assumptions:
     """What findings add to the covariance; None: nothing."""
 
     @property
-    def cues(self) -> Cues | None:
-        """What the scale is known from."""
-        return None if self.scale_std is None else Cues(scale=(1.0, self.scale_std))
+    def priors(self) -> tuple[LinearPrior, ...]:
+        """Measurement of the scale."""
+        return () if self.scale_std is None else (scale_prior(1.0, self.scale_std),)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,14 +118,16 @@ class Ahead:
         """The `count` of them that leave the least, systematic errors of the robot included, chosen one by one."""
         now, x = self.base_from_gripper, self.assumptions.gripper_from_camera
         systematic, noise = self.robot.with_poses(now, self.added), self.assumptions.noise
-        point, cues = point_ahead(x, self.assumptions.distance_m), self.assumptions.cues
+        point, priors = point_ahead(x, self.assumptions.distance_m), self.assumptions.priors
         chosen, left = list[int](), list(range(len(self.added)))
 
         def remaining(row: int) -> float:
             rows = np.r_[np.arange(len(now)), len(now) + np.array([*chosen, row])]
             poses = np.concatenate([now, self.added])[rows]
             of_rows = of_poses(systematic, rows)
-            return float(uncertainty(expected_fit(poses, x, noise, of_rows, cues, averaged=False), point))
+            return float(
+                uncertainty(expected_pose_covariance(poses, x, noise, of_rows, priors, averaged=False), point)
+            )
 
         for _ in range(count):
             best = min(left, key=remaining)
@@ -216,11 +218,11 @@ def worse_of(noise: RobotNoise, other: RobotNoise) -> RobotNoise:
 def typical_camera(
     intrinsics: Intrinsics | None, size: tuple[int, int], std: Float[ndarray, " q"] | None = None
 ) -> ForeseenCamera:
-    """A camera whose images are not matched yet; `size` is width and height (px), `std` as prior_about takes it."""
+    """A camera whose images are not matched yet; `size` is width and height (px), `std` as camera_about takes it."""
     width, height = size
     focal, centre = USUAL_FOCAL * width, ((width - 1) / 2, (height - 1) / 2)
     camera = intrinsics or Intrinsics(focal, focal, *centre, width, height)
-    return ForeseenCamera(intrinsics=camera, prior=prior_about(camera, intrinsics is not None, std))
+    return ForeseenCamera(camera=camera_about(camera, intrinsics is not None, std))
 
 
 def scene_distance(camera: Poses) -> float:
@@ -238,16 +240,14 @@ def expected(
     """
     x, camera, identity = assumptions.gripper_from_camera, assumptions.camera, np.eye(4)
     if camera is None:
-        covariance = expected_fit(base_from_gripper, x, assumptions.noise, systematic, assumptions.cues)
+        covariance = expected_pose_covariance(
+            base_from_gripper, x, assumptions.noise, systematic, assumptions.priors
+        )
         estimate = Estimate(gripper_from_camera=x, scale=1.0, base_from_recon=identity, covariance=covariance)
     else:
-        arm = ArmPoses(
-            rigs=np.arange(len(base_from_gripper)),
-            base_from_gripper=base_from_gripper,
-            systematic=systematic,
-            start=(x, identity),
+        adjusted = foreseen(
+            wrist_arm(base_from_gripper, systematic), x, camera, assumptions.noise, assumptions.distance_m
         )
-        adjusted = foreseen(arm, camera, assumptions.noise, assumptions.distance_m)
         estimate = estimate_in(adjusted, 1.0, identity)
     if assumptions.faults is not None:
         estimate = estimate.with_fault(assumptions.faults)

@@ -11,8 +11,8 @@ from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import RobotErrors
 from jcr.errors import RejectedError
-from jcr.estimation.fit import Cues
-from jcr.estimation.hand_eye import solve_hand_eye
+from jcr.estimation.hand_eye import SCALE_STD, Offset, solve_hand_eye
+from jcr.estimation.problem import offset_prior, scale_prior
 from jcr.records import Capture, HandEye, Reconstruction
 
 
@@ -31,22 +31,24 @@ def fitted(
             also=(*reconstruction.warnings, *reconstruction.notes),
         )
     gripper = capture.base_from_gripper[reconstruction.image_index]
-    cues, contradiction = _measured(capture, reconstruction, options), None
-    if cues is not None and cues.offset is None:
+    (scale, offset), contradiction = _measured(capture, reconstruction, options), None
+    if scale is not None and offset is None:
         # Where the motions determine the scale, it is compared with the length beside others (checks/lengths.py).
-        cues = None if _solved(gripper, reconstruction, options, robot, None).converged else cues
-    if cues is None and (metric_std := reconstruction.metric_std) is not None:
-        free = _solved(gripper, reconstruction, options, robot, None)
+        scale = None if _solved(gripper, reconstruction, options, robot).converged else scale
+    if scale is offset is None and (metric_std := reconstruction.metric_std) is not None:
+        free = _solved(gripper, reconstruction, options, robot)
         contradiction = scale_contradiction(free, metric_std)
-        cues = Cues(scale=(1.0, metric_std))
-    hand_eye = _solved(gripper, reconstruction, options, robot, cues)
+        scale = 1.0, metric_std
+    hand_eye = _solved(gripper, reconstruction, options, robot, scale, offset)
+    priors = () if scale is None else (scale_prior(*scale),)
+    priors += () if offset is None else (offset_prior(*offset),)
     hand_eye = replace(hand_eye, estimate=replace(hand_eye.estimate, intrinsics=reconstruction.intrinsics))
     return Case(
         capture=capture,
         reconstruction=reconstruction,
         options=options,
         robot=robot,
-        cues=cues,
+        priors=priors,
         hand_eye=hand_eye if contradiction is None else hand_eye.with_findings(contradiction),
     )
 
@@ -56,28 +58,32 @@ def _solved(
     reconstruction: Reconstruction,
     options: CalibrateOptions,
     robot: RobotErrors,
-    cues: Cues | None,
+    scale: tuple[float, float] | None = None,
+    offset: Offset | None = None,
 ) -> HandEye:
     evidence = reconstruction.evidence
     return solve_hand_eye(
         gripper,
         reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera,
         robot_noise=options.robot_noise_m_rad,
-        cues=cues,
+        scale=None if scale is None else scale[0],
+        scale_std=SCALE_STD if scale is None else scale[1],
+        offset=offset,
         camera_covariance=None if evidence is None else evidence.covariance,
         systematic=robot.systematic,
     )
 
 
-def _measured(capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions) -> Cues | None:
-    """What the user measured with a ruler."""
-    if options.known_height is None and options.known_length is None:
-        return None
+def _measured(
+    capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions
+) -> tuple[tuple[float, float] | None, Offset | None]:
+    """Return the scale and the height that the user measured, each with its standard deviation."""
     gripper = capture.base_from_gripper[reconstruction.image_index]
     scale = offset = None
     if options.known_height is not None:
         offset = height_cue(gripper, options.known_height / 1e3)
     if options.known_length is not None:
         image, *ends, length_mm = options.known_length
-        scale = length_cue(capture, reconstruction, image, np.array(ends).reshape(2, 2), length_mm / 1e3)
-    return Cues(scale, offset)
+        ends_px = np.array(ends).reshape(2, 2)
+        scale = length_cue(capture, reconstruction, image, ends_px, length_mm / 1e3)
+    return scale, offset

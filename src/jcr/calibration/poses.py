@@ -1,5 +1,7 @@
 """The calibration of camera poses that somebody else found, without images."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from jcr.calibration.checks.effects import effects_of_fit, with_rejected_runs
@@ -12,8 +14,8 @@ from jcr.calibration.robot_errors import RobotErrors, errors_of
 from jcr.calibration.verdict import with_findings
 from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
-from jcr.estimation.fit import Cues, PoseProblem
 from jcr.estimation.hand_eye import SCALE_STD, solve_hand_eye
+from jcr.estimation.wrist import pose_problem
 from jcr.records import Finding, HandEye, Kind, PosePairs
 
 METRIC_STD = 0.005
@@ -29,15 +31,17 @@ def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -
     check_options(options := options or CalibrateOptions())
     robot = errors_of(pairs.base_from_gripper, None if options.robot is None else arm_named(options.robot))
     hand_eye = _calibrated_poses(pairs, options, robot)
-    problem = PoseProblem(
-        base_from_gripper=pairs.base_from_gripper,
-        recon_from_camera=pairs.recon_from_camera,
-        used=with_rejected_runs(hand_eye.inliers),
-        systematic=robot.systematic,
-        noise=options.robot_noise_m_rad,
-    )
     if hand_eye.observability.observable:
-        hand_eye = with_findings(hand_eye, effects_of_fit(problem, hand_eye, pairs.images))
+        start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon
+        problem, state = pose_problem(
+            pairs.base_from_gripper,
+            pairs.recon_from_camera,
+            start,
+            error_covariance=robot.systematic,
+            noise_floor=options.robot_noise_m_rad,
+        )
+        problem = replace(problem, used=with_rejected_runs(hand_eye.inliers))
+        hand_eye = with_findings(hand_eye, effects_of_fit(problem, state, hand_eye, pairs.images))
     is_known = options.scale is not None or (pairs.is_metric and is_one(hand_eye))
     gripper = pairs.base_from_gripper
     assumptions = assumed_of_poses(hand_eye, gripper[hand_eye.inliers], SCALE_STD if is_known else None)
@@ -48,16 +52,16 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotE
     gripper, camera, noise = pairs.base_from_gripper, pairs.recon_from_camera, options.robot_noise_m_rad
     if options.known_length is not None:
         raise InputError("--known-length: there are no images in which it could be seen; leave it out")
-    offset = None if options.known_height is None else height_cue(gripper, options.known_height / 1e3)
+    height = options.known_height
+    offset = None if height is None else height_cue(gripper, height / 1e3)
     systematic = robot.systematic
-    cues = Cues(offset=offset)
-    free = solve_hand_eye(gripper, camera, robot_noise=noise, cues=cues, systematic=systematic)
+    free = solve_hand_eye(gripper, camera, robot_noise=noise, offset=offset, systematic=systematic)
     scale = 1.0 if options.scale is None and pairs.is_metric else options.scale
     hand_eye = free
     # A known size makes few samples worth more; where the robot's motion excludes it, the motion decides.
     if scale is not None and (options.scale is not None or not free.converged or is_one(free)):
         hand_eye = solve_hand_eye(
-            gripper, camera, robot_noise=noise, cues=cues, systematic=systematic, scale=scale
+            gripper, camera, robot_noise=noise, offset=offset, systematic=systematic, scale=scale
         )
         if not free.observability.observable and scale == 1.0:
             return hand_eye.with_findings(Finding.of(Kind.SCALE_ASSUMED, "warns", "motion"))

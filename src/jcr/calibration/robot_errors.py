@@ -10,11 +10,11 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
+from jcr.estimation.equation import Poses
 from jcr.estimation.inverse_kinematics import reach_toward
 from jcr.estimation.kinematics import Arm, Joints
 from jcr.estimation.mounting import LengthError
 from jcr.estimation.next_poses import nearest
-from jcr.estimation.pose_equations import Poses
 from jcr.estimation.systematic import arm_errors, posed, smooth_errors
 from jcr.records import Capture, Finding, Kind
 

@@ -9,7 +9,7 @@ from numpy import ndarray
 from jcr.capture.images import BLURRED
 from jcr.capture.options import MIN_FRAMES
 from jcr.errors import InputError
-from jcr.estimation.pose_equations import ASSUMED_NOISE, most_informative, pose_information
+from jcr.estimation.equation import ASSUMED_NOISE, most_informative, pose_information
 from jcr.geometry import inverse, motion_length
 
 STILL = 0.005

@@ -3,7 +3,7 @@
 In the frame of the carried object the camera moves as a wrist camera does in the base: with the inverse gripper poses
 everything that calibrates a wrist camera calibrates this one, from matches that the robot checks to the verdict. Only
 the robot's errors are not those of inverse poses, so that the answer and its covariance are found once more with the
-errors where they are (estimation/image_robots.py).
+errors where they are (estimation/pose_equations.py).
 """
 
 from dataclasses import replace
@@ -65,9 +65,9 @@ def refined(
         reconstruction=reconstruction,
         options=options,
         robot=robot,
-        cues=None,
+        priors=(),
         hand_eye=found,
-        exchanged=True,
+        carries="scene",
     )
     if found.before is None or case.tracks.from_pointmaps or len(case.tracks.image) < MIN_OBSERVATIONS:
         return found

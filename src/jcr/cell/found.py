@@ -12,7 +12,8 @@ from jcr.geometry import skew
 from jcr.records import Assessed, CellCamera, Finding, Intrinsics, Mount
 
 if TYPE_CHECKING:
-    from jcr.estimation.image_robots import Adjusted, Placed
+    from jcr.estimation.problem import State
+    from jcr.estimation.solve import Solution
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +83,7 @@ class CellFound:
 
     cameras: tuple[CameraFound, ...]
     arms: tuple[ArmFound, ...]
-    answer: "Adjusted | None"
+    answer: "Solution | None"
     """None where no camera could be placed."""
-    of: "dict[str, Callable[[Placed], Float[ndarray, '4 4']]]" = field(default_factory=dict)
+    of: "dict[str, Callable[[State], Float[ndarray, '4 4']]]" = field(default_factory=dict)
     """By camera that was placed: its parent_from_camera, wherever `answer` puts everything."""

@@ -11,11 +11,11 @@ from jcr.calibration.case import MIN_OBSERVATIONS, of_images
 from jcr.calibration.options import CalibrateOptions
 from jcr.cell.localise import Known
 from jcr.cell.rigs import Member, Rigs
-from jcr.estimation.image_robots import Adjusted, ArmPoses
-from jcr.estimation.intrinsics_prior import IntrinsicsPrior, prior_about
-from jcr.estimation.scene import Freedom, Observations, RigInformation, Scene
-from jcr.estimation.score_test import freed, with_intrinsics
-from jcr.estimation.together import adjust
+from jcr.estimation.intrinsics_prior import Camera, camera_about
+from jcr.estimation.observations import Observations
+from jcr.estimation.problem import Problem, RigGaussian, State, with_observations
+from jcr.estimation.score_test import freed, with_camera
+from jcr.estimation.solve import Solution, solve
 from jcr.records import Capture, HandEye, Intrinsics, Kind, Reconstruction
 from jcr.sfm.track_refinement import KEYPOINT_STD_PX
 
@@ -33,42 +33,35 @@ NOTHING: dict[str, ndarray] = {
 
 @dataclass(frozen=True, kw_only=True)
 class CellImages:
-    """What an adjustment of a cell starts from; cameras by their numbers, the capture's own is 0."""
+    """Problem and initial state of a cell; cameras by their numbers, the capture's own is 0."""
 
-    scene: Scene
+    problem: Problem
+    """Without its observations."""
+    state: State
     observations: Observations
-    freedom: Freedom
-    arms: Sequence[ArmPoses]
-    noise: tuple[float, float] | None
-    """m, rad: of the gripper poses, at least."""
-    prior: RigInformation | None
-    """What others than the images and the robots know of the own camera's poses."""
 
-    def adjusted(self) -> Adjusted:
-        """Images and arms together."""
-        return adjust(self.scene, self.observations, self.freedom, self.arms, self.noise, self.prior)
+    def adjusted(self) -> Solution:
+        """Adjust images and arms together."""
+        return solve(*with_observations(self.problem, self.state, self.observations))
 
     def with_freed(
-        self,
-        prior: IntrinsicsPrior,
-        camera: int,
-        combinations: Float[ndarray, "e p"] | None = None,
+        self, prior: Camera, camera: int, combinations: Float[ndarray, "e p"] | None = None
     ) -> "CellImages":
-        """Return the images with another prior of a camera's intrinsics, and with combinations of the columns of its
+        """Return the cell with another prior of a camera's intrinsics, and combinations of the columns of its
         score_test.Alternatives free too."""
-        freedom = with_intrinsics(self.freedom, prior, camera)
+        problem = with_camera(self.problem, prior, camera)
         if combinations is not None:
             mine = np.flatnonzero(self.observations.camera == camera)
-            freedom = freed(freedom, combinations, mine, camera)
-        return replace(self, freedom=freedom)
+            problem = freed(problem, combinations, mine, len(self.observations.rig), camera)
+        return replace(self, problem=problem)
 
-    def with_bent(self, arm: int | None, bent: Float[ndarray, "s b"] | None) -> "CellImages":
-        """Return the images with errors of one standard deviation each of the poses of an arm."""
-        if arm is None or bent is None:
+    def with_confirmed(self, arm: int | None, errors: Float[ndarray, "s b"] | None) -> "CellImages":
+        """Return the cell with confirmed errors of the poses of an arm, of one standard deviation each."""
+        if arm is None or errors is None:
             return self
-        arms = list(self.arms)
-        arms[arm] = replace(arms[arm], bent=bent)
-        return replace(self, arms=arms)
+        arms = list(self.problem.arms)
+        arms[arm] = replace(arms[arm], confirmed_errors=errors)
+        return replace(self, problem=replace(self.problem, arms=tuple(arms)))
 
 
 def cell_images(
@@ -104,12 +97,21 @@ def cell_images(
             rig.append(int(member.rig[k]))
             camera.append(c)
     mounts = [np.eye(4) if one.rig_from_camera is None else one.rig_from_camera for one in members]
-    cameras = (reconstruction.intrinsics, *(member.seen.intrinsics for member in members))
+    arms, starts = rigs.arm_poses(options)
     return CellImages(
-        scene=Scene(
+        problem=Problem(
+            arms=tuple(arms),
+            n_rigs=len(rigs.poses),
+            cameras=_cameras(capture, reconstruction.intrinsics, hand_eye, members),
+            known_rigs=prior,
+            robot_noise_floor=options.robot_noise_m_rad,
+        ),
+        state=State(
+            x=np.stack([x for x, _ in starts]),
+            scale=1.0,
+            z=np.stack([z for _, z in starts]),
             world_from_rig=np.stack(rigs.poses),
             rig_from_camera=np.stack([np.eye(4), *mounts]),
-            cameras=cameras,
             points_in_world=np.concatenate(points),
         ),
         observations=Observations(
@@ -120,37 +122,32 @@ def cell_images(
             point=np.concatenate(point),
             std_px=np.concatenate(std_px),
         ),
-        freedom=_freedom(capture, hand_eye, members, cameras, len(rig)),
-        arms=rigs.arm_poses(options),
-        noise=options.robot_noise_m_rad,
-        prior=prior,
     )
 
 
-def _freedom(
-    capture: Capture, hand_eye: HandEye, members: Sequence[Member], cameras: Sequence[Intrinsics], images: int
-) -> Freedom:
-    """Intrinsics free about what was given or found of each camera; a mount only beside another camera on its rig.
+def _cameras(
+    capture: Capture, own: Intrinsics, hand_eye: HandEye, members: Sequence[Member]
+) -> tuple[Camera, ...]:
+    """Return the cameras with the prior of their intrinsics; a mount is free only beside another camera on its rig.
 
-    Those that the own camera's images contradict were found, not given.
+    Given intrinsics that the own camera's images contradict count as estimated.
     """
     contradicted = any(one.kind is Kind.INTRINSICS and one.shift is None for one in hand_eye.findings)
-    own = prior_about(cameras[0], capture.intrinsics is not None and not contradicted, capture.intrinsics_std)
-    priors, mounts = [own], [False]
-    for start, member in zip(cameras[1:], members, strict=True):
+    given = capture.intrinsics is not None and not contradicted
+    cameras = [camera_about(own, given, capture.intrinsics_std)]
+    for member in members:
         known = member.camera.intrinsics is not None
-        priors.append(prior_about(start, known, member.camera.intrinsics_std))
-        mounts.append(member.rig_from_camera is not None)
-    return Freedom.of(cameras, priors, images, mounts)
+        camera = camera_about(member.seen.intrinsics, known, member.camera.intrinsics_std)
+        cameras.append(replace(camera, mount_free=member.rig_from_camera is not None))
+    return tuple(cameras)
 
 
-def _as_given(reconstruction: Reconstruction, hand_eye: HandEye, known: Known) -> RigInformation:
-    """Information on the used images' poses, where other than features found in the images decided them."""
+def _as_given(reconstruction: Reconstruction, hand_eye: HandEye, known: Known) -> RigGaussian:
+    """Return the distribution of the used images' poses, where other than features found in the images decided them."""
     rows = np.flatnonzero(hand_eye.inliers)
     spread_of = np.zeros((6 * len(rows), 6 * len(rows)))
     if (evidence := reconstruction.evidence) is not None:
         unit = np.tile(np.repeat([hand_eye.scale, 1.0], 3), len(rows))
         among = (6 * rows[:, None] + np.arange(6)).ravel()
         spread_of = unit[:, None] * evidence.covariance[np.ix_(among, among)] * unit
-    information = np.linalg.inv(spread_of + EXACT**2 * np.eye(len(spread_of)))
-    return RigInformation(known.recon_from_camera, information, np.zeros(len(information)))
+    return RigGaussian(known.recon_from_camera, spread_of + EXACT**2 * np.eye(len(spread_of)))

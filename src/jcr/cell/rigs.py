@@ -15,10 +15,10 @@ from jcr.cell.camera_views import CameraViews
 from jcr.cell.found import CameraFound
 from jcr.cell.localise import Shared
 from jcr.estimation.hand_eye import solve_hand_eye
-from jcr.estimation.image_robots import ArmPoses
 from jcr.estimation.pose_effects import arm_rows
+from jcr.estimation.problem import Arm
 from jcr.estimation.systematic import smooth_errors
-from jcr.geometry import inverse, motion_length, step_between
+from jcr.geometry import Transform, inverse, motion_length, step_between
 from jcr.records import BENT, Capture, CellCamera, Finding, HandEye, Kind
 
 SAME_PLACE = (0.02, np.radians(2.0))
@@ -154,30 +154,25 @@ class Rigs:
         self._of_arms.append((rig[seen.rows[used]], gripper[used], found))
         return Member(seen=seen.without(why), rig=rig, rig_from_camera=None, arm=len(self.arms))
 
-    def arm_poses(self, options: CalibrateOptions) -> list[ArmPoses]:
-        """The arms, the capture's own first."""
+    def arm_poses(self, options: CalibrateOptions) -> tuple[list[Arm], list[tuple[Transform, Transform]]]:
+        """Return the arms, the capture's own first, and initial X and base_from_world of each."""
         robot = robot_errors(self._capture, options).of(self._rows)
         hand_eye = self._hand_eye
         poses = self._capture.base_from_gripper[self._rows]
-        found = {one.kind for one in hand_eye.findings if one.kind in BENT}
-        bent = [row.prior_std * row.columns for row in arm_rows(poses) if row.kind in found]
-        first = ArmPoses(
-            rigs=np.arange(len(self._rows)),
-            base_from_gripper=poses,
-            bent=np.concatenate(bent, axis=1) if bent else None,
-            systematic=robot.systematic,
-            start=(hand_eye.gripper_from_camera, hand_eye.base_from_recon),
-        )
-        others = [
-            ArmPoses(
-                rigs=rigs,
-                base_from_gripper=gripper,
-                systematic=smooth_errors(gripper),
-                start=(found.gripper_from_camera, found.base_from_recon),
+        kinds = {one.kind for one in hand_eye.findings if one.kind in BENT}
+        bent = [row.prior_std * row.columns for row in arm_rows(poses) if row.kind in kinds]
+        arms = [
+            Arm(
+                rigs=np.arange(len(self._rows)),
+                base_from_gripper=poses,
+                error_covariance=robot.systematic,
+                confirmed_errors=np.concatenate(bent, axis=1) if bent else None,
             )
-            for rigs, gripper, found in self._of_arms
         ]
-        return [first, *others]
+        for rigs, gripper, _ in self._of_arms:
+            arms.append(Arm(rigs=rigs, base_from_gripper=gripper, error_covariance=smooth_errors(gripper)))
+        found = [hand_eye, *(one for _, _, one in self._of_arms)]
+        return arms, [(one.gripper_from_camera, one.base_from_recon) for one in found]
 
 
 def _apart(

@@ -30,9 +30,10 @@ from jcr.cell.place_checks import (
     with_faults,
 )
 from jcr.cell.rigs import Member, Rigs
-from jcr.estimation.image_robots import Adjusted, Placed
-from jcr.estimation.images import median_reprojection_px
-from jcr.estimation.intrinsics_prior import ESTIMATED, prior_of
+from jcr.estimation.image_equations import median_reprojection_px
+from jcr.estimation.intrinsics_prior import ESTIMATED, camera_with_prior
+from jcr.estimation.problem import State
+from jcr.estimation.solve import Solution
 from jcr.geometry import inverse, scale_translation
 from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress, silent, steps
@@ -106,14 +107,14 @@ def place_cameras(
     return CellFound(tuple(cameras[camera.name] for camera in others), tuple(arms), answer, of)
 
 
-def _place_of(member: Member, c: int) -> Callable[[Placed], Float[ndarray, "4 4"]]:
+def _place_of(member: Member, c: int) -> Callable[[State], Float[ndarray, "4 4"]]:
     """Where the camera, the c-th of the images', is on its parent."""
     rig, arm = int(member.rig[member.rig >= 0][0]), member.arm
 
-    def parent_from_camera(placed: Placed) -> Float[ndarray, "4 4"]:
+    def parent_from_camera(placed: State) -> Float[ndarray, "4 4"]:
         if arm is None:
-            return placed.z[0] @ scale_translation(placed.scene.world_from_rig[rig], placed.scale)
-        return placed.x[arm] @ scale_translation(placed.scene.rig_from_camera[c], placed.scale)
+            return placed.z[0] @ scale_translation(placed.world_from_rig[rig], placed.scale)
+        return placed.x[arm] @ scale_translation(placed.rig_from_camera[c], placed.scale)
 
     return parent_from_camera
 
@@ -121,9 +122,9 @@ def _place_of(member: Member, c: int) -> Callable[[Placed], Float[ndarray, "4 4"
 def _examined(
     images: CellImages,
     members: Sequence[Member],
-    places: Sequence[Callable[[Placed], Float[ndarray, "4 4"]]],
+    places: Sequence[Callable[[State], Float[ndarray, "4 4"]]],
     hand_eye: HandEye,
-) -> tuple[Adjusted, list[tuple[Finding, ...]]]:
+) -> tuple[Solution, list[tuple[Finding, ...]]]:
     """All images adjusted, and what those of each camera show against it (calibration/checks/camera.py).
 
     Where they contradict intrinsics that were given, or leave doubt of them, the images are adjusted as if none had
@@ -132,7 +133,7 @@ def _examined(
     answer, found = images.adjusted(), list[tuple[Finding, ...]]()
     tested: set[int | None] = {0}
     for c, (member, place) in enumerate(zip(members, places, strict=True), start=1):
-        if not len(images.freedom.intrinsics[c].std):  # exact, as of a camera that is compared with itself
+        if not len(images.problem.cameras[c].std):  # exact, as of a camera that is compared with itself
             found.append(())
             continue
         is_given = member.camera.intrinsics is not None
@@ -148,7 +149,7 @@ def _examined(
             contradiction = contradicted_by(imaged, SURE_OF_INTRINSICS)
         if contradiction is not None:
             answer, contradicted = contradiction
-            images = images.with_freed(prior_of(imaged.start, ESTIMATED), c)
+            images = images.with_freed(camera_with_prior(imaged.start, ESTIMATED), c)
             faults = with_contradiction(faults, (contradicted,))
         found.append(faults)
     return answer, found
@@ -156,10 +157,10 @@ def _examined(
 
 def _imaged(
     images: CellImages,
-    answer: Adjusted,
+    answer: Solution,
     found: CameraFound,
     c: int,
-    arm_and_place: tuple[int | None, Callable[[Placed], Float[ndarray, "4 4"]]],
+    arm_and_place: tuple[int | None, Callable[[State], Float[ndarray, "4 4"]]],
     is_given: bool,
 ) -> Imaged:
     """Return a further camera, the c-th, as its checks take it, with the arm whose poses are tested with it."""
@@ -168,15 +169,15 @@ def _imaged(
     return Imaged(
         adjusted=answer,
         adjust=lambda prior, combinations, bent: (
-            images.with_bent(arm, bent).with_freed(prior, c, combinations).adjusted()
+            images.with_confirmed(arm, bent).with_freed(prior, c, combinations).adjusted()
         ),
         arm=arm,
         names=[image.image for image in found.images if image.used],
-        start=images.freedom.start[c],
+        start=images.problem.cameras[c].intrinsics,
         is_given=is_given,
-        prior=images.freedom.intrinsics[c],
+        prior=images.problem.cameras[c],
         std=np.sqrt(np.diag(found.covariance)) * found.converged,
-        answer=lambda adjusted: (place(adjusted.placed), adjusted.placed.scale),
+        answer=lambda adjusted: (place(adjusted.state), adjusted.state.scale),
         camera=c,
         place=place,
     )
@@ -185,16 +186,17 @@ def _imaged(
 def _found(
     member: Member,
     c: int,
-    answer: Adjusted,
-    parent_from_camera: Callable[[Placed], Float[ndarray, "4 4"]],
+    answer: Solution,
+    parent_from_camera: Callable[[State], Float[ndarray, "4 4"]],
     hand_eye: HandEye,
 ) -> CameraFound:
     """Where the camera, the c-th, is, and what speaks against its place."""
-    camera, evidence = member.camera, answer.given.evidence
+    camera, problem = member.camera, answer.problem
+    assert problem.observations is not None
     transform, covariance = answer.transform(parent_from_camera)
     covariance = covariance + _by_faults(answer, answer.derivative(parent_from_camera), hand_eye)
-    of_all = median_reprojection_px(evidence.view, evidence.problem)
-    medians = of_all[evidence.problem.observations.camera == c].tolist()
+    of_all = median_reprojection_px(problem, answer.images.view)
+    medians = of_all[problem.observations.camera == c].tolist()
     px = dict(zip((k for k, _ in member.used), medians, strict=True))
     images = tuple(
         ImageFound(image=image, used=reason is None, points=count, reprojection_px=px.get(k), reason=reason)
@@ -209,8 +211,8 @@ def _found(
         images=images,
         parent_from_camera=transform,
         covariance=covariance,
-        scene_distance=member.seen.distance * answer.placed.scale,
-        intrinsics=answer.placed.scene.cameras[c],
+        scene_distance=member.seen.distance * answer.state.scale,
+        intrinsics=problem.intrinsics(answer.state)[c],
         intrinsics_std=np.sqrt(np.diag(answer.intrinsics_covariance(c))),
     )
     # An image that contradicts the place also makes it uncertain.
@@ -220,7 +222,7 @@ def _found(
 
 
 def _by_faults(
-    answer: Adjusted, derivative: Float[ndarray, "6 p"], hand_eye: HandEye
+    answer: Solution, derivative: Float[ndarray, "6 p"], hand_eye: HandEye
 ) -> Float[ndarray, "6 6"]:
     """What the calibration of the capture's own camera counts beside its images and robot, carried over.
 

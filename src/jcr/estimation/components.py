@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.estimation.mixed_model import Each, Equations, LogSizes, Solution, solve
+from jcr.estimation.mixed_model import Each, Equations, LinearSolution, LogSizes, solve_equations
 
 LEVELS = tuple(1.5 * np.arange(-4, 5))
 """Standard deviations of the log sizes at which the posterior is evaluated; for a normal one, the error of so coarse a
@@ -29,7 +29,7 @@ SETTLED = 1e-4
 
 Information = Float[ndarray, "c c"]
 """Expected, of the log sizes at their mode."""
-Weighed = list[tuple[Float[ndarray, " g"], Float[ndarray, "g c"], Solution]]
+Weighed = list[tuple[Float[ndarray, " g"], Float[ndarray, "g c"], LinearSolution]]
 """Posterior weights (their sum is 1) of log sizes about their mode, and the solutions at these, in groups."""
 
 
@@ -64,7 +64,7 @@ def most_likely(
     return at, information
 
 
-def log_evidence(equations: Equations, solution: Solution, information: Information) -> float:
+def log_evidence(equations: Equations, solution: LinearSolution, information: Information) -> float:
     """Log density of the residuals, averaged over unknowns and sizes: of s residuals but for (2π)^(−s/2), and up to a
     constant that all sets of residuals share.
 
@@ -79,16 +79,18 @@ def over_sizes(
     equations: Equations,
     log_sizes: LogSizes,
     information: Information,
-    density: Callable[[Solution], Each] = lambda solution: solution.log_posterior,
+    density: Callable[[LinearSolution], Each] = lambda solution: solution.log_posterior,
 ) -> Weighed:
     """The log sizes about their mode that stand for all.
 
     `density` is the logarithm of the sizes' posterior, up to a constant.
     """
-    sizes, log_volumes = _grid(equations, log_sizes, information, lambda at: density(solve(equations, at)))
+    sizes, log_volumes = _grid(
+        equations, log_sizes, information, lambda at: density(solve_equations(equations, at))
+    )
     together = max(1, int(AT_ONCE / len(equations.residual) ** 2))
     groups = [sizes[at : at + together] for at in range(0, len(sizes), together)]
-    solutions = [solve(equations, group) for group in groups]
+    solutions = [solve_equations(equations, group) for group in groups]
     log_weight = np.concatenate([density(each) for each in solutions]) + log_volumes
     weight = np.exp(log_weight - log_weight.max())
     shares = np.split(weight / weight.sum(), np.cumsum([len(group) for group in groups])[:-1])
@@ -102,7 +104,7 @@ def expected_information(equations: Equations, log_sizes: LogSizes) -> Informati
 
 def _score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, Information]:
     """Log posterior of the sizes, its gradient, and the expected information."""
-    solution = solve(equations, log_sizes)
+    solution = solve_equations(equations, log_sizes)
     projection, left = solution.projection, solution.weighed_left
     masks = np.stack([equations.of_position, 1 - equations.of_position])
     squares, traces = masks @ left**2, masks @ np.diagonal(projection)

@@ -1,26 +1,28 @@
 """The adjustment of a capture before its images are matched: the equations of a scene that its cameras would see.
 
-What a calibration leaves unknown depends on where the gripper is, on what is known of the camera beforehand and on how
-exact images and robot are, but hardly on what the scene is. So points are put where the cameras look, on a surface with
-some relief, and seen where a matcher would find them again. The equations are those of robots.py at residuals of 0; the
-sizes of the errors are given.
+What a calibration leaves unknown depends on where the gripper is, on what is known of the camera beforehand and on
+how exact images and robot are, but hardly on what the scene is. So points are put where the cameras look, on a
+surface with some relief, and seen where a matcher would find them again. The equations are those of pose_equations.py
+at residuals of 0; the sizes of the errors are given.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.camera import parameters, project, unproject, with_parameters
-from jcr.estimation.image_robots import Adjusted, ArmPoses, Given, Placed, equations_of
-from jcr.estimation.images import evidence, posed
-from jcr.estimation.intrinsics_prior import IntrinsicsPrior
+from jcr.estimation.covariance import expected_covariance_at
+from jcr.estimation.image_equations import evidence
+from jcr.estimation.intrinsics_prior import Camera
+from jcr.estimation.observations import Observations
 from jcr.estimation.pixel_noise import PixelNoise
-from jcr.estimation.pose_equations import Poses
-from jcr.estimation.posterior import expected_posterior
-from jcr.estimation.scene import Freedom, Observations, Scene
-from jcr.geometry import apply, inverse
+from jcr.estimation.pose_equations import pose_equations
+from jcr.estimation.problem import Arm, LinearPrior, Problem, State, with_observations
+from jcr.estimation.solve import Solution, expected_solution
+from jcr.estimation.wrist import pose_problem
+from jcr.geometry import Poses, Transform, apply, inverse
 from jcr.records import Intrinsics, RobotNoise, Tracks
 
 COLUMNS = 9
@@ -41,69 +43,92 @@ SAME_FEATURE = np.radians(40.0), 2.0
 """Rotation of the line of sight, and ratio of distances, up to which a matcher finds a feature again."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ForeseenCamera:
-    """A camera, what is known of it beforehand, and how much its images will show."""
+    """A camera with the prior of its intrinsics, and the information of its images."""
 
-    intrinsics: Intrinsics
-    prior: IntrinsicsPrior
+    camera: Camera
     information_per_px2: float = TYPICAL_INFORMATION
-    """Of an image, on average: the inverse variances of its observations' x, or y, added up."""
+    """Sum of the inverse variances of an image's observations of x, or of y, on average."""
     model_error: float = TYPICAL_MODEL_ERROR
-    """Size of each displacement that the camera's model leaves, in widths of the image."""
+    """Size of the remaining distortion of the camera's model, in widths of the image."""
 
     @staticmethod
-    def of(adjusted: Adjusted) -> "ForeseenCamera":
-        """The first camera of an adjustment, its next images being as those were."""
-        images = adjusted.given.evidence
-        problem, left = images.problem, images.problem.freedom.model_error_std
+    def of(solution: Solution) -> "ForeseenCamera":
+        """Return the first camera of a solution, its next images being like those."""
+        images, problem = solution.images, solution.problem
+        own = problem.columns.model_error[0]
         return ForeseenCamera(
-            intrinsics=images.scene.cameras[0],
-            prior=problem.freedom.intrinsics[0],
-            information_per_px2=float(images.weight.sum()) / len(problem.observations.rig),
-            model_error=float(left[0]) if len(left) else 0.0,
+            camera=replace(problem.cameras[0], intrinsics=images.view.cameras[0]),
+            information_per_px2=float(images.weight.sum()) / problem.n_images,
+            model_error=float(images.state.model_error_std[0]) if own.stop > own.start else 0.0,
         )
 
 
-def foreseen(arm: ArmPoses, camera: ForeseenCamera, noise: RobotNoise, distance_m: float) -> Adjusted:
-    """What the adjustment of images from an arm's poses is expected to come to, where its errors are of this size.
+def foreseen(
+    arm: Arm, x: Transform, camera: ForeseenCamera, noise: RobotNoise, distance_m: float
+) -> Solution:
+    """Return the expected solution of a problem with images from an arm's poses, its errors having these sizes.
 
-    The arm's start is its X and the identity; the scene is `distance_m` from the cameras, in metres.
+    `x` is gripper_from_camera; the scene is `distance_m` from the cameras, in metres.
     """
-    x, z = arm.start
-    # Far outside the image a distortion may fold; how large it is hardly matters to how well it becomes known.
-    straight = parameters(camera.intrinsics)
+    # Far outside the image a distortion may fold; its size hardly changes how well it becomes known.
+    straight = parameters(camera.camera.intrinsics)
     straight[4:] = 0.0
-    intrinsics = with_parameters(camera.intrinsics, straight)
-    tracks = _seen_points(arm.base_from_gripper @ x, intrinsics, distance_m)
-    scene = Scene(
-        world_from_rig=arm.base_from_gripper @ x,
-        rig_from_camera=np.eye(4)[None],
-        cameras=(intrinsics,),
+    intrinsics = with_parameters(camera.camera.intrinsics, straight)
+    cameras, count = arm.base_from_gripper @ x, len(arm.rigs)
+    tracks = _seen_points(cameras, intrinsics, distance_m)
+    problem = Problem(
+        arms=(arm,),
+        n_rigs=count,
+        cameras=(replace(camera.camera, intrinsics=intrinsics),),
+        robot_noise_floor=noise.given,
+    )
+    state = State(
+        x=x[None],
+        scale=1.0,
+        z=np.eye(4)[None],
+        world_from_rig=cameras,
         points_in_world=tracks.points_in_recon,
     )
-    freedom = Freedom.of((intrinsics,), (camera.prior,), len(arm.rigs))
-    scene, problem = posed(scene, Observations.of_one_camera(tracks, len(arm.rigs)), freedom)
-    sizes = np.full(len(problem.freedom.model_error_std), max(camera.model_error, LEAST_MODEL_ERROR))
-    problem = problem.with_model_error(sizes)
-    # The images' own information is shared by these observations.
-    an_image = len(problem.observations.point) / len(arm.rigs)
-    pixels = PixelNoise(np.array([np.sqrt(an_image / camera.information_per_px2)]))
-    images = evidence(scene, problem, pixels)
-    images.information[np.diag_indices(len(images.information))] += LOST
-    given = Given(evidence=images, arms=(arm,), noise=noise.given)
-    placed = Placed(x=x[None], scale=1.0, z=z[None], scene=scene)
-    equations, region = equations_of(placed, given)
-    found = expected_posterior(equations, noise, region)
-    return Adjusted(
-        placed=placed,
-        covariance=found.covariance,
-        budget=found.budget,
-        most_likely=placed,
-        log_sizes=found.log_sizes,
-        equations=equations,
-        given=given,
+    problem, state = with_observations(problem, state, Observations.of_one_camera(tracks, count))
+    assert problem.observations is not None
+    an_image = len(problem.observations.point) / count
+    state = replace(
+        state,
+        model_error_std=np.array([max(camera.model_error, LEAST_MODEL_ERROR)]),
+        pixel_noise=PixelNoise(np.array([np.sqrt(an_image / camera.information_per_px2)])),
     )
+    images = evidence(problem, state)
+    images.information[np.diag_indices(len(images.information))] += LOST
+    return expected_solution(problem, state, images, noise)
+
+
+def expected_pose_covariance(
+    base_from_gripper: Poses,
+    x: Transform,
+    noise: RobotNoise,
+    error_covariance: Float[ndarray, "s s"],
+    priors: tuple[LinearPrior, ...] = (),
+    averaged: bool = True,
+) -> Float[ndarray, "7 7"]:
+    """Return the covariance that a solution with exact, metric camera poses is expected to report.
+
+    Without `averaged` it is the covariance where the sizes of the robot's errors are known.
+    """
+    start = x, 1.0, np.eye(4)
+    problem, state = pose_problem(
+        base_from_gripper,
+        base_from_gripper @ x,
+        start,
+        error_covariance=error_covariance,
+        noise_floor=noise.given,
+        priors=priors,
+    )
+    if averaged:
+        return expected_solution(problem, state, None, noise).covariance[:7, :7]
+    poses = pose_equations(problem, state, None)
+    return expected_covariance_at(poses.equations, noise, poses.region)[:7, :7]
 
 
 def _seen_points(cameras: Poses, intrinsics: Intrinsics, distance_m: float) -> Tracks:

@@ -10,14 +10,15 @@ from numpy.typing import ArrayLike
 
 from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
-from jcr.estimation.fit import Cues, PoseFit
+from jcr.estimation.equation import residuals
 from jcr.estimation.kinematics import Arm, Joints
 from jcr.estimation.observability import observability
-from jcr.estimation.pose_equations import Poses
+from jcr.estimation.problem import LinearPrior, offset_prior, scale_prior
 from jcr.estimation.residuals import paper_residuals
 from jcr.estimation.robust import robust_fit
+from jcr.estimation.solve import Solution
 from jcr.estimation.systematic import arm_errors, posed, smooth_errors
-from jcr.geometry import require_rigid
+from jcr.geometry import Poses, require_rigid
 from jcr.least_squares import one_blas_thread
 from jcr.records import (
     Estimate,
@@ -47,13 +48,17 @@ SURPRISE = 1.5
 """Times the robot noise that was given; more is worth saying."""
 
 
+Offset = tuple[Float[ndarray, "3"], float, float]
+"""Axis in the gripper frame, position of the camera along it (m), standard deviation (m)."""
+
+
 @one_blas_thread
 def solve_hand_eye(  # noqa: PLR0913 (published; each is a fact about the capture)
     base_from_gripper: ArrayLike,
     recon_from_camera: ArrayLike,
     *,
     robot_noise: tuple[float, float] | None = None,
-    cues: Cues | None = None,
+    offset: Offset | None = None,
     camera_covariance: Float[ndarray, "r r"] | None = None,
     scale: float | None = None,
     scale_std: float = SCALE_STD,
@@ -64,9 +69,9 @@ def solve_hand_eye(  # noqa: PLR0913 (published; each is a fact about the captur
     """Hand-eye calibration with unknown scale from camera poses of your own.
 
     Takes two stacks (n,4,4), n ≥ 2, taken at the same instants and in the same order: gripper poses in the base frame
-    (m) and camera poses in any frame and unit. `robot_noise` is a lower bound on the noise of the gripper poses (1 sigma
-    per axis: m, rad); the residuals may show more. `camera_covariance` (6n,6n), as records.CameraEvidence defines it, is
-    needed if the camera poses are not exact compared with the gripper poses.
+    (m) and camera poses in any frame and unit. `robot_noise` is a lower bound on the noise of the gripper poses (1
+    sigma per axis: m, rad); the residuals may show more. `camera_covariance` (6n,6n), as records.CameraEvidence
+    defines it, is needed if the camera poses are not exact compared with the gripper poses.
 
     `robot` names the arm (jcr.estimation.arms.ROBOT_NAMES) and `joints` (n,dof) are its angles (rad), starting at the
     base: they determine how joint offsets and link errors affect the poses. With `robot` only, the angles are computed
@@ -74,19 +79,20 @@ def solve_hand_eye(  # noqa: PLR0913 (published; each is a fact about the captur
     covariance, if it is known already (systematic.py).
 
     `scale` (metres per unit of the camera poses, 1 if these are metric) is known to `scale_std` (relative); without it
-    the scale is estimated.
+    the scale is estimated. `offset` is an axis of the gripper frame, the position of the camera along it (m), and its
+    standard deviation (m), for motions that do not determine it.
 
     Raises InputError for shapes, values or counts that cannot be poses, and for poses or angles that do not fit the
     robot. Degenerate motion raises nothing; it is in the result (`observability`, `converged`).
     """
     gripper, camera = _checked_pairs(base_from_gripper, recon_from_camera)
-    n = len(gripper)
+    n, priors = len(gripper), () if offset is None else (offset_prior(*offset),)
     if scale is not None:
         if not (np.isfinite([scale, scale_std]).all() and scale > 0 and scale_std > 0):
             raise InputError(
                 f"scale: {scale} ± {scale_std} must be two positive numbers (m per unit, relative)"
             )
-        cues = replace(cues or Cues(), scale=(scale, scale_std))
+        priors += (scale_prior(scale, scale_std),)
     if robot_noise is not None and not (np.isfinite(robot_noise).all() and min(robot_noise) > 0):
         raise InputError(f"robot_noise: {robot_noise} must be two positive numbers (m, rad)")
     if camera_covariance is not None and camera_covariance.shape != (6 * n, 6 * n):
@@ -96,22 +102,22 @@ def solve_hand_eye(  # noqa: PLR0913 (published; each is a fact about the captur
     if systematic is None:
         arm, angles = _checked_arm(robot, joints, n)
         systematic = smooth_errors(gripper) if arm is None else arm_errors(*posed(arm, angles, gripper))
-    fitted = _fit_distinct(gripper, camera, robot_noise, cues, camera_covariance, systematic)
-    return judged(_with_residuals(gripper, camera, *fitted, cues))
+    fit, distinct = _fit_distinct(gripper, camera, robot_noise, priors, camera_covariance, systematic)
+    return judged(_with_residuals(gripper, camera, fit, distinct))
 
 
 def _fit_distinct(
     gripper: Poses,
     camera: Poses,
     noise: tuple[float, float] | None,
-    cues: Cues | None,
+    priors: tuple[LinearPrior, ...],
     covariance: Float[ndarray, "r r"] | None,
     systematic: Float[ndarray, "r r"],
-) -> tuple[PoseFit, Bool[ndarray, " d"], Int[ndarray, " n"]]:
-    """The robust fit to the distinct images, which of these it uses, and which of these each image is.
+) -> tuple[Solution, Int[ndarray, " n"]]:
+    """Return the robust fit to the distinct images, and the distinct image that each image is.
 
-    Sorted by what the poses are, not by how they came: the same images in any order, the same last bit. An image that
-    was given twice is one: its error counted as two would pass for agreement.
+    The images are sorted by their poses, so that the result does not depend on their order. An image that was given
+    twice is one: its error counted as two would pass for agreement.
     """
     n = len(gripper)
     pairs = np.concatenate([gripper.reshape(n, 16), camera.reshape(n, 16)], axis=1)
@@ -120,27 +126,23 @@ def _fit_distinct(
     among = np.ix_(rows, rows)
     if covariance is not None:
         covariance = covariance[among]
-    return *robust_fit(gripper[order], camera[order], noise, cues, covariance, systematic[among]), back
+    return robust_fit(gripper[order], camera[order], noise, priors, covariance, systematic[among]), back
 
 
-def _with_residuals(
-    gripper: Poses,
-    camera: Poses,
-    fit: PoseFit,
-    used_distinct: Bool[ndarray, " d"],
-    distinct: Int[ndarray, " n"],
-    cues: Cues | None,
-) -> HandEye:
-    """The calibration of a fit to distinct images, not judged yet; `distinct` is which of these each image is."""
-    used = used_distinct[distinct]
-    seen = observability(gripper[used], fit.gripper_from_camera, camera[used], cues)
-    delta_t, delta_r = paper_residuals(gripper, camera, fit.gripper_from_camera, fit.scale, used)
-    metres, radians = np.linalg.norm(fit.residual[distinct].reshape(-1, 2, 3), axis=2).T
+def _with_residuals(gripper: Poses, camera: Poses, fit: Solution, distinct: Int[ndarray, " n"]) -> HandEye:
+    """Return the calibration of a fit to distinct images, without findings that its numbers decide."""
+    assert fit.problem.used is not None
+    x, scale, z = fit.state.x[0], fit.state.scale, fit.state.z[0]
+    used = fit.problem.used[distinct]
+    seen = observability(gripper[used], x, camera[used], fit.problem.priors)
+    delta_t, delta_r = paper_residuals(gripper, camera, x, scale, used)
+    residual, _ = residuals(x, scale, z, gripper, camera)
+    metres, radians = np.linalg.norm(residual.reshape(-1, 2, 3), axis=2).T
     return HandEye(
         estimate=Estimate(
-            gripper_from_camera=fit.gripper_from_camera,
-            scale=fit.scale,
-            base_from_recon=fit.base_from_recon,
+            gripper_from_camera=x,
+            scale=scale,
+            base_from_recon=z,
             covariance=fit.covariance,
             budget=fit.budget,
         ),
@@ -152,7 +154,7 @@ def _with_residuals(
         ),
         residuals=PaperResiduals(delta_t, delta_r),
         robot=RobotExamined(fit.noise),
-        leave_one_out=_leave_one_out(fit, used_distinct),
+        leave_one_out=_leave_one_out(fit, fit.problem.used),
         findings=seen.findings,
     )
 
@@ -251,11 +253,11 @@ def _reasons(
     )
 
 
-def _leave_one_out(fit: PoseFit, used: Bool[ndarray, " n"]) -> LeaveOneOut | None:
+def _leave_one_out(fit: Solution, used: Bool[ndarray, " n"]) -> LeaveOneOut | None:
     """Each used image predicted by a fit to the others; None when too few are left to fit."""
     if used.sum() < 4:
         return None
-    metres, radians = np.linalg.norm(fit.leave_one_out[used].reshape(-1, 2, 3), axis=2).mean(0)
+    metres, radians = np.linalg.norm(fit.leave_one_out()[0][used].reshape(-1, 2, 3), axis=2).mean(0)
     return LeaveOneOut(
         1e3 * float(metres), float(np.degrees(radians)), None, "each image predicted by the others"
     )

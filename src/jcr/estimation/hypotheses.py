@@ -14,8 +14,8 @@ from numpy import ndarray
 
 from jcr.distributions import f as f_distribution
 from jcr.estimation.components import most_likely, over_sizes
-from jcr.estimation.mixed_model import Equations, LogSizes, solve
-from jcr.estimation.pose_equations import UNKNOWNS
+from jcr.estimation.equation import UNKNOWNS
+from jcr.estimation.mixed_model import Equations, LogSizes, solve_equations
 from jcr.records import Kind, RobotNoise
 
 CONFIRMED_AT_MOST = 3
@@ -65,7 +65,7 @@ def gains(equations: Equations, log_sizes: LogSizes, rows: Sequence[Row]) -> Flo
 
     The gain is gᵀS⁻¹g with g = Aᵀ V⁻¹(r + Jθ) and S = Aᵀ P A, where P is the projection of the solution.
     """
-    solution = solve(equations, log_sizes)
+    solution = solve_equations(equations, log_sizes)
     projection, left = solution.projection, solution.weighed_left
     out = np.empty(len(rows))
     for k, row in enumerate(rows):
@@ -98,8 +98,8 @@ def confirm(equations: Equations, row: Row, places: int = 1) -> Test:
     free = with_columns(equations, row.columns)
     count, d = equations.jacobian.shape[1], row.columns.shape[1]
     likeliest, information = most_likely(free)
-    found = solve(free, likeliest)
-    without = solve(equations, likeliest)
+    found = solve_equations(free, likeliest)
+    without = solve_equations(equations, likeliest)
     freedom = max(len(equations.residual) - UNKNOWNS - d, 1)
     log_shares = []
     # With few poses the sizes are hardly known, and larger ones leave more to chance.
@@ -131,7 +131,7 @@ def explains_by_order(
     A permutation test of the score gain: the errors of real arms have heavy tails, and one wrong pose is no motion.
     """
     rng = np.random.default_rng(0)
-    solution = solve(equations, log_sizes)
+    solution = solve_equations(equations, log_sizes)
     projection, left = solution.projection, solution.weighed_left
 
     def gain(of_image: Float[ndarray, " n"]) -> float:

@@ -1,5 +1,6 @@
-"""What is known of a camera before its images are asked: intrinsics that were measured once, or those of any camera."""
+"""Cameras with the prior distribution of their intrinsics."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,35 +35,38 @@ ESTIMATED = {
     "p1": 3e-3,
     "p2": 3e-3,
 }
-"""Of a cheap camera that nobody calibrated, about what the reconstruction found."""
-FIXED: dict[str, float] = {}
-"""Of intrinsics that are exact."""
+"""Standard deviations of intrinsics that a reconstruction estimated, of a cheap camera."""
+FIXED: Mapping[str, float] = {}
+"""Standard deviations of exact intrinsics: no parameter is free."""
 LEAST = 1e-12
-"""A standard deviation below it leaves a parameter as it is."""
+"""Standard deviation below which a parameter is fixed."""
 
 
-@dataclass(frozen=True)
-class IntrinsicsPrior:
-    """Independent directions in which intrinsics may differ from where they start, with their standard deviations."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Camera:
+    """A camera, independent directions in which its intrinsics may differ, and their standard deviations."""
 
+    intrinsics: Intrinsics
+    """Middle of the prior."""
     directions: Float[ndarray, "q c"]
     """In the order of camera.parameters."""
     std: Float[ndarray, " c"]
+    mount_free: bool = False
+    """Whether its pose on the rig is estimated."""
 
 
-def prior_of(
-    intrinsics: Intrinsics, std: dict[str, float] | Float[ndarray, " q"] = MEASURED
-) -> IntrinsicsPrior:
-    """The prior about `intrinsics`: relative sizes as in MEASURED, or a standard deviation for each of its `parameters`.
+def camera_with_prior(
+    intrinsics: Intrinsics, std: Mapping[str, float] | Float[ndarray, " q"] = MEASURED
+) -> Camera:
+    """Return the camera with relative standard deviations as in MEASURED, or one for each of its `parameters`.
 
-    One that is not a number is that of MEASURED. Coefficients that a distortion model does not have are left out.
+    One that is not a number is that of MEASURED. Coefficients that the distortion model does not have are left out.
     """
-    if not isinstance(std, dict):
-        usual = prior_of(intrinsics)
-        spread = np.sqrt(usual.directions**2 @ usual.std**2)
-        std = np.where(np.isnan(std), spread, std)
+    if isinstance(std, ndarray):
+        usual = camera_with_prior(intrinsics)
+        std = np.where(np.isnan(std), np.sqrt(usual.directions**2 @ usual.std**2), std)
         free = np.flatnonzero(std > LEAST)
-        return IntrinsicsPrior(np.eye(len(std))[:, free], std[free])
+        return Camera(intrinsics=intrinsics, directions=np.eye(len(std))[:, free], std=std[free])
     fx, fy, width = intrinsics.fx, intrinsics.fy, intrinsics.width
     moves = {
         "f": {"fx": fx, "fy": fy},
@@ -76,11 +80,11 @@ def prior_of(
     for column, name in enumerate(known):
         for parameter, unit in moves.get(name, {name: 1.0}).items():
             directions[names.index(parameter), column] = unit
-    return IntrinsicsPrior(directions, np.array(list(known.values())))
+    return Camera(intrinsics=intrinsics, directions=directions, std=np.array(list(known.values())))
 
 
-def prior_about(found: Intrinsics, given: bool, std: Float[ndarray, " q"] | None = None) -> IntrinsicsPrior:
-    """Of a camera whose intrinsics were given, with standard deviations or not, or were found by the reconstruction."""
+def camera_about(found: Intrinsics, given: bool, std: Float[ndarray, " q"] | None = None) -> Camera:
+    """Return a camera whose intrinsics were given, with standard deviations or not, or were estimated."""
     if not given:
-        return prior_of(found, ESTIMATED)
-    return prior_of(found, MEASURED if std is None else std)
+        return camera_with_prior(found, ESTIMATED)
+    return camera_with_prior(found, MEASURED if std is None else std)

@@ -8,10 +8,11 @@ from numpy import ndarray
 
 from jcr.distributions import chi2
 from jcr.estimation.components import most_likely
-from jcr.estimation.fit import Linearised, PoseProblem, linearised
+from jcr.estimation.equation import Poses
 from jcr.estimation.kinematics import Arm, Joints, error_jacobian
-from jcr.estimation.mixed_model import solve
-from jcr.estimation.pose_equations import Poses
+from jcr.estimation.mixed_model import solve_equations
+from jcr.estimation.pose_equations import PoseEquations, pose_equations
+from jcr.estimation.wrist import pose_problem
 from jcr.records import HandEye, JointOffsets
 
 Systematic = Float[ndarray, "s s"]
@@ -28,7 +29,7 @@ def systematic_p_value(
     """
     both = _linearised(solved, base_from_gripper, recon_from_camera, systematic).equations
     tried = both, replace(both, systematic=None)
-    likely = [float(solve(one, most_likely(one)[0]).log_likelihood) for one in tried]
+    likely = [float(solve_equations(one, most_likely(one)[0]).log_likelihood) for one in tried]
     return float(chi2.sf(max(2 * (likely[0] - likely[1]), 0.0), 1) / 2)
 
 
@@ -47,7 +48,7 @@ def joint_offsets(
     """
     linear = _linearised(solved, base_from_gripper, recon_from_camera, systematic)
     sizes = most_likely(linear.equations)[0]
-    solution = solve(linear.equations, sizes)
+    solution = solve_equations(linear.equations, sizes)
     size = float(np.sqrt(linear.equations.variances(sizes)[2]))
     columns = error_jacobian(arm, joints)[:, :, : arm.dof].reshape(-1, arm.dof)
     columns = columns - linear.region.by_unknown @ (linear.region.fit @ columns)
@@ -58,12 +59,13 @@ def joint_offsets(
 
 def _linearised(
     solved: HandEye, base_from_gripper: Poses, recon_from_camera: Poses, systematic: Systematic
-) -> Linearised:
-    problem = PoseProblem(
-        base_from_gripper=base_from_gripper,
-        recon_from_camera=recon_from_camera,
-        used=np.ones(len(base_from_gripper), bool),
-        systematic=systematic,
-        noise=solved.robot_noise.given,
+) -> PoseEquations:
+    start = solved.gripper_from_camera, solved.scale, solved.base_from_recon
+    problem, state = pose_problem(
+        base_from_gripper,
+        recon_from_camera,
+        start,
+        error_covariance=systematic,
+        noise_floor=solved.robot_noise.given,
     )
-    return linearised(problem, (solved.gripper_from_camera, solved.scale, solved.base_from_recon))
+    return pose_equations(problem, state, None)

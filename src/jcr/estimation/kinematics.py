@@ -23,8 +23,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.estimation.pose_equations import Poses
-from jcr.geometry import ARM, Transform, rotation_exp, transform
+from jcr.geometry import ARM, Poses, Transform, rotation_exp, transform
 
 Joints = Float[ndarray, "n dof"]
 LINK_ERRORS = 4

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.estimation.pose_equations import UNKNOWNS, Poses, columns_of_arm, residuals, share_within_limits
+from jcr.estimation.equation import UNKNOWNS, Poses, columns_of_arm, residuals, share_within_limits
 from jcr.geometry import Transform, retract
 
 STEPS, SETTLED = 30, 1e-12

@@ -54,8 +54,8 @@ class Equations:
     """Of the systematic part where σ_s is 1 rad; None: there is none."""
     given: tuple[float, float] | None = None
     """σ_t and σ_r as the user gave them (m, rad): no less is counted."""
-    bent: Covariance | None = None
-    """Of errors that were found beside (bent.py), whatever the sizes of the others are."""
+    confirmed: Covariance | None = None
+    """Covariance of errors that were confirmed, whatever the sizes of the others are."""
 
     @property
     def least(self) -> Float[ndarray, "2"]:
@@ -118,7 +118,7 @@ class Equations:
         covariance = np.zeros((*random.shape, random.shape[-1]))
         if self.systematic is not None:
             covariance += self.variances(log_sizes)[..., 2, None, None] * self.systematic
-        for part in (self.known, self.bent):
+        for part in (self.known, self.confirmed):
             if part is not None:
                 covariance += part
         diagonal = np.arange(random.shape[-1])
@@ -142,7 +142,7 @@ class Equations:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Solution:
+class LinearSolution:
     """The unknowns at one value of the sizes, or at k values."""
 
     log_likelihood: Each
@@ -180,7 +180,7 @@ class Solution:
         return self.weight - self.weighed @ self.gain
 
 
-def solve(equations: Equations, log_sizes: LogSizes) -> Solution:
+def solve_equations(equations: Equations, log_sizes: LogSizes) -> LinearSolution:
     """Generalised least squares at given sizes."""
     root = cholesky(equations.covariance(log_sizes))
     whitened = lower(root, np.column_stack([equations.jacobian, equations.residual]))
@@ -193,7 +193,7 @@ def solve(equations: Equations, log_sizes: LogSizes) -> Solution:
     determinants = log_root_determinant(root) + log_root_determinant(information_root)
     log_likelihood = -determinants - squares / 2
     weighed = upper(root, whitened)
-    return Solution(
+    return LinearSolution(
         log_likelihood=log_likelihood,
         log_posterior=log_likelihood + equations.log_prior(log_sizes),
         step=step[..., 0],
@@ -205,7 +205,7 @@ def solve(equations: Equations, log_sizes: LogSizes) -> Solution:
 
 
 def left_out(
-    solution: Solution, noise: tuple[float, float]
+    solution: LinearSolution, noise: tuple[float, float]
 ) -> tuple[Float[ndarray, "m 6"], Float[ndarray, "m 6 6"]]:
     """Each pose's residual from a fit without it, P_ii⁻¹ (P r)_i, and its covariance P_ii⁻¹.
 

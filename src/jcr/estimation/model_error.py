@@ -7,13 +7,15 @@ the rest (MacKay, "Bayesian interpolation", Neural Computation 4, 1992, eq. 4.9)
 taken out of them, so that the intrinsics are those that fit the image best.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 from numpy.polynomial.legendre import legvander2d
 
 from jcr.camera import by_parameters, unproject
-from jcr.estimation.intrinsics_prior import IntrinsicsPrior
+from jcr.estimation.intrinsics_prior import Camera
 from jcr.records import Intrinsics, ModelError
 
 DEGREE = 5
@@ -27,37 +29,35 @@ WORTH = 2.0
 
 
 def displacements(
-    cameras: tuple[Intrinsics, ...],
-    priors: tuple[IntrinsicsPrior, ...],
-    x_px: Float[ndarray, "k 2"],
-    camera: Int[ndarray, " k"],
+    cameras: Sequence[Camera], counts: Sequence[int], x_px: Float[ndarray, "k 2"], camera: Int[ndarray, " k"]
 ) -> Float[ndarray, "k 2 e"]:
-    """Of each observation by each polynomial, in widths of the image; none for a camera whose intrinsics are exact."""
+    """Return the displacement of each observation by each of the `counts` polynomials of each camera.
+
+    The unit of a polynomial is the width of the image. Displacements that the intrinsics can express are taken out.
+    """
     blocks = [np.zeros((len(camera), 2, 0))]
-    for c, (intrinsics, prior) in enumerate(zip(cameras, priors, strict=True)):
-        rows = np.flatnonzero(camera == c)
-        if len(rows) <= (count := polynomials_of(prior)) or count == 0:
+    for c, (one, count) in enumerate(zip(cameras, counts, strict=True)):
+        if count == 0:
             continue
-        by_prior = by_parameters(intrinsics, unproject(intrinsics, x_px[rows])) @ prior.directions
+        rows = np.flatnonzero(camera == c)
+        by_prior = by_parameters(one.intrinsics, unproject(one.intrinsics, x_px[rows])) @ one.directions
         block = np.zeros((len(camera), 2, count))
-        block[rows] = intrinsics.width * _beside(_polynomials(x_px[rows], intrinsics), by_prior)
+        block[rows] = one.intrinsics.width * _beside(_polynomials(x_px[rows], one.intrinsics), by_prior)
         blocks.append(block)
     return np.concatenate(blocks, axis=2)
 
 
-def size_of(
-    likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], std: Float[ndarray, " e"]
-) -> Float[ndarray, " e"]:
-    """The size of displacements, from where they are likeliest with a prior of size `std` and how well that is known.
+def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], std: float) -> float:
+    """Return the size of the displacements of one camera, from their estimate under a prior of size `std`.
 
-    At the fixed point of MacKay's update, beside a weak prior.
+    The fixed point of MacKay's update, with a weak prior of the size.
     """
     posterior = np.linalg.inv(covariance)
     right = posterior @ likeliest
     # Of the images alone, along directions that they measure independently.
-    known, directions = np.linalg.eigh(posterior - np.diag(std**-2.0))
+    known, directions = np.linalg.eigh(posterior - np.eye(len(likeliest)) * std**-2.0)
     known, right = np.maximum(known, 0.0), directions.T @ right
-    variance = float(std[0] ** 2)
+    variance = std**2
     for _ in range(UPDATES):
         information = known + 1 / variance
         determined = float((known / information).sum())
@@ -65,19 +65,18 @@ def size_of(
         before, variance = variance, (squares + WORTH * TYPICAL**2) / (determined + WORTH)
         if abs(np.log(variance / before)) < SETTLED:
             break
-    return np.full(len(std), np.sqrt(variance))
+    return float(np.sqrt(variance))
 
 
-def expressed(
-    camera: Intrinsics, prior: IntrinsicsPrior, x_px: Float[ndarray, "k 2"]
-) -> Float[ndarray, "q e"]:
-    """By how much the camera's parameters express each polynomial over these pixels."""
-    by_prior = by_parameters(camera, unproject(camera, x_px)) @ prior.directions
-    polynomials = camera.width * _polynomials(x_px, camera)
+def expressed(camera: Camera, x_px: Float[ndarray, "k 2"]) -> Float[ndarray, "q e"]:
+    """Return the part of each polynomial over these pixels that the camera's parameters express."""
+    intrinsics = camera.intrinsics
+    by_prior = by_parameters(intrinsics, unproject(intrinsics, x_px)) @ camera.directions
+    polynomials = intrinsics.width * _polynomials(x_px, intrinsics)
     fit = np.linalg.lstsq(
         by_prior.reshape(2 * len(x_px), -1), polynomials.reshape(2 * len(x_px), -1), rcond=None
     )[0]
-    return prior.directions @ fit
+    return camera.directions @ fit
 
 
 def second_moment_px2(
@@ -92,9 +91,9 @@ def second_moment_px2(
     return (by @ moment @ np.swapaxes(by, 1, 2)).reshape(*x_px.shape, 2)
 
 
-def polynomials_of(prior: IntrinsicsPrior) -> int:
-    """How many displacements a camera has whose intrinsics are known like this; 0 where they are exact."""
-    return (DEGREE + 1) * (DEGREE + 2) if len(prior.std) else 0
+def polynomials_of(camera: Camera) -> int:
+    """Return the number of displacements of a camera; 0 where its intrinsics are exact."""
+    return (DEGREE + 1) * (DEGREE + 2) if len(camera.std) else 0
 
 
 def _polynomials(x_px: Float[ndarray, "k 2"], camera: Intrinsics) -> Float[ndarray, "k 2 e"]:

@@ -12,9 +12,9 @@ from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.estimation.closed_form import closed_form
+from jcr.estimation.equation import Poses, expected_covariance, residuals
 from jcr.estimation.kinematics import Arm, Joints, forward_kinematics, with_tool
 from jcr.estimation.known_scale import fit_known_scale
-from jcr.estimation.pose_equations import Poses, expected_covariance, residuals
 from jcr.geometry import ARM, inverse, rotation_exp, transform
 
 NOISE = (1e-3, 1e-3 / ARM)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.estimation.pose_equations import Poses, most_informative, point_ahead, pose_information
+from jcr.estimation.equation import Poses, most_informative, point_ahead, pose_information
 from jcr.geometry import Transform, inverse, motion_length, nearest_to_lines, rotation_exp, transform
 
 CANDIDATES = 600

@@ -6,6 +6,7 @@ well as it can; rotations count at geometry.ARM, scale by the spread of the came
 for general motion, and the sine of the deviation for a nearly degenerate one.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,8 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.estimation.fit import Cues
-from jcr.estimation.pose_equations import BASE_ROTATION, ROTATION, SCALE, Poses, residuals
+from jcr.estimation.equation import BASE_ROTATION, ROTATION, SCALE, Poses, residuals
+from jcr.estimation.problem import LinearPrior
 from jcr.geometry import ARM, Transform, transform
 from jcr.records import Excitation, Finding, Kind, Observability
 
@@ -27,7 +28,7 @@ EXACT = 0.005
 
 
 def excitation(
-    base_from_gripper: Poses, gripper_from_camera: Transform | None, cues: Cues | None = None
+    base_from_gripper: Poses, gripper_from_camera: Transform | None, priors: Sequence[LinearPrior] = ()
 ) -> Excitation:
     """What gripper poses (n,4,4) can see of X and λ; without an X the camera is put at the gripper."""
     n = len(base_from_gripper)
@@ -45,10 +46,8 @@ def excitation(
     j *= np.repeat([1.0, ARM], 3)[:, None] / unit
     hessian = np.einsum("nij,nik->jk", j, j) / n
     seen = hessian[:7, :7] - hessian[:7, 7:] @ np.linalg.pinv(hessian[7:, 7:], rcond=1e-12) @ hessian[7:, :7]
-    if cues is not None and cues.scale is not None:
-        seen[6, 6] += 1.0
-    if cues is not None and cues.offset is not None:
-        seen[:3, :3] += np.outer(cues.offset[0], cues.offset[0])
+    for one in priors:
+        seen += np.outer(one.row[:7], one.row[:7])
     squared, vectors = np.linalg.eigh(seen)
     return Excitation(np.sqrt(np.maximum(squared, 0.0)), vectors.T, spread)
 
@@ -57,13 +56,13 @@ def observability(
     base_from_gripper: Poses,
     gripper_from_camera: Transform | None = None,
     recon_from_camera: Poses | None = None,
-    cues: Cues | None = None,
+    priors: Sequence[LinearPrior] = (),
 ) -> Observability:
     """A finding for each unseen direction; camera poses, if given, distinguish an orbit from a fixed tool."""
     n = len(base_from_gripper)
     if n == 2:
         return Observability((_unseen("two images"),))
-    found = excitation(base_from_gripper, gripper_from_camera, cues)
+    found = excitation(base_from_gripper, gripper_from_camera, priors)
     # Few images excite less by chance alone: three general ones as little as twenty at three degrees.
     few = min(1.0, (n - 2) / 4)
     unseen = found.value < WEAK * few

@@ -11,8 +11,9 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.distributions import chi2
+from jcr.estimation.boards import BoardShapes
 from jcr.estimation.elimination import point_blocks
-from jcr.estimation.scene import Observations
+from jcr.estimation.observations import Observations
 from jcr.least_squares import loss_weight
 
 LOSS_SCALE = 2.0
@@ -88,16 +89,16 @@ class Layout:
     views its position takes up 3, but for a corner of a board, whose place is known."""
 
     @staticmethod
-    def of(observations: Observations, widths: Int[ndarray, " c"]) -> "Layout":
-        """Of observations in images of these widths (px), by camera."""
+    def of(observations: Observations, widths: Int[ndarray, " c"], boards: BoardShapes | None) -> "Layout":
+        """Return the layout of observations in images of these widths (px), by camera."""
         camera = observations.camera[observations.image]
         column, row = (CELLS * observations.x_px / widths[camera, None]).astype(int).T
         keys = np.stack([observations.rig[observations.image], camera, row, column])
         _, cell = np.unique(keys, axis=1, return_inverse=True)
         seen = np.bincount(observations.point)
         corner = np.zeros(len(seen), bool)
-        if observations.boards is not None:
-            corner = observations.boards.is_corner(len(seen))
+        if boards is not None:
+            corner = boards.is_corner(len(seen))
         freedom = np.maximum(2 * seen - 3 * ~corner, 1)
         cameras = len(widths)
         stated = (observations.std_px / np.median(observations.std_px)) ** 2 if len(camera) else np.ones(0)

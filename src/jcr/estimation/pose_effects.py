@@ -7,8 +7,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.estimation.hypotheses import Row
-from jcr.estimation.pose_equations import Poses
-from jcr.geometry import skew
+from jcr.geometry import Poses, skew
 from jcr.records import Kind
 
 LEAST_PART = 3

@@ -1,170 +1,126 @@
-"""The hand-eye equation of one image as residuals with Jacobians, and what its pose shows of the unknowns.
+"""Linear mixed model of the reported poses of all arms about a state, with the evidence of images about the rigs."""
 
-`base_from_gripper · X = base_from_recon · S_λ(recon_from_camera)`: the information of a pose depends on where it
-is and not on what its image shows, so poses can be chosen before any image is looked at.
-
-The 13 unknowns are steps of geometry.retract: of X (6), the logarithm of the scale λ, of Z = base_from_recon (6). Each
-further arm adds 12: its own X and Z.
-"""
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
+from scipy.linalg import block_diag
 
-from jcr.geometry import (
-    Transform,
-    Transforms,
-    by_inverse,
-    by_similarity,
-    inverse,
-    scale_translation,
-    skew,
-    step_between,
-)
-
-Poses = Float[ndarray, "n 4 4"]
-TRANSLATION, ROTATION, SCALE = slice(0, 3), slice(3, 6), slice(6, 7)
-BASE_TRANSLATION, BASE_ROTATION = slice(7, 10), slice(10, 13)
-"""Columns of the 13 unknowns; the first seven are records.COVARIANCE_ORDER."""
-UNKNOWNS = 13
-
-PRIOR_STD = np.array([1.0] * 3 + [np.pi] * 3 + [5.0])
-"""So weak that it only keeps what the motions cannot see finite: 1 m, π rad, a factor e⁵."""
-LARGEST_ROTATION = 0.5
-"""rad, and of the logarithm of scale, in one step: a poor start on nearly unobservable motions must not throw rotations
-around the circle."""
-UNIT = np.array([1e-3] * 3 + [np.radians(0.1)] * 3 + [2e-3])
-"""What counts alike: 1 mm, 0.1°, 0.2 % of scale."""
-ASSUMED_NOISE = (5e-4, np.radians(0.1))
-"""m, rad; of a robot that has not been measured yet."""
+from jcr.estimation.equation import SCALE, pose_by_pose, residuals, residuals_by_camera, weak_prior
+from jcr.estimation.image_equations import ImageEvidence
+from jcr.estimation.mixed_model import Equations
+from jcr.estimation.problem import Problem, State, columns_of_arm
+from jcr.estimation.systematic import Region
 
 
-def predict(
-    x: Transforms,
-    scale: Float[ndarray, "*batch"] | np.floating | float,
-    z: Transforms,
-    recon_from_camera: Poses,
-) -> Float[ndarray, "*batch n 4 4"]:
-    """Gripper poses in base (...,n,4,4): base_from_recon · S_λ(recon_from_camera) · X⁻¹, for one or many (X, λ, Z)."""
-    scaled = scale_translation(recon_from_camera, np.asarray(scale)[..., None])
-    return z[..., None, :, :] @ scaled @ inverse(x)[..., None, :, :]
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PoseEquations:
+    """Equations of all reported poses about a state, and the mixed model of those that are used."""
+
+    residual: Float[ndarray, "n 6"]
+    """Steps from the reported to the predicted gripper poses, at the mean of the rigs."""
+    jacobian: Float[ndarray, "s p"]
+    shared: Float[ndarray, "s s"] | None
+    """Covariance of the residuals by the rigs; None where the rigs are exact."""
+    systematic: Float[ndarray, "s s"]
+    """Covariance of the systematic residuals where the size of systematic errors is 1 rad."""
+    region: Region
+    """Effective transform of the used poses."""
+    used: Bool[ndarray, " n"]
+    equations: Equations
 
 
-def residuals(
-    x: Transform,
-    scale: float,
-    z: Transform,
-    base_from_gripper: Poses,
-    recon_from_camera: Poses,
-    exchanged: bool = False,
-) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 13"]]:
-    """Steps from the reported gripper poses to the predicted ones (base axes), and their Jacobian.
+def reported_poses(
+    problem: Problem, state: State
+) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 u"], Float[ndarray, "n 6 6"]]:
+    """Return the residuals of the reported poses of all arms, and their derivatives by the arms' unknowns and by the rig
+    of each."""
+    each, begin = [], 0
+    jacobian = np.zeros((sum(len(arm.rigs) for arm in problem.arms), 6, problem.arm_unknowns))
+    for k, arm in enumerate(problem.arms):
+        at, rigs = (state.x[k], state.scale, state.z[k]), state.world_from_rig[arm.rigs]
+        exchanged = arm.carries == "scene"
+        residual, by_unknown = residuals(*at, arm.base_from_gripper, rigs, exchanged)
+        # X, then the scale that all arms share, then Z.
+        jacobian[begin : begin + len(rigs), :, np.insert(columns_of_arm(k), 6, SCALE.start)] = by_unknown
+        each.append((residual, residuals_by_camera(*at, rigs, exchanged)))
+        begin += len(rigs)
+    residual, by_rig = (np.concatenate(part) for part in zip(*each, strict=True))
+    return residual, jacobian, by_rig
 
-    `exchanged`: the camera stands still and the gripper carries what it sees. X is then base_from_camera, Z
-    gripper_from_recon, and they predict gripper_from_base; the residuals are still those of base_from_gripper.
+
+def pose_equations(problem: Problem, state: State, images: ImageEvidence | None) -> PoseEquations:
+    """Return the equations of the reported poses about a state, with the evidence of the images about the rigs.
+
+    Without observations the rigs are where `Problem.known_rigs` has them, with that covariance.
     """
-    predicted = predict(x, scale, z, recon_from_camera)
-    rotation = predicted[:, :3, :3]
-    arm = scale * recon_from_camera[:, :3, 3] @ z[:3, :3].T
-    j = np.zeros((len(predicted), 6, UNKNOWNS))
-    j[:, :3, TRANSLATION] = -rotation
-    j[:, :3, ROTATION] = -rotation @ skew(x[:3, 3])
-    j[:, :3, 6] = arm
-    j[:, :3, BASE_TRANSLATION] = np.eye(3)
-    j[:, :3, BASE_ROTATION] = -skew(arm - rotation @ x[:3, 3])
-    j[:, 3:, ROTATION] = -rotation
-    j[:, 3:, BASE_ROTATION] = np.eye(3)
-    if exchanged:
-        return step_between(base_from_gripper, inverse(predicted)), by_inverse(predicted) @ j
-    return step_between(base_from_gripper, predicted), j
+    residual, by_arms, by_rig = reported_poses(problem, state)
+    n, arms, free = len(residual), problem.arm_unknowns, problem.free
+    used = np.ones(n, bool) if problem.used is None else problem.used
+    rows = np.flatnonzero(np.repeat(used, 6))
+    jacobian = by_arms.reshape(6 * n, arms)
+    information, gradient = _prior(problem, state)
+    if images is None:
+        assert problem.known_rigs is not None
+        covariance = problem.known_rigs.covariance
+    else:
+        rigs, coupling = images.rigs, images.information[np.ix_(problem.by_arm, free)]
+        covariance = rigs.covariance
+        residual = residual - pose_by_pose(by_rig, rigs.step[:, None]).reshape(n, 6)
+        jacobian = np.concatenate([jacobian, -pose_by_pose(by_rig, rigs.follow)], axis=1)
+        of_free = images.information[np.ix_(free, free)] - coupling.T @ rigs.follow
+        information[arms:, arms:] += (of_free + of_free.T) / 2
+        gradient[arms:] += images.gradient[free] - coupling.T @ rigs.step
+    shared = None
+    if covariance is not None:
+        shared = pose_by_pose(by_rig, pose_by_pose(by_rig, covariance).T)
+        shared = (shared + shared.T) / 2
+    by_unknown = np.delete(by_arms.reshape(6 * n, arms), SCALE, axis=1)
+    region = Region.of_unknowns(by_unknown[rows], jacobian.shape[1])
+    fit = np.zeros((by_unknown.shape[1], 6 * n))
+    fit[:, rows] = region.fit
+    everywhere = replace(region, by_unknown=by_unknown, fit=fit)
+    systematic = everywhere.left(np.asarray(block_diag(*(arm.error_covariance for arm in problem.arms))))
+    among = np.ix_(rows, rows)
+    return PoseEquations(
+        residual=residual,
+        jacobian=jacobian,
+        shared=shared,
+        systematic=systematic,
+        region=region,
+        used=used,
+        equations=Equations(
+            residual=residual.ravel()[rows],
+            jacobian=jacobian[rows],
+            prior_information=information,
+            prior_gradient=gradient,
+            known=None if shared is None else shared[among],
+            systematic=systematic[among],
+            given=problem.robot_noise_floor,
+            confirmed=_confirmed(problem, region, rows),
+        ),
+    )
 
 
-def residuals_by_camera(
-    x: Transform, scale: float, z: Transform, recon_from_camera: Poses, exchanged: bool = False
-) -> Float[ndarray, "n 6 6"]:
-    """Derivative of `residuals` by a step of each camera."""
-    base_from_recon = z[:3, :3]
-    lever = recon_from_camera[:, :3, :3] @ x[:3, :3].T @ x[:3, 3]
-    j = np.zeros((len(lever), 6, 6))
-    j[:, :3, :3] = scale * base_from_recon
-    j[:, :3, 3:] = base_from_recon @ skew(lever)
-    j[:, 3:, 3:] = base_from_recon
-    return by_inverse(predict(x, scale, z, recon_from_camera)) @ j if exchanged else j
+def _prior(problem: Problem, state: State) -> tuple[Float[ndarray, "p p"], Float[ndarray, " p"]]:
+    """Return the information of the weak prior and the linear priors, and their gradient."""
+    arms = problem.arm_unknowns
+    information, gradient = np.zeros((problem.unknowns, problem.unknowns)), np.zeros(problem.unknowns)
+    information[:arms, :arms] = weak_prior(len(problem.arms))
+    for row, value, std in problem.priors:
+        information += np.outer(row, row) / std**2
+        gradient += row * (row @ problem.coordinates(state) - value) / std**2
+    return information, gradient
 
 
-def pose_by_pose(blocks: Float[ndarray, "n 6 6"], matrix: Float[ndarray, "r c"]) -> Float[ndarray, "r c"]:
-    """The block diagonal matrix of a block a pose, times a matrix of r = 6n rows."""
-    return (blocks @ matrix.reshape(len(blocks), 6, -1)).reshape(matrix.shape)
-
-
-def columns_of_arm(arm: int) -> Int[ndarray, "12"]:
-    """Of X and Z of an arm among the unknowns."""
-    first = 12 * arm
-    return np.r_[:6, 7:13] if arm == 0 else np.arange(first + 1, first + 13)
-
-
-def weak_prior(arms: int = 1) -> Float[ndarray, "u u"]:
-    """Information that keeps finite what the motions cannot see of the unknowns of that number of arms."""
-    std = np.full(12 * arms + 1, np.inf)
-    for arm in range(arms):
-        std[columns_of_arm(arm)[:6]] = PRIOR_STD[:6]
-    std[SCALE] = PRIOR_STD[SCALE]
-    return np.diag(std**-2.0)
-
-
-def share_within_limits(step: Float[ndarray, " u"]) -> float:
-    """Of a step of the unknowns of one or more arms, how much of it rotates nothing too far."""
-    arms = range((len(step) - 1) // 12)
-    rotations = np.r_[SCALE, *(columns_of_arm(arm)[[3, 4, 5, 9, 10, 11]] for arm in arms)]
-    return min(1.0, LARGEST_ROTATION / max(float(np.abs(step[rotations]).max()), 1e-300))
-
-
-def pose_information(
-    base_from_gripper: Poses, gripper_from_camera: Transform, noise: tuple[float, float]
-) -> Float[ndarray, "n 13 13"]:
-    """What each gripper pose shows of the 13 unknowns (Fisher information), whatever its image shows."""
-    # Any frame and unit of the reconstruction will do: the base's, in metres.
-    camera = base_from_gripper @ gripper_from_camera
-    _, j = residuals(gripper_from_camera, 1.0, np.eye(4), base_from_gripper, camera)
-    j /= np.repeat(noise, 3)[:, None]
-    return np.swapaxes(j, 1, 2) @ j
-
-
-def expected_covariance(hessian: Float[ndarray, "*batch 13 13"]) -> Float[ndarray, "*batch 7 7"]:
-    """Covariance that information leaves, in records.COVARIANCE_ORDER; the prior is added here."""
-    return np.linalg.inv(hessian + weak_prior())[..., :7, :7]
-
-
-def point_ahead(x: Transform, distance_m: float) -> Float[ndarray, "3 7"]:
-    """By how much a point on the optical axis moves on the gripper, in gripper axes, with X and scale."""
-    return by_similarity(distance_m * x[:3, 2])
-
-
-def uncertainty(
-    covariance: Float[ndarray, "*batch 7 7"], point: Float[ndarray, "3 7"] | None = None
-) -> Float[ndarray, "*batch"] | np.floating:
-    """One number for it: variances over what counts alike, of the camera, the rotation and the scale, or of the place
-    of a `point_ahead`, which the scale moves, and the rotation."""
-    counted = np.eye(7) / UNIT[:, None]
-    if point is not None:
-        counted = np.concatenate([point / UNIT[TRANSLATION, None], counted[ROTATION]])
-    return np.einsum("ri,...ij,rj->...", counted, covariance, counted)
-
-
-def most_informative(
-    known: Float[ndarray, "13 13"],
-    gain: Float[ndarray, "k 13 13"],
-    count: int,
-    point: Float[ndarray, "3 7"] | None = None,
-) -> Int[ndarray, " c"]:
-    """The rows of the `count` candidates that leave the least uncertainty, chosen one by one (A-optimal design).
-
-    What counts is what `uncertainty` counts.
-    """
-    rows, left = list[int](), np.arange(len(gain))
-    for _ in range(min(count, len(gain))):
-        best = int(np.argmin(uncertainty(expected_covariance(known + gain[left]), point)))
-        known = known + gain[left[best]]
-        rows.append(int(left[best]))
-        left = np.delete(left, best)
-    return np.array(rows, dtype=int)
+def _confirmed(problem: Problem, region: Region, rows: Int[ndarray, " r"]) -> Float[ndarray, "r r"] | None:
+    """Return the covariance that confirmed errors leave in the used poses of all arms; None where there are none."""
+    if all(arm.confirmed_errors is None for arm in problem.arms):
+        return None
+    each = [
+        np.zeros((6 * len(arm.rigs), 0)) if arm.confirmed_errors is None else arm.confirmed_errors
+        for arm in problem.arms
+    ]
+    columns = np.asarray(block_diag(*each))[rows]
+    return region.left(columns @ columns.T)

@@ -16,12 +16,15 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.estimation.closed_form import closed_form, initial_estimate, motions, sine_axis
-from jcr.estimation.fit import Cues, PoseFit, PoseProblem, fit_poses
-from jcr.estimation.pose_equations import Poses, predict
-from jcr.estimation.systematic import smooth_errors
-from jcr.geometry import ARM, rotation_angle, transform
+from jcr.estimation.equation import SCALE, predict
+from jcr.estimation.problem import LinearPrior
+from jcr.estimation.solve import Solution, solve
+from jcr.estimation.wrist import pose_problem
+from jcr.geometry import ARM, Poses, rotation_angle, transform
 
 Images = Bool[ndarray, " n"]
+Fit = tuple[float, Float[ndarray, "n 6"], Float[ndarray, "n 6 6"]]
+"""Log evidence of a fit, and the leave-one-out residuals of all poses with their covariances."""
 
 SHARE_RIGHT = 0.65
 """Share of images that the trimmed fit relies on; up to the rest may be wrong."""
@@ -41,64 +44,67 @@ def robust_fit(
     base_from_gripper: Poses,
     recon_from_camera: Poses,
     noise: tuple[float, float] | None = None,
-    cues: Cues | None = None,
+    priors: tuple[LinearPrior, ...] = (),
     camera_covariance: Float[ndarray, "r r"] | None = None,
     systematic: Float[ndarray, "r r"] | None = None,
-) -> tuple[PoseFit, Images]:
-    """The fit to the images that agree with each other, and which those are.
+) -> Solution:
+    """Solve for the images that agree with each other, which `problem.used` of the solution names.
 
-    With fewer than five images there is nothing to vote with, and all are kept. The arguments are those of fit_poses.
-    Solved in a frame at the middle of the cameras and in their extent as unit: a frame far away makes a rotation about
-    its origin look like a translation.
+    With fewer than five images there is nothing to vote with, and all are kept. The arguments are those of pose_problem.
+    Solved in a frame at the middle of the cameras and in their extent as unit, for in a frame far away a rotation about
+    its origin looks like a translation; `state` of the solution is in the frame of the cameras as given.
     """
-    n, centers, cues = len(base_from_gripper), recon_from_camera[:, :3, 3], cues or Cues()
+    n, centers = len(base_from_gripper), recon_from_camera[:, :3, 3]
     middle = centers.mean(0)
     unit = float(np.sqrt(((centers - middle) ** 2).sum(1).mean()))
     unit = unit if unit > 1e-12 * np.abs(centers).max() else 1.0
     recon_from_camera = transform(recon_from_camera[:, :3, :3], (centers - middle) / unit)
-    if cues.scale is not None:
-        cues = replace(cues, scale=(unit * cues.scale[0], cues.scale[1]))
+    priors = tuple(
+        one._replace(value=one.value + np.log(unit) * float(one.row[SCALE].item())) for one in priors
+    )
     if camera_covariance is not None:
         per_unit = np.tile(np.repeat([1 / unit, 1.0], 3), n)
         camera_covariance = per_unit[:, None] * camera_covariance * per_unit
-    every = PoseProblem(
-        base_from_gripper=base_from_gripper,
-        recon_from_camera=recon_from_camera,
-        used=np.ones(n, dtype=bool),
-        systematic=smooth_errors(base_from_gripper) if systematic is None else systematic,
-        noise=noise,
-        cues=cues,
+    every, state = pose_problem(
+        base_from_gripper,
+        recon_from_camera,
+        (np.eye(4), 1.0, np.eye(4)),
         camera_covariance=camera_covariance,
+        error_covariance=systematic,
+        noise_floor=noise,
+        priors=priors,
     )
-    fits: dict[bytes, PoseFit] = {}
+    fits: dict[bytes, Fit] = {}
 
-    def fit_to(used: Images, averaged: bool = False) -> PoseFit:
-        start = initial_estimate(base_from_gripper, recon_from_camera, used.astype(float))
-        return fit_poses(replace(every, used=used), start, averaged)
+    def fit_to(used: Images, averaged: bool = False) -> Solution:
+        x, scale, z = initial_estimate(base_from_gripper, recon_from_camera, used.astype(float))
+        start = replace(state, x=x[None], scale=scale, z=z[None])
+        return solve(replace(every, used=used), start, averaged=averaged)
 
-    def fitted(used: Images) -> PoseFit:
+    def fitted(used: Images) -> Fit:
         if used.tobytes() not in fits:
-            fits[used.tobytes()] = fit_to(used)
+            found = fit_to(used)
+            fits[used.tobytes()] = found.log_evidence, *found.leave_one_out()
         return fits[used.tobytes()]
 
-    used = every.used
+    used = np.ones(n, dtype=bool)
     if n >= 5:
         fewest = least_trimmed(base_from_gripper, recon_from_camera)[0]
         used = max(_left(fitted, used), _joined(fitted, fewest), key=lambda found: found[1])[0]
     fit = fit_to(used, averaged=True)
-    scale, z = fit.scale / unit, fit.base_from_recon
+    scale, z = fit.state.scale / unit, fit.state.z[0]
     z = transform(z[:3, :3], z[:3, 3] - z[:3, :3] @ (scale * middle))
-    return replace(fit, scale=scale, base_from_recon=z), used
+    return replace(fit, state=replace(fit.state, scale=scale, z=z[None]))
 
 
-def _joined(fitted: Callable[[Images], PoseFit], used: Images) -> tuple[Images, float]:
+def _joined(fitted: Callable[[Images], Fit], used: Images) -> tuple[Images, float]:
     """The images to use, and the log evidence of that: those join `used` that are likelier sound than wrong, or the
     likeliest of all, as long as the evidence grows.
     """
     fit = fitted(used)
     best = _evidence(fit, used)
     while not used.all():
-        _, spread = np.linalg.slogdet(fit.leave_one_out_covariance)
+        _, spread = np.linalg.slogdet(fit[2])
         likelier = np.where(used, -np.inf, -(_distance(fit) + spread) / 2 - _log_wrong(fit))
         for joining in (likelier > 0, likelier == likelier.max()):
             if not joining.any():
@@ -114,7 +120,7 @@ def _joined(fitted: Callable[[Images], PoseFit], used: Images) -> tuple[Images, 
     return used, best
 
 
-def _left(fitted: Callable[[Images], PoseFit], used: Images) -> tuple[Images, float]:
+def _left(fitted: Callable[[Images], Fit], used: Images) -> tuple[Images, float]:
     """The same from the other side: the farthest leaves, as long as the evidence grows and more than four are left."""
     fit = fitted(used)
     best = _evidence(fit, used)
@@ -129,21 +135,22 @@ def _left(fitted: Callable[[Images], PoseFit], used: Images) -> tuple[Images, fl
     return used, best
 
 
-def _evidence(fit: PoseFit, used: Images) -> float:
-    return fit.log_evidence + float(_log_wrong(fit)[~used].sum())
+def _evidence(fit: Fit, used: Images) -> float:
+    return fit[0] + float(_log_wrong(fit)[~used].sum())
 
 
-def _distance(fit: PoseFit) -> Float[ndarray, " n"]:
+def _distance(fit: Fit) -> Float[ndarray, " n"]:
     """Squared, of each pose from a fit without it, in what noise lets expect."""
-    gap = np.linalg.solve(fit.leave_one_out_covariance, fit.leave_one_out[..., None])[..., 0]
-    return np.einsum("ni,ni->n", fit.leave_one_out, gap)
+    _, left_out, covariance = fit
+    gap = np.linalg.solve(covariance, left_out[..., None])[..., 0]
+    return np.einsum("ni,ni->n", left_out, gap)
 
 
-def _log_wrong(fit: PoseFit) -> Float[ndarray, " n"]:
+def _log_wrong(fit: Fit) -> Float[ndarray, " n"]:
     """Of each pose, the log density of how far it is off if it is wrong, times (2π)^3: of any size alike, in any
     direction; and the odds that it is.
     """
-    off = np.linalg.norm(fit.leave_one_out.reshape(-1, 2, 3), axis=2)
+    off = np.linalg.norm(fit[1].reshape(-1, 2, 3), axis=2)
     least, most = np.array(LEAST_WRONG), np.array(MOST_WRONG)
     density = -np.log(4 * np.pi * np.log(most / least)) - 3 * np.log(np.maximum(off, least))
     odds = np.log(WRONG / (1 - WRONG)) + 3 * np.log(2 * np.pi)

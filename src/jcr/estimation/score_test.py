@@ -2,10 +2,10 @@
 
 The mixed model is written once more with columns for what was fixed: every parameter of a camera, a focal length, a
 shear and an offset for each of its images by itself, and a thin prism. A hypothesis is a few combinations of these
-columns. How much freeing them would lower the cost, at one Gauss-Newton step, over the dispersion of the residuals, is
-Rao's score test (Rao, Proc. Cambridge Phil. Soc. 44, 1948), here beside F, for the robot pose noise was estimated from
-few residuals. The same step shows how large they are and how far the camera's place would move; the adjustment with them
-free (`freed`) is what they come to.
+columns. How much freeing them would lower the cost, at one Gauss-Newton step, over the dispersion of the residuals,
+is Rao's score test (Rao, Proc. Cambridge Phil. Soc. 44, 1948), here beside F, for the robot pose noise was estimated
+from few residuals. The same step shows how large they are and how far the camera's place would move; the adjustment
+with them free (`freed`) is what they come to.
 """
 
 from collections.abc import Callable
@@ -19,11 +19,12 @@ from numpy import ndarray
 from jcr.camera import parameter_names, parameters
 from jcr.distributions import f as f_distribution
 from jcr.estimation.cholesky import cholesky, over
-from jcr.estimation.image_robots import Adjusted, Placed, equations_of
-from jcr.estimation.images import ImageEvidence, evidence
-from jcr.estimation.intrinsics_prior import IntrinsicsPrior
-from jcr.estimation.mixed_model import solve
-from jcr.estimation.scene import OF_IMAGE, PRISM, Freedom, NuisancePrior
+from jcr.estimation.image_equations import ImageEvidence, evidence
+from jcr.estimation.intrinsics_prior import Camera
+from jcr.estimation.mixed_model import solve_equations
+from jcr.estimation.pose_equations import pose_equations
+from jcr.estimation.problem import OF_IMAGE, PRISM, Problem, State, with_free
+from jcr.estimation.solve import Solution
 from jcr.geometry import Transform
 from jcr.records import Intrinsics
 
@@ -92,106 +93,107 @@ class Tested:
     """The step of the camera's place that comes with it, axes of its parent."""
 
 
-def first_x(placed: Placed) -> Transform:
-    """The place of a wrist camera that is the first of its arm."""
-    return placed.x[0]
+def first_x(state: State) -> Transform:
+    """Return gripper_from_camera of the arm's first wrist camera."""
+    return state.x[0]
 
 
 def alternatives(
-    adjusted: Adjusted,
-    prior: IntrinsicsPrior,
+    solution: Solution,
+    prior: Camera,
     camera: int = 0,
-    place: Callable[[Placed], Transform] = first_x,
+    place: Callable[[State], Transform] = first_x,
     model_error_std: float | None = None,
 ) -> Alternatives:
-    """The columns and equations of one camera about an adjustment.
+    """Return the columns and equations of one camera about a solution.
 
-    `prior` is what was known of its intrinsics; what was freed beyond it is among the columns. `place` is where the
-    camera is on its parent. `model_error_std` is how large, in widths of the image, what the cameras' models leave may
-    be; None: as large as it was estimated.
+    `prior` is the prior of its intrinsics; directions that were freed beside it are among the columns. `place`
+    returns the pose of the camera on its parent. `model_error_std` is the size of the remaining distortion of the
+    cameras' models, in widths of the image; None: as estimated.
     """
-    given = adjusted.given
-    problem, own = given.evidence.problem, len(prior.std)
+    problem, own = solution.problem, len(prior.std)
+    assert problem.observations is not None
     mine = np.flatnonzero(problem.observations.camera == camera)
-    wider = _with_all_free(adjusted, prior, camera, mine, model_error_std)
-    placed = replace(adjusted.most_likely, scene=wider.scene)
-    equations, _ = equations_of(placed, replace(given, evidence=wider))
-    solution = solve(equations, adjusted.log_sizes)
-    hessian = equations.jacobian.T @ solution.weighed + equations.prior_information
-    right = -(solution.weighed.T @ equations.residual + equations.prior_gradient)
-    # What was adjusted: the arms, the cameras as far as they were free, and what their models leave.
-    all_free, begin = wider.problem.freedom, adjusted.first_camera_column
-    of_camera, of_images = all_free.intrinsics_columns[camera], all_free.nuisance_columns
+    wider = _with_all_free(solution, prior, camera, mine, model_error_std)
+    # The arms are at the most likely state, the images where the evidence is.
+    at, likely = wider.state, solution.most_likely
+    equations = pose_equations(
+        wider.problem, replace(at, x=likely.x, scale=likely.scale, z=likely.z), wider
+    ).equations
+    found = solve_equations(equations, solution.log_sizes)
+    hessian = equations.jacobian.T @ found.weighed + equations.prior_information
+    right = -(found.weighed.T @ equations.residual + equations.prior_gradient)
+    begin, columns = problem.arm_unknowns, wider.problem.columns
+    of_camera, of_images = columns.intrinsics[camera], columns.nuisance
     rest = begin + np.r_[of_camera.start + own : of_camera.stop, of_images]
     kept = np.setdiff1d(np.arange(len(hessian)), rest)
     coupling = hessian[np.ix_(kept, rest)]
     by_column = over(cholesky(hessian[np.ix_(kept, kept)]), coupling)
-    start = given.evidence.scene.cameras[camera]
-    now, rig = adjusted.placed.scene, problem.observations.rig[mine]
+    start = problem.intrinsics(solution.images.state)[camera]
+    now, rig = solution.state, problem.observations.rig[mine]
     return Alternatives(
         hessian=hessian[np.ix_(rest, rest)] - coupling.T @ by_column,
         right=right[rest] - by_column.T @ right[kept],
-        place_by_column=-_place_by_kept(adjusted, place, len(hessian), kept) @ by_column,
+        place_by_column=-_place_by_kept(solution, place, len(hessian), kept) @ by_column,
         images=len(mine),
         freedom=max(len(equations.residual) - begin, 1),
-        dispersion=_dispersion(given.evidence),
+        dispersion=_dispersion(solution.images),
         names=parameter_names(start),
         units=units_of(start),
         distance=_distances(wider, mine),
-        down_in_camera=-(adjusted.placed.z[0] @ now.world_from_rig[rig] @ now.rig_from_camera[camera])[
-            :, 2, :3
-        ],
+        down_in_camera=-(now.z[0] @ now.world_from_rig[rig] @ now.rig_from_camera[camera])[:, 2, :3],
     )
 
 
 def nuisances_of(images: Int[ndarray, " m"], count: int) -> Int[ndarray, " r"]:
-    """Of these images among the nuisances of `count`, and what all share."""
+    """Return the rows of these images among the nuisances of `count` images, and of what all share."""
     return np.r_[(count * np.arange(OF_IMAGE)[:, None] + images).ravel(), OF_IMAGE * count + np.arange(PRISM)]
 
 
 def _with_all_free(
-    adjusted: Adjusted,
-    prior: IntrinsicsPrior,
+    solution: Solution,
+    prior: Camera,
     camera: int,
     images: Int[ndarray, " m"],
     model_error_std: float | None,
 ) -> ImageEvidence:
-    """What the images show where every parameter of a camera and of its images is free."""
-    found = adjusted.given.evidence
-    problem, scene, own = found.problem, found.scene, len(prior.std)
-    freedom, m = problem.freedom, len(images)
-    start = scene.cameras[camera]
+    """Return the evidence of the images where every parameter of a camera and of its images is free."""
+    problem, state, own = solution.problem, solution.images.state, len(prior.std)
+    start = problem.intrinsics(state)[camera]
     units = units_of(start)
-    wider = IntrinsicsPrior(
-        np.column_stack([prior.directions, np.diag(units)]), np.r_[prior.std, weak_of(start)]
+    wider = replace(
+        prior,
+        directions=np.column_stack([prior.directions, np.diag(units)]),
+        std=np.r_[prior.std, weak_of(start)],
     )
-    rows = nuisances_of(images, len(problem.observations.rig))
-    left = freedom.model_error_std
-    all_free = replace(
-        freedom,
-        intrinsics=with_intrinsics(freedom, wider, camera).intrinsics,
-        nuisance=NuisancePrior(np.eye(len(freedom.nuisance.directions))[:, rows], _weak_nuisances(m)),
-        model_error_std=left if model_error_std is None else np.full_like(left, model_error_std),
+    rows = nuisances_of(images, problem.n_images)
+    all_free = with_free(
+        problem,
+        cameras=with_camera(problem, wider, camera).cameras,
+        nuisance_directions=np.eye(len(problem.nuisance_directions))[:, rows],
+        nuisance_std=_weak_nuisances(len(images)),
     )
-    steps = scene.camera_steps
-    columns = freedom.intrinsics_columns[camera]
+    steps, columns = state.camera_steps, problem.columns
+    mine = columns.intrinsics[camera]
     wider_steps = np.r_[
-        steps[: columns.start + own],
-        beyond_prior(adjusted, prior, camera) / units,
-        steps[columns.stop : freedom.nuisance_columns.start],
-        scene.nuisances(freedom)[rows],
-        steps[freedom.model_error_columns.start : freedom.board_columns.stop],
+        steps[: mine.start + own],
+        beyond_prior(solution, prior, camera) / units,
+        steps[mine.stop : columns.nuisance.start],
+        problem.nuisances(state)[rows],
+        steps[columns.nuisance.stop :],
     ]
-    return evidence(replace(scene, camera_steps=wider_steps), replace(problem, freedom=all_free), found.noise)
+    sizes = state.model_error_std
+    sizes = sizes if model_error_std is None else np.full_like(sizes, model_error_std)
+    return evidence(all_free, replace(state, camera_steps=wider_steps, model_error_std=sizes))
 
 
 def _place_by_kept(
-    adjusted: Adjusted, place: Callable[[Placed], Transform], columns: int, kept: Int[ndarray, " k"]
+    solution: Solution, place: Callable[[State], Transform], columns: int, kept: Int[ndarray, " k"]
 ) -> Float[ndarray, "6 k"]:
-    """How far a camera's place moves with each of the kept columns; with no parameter of a camera it does."""
-    derivative = adjusted.derivative(place)
-    arms = adjusted.first_camera_column
-    after = derivative.shape[1] - arms - adjusted.given.evidence.problem.freedom.model_error_columns.stop
+    """Return the derivative of a camera's pose by the kept columns; it does not depend on parameters of cameras."""
+    derivative = solution.derivative(place)
+    arms = solution.problem.arm_unknowns
+    after = derivative.shape[1] - arms - solution.problem.columns.boards.start
     wide = np.zeros((6, columns))
     wide[:, :arms] = derivative[:, :arms]
     if after:
@@ -201,51 +203,48 @@ def _place_by_kept(
 
 def _distances(images: ImageEvidence, mine: Int[ndarray, " m"]) -> Float[ndarray, " m"]:
     """Median depth of the points of each image; of one without points that of the others."""
+    assert images.problem.observations is not None
     depth, image = images.view.depth, images.problem.observations.image
     distance = np.array([np.median(depth[image == k]) if (image == k).any() else np.nan for k in mine])
     return np.where(np.isfinite(distance), distance, np.nanmedian(distance))
 
 
 def freed_intrinsics(
-    adjusted: Adjusted, prior: IntrinsicsPrior, camera: int = 0
+    solution: Solution, prior: Camera, camera: int = 0
 ) -> tuple[Float[ndarray, " q"], Float[ndarray, "q q"]]:
-    """The parameters of a camera one Gauss-Newton step on, with another prior about where they started, and their
-    covariance."""
-    given = adjusted.given
-    problem, scene = given.evidence.problem, given.evidence.scene
-    freedom, now = problem.freedom, parameters(scene.cameras[camera])
-    columns = freedom.intrinsics_columns[camera]
-    off = now - parameters(freedom.start[camera])
+    """Return the parameters of a camera after one Gauss-Newton step under another prior, and their covariance."""
+    problem, state = solution.problem, solution.images.state
+    now, columns = parameters(problem.intrinsics(state)[camera]), problem.columns.intrinsics[camera]
+    off = now - parameters(problem.cameras[camera].intrinsics)
     steps = np.r_[
-        scene.camera_steps[: columns.start],
+        state.camera_steps[: columns.start],
         np.linalg.pinv(prior.directions) @ off,
-        scene.camera_steps[columns.stop :],
+        state.camera_steps[columns.stop :],
     ]
-    wider = evidence(
-        replace(scene, camera_steps=steps),
-        replace(problem, freedom=with_intrinsics(freedom, prior, camera)),
-        given.evidence.noise,
-    )
-    equations, _ = equations_of(adjusted.most_likely, replace(given, evidence=wider))
-    solution = solve(equations, adjusted.log_sizes)
-    begin = adjusted.first_camera_column + columns.start
+    prior = replace(prior, intrinsics=problem.cameras[camera].intrinsics)
+    freed_problem = with_free(problem, cameras=with_camera(problem, prior, camera).cameras)
+    wider = evidence(freed_problem, replace(state, camera_steps=steps))
+    likely = solution.most_likely
+    at = replace(wider.state, x=likely.x, scale=likely.scale, z=likely.z)
+    found = solve_equations(pose_equations(freed_problem, at, wider).equations, solution.log_sizes)
+    begin = problem.arm_unknowns + columns.start
     own = slice(begin, begin + len(prior.std))
-    covariance = solution.covariance[own, own]
-    return now + prior.directions @ solution.step[own], prior.directions @ covariance @ prior.directions.T
+    covariance = found.covariance[own, own]
+    return now + prior.directions @ found.step[own], prior.directions @ covariance @ prior.directions.T
 
 
-def with_intrinsics(freedom: Freedom, prior: IntrinsicsPrior, camera: int = 0) -> Freedom:
-    """The freedom with another prior of a camera's intrinsics."""
-    priors = freedom.intrinsics
-    return replace(freedom, intrinsics=(*priors[:camera], prior, *priors[camera + 1 :]))
+def with_camera(problem: Problem, prior: Camera, camera: int = 0) -> Problem:
+    """Return the problem with another prior of a camera's intrinsics."""
+    cameras = problem.cameras
+    prior = replace(prior, mount_free=cameras[camera].mount_free)
+    return replace(problem, cameras=(*cameras[:camera], prior, *cameras[camera + 1 :]))
 
 
-def beyond_prior(adjusted: Adjusted, prior: IntrinsicsPrior, camera: int = 0) -> Float[ndarray, " q"]:
-    """How far the parameters of a camera went by what was freed beside its prior, from where they started."""
-    found, own = adjusted.given.evidence, len(prior.std)
-    freedom = found.problem.freedom
-    steps = found.scene.camera_steps[freedom.intrinsics_columns[camera]]
-    return freedom.intrinsics[camera].directions[:, own:] @ steps[own:]
+def beyond_prior(solution: Solution, prior: Camera, camera: int = 0) -> Float[ndarray, " q"]:
+    """Return the displacement of a camera's parameters along directions that were freed beside its prior."""
+    problem, own = solution.problem, len(prior.std)
+    steps = solution.images.state.camera_steps[problem.columns.intrinsics[camera]]
+    return problem.cameras[camera].directions[:, own:] @ steps[own:]
 
 
 def units_of(camera: Intrinsics) -> Float[ndarray, " q"]:
@@ -274,24 +273,28 @@ def differences(count: int) -> Float[ndarray, "n d"]:
 
 
 def freed(
-    freedom: Freedom, combinations: Float[ndarray, "e p"], images: Int[ndarray, " m"], camera: int = 0
-) -> Freedom:
-    """A freedom with combinations of the columns of one camera's `Alternatives` free too.
+    problem: Problem,
+    combinations: Float[ndarray, "e p"],
+    images: Int[ndarray, " m"],
+    n_images: int,
+    camera: int = 0,
+) -> Problem:
+    """Return the problem with combinations of the columns of one camera's `Alternatives` free, too.
 
-    Parameters of the camera, in units of where it starts, and of its `images` are freed each by themselves.
+    Parameters of the camera and of its `images`, of `n_images`, are freed each by themselves.
     """
-    start, own = freedom.start[camera], freedom.intrinsics[camera]
-    q, m = len(parameter_names(start)), len(images)
+    own = problem.cameras[camera]
+    q = len(parameter_names(own.intrinsics))
     of_camera, of_images = spanned(combinations[:q]), spanned(combinations[q:])
-    wider = IntrinsicsPrior(
-        np.column_stack([own.directions, units_of(start)[:, None] * of_camera]),
-        np.r_[own.std, _std(of_camera, weak_of(start))],
+    wider = replace(
+        own,
+        directions=np.column_stack([own.directions, units_of(own.intrinsics)[:, None] * of_camera]),
+        std=np.r_[own.std, _std(of_camera, weak_of(own.intrinsics))],
     )
-    all_rows = len(freedom.nuisance.directions)
-    directions = np.zeros((all_rows, of_images.shape[1]))
-    directions[nuisances_of(images, (all_rows - PRISM) // OF_IMAGE)] = of_images
-    std = _std(of_images, _weak_nuisances(m))
-    return replace(with_intrinsics(freedom, wider, camera), nuisance=NuisancePrior(directions, std))
+    directions = np.zeros((OF_IMAGE * n_images + PRISM, of_images.shape[1]))
+    directions[nuisances_of(images, n_images)] = of_images
+    std = _std(of_images, _weak_nuisances(len(images)))
+    return replace(with_camera(problem, wider, camera), nuisance_directions=directions, nuisance_std=std)
 
 
 def _weak_nuisances(images: int) -> Float[ndarray, " r"]:
@@ -341,7 +344,7 @@ def _dispersion(images: ImageEvidence) -> float:
     Liang and Zeger, Biometrika 73, 1986)."""
     problem, weight = images.problem, images.weight
     pull = weight[:, None] * images.view.residual_px
-    taken = 3 * len(problem.points) + 6 * len(problem.seen.rows)
+    taken = 3 * len(images.state.points_in_world) + 6 * len(problem.seen.rows)
     share = max(1 - taken / (2 * len(weight)), 0.1)
     scale = 2 * weight.sum() * share
     return max(float((pull**2).sum()), problem.layout.squares_of_cells(pull)) / scale

@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.estimation.equation import SCALE
 from jcr.estimation.inverse_kinematics import required_posture
 from jcr.estimation.kinematics import Arm, Joints, error_jacobian, error_std, with_tool
 from jcr.estimation.mounting import mounted_arm
-from jcr.estimation.pose_equations import SCALE, Poses
-from jcr.geometry import rotation_angle
+from jcr.geometry import Poses, rotation_angle
 
 REACH = 0.45
 """m. A joint's error shows in the gripper's position as in its rotation (rad) times the reach behind it."""
@@ -82,11 +82,6 @@ class Region:
     """A = (JᵀWJ)⁻¹JᵀW; zero for poses that are not used."""
     unknowns: int = 13
     """Of the whole problem; they begin as those of equation.py do."""
-
-    @staticmethod
-    def of_poses(jacobian: Float[ndarray, "s p"]) -> "Region":
-        """That of the poses whose residuals have this derivative; the least change where these do not determine it."""
-        return Region.of_unknowns(np.delete(jacobian[:, :13], SCALE, axis=1), jacobian.shape[1])
 
     @staticmethod
     def of_unknowns(by_unknown: Float[ndarray, "s u"], unknowns: int) -> "Region":

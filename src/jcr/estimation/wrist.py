@@ -1,99 +1,120 @@
-"""The adjustment of one wrist camera, a rig an image: what a capture's own camera needs of robots.py."""
-
-from dataclasses import dataclass
+"""The estimation problem of one wrist camera, each of whose images is a rig, and of camera poses without images."""
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.estimation.boards import shapes_of
-from jcr.estimation.fit import Unknowns
-from jcr.estimation.image_robots import Adjusted, ArmPoses
-from jcr.estimation.intrinsics_prior import FIXED, IntrinsicsPrior, prior_of
-from jcr.estimation.pose_equations import Poses
-from jcr.estimation.scene import Freedom, Observations, Scene
+from jcr.estimation.intrinsics_prior import FIXED, Camera, camera_with_prior
+from jcr.estimation.observations import Observations
+from jcr.estimation.problem import (
+    Arm,
+    LinearPrior,
+    Problem,
+    RigGaussian,
+    State,
+    transferred,
+    with_observations,
+)
 from jcr.estimation.score_test import freed
+from jcr.estimation.solve import START_NOISE, Solution, solve
 from jcr.estimation.systematic import smooth_errors
-from jcr.estimation.together import START_NOISE, adjust
-from jcr.geometry import Transform, apply, fit_similarity, scale_translation
+from jcr.geometry import Poses, Transform, apply, fit_similarity, scale_translation
 from jcr.records import Intrinsics, Tracks
 
-
-@dataclass(frozen=True, kw_only=True)
-class WristOptions:
-    """What is free beside the intrinsics, what was found of the robot before, and where to begin."""
-
-    systematic: Float[ndarray, "s s"] | None = None
-    """Covariance of the systematic errors of the gripper poses at 1 rad; None: that of errors smooth over the poses."""
-    combinations: Float[ndarray, "e p"] | None = None
-    """Of the columns of score_test.Alternatives, that are free too."""
-    exchanged: bool = False
-    """The camera stands still, and the arm carries what it sees."""
-    near: Adjusted | None = None
-    """An adjustment of the same poses and tracks, or of more of them, to begin from."""
-    start_noise: tuple[float, float] = START_NOISE
-    """m, rad; of the gripper poses, until it is estimated."""
-    bent: Float[ndarray, "s b"] | None = None
-    """Errors that were found of the gripper poses (estimation/pose_effects.py), of one standard deviation each."""
+Start = tuple[Transform, float, Transform]
+"""gripper_from_camera, scale and base_from_recon."""
 
 
-def adjust_wrist(
+def wrist_arm(base_from_gripper: Poses, error_covariance: Float[ndarray, "s s"] | None = None) -> Arm:
+    """Return an arm that moves rig i at pose i; `error_covariance` None: errors that are smooth over the poses."""
+    if error_covariance is None:
+        error_covariance = smooth_errors(base_from_gripper)
+    rigs = np.arange(len(base_from_gripper))
+    return Arm(rigs=rigs, base_from_gripper=base_from_gripper, error_covariance=error_covariance)
+
+
+def pose_problem(
     base_from_gripper: Poses,
-    start: Unknowns,
     recon_from_camera: Poses,
-    intrinsics: Intrinsics,
+    start: Start,
+    *,
+    camera_covariance: Float[ndarray, "r r"] | None = None,
+    error_covariance: Float[ndarray, "s s"] | None = None,
+    noise_floor: tuple[float, float] | None = None,
+    priors: tuple[LinearPrior, ...] = (),
+) -> tuple[Problem, State]:
+    """Return the problem of camera poses with the covariance of their steps (None: exact), and its initial state."""
+    x, scale, z = start
+    problem = Problem(
+        arms=(wrist_arm(base_from_gripper, error_covariance),),
+        n_rigs=len(base_from_gripper),
+        known_rigs=RigGaussian(recon_from_camera, camera_covariance),
+        priors=priors,
+        robot_noise_floor=noise_floor,
+    )
+    return problem, State(x=x[None], scale=scale, z=z[None], world_from_rig=recon_from_camera)
+
+
+def adjust_wrist(  # noqa: PLR0913 (each is a fact about the capture)
+    arm: Arm | Poses,
+    start: Start,
+    recon_from_camera: Poses,
+    camera: Camera | Intrinsics,
     tracks: Tracks,
     *,
     noise: tuple[float, float] | None = None,
-    prior: IntrinsicsPrior | None = None,
-    options: WristOptions = WristOptions(),
-) -> Adjusted:
-    """Images and robot adjusted from a pose fit's (gripper_from_camera, scale, base_from_recon).
+    combinations: Float[ndarray, "e p"] | None = None,
+    near: Solution | None = None,
+    start_noise: tuple[float, float] = START_NOISE,
+) -> Solution:
+    """Adjust images and reported poses together, from a result of a fit to poses.
 
-    `noise` is the robot's (m, rad), at least; it is estimated with the rest. `prior` is what is known of the
-    intrinsics; None: that they are exact.
+    `arm` moves rig i at image i; of poses alone the systematic errors are smooth over the poses. `camera` given as
+    intrinsics is exact. `noise` is a lower bound on the random errors of the poses (m, rad), and `start_noise` their
+    initial size. `combinations` of the columns of score_test.Alternatives are free, too. `near` is a solution of the
+    same poses and of the same points or more, from which the adjustment starts.
     """
     x, scale, z = start
-    each, systematic = np.arange(len(base_from_gripper)), options.systematic
-    prior = prior_of(intrinsics, FIXED) if prior is None else prior
+    arm = arm if isinstance(arm, Arm) else wrist_arm(arm)
+    each = arm.rigs
+    if isinstance(camera, Intrinsics):
+        camera = camera_with_prior(camera, FIXED)
     points_in_world = scale * tracks.points_in_recon.astype(float)
     twice = np.bincount(tracks.point, minlength=len(points_in_world)) >= 2
     boards, world_from_board = shapes_of(tracks.boards, points_in_world, twice, len(each))
-    freedom = Freedom.of((intrinsics,), (prior,), len(each))
-    if options.combinations is not None:
-        freedom = freed(freedom, options.combinations, each)
-    arm = ArmPoses(
-        rigs=each,
-        base_from_gripper=base_from_gripper,
-        systematic=smooth_errors(base_from_gripper) if systematic is None else systematic,
-        start=(x, z),
-        exchanged=options.exchanged,
-        bent=options.bent,
+    problem = Problem(
+        arms=(arm,),
+        n_rigs=len(each) + len(world_from_board),
+        cameras=(camera,),
+        boards=boards,
+        robot_noise_floor=noise,
     )
-    return adjust(
-        Scene(
-            world_from_rig=np.concatenate([scale_translation(recon_from_camera, scale), world_from_board]),
-            rig_from_camera=np.eye(4)[None],
-            cameras=(intrinsics,),
-            points_in_world=points_in_world,
-        ),
-        Observations.of_one_camera(tracks, len(each), boards),
-        freedom,
-        [arm],
-        noise,
-        near=options.near,
-        start_noise=options.start_noise,
+    state = State(
+        x=x[None],
+        scale=1.0,
+        z=z[None],
+        world_from_rig=np.concatenate([scale_translation(recon_from_camera, scale), world_from_board]),
+        points_in_world=points_in_world,
     )
+    observations = Observations.of_one_camera(tracks, len(each))
+    if combinations is not None:
+        problem = freed(problem, combinations, each, len(each))
+    problem, state = with_observations(problem, state, observations)
+    if near is not None:
+        state = transferred(near.problem, near.state, problem)
+    return solve(problem, state, start_noise=start_noise)
 
 
-def recon_frame(adjusted: Adjusted, tracks: Tracks) -> tuple[float, Transform]:
-    """Scale (metres per unit) and base_from_recon of the reconstruction whose tracks were adjusted.
+def recon_frame(solution: Solution, tracks: Tracks) -> tuple[float, Transform]:
+    """Return scale (metres per unit) and base_from_recon of the reconstruction whose tracks were adjusted.
 
-    Its points against the adjusted ones, weighed down where the two disagree.
+    A similarity is fitted to its points and the adjusted ones, points that disagree having less weight.
     """
-    placed, problem = adjusted.placed, adjusted.given.evidence.problem
-    points = apply(placed.z[0], placed.scale * placed.scene.points_in_world)
-    recon = tracks.points_in_recon[problem.points].astype(np.float64)
+    state, observations = solution.state, solution.problem.observations
+    assert observations is not None and observations.point_rows is not None
+    points = apply(state.z[0], state.scale * state.points_in_world)
+    recon = tracks.points_in_recon[observations.point_rows].astype(np.float64)
     weight = np.ones(len(points))
     base_from_recon, scale = fit_similarity(points, recon, weight)
     for _ in range(5):

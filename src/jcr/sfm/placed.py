@@ -39,12 +39,14 @@ def predicted_cameras(
     rows = sorted(image_id - 1 for image_id in model.reg_image_ids())
     if len(rows) < LEAST_MAPPED:
         return None
-    fit, agree = robust_fit(base_from_gripper[rows], poses_of(model, rows))
-    if fit.scale <= 0 or agree.sum() < LEAST_MAPPED - 1:
+    fit = robust_fit(base_from_gripper[rows], poses_of(model, rows))
+    agree, state = fit.problem.used, fit.state
+    assert agree is not None
+    if state.scale <= 0 or agree.sum() < LEAST_MAPPED - 1:
         return None
-    base_from_camera = base_from_gripper @ fit.gripper_from_camera
-    recon_from_camera = inverse(fit.base_from_recon) @ base_from_camera
-    recon_from_camera[:, :3, 3] /= fit.scale
+    base_from_camera = base_from_gripper @ state.x[0]
+    recon_from_camera = inverse(state.z[0]) @ base_from_camera
+    recon_from_camera[:, :3, 3] /= state.scale
     return recon_from_camera
 
 

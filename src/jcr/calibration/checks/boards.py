@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.case import Case, Checked
-from jcr.estimation.image_robots import Adjusted, size_of_boards
+from jcr.estimation.solve import Solution, size_of_boards
 from jcr.geometry import apply
 from jcr.records import BoardFound, Boards, Finding, Kind
 
@@ -26,7 +26,7 @@ def check_boards(case: Case) -> Checked:
         elsewhere = [case.names[row] for row in boards.elsewhere]
         findings.append(Finding.of(Kind.BOARD_MOVED, "warns", "images", *elsewhere, board=boards.spec))
     hand_eye = case.hand_eye
-    if case.adjusted is None or case.adjusted.given.evidence.problem.observations.boards is None:
+    if case.adjusted is None or case.adjusted.problem.boards is None:
         return Checked(tuple(findings))
     found = board_found(case.adjusted, boards)
     if boards.size_std is None and hand_eye.before is not None:
@@ -36,25 +36,23 @@ def check_boards(case: Case) -> Checked:
     return Checked(tuple(findings), replace(hand_eye, scale_evidence=evidence))
 
 
-def board_found(adjusted: Adjusted, boards: Boards) -> BoardFound:
-    """The boards as an adjustment has them."""
-    evidence, placed = adjusted.given.evidence, adjusted.placed
-    problem, scene = evidence.problem, placed.scene
-    shapes = problem.observations.boards
-    assert shapes is not None
-    size, by_unknown = size_of_boards(placed, adjusted.given)
+def board_found(adjusted: Solution, boards: Boards) -> BoardFound:
+    """Return the boards as an adjustment has them."""
+    problem, state, shapes = adjusted.problem, adjusted.state, adjusted.problem.boards
+    assert shapes is not None and problem.observations is not None
+    size, by_unknown = size_of_boards(adjusted)
     side_mm = 1e3 * boards.side * float(np.exp(size))
     std = float(np.sqrt(by_unknown @ adjusted.covariance @ by_unknown))
     of_corners = np.isin(problem.observations.point, shapes.point)
-    shape = scene.camera_steps[problem.freedom.board_columns]
+    shape = state.camera_steps[problem.columns.boards]
     bent = np.column_stack([shapes.x_in_body[:, :2], shapes.bend(shape)])
-    bent_mm = 1e3 * placed.scale * np.exp(shape[0]) * bent
+    bent_mm = 1e3 * state.scale * np.exp(shape[0]) * bent
     numbers = np.unique(shapes.body)
     bends_mm = [float(np.ptp(bent_mm[shapes.body == k, 2])) for k in numbers]
     most = shapes.body == numbers[int(np.argmax(bends_mm))]
-    rigs = scene.world_from_rig[shapes.first_rig + numbers]
-    normals = rigs[:, :3, 2] @ placed.z[0][:3, :3].T
-    points = apply(placed.z[0], placed.scale * scene.points_in_world[shapes.point])
+    rigs = state.world_from_rig[shapes.first_rig + numbers]
+    normals = rigs[:, :3, 2] @ state.z[0][:3, :3].T
+    points = apply(state.z[0], state.scale * state.points_in_world[shapes.point])
     return BoardFound(
         spec=boards.spec,
         bodies=len(numbers),
@@ -63,7 +61,7 @@ def board_found(adjusted: Adjusted, boards: Boards) -> BoardFound:
         side_mm=side_mm,
         side_std_mm=side_mm * std,
         stated_mm=None if boards.size_std is None else 1e3 * boards.side,
-        rms_px=float(np.sqrt((evidence.view.residual_px[of_corners] ** 2).mean())),
+        rms_px=float(np.sqrt((adjusted.images.view.residual_px[of_corners] ** 2).mean())),
         bend_mm=max(bends_mm),
         centres_in_base=tuple(_xyz(points[shapes.body == k].mean(0)) for k in numbers),
         tilts_deg=tuple(np.degrees(np.arccos(np.abs(normals[:, 2]).clip(0, 1))).tolist()),

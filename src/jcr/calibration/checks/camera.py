@@ -18,9 +18,8 @@ from jcr.calibration.case import Case, of_points
 from jcr.calibration.checks.imaged import Imaged
 from jcr.camera import parameter_names, parameters
 from jcr.estimation.hypotheses import Row
-from jcr.estimation.image_robots import Adjusted
 from jcr.estimation.model_error import TYPICAL
-from jcr.estimation.scene import OF_IMAGE, PRISM
+from jcr.estimation.problem import OF_IMAGE, PRISM
 from jcr.estimation.score_test import (
     Alternatives,
     Tested,
@@ -31,6 +30,7 @@ from jcr.estimation.score_test import (
     spanned,
     tested,
 )
+from jcr.estimation.solve import Solution
 from jcr.geometry import step_between
 from jcr.records import Finding, Intrinsics, Kind, Mend, Tracks
 
@@ -107,7 +107,7 @@ class State:
 
     imaged: Imaged
     found: tuple[CameraEffect, ...]
-    adjusted: Adjusted
+    adjusted: Solution
     poses: tuple[Row, ...] = ()
     """Effects on the gripper poses."""
 
@@ -143,15 +143,15 @@ class State:
     @property
     def camera(self) -> Intrinsics:
         """As adjusted."""
-        return self.adjusted.given.evidence.scene.cameras[self.imaged.camera]
+        return self.adjusted.images.view.cameras[self.imaged.camera]
 
     @property
     def total(self) -> Float[ndarray, " e"]:
         """How far the columns that may be freed are from where they start."""
-        evidence, imaged = self.adjusted.given.evidence, self.imaged
+        problem, imaged = self.adjusted.problem, self.imaged
         of_camera = beyond_prior(self.adjusted, imaged.prior, imaged.camera) / self.equations.units
-        of_all = evidence.scene.nuisances(evidence.problem.freedom)
-        return np.r_[of_camera, of_all[nuisances_of(imaged.images, len(evidence.problem.observations.rig))]]
+        of_all = problem.nuisances(self.adjusted.images.state)
+        return np.r_[of_camera, of_all[nuisances_of(imaged.images, problem.n_images)]]
 
 
 def of_fewer_points(case: Case) -> Case:
@@ -300,7 +300,7 @@ def _hypotheses(state: State) -> list[CameraEffect]:
         found.append(CameraEffect(Kind.ZOOM, free, common, places=len(steps), after=int(k) - 1))
     of_centre = np.concatenate([common, equations.of_camera(("cx", "cy"))], axis=1)
     found.append(CameraEffect(Kind.CENTRE_SAGS, np.concatenate(sag, axis=1), of_centre))
-    if len(state.adjusted.given.evidence.scene.cameras) == 1:  # all images share the glass
+    if len(state.adjusted.problem.cameras) == 1:  # all images share the glass
         found.append(CameraEffect(Kind.THIN_PRISM, np.eye(equations.columns)[:, -PRISM:], of_centre))
     # Intrinsics that are wrong in all images include the focal length that shows nothing in the others.
     found.append(CameraEffect(Kind.INTRINSICS, equations.of_camera(_freed(state)), nothing))
@@ -350,7 +350,7 @@ def _largest_px(
     after: State, value: Float[ndarray, "4"], covariance: Float[ndarray, "4 4"]
 ) -> tuple[float, float]:
     """The displacement by a thin prism where it is largest among the points, and its standard deviation."""
-    by = after.adjusted.given.evidence.problem.prism
+    by = after.adjusted.problem.prism
     moved = np.linalg.norm(by @ value, axis=1)
     k = int(moved.argmax())
     along = (by[k] @ value / max(float(moved[k]), 1e-12)) @ by[k]

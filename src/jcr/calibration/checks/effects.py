@@ -30,14 +30,18 @@ from jcr.calibration.checks.camera import (
 from jcr.calibration.checks.given_intrinsics import intrinsics_contradiction
 from jcr.calibration.checks.imaged import Imaged, of_case
 from jcr.estimation.components import most_likely
-from jcr.estimation.fit import Cues, PoseProblem, linearised
+from jcr.estimation.equation import SCALE, UNKNOWNS, columns_of_arm
 from jcr.estimation.hand_eye import MAX_NOISE, judged
 from jcr.estimation.hypotheses import Row, Test, best_tests, explains_by_order
-from jcr.estimation.image_robots import Adjusted
-from jcr.estimation.mixed_model import Equations, LogSizes, solve
+from jcr.estimation.mixed_model import Equations, LogSizes, solve_equations
 from jcr.estimation.pose_effects import PLAUSIBLE, STRAINS, arm_rows, order_rows
-from jcr.estimation.pose_equations import SCALE, UNKNOWNS, Poses, columns_of_arm
+from jcr.estimation.pose_equations import pose_equations
+from jcr.estimation.problem import Problem
+from jcr.estimation.problem import State as ProblemState
+from jcr.estimation.solve import Solution
 from jcr.estimation.systematic import Region
+from jcr.estimation.wrist import pose_problem
+from jcr.geometry import Poses
 from jcr.records import BENT, CAMERA, Finding, HandEye, Kind
 
 AT_ONCE = 3
@@ -152,7 +156,7 @@ def _poses_of(state: State) -> ArmEquations | None:
     return ArmEquations(
         equations=adjusted.equations,
         log_sizes=adjusted.log_sizes,
-        base_from_gripper=adjusted.given.arms[arm].base_from_gripper,
+        base_from_gripper=adjusted.problem.arms[arm].base_from_gripper,
         rows=state.imaged.rows_of_arm,
         columns=columns_of_arm(arm),
     )
@@ -275,7 +279,7 @@ def _adopted(case: Case, state: State, findings: tuple[Finding, ...]) -> Checked
 
 def with_effects(
     case: Case, state: State, findings: tuple[Finding, ...]
-) -> tuple[Adjusted | None, tuple[Finding, ...]]:
+) -> tuple[Solution | None, tuple[Finding, ...]]:
     """Adjust a case with the effects on camera and arm free, and return the findings with the shifts that remain.
 
     The calibration stays that of the effective transform, which predicts best from the poses as they are reported. How
@@ -287,7 +291,7 @@ def with_effects(
         return None, findings
     combinations = np.concatenate([one.both for one in state.found], axis=1) if state.found else None
     bent = np.concatenate([row.prior_std * row.columns for row in strains], axis=1) if strains else None
-    adjusted = adjust_case(case, combinations=combinations, bent=bent)
+    adjusted = adjust_case(case, combinations=combinations, confirmed_errors=bent)
     straight = [np.zeros(7)] * len(strains)
     if bent is not None:
         straight[0] = straight_shift(adjusted.equations, adjusted.log_sizes, bent)[:7]
@@ -295,7 +299,7 @@ def with_effects(
     return adjusted, tuple(_as_adopted(one, shifts.get(one.kind), adjusted) for one in findings)
 
 
-def _as_adopted(found: Finding, straight: Float[ndarray, "7"] | None, adjusted: Adjusted) -> Finding:
+def _as_adopted(found: Finding, straight: Float[ndarray, "7"] | None, adjusted: Solution) -> Finding:
     """Return a finding with the uncertainty that remains after the calibration adopted the effect."""
     if found.kind in CAMERA:
         return replace(found, shift=None, intrinsics_shift=None)
@@ -304,12 +308,12 @@ def _as_adopted(found: Finding, straight: Float[ndarray, "7"] | None, adjusted: 
     return replace(found, shift=tuple(_with_metre(found, straight, adjusted).tolist()))
 
 
-def _with_metre(found: Finding, shift: Float[ndarray, "7"], adjusted: Adjusted) -> Float[ndarray, "7"]:
+def _with_metre(found: Finding, shift: Float[ndarray, "7"], adjusted: Solution) -> Float[ndarray, "7"]:
     """Add to a shift what the scale may be off by: of three lengths one differs, and no image shows which is a metre."""
     if found.kind is not Kind.LENGTHS or found.value is None:
         return shift
     equations = adjusted.equations
-    region = Region.of_poses(equations.jacobian[:, :UNKNOWNS])
+    region = Region.of_unknowns(np.delete(equations.jacobian[:, :UNKNOWNS], SCALE, axis=1), UNKNOWNS)
     metre = np.r_[-(region.fit @ equations.jacobian[:, SCALE])[:6, 0], 1.0]
     of_metre = abs(found.value) / 3 * metre
     return shift + of_metre * (1 if shift[:6] @ of_metre[:6] >= 0 else -1)
@@ -319,8 +323,8 @@ def straight_shift(
     equations: Equations, log_sizes: LogSizes, columns: Float[ndarray, "s b"]
 ) -> Float[ndarray, " p"]:
     """Return the step from the effective unknowns to those of the true poses; `columns` are errors of the poses."""
-    straight = replace(equations, bent=columns @ columns.T)
-    return solve(straight, log_sizes).step - solve(equations, log_sizes).step
+    straight = replace(equations, confirmed=columns @ columns.T)
+    return solve_equations(straight, log_sizes).step - solve_equations(equations, log_sizes).step
 
 
 def _with_rejected_runs(case: Case) -> Case:
@@ -347,27 +351,28 @@ def with_rejected_runs(used: Bool[ndarray, " n"]) -> Bool[ndarray, " n"]:
 def _effects_of_poses(case: Case) -> tuple[Finding, ...]:
     """Return the most significant effect of the order where camera poses alone decide the calibration."""
     evidence = case.reconstruction.evidence
-    problem = PoseProblem(
-        base_from_gripper=case.base_from_gripper,
-        recon_from_camera=case.recon_from_camera,
-        used=case.hand_eye.inliers,
-        systematic=case.robot.systematic,
-        noise=case.options.robot_noise_m_rad,
-        cues=case.cues or Cues(),
+    fit = case.hand_eye.before or case.hand_eye
+    problem, state = pose_problem(
+        case.base_from_gripper,
+        case.recon_from_camera,
+        (fit.gripper_from_camera, fit.scale, fit.base_from_recon),
         camera_covariance=None if evidence is None else evidence.covariance,
+        error_covariance=case.robot.systematic,
+        noise_floor=case.options.robot_noise_m_rad,
+        priors=case.priors,
     )
-    return effects_of_fit(problem, case.hand_eye, case.names)
+    return effects_of_fit(replace(problem, used=case.hand_eye.inliers), state, case.hand_eye, case.names)
 
 
-def effects_of_fit(problem: PoseProblem, hand_eye: HandEye, names: Sequence[str]) -> tuple[Finding, ...]:
+def effects_of_fit(
+    problem: Problem, state: ProblemState, hand_eye: HandEye, names: Sequence[str]
+) -> tuple[Finding, ...]:
     """Return the most significant effect of the order on a fit to camera poses; `names` are those of its poses."""
-    fit = hand_eye.before or hand_eye
-    equations = linearised(problem, (fit.gripper_from_camera, fit.scale, fit.base_from_recon)).equations
-    used = np.flatnonzero(problem.used)
+    equations, used = pose_equations(problem, state, None).equations, np.flatnonzero(problem.used)
     poses = ArmEquations(
         equations=equations,
         log_sizes=most_likely(equations)[0],
-        base_from_gripper=problem.base_from_gripper[used],
+        base_from_gripper=problem.arms[0].base_from_gripper[used],
         rows=slice(0, 6 * len(used)),
         columns=columns_of_arm(0),
     )

@@ -14,9 +14,9 @@ from jcr.calibration.case import Case, Checked
 from jcr.calibration.checks.imaged import Imaged, of_case
 from jcr.camera import PARAMETERS, by_parameters, parameters, unproject
 from jcr.estimation.hand_eye import judged
-from jcr.estimation.image_robots import Adjusted
-from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, prior_of
+from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, camera_with_prior
 from jcr.estimation.score_test import freed_intrinsics
+from jcr.estimation.solve import Solution
 from jcr.geometry import ARM, step_between
 from jcr.records import Finding, Kind
 
@@ -47,7 +47,8 @@ def intrinsics_contradiction(case: Case) -> Checked:
     if case.hand_eye.converged and (refined := judged(refined_by(case, freed))).converged:
         return Checked((contradicted,), refined, freed)
     with_found, as_given = (
-        estimate_of(one, case.tracks) for one in (freed, adjust_case(case, prior=prior_of(given, FIXED)))
+        estimate_of(one, case.tracks)
+        for one in (freed, adjust_case(case, prior=camera_with_prior(given, FIXED)))
     )
     # Camera poses may have been found with other intrinsics than those given: the farther of the two answers counts.
     shifts = [
@@ -63,7 +64,7 @@ def intrinsics_contradiction(case: Case) -> Checked:
     return Checked((replace(contradicted, shift=tuple(shift.tolist())),), case.hand_eye.before)
 
 
-def contradicted_by(imaged: Imaged, sure: float = SURE) -> tuple[Adjusted, Finding] | None:
+def contradicted_by(imaged: Imaged, sure: float = SURE) -> tuple[Solution, Finding] | None:
     """The images adjusted as if no intrinsics had been given for one camera, and what they show against those that were;
     None where that is nothing. A finding of less than `sure` standard deviations only informs: it leaves doubt.
 
@@ -72,7 +73,7 @@ def contradicted_by(imaged: Imaged, sure: float = SURE) -> tuple[Adjusted, Findi
     """
     if not _found_off(imaged, imaged.adjusted, *DOUBT):
         return None
-    freed = imaged.adjust(prior_of(imaged.start, ESTIMATED), None, None)
+    freed = imaged.adjust(camera_with_prior(imaged.start, ESTIMATED), None, None)
     surely = _found_off(imaged, freed, sure, 1.0)
     found = surely or _found_off(imaged, freed, *DOUBT)
     if not found:
@@ -81,10 +82,10 @@ def contradicted_by(imaged: Imaged, sure: float = SURE) -> tuple[Adjusted, Findi
     return freed, Finding.of(Kind.INTRINSICS, severity, "intrinsics", **found)
 
 
-def _found_off(imaged: Imaged, adjusted: Adjusted, sure: float, share: float) -> dict[str, float]:
+def _found_off(imaged: Imaged, adjusted: Solution, sure: float, share: float) -> dict[str, float]:
     """Each part of the intrinsics that is off by `sure` standard deviations and by `share` of what matters (px)."""
     given = imaged.start
-    camera, covariance = freed_intrinsics(adjusted, prior_of(given, ESTIMATED), imaged.camera)
+    camera, covariance = freed_intrinsics(adjusted, camera_with_prior(given, ESTIMATED), imaged.camera)
     by = camera - parameters(given)
     std = np.sqrt(np.diag(covariance))
     off: dict[str, float] = {}

@@ -6,7 +6,7 @@ from numpy import ndarray
 
 from jcr.capture.images import read_image
 from jcr.estimation.absolute_pose import CameraPose
-from jcr.estimation.pose_equations import predict
+from jcr.estimation.equation import predict
 from jcr.geometry import step_between
 from jcr.records import Capture, Finding, HandEye, Kind, Reconstruction
 from jcr.sfm.register import register

@@ -19,10 +19,10 @@ from jcr.calibration.adjust import refined_by
 from jcr.calibration.case import Case, Checked
 from jcr.calibration.checks.depth_camera import depth_check
 from jcr.calibration.cues import CONTRADICTED, length_cue
+from jcr.estimation.equation import SCALE
 from jcr.estimation.hand_eye import judged
-from jcr.estimation.image_robots import Adjusted, KnownLength, size_of_boards
-from jcr.estimation.pose_equations import SCALE
-from jcr.estimation.together import with_lengths
+from jcr.estimation.problem import LinearPrior
+from jcr.estimation.solve import Solution, size_of_boards, with_priors
 from jcr.records import Finding, HandEye, Kind, LengthCheck, LengthName, ScaleCheck, ScaleEvidence
 
 DEPTH_STD, NETWORK_STD = 0.02, 0.05
@@ -100,7 +100,7 @@ def _measured(case: Case) -> tuple[HandEye, list[Length]]:
     boards, adjusted = case.reconstruction.tracks.boards, case.adjusted
     if adjusted is not None and boards is not None and hand_eye.before is not None:
         found.extend(_of_boards(adjusted, boards.size_std))
-    if case.options.known_length is not None and case.cues is None:
+    if case.options.known_length is not None and not case.priors:
         image, *ends, length_mm = case.options.known_length
         ends_px = np.array(ends).reshape(2, 2)
         scale, std = length_cue(case.capture, case.reconstruction, image, ends_px, length_mm / 1e3)
@@ -119,11 +119,11 @@ def _measured(case: Case) -> tuple[HandEye, list[Length]]:
     return hand_eye, found
 
 
-def _of_boards(adjusted: Adjusted, size_std: float | None) -> Iterator[Length]:
+def _of_boards(adjusted: Solution, size_std: float | None) -> Iterator[Length]:
     """The size of the boards, where it is known and they were adjusted."""
-    if size_std is None or adjusted.given.evidence.problem.observations.boards is None:
+    if size_std is None or adjusted.problem.boards is None:
         return
-    off, by_unknown = size_of_boards(adjusted.placed, adjusted.given)
+    off, by_unknown = size_of_boards(adjusted)
     together = float(by_unknown @ adjusted.covariance @ by_unknown)
     of_images = max(together - float(adjusted.covariance[SCALE, SCALE].item()), 0.0)
     yield Length("board", off, float(np.hypot(np.sqrt(of_images), size_std)))
@@ -190,7 +190,7 @@ def _shift(off: float, hand_eye: HandEye) -> Float[ndarray, "7"]:
 def _from_robot_alone(case: Case, hand_eye: HandEye) -> tuple[Finding, ...]:
     """That the scale comes from the robot's positions alone, where nothing was compared with it but a network."""
     compared = any(one.name != "network" for one in hand_eye.scale_evidence.lengths)
-    if compared or case.cues is not None or case.reconstruction.metric_std is not None:
+    if compared or case.priors or case.reconstruction.metric_std is not None:
         return ()
     return (Finding.of(Kind.SCALE_FROM_ROBOT, "informs"),)
 
@@ -208,16 +208,17 @@ def _fault(hand_eye: HandEye, lengths: list[Length]) -> Float[ndarray, "7 7"]:
 def _fused(case: Case, hand_eye: HandEye, lengths: list[Length], fault: Float[ndarray, "7 7"]) -> Checked:
     """The calibration with the lengths as priors of its scale."""
     assert case.adjusted is not None
-    placed, boards = case.adjusted.most_likely, case.reconstruction.tracks.boards
-    known = [
-        KnownLength(log_scale=0.0, std=float(np.hypot(boards.size_std, ROBOT_STD)), of_boards=True)
-        if one.name == "board" and boards is not None and boards.size_std is not None
-        else KnownLength(
-            log_scale=float(np.log(placed.scale)) - one.off, std=float(np.hypot(one.std, ROBOT_STD))
-        )
-        for one in lengths
-    ]
-    adjusted = with_lengths(case.adjusted, known)
+    log_scale, boards = float(np.log(case.adjusted.most_likely.scale)), case.reconstruction.tracks.boards
+    by_scale = np.eye(case.adjusted.problem.unknowns)[SCALE.start]
+    known = []
+    for one in lengths:
+        if one.name == "board" and boards is not None and boards.size_std is not None:
+            size, by_unknown = size_of_boards(case.adjusted)
+            value = float(by_unknown @ case.adjusted.problem.coordinates(case.adjusted.state)) - size
+            known.append(LinearPrior(by_unknown, value, float(np.hypot(boards.size_std, ROBOT_STD))))
+        else:
+            known.append(LinearPrior(by_scale, log_scale - one.off, float(np.hypot(one.std, ROBOT_STD))))
+    adjusted = with_priors(case.adjusted, known)
     refined = refined_by(case, adjusted)
     estimate = refined.estimate.with_fault(fault)
     for one in hand_eye.findings:

@@ -14,9 +14,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.camera import unproject
-from jcr.estimation.images import ImageEvidence, adjust_images
-from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, prior_of
-from jcr.estimation.scene import Freedom, Observations, Scene
+from jcr.estimation.image_equations import ImageEvidence, adjust_images
+from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, camera_with_prior
+from jcr.estimation.observations import Observations
+from jcr.estimation.problem import Problem, State, with_observations
 from jcr.geometry import inverse
 from jcr.reconstruct.preprocess import ImageGrid, PreparedImages
 from jcr.reconstruct.views_at_once.colour_matches import Geometry, Matches, colour_matches
@@ -75,7 +76,7 @@ def refine(predicted: Predicted, images: PreparedImages, pinhole: Intrinsics) ->
         adjusted = adjust_matches(tracks, geometry, fixed=images.pinhole is not None)
         if len(adjusted.tracks.image) == 0:
             return None
-        poses, camera = adjusted.shown.scene.world_from_rig, adjusted.shown.scene.cameras[0]
+        poses, camera = adjusted.shown.state.world_from_rig, adjusted.shown.view.cameras[0]
         change = depth_changes(adjusted.tracks, poses, depth)
         depth = depth * np.stack([smooth_factor(c, work.size[1], work.size[0]) for c in change])
         factor = factor * np.stack([smooth_factor(c, *predicted.grid.size[::-1]) for c in change])
@@ -139,18 +140,19 @@ def adjust_matches(tracks: Tracks, geometry: Geometry, fixed: bool) -> _Adjusted
     """Cameras and points adjusted, and the focal length unless it is fixed; matches far from their points left out, and
     points that fewer than two views are left to see."""
     images, camera = len(geometry.recon_from_camera), geometry.pinhole
-    prior = prior_of(camera, FIXED if fixed else {"f": ESTIMATED["f"]})
-    shown = adjust_images(
-        Scene(
-            world_from_rig=geometry.recon_from_camera,
-            rig_from_camera=np.eye(4)[None],
-            cameras=(camera,),
-            points_in_world=tracks.points_in_recon,
-        ),
-        Observations.of_one_camera(tracks, images),
-        Freedom.of((camera,), (prior,), images),
+    prior = camera_with_prior(camera, FIXED if fixed else {"f": ESTIMATED["f"]})
+    nothing = np.zeros((0, 4, 4))
+    state = State(
+        x=nothing,
+        scale=1.0,
+        z=nothing,
+        world_from_rig=geometry.recon_from_camera,
+        points_in_world=tracks.points_in_recon,
     )
-    seen, points = shown.problem.observations, shown.scene.points_in_world
+    problem = Problem(arms=(), n_rigs=images, cameras=(prior,))
+    shown = adjust_images(*with_observations(problem, state, Observations.of_one_camera(tracks, images)))
+    seen, points = shown.problem.observations, shown.state.points_in_world
+    assert seen is not None
     error = np.linalg.norm(shown.view.residual_px, axis=1)
     error[shown.view.depth <= 0] = np.inf
     good = error < LARGEST_PX * max(float(np.median(error)), 0.1)

@@ -15,8 +15,8 @@ from numpy import ndarray
 from jcr.distributions import chi2
 from jcr.estimation.cholesky import cholesky, lower
 from jcr.estimation.components import Information, Weighed, expected_information, over_sizes
-from jcr.estimation.mixed_model import Each, Equations, LogSizes, Solution, solve
-from jcr.estimation.pose_equations import UNKNOWNS
+from jcr.estimation.equation import UNKNOWNS
+from jcr.estimation.mixed_model import Each, Equations, LinearSolution, LogSizes, solve_equations
 from jcr.estimation.systematic import Region
 from jcr.records import Budget, RobotNoise
 
@@ -59,7 +59,7 @@ def expected_posterior(equations: Equations, noise: RobotNoise, region: Region |
     mode = equations.log_sizes_of(noise)
     root = cholesky(equations.covariance(mode))
 
-    def density(solution: Solution) -> Each:
+    def density(solution: LinearSolution) -> Each:
         whitened, fitted = _whitened_and_fitted(solution, root)
         return solution.log_posterior - ((whitened**2).sum((-1, -2)) - (fitted**2).sum((-1, -2))) / 2
 
@@ -70,14 +70,14 @@ def expected_posterior(equations: Equations, noise: RobotNoise, region: Region |
 def expected_covariance_at(equations: Equations, noise: RobotNoise, region: Region | None) -> Square:
     """The covariance of the same at the sizes themselves, as if these were known exactly: for comparisons."""
     mode = equations.log_sizes_of(noise)
-    return solve(equations, mode).covariance + _expected_elsewhere(equations, mode, region)
+    return solve_equations(equations, mode).covariance + _expected_elsewhere(equations, mode, region)
 
 
 def _averaged(
     equations: Equations,
     mode: Float[ndarray, " c"],
     found: Weighed,
-    elsewhere: Callable[[Solution, LogSizes], Stack],
+    elsewhere: Callable[[LinearSolution, LogSizes], Stack],
 ) -> Posterior:
     """The mixture of the solutions that were `found` with their weights, each wider by `elsewhere`."""
     groups = [(share, one.step, one.covariance + elsewhere(one, sizes)) for share, sizes, one in found]
@@ -87,11 +87,13 @@ def _averaged(
     covariance = np.einsum("k,kij->ij", weight, each) + np.einsum("k,ki,kj->ij", weight, off, off)
     n = UNKNOWNS
     covariance *= _widening(weight, off[:, :n], each[:, :n, :n], covariance[:n, :n])
-    at_mode = elsewhere(solve(equations, mode), mode)
+    at_mode = elsewhere(solve_equations(equations, mode), mode)
     return Posterior(step, covariance, _budget(equations, mode, at_mode, covariance), mode)
 
 
-def _elsewhere(equations: Equations, solution: Solution, log_sizes: LogSizes, region: Region | None) -> Stack:
+def _elsewhere(
+    equations: Equations, solution: LinearSolution, log_sizes: LogSizes, region: Region | None
+) -> Stack:
     """Covariance of what the systematic part leaves open because the answer is asked for the region, not its poses."""
     if region is None or equations.systematic is None:
         return np.zeros_like(solution.information_root)
@@ -114,7 +116,7 @@ def _expected_elsewhere(equations: Equations, log_sizes: LogSizes, region: Regio
 
 
 def _whitened_and_fitted(
-    solution: Solution, matrix: Float[ndarray, "*#k s r"]
+    solution: LinearSolution, matrix: Float[ndarray, "*#k s r"]
 ) -> tuple[Float[ndarray, "*k s r"], Float[ndarray, "*k p r"]]:
     """A and B with AᵀA − BᵀB = MᵀPM, P the projection of the solution."""
     fitted = lower(solution.information_root, np.swapaxes(solution.weighed, -1, -2) @ matrix)
@@ -170,19 +172,19 @@ def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covari
         prior_information=equations.prior_information[:UNKNOWNS, :UNKNOWNS],
         prior_gradient=equations.prior_gradient[:UNKNOWNS],
     )
-    solution = solve(exact, log_sizes)
+    solution = solve_equations(exact, log_sizes)
     gain = solution.gain
     random = (gain * exact.random(log_sizes)) @ gain.T
     systematic = elsewhere[:UNKNOWNS, :UNKNOWNS]
     if exact.systematic is not None:
         systematic = systematic + exact.variances(log_sizes)[2] * gain @ exact.systematic @ gain.T
-    if exact.bent is not None:
-        systematic = systematic + gain @ exact.bent @ gain.T
+    if exact.confirmed is not None:
+        systematic = systematic + gain @ exact.confirmed @ gain.T
     # What neither robot nor cameras show.
     images = solution.covariance @ exact.prior_information @ solution.covariance
     if exact.known is not None:
         images = images + gain @ exact.known @ gain.T
-    intrinsics = solve(equations, log_sizes).covariance[:UNKNOWNS, :UNKNOWNS] - solution.covariance
+    intrinsics = solve_equations(equations, log_sizes).covariance[:UNKNOWNS, :UNKNOWNS] - solution.covariance
     parts = [part[:7, :7] for part in (random, systematic, intrinsics, images)]
     to_whole = _between(sum(parts[1:], parts[0]), covariance[:7, :7])
     random, systematic, intrinsics, _ = (to_whole @ part @ to_whole.T for part in parts)

@@ -1,0 +1,310 @@
+"""Equations of images: bundle adjustment, and the evidence about rigs and cameras that images give by themselves.
+
+Reprojection errors under a Cauchy loss, over intrinsics, nuisances of images, mounts, rigs and points. The points are
+eliminated (elimination.py); the rest is a small dense system. The evidence excludes the reported poses, even where these
+keep the rigs in place while the images are adjusted, so that nothing is counted twice.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.estimation.cholesky import cholesky, inverse_of, over
+from jcr.estimation.elimination import Normal, with_fixed_points, without_points
+from jcr.estimation.model_error import size_of
+from jcr.estimation.pixel_noise import common_share, left_of_points, pixel_noise, variance_ratios
+from jcr.estimation.problem import Problem, State, image_step, similarities, similarities_of_rigs
+from jcr.estimation.projection import (
+    View,
+    by_points,
+    derivatives,
+    shape_information,
+    shape_residuals,
+    view_of,
+)
+from jcr.geometry import apply, inverse, scale_translation, step_between
+from jcr.least_squares import START_DAMPING, damped_gauss_newton, one_blas_thread
+
+ROUNDS = 12
+"""Largest number of adjustments of images alone, between which the sizes of errors are estimated."""
+SIZES_SETTLED = 0.01
+"""Relative change of the sizes of errors, of pixels and of robots, that ends the rounds."""
+ENOUGH = 1e-5
+"""Change of the cost, in squared standard deviations, that ends an adjustment."""
+STEPS = 60
+LARGEST_DAMPING = 1e8
+FAINT = 1e-6
+"""Information added to every column (1/m², 1/rad²): an image without observations is anywhere within a kilometre."""
+
+
+class RigInformation(NamedTuple):
+    """Twice a cost that is quadratic in the steps of the first rigs from a reference: sᵀ H s + 2 gᵀ s."""
+
+    world_from_rig: Float[ndarray, "m 4 4"]
+    information: Float[ndarray, "r r"]
+    gradient: Float[ndarray, " r"]
+
+    def steps(self, state: State) -> Float[ndarray, " r"]:
+        """Return the steps of the rigs of a state from the reference."""
+        return step_between(self.world_from_rig, state.world_from_rig[: len(self.world_from_rig)]).ravel()
+
+
+class RigsGivenCameras(NamedTuple):
+    """Normal distribution of the rigs that arms move, given the free columns."""
+
+    follow: Float[ndarray, "s e"]
+    """Step of the rigs with each free column, the sign reversed."""
+    step: Float[ndarray, " s"]
+    """Step to the mean, the sign reversed."""
+    covariance: Float[ndarray, "s s"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ImageEvidence:
+    """Normal distribution of the columns of the images about a state, without the reported poses."""
+
+    problem: Problem
+    state: State
+    view: View
+    information: Float[ndarray, "d d"]
+    """With the priors of intrinsics and nuisances; the similarity of the world has a negligible one."""
+    gradient: Float[ndarray, " d"]
+    """Gradient of half the squared distance."""
+
+    @cached_property
+    def weight(self) -> Float[ndarray, " k"]:
+        """Weight of each observation, 1/px²."""
+        return weights_of(self.problem, self.state, self.view)
+
+    @cached_property
+    def rigs(self) -> RigsGivenCameras:
+        """Distribution of the rigs that arms move, given the free columns."""
+        by_arm, free = self.problem.by_arm, self.problem.free
+        root = cholesky(self.information[np.ix_(by_arm, by_arm)])
+        coupling = self.information[np.ix_(by_arm, free)]
+        solved = over(root, np.column_stack([coupling, self.gradient[by_arm]]))
+        return RigsGivenCameras(solved[:, :-1], solved[:, -1], inverse_of(root))
+
+    def rig_covariance(self) -> Float[ndarray, "r r"]:
+        """Return the covariance of the steps of the rigs, r = 6m, in the frame of the first and at one size of the
+        world; the steps of the first rig are 0."""
+        first, rigs = self.problem.columns.first_rig, self.state.world_from_rig
+        unseen, others = similarities(self.problem, self.state), slice(first + 6, None)
+        gauge = np.zeros((7, len(unseen)))
+        gauge[:6, first : first + 6] = np.eye(6)
+        gauge[6, first:].reshape(-1, 6)[:, :3] = rigs[:, :3, 3] - rigs[0, :3, 3]
+        to_gauge = (np.eye(len(unseen)) - unseen @ np.linalg.solve(gauge @ unseen, gauge))[others]
+        covariance = np.zeros((6 * len(rigs), 6 * len(rigs)))
+        covariance[6:, 6:] = to_gauge @ np.linalg.solve(self.information, to_gauge.T)
+        return (covariance + covariance.T) / 2
+
+
+@one_blas_thread
+def adjust_images(problem: Problem, state: State) -> ImageEvidence:
+    """Adjust images alone from an initial state; the first rig stays fixed, and the depths keep their median."""
+    start, view = state.world_from_rig, view_of(problem, state)
+    state = with_pixel_noise(problem, state, view)
+    depth, damping = view.depth, START_DAMPING
+    unseen = information_along(similarities_of_rigs(start), 1.0)
+    world = RigInformation(start, unseen, np.zeros(len(unseen)))
+    for _ in range(ROUNDS):
+        before = state.pixel_noise
+        state, view, damping = adjusted_images(problem, state, [world], damping)
+        state = with_pixel_noise(problem, state, view)
+        images, change = with_model_error_of(evidence(problem, state))
+        state = images.state
+        assert before is not None and state.pixel_noise is not None
+        if max(state.pixel_noise.change(before), change) < SIZES_SETTLED:
+            break
+    unit = float(np.median(np.abs(depth / view.depth)))
+    back = inverse(scale_translation(state.world_from_rig[0], unit))
+    steps = state.camera_steps.copy()
+    steps[problem.columns.boards][:1] += np.log(unit)
+    state = replace(
+        state,
+        camera_steps=steps,
+        world_from_rig=start[0] @ back @ scale_translation(state.world_from_rig, unit),
+        rig_from_camera=scale_translation(state.rig_from_camera, unit),
+        points_in_world=apply(start[0] @ back, unit * state.points_in_world),
+    )
+    return evidence(problem, state)
+
+
+def with_pixel_noise(problem: Problem, state: State, view: View) -> State:
+    """Return the state with the pixel errors that its residuals show.
+
+    Groups of observations, and observations by their stated variances, are distinguished where an estimate was made
+    before.
+    """
+    layout, residual_px, depth, before = problem.layout, view.residual_px, view.depth, state.pixel_noise
+    if before is None or (layout.groups == 1 and not layout.states_variances):
+        noise = pixel_noise(layout, residual_px, depth, np.ones(layout.groups))
+    else:
+        by, known = by_points(problem, state, view), shape_information(problem, state)
+        left = left_of_points(layout, before, residual_px, depth, by, problem.seen.starts, known)
+        ratio = variance_ratios(layout, before, residual_px, depth, left)
+        noise = pixel_noise(layout, residual_px, depth, ratio, common_share(layout, residual_px, left, ratio))
+    return replace(state, pixel_noise=noise)
+
+
+def weights_of(problem: Problem, state: State, view: View) -> Float[ndarray, " k"]:
+    """Return the weight of each observation, 1/px²."""
+    assert state.pixel_noise is not None
+    return state.pixel_noise.weights(view.residual_px, view.depth, problem.layout)
+
+
+def adjusted_images(
+    problem: Problem, state: State, known: Sequence[RigInformation], damping: float = START_DAMPING
+) -> tuple[State, View, float]:
+    """Adjust the columns of the images with the weights that observations have at the start; return also the damping.
+
+    `known` is information about the rigs beside that of the images and `known_rigs`.
+    """
+    view = view_of(problem, state)
+    weight, known = weights_of(problem, state, view), [*_known_rigs(problem), *known]
+
+    def step(now: tuple[State, View], _: None, damping: float) -> tuple[State, View]:
+        tried = _after_step(problem, now[0], _normal_equations(problem, *now, weight, known, damping))
+        return tried, view_of(problem, tried)
+
+    found, _, damping, _ = damped_gauss_newton(
+        lambda _: None,
+        step,
+        lambda now: _cost(problem, *now, weight, known),
+        (state, view),
+        enough=lambda _: ENOUGH,
+        damping=damping,
+        iterations=STEPS,
+    )
+    return *found, START_DAMPING if damping > LARGEST_DAMPING else damping
+
+
+def evidence(problem: Problem, state: State) -> ImageEvidence:
+    """Return the evidence of the images and of the priors of their cameras about a state."""
+    return linearised(problem, state, view_of(problem, state))[0]
+
+
+def linearised(problem: Problem, state: State, view: View) -> tuple[ImageEvidence, Normal]:
+    """Return the evidence about a state, and the normal equations, which step the points."""
+    weight = weights_of(problem, state, view)
+    normal = _normal_equations(problem, state, view, weight, _known_rigs(problem), 0.0)
+    information = normal.hessian
+    information[np.diag_indices(len(information))] += FAINT
+    if problem.known_rigs is None:
+        # The unit of the world is that of the positions of its rigs. Boards are left out: λ would depend on their size.
+        boards, first = problem.boards, problem.columns.first_rig
+        rigs = slice(first, len(information) if boards is None else first + 6 * boards.first_rig)
+        by_similarity = similarities(problem, state)
+        by_similarity[problem.columns.boards] = by_similarity[rigs.stop :] = 0.0
+        information += information_along(by_similarity, float(information.diagonal()[rigs].mean()))
+    found = ImageEvidence(
+        problem=problem, state=state, view=view, information=information, gradient=-normal.right
+    )
+    return found, normal
+
+
+def with_model_error_of(images: ImageEvidence) -> tuple[ImageEvidence, float]:
+    """Return the evidence with the estimated size of the remaining distortion, and the relative change of that size."""
+    state, columns = images.state, [c for c in images.problem.columns.model_error if c.stop > c.start]
+    if not columns:
+        return images, 0.0
+    covariance, change = np.linalg.inv(images.information), 0.0
+    information, gradient = images.information.copy(), images.gradient.copy()
+    sizes = state.model_error_std.copy()
+    cameras = [k for k, c in enumerate(images.problem.columns.model_error) if c.stop > c.start]
+    for k, own in zip(cameras, columns, strict=True):
+        steps, std = state.camera_steps[own], float(sizes[k])
+        likeliest = steps - covariance[own] @ images.gradient
+        sizes[k] = size_of(likeliest, covariance[own, own], std)
+        added = sizes[k] ** -2.0 - std**-2.0
+        information[own, own] += added * np.eye(len(steps))
+        gradient[own] += added * steps
+        change = max(change, abs(float(np.log(sizes[k] / std))))
+    state = replace(state, model_error_std=sizes)
+    return replace(images, state=state, information=information, gradient=gradient), change
+
+
+def median_reprojection_px(problem: Problem, view: View) -> Float[ndarray, " n"]:
+    """Return the median reprojection error of every image; NaN of an image without observations."""
+    assert problem.observations is not None
+    length, image = np.linalg.norm(view.residual_px, axis=1), problem.observations.image
+    out = np.full(problem.n_images, np.nan)
+    for k in np.unique(image):
+        out[k] = np.median(length[image == k])
+    return out
+
+
+def cost_of_images(images: ImageEvidence, state: State) -> float:
+    """Return the cost of another state, with the weights and priors of the evidence."""
+    view, sizes = view_of(images.problem, state), images.state.model_error_std
+    state = replace(state, model_error_std=sizes)
+    return _cost(images.problem, state, view, images.weight, _known_rigs(images.problem))
+
+
+def information_along(steps: Float[ndarray, "d 7"], strength: float) -> Float[ndarray, "d d"]:
+    """Return information of this strength along the steps of a similarity, which nothing else determines."""
+    unseen = np.linalg.qr(steps)[0]
+    return strength * unseen @ unseen.T
+
+
+def _cost(
+    problem: Problem,
+    state: State,
+    view: View,
+    weight: Float[ndarray, " k"],
+    known: Sequence[RigInformation],
+) -> float:
+    """Return the cost in squared standard deviations, with these weights of the observations."""
+    total = float(weight @ (view.residual_px**2).sum(1))
+    total += float(((state.camera_steps / problem.prior_std(state)) ** 2).sum())
+    total += float((shape_residuals(problem, state) ** 2).sum())
+    for one in known:
+        steps = one.steps(state)
+        total += float(steps @ one.information @ steps + 2 * one.gradient @ steps)
+    return total
+
+
+def _known_rigs(problem: Problem) -> list[RigInformation]:
+    """Return the information of the problem about its rigs."""
+    if problem.known_rigs is None:
+        return []
+    poses, covariance = problem.known_rigs
+    assert covariance is not None
+    return [RigInformation(poses, np.linalg.inv(covariance), np.zeros(len(covariance)))]
+
+
+def _normal_equations(
+    problem: Problem,
+    state: State,
+    view: View,
+    weight: Float[ndarray, " k"],
+    known: Sequence[RigInformation],
+    damping: float,
+) -> Normal:
+    """Return the normal equations of all columns, the points eliminated."""
+    first, std, seen = problem.columns.first_rig, problem.prior_std(state), problem.rows[3]
+    weighted = derivatives(problem, state, view, weight)
+    hessian, right = with_fixed_points(weighted, seen)
+    hessian[range(len(std)), range(len(std))] += std**-2.0
+    right[: len(std)] -= state.camera_steps / std**2
+    for one in known:
+        of_rigs = slice(first, first + len(one.gradient))
+        hessian[of_rigs, of_rigs] += one.information
+        right[of_rigs] -= one.information @ one.steps(state) + one.gradient
+    hessian[np.diag_indices(len(right))] *= 1 + damping
+    return without_points(hessian, right, weighted, seen, damping)
+
+
+def _after_step(problem: Problem, state: State, normal: Normal) -> State:
+    """Return the state after one Gauss-Newton step; along the similarity of the world, the smallest one."""
+    scale = 1 / np.sqrt(np.maximum(normal.hessian.diagonal(), FAINT))
+    scaled = scale[:, None] * normal.hessian * scale
+    scaled[np.diag_indices(len(scale))] += 1e-12
+    step = scale * over(cholesky(scaled), (scale * normal.right)[:, None])[:, 0]
+    points = normal.stepped(state.points_in_world, step)
+    return replace(image_step(problem, state, step), points_in_world=points)

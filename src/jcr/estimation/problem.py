@@ -1,0 +1,400 @@
+"""The estimation problem, its state, and the layout of the columns of its equations.
+
+A rig is a rigid body that carries cameras or corners: the wrist of an arm at one image, a fixed camera, or a board.
+`world` has any origin and unit; the images determine the rigs up to one similarity of it. The rigs that an arm moves
+obey `base_from_gripper[i] · X = Z · S_λ(world_from_rig[i])`. Where the camera is fixed and the arm carries the scene,
+X is base_from_camera, Z is gripper_from_world, and the equation is that of gripper_from_base.
+"""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+from jcr.camera import parameters, unproject, with_parameters
+from jcr.estimation.boards import BoardShapes
+from jcr.estimation.elimination import Sightings
+from jcr.estimation.equation import SCALE, UNKNOWNS, columns_of_arm
+from jcr.estimation.intrinsics_prior import Camera
+from jcr.estimation.model_error import TYPICAL, displacements, polynomials_of
+from jcr.estimation.observations import Observations, sorted_by_point
+from jcr.estimation.pixel_noise import Layout, PixelNoise
+from jcr.geometry import Poses, retract, skew, step_between
+from jcr.records import Intrinsics
+
+OF_IMAGE, PRISM = 4, 4
+"""Number of nuisance parameters of each image, and of those that all images share.
+
+Of an image: the logarithm of its focal length over its camera's; a shear, by which x moves from the top of the image
+to its bottom in focal lengths (rolling shutter); an offset in x and one in y, in widths of the image. All images
+share the coefficients s1 to s4 of OpenCV's thin prism distortion."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Arm:
+    """Reported poses of one arm, and the rigs that it moves."""
+
+    rigs: Int[ndarray, " n"]
+    base_from_gripper: Poses
+    error_covariance: Float[ndarray, "s s"]
+    """Covariance (6n,6n) of the systematic errors of the poses where their size is 1 rad."""
+    carries: Literal["camera", "scene"] = "camera"
+    confirmed_errors: Float[ndarray, "s b"] | None = None
+    """Columns of errors that were confirmed, one standard deviation each; None: none."""
+
+
+class LinearPrior(NamedTuple):
+    """A measurement `row · coordinates = value ± std`, the coordinates being those of `Problem.coordinates`."""
+
+    row: Float[ndarray, " p"]
+    value: float
+    std: float
+
+
+def scale_prior(metres_per_unit: float, std: float) -> LinearPrior:
+    """Return the prior of one arm's problem whose scale is known with a relative standard deviation."""
+    return LinearPrior(np.eye(UNKNOWNS)[6], float(np.log(metres_per_unit)), std)
+
+
+def offset_prior(axis: Float[ndarray, "3"], metres: float, std: float) -> LinearPrior:
+    """Return the prior of one arm's problem whose camera is known to be so far along an axis of the gripper frame."""
+    return LinearPrior(np.r_[axis, np.zeros(UNKNOWNS - 3)], metres, std)
+
+
+class RigGaussian(NamedTuple):
+    """Poses of the first rigs, and the covariance of their steps; None: exact."""
+
+    world_from_rig: Float[ndarray, "m 4 4"]
+    covariance: Float[ndarray, "r r"] | None = None
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Columns of the equations of images; six columns for each rig follow from `first_rig` on."""
+
+    intrinsics: tuple[slice, ...]
+    nuisance: slice
+    model_error: tuple[slice, ...]
+    boards: slice
+    mounts: tuple[slice | None, ...]
+    first_rig: int
+    count: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class State:
+    """Estimates of all unknowns of a problem, and of the sizes of its errors."""
+
+    x: Float[ndarray, "a 4 4"]
+    """gripper_from_rig of each arm, or base_from_camera where the arm carries the scene."""
+    scale: float
+    """Metres per unit of the world."""
+    z: Float[ndarray, "a 4 4"]
+    """base_from_world of each arm, or gripper_from_world; the world in metres."""
+    world_from_rig: Float[ndarray, "m 4 4"]
+    rig_from_camera: Float[ndarray, "c 4 4"] = field(default_factory=lambda: np.eye(4)[None])
+    camera_steps: Float[ndarray, " l"] = field(default_factory=lambda: np.zeros(0))
+    """Steps of the columns before the mounts, from the initial values of the cameras."""
+    points_in_world: Float[ndarray, "p 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    model_error_std: Float[ndarray, " c"] = field(default_factory=lambda: np.zeros(0))
+    """Size of the remaining distortion of each camera's model, in widths of its image."""
+    pixel_noise: PixelNoise | None = None
+    """None before the first estimate."""
+    robot_log_sizes: Float[ndarray, " s"] | None = None
+    """Logarithms of the sizes of the robot's errors; None before the first estimate."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Problem:
+    """Measurements and priors: reported poses, and observations in images or Gaussian distributions of rigs."""
+
+    arms: tuple[Arm, ...]
+    n_rigs: int
+    cameras: tuple[Camera, ...] = ()
+    observations: Observations | None = None
+    """Sorted by point and rig, every point with at least two; None: the poses of the rigs are in `known_rigs`."""
+    boards: BoardShapes | None = None
+    nuisance_directions: Float[ndarray, "r e"] = field(default_factory=lambda: np.zeros((PRISM, 0)))
+    """Directions in which images differ from their cameras; r = 4 n_images + 4, parameter by parameter."""
+    nuisance_std: Float[ndarray, " e"] = field(default_factory=lambda: np.zeros(0))
+    known_rigs: RigGaussian | None = None
+    priors: tuple[LinearPrior, ...] = ()
+    robot_noise_floor: tuple[float, float] | None = None
+    """Lower bound on the random errors of the reported poses (m, rad); None: unknown."""
+    used: Bool[ndarray, " n"] | None = None
+    """Reported poses that the estimate rests on; None: all. Of a problem without observations only."""
+
+    @cached_property
+    def columns(self) -> Columns:
+        """Columns of the equations of images."""
+        begin = 0
+
+        def following(count: int) -> slice:
+            nonlocal begin
+            begin += count
+            return slice(begin - count, begin)
+
+        intrinsics = tuple(following(len(camera.std)) for camera in self.cameras)
+        nuisance = following(len(self.nuisance_std))
+        model_error = tuple(following(count) for count in self.model_error_counts)
+        boards = following(0 if self.boards is None else len(self.boards.shape_std))
+        mounts = tuple(following(6) if camera.mount_free else None for camera in self.cameras)
+        return Columns(intrinsics, nuisance, model_error, boards, mounts, begin, begin + 6 * self.n_rigs)
+
+    @cached_property
+    def model_error_counts(self) -> list[int]:
+        """Number of displacements of each camera: none of a camera with too few observations."""
+        counts = [polynomials_of(camera) for camera in self.cameras]
+        seen = np.bincount(self.layout.camera, minlength=len(counts)) if self.observations else counts
+        return [count if n > count else 0 for n, count in zip(seen, counts, strict=True)]
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Groups and cells of the observations, for the estimate of their errors."""
+        assert self.observations is not None
+        widths = np.array([camera.intrinsics.width for camera in self.cameras])
+        return Layout.of(self.observations, widths, self.boards)
+
+    @cached_property
+    def seen(self) -> Sightings:
+        """Observations of each point by rig."""
+        assert self.observations is not None
+        rig = self.observations.rig[self.observations.image]
+        return Sightings.of(self.observations.point, rig, self.n_rigs)
+
+    @cached_property
+    def rows(self) -> tuple[Int[ndarray, " r"], Int[ndarray, " r"], Int[ndarray, " r"], Sightings]:
+        """Order of the rows of the equations, which are sorted by point, and their points, rigs and sightings.
+
+        The unsorted rows are the observations, then two rows for each corner of a board.
+        """
+        assert self.observations is not None
+        point, rig = self.observations.point, self.observations.rig[self.observations.image]
+        if self.boards is None:
+            return np.arange(len(point)), point, rig, self.seen
+        both = np.stack([point, rig])
+        both = np.concatenate([both, np.repeat([self.boards.point, self.boards.rig], 2, axis=1)], axis=1)
+        order = np.lexsort(both[::-1])
+        point, rig = both[:, order]
+        return order, point, rig, Sightings.of(point, rig, self.n_rigs)
+
+    @cached_property
+    def displacements(self) -> Float[ndarray, "k 2 e"]:
+        """Displacement of each observation by the remaining distortion of its camera's model, px."""
+        assert self.observations is not None
+        return displacements(
+            self.cameras, self.model_error_counts, self.observations.x_px, self.layout.camera
+        )
+
+    @cached_property
+    def camera_rows(self) -> list[Int[ndarray, "..."]]:
+        """Observations of each camera."""
+        return [np.flatnonzero(self.layout.camera == c) for c in range(len(self.cameras))]
+
+    @cached_property
+    def prism(self) -> Float[ndarray, "k 2 4"]:
+        """Displacement of each observation by the coefficients of a thin prism, px."""
+        assert self.observations is not None
+        out = np.zeros((len(self.observations.image), 2, PRISM))
+        for camera, rows in zip(self.cameras, self.camera_rows, strict=True):
+            intrinsics = camera.intrinsics
+            r2 = (unproject(intrinsics, self.observations.x_px[rows])[:, :2] ** 2).sum(1)
+            for axis, focal in enumerate((intrinsics.fx, intrinsics.fy)):
+                out[rows, axis, 2 * axis] = focal * r2
+                out[rows, axis, 2 * axis + 1] = focal * r2**2
+        return out
+
+    @property
+    def n_images(self) -> int:
+        """Number of images."""
+        return 0 if self.observations is None else len(self.observations.rig)
+
+    @property
+    def arm_unknowns(self) -> int:
+        """Number of unknowns of the arms: X and Z of each, and one scale."""
+        return 12 * len(self.arms) + 1
+
+    @cached_property
+    def by_arm(self) -> Int[ndarray, " s"]:
+        """Columns of the rigs that arms move, in the order of the reported poses."""
+        moving = np.concatenate([arm.rigs for arm in self.arms])
+        return (self.columns.first_rig + 6 * moving[:, None] + np.arange(6)).ravel()
+
+    @cached_property
+    def free(self) -> Int[ndarray, " e"]:
+        """Columns that are unknowns beside those of the arms: cameras, mounts, and rigs that no arm moves."""
+        return np.setdiff1d(np.arange(self.columns.count), self.by_arm)
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns of the mixed model."""
+        return self.arm_unknowns + len(self.free)
+
+    def unknown_of(self, column: int) -> int:
+        """Return the unknown of the mixed model that a free column of the images is."""
+        return self.arm_unknowns + int(np.searchsorted(self.free, column))
+
+    def prior_std(self, state: State) -> Float[ndarray, " l"]:
+        """Return the prior standard deviations of the columns before the mounts."""
+        each = [np.full(c.stop - c.start, size)
+                for c, size in zip(self.columns.model_error, state.model_error_std, strict=True)]  # fmt: skip
+        boards = np.zeros(0) if self.boards is None else self.boards.shape_std
+        return np.concatenate([*(camera.std for camera in self.cameras), self.nuisance_std, *each, boards])
+
+    def intrinsics(self, state: State) -> tuple[Intrinsics, ...]:
+        """Return the estimated intrinsics of each camera."""
+        return tuple(
+            with_parameters(
+                camera.intrinsics,
+                parameters(camera.intrinsics) + camera.directions @ state.camera_steps[columns],
+            )
+            for camera, columns in zip(self.cameras, self.columns.intrinsics, strict=True)
+        )
+
+    def nuisances(self, state: State) -> Float[ndarray, " r"]:
+        """Return the nuisance parameters, in the order of the rows of `nuisance_directions`."""
+        return self.nuisance_directions @ state.camera_steps[self.columns.nuisance]
+
+    def coordinates(self, state: State) -> Float[ndarray, " p"]:
+        """Return the unknowns that linear priors measure: translation of X and log scale, m; steps of the cameras."""
+        out = np.zeros(self.unknowns)
+        out[:3], out[SCALE] = state.x[0][:3, 3], np.log(state.scale)
+        steps = self.free[self.free < self.columns.boards.stop]
+        out[self.arm_unknowns : self.arm_unknowns + len(steps)] = state.camera_steps[steps]
+        return out
+
+
+def with_observations(problem: Problem, state: State, observations: Observations) -> tuple[Problem, State]:
+    """Return the problem with the observations of all points that two or more show, and its initial state.
+
+    The cameras start at the middle of their priors.
+    """
+    observations = sorted_by_point(observations, len(state.points_in_world))
+    kept = observations.point_rows
+    assert kept is not None
+    boards = None if problem.boards is None else problem.boards.of_points(kept)
+    if not len(problem.nuisance_std):
+        rows = OF_IMAGE * len(observations.rig) + PRISM
+        problem = replace(problem, nuisance_directions=np.zeros((rows, 0)))
+    problem = replace(problem, observations=observations, boards=boards)
+    state = replace(
+        state,
+        points_in_world=state.points_in_world[kept],
+        camera_steps=np.zeros(problem.columns.boards.stop),
+        model_error_std=np.full(len(problem.cameras), TYPICAL),
+    )
+    return problem, state
+
+
+OF_OBSERVATIONS = ("model_error_counts", "layout", "seen", "rows", "displacements", "camera_rows", "prism")
+"""Cached properties of a problem that depend on its observations."""
+
+
+def with_free(problem: Problem, **changes: object) -> Problem:
+    """Return the problem with other free directions of the cameras (`cameras`, `nuisance_directions`, `nuisance_std`).
+
+    What depends on the observations is kept, and with it the displacements of the remaining distortion, although the
+    cameras may express other ones.
+    """
+    other = replace(problem, **changes)  # type: ignore[arg-type]
+    other.__dict__.update({name: getattr(problem, name) for name in OF_OBSERVATIONS})
+    return other
+
+
+def transferred(problem: Problem, state: State, other: Problem) -> State:
+    """Return the state in a problem of the same rigs whose cameras have other free directions, or that has fewer points.
+
+    The cameras stay as they are, as far as the directions of the other problem can express that.
+    """
+    along = np.zeros(other.columns.boards.stop)
+    before, after = problem.columns, other.columns
+    for now, camera, columns in zip(problem.intrinsics(state), other.cameras, after.intrinsics, strict=True):
+        off = parameters(now) - parameters(camera.intrinsics)
+        along[columns] = _along(camera.directions, camera.std, off)
+    along[after.nuisance] = _along(other.nuisance_directions, other.nuisance_std, problem.nuisances(state))
+    for old, new in zip(before.model_error, after.model_error, strict=True):
+        if old.stop - old.start == new.stop - new.start:
+            along[new] = state.camera_steps[old]
+    along[after.boards] = state.camera_steps[before.boards]
+    old, new = problem.observations, other.observations
+    assert old is not None and new is not None and old.point_rows is not None and new.point_rows is not None
+    points = state.points_in_world[np.searchsorted(old.point_rows, new.point_rows)]
+    return replace(state, camera_steps=along, points_in_world=points)
+
+
+def _along(
+    directions: Float[ndarray, "q c"], std: Float[ndarray, " c"], off: Float[ndarray, " q"]
+) -> Float[ndarray, " c"]:
+    """Return the most likely steps along directions that come nearest to a displacement."""
+    return std * (np.linalg.pinv(directions * std) @ off)
+
+
+def image_step(problem: Problem, state: State, step: Float[ndarray, " d"]) -> State:
+    """Return the state after a step of the columns of the images; arms and points stay."""
+    columns = problem.columns
+    mounts = state.rig_from_camera.copy()
+    for c, own in enumerate(columns.mounts):
+        if own is not None:
+            mounts[c] = retract(mounts[c], step[own])
+    return replace(
+        state,
+        world_from_rig=retract(state.world_from_rig, step[columns.first_rig :].reshape(-1, 6)),
+        rig_from_camera=mounts,
+        camera_steps=state.camera_steps + step[: columns.boards.stop],
+    )
+
+
+def full_step(problem: Problem, state: State, step: Float[ndarray, " p"]) -> State:
+    """Return the state after a step of the unknowns of the mixed model: X, log scale, Z of the first arm, X and Z of the
+    others, then the free columns."""
+    own = np.stack([step[columns_of_arm(arm)] for arm in range(len(state.x))])
+    of_images = np.zeros(problem.columns.count)
+    of_images[problem.free] = step[problem.arm_unknowns :]
+    moved = image_step(problem, state, of_images) if of_images.any() else state
+    return replace(
+        moved,
+        x=retract(state.x, own[:, :6]),
+        scale=float(state.scale * np.exp(step[6])),
+        z=retract(state.z, own[:, 6:]),
+    )
+
+
+def step_to(
+    problem: Problem, state: State, other: State
+) -> tuple[Float[ndarray, " u"], Float[ndarray, " d"]]:
+    """Return the steps of the arms' unknowns and of the columns of the images that lead to another state."""
+    own = np.concatenate([step_between(state.x, other.x), step_between(state.z, other.z)], axis=1)
+    arms = np.zeros(problem.arm_unknowns)
+    arms[SCALE] = np.log(other.scale / state.scale)
+    for arm, step in enumerate(own):
+        arms[columns_of_arm(arm)] = step
+    columns = np.zeros(problem.columns.count)
+    columns[: problem.columns.boards.stop] = other.camera_steps - state.camera_steps
+    for c, of_mount in enumerate(problem.columns.mounts):
+        if of_mount is not None:
+            columns[of_mount] = step_between(state.rig_from_camera[c], other.rig_from_camera[c])
+    columns[problem.columns.first_rig :] = step_between(state.world_from_rig, other.world_from_rig).ravel()
+    return arms, columns
+
+
+def similarities(problem: Problem, state: State) -> Float[ndarray, "d 7"]:
+    """Return the steps of all columns with a similarity of the world, which no image shows; the scale first."""
+    out = np.zeros((problem.columns.count, 7))
+    out[problem.columns.first_rig :] = similarities_of_rigs(state.world_from_rig)
+    out[problem.columns.boards, 0][:1] = 1.0  # the logarithm of their size
+    for c, columns in enumerate(problem.columns.mounts):
+        if columns is not None:
+            out[columns.start : columns.start + 3, 0] = state.rig_from_camera[c, :3, 3]
+    return out
+
+
+def similarities_of_rigs(world_from_rig: Float[ndarray, "m 4 4"]) -> Float[ndarray, "r 7"]:
+    """Return the steps of rigs with a similarity of the world; r = 6m."""
+    position = world_from_rig[:, :3, 3]
+    rigs = np.zeros((len(position), 6, 7))
+    rigs[:, :3, 0], rigs[:, :3, 1:4] = position, np.eye(3)
+    rigs[:, :3, 4:], rigs[:, 3:, 4:] = -skew(position), np.eye(3)
+    return rigs.reshape(-1, 7)

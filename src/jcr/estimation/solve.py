@@ -1,0 +1,428 @@
+"""The solution of an estimation problem: sizes of all errors and a Gauss-Newton step of all unknowns, in turn.
+
+Without observations the unknowns are those of the arms. With observations, arms, cameras, rigs and points step together,
+and Anderson's acceleration (acceleration.py) shortens the way to the fixed point. The result is averaged over the sizes
+of the robot's errors (covariance.py).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.estimation.acceleration import Acceleration
+from jcr.estimation.cholesky import cholesky, inverse_of, lower, over
+from jcr.estimation.components import SETTLED, Information, log_evidence, most_likely
+from jcr.estimation.covariance import expected_posterior, posterior
+from jcr.estimation.elimination import Normal
+from jcr.estimation.equation import SCALE, pose_by_pose, share_within_limits, weak_prior
+from jcr.estimation.image_equations import (
+    SIZES_SETTLED,
+    ImageEvidence,
+    RigInformation,
+    adjusted_images,
+    cost_of_images,
+    evidence,
+    information_along,
+    linearised,
+    with_model_error_of,
+    with_pixel_noise,
+)
+from jcr.estimation.mixed_model import Equations, LogSizes, left_out, solve_equations
+from jcr.estimation.model_error import expressed, polynomials_of
+from jcr.estimation.pose_equations import PoseEquations, pose_equations, reported_poses
+from jcr.estimation.problem import (
+    LinearPrior,
+    Problem,
+    State,
+    full_step,
+    image_step,
+    similarities_of_rigs,
+    step_to,
+    with_free,
+)
+from jcr.estimation.projection import view_of
+from jcr.geometry import Transform, step_between
+from jcr.least_squares import one_blas_thread
+from jcr.records import Budget, ModelError, RobotNoise
+
+START_NOISE = (1e-3, float(np.radians(0.2)))
+"""Random errors of gripper poses before the first estimate (m, rad)."""
+ROUNDS, STEPS = 25, 50
+"""Largest number of rounds with observations, and of steps of the arms alone."""
+STEP_SETTLED = 0.01
+"""Step of an arm's unknown, in standard deviations, that ends the rounds."""
+ROUNDING = 1e-9
+"""Relative increase of a cost that is rounding."""
+ARMS_SETTLED, NEARLY_SETTLED = 1e-14, 1e-6
+"""Steps of the arms alone, in squared standard deviations, that end them: of a result, and of one to compare."""
+TINY_STEP = 1e-6
+"""Step for derivatives by differences (m, rad, or standard deviations)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Solution:
+    """Estimates of a problem, averaged over the sizes of the robot's errors, and their covariance."""
+
+    problem: Problem
+    state: State
+    covariance: Float[ndarray, "p p"]
+    """Covariance of steps as `full_step` takes them."""
+    budget: Budget | None
+    """Covariance of the first arm's X and scale by its causes; None where it was not averaged."""
+    most_likely: State
+    """Before the averaging: the state about which the equations are linear."""
+    poses: PoseEquations
+    size_information: Information
+    """Expected information of the log sizes of the robot's errors."""
+    evidence: ImageEvidence | None
+    settled: bool
+    iterations: int
+
+    @property
+    def equations(self) -> Equations:
+        """Mixed model of the reported poses, in the order of the covariance."""
+        return self.poses.equations
+
+    @property
+    def log_sizes(self) -> LogSizes:
+        """Most likely log sizes of the robot's errors."""
+        assert self.most_likely.robot_log_sizes is not None
+        return self.most_likely.robot_log_sizes
+
+    @property
+    def noise(self) -> RobotNoise:
+        """Errors of the reported poses, the same for all arms."""
+        return self.equations.noise(self.log_sizes)
+
+    @property
+    def images(self) -> ImageEvidence:
+        """Evidence of the images of a problem with observations."""
+        assert self.evidence is not None
+        return self.evidence
+
+    @property
+    def log_evidence(self) -> float:
+        """Log density of the used residuals, averaged over unknowns and sizes, times (2π)^(3m)."""
+        found = solve_equations(self.equations, self.log_sizes)
+        return log_evidence(self.equations, found, self.size_information)
+
+    def leave_one_out(self) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 6"]]:
+        """Return the residual of each reported pose from a solution without it (m, rad; base axes), and its covariance,
+        the pose's own errors included."""
+        poses, noise = self.poses, self.noise
+        solution, random = (
+            solve_equations(self.equations, self.log_sizes),
+            (noise.translation, noise.rotation),
+        )
+        found, covariance = np.empty_like(poses.residual), np.empty((len(poses.used), 6, 6))
+        found[poses.used], covariance[poses.used] = left_out(solution, random)
+        if poses.used.all():
+            return found, covariance
+        # Errors of an unused pose as the errors of the others show them (best linear unbiased prediction).
+        alike = noise.systematic**2 * poses.systematic + (0.0 if poses.shared is None else poses.shared)
+        rows, jacobian = np.repeat(poses.used, 6), poses.jacobian.reshape(len(poses.used), 6, -1)
+        for i in np.flatnonzero(~poses.used):
+            mine = slice(6 * i, 6 * i + 6)
+            gain = alike[mine, rows] @ solution.weight
+            by = jacobian[i] - gain @ self.equations.jacobian
+            found[i] = poses.residual[i] - gain @ self.equations.residual
+            own = alike[mine, mine] - gain @ alike[mine, rows].T + np.diag(np.repeat(np.square(random), 3))
+            covariance[i] = own + by @ solution.covariance @ by.T
+        return found, covariance
+
+    def intrinsics_covariance(self, camera: int) -> Float[ndarray, "q q"]:
+        """Return the covariance of the parameters of a camera, in the order of camera.parameters."""
+        own, directions = self.intrinsics_columns(camera), self.problem.cameras[camera].directions
+        return directions @ self.covariance[own, own] @ directions.T
+
+    def intrinsics_cross(self, camera: int) -> Float[ndarray, "7 q"]:
+        """Return the covariance of the first arm's X and scale with the parameters of a camera."""
+        return (
+            self.covariance[:7, self.intrinsics_columns(camera)] @ self.problem.cameras[camera].directions.T
+        )
+
+    def intrinsics_columns(self, camera: int) -> slice:
+        """Return the unknowns that are steps of the intrinsics of a camera."""
+        first, own = self.problem.arm_unknowns, self.problem.columns.intrinsics[camera]
+        return slice(first + own.start, first + own.stop)
+
+    def model_error(self) -> ModelError | None:
+        """Return the remaining distortion of the first camera's model; None where its intrinsics are exact."""
+        problem, own = self.problem, self.problem.columns.model_error[0]
+        if polynomials_of(problem.cameras[0]) == 0 or own.stop == own.start:
+            return None
+        assert problem.observations is not None
+        unknowns = slice(problem.arm_unknowns + own.start, problem.arm_unknowns + own.stop)
+        return ModelError(
+            likeliest=self.state.camera_steps[own],
+            covariance=self.covariance[unknowns, unknowns],
+            expressed=expressed(problem.cameras[0], problem.observations.x_px[problem.camera_rows[0]]),
+        )
+
+    def transform(self, of: Callable[[State], Transform]) -> tuple[Transform, Float[ndarray, "6 6"]]:
+        """Return a transform that is a function of the state, and the covariance of its step."""
+        j = self.derivative(of)
+        return of(self.state), j @ self.covariance @ j.T
+
+    def derivative(self, of: Callable[[State], Transform]) -> Float[ndarray, "6 p"]:
+        """Return the derivative of the step of a transform that is a function of the state."""
+        found, cameras = of(self.state), self.problem.arm_unknowns
+        size = TINY_STEP * np.ones(len(self.covariance))
+        std = np.sqrt(np.diag(self.covariance))
+        size[cameras:] = np.minimum(1e-2 * std[cameras:], 1e-2) + 1e-9
+        j = np.empty((6, len(size)))
+        for k, step in enumerate(np.diag(size)):
+            ahead, behind = (of(full_step(self.problem, self.state, way * step)) for way in (1, -1))
+            j[:, k] = (step_between(found, ahead) - step_between(found, behind)) / (2 * size[k])
+        return j
+
+
+@one_blas_thread
+def solve(
+    problem: Problem,
+    start: State,
+    *,
+    averaged: bool = True,
+    start_noise: tuple[float, float] = START_NOISE,
+) -> Solution:
+    """Solve a problem from an initial state.
+
+    A state that contains sizes of errors is taken for one near the solution. `averaged`: the result is averaged over the
+    sizes of the robot's errors; else these are taken at their most likely values, which is faster and understates the
+    uncertainty. `start_noise` is the initial size of the random errors of the poses (m, rad).
+    """
+    if problem.observations is None:
+        return _with_covariance(problem, start, None, averaged)
+    if start.pixel_noise is None:
+        start = _adjusted_to_poses(problem, start, problem.robot_noise_floor or start_noise)
+    state, images, settled, rounds = _rounds(problem, start)
+    return replace(_with_covariance(problem, state, images, averaged), settled=settled, iterations=rounds)
+
+
+def with_priors(solution: Solution, priors: Sequence[LinearPrior]) -> Solution:
+    """Return the solution with other linear priors; the evidence of the images stays as it is."""
+    problem = with_free(solution.problem, priors=tuple(priors))
+    return _with_covariance(problem, solution.most_likely, solution.evidence, True)
+
+
+def size_of_boards(solution: Solution) -> tuple[float, Float[ndarray, " p"]]:
+    """Return the logarithm of the metres, by the scale, of a stated metre of the boards, and its derivative by the
+    unknowns of the mixed model."""
+    problem, column = solution.problem, solution.problem.columns.boards.start
+    assert problem.boards is not None
+    by_unknown = np.zeros(problem.unknowns)
+    by_unknown[SCALE] = by_unknown[problem.unknown_of(column)] = 1.0
+    size = np.log(solution.state.scale * problem.boards.unit) + solution.state.camera_steps[column]
+    return float(size), by_unknown
+
+
+def expected_solution(
+    problem: Problem, state: State, images: ImageEvidence | None, noise: RobotNoise
+) -> Solution:
+    """Return the solution to expect of a problem without residuals, the robot's errors having these sizes."""
+    poses = pose_equations(problem, state, images)
+    found = expected_posterior(poses.equations, noise, poses.region)
+    state = replace(state, robot_log_sizes=found.log_sizes)
+    return Solution(
+        problem=problem,
+        state=state,
+        covariance=found.covariance,
+        budget=found.budget,
+        most_likely=state,
+        poses=poses,
+        size_information=np.eye(len(found.log_sizes)),
+        evidence=images,
+        settled=True,
+        iterations=0,
+    )
+
+
+def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool, int]:
+    """Estimate the sizes of errors and step all unknowns, in turn until both settle."""
+    state, acceleration, log_sizes = start, Acceleration(), start.robot_log_sizes
+    for count in range(1, ROUNDS + 1):
+        before, view = state.pixel_noise, view_of(problem, state)
+        state = with_pixel_noise(problem, state, view)
+        images, normal = linearised(problem, state, view)
+        unresized, (images, resized) = state, with_model_error_of(images)
+        state = images.state
+        together = _JointStep.of(images, log_sizes)
+        change = np.inf if log_sizes is None else float(np.abs(together.log_sizes - log_sizes).max())
+        log_sizes = together.log_sizes
+        assert before is not None and state.pixel_noise is not None
+        repixeled = state.pixel_noise.change(before)
+        if max(change, resized, repixeled) < SIZES_SETTLED and together.size < STEP_SETTLED:
+            return replace(state, robot_log_sizes=log_sizes), images, True, count
+        moved = together.after(state, normal)
+        if together.cost(moved) <= together.cost(state) * (1 + ROUNDING):
+            begun, ended = _coordinates(problem, start, unresized), _coordinates(problem, start, moved)
+            state = _state_at(
+                problem, start, moved, acceleration.next(begun, ended, together.weights(len(begun)))
+            )
+        else:
+            state = together.damped(replace(state, robot_log_sizes=log_sizes))
+            acceleration.forget()
+    state = replace(state, robot_log_sizes=log_sizes)
+    return state, evidence(problem, state), False, ROUNDS
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _JointStep:
+    """One Gauss-Newton step of arms, cameras, rigs and points together."""
+
+    images: ImageEvidence
+    log_sizes: LogSizes
+    """Most likely log sizes of the robot's errors."""
+    arms: Float[ndarray, " u"]
+    columns: Float[ndarray, " d"]
+    """Step of the columns of the images."""
+    std: Float[ndarray, " p"]
+    """Standard deviations of the unknowns of the mixed model."""
+    root: Float[ndarray, "s s"]
+    """Lower Cholesky factor of the covariance of the reported poses."""
+
+    @staticmethod
+    def of(images: ImageEvidence, log_sizes: LogSizes | None) -> "_JointStep":
+        """Return the step from the state of the evidence."""
+        problem, state, rigs = images.problem, images.state, images.rigs
+        equations = pose_equations(problem, state, images).equations
+        log_sizes, _ = most_likely(equations, log_sizes, SIZES_SETTLED / 3)
+        solution, arms = solve_equations(equations, log_sizes), problem.arm_unknowns
+        step = solution.step
+        # The rigs step to the images' estimate given the cameras, and towards the reported poses by their weight.
+        by_rig = reported_poses(problem, state)[2]
+        pull = pose_by_pose(np.swapaxes(by_rig, 1, 2), solution.weighed_left[:, None])[:, 0]
+        columns = np.zeros(problem.columns.count)
+        columns[problem.free] = step[arms:]
+        columns[problem.by_arm] = -rigs.step - rigs.follow @ step[arms:] - rigs.covariance @ pull
+        return _JointStep(
+            images=images,
+            log_sizes=log_sizes,
+            arms=step[:arms],
+            columns=columns,
+            std=np.sqrt(solution.covariance.diagonal()),
+            root=cholesky(replace(equations, known=None).covariance(log_sizes)),
+        )
+
+    @property
+    def size(self) -> float:
+        """Largest step of an arm's unknown, in standard deviations."""
+        return float(np.abs(self.arms / self.std[: len(self.arms)]).max())
+
+    def weights(self, count: int) -> Float[ndarray, " n"]:
+        """Return the weight of each of the `count` coordinates of a state: one over the standard deviation, or 0."""
+        problem, out = self.images.problem, np.zeros(count)
+        out[np.r_[: problem.arm_unknowns, problem.arm_unknowns + problem.free]] = 1 / self.std
+        return out
+
+    def after(self, state: State, normal: Normal) -> State:
+        """Return the state after the step; `normal` steps the points."""
+        share, problem = share_within_limits(self.arms), self.images.problem
+        moved = image_step(problem, state, share * self.columns)
+        moved = replace(moved, points_in_world=normal.stepped(state.points_in_world, share * self.columns))
+        return full_step(problem, moved, np.r_[share * self.arms, np.zeros(len(problem.free))])
+
+    def cost(self, state: State) -> float:
+        """Return the cost of a state, with the weights and sizes of errors at the start of the step."""
+        residual = reported_poses(self.images.problem, state)[0].reshape(-1, 1)
+        return float((lower(self.root, residual) ** 2).sum()) + cost_of_images(self.images, state)
+
+    def damped(self, state: State) -> State:
+        """Return the state after an adjustment of the images to the reported poses, then of the arms."""
+        problem = self.images.problem
+        state, _, _ = adjusted_images(problem, state, [_rig_information(problem, state, self.root)])
+        return _most_likely_arms(problem, state, evidence(problem, state), STEP_SETTLED**2)
+
+
+def _with_covariance(
+    problem: Problem, state: State, images: ImageEvidence | None, averaged: bool
+) -> Solution:
+    """Return the solution with the evidence of the images, from a state that is near."""
+    state = _most_likely_arms(problem, state, images, ARMS_SETTLED if averaged else NEARLY_SETTLED)
+    poses = pose_equations(problem, state, images)
+    log_sizes, information = most_likely(poses.equations, state.robot_log_sizes)
+    state = likeliest = replace(state, robot_log_sizes=log_sizes)
+    if averaged:
+        found = posterior(poses.equations, log_sizes, information, poses.region)
+        covariance, budget, state = found.covariance, found.budget, full_step(problem, state, found.step)
+    else:
+        covariance, budget = solve_equations(poses.equations, log_sizes).covariance, None
+    return Solution(
+        problem=problem,
+        state=state,
+        covariance=covariance,
+        budget=budget,
+        most_likely=likeliest,
+        poses=poses,
+        size_information=information,
+        evidence=images,
+        settled=True,
+        iterations=0,
+    )
+
+
+def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | None, settled: float) -> State:
+    """Step the arms' unknowns and the sizes of the robot's errors, until a step is below `settled` squared standard
+    deviations."""
+    arms, fine = problem.arm_unknowns, SETTLED if images is None else SIZES_SETTLED / 3
+    for _ in range(STEPS):
+        equations = pose_equations(problem, state, images).equations
+        log_sizes, _ = most_likely(equations, state.robot_log_sizes, fine)
+        solution = solve_equations(equations, log_sizes)
+        step = np.zeros(problem.unknowns)
+        step[:arms] = share_within_limits(solution.step[:arms]) * solution.step[:arms]
+        state = replace(full_step(problem, state, step), robot_log_sizes=log_sizes)
+        if float(((solution.information_root.T @ step) ** 2).sum()) < settled:
+            break
+    return state
+
+
+def _adjusted_to_poses(problem: Problem, start: State, noise: tuple[float, float]) -> State:
+    """Return the state after an adjustment of the images beside poses with random errors of this size (m, rad)."""
+    state = with_pixel_noise(problem, start, view_of(problem, start))
+    white = np.tile(np.repeat(noise, 3), sum(len(arm.rigs) for arm in problem.arms))
+    return adjusted_images(problem, state, [_rig_information(problem, state, np.diag(white))])[0]
+
+
+def _rig_information(problem: Problem, state: State, root: Float[ndarray, "s s"]) -> RigInformation:
+    """Return the information of the reported poses about the rigs, X, scale and Z eliminated.
+
+    `root` is the lower Cholesky factor of the covariance of the errors of the poses.
+    """
+    residual, jacobian, by_rig = reported_poses(problem, state)
+    jacobian = jacobian.reshape(len(root), -1)
+    weighed = over(root, jacobian)
+    eliminated = over(cholesky(jacobian.T @ weighed + weak_prior(len(problem.arms))), weighed.T)
+    projection, to_rig = inverse_of(root) - weighed @ eliminated, np.swapaxes(by_rig, 1, 2)
+    information = pose_by_pose(to_rig, pose_by_pose(to_rig, projection).T)
+    rows, count = problem.by_arm - problem.columns.first_rig, 6 * problem.n_rigs
+    of_all, gradient = np.zeros((count, count)), np.zeros(count)
+    of_all[np.ix_(rows, rows)] = (information + information.T) / 2
+    gradient[rows] = pose_by_pose(to_rig, (projection @ residual.ravel())[:, None])[:, 0]
+    now = state.world_from_rig
+    of_all += information_along(similarities_of_rigs(now), float(of_all.diagonal().mean()))
+    return RigInformation(now, of_all, gradient)
+
+
+def _coordinates(problem: Problem, start: State, state: State) -> Float[ndarray, " n"]:
+    """Return a state as steps from the start: arms, columns of the images, points, and log sizes of the remaining
+    distortion."""
+    points = (state.points_in_world - start.points_in_world).ravel()
+    return np.concatenate([*step_to(problem, start, state), points, np.log(state.model_error_std)])
+
+
+def _state_at(problem: Problem, start: State, like: State, coordinates: Float[ndarray, " n"]) -> State:
+    """Return the state with these coordinates; the other sizes of errors are those of `like`."""
+    ends = np.cumsum([problem.arm_unknowns, problem.columns.count, start.points_in_world.size])
+    arms, columns, points, sizes = np.split(coordinates, ends)
+    state = replace(
+        image_step(problem, start, columns),
+        points_in_world=start.points_in_world + points.reshape(-1, 3),
+        model_error_std=np.exp(sizes),
+        pixel_noise=like.pixel_noise,
+        robot_log_sizes=like.robot_log_sizes,
+    )
+    return full_step(problem, state, np.r_[arms, np.zeros(len(problem.free))])
