@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from jcr.estimation.fit import PoseProblem, fit_poses
 from scipy.spatial.transform import Rotation
 
 import jcr
@@ -21,7 +20,9 @@ from jcr.cli import dispatch
 from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.arms import arm_named
 from jcr.estimation.closed_form import initial_estimate
+from jcr.estimation.solve import solve
 from jcr.estimation.systematic import arm_errors, posed, smooth_errors
+from jcr.estimation.wrist import pose_problem
 from jcr.geometry import inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.records import Capture, Reconstruction, Tracks
@@ -122,15 +123,7 @@ def drifts(
         SCALE,
         inverse(transform(rotation_exp(np.array([0.3, -0.8, 0.5])), np.array([0.2, 0.1, -0.4]))),
     )
-    fit = fit_poses(
-        PoseProblem(
-            base_from_gripper=reported[:OLD],
-            recon_from_camera=places[:OLD],
-            used=np.ones(OLD, bool),
-            systematic=smooth_errors(reported[:OLD]),
-        ),
-        start,
-    )
+    fit = solve(*pose_problem(reported[:OLD], places[:OLD], start))
     spread = np.broadcast_to(np.diag(camera_std**2), (len(rows), 6, 6))
     systematic = smooth_errors(np.concatenate([reported[:OLD], reported[rows]]))
     return drift(
@@ -150,13 +143,8 @@ def test_joint_angles_show_a_drift_that_poses_of_a_bent_arm_hide():
         bumped[OLD:, :3, 3] += 1e-3 / made.scale * camera[OLD:, :3, 0]
         for systematic in covariances:
             of_used = systematic[: 6 * OLD, : 6 * OLD]
-            problem = PoseProblem(
-                base_from_gripper=gripper[of_old],
-                recon_from_camera=camera[of_old],
-                used=np.ones(OLD, bool),
-                systematic=of_used,
-            )
-            fit = fit_poses(problem, start, averaged=False)
+            problem = pose_problem(gripper[of_old], camera[of_old], start, error_covariance=of_used)
+            fit = solve(*problem, averaged=False)
             for cameras in (camera, bumped):
                 new = gripper[OLD:], cameras[OLD:], np.broadcast_to(1e-10 * np.eye(6), (3, 6, 6))
                 shown.append(drift(fit, (gripper[of_old], camera[of_old]), new, systematic, 1e-3).p_value)

@@ -3,12 +3,12 @@
 import cv2
 import numpy as np
 import pytest
-from jcr.estimation.fit import Cues
 
 import jcr
 from jcr.calibration.consider import with_intrinsics_considered
 from jcr.camera import parameters, with_parameters
-from jcr.estimation.intrinsics_prior import prior_of
+from jcr.estimation.intrinsics_prior import camera_with_prior
+from jcr.estimation.problem import scale_prior
 from jcr.estimation.systematic import smooth_errors
 from jcr.geometry import inverse, transform
 from simulation.problems import INTRINSICS, error, hand_eye_problem, observed
@@ -33,16 +33,14 @@ def test_cameras_that_were_placed_with_a_wrong_focal_length_are_within_sigma_onc
                 tracks.points_in_recon[tracks.point[seen]], tracks.x_px[seen], k, np.array(given.distortion)
             )
             camera.append(inverse(transform(cv2.Rodrigues(rotation)[0], translation[:, 0])))
-        cues = Cues(scale=(problem.scale, 1e-3))
-        solved = jcr.solve_hand_eye(problem.base_from_gripper, camera, cues=cues)
+        solved = jcr.solve_hand_eye(problem.base_from_gripper, camera, scale=problem.scale, scale_std=1e-3)
         whole = with_intrinsics_considered(
             solved,
             problem.base_from_gripper,
             np.array(camera),
             tracks,
-            given,
-            prior_of(given),
-            cues,
+            camera_with_prior(given),
+            (scale_prior(problem.scale, 1e-3),),
             smooth_errors(problem.base_from_gripper),
         )
         off = error(problem, solved.gripper_from_camera, solved.scale)[:6]

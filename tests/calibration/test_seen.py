@@ -5,7 +5,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from jcr.estimation.image_robots import Adjusted
 
 from benchmarks.seen import BENT, WAYS, measure
 from jcr.calibration.adjust import estimate_of
@@ -21,8 +20,9 @@ from jcr.calibration.seen import (
 )
 from jcr.camera import parameters, unproject, with_parameters
 from jcr.estimation.hand_eye import solve_hand_eye
-from jcr.estimation.intrinsics_prior import ESTIMATED, prior_of
+from jcr.estimation.intrinsics_prior import ESTIMATED, camera_with_prior
 from jcr.estimation.points import points_in_base
+from jcr.estimation.solve import Solution
 from jcr.estimation.wrist import adjust_wrist
 from jcr.geometry import apply, inverse, retract
 from jcr.records import Estimate, HandEye, Intrinsics, Tracks
@@ -32,16 +32,15 @@ X_PX = np.array([[319.5, 239.5], [40.0, 30.0], [600.0, 450.0]])
 DISTANCE_M = 0.45
 
 
-def adjusted(problem: HandEyeProblem, seed: int) -> tuple[Adjusted, Tracks, HandEye]:
+def adjusted(problem: HandEyeProblem, seed: int) -> tuple[Solution, Tracks, HandEye]:
     tracks = observed(problem, np.random.default_rng([seed, 1]), 300, 0.3)
     start = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     found = adjust_wrist(
         problem.base_from_gripper,
         (start.gripper_from_camera, start.scale, start.base_from_recon),
         problem.recon_from_camera,
-        INTRINSICS,
+        camera_with_prior(INTRINSICS, ESTIMATED),
         tracks,
-        prior=prior_of(INTRINSICS, ESTIMATED),
     )
     return found, tracks, start
 

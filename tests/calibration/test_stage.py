@@ -9,7 +9,7 @@ from benchmarks.attack import reconstructed
 from jcr.calibration import adjust as adjust_stage
 from jcr.calibration import case
 from jcr.calibration.stage import calibrate
-from jcr.estimation import images
+from jcr.estimation import image_equations
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.estimation.wrist import adjust_wrist
 from jcr.geometry import retract, step_between
@@ -64,8 +64,10 @@ def test_images_of_contradictory_poses_take_few_steps(monkeypatch):
     rng, solved = np.random.default_rng(1), list[int]()
     capture, reconstruction = reconstructed(faulty_capture(rng, 12), estimated=False)
     shuffled = capture.base_from_gripper[np.random.default_rng(0).permutation(12)]
-    equations = images._normal_equations
-    monkeypatch.setattr(images, "_normal_equations", lambda *given: solved.append(1) or equations(*given))
+    equations = image_equations._normal_equations
+    monkeypatch.setattr(
+        image_equations, "_normal_equations", lambda *given: solved.append(1) or equations(*given)
+    )
     hand_eye = calibrate(replace(capture, base_from_gripper=shuffled), reconstruction)
     assert Kind.POSES_CONTRADICT_IMAGES in {one.kind for one in hand_eye.findings}
     assert len(solved) <= 40

@@ -2,16 +2,13 @@
 
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from jcr.estimation.image_robots import Adjusted
-from jcr.estimation.images import evidence, noise_of
-from jcr.estimation.scene import Freedom, Scene, at_start, similarities
-from jcr.estimation.together import adjust
 
 import jcr
 from jcr.calibration.checks.effects import effects
@@ -26,8 +23,11 @@ from jcr.cell.found import CameraFound, CellFound
 from jcr.cell.images import CellImages
 from jcr.cell.place_checks import far_from_gripper
 from jcr.cell.stage import place_cameras
-from jcr.estimation.intrinsics_prior import FIXED, prior_of
-from jcr.estimation.projection import ImageProblem, view_of
+from jcr.estimation.image_equations import evidence, with_pixel_noise
+from jcr.estimation.intrinsics_prior import FIXED, Camera, camera_with_prior
+from jcr.estimation.problem import Problem, State, similarities, with_observations
+from jcr.estimation.projection import view_of
+from jcr.estimation.solve import Solution, solve
 from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.records import Capture, CellCamera, Finding, HandEye, Reconstruction, Tracks
 from jcr.records import Kind as FindingKind
@@ -39,37 +39,46 @@ OLD = 9
 SCALE = 0.37
 
 
-def adjusted(problem: CellProblem, world: np.ndarray | None = None, intrinsics_off: bool = True) -> Adjusted:
+def adjusted(problem: CellProblem, world: np.ndarray | None = None, intrinsics_off: bool = True) -> Solution:
     """As the stage does it, from starts that are near; intrinsics off by what is usual."""
     rng = np.random.default_rng(5)
-    cameras, priors = [], []
-    for camera in problem.cameras:
-        free = prior_of(camera)
+    cameras = []
+    for k, camera in enumerate(problem.cameras):
+        free = camera_with_prior(camera)
         off = free.std * rng.normal(size=len(free.std)) if intrinsics_off else 0 * free.std
-        cameras.append(with_parameters(camera, parameters(camera) + free.directions @ off))
-        priors.append(prior_of(cameras[-1]) if intrinsics_off else prior_of(cameras[-1], FIXED))
+        moved = with_parameters(camera, parameters(camera) + free.directions @ off)
+        free = camera_with_prior(moved) if intrinsics_off else camera_with_prior(moved, FIXED)
+        cameras.append(replace(free, mount_free=problem.kind == "wrists" and k > 0))
     move = np.eye(4) if world is None else world
-    scene = Scene(
+    return solve(*with_observations(*cell_of(problem, cameras, move), problem.observations))
+
+
+def cell_of(
+    problem: CellProblem, cameras: Sequence[Camera], move: np.ndarray | None = None
+) -> tuple[Problem, State]:
+    """The problem without its observations, in a world that is moved."""
+    move = np.eye(4) if move is None else move
+    unmove = scale_translation(inverse(move), problem.scale)
+    state = State(
+        x=np.stack([x for x, _ in problem.starts]),
+        scale=1.0,
+        z=np.stack([z @ unmove for _, z in problem.starts]),
         world_from_rig=move @ problem.world_from_rig,
         rig_from_camera=problem.rig_from_camera,
-        cameras=tuple(cameras),
         points_in_world=apply(move, problem.points_in_world),
     )
-    mounts = [False, *[problem.kind == "wrists"] * (len(cameras) - 1)]
-    unmove = scale_translation(inverse(move), problem.scale)
-    arms = [replace(arm, start=(arm.start[0], arm.start[1] @ unmove)) for arm in problem.arms]
-    freedom = Freedom.of(cameras, priors, len(problem.observations.rig), mounts)
-    return adjust(scene, problem.observations, freedom, arms)
+    rigs = len(problem.world_from_rig)
+    return Problem(arms=tuple(problem.arms), n_rigs=rigs, cameras=tuple(cameras)), state
 
 
 WANTED = {
     "fixed": (
         "base_from_camera",
-        lambda p: p.z[0] @ scale_translation(p.scene.world_from_rig[COUNT], p.scale),
+        lambda p: p.z[0] @ scale_translation(p.world_from_rig[COUNT], p.scale),
     ),
     "wrists": (
         "gripper_from_second",
-        lambda p: p.x[0] @ scale_translation(p.scene.rig_from_camera[1], p.scale),
+        lambda p: p.x[0] @ scale_translation(p.rig_from_camera[1], p.scale),
     ),
     "arms": ("base1_from_base2", lambda p: p.z[0] @ inverse(p.z[1])),
     "carried": ("base_from_camera", lambda p: p.x[0]),
@@ -97,7 +106,7 @@ def test_exact_robots_and_images_give_the_exact_answer():
         problem = cell_problem(kind, "white", COUNT, seed=4, noise_px=1e-4, points=120)
         exact = replace(problem, reported=truly(problem))
         answer = adjusted(exact, intrinsics_off=False)
-        found = of(answer.placed)
+        found = of(answer.state)
         assert np.abs(step_between(found, problem.truth[name])).max() < 2e-5, kind
 
 
@@ -124,18 +133,13 @@ def test_the_frame_of_the_images_does_not_matter():
 
 def test_images_alone_leave_one_similarity_open():
     problem = cell_problem("wrists", "white", COUNT, seed=2, points=100)
-    priors = [prior_of(camera, FIXED) for camera in problem.cameras]
-    freedom = Freedom.of(problem.cameras, priors, len(problem.observations.rig), [False, True])
-    scene = Scene(
-        world_from_rig=problem.world_from_rig,
-        rig_from_camera=problem.rig_from_camera,
-        cameras=problem.cameras,
-        points_in_world=problem.points_in_world,
-    )
-    scene = at_start(scene, freedom)
-    images = ImageProblem.of(scene, problem.observations, freedom)
-    found = evidence(scene, images, noise_of(scene, view_of(scene, images), images))
-    unseen = np.linalg.qr(similarities(scene, freedom))[0]
+    cameras = [
+        replace(camera_with_prior(camera, FIXED), mount_free=k > 0)
+        for k, camera in enumerate(problem.cameras)
+    ]
+    images, state = with_observations(*cell_of(problem, cameras), problem.observations)
+    found = evidence(images, with_pixel_noise(images, state, view_of(images, state)))
+    unseen = np.linalg.qr(similarities(images, state))[0]
     assert unseen.shape[1] == 7
     # Along it there is what keeps the world in place, alike in all directions, and nothing else.
     along = unseen.T @ found.information @ unseen
@@ -279,24 +283,9 @@ def test_a_zoom_of_a_second_camera_is_named_with_its_size_and_none_where_there_i
     late = (seen.camera[seen.image] == 1) & (seen.image >= zoomed_from)
     centre = np.array([camera.cx, camera.cy])
     x_px = np.where(late[:, None], centre + zoom * (seen.x_px - centre), seen.x_px)
-    images = CellImages(
-        scene=Scene(
-            world_from_rig=problem.world_from_rig,
-            rig_from_camera=problem.rig_from_camera,
-            cameras=problem.cameras,
-            points_in_world=problem.points_in_world,
-        ),
-        observations=replace(seen, x_px=x_px),
-        freedom=Freedom.of(
-            problem.cameras, [prior_of(one) for one in problem.cameras], len(seen.rig), [False, True]
-        ),
-        arms=[
-            replace(arm, start=(arm.start[0], arm.start[1] @ scale_translation(np.eye(4), problem.scale)))
-            for arm in problem.arms
-        ],
-        noise=None,
-        prior=None,
-    )
+    own, other = (camera_with_prior(one) for one in problem.cameras)
+    cell, state = cell_of(problem, [own, replace(other, mount_free=True)])
+    images = CellImages(problem=cell, state=state, observations=replace(seen, x_px=x_px))
     answer, place = images.adjusted(), WANTED["wrists"][1]
     second = Imaged(
         adjusted=answer,
@@ -305,9 +294,9 @@ def test_a_zoom_of_a_second_camera_is_named_with_its_size_and_none_where_there_i
         names=[f"{k}.png" for k in range(COUNT)],
         start=camera,
         is_given=True,
-        prior=images.freedom.intrinsics[1],
+        prior=images.problem.cameras[1],
         std=np.sqrt(np.diag(answer.transform(place)[1])),
-        answer=lambda adjusted: (place(adjusted.placed), adjusted.placed.scale),
+        answer=lambda adjusted: (place(adjusted.state), adjusted.state.scale),
         camera=1,
         place=place,
     )

@@ -4,14 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from jcr.estimation.image_robots import Adjusted
-from jcr.estimation.images import ImageEvidence, adjust_images
-from jcr.estimation.scene import Freedom, Observations, Scene, similarities, stepped
 
 from jcr.estimation.boards import shapes_of
-from jcr.estimation.intrinsics_prior import FIXED, prior_of
+from jcr.estimation.image_equations import ImageEvidence, adjust_images
+from jcr.estimation.intrinsics_prior import FIXED, camera_with_prior
+from jcr.estimation.observations import Observations
+from jcr.estimation.problem import image_step, similarities
 from jcr.estimation.projection import derivatives, shape_residuals
-from jcr.estimation.wrist import adjust_wrist
+from jcr.estimation.solve import Solution
+from jcr.estimation.wrist import adjust_wrist, image_problem
 from jcr.geometry import inverse, step_between
 from simulation.boards import Sheet, with_sheet
 from simulation.faults import Faults, FaultyCapture, faulty_capture
@@ -19,36 +20,36 @@ from simulation.faults import Faults, FaultyCapture, faulty_capture
 pytestmark = pytest.mark.slow
 
 
-def adjusted(seed: int, sheet: Sheet | None, images: int = 8) -> Adjusted:
+def adjusted(seed: int, sheet: Sheet | None, images: int = 8) -> Solution:
     rng = np.random.default_rng(seed)
     found = faulty_capture(rng, images, Faults(robot_noise=(1e-5, 1e-5)))
     found = found if sheet is None else with_sheet(found, rng, sheet)
     cameras = found.base_from_camera
     start = found.gripper_from_camera, 1.0, np.eye(4)
-    prior = prior_of(found.intrinsics, FIXED)
-    return adjust_wrist(found.base_from_gripper, start, cameras, found.intrinsics, found.tracks, prior=prior)
+    prior = camera_with_prior(found.intrinsics, FIXED)
+    return adjust_wrist(found.base_from_gripper, start, cameras, prior, found.tracks)
 
 
 def test_the_derivatives_of_corners_are_those_of_their_residuals():
-    given = adjusted(0, Sheet(bend_m=2e-3)).given.evidence
-    scene, problem, boards = given.scene, given.problem, given.problem.observations.boards
+    given = adjusted(0, Sheet(bend_m=2e-3)).images
+    scene, problem, boards = given.state, given.problem, given.problem.boards
     assert boards is not None
-    freedom, shape = problem.freedom, scene.camera_steps[problem.freedom.board_columns]
+    freedom, shape = problem.columns, scene.camera_steps[problem.columns.boards]
     rows = boards.derivatives(
-        scene.world_from_rig, scene.points_in_world, shape, freedom.board_columns, freedom.first_rig
+        scene.world_from_rig, scene.points_in_world, shape, freedom.boards, freedom.first_rig
     )
-    rng, count = np.random.default_rng(0), freedom.first_rig + 6 * len(scene.world_from_rig)
+    rng, count = np.random.default_rng(0), freedom.count
     for _ in range(3):
         step = np.zeros(count)
-        step[freedom.board_columns] = 1e-3 * rng.normal(size=len(shape))
+        step[freedom.boards] = 1e-3 * rng.normal(size=len(shape))
         step[-6:] = 1e-3 * rng.normal(size=6)
         off = 1e-3 * rng.normal(size=scene.points_in_world.shape)
         tiny = 1e-4
         ends = []
         for sign in (1, -1):
-            there = stepped(scene, freedom, sign * tiny * step)
+            there = image_step(problem, scene, sign * tiny * step)
             there = replace(there, points_in_world=scene.points_in_world + sign * tiny * off)
-            ends.append(shape_residuals(there, problem))
+            ends.append(shape_residuals(problem, there))
         expected = (ends[0] - ends[1]) / (2 * tiny)
         found = rows.shared @ step[: freedom.first_rig] + rows.own @ step[-6:]
         found += (rows.by_point @ np.repeat(off[boards.point], 2, axis=0)[..., None])[..., 0]
@@ -56,12 +57,12 @@ def test_the_derivatives_of_corners_are_those_of_their_residuals():
 
 
 def test_the_shape_of_a_board_is_the_same_at_any_size_and_place_of_the_world():
-    given = adjusted(1, Sheet()).given.evidence
-    problem, scene = given.problem, given.scene
-    weighted = derivatives(scene, given.view, problem, given.weight)
-    by_world = similarities(scene, problem.freedom)
-    first, point = problem.freedom.first_rig, problem.rows_point
-    own = by_world[first:].reshape(-1, 6, 7)[problem.rows_rig]
+    given = adjusted(1, Sheet()).images
+    problem, scene = given.problem, given.state
+    weighted = derivatives(problem, scene, given.view, given.weight)
+    by_world = similarities(problem, scene)
+    first, (_, point, rig, _) = problem.columns.first_rig, problem.rows
+    own = by_world[first:].reshape(-1, 6, 7)[rig]
     p = scene.points_in_world
     of_points = np.zeros((len(p), 3, 7))
     of_points[:, :, 0], of_points[:, :, 1:4] = p, np.eye(3)
@@ -74,11 +75,11 @@ def test_the_shape_of_a_board_is_the_same_at_any_size_and_place_of_the_world():
 def test_a_sheet_is_found_as_large_and_as_bent_as_it_is(bend_m: float):
     """A bend of ten times the usual one is the corners' to show."""
     found = adjusted(2, Sheet(bend_m=bend_m), images=12)
-    given = found.given.evidence
-    boards = given.problem.observations.boards
+    given = found.images
+    boards = given.problem.boards
     assert boards is not None
-    shape = given.scene.camera_steps[given.problem.freedom.board_columns]
-    size = found.placed.scale * boards.unit * np.exp(shape[0])
+    shape = given.state.camera_steps[given.problem.columns.boards]
+    size = found.state.scale * boards.unit * np.exp(shape[0])
     assert size == pytest.approx(1.0, abs=5e-4)
     height = boards.bend(shape)
     assert np.ptp(height) == pytest.approx(bend_m, abs=3e-4)
@@ -88,7 +89,7 @@ def test_the_unit_of_the_world_is_that_of_the_cameras_with_a_board_too():
     """A few bad corners show nothing more: transform and scale are as certain as without them, and go together."""
     alone, with_it = (adjusted(3, one) for one in (None, Sheet(corners=(4, 3), side_m=0.01, noise_px=0.5)))
     along = np.r_[
-        alone.placed.x[0][:3, 2], np.zeros(3), 0.5
+        alone.state.x[0][:3, 2], np.zeros(3), 0.5
     ]  # of a point half a metre ahead, where the errors of both nearly cancel
     for by in (along, np.eye(7)[2], np.eye(7)[6]):
         expected = by @ alone.covariance[:7, :7] @ by
@@ -116,19 +117,17 @@ def images_alone(found: FaultyCapture) -> ImageEvidence:
     points = tracks.points_in_recon
     seen = np.bincount(tracks.point, minlength=len(points)) >= 2
     boards, bodies = shapes_of(tracks.boards, points, seen, each)
-    scene = Scene(
-        world_from_rig=np.concatenate([found.base_from_camera, bodies]),
-        rig_from_camera=np.eye(4)[None],
-        cameras=(found.intrinsics,),
-        points_in_world=points,
+    camera, observations = (
+        camera_with_prior(found.intrinsics, FIXED),
+        Observations.of_one_camera(tracks, each),
     )
-    freedom = Freedom.of((found.intrinsics,), (prior_of(found.intrinsics, FIXED),), each)
-    return adjust_images(scene, Observations.of_one_camera(tracks, each, boards), freedom)
+    rigs = np.concatenate([found.base_from_camera, bodies])
+    return adjust_images(*image_problem(rigs, camera, observations, points, boards))
 
 
 def squared_distance(found: ImageEvidence, cameras: np.ndarray) -> float:
     """Of the cameras from the true ones, per unknown, in the frame of the first and at one size."""
-    covariance, rigs = found.rig_covariance(), found.scene.world_from_rig
+    covariance, rigs = found.rig_covariance(), found.state.world_from_rig
     own = slice(6, 6 * len(cameras))
     true = rigs[0] @ inverse(cameras[0]) @ cameras
     true[:, :3, 3] = rigs[0, :3, 3] + found_size(found) * (true[:, :3, 3] - rigs[0, :3, 3])
@@ -144,4 +143,4 @@ def squared_distance(found: ImageEvidence, cameras: np.ndarray) -> float:
 
 def found_size(found: ImageEvidence) -> float:
     """The world of a sheet that is as large as stated."""
-    return float(np.exp(found.scene.camera_steps[found.problem.freedom.board_columns][0]))
+    return float(np.exp(found.state.camera_steps[found.problem.columns.boards][0]))

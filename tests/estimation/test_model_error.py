@@ -5,19 +5,19 @@ from functools import cache
 
 import numpy as np
 import pytest
-from jcr.estimation.image_robots import Adjusted
 
 from jcr.camera import by_parameters, unproject
 from jcr.estimation.hand_eye import solve_hand_eye
-from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, prior_of
-from jcr.estimation.model_error import TYPICAL, displacements
+from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, camera_with_prior
+from jcr.estimation.model_error import TYPICAL, displacements, polynomials_of
+from jcr.estimation.solve import Solution
 from jcr.estimation.wrist import adjust_wrist
 from jcr.records import Intrinsics
 from simulation.problems import INTRINSICS, hand_eye_problem, observed
 
 
 @cache
-def adjusted(warp_px: float) -> Adjusted:
+def adjusted(warp_px: float) -> Solution:
     """Of images whose pixels a wave over the image displaces, which no coefficient describes."""
     rng = np.random.default_rng(3)
     problem = hand_eye_problem(rng, 12, robot_noise=(1e-4, np.radians(0.01)))
@@ -30,36 +30,33 @@ def adjusted(warp_px: float) -> Adjusted:
         problem.base_from_gripper,
         (start.gripper_from_camera, start.scale, start.base_from_recon),
         problem.recon_from_camera,
-        guess,
+        camera_with_prior(guess, ESTIMATED),
         tracks,
-        prior=prior_of(guess, ESTIMATED),
     )
 
 
 def test_displacements_are_beside_what_the_intrinsics_express():
     rng = np.random.default_rng(0)
-    x_px, prior = rng.uniform([0, 0], [640, 480], (500, 2)), prior_of(INTRINSICS, ESTIMATED)
-    by = displacements((INTRINSICS,), (prior,), x_px, np.zeros(500, int)).reshape(1000, -1)
+    x_px, prior = rng.uniform([0, 0], [640, 480], (500, 2)), camera_with_prior(INTRINSICS, ESTIMATED)
+    by = displacements((prior,), [polynomials_of(prior)], x_px, np.zeros(500, int)).reshape(1000, -1)
     of_intrinsics = (by_parameters(INTRINSICS, unproject(INTRINSICS, x_px)) @ prior.directions).reshape(
         1000, -1
     )
     size = np.linalg.norm(by, axis=0).max() * np.linalg.norm(of_intrinsics, axis=0)
     assert np.abs(by.T @ of_intrinsics / size).max() < 1e-9
-    exact = prior_of(INTRINSICS, FIXED)
-    assert displacements((INTRINSICS,), (exact,), x_px, np.zeros(500, int)).shape == (500, 2, 0)
+    exact = camera_with_prior(INTRINSICS, FIXED)
+    assert displacements((exact,), [polynomials_of(exact)], x_px, np.zeros(500, int)).shape == (500, 2, 0)
 
 
 @pytest.mark.slow
 def test_the_size_of_what_the_model_leaves_is_found():
-    of_none, of_some, of_much = (
-        adjusted(warp_px).given.evidence.problem.freedom.model_error_std[0] for warp_px in (0.0, 0.3, 1.0)
-    )
+    of_none, of_some, of_much = (adjusted(warp_px).state.model_error_std[0] for warp_px in (0.0, 0.3, 1.0))
     assert of_none < 0.5 * TYPICAL
     assert of_much / of_some == pytest.approx(1.0 / 0.3, rel=0.3)
 
 
 def test_what_the_model_leaves_is_not_taken_for_pixel_noise():
-    noise = adjusted(0.3).given.evidence.noise
+    noise = adjusted(0.3).images.state.pixel_noise
     assert noise.sigma_px[0] == pytest.approx(0.1, rel=0.15) and noise.inflation < 1.5
 
 

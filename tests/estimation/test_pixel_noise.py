@@ -5,11 +5,12 @@ from functools import cache
 import numpy as np
 import pytest
 from jaxtyping import Float
-from jcr.estimation.images import ImageEvidence, adjust_images
-from jcr.estimation.scene import Freedom, Observations, Scene
 from numpy import ndarray
 
-from jcr.estimation.intrinsics_prior import FIXED, prior_of
+from jcr.estimation.image_equations import ImageEvidence, adjust_images
+from jcr.estimation.intrinsics_prior import FIXED, camera_with_prior
+from jcr.estimation.observations import Observations
+from jcr.estimation.wrist import image_problem
 from jcr.geometry import step_between
 from jcr.records import Tracks
 from simulation.problems import INTRINSICS, hand_eye_problem, observed
@@ -29,32 +30,24 @@ def adjusted(seed: int, stated: str) -> tuple[ImageEvidence, Float[ndarray, "11 
     std_px = np.exp(rng.uniform(np.log(0.05), np.log(0.5), len(exact.image)))
     x_px = exact.x_px + std_px[:, None] * rng.normal(size=exact.x_px.shape)
     of = {"nothing": None, "size": 3 * std_px, "chance": rng.permutation(std_px)}
-    found = adjust_images(
-        Scene(
-            world_from_rig=problem.recon_from_camera,
-            rig_from_camera=np.eye(4)[None],
-            cameras=(INTRINSICS,),
-            points_in_world=exact.points_in_recon,
-        ),
-        Observations.of_one_camera(
-            Tracks(
-                image=exact.image,
-                x_px=x_px,
-                point=exact.point,
-                points_in_recon=exact.points_in_recon,
-                std_px=of[stated],
-            ),
-            12,
-        ),
-        Freedom.of((INTRINSICS,), (prior_of(INTRINSICS, FIXED),), 12),
+    tracks = Tracks(
+        image=exact.image,
+        x_px=x_px,
+        point=exact.point,
+        points_in_recon=exact.points_in_recon,
+        std_px=of[stated],
     )
-    return found, step_between(problem.recon_from_camera, found.scene.world_from_rig)[1:, 3:]
+    camera, observations = camera_with_prior(INTRINSICS, FIXED), Observations.of_one_camera(tracks, 12)
+    found = adjust_images(
+        *image_problem(problem.recon_from_camera, camera, observations, exact.points_in_recon)
+    )
+    return found, step_between(problem.recon_from_camera, found.state.world_from_rig)[1:, 3:]
 
 
 @pytest.mark.slow
 def test_what_matches_state_is_believed_as_far_as_residuals_show_it():
     common = {
-        name: [adjusted(seed, name)[0].noise.common for seed in SEEDS]
+        name: [adjusted(seed, name)[0].state.pixel_noise.common for seed in SEEDS]
         for name in ("nothing", "size", "chance")
     }
     assert max(common["size"]) <= 0.06
@@ -76,14 +69,14 @@ def test_covariance_is_that_of_the_errors():
         of_rotations = found.rig_covariance().reshape(12, 6, 12, 6)[1:, 3:, 1:, 3:].reshape(33, 33)
         squares.append(errors.ravel() ** 2 / np.diag(of_rotations))
     assert np.mean(squares) == pytest.approx(1.0, abs=0.4)
-    assert adjusted(0, "size")[0].noise.sigma_px[0] == pytest.approx(np.sqrt(0.05 * 0.5), rel=0.2)
+    assert adjusted(0, "size")[0].state.pixel_noise.sigma_px[0] == pytest.approx(np.sqrt(0.05 * 0.5), rel=0.2)
 
 
 def test_what_no_camera_focuses_on_counts_nothing():
     found, _ = adjusted(0, "size")
     depth = found.view.depth.copy()
     depth[:3] = np.median(depth) * np.array([-1.0, 1e-6, 0.01])
-    weight = found.noise.weights(found.view.residual_px, depth, found.problem.layout)
+    weight = found.state.pixel_noise.weights(found.view.residual_px, depth, found.problem.layout)
     assert (weight[:3] == 0).all() and (weight[3:] > 0).all()
 
 

@@ -1,16 +1,19 @@
 """The calibration from poses: known answers, invariances, outliers, coverage, degenerate motions."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
-from jcr.estimation.fit import Cues, PoseProblem, fit_poses
 from scipy.stats import chi2
 
 import jcr
 from jcr.estimation.closed_form import closed_form
 from jcr.estimation.equation import PRIOR_STD, residuals, residuals_by_camera
-from jcr.estimation.mixed_model import Equations, left_out, solve
+from jcr.estimation.mixed_model import Equations, left_out, solve_equations
+from jcr.estimation.solve import solve
 from jcr.estimation.systematic import smooth_errors
+from jcr.estimation.wrist import pose_problem
 from jcr.geometry import inverse, retract, rotation_between_deg, rotation_exp, scale_translation, transform
 from jcr.records import Kind
 from simulation.problems import error, hand_eye_problem
@@ -217,15 +220,9 @@ def test_covariance_matches_a_jackknife_over_images():
     noise = (full.robot_noise.translation, full.robot_noise.rotation)
     left_out = []
     for k in range(30):
-        others = PoseProblem(
-            base_from_gripper=gripper,
-            recon_from_camera=camera,
-            used=~np.eye(30, dtype=bool)[k],
-            systematic=smooth_errors(gripper),
-            noise=noise,
-        )
-        fit = fit_poses(others, start)
-        left_out.append(error(problem, fit.gripper_from_camera, fit.scale))
+        every, state = pose_problem(gripper, camera, start, noise_floor=noise)
+        fit = solve(replace(every, used=~np.eye(30, dtype=bool)[k]), state).state
+        left_out.append(error(problem, fit.x[0], fit.scale))
     jackknife = 29 / 30 * ((np.array(left_out) - np.mean(left_out, 0)) ** 2).sum(0)
     ratio = np.sqrt(jackknife / np.diag(full.covariance))
     assert (ratio > 0.6).all() and (ratio < 1.6).all()
@@ -251,11 +248,11 @@ def test_leave_one_out_error_is_that_of_a_fit_without_the_image():
         )
 
     everything = of_rows(np.arange(48))
-    errors, covariance = left_out(solve(everything, sizes), NOISE)
+    errors, covariance = left_out(solve_equations(everything, sizes), NOISE)
     v = everything.covariance(sizes)
     for k in range(8):
         mine, others = np.arange(6 * k, 6 * k + 6), np.delete(np.arange(48), np.arange(6 * k, 6 * k + 6))
-        without = solve(of_rows(others), sizes)
+        without = solve_equations(of_rows(others), sizes)
         gain = v[np.ix_(mine, others)] @ np.linalg.inv(v[np.ix_(others, others)])
         by_unknown = jacobian[mine] - gain @ jacobian[others]
         expected = residual[mine, 0] - gain @ residual[others, 0] + by_unknown @ without.step
@@ -339,14 +336,14 @@ def test_a_known_offset_cures_planar_motion_and_a_known_scale_cures_an_orbit():
     down = planar.true_base_from_gripper[0, 2, :3]  # the base's z axis in the gripper frame
     height = float(down @ planar.gripper_from_camera[:3, 3])
     solved = jcr.solve_hand_eye(
-        planar.base_from_gripper, planar.recon_from_camera, cues=Cues(offset=(down, height, 1e-3))
+        planar.base_from_gripper, planar.recon_from_camera, offset=(down, height, 1e-3)
     )
     assert solved.converged
     assert np.linalg.norm(error(planar, solved.gripper_from_camera, solved.scale)[:3]) < 5e-3
 
     orbit = hand_eye_problem(np.random.default_rng(11), 10, "orbit", NOISE)
     solved = jcr.solve_hand_eye(
-        orbit.base_from_gripper, orbit.recon_from_camera, cues=Cues(scale=(orbit.scale, 1e-3))
+        orbit.base_from_gripper, orbit.recon_from_camera, scale=orbit.scale, scale_std=1e-3
     )
     assert solved.converged
     assert np.linalg.norm(error(orbit, solved.gripper_from_camera, solved.scale)[:3]) < 5e-3

@@ -2,15 +2,15 @@
 
 import numpy as np
 import pytest
-from jcr.estimation.image_robots import Adjusted
-from jcr.estimation.images import median_reprojection_px
 from scipy.stats import chi2
 
 import jcr
 from jcr.camera import parameters, with_parameters
-from jcr.estimation import together
-from jcr.estimation.intrinsics_prior import ESTIMATED, MEASURED, prior_of
-from jcr.estimation.wrist import WristOptions, adjust_wrist, recon_frame
+from jcr.estimation import solve
+from jcr.estimation.image_equations import median_reprojection_px
+from jcr.estimation.intrinsics_prior import ESTIMATED, MEASURED, camera_with_prior
+from jcr.estimation.solve import Solution
+from jcr.estimation.wrist import adjust_wrist, recon_frame
 from jcr.geometry import step_between
 from jcr.records import Intrinsics, Tracks
 from simulation.problems import INTRINSICS, HandEyeProblem, error, hand_eye_problem, observed
@@ -18,7 +18,7 @@ from simulation.problems import INTRINSICS, HandEyeProblem, error, hand_eye_prob
 
 def solved(
     problem: HandEyeProblem, tracks: Tracks, intrinsics: Intrinsics = INTRINSICS, **options
-) -> Adjusted:
+) -> Solution:
     start = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     return adjust_wrist(
         problem.base_from_gripper,
@@ -37,12 +37,12 @@ def test_camera_noise_is_beaten_by_the_images():
     start = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     adjusted = solved(problem, tracks)
     before = error(problem, start.gripper_from_camera, start.scale)
-    after = error(problem, adjusted.placed.x[0], problem.scale)
+    after = error(problem, adjusted.state.x[0], problem.scale)
     assert np.linalg.norm(after[:3]) < 0.3e-3
     assert np.degrees(np.linalg.norm(after[3:6])) < 0.03
     assert np.linalg.norm(after[:3]) < 0.3 * np.linalg.norm(before[:3])
-    evidence = adjusted.given.evidence
-    assert np.nanmax(median_reprojection_px(evidence.view, evidence.problem)) < 0.6
+    evidence = adjusted.images
+    assert np.nanmax(median_reprojection_px(evidence.problem, evidence.view)) < 0.6
 
 
 def test_a_focal_length_off_by_five_percent_is_found():
@@ -50,9 +50,9 @@ def test_a_focal_length_off_by_five_percent_is_found():
     problem = hand_eye_problem(rng, 10, robot_noise=(1e-4, np.radians(0.01)), camera_noise=(5e-3, 0.01))
     tracks = observed(problem, rng, 600, 0.3)
     guess = Intrinsics(INTRINSICS.fx * 1.05, INTRINSICS.fy * 1.05, 319.5, 239.5, 640, 480)
-    adjusted = solved(problem, tracks, guess, prior=prior_of(guess, ESTIMATED))
-    assert adjusted.placed.scene.cameras[0].fx == pytest.approx(INTRINSICS.fx, rel=2e-3)
-    assert np.linalg.norm(error(problem, adjusted.placed.x[0], problem.scale)[:3]) < 1e-3
+    adjusted = solved(problem, tracks, camera_with_prior(guess, ESTIMATED))
+    assert adjusted.problem.intrinsics(adjusted.state)[0].fx == pytest.approx(INTRINSICS.fx, rel=2e-3)
+    assert np.linalg.norm(error(problem, adjusted.state.x[0], problem.scale)[:3]) < 1e-3
 
 
 def test_wrong_matches_do_not_pull():
@@ -62,7 +62,7 @@ def test_wrong_matches_do_not_pull():
     wrong = rng.random(len(tracks.image)) < 0.1
     tracks.x_px[wrong] += rng.normal(size=(wrong.sum(), 2)) * 40
     adjusted = solved(problem, tracks)
-    assert np.linalg.norm(error(problem, adjusted.placed.x[0], problem.scale)[:3]) < 1e-3
+    assert np.linalg.norm(error(problem, adjusted.state.x[0], problem.scale)[:3]) < 1e-3
 
 
 @pytest.mark.parametrize("views", [2, 3, 8])
@@ -78,7 +78,7 @@ def test_noise_of_the_images_is_found_from_short_tracks_too(views: int):
         rank[own] = np.arange(len(own))
     few = rank < views
     tracks = tracks.only(few)
-    assert solved(problem, tracks).given.evidence.noise.sigma_px[0] == pytest.approx(0.3, rel=0.1)
+    assert solved(problem, tracks).images.state.pixel_noise.sigma_px[0] == pytest.approx(0.3, rel=0.1)
 
 
 @pytest.mark.slow
@@ -90,7 +90,7 @@ def test_robot_noise_is_found_and_the_ellipsoid_covers():
         problem = hand_eye_problem(rng, 10, robot_noise=noise)
         tracks = observed(problem, rng, 80, 0.3)
         adjusted = solved(problem, tracks)
-        errors = error(problem, adjusted.placed.x[0], recon_frame(adjusted, tracks)[0])
+        errors = error(problem, adjusted.state.x[0], recon_frame(adjusted, tracks)[0])
         inside += errors @ np.linalg.solve(adjusted.covariance[:7, :7], errors) < chi2.ppf(0.95, 7)
         # A part of a few random errors looks smooth.
         estimates.append(adjusted.noise.together)
@@ -103,13 +103,15 @@ def test_intrinsics_go_as_far_from_what_was_given_as_their_standard_deviation_le
     problem = hand_eye_problem(rng, 8, robot_noise=(2e-4, np.radians(0.03)))
     tracks = observed(problem, rng, 300, 0.3)
     off = with_parameters(INTRINSICS, parameters(INTRINSICS) + np.r_[3.0, 3.0, 4.0, 4.0, np.zeros(5)])
-    exact, usual = (solved(problem, tracks, off, prior=prior_of(off, std)) for std in (np.zeros(9), MEASURED))
-    assert exact.placed.scene.cameras[0] == off
+    exact, usual = (solved(problem, tracks, camera_with_prior(off, std)) for std in (np.zeros(9), MEASURED))
+    assert exact.problem.intrinsics(exact.state)[0] == off
     std = np.sqrt(np.diag(usual.intrinsics_covariance(0)))
     assert (
-        abs(usual.placed.scene.cameras[0].fx - INTRINSICS.fx) < 3 * std[0] < abs(off.fx - INTRINSICS.fx) * 3
+        abs(usual.problem.intrinsics(usual.state)[0].fx - INTRINSICS.fx)
+        < 3 * std[0]
+        < abs(off.fx - INTRINSICS.fx) * 3
     )
-    errors = [error(problem, found.placed.x[0], problem.scale)[:6] for found in (exact, usual)]
+    errors = [error(problem, found.state.x[0], problem.scale)[:6] for found in (exact, usual)]
     sigmas = [
         np.abs(gap / np.sqrt(np.diag(found.covariance)[:6])).max()
         for gap, found in zip(errors, (exact, usual), strict=True)
@@ -120,8 +122,8 @@ def test_intrinsics_go_as_far_from_what_was_given_as_their_standard_deviation_le
 
 def counted(monkeypatch) -> list[int]:
     """One more entry for each time that images are linearised."""
-    calls, linearised = [], together.linearised
-    monkeypatch.setattr(together, "linearised", lambda *given: (calls.append(1), linearised(*given))[1])
+    calls, linearised = [], solve.linearised
+    monkeypatch.setattr(solve, "linearised", lambda *given: (calls.append(1), linearised(*given))[1])
     return calls
 
 
@@ -131,12 +133,12 @@ def test_an_adjustment_goes_on_until_it_stays(monkeypatch):
     tracks = observed(problem, rng, 300, 0.4)
     # Errors of matches have long tails, and their size and the weights then depend on each other for long.
     tracks.x_px[:] += rng.standard_t(2, size=tracks.x_px.shape)
-    found = solved(problem, tracks, prior=prior_of(INTRINSICS, MEASURED))
-    monkeypatch.setattr(together, "STEP_SETTLED", 1e-5)
-    monkeypatch.setattr(together, "SIZES_SETTLED", 1e-5)
-    monkeypatch.setattr(together, "ROUNDS", 200)
-    settled = solved(problem, tracks, prior=prior_of(INTRINSICS, MEASURED))
-    off = step_between(found.placed.x[0], settled.placed.x[0])
+    found = solved(problem, tracks, camera_with_prior(INTRINSICS, MEASURED))
+    monkeypatch.setattr(solve, "STEP_SETTLED", 1e-5)
+    monkeypatch.setattr(solve, "SIZES_SETTLED", 1e-5)
+    monkeypatch.setattr(solve, "ROUNDS", 200)
+    settled = solved(problem, tracks, camera_with_prior(INTRINSICS, MEASURED))
+    off = step_between(found.state.x[0], settled.state.x[0])
     assert (np.abs(off) < 0.05 * np.sqrt(np.diag(settled.covariance)[:6])).all()
 
 
@@ -145,14 +147,14 @@ def test_an_adjustment_that_begins_near_ends_where_one_from_poses_does(monkeypat
     problem = hand_eye_problem(rng, 10, robot_noise=(3e-4, np.radians(0.05)))
     tracks = observed(problem, rng, 300, 0.4)
     off = with_parameters(INTRINSICS, parameters(INTRINSICS) + np.r_[2.0, 2.0, 2.0, -2.0, np.zeros(5)])
-    near = solved(problem, tracks, off, prior=prior_of(off, MEASURED))
+    near = solved(problem, tracks, camera_with_prior(off, MEASURED))
     calls = counted(monkeypatch)
-    from_poses = solved(problem, tracks, off, prior=prior_of(off, ESTIMATED))
+    from_poses = solved(problem, tracks, camera_with_prior(off, ESTIMATED))
     of_poses = len(calls)
-    again = solved(problem, tracks, off, prior=prior_of(off, ESTIMATED), options=WristOptions(near=near))
+    again = solved(problem, tracks, camera_with_prior(off, ESTIMATED), near=near)
     assert len(calls) - of_poses < of_poses
-    apart = step_between(from_poses.placed.x[0], again.placed.x[0])
+    apart = step_between(from_poses.state.x[0], again.state.x[0])
     assert (np.abs(apart) < 0.05 * np.sqrt(np.diag(from_poses.covariance)[:6])).all()
     std = np.sqrt(np.diag(from_poses.intrinsics_covariance(0)))[:4]
-    cameras = [parameters(one.placed.scene.cameras[0])[:4] for one in (from_poses, again)]
+    cameras = [parameters(one.problem.intrinsics(one.state)[0])[:4] for one in (from_poses, again)]
     assert (np.abs(cameras[0] - cameras[1]) < 0.1 * std).all()

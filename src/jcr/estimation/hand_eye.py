@@ -143,7 +143,7 @@ def _with_residuals(gripper: Poses, camera: Poses, fit: Solution, distinct: Int[
             gripper_from_camera=x,
             scale=scale,
             base_from_recon=z,
-            covariance=fit.covariance,
+            covariance=fit.covariance[:7, :7],
             budget=fit.budget,
         ),
         images=ImageResiduals(

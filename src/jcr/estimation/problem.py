@@ -99,7 +99,7 @@ class State:
     camera_steps: Float[ndarray, " l"] = field(default_factory=lambda: np.zeros(0))
     """Steps of the columns before the mounts, from the initial values of the cameras."""
     points_in_world: Float[ndarray, "p 3"] = field(default_factory=lambda: np.zeros((0, 3)))
-    model_error_std: Float[ndarray, " c"] = field(default_factory=lambda: np.zeros(0))
+    model_error_std: Float[ndarray, " g"] = field(default_factory=lambda: np.zeros(0))
     """Size of the remaining distortion of each camera's model, in widths of its image."""
     pixel_noise: PixelNoise | None = None
     """None before the first estimate."""

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.estimation.boards import shapes_of
+from jcr.estimation.boards import BoardShapes, shapes_of
 from jcr.estimation.intrinsics_prior import FIXED, Camera, camera_with_prior
 from jcr.estimation.observations import Observations
 from jcr.estimation.problem import (
@@ -54,6 +54,22 @@ def pose_problem(
         robot_noise_floor=noise_floor,
     )
     return problem, State(x=x[None], scale=scale, z=z[None], world_from_rig=recon_from_camera)
+
+
+def image_problem(
+    world_from_rig: Float[ndarray, "m 4 4"],
+    camera: Camera,
+    observations: Observations,
+    points_in_world: Float[ndarray, "p 3"],
+    boards: BoardShapes | None = None,
+) -> tuple[Problem, State]:
+    """Return the problem of the images of one camera without an arm, and its initial state."""
+    nothing = np.zeros((0, 4, 4))
+    state = State(
+        x=nothing, scale=1.0, z=nothing, world_from_rig=world_from_rig, points_in_world=points_in_world
+    )
+    problem = Problem(arms=(), n_rigs=len(world_from_rig), cameras=(camera,), boards=boards)
+    return with_observations(problem, state, observations)
 
 
 def adjust_wrist(  # noqa: PLR0913 (each is a fact about the capture)

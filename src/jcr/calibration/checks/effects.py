@@ -368,7 +368,8 @@ def effects_of_fit(
     problem: Problem, state: ProblemState, hand_eye: HandEye, names: Sequence[str]
 ) -> tuple[Finding, ...]:
     """Return the most significant effect of the order on a fit to camera poses; `names` are those of its poses."""
-    equations, used = pose_equations(problem, state, None).equations, np.flatnonzero(problem.used)
+    found = pose_equations(problem, state, None)
+    equations, used = found.equations, np.flatnonzero(found.used)
     poses = ArmEquations(
         equations=equations,
         log_sizes=most_likely(equations)[0],

@@ -17,7 +17,7 @@ from jcr.camera import unproject
 from jcr.estimation.image_equations import ImageEvidence, adjust_images
 from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, camera_with_prior
 from jcr.estimation.observations import Observations
-from jcr.estimation.problem import Problem, State, with_observations
+from jcr.estimation.wrist import image_problem
 from jcr.geometry import inverse
 from jcr.reconstruct.preprocess import ImageGrid, PreparedImages
 from jcr.reconstruct.views_at_once.colour_matches import Geometry, Matches, colour_matches
@@ -141,16 +141,10 @@ def adjust_matches(tracks: Tracks, geometry: Geometry, fixed: bool) -> _Adjusted
     points that fewer than two views are left to see."""
     images, camera = len(geometry.recon_from_camera), geometry.pinhole
     prior = camera_with_prior(camera, FIXED if fixed else {"f": ESTIMATED["f"]})
-    nothing = np.zeros((0, 4, 4))
-    state = State(
-        x=nothing,
-        scale=1.0,
-        z=nothing,
-        world_from_rig=geometry.recon_from_camera,
-        points_in_world=tracks.points_in_recon,
+    observations = Observations.of_one_camera(tracks, images)
+    shown = adjust_images(
+        *image_problem(geometry.recon_from_camera, prior, observations, tracks.points_in_recon)
     )
-    problem = Problem(arms=(), n_rigs=images, cameras=(prior,))
-    shown = adjust_images(*with_observations(problem, state, Observations.of_one_camera(tracks, images)))
     seen, points = shown.problem.observations, shown.state.points_in_world
     assert seen is not None
     error = np.linalg.norm(shown.view.residual_px, axis=1)
