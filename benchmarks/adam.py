@@ -16,12 +16,12 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from jcr.geometry import inverse, transform
-from jcr.reconstruct.global_alignment.alignment import Alignment, AlignOptions, Pinhole, pinhole_of
-from jcr.reconstruct.global_alignment.depths import initial_depth
-from jcr.reconstruct.global_alignment.initial_estimate import initial_state
-from jcr.reconstruct.global_alignment.observations import choose_pixels, observe, weigh, weight_is_log
-from jcr.reconstruct.global_alignment.pairs import PairPredictions
-from jcr.reconstruct.global_alignment.pointmap_residuals import State
+from jcr.pointmaps.global_alignment.alignment import Alignment, AlignOptions, Pinhole, pinhole_of
+from jcr.pointmaps.global_alignment.depths import initial_depth
+from jcr.pointmaps.global_alignment.initial_estimate import initial_state
+from jcr.pointmaps.global_alignment.observations import choose_pixels, observe, weigh, weight_is_log
+from jcr.pointmaps.global_alignment.pointmap_residuals import State
+from jcr.pointmaps.pairs import PairPredictions
 
 START_PIXELS = 2048
 FOCAL_SLOWNESS = 20.0

@@ -24,9 +24,9 @@ from jcr.geometry import (
     rotation_exp,
     transform,
 )
-from jcr.reconstruct.dust3r.pair_graph import complete_pairs
-from jcr.reconstruct.global_alignment.align import global_align
-from jcr.reconstruct.global_alignment.pairs import PairPredictions
+from jcr.pointmaps.dust3r.pair_graph import complete_pairs
+from jcr.pointmaps.global_alignment.align import global_align
+from jcr.pointmaps.pairs import PairPredictions
 from simulation.problems import HandEyeProblem, disturbed, error
 
 SMALL, MIDDLE, LARGE = (64, 48), (128, 96), (512, 384)

@@ -13,9 +13,9 @@ import tyro
 
 from benchmarks.adam import AdamOptions, align_adam
 from jcr.files import written_whole
-from jcr.reconstruct.global_alignment.align import global_align
-from jcr.reconstruct.global_alignment.alignment import AlignOptions
-from jcr.reconstruct.global_alignment.pairs import read_pairs
+from jcr.pointmaps.global_alignment.align import global_align
+from jcr.pointmaps.global_alignment.alignment import AlignOptions
+from jcr.pointmaps.pairs import read_pairs
 
 
 @dataclass(frozen=True)

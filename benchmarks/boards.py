@@ -24,7 +24,7 @@ from jcr.capture.read import read_capture
 from jcr.errors import InputError, RejectedError
 from jcr.geometry import apply, inverse, nearest_to_lines, rotation_between_deg, step_between
 from jcr.pipeline import calibrate
-from jcr.reconstruct.backends import ReconstructOptions
+from jcr.reconstruct import ReconstructOptions
 from jcr.records import Capture, HandEye, Intrinsics, Kind, Reconstruction, Tracks
 from jcr.results import RunOptions, RunResult
 from simulation.boards import Sheet, with_sheet

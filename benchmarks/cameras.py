@@ -20,7 +20,7 @@ from jcr.estimation.intrinsics_prior import camera_with_prior
 from jcr.estimation.problem import Problem, State, with_observations
 from jcr.estimation.solve import Solution, solve
 from jcr.geometry import inverse, scale_translation, skew, step_between
-from jcr.reconstruct.backends import ReconstructOptions, reconstruct
+from jcr.reconstruct import ReconstructOptions, reconstruct
 from jcr.records import Capture, CellCamera
 from simulation.arms import PresetName
 from simulation.cells import BOX, CellProblem, Kind, cell_problem

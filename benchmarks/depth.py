@@ -18,7 +18,7 @@ from jcr.camera import project, rays
 from jcr.capture.read import read_capture
 from jcr.depth.densify import densify
 from jcr.geometry import apply, inverse
-from jcr.reconstruct.backends import ReconstructOptions, reconstruct
+from jcr.reconstruct import ReconstructOptions, reconstruct
 from jcr.records import BOTH, MATCHED, PRIOR, HandEye, Intrinsics, Reconstruction
 from jcr.scene.build import build_scene
 from jcr.scene.cloud import point_cloud

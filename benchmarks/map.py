@@ -25,7 +25,7 @@ from jcr.errors import InputError
 from jcr.export.provenance import Provenance
 from jcr.export.volume import write_octomap
 from jcr.geometry import apply, inverse
-from jcr.reconstruct.backends import ReconstructOptions, reconstruct
+from jcr.reconstruct import ReconstructOptions, reconstruct
 from jcr.records import PointCloud
 from jcr.scene.build import build_scene
 from jcr.scene.cloud import point_cloud

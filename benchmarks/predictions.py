@@ -11,7 +11,7 @@ from benchmarks.synthetic_pairs import pairs_of_capture, write_pairs
 from jcr.capture.read import read_capture
 from jcr.pipeline import RunOptions
 from jcr.pipeline import run as run_all
-from jcr.reconstruct.backends import ReconstructOptions
+from jcr.reconstruct import ReconstructOptions
 from jcr.results import RunResult
 from simulation.capture import SimulateOptions, simulate
 from simulation.problems import HandEyeProblem, error

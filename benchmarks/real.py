@@ -29,7 +29,7 @@ from jcr.geometry import (
     transform,
 )
 from jcr.pipeline import RunOptions, calibrate
-from jcr.reconstruct.backends import ReconstructOptions
+from jcr.reconstruct import ReconstructOptions
 from jcr.records import Capture, HandEye, Intrinsics, LeaveOneOut, coefficients_of
 
 

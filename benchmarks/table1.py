@@ -16,8 +16,8 @@ from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
 from jcr.estimation.residuals import paper_residuals
 from jcr.geometry import Transforms, fit_similarity, rotation_log, scale_translation
-from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, candidates, reconstruct
-from jcr.reconstruct.global_alignment.pairs import ARRAYS
+from jcr.pointmaps.pairs import ARRAYS
+from jcr.reconstruct import BACKENDS, ReconstructOptions, candidates, reconstruct
 from jcr.records import Capture, Reconstruction
 from jcr.sfm.colmap import reconstruct_colmap
 from jcr.sfm.options import ColmapOptions

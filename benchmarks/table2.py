@@ -14,7 +14,7 @@ from benchmarks.page import table
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.depth.densify import densify
-from jcr.reconstruct.backends import ReconstructOptions, reconstruct
+from jcr.reconstruct import ReconstructOptions, reconstruct
 from jcr.scene.cloud import point_cloud
 from jcr.segments.labels import read_labels
 from jcr.segments.measure import ObjectSize, measure

@@ -24,8 +24,8 @@ from jcr.cli import COMMANDS, dispatch
 from jcr.cli.models import SCALES
 from jcr.depth.depth_npz import About as DepthAbout
 from jcr.pages import pages
-from jcr.reconstruct.backends import BACKENDS
-from jcr.reconstruct.reconstruction_npz import About
+from jcr.reconstruct import BACKENDS
+from jcr.reconstruction_npz import About
 from jcr.run_folder import State
 
 REFERENCE = Path(__file__).parent / "reference"

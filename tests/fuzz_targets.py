@@ -27,9 +27,9 @@ from jcr.cli.query import read_points
 from jcr.depth.dense import pointmaps_of
 from jcr.depth.depth_npz import read_depth, write_depth
 from jcr.geometry import inverse
-from jcr.reconstruct.backends import ReconstructOptions
-from jcr.reconstruct.global_alignment.pairs import pairs_from_arrays, read_arrays
-from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
+from jcr.pointmaps.pairs import pairs_from_arrays, read_arrays
+from jcr.reconstruct import ReconstructOptions
+from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Attempt, Capture, Intrinsics, PointCloud, Pointmaps, PosePairs, Reconstruction, Tracks
 from jcr.scene.cloud_ply import read_cloud, write_cloud
 from jcr.scene.map_file import load_map
@@ -211,8 +211,8 @@ def networks(folder: Path) -> dict[str, Target]:
     """What networks leave, or are."""
     import torch
 
-    from jcr.reconstruct.dust3r.weights import load_weights
-    from jcr.reconstruct.hub import Weights
+    from jcr.hub import Weights
+    from jcr.pointmaps.dust3r.weights import load_weights
 
     folder.mkdir()
     shape = (2, 4, 4)

@@ -19,7 +19,7 @@ from fuzz_targets import sound_run
 from jcr.capture.images import encode_png
 from jcr.capture.options import ReadOptions
 from jcr.options import checked_options
-from jcr.reconstruct.backends import BACKENDS
+from jcr.reconstruct import BACKENDS
 from jcr.results import RunOptions
 
 

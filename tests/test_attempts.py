@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from jcr import attempts
+from jcr import reconstruct as backends
 from jcr.calibration import stage as calibration_stage
 from jcr.calibration.checks import capture as capture_checks
 from jcr.calibration.options import CalibrateOptions
@@ -18,8 +19,7 @@ from jcr.cli import dispatch
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.geometry import rotation_exp, transform
-from jcr.reconstruct import backends
-from jcr.reconstruct.backends import Backend, ReconstructOptions
+from jcr.reconstruct import Backend, ReconstructOptions
 from jcr.records import Capture, Finding, HandEye, Intrinsics, Kind, Pointmaps, Reconstruction, Tracks
 from simulation.problems import HandEyeProblem, hand_eye_problem
 
@@ -457,7 +457,7 @@ def garbage_weights(tmp_path: Path) -> Path:
     import torch
     from safetensors.torch import save_file
 
-    from jcr.reconstruct.dust3r.network import Dust3r
+    from jcr.pointmaps.dust3r.network import Dust3r
 
     torch.manual_seed(0)
     network = Dust3r(**GARBAGE)

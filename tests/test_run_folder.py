@@ -14,7 +14,7 @@ from fuzz_targets import RUN_IMAGES, sound_run
 from jcr.calibration.options import CalibrateOptions
 from jcr.cli import call, dispatch
 from jcr.errors import InputError
-from jcr.reconstruct.backends import ReconstructOptions
+from jcr.reconstruct import ReconstructOptions
 from jcr.records import Capture, CellCamera
 from jcr.results import RunOptions
 from jcr.run_folder import MadeWith, RunFolder, state_of

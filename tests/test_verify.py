@@ -24,7 +24,7 @@ from jcr.estimation.solve import solve
 from jcr.estimation.systematic import arm_errors, posed, smooth_errors
 from jcr.estimation.wrist import pose_problem
 from jcr.geometry import inverse, rotation_exp, scale_translation, step_between, transform
-from jcr.reconstruct.backends import ReconstructOptions
+from jcr.reconstruct import ReconstructOptions
 from jcr.records import Capture, Reconstruction, Tracks
 from jcr.run_folder import MadeWith, RunFolder, state_of
 from jcr.sfm.register import register

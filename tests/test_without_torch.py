@@ -17,8 +17,8 @@ pytestmark = pytest.mark.slow
 
 MAY_NEED_TORCH = (
     "features/learned", "features/xfeat",
-    "reconstruct/dust3r/",
-    "reconstruct/views_at_once/", "reconstruct/predictions", "scene/", "segments/sam",
+    "pointmaps/dust3r/",
+    "pointmaps/", "pointmaps/predictions", "scene/", "segments/sam",
     "export/rrd", "export/volume", "viewer/",
 )  # fmt: skip
 """Modules in src/jcr that may import torch (or viser) when they are imported themselves."""

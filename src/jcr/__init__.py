@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from jcr.live.calibration import LiveCalibration
     from jcr.live.calibration_progress import Progress, Reached
     from jcr.pipeline import add_camera, build_map, calibrate, measure, run
-    from jcr.reconstruct.backends import ReconstructOptions
-    from jcr.reconstruct.global_alignment.align import global_align
-    from jcr.reconstruct.global_alignment.alignment import Alignment, AlignOptions
-    from jcr.reconstruct.global_alignment.pairs import PairPredictions
+    from jcr.pointmaps.global_alignment.align import global_align
+    from jcr.pointmaps.global_alignment.alignment import Alignment, AlignOptions
+    from jcr.pointmaps.pairs import PairPredictions
+    from jcr.reconstruct import ReconstructOptions
     from jcr.records import (
         Budget,
         Capture,
@@ -69,7 +69,7 @@ if TYPE_CHECKING:
 _MODULE_OF = {
     "ReadOptions": "jcr.capture.options",
     "CalibrateOptions": "jcr.calibration.options",
-    "ReconstructOptions": "jcr.reconstruct.backends",
+    "ReconstructOptions": "jcr.reconstruct",
     "CloudOptions": "jcr.scene.options",
     "MapOptions": "jcr.scene.options",
     "SegmentOptions": "jcr.segments.options",
@@ -116,10 +116,10 @@ _MODULE_OF = {
     "export_run": "jcr.export.formats",
     "read_capture": "jcr.capture.read",
     "solve_hand_eye": "jcr.estimation.hand_eye",
-    "Alignment": "jcr.reconstruct.global_alignment.alignment",
-    "AlignOptions": "jcr.reconstruct.global_alignment.alignment",
-    "PairPredictions": "jcr.reconstruct.global_alignment.pairs",
-    "global_align": "jcr.reconstruct.global_alignment.align",
+    "Alignment": "jcr.pointmaps.global_alignment.alignment",
+    "AlignOptions": "jcr.pointmaps.global_alignment.alignment",
+    "PairPredictions": "jcr.pointmaps.pairs",
+    "global_align": "jcr.pointmaps.global_alignment.align",
     "LiveCalibration": "jcr.live.calibration",
     "Progress": "jcr.live.calibration_progress",
     "Reached": "jcr.live.calibration_progress",

@@ -14,7 +14,7 @@ from jcr.depth.densify import densify
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError, RejectedError
 from jcr.progress import Progress, silent
-from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, reconstruct, tries
+from jcr.reconstruct import BACKENDS, ReconstructOptions, reconstruct, tries
 from jcr.records import (
     LASTING,
     Attempt,

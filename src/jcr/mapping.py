@@ -9,7 +9,7 @@ from jcr.calibration.calibration_json import CalibrationFile
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError
 from jcr.progress import Progress
-from jcr.reconstruct.backends import device_of
+from jcr.reconstruct import device_of
 from jcr.records import Capture, PointCloud
 from jcr.results import RunOptions, RunResult
 from jcr.scene.cloud import point_cloud

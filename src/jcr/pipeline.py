@@ -23,7 +23,7 @@ from jcr.errors import InputError, RejectedError
 from jcr.extras import is_installed
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
-from jcr.reconstruct.backends import BackendName, check_board
+from jcr.reconstruct import BackendName, check_board
 from jcr.records import Capture, PosePairs
 from jcr.results import PosesResult, RunOptions, RunResult, SavedRun, load_run
 from jcr.run_folder import CAPTURE, REPORT, RunFolder, locked

@@ -15,7 +15,7 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.cell.cameras_json import CamerasFile
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError
-from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, tries, with_cameras_of
+from jcr.reconstruct import BACKENDS, ReconstructOptions, tries, with_cameras_of
 from jcr.records import (
     Capture,
     HandEye,

@@ -35,8 +35,8 @@ from jcr.depth.depth_npz import is_made_from, read_depth, write_depth
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError
 from jcr.files import read_bytes, remove_unfinished, write_text
-from jcr.reconstruct.backends import ReconstructOptions, candidates
-from jcr.reconstruct.reconstruction_npz import FORMAT, read_reconstruction, write_reconstruction
+from jcr.reconstruct import ReconstructOptions, candidates
+from jcr.reconstruction_npz import FORMAT, read_reconstruction, write_reconstruction
 from jcr.records import Attempt, Capture, PointCloud, Reconstruction
 from jcr.scene.cloud_ply import read_cloud, write_cloud
 from jcr.scene.map_file import FILE as MAP

@@ -25,7 +25,7 @@ from jcr.estimation.wrist import pose_problem
 from jcr.geometry import Poses, step_between
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
-from jcr.reconstruct.backends import ReconstructOptions, reconstruct
+from jcr.reconstruct import ReconstructOptions, reconstruct
 from jcr.records import Capture, PosePairs, Reconstruction, Verdict
 from jcr.records.words import sentence
 from jcr.run_folder import RunFolder

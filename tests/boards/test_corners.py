@@ -12,7 +12,7 @@ from jcr.boards.detection import Board, Sighting, boards, is_of_unknown_size, si
 from jcr.calibration.stage import calibrate
 from jcr.camera import project
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
+from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Capture, Kind, Reconstruction
 from jcr.records.words import sentence
 from simulation.faults import Faults, FaultyCapture, faulty_capture

@@ -158,7 +158,7 @@ def test_objects_are_measured_to_three_percent(done: Path, tabletop: Path):
 
 def test_scale_is_metric_to_half_a_percent(done: Path, tabletop: Path):
     from jcr.geometry import fit_similarity
-    from jcr.reconstruct.reconstruction_npz import read_reconstruction
+    from jcr.reconstruction_npz import read_reconstruction
 
     reconstruction = read_reconstruction(done / "reconstruction.npz")
     truth = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])

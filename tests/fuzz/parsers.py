@@ -19,7 +19,8 @@ READERS = [
     "jcr.cli.query",
     "jcr.scene.cloud_ply",
     "jcr.live",
-    "jcr.reconstruct",
+    "jcr.pointmaps",
+    "jcr.reconstruction_npz",
 ]
 READERS += ["jcr.scene", "rosbags", "safetensors", "yaml"]
 with atheris.instrument_imports(include=READERS):

@@ -18,7 +18,7 @@ from jcr.capture.images import read_image
 from jcr.geometry import inverse, rotation_exp, step_between, transform
 from jcr.live.calibration import LiveCalibration
 from jcr.live.calibration_progress import Progress
-from jcr.reconstruct.backends import ReconstructOptions, reconstruct
+from jcr.reconstruct import ReconstructOptions, reconstruct
 from jcr.records import Kind
 
 REQUIRED = (2.0, 0.3)

@@ -12,7 +12,7 @@ from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output
 from jcr.cli.source import run_options
 from jcr.depth.options import DepthOptions
-from jcr.reconstruct.backends import ReconstructOptions
+from jcr.reconstruct import ReconstructOptions
 from jcr.scene.options import CloudOptions, MapOptions
 
 if TYPE_CHECKING:

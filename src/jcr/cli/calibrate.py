@@ -12,7 +12,7 @@ from jcr.cli.output import Output
 from jcr.cli.result import show, show_calibration
 from jcr.cli.source import run_options, source
 from jcr.depth.options import DepthOptions
-from jcr.reconstruct.backends import ReconstructOptions
+from jcr.reconstruct import ReconstructOptions
 
 
 @dataclass(frozen=True, kw_only=True)

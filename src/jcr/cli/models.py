@@ -8,8 +8,8 @@ import tyro
 
 from jcr.cli.output import Output
 from jcr.errors import InputError
-from jcr.reconstruct.backends import BACKENDS, Backend, weights_command
-from jcr.reconstruct.hub import HUB_FILES, HUB_ID, download
+from jcr.hub import HUB_FILES, HUB_ID, download
+from jcr.reconstruct import BACKENDS, Backend, weights_command
 
 
 @dataclass(frozen=True, kw_only=True)

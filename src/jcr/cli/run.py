@@ -13,7 +13,7 @@ from jcr.cli.output import Output
 from jcr.cli.result import show, show_calibration
 from jcr.cli.source import run_options, source, with_images
 from jcr.depth.options import DepthOptions
-from jcr.reconstruct.backends import ReconstructOptions
+from jcr.reconstruct import ReconstructOptions
 from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 

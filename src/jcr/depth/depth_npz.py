@@ -16,7 +16,7 @@ from jcr.capture.images import read_image
 from jcr.depth.dense import pointmaps_of
 from jcr.geometry import apply, inverse
 from jcr.intrinsics_json import IntrinsicsJson
-from jcr.reconstruct.reconstruction_npz import check_arrays, read_npz, write_npz
+from jcr.reconstruction_npz import check_arrays, read_npz, write_npz
 from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction
 
 FILE = "depth.npz"

@@ -19,8 +19,8 @@ from torch.nn import functional as F
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.geometry import apply_similarity
+from jcr.hub import cached_files
 from jcr.progress import Progress
-from jcr.reconstruct.hub import cached_files
 from jcr.records import HandEye, Reconstruction
 from jcr.segments.labels import LabelImages
 

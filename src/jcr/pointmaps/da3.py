@@ -1,0 +1,113 @@
+"""Depth Anything 3 (Lin et al. 2025, arXiv 2511.10647): depth, confidence and cameras of any number of views.
+
+Its package builds the network of a configuration (`create_object(load_config(...))`, its README), which is all that is
+taken of it: reading images, exporting and the web page are left alone, and so need not be installed. Its conventions:
+cameras are camera_from_recon, x right, y down, z forward; depth is along z, not along the ray; intrinsics count from the
+image's corner; the unit is arbitrary.
+"""
+
+import json
+import os
+import warnings
+from contextlib import nullcontext
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from numpy import ndarray
+from torch import nn
+
+from jcr.errors import InputError
+from jcr.geometry import inverse
+from jcr.pointmaps.grid import ImageGrid
+from jcr.pointmaps.interface import (
+    Predict,
+    Predicted,
+    Views,
+    checked,
+    normalised,
+    output,
+    pinhole_of_edges,
+    rays_of,
+    rigid,
+)
+
+LONG_EDGE, PATCH = 504, 14
+
+
+def load(weights: Path, device: str) -> Predict:
+    """The network in a folder of config.json and model.safetensors.
+
+    Raises InputError for files that are missing, damaged or of another network.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        name = json.loads((weights / "config.json").read_text("utf-8"))["model_name"]
+        state = load_file(weights / "model.safetensors")
+        network = build(name)
+        network.load_state_dict({key.removeprefix("model."): state[key] for key in state})
+    except (OSError, ValueError, KeyError, RuntimeError, SafetensorError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{weights}: no weights of Depth Anything 3 ({reason})") from None
+    return partial(predict, network.to(device))
+
+
+def build(name: str) -> nn.Module:
+    """The network of a configuration of the package, with random weights; KeyError for a name it does not know."""
+    os.environ.setdefault("DA3_LOG_LEVEL", "ERROR")  # it tells stdout which layers it builds
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of its configuration's library
+        from depth_anything_3.cfg import create_object, load_config  # type: ignore[import-not-found]
+        from depth_anything_3.registry import MODEL_REGISTRY  # type: ignore[import-not-found]
+
+        return create_object(load_config(MODEL_REGISTRY[name])).eval()
+
+
+def predict(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) -> Predicted:
+    """Predict all views in one pass."""
+    grid = grid_of(views.size, long_edge)
+    colors = np.stack([resized(image, grid, long_edge) for image in views.colors])
+    device = next(network.parameters()).device.type
+    # Half the time on a GPU, and what the package does there; on a CPU half precision is no faster.
+    half = torch.autocast("cuda", torch.bfloat16) if device == "cuda" else nullcontext()
+    with torch.inference_mode(), half:
+        answer = network(normalised(colors, device)[None], None, None)
+    count, height, width = colors.shape[:3]
+    depth = output(answer, "depth", (count, height, width), "Depth Anything 3")
+    pinholes = pinhole_of_edges(output(answer, "intrinsics", (count, 3, 3), "Depth Anything 3"))
+    camera_from_recon = rigid(output(answer, "extrinsics", (count, 3, 4), "Depth Anything 3"))
+    return checked(
+        Predicted(
+            grid=grid,
+            x_in_camera=depth[..., None] * rays_of(pinholes, height, width),
+            confidence=output(answer, "depth_conf", (count, height, width), "Depth Anything 3"),
+            pinholes=pinholes,
+            recon_from_camera=inverse(camera_from_recon),
+            is_metric=False,
+        ),
+        "Depth Anything 3",
+    )
+
+
+def grid_of(size: tuple[int, int], long_edge: int = LONG_EDGE) -> ImageGrid:
+    """Nothing is cropped: the long edge becomes `long_edge`, then each edge the nearest multiple of the patch."""
+    edges = (round(edge * long_edge / max(size)) for edge in size)
+    width, height = (max(1, (edge + PATCH // 2) // PATCH) * PATCH for edge in edges)
+    return ImageGrid.uncropped(size, (width, height))
+
+
+def resized(image: UInt8[ndarray, "h w 3"], grid: ImageGrid, long_edge: int) -> UInt8[ndarray, "h2 w2 3"]:
+    """An image on the grid, in the two steps and with the filters of the package."""
+    height, width = image.shape[:2]
+    scale = long_edge / max(width, height)
+    for size in ((max(1, round(width * scale)), max(1, round(height * scale))), grid.size):
+        if size != (width, height):
+            enlarges = size[0] > width or size[1] > height
+            image = cv2.resize(image, size, interpolation=cv2.INTER_CUBIC if enlarges else cv2.INTER_AREA)
+            width, height = size
+    return image

@@ -1,0 +1,130 @@
+"""Options and result of global alignment."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.camera import rays
+from jcr.errors import InputError
+from jcr.pointmaps.pairs import PairPredictions
+from jcr.records import Intrinsics
+
+LEAST_PIXELS = 50
+"""Several for each coarse cell that tells how far residuals go together."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlignOptions:
+    """Options of global alignment."""
+
+    focal: Literal["auto", "shared", "own", "given"] = "auto"
+    """shared: one for all images; own: one per image; given: fixed at the predictions' intrinsics; auto: given
+    where the predictions carry intrinsics, else shared."""
+    principal_point_px: tuple[float, float] | None = None
+    """x, y on the pointmaps' grid, pixel (0, 0) being a centre; unset: the predictions' intrinsics where they
+    carry them, else (W/2, H/2), where DUSt3R puts it (half a pixel right and down of the image's middle)."""
+    pixels: int = 2048
+    """Pixels per image, the most confident of as many equal cells."""
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """The projection the images share, up to the focal lengths that alignment estimates."""
+
+    principal_point_px: tuple[float, float]
+    aspect: float
+    """fy over fx."""
+    focal_px: float | None
+    """fx where it is given; None: to be estimated."""
+    shared: bool
+    """One focal length for all images."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Alignment:
+    """One reconstruction from pairwise pointmaps: a camera and a depth map per image, a scale per pair.
+
+    The recon frame is the camera frame of image 0; its unit is the geometric mean of the pairs' own units, so
+    metric predictions give metres.
+    """
+
+    recon_from_camera: Float[ndarray, "n 4 4"]
+    focal_px: Float[ndarray, "n 2"]
+    """fx, fy of each image."""
+    principal_point_px: tuple[float, float]
+    depth: Float[ndarray, "n h w"]
+    """Depth along the optical axis, recon units."""
+    confidence: Float[ndarray, "n h w"]
+    """The network's, averaged over the pairs, each pair counting as far as it agrees with this depth."""
+    pair_scale: Float[ndarray, " e"]
+    """σ_e: recon units per unit of the pair's pointmaps (paper eq. 1)."""
+    pair_residual: Float[ndarray, " e"]
+    """Typical distance of a pair's points from the reconstruction, relative to that from the camera."""
+    covariance: Float[ndarray, "r r"]
+    """Covariance of the steps of all cameras (translation, rotation), r = 6n; zero for image 0."""
+    notes: tuple[str, ...] = ()
+    """Pairs that contradict the others and count little."""
+    warnings: tuple[str, ...] = ()
+    """Faults of the alignment that the user must act on, such as pairs that agree on nothing."""
+
+    def points_in_recon(self) -> Float[ndarray, "n h w 3"]:
+        """The pointmaps, float32."""
+        count, height, width = self.depth.shape
+        cx, cy = self.principal_point_px
+        points = np.empty((count, height, width, 3), np.float32)
+        for k, (recon_from_camera, (fx, fy)) in enumerate(
+            zip(self.recon_from_camera, self.focal_px, strict=True)
+        ):
+            ray = rays(Intrinsics(fx, fy, cx, cy, width, height)).astype(np.float32)
+            points[k] = (ray * self.depth[k, ..., None]) @ recon_from_camera[:3, :3].T.astype(np.float32)
+            points[k] += recon_from_camera[:3, 3].astype(np.float32)
+        return points
+
+
+def pinhole_of(predictions: PairPredictions, options: AlignOptions) -> Pinhole:
+    """What is known of the projection before alignment.
+
+    Raises InputError where a given focal length is asked for and the predictions carry none.
+    """
+    given = predictions.intrinsics
+    if options.focal == "given" and given is None:
+        raise InputError(
+            "focal 'given', but the predictions carry no intrinsics; add them or ask for 'shared'"
+        )
+    height, width = predictions.conf.shape[1:]
+    middle = (width / 2, height / 2) if given is None else (given.cx, given.cy)
+    return Pinhole(
+        principal_point_px=options.principal_point_px or middle,
+        aspect=given.fy / given.fx if given else 1.0,
+        focal_px=given.fx if given and options.focal in ("auto", "given") else None,
+        shared=options.focal != "own",
+    )
+
+
+def check_options(options: AlignOptions) -> None:
+    """Raise InputError for numbers that no alignment can work with."""
+    if options.pixels < LEAST_PIXELS:
+        raise InputError(
+            f"{options.pixels} pixels per image are too few; alignment needs {LEAST_PIXELS} or more"
+        )
+
+
+def check_connected(predictions: PairPredictions) -> None:
+    """Raise InputError naming the images that no chain of pairs joins to the first."""
+    count = predictions.image_count
+    if len(predictions.edges) == 0:
+        raise InputError("the predictions have no pair; predict at least one")
+    reached = np.zeros(count, dtype=bool)
+    reached[predictions.edges[0, 0]] = True
+    for _ in range(count):
+        joined = reached[predictions.edges].any(axis=1)
+        reached[predictions.edges[joined].ravel()] = True
+    if not reached.all():
+        names = ", ".join(predictions.names[k] for k in np.flatnonzero(~reached))
+        raise InputError(
+            f"no chain of pairs joins {names} to the other images; predict pairs between them, "
+            "or leave these images out"
+        )

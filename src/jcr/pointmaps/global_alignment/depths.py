@@ -1,0 +1,42 @@
+"""Depth of every pixel of an image from all pairs, once cameras, focal lengths and pair scales are known."""
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.pointmaps.global_alignment.normal_equations import depth_equations
+from jcr.pointmaps.global_alignment.observations import ImageObservations
+from jcr.pointmaps.global_alignment.pointmap_residuals import Noise, State, agreement, residuals
+
+DEPTH_ITERATIONS = 2
+"""The median it starts from is within a percent or two of the answer."""
+
+
+def initial_depth(observations: ImageObservations, state: State) -> Float[ndarray, " m"]:
+    """Median over the pairs of the depth each one predicts; first views alone where the image has any."""
+    o, n = observations, observations.second_count
+    scale = np.exp(o.log_range + state.log_pair_scale[o.pair].astype(np.float32)[:, None])
+    if n < len(o.pair):
+        return np.maximum(np.median(scale[n:] * o.direction[n:, 2], axis=0), 1e-6)
+    camera_axis = state.recon_from_camera[o.image, :3, 2]
+    rotation, center = state.recon_from_camera[o.observer, :3, :3], state.recon_from_camera[o.observer, :3, 3]
+    forward = (camera_axis @ rotation).astype(np.float32)
+    ahead = (center - state.recon_from_camera[o.image, :3, 3]) @ camera_axis
+    depths = scale * np.einsum("kc,kcm->km", forward, o.direction) + ahead.astype(np.float32)[:, None]
+    return np.maximum(np.median(depths, axis=0), 1e-6)
+
+
+def fused_depth(
+    observations: ImageObservations, state: State, noise: Noise
+) -> tuple[Float[ndarray, " m"], Float[ndarray, " m"]]:
+    """Depth of the observed pixels by Gauss-Newton from `initial_depth`, and their weight averaged over the
+    pointmaps, each counting as far as it agrees and as its noise allows."""
+    log_depth = np.log(initial_depth(observations, state))
+    weight = observations.weight
+    for _ in range(DEPTH_ITERATIONS):
+        r = residuals(observations, state, log_depth)
+        weight = observations.weight * agreement(r, noise)
+        hessian, gradient = depth_equations(r, noise, weight)
+        log_depth -= np.clip(gradient / hessian, -0.3, 0.3)
+    share = noise.along**-2 / (noise.along**-2).sum()
+    return np.exp(log_depth), share @ weight

@@ -1,0 +1,139 @@
+"""The pointmaps of all pairs at chosen pixels of one image, laid out for vector arithmetic."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+from jcr.errors import InputError
+from jcr.pointmaps.global_alignment.alignment import Pinhole
+from jcr.pointmaps.pairs import PairPredictions
+
+CELL_SIDE = 4
+"""Residuals are correlated over an image; their cell means on a 4x4 grid measure by how much."""
+POOR = 0.2
+"""Share of a good pixel's weight under which a cell's best pixel is not worth having."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageObservations:
+    """Pointmaps of one image, seen from the cameras of other images (`second` views) and from its own.
+
+    The `k` pointmaps come second views first. Components run before pixels, float32, for speed.
+    """
+
+    image: int
+    pixel_offset: Float[ndarray, "2 m"]
+    """x, y minus the principal point, y divided by fy/fx: over fx they are the ray at unit depth."""
+    cell: Float[ndarray, "m c"]
+    """1 where pixel m lies in coarse cell c."""
+    pair: Int[ndarray, " k"]
+    observer: Int[ndarray, " k"]
+    """The image in whose camera frame the pointmap is."""
+    second: Bool[ndarray, " k"]
+    direction: Float[ndarray, "k 3 m"]
+    """Unit vectors to the predicted points, in the observer's camera frame."""
+    log_range: Float[ndarray, "k m"]
+    """Log of the points' distance to the observer, in the pair's unit."""
+    weight: Float[ndarray, "k m"]
+
+    @property
+    def second_count(self) -> int:
+        """Number of second views, which come first."""
+        return int(self.second.sum())
+
+    @property
+    def second_pairs(self) -> Int[ndarray, " n"]:
+        """Pairs of the second views."""
+        return self.pair[self.second]
+
+    @property
+    def observers(self) -> Int[ndarray, " n"]:
+        """Observers of the second views."""
+        return self.observer[self.second]
+
+
+def choose_pixels(predictions: PairPredictions, count: int) -> list[Int[ndarray, " _"]]:
+    """Flat indices per image: the most confident pixel of each of about `count` equal cells.
+
+    Equal cells keep the whole field of view, which a plain ranking by confidence would give up. Cells without
+    a pixel worth having (sky) are left out. Raises InputError for an image without any confidence.
+    """
+    height, width = predictions.conf.shape[1:]
+    side = np.sqrt(max(1.0, height * width / count))
+    rows, columns = max(1, round(height / side)), max(1, round(width / side))
+    cell = (
+        (np.arange(height)[:, None] * rows // height) * columns + np.arange(width) * columns // width
+    ).ravel()
+    by_cell = np.argsort(cell, kind="stable")
+    starts = np.searchsorted(cell[by_cell], np.arange(rows * columns))
+
+    total = np.zeros((predictions.image_count, height * width), np.float32)
+    for (first, second), conf, conf2 in zip(
+        predictions.edges, predictions.conf, predictions.conf2, strict=True
+    ):
+        total[first] += conf.ravel()
+        total[second] += conf2.ravel()
+    shown = np.bincount(predictions.edges.ravel(), minlength=len(total)).astype(np.float32)
+    chosen = []
+    for k, weight in enumerate(weigh(total / shown[:, None], weight_is_log(predictions))):
+        best = np.maximum.reduceat(weight[by_cell], starts)
+        if best.max() <= 0:
+            name = predictions.images[k] if predictions.images else f"#{k}"
+            raise InputError(f"no pixel of image {name} has any confidence; leave the image out")
+        winners = by_cell[weight[by_cell] == best[cell[by_cell]]]
+        winners = winners[np.unique(cell[winners], return_index=True)[1]]
+        chosen.append(winners[best > POOR * np.quantile(best, 0.9)])
+    return chosen
+
+
+def weigh(confidence: Float[ndarray, "*k"], log_weight: bool) -> Float[ndarray, "*k"]:
+    """Weights of confidences, at least 0."""
+    return np.log(np.maximum(confidence, 1.0)) if log_weight else confidence
+
+
+def weight_is_log(predictions: PairPredictions) -> bool:
+    """Whether confidences follow DUSt3R, from 1 up and weighing log C as published; else they are weights."""
+    largest = max(float(conf.max()) for conf in predictions.conf)
+    return largest > 1.0
+
+
+def observe(
+    predictions: PairPredictions,
+    pinhole: Pinhole,
+    image: int,
+    pixels: Int[ndarray, " m"] | slice,
+    log_weight: bool,
+) -> ImageObservations:
+    """Gather the pointmaps of all pairs at `pixels` (flat indices) of one image."""
+    height, width = predictions.conf.shape[1:]
+    as_second = np.flatnonzero(predictions.edges[:, 1] == image)
+    as_first = np.flatnonzero(predictions.edges[:, 0] == image)
+    sources: Sequence[tuple[ndarray, ndarray, ndarray]] = (
+        (as_second, predictions.pts3d_in_other_view, predictions.conf2),
+        (as_first, predictions.pts3d, predictions.conf),
+    )
+    points = np.stack([view[e].reshape(-1, 3)[pixels].T for edges, view, _ in sources for e in edges])
+    confidence = np.stack([conf[e].ravel()[pixels] for edges, _, conf in sources for e in edges])
+    distance = np.sqrt(np.einsum("kcm,kcm->km", points, points))
+    usable = distance > 1e-12
+    distance[~usable] = 1.0
+    weight = weigh(confidence, log_weight)
+    flat = np.arange(height * width)[pixels]
+    y, x = np.divmod(flat, width)
+    cx, cy = pinhole.principal_point_px
+    coarse = (y * CELL_SIDE // height) * CELL_SIDE + x * CELL_SIDE // width
+    pair = np.concatenate([as_second, as_first])
+    return ImageObservations(
+        image=image,
+        pixel_offset=np.stack([x - cx, (y - cy) / pinhole.aspect]).astype(np.float32),
+        cell=(coarse[:, None] == np.arange(CELL_SIDE**2)).astype(np.float32),
+        pair=pair,
+        observer=predictions.edges[pair, 0],
+        second=np.arange(len(pair)) < len(as_second),
+        direction=points / distance[:, None],
+        log_range=np.log(distance),
+        weight=np.where(usable, weight, np.float32(0.0)),
+    )

@@ -1,0 +1,172 @@
+"""Pointmaps of pairs of images, as a record and a file: what global alignment reads, whoever predicted them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from numpy import ndarray
+
+from jcr.allocator import require_memory
+from jcr.errors import InputError
+from jcr.pointmaps.grid import ImageGrid
+from jcr.records import Intrinsics
+
+ARRAYS = {"edges": 2, "pts3d": 4, "conf": 3, "pts3d_in_other_view": 4, "conf2": 3}
+"""Keys every file has, and their dimensions; the names are those of DUSt3R's own output."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairPredictions:
+    """Pointmaps of ordered image pairs, each pair in its first image's camera frame, at a scale of its own.
+
+    For edge e = (n, m), `pts3d[e]` has a point for each pixel of image n, `pts3d_in_other_view[e]` one for
+    each pixel of image m, both in the camera frame of n (paper section III: X_n,e and X_m,e).
+    """
+
+    edges: Int[ndarray, "e 2"]
+    pts3d: Float[ndarray, "e h w 3"]
+    conf: Float[ndarray, "e h w"]
+    """Confidence of `pts3d`, at least 0; the network's own is at least 1."""
+    pts3d_in_other_view: Float[ndarray, "e h w 3"]
+    conf2: Float[ndarray, "e h w"]
+    """Confidence of `pts3d_in_other_view`."""
+    images: tuple[str, ...] = ()
+    """Names of the images in the capture; empty when the file has none."""
+    colors: UInt8[ndarray, "n h w 3"] | None = None
+    """RGB at the pointmaps' pixels."""
+    intrinsics: Intrinsics | None = None
+    """Of the pointmaps' pixel grid, pixel (0, 0) being a centre; None: unknown, to be estimated."""
+    grid: ImageGrid | None = None
+    """Where the grid's pixels lie in the original images."""
+    is_metric: bool = False
+
+    @property
+    def image_count(self) -> int:
+        """Images that the edges join."""
+        return len(self.images) or int(self.edges.max()) + 1
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the images, for messages: their numbers where they have none."""
+        return self.images or tuple(f"#{k}" for k in range(self.image_count))
+
+    @property
+    def pointmaps(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+        """Points and confidences of the first views, and of the second ones."""
+        return self.pts3d, self.conf, self.pts3d_in_other_view, self.conf2
+
+
+def read_pairs(path: Path) -> PairPredictions:
+    """Read predictions from npz and check them.
+
+    Raises InputError for a file that is missing, damaged, lacks an array, or has shapes that do not agree.
+    """
+    return pairs_from_arrays(read_arrays(path), str(path))
+
+
+def read_arrays(path: Path) -> dict[str, ndarray]:
+    """Read all arrays of an npz file.
+
+    Raises InputError where the file is missing or damaged, or unpacks to more than the machine's memory.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give predictions as npz (jcr docs predictions)")
+    try:
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
+            if file.zip is not None:
+                require_memory(sum(member.file_size for member in file.zip.infolist()), str(path))
+            arrays = dict(file)
+        # NumPy hands out the bytes of what does not begin as an array does.
+        if strangers := [name for name, array in arrays.items() if not isinstance(array, ndarray)]:
+            raise ValueError(f"{strangers[0]} in it is not an array")
+        return arrays
+    except InputError:
+        raise
+    except Exception as error:  # zipfile, zlib and NumPy's parser of headers have errors of their own
+        raise InputError(f"{path}: no readable npz file ({error}); write it again with numpy.savez") from None
+
+
+def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPredictions:
+    """Checked predictions from the arrays of a file, `source` being its name in messages.
+
+    Raises InputError for what is missing or does not agree.
+    """
+    for name, dimensions in ARRAYS.items():
+        if name not in arrays:
+            raise InputError(f"{source}: no array {name!r}; pair predictions need {', '.join(ARRAYS)}")
+        if arrays[name].ndim != dimensions:
+            raise InputError(
+                f"{source}: {name} has shape {arrays[name].shape}, it needs {dimensions} dimensions"
+            )
+    edges = arrays["edges"]
+    count, height, width = arrays["pts3d"].shape[:3]
+    for name, shape in {
+        "edges": (count, 2),
+        "pts3d": (count, height, width, 3),
+        "conf": (count, height, width),
+        "pts3d_in_other_view": (count, height, width, 3),
+        "conf2": (count, height, width),
+    }.items():
+        if arrays[name].shape != shape:
+            raise InputError(f"{source}: {name} has shape {arrays[name].shape}, pts3d asks for {shape}")
+    images = tuple(str(name) for name in arrays.get("images", ()))
+    image_count = _check_edges(edges, len(images), source)
+    for name in ("pts3d", "conf", "pts3d_in_other_view", "conf2"):
+        _check_values(name, arrays[name], source)
+    intrinsics, grid = camera_of_arrays(arrays, (width, height), source)
+    colors = arrays.get("colors")
+    if colors is not None and (colors.shape != (image_count, height, width, 3) or colors.dtype != np.uint8):
+        raise InputError(f"{source}: colors must be uint8 of shape {(image_count, height, width, 3)}")
+    return PairPredictions(
+        edges=edges.astype(np.int64),
+        **{name: arrays[name].astype(np.float32, copy=False) for name in ARRAYS if name != "edges"},
+        images=images,
+        colors=colors,
+        intrinsics=intrinsics,
+        grid=grid,
+        is_metric=bool(arrays.get("is_metric", False)),
+    )
+
+
+def _check_edges(edges: ndarray, names: int, source: str) -> int:
+    """The number of images: `names`, or where that is 0 as many as the edges count; InputError for wrong edges."""
+    if len(edges) == 0:
+        raise InputError(f"{source}: no pair in it; predict at least one")
+    if edges.dtype.kind not in "iu":
+        raise InputError(f"{source}: edges must be integers, they are {edges.dtype}")
+    images = names or int(edges.max()) + 1
+    if edges.min() < 0 or edges.max() >= images or (edges[:, 0] == edges[:, 1]).any():
+        raise InputError(f"{source}: edges must join two of the {images} images, counted from 0")
+    return images
+
+
+def _check_values(name: str, array: ndarray, source: str) -> None:
+    """InputError for points or confidences of a pair that are not finite, or confidences below 0."""
+    # One edge at a time: a mask of all pairs would take a quarter of the pairs' memory.
+    for edge, values in enumerate(array):
+        if not np.isfinite(values).all():
+            raise InputError(
+                f"{source}: {name}[{edge}] is not finite everywhere; put 0 there, with confidence 0"
+            )
+        if name in ("conf", "conf2") and values.min() < 0:
+            raise InputError(f"{source}: {name}[{edge}] is negative somewhere; a confidence is at least 0")
+
+
+def camera_of_arrays(
+    arrays: dict[str, ndarray], size: tuple[int, int], source: str
+) -> tuple[Intrinsics | None, ImageGrid | None]:
+    """`intrinsics` and `grid` of a file for pointmaps of `size` (width, height); InputError if wrong."""
+    intrinsics = grid = None
+    if "intrinsics" in arrays:
+        if arrays["intrinsics"].shape != (4,) or not (arrays["intrinsics"][:2] > 0).all():
+            raise InputError(f"{source}: intrinsics must be fx, fy, cx, cy of the {size[0]}x{size[1]} grid")
+        fx, fy, cx, cy = (float(value) for value in arrays["intrinsics"])
+        intrinsics = Intrinsics(fx, fy, cx, cy, *size)
+    if "grid" in arrays:
+        if arrays["grid"].shape != (4, 2) or tuple(arrays["grid"][3]) != size:
+            raise InputError(
+                f"{source}: grid must be original size, resized size, crop corner and {size[0]}, {size[1]}"
+            )
+        grid = ImageGrid(*((int(x), int(y)) for x, y in arrays["grid"]))
+    return intrinsics, grid

@@ -1,0 +1,155 @@
+"""The `predictions` back end: bring the output of any network as one npz file (jcr docs predictions).
+
+Either pairwise pointmaps, which are aligned here, or pointmaps that share one frame, with camera poses.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int
+from numpy import ndarray
+
+from jcr.camera import is_distorted, usable_intrinsics
+from jcr.errors import InputError
+from jcr.geometry import require_rigid
+from jcr.pointmaps.from_pairs import reconstruction_from_pairs
+from jcr.pointmaps.grid import ImageGrid, PreparedImages, image_grid, read_colors
+from jcr.pointmaps.pairs import camera_of_arrays, pairs_from_arrays, read_arrays
+from jcr.pointmaps.posed import PosedPointmaps, reconstruction_from_pointmaps
+from jcr.progress import Progress
+from jcr.records import Capture, Reconstruction
+
+
+def reconstruct_predictions(capture: Capture, path: Path, progress: Progress | None = None) -> Reconstruction:
+    """Return camera poses, pointmaps and tracks from predictions in an npz file.
+
+    Raises InputError for a file that is missing, damaged, or does not fit the capture.
+    """
+    arrays, source = read_arrays(path), str(path)
+    if "edges" in arrays:
+        predictions = pairs_from_arrays(arrays, source)
+        rows = _rows(predictions.images, predictions.image_count, capture, source)
+        rank = np.argsort(np.argsort(rows))
+        # Rows of a reconstruction ascend; the file's images are renumbered to that order.
+        predictions = replace(predictions, edges=rank[predictions.edges], images=())
+        height, width = predictions.conf.shape[1:]
+        images = _images(capture, rows, arrays, (width, height), source)
+        return reconstruction_from_pairs(
+            images, np.sort(rows), predictions, backend="predictions", progress=progress
+        )
+    if "recon_from_camera" in arrays:
+        return _from_pointmaps(capture, arrays, source)
+    raise InputError(
+        f"{source}: holds neither 'edges' with pairwise pointmaps nor 'recon_from_camera' with pointmaps; "
+        "see jcr docs predictions"
+    )
+
+
+def _from_pointmaps(capture: Capture, arrays: dict[str, ndarray], source: str) -> Reconstruction:
+    dimensions = {"recon_from_camera": 3, "points_in_recon": 4, "confidence": 3}
+    for name, number in dimensions.items():
+        if name not in arrays:
+            raise InputError(f"{source}: no array {name!r}; pointmaps need {', '.join(dimensions)}")
+        if arrays[name].ndim != number or arrays[name].dtype.kind not in "fiu":
+            raise InputError(
+                f"{source}: {name} must be numbers in {number} dimensions, not {arrays[name].shape}"
+            )
+        if not np.isfinite(arrays[name]).all():
+            raise InputError(f"{source}: {name} is not finite everywhere; put 0 there, with confidence 0")
+    count, height, width = arrays["confidence"].shape
+    for name, shape in (("recon_from_camera", (count, 4, 4)), ("points_in_recon", (count, height, width, 3))):
+        if arrays[name].shape != shape:
+            raise InputError(f"{source}: {name} has shape {arrays[name].shape}, confidence asks for {shape}")
+    if arrays["confidence"].min() < 0:
+        raise InputError(f"{source}: confidence is negative somewhere; 0 is for no estimate")
+    rows = _rows(tuple(str(name) for name in arrays.get("images", ())), count, capture, source)
+    order, poses = np.argsort(rows), arrays["recon_from_camera"].astype(np.float64)
+    return reconstruction_from_pointmaps(
+        _images(capture, rows, arrays, (width, height), source),
+        PosedPointmaps(
+            rows[order],
+            np.stack([require_rigid(poses[k], f"{source}: recon_from_camera[{k}]") for k in order]),
+            arrays["points_in_recon"][order].astype(np.float32, copy=False),
+            arrays["confidence"][order].astype(np.float32, copy=False),
+        ),
+        source=source,
+        backend="predictions",
+        is_metric=bool(arrays.get("is_metric", False)),
+    )
+
+
+def _rows(names: tuple[str, ...], count: int, capture: Capture, source: str) -> Int[ndarray, " m"]:
+    """Rows of the capture that the file's images are."""
+    if not names:
+        if count != len(capture):
+            raise InputError(
+                f"{source}: {count} images, the capture has {len(capture)}; add their names as array 'images'"
+            )
+        return np.arange(count)
+    if len(names) != count or len(set(names)) != count:
+        raise InputError(
+            f"{source}: 'images' has {len(names)} names for {count} images; give one different each"
+        )
+    unknown = [name for name in names if name not in capture.images]
+    if unknown:
+        raise InputError(f"{source}: no image {unknown[0]!r} in the capture; it has {capture.images[0]!r} …")
+    return np.array([capture.images.index(name) for name in names])
+
+
+def _images(
+    capture: Capture, rows: Int[ndarray, " m"], arrays: dict[str, ndarray], size: tuple[int, int], source: str
+) -> PreparedImages:
+    """How the file's pixels lie in the capture's images, in ascending order of `rows`.
+
+    Intrinsics in the file are those of an undistorted image, as our own predictions are made from. Without
+    them the pixels are taken to be the capture's own, and a known distortion cannot be accounted for.
+    """
+    seen, grid = camera_of_arrays(arrays, size, source)
+    intrinsics, warnings = usable_intrinsics(capture.intrinsics)
+    grid = grid or _plain_grid(capture.image_size, size, source)
+    if seen is not None:
+        pinhole = grid.original_intrinsics(seen)
+        intrinsics = intrinsics or pinhole
+    elif intrinsics is not None and is_distorted(intrinsics):
+        intrinsics = pinhole = None
+        warnings += (
+            f"{source} has no intrinsics, so its pointmaps are taken to be of the distorted images and their "
+            "intrinsics are estimated as a pinhole",
+        )
+    else:
+        pinhole = intrinsics
+    if grid.original_size != capture.image_size and (intrinsics is None or not is_distorted(intrinsics)):
+        raise InputError(
+            f"{source}: made from images of {'x'.join(map(str, grid.original_size))}, the capture's are "
+            f"{'x'.join(map(str, capture.image_size))}; predict from this capture's images"
+        )
+    ordered = np.sort(rows)
+    if "colors" in arrays:
+        colors = arrays["colors"]
+        if colors.shape != (len(rows), size[1], size[0], 3) or colors.dtype != np.uint8:
+            raise InputError(f"{source}: colors must be uint8 of shape {(len(rows), size[1], size[0], 3)}")
+        colors = colors[np.argsort(rows)]
+    else:
+        part = replace(
+            capture,
+            images=tuple(capture.images[row] for row in ordered),
+            base_from_gripper=capture.base_from_gripper[ordered],
+        )
+        colors = read_colors(part, grid, intrinsics, pinhole)
+    return PreparedImages(
+        colors=colors, grid=grid, intrinsics_of_capture=intrinsics, pinhole=pinhole, warnings=warnings
+    )
+
+
+def _plain_grid(original: tuple[int, int], size: tuple[int, int], source: str) -> ImageGrid:
+    """The published resize and crop where it gives `size`, else a resize alone where the aspect allows it."""
+    for published in (image_grid(original), image_grid(original, 224)):
+        if published.size == size:
+            return published
+    if abs(size[0] * original[1] - size[1] * original[0]) <= max(original):
+        return ImageGrid.uncropped(original, size)
+    raise InputError(
+        f"{source}: pointmaps of {size[0]}x{size[1]} are no plain resize of {original[0]}x{original[1]} "
+        "images; give their crop as array 'grid'"
+    )

@@ -1,0 +1,546 @@
+"""The back ends: each makes the same Reconstruction of a capture. A new one is a file and a row of this table."""
+
+from collections.abc import Callable
+from dataclasses import KW_ONLY, asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import tyro
+from jaxtyping import Int
+from numpy import ndarray
+
+from jcr.errors import InputError
+from jcr.extras import extra, install, is_installed, xfeat_is_installed
+from jcr.features.order import order_by_pose
+from jcr.hub import HUB_FILES, HUB_ID, Weights, cached_files
+from jcr.progress import Progress
+from jcr.records import Boards, CameraEvidence, Capture, Reconstruction
+
+CC_BY_NC_SA = "CC BY-NC-SA 4.0, non-commercial use only (https://creativecommons.org/licenses/by-nc-sa/4.0/)"
+INSTALL_DA3 = "pip install omegaconf addict einops && pip install --no-deps depth-anything-3"
+"""Without what the package asks for beside these, numpy below 2 among it; its network uses none of it."""
+
+
+def _colmap(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
+    from jcr.sfm.colmap import reconstruct_colmap
+    from jcr.sfm.options import ColmapOptions
+
+    features = "sift" if options.features == "auto" else options.features
+    if features != "sift":
+        extra("torch", "match", f"--features {features}")
+    made = ColmapOptions(seed=options.seed, features=features)
+    return reconstruct_colmap(capture, made, progress)
+
+
+def _direct(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
+    from jcr.photometric.direct import reconstruct_direct
+
+    return reconstruct_direct(capture, progress)
+
+
+def _dust3r(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
+    """MASt3R, too: its files bring one more head, which is left out, and points in metres."""
+    extra("torch", "networks", f"--backend {options.backend}")
+    from jcr.pointmaps.dust3r.dust3r import Dust3rOptions, reconstruct_dust3r
+
+    made = Dust3rOptions(
+        weights=weights_of(options),
+        device=device_of(options),
+        pair_graph=options.pair_graph,
+        backend=options.backend,
+    )
+    return reconstruct_dust3r(capture, made, progress)
+
+
+def _views_at_once(
+    capture: Capture, options: "ReconstructOptions", progress: Progress | None
+) -> Reconstruction:
+    """All models that see every view at once: their rows name the adapter."""
+    extra("torch", "networks", f"--backend {options.backend}")
+    from jcr.pointmaps import da3, mapanything
+    from jcr.pointmaps.any_view import ViewsOptions, reconstruct_views_at_once
+
+    row = BACKENDS[options.backend]
+    made = ViewsOptions(
+        backend=row.name,
+        load=mapanything.load if row.name == "mapanything" else da3.load,
+        weights=weights_of(options),
+        device=device_of(options),
+    )
+    return reconstruct_views_at_once(capture, made, progress)
+
+
+def _marker(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
+    from jcr.boards.marker import reconstruct_marker
+
+    if options.board is None:
+        raise InputError("--backend marker: name the board with --board, such as chessboard:9x6:0.025")
+    return reconstruct_marker(capture, options.board, progress)
+
+
+def _predictions(
+    capture: Capture, options: "ReconstructOptions", progress: Progress | None
+) -> Reconstruction:
+    from jcr.pointmaps.predictions import reconstruct_predictions
+
+    if options.predictions is None:
+        raise InputError(
+            "--backend predictions: name the file with --predictions FILE.npz (jcr docs predictions)"
+        )
+    return reconstruct_predictions(capture, options.predictions, progress)
+
+
+def _given(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
+    from jcr.sfm.given import reconstruct_given
+    from jcr.sfm.options import ColmapOptions
+
+    if options.cameras is None:
+        raise InputError("--backend given: name the COLMAP model with --cameras PATH")
+    made = ColmapOptions(seed=options.seed)
+    return reconstruct_given(capture, options.cameras, made, progress)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Backend:
+    """A row of the table."""
+
+    name: str
+    """For --backend."""
+    reconstruct: Callable[..., Reconstruction]
+    """A function of capture, ReconstructOptions and progress; its heavy imports happen inside."""
+    licence: str
+    _: KW_ONLY
+    metric: bool | None = False
+    """Whether its scale is metres already; None: its input has a flag for it."""
+    auto: bool = False
+    """Whether `auto` may take it, where its package and its weights are on this machine."""
+    tests_camera: bool = True
+    """Whether its calibrations are tested for a camera that is not as given: by points found in the images alone."""
+    options: tuple[str, ...] = ()
+    """Fields of ReconstructOptions that it uses and not every back end does."""
+    selected_by: str = ""
+    """The one of these by which `auto` takes it."""
+    hub_id: str = ""
+    """Of its published weights; empty: it needs none."""
+    package: str = ""
+    """That must be installed beside this one's core."""
+    install: str = ""
+    """The command that does so."""
+    keeps_order: bool = False
+    """Whether its input or its options count images in the capture's own order."""
+    accuracy: str = ""
+    """As measured, and where that stands; empty: not measured here."""
+    revision: str = ""
+    """The commit of its weights that `jcr models get` downloads."""
+    parameters: int = 0
+    """Of the network, in millions."""
+    download_gb: float = 0.0
+    commercial: bool = True
+    """Whether the licence of its weights allows commercial use."""
+    sees_all_views: bool = False
+    """Whether it is a network that processes all views at once."""
+
+    @property
+    def predicts_depth(self) -> bool:
+        """Whether its reconstructions come with pointmaps, a network's."""
+        return bool(self.hub_id) or "predictions" in self.options
+
+    def is_installed(self) -> bool:
+        """Whether the package it needs is there, without importing it."""
+        return not self.package or is_installed(self.package)
+
+    def has_weights(self) -> bool:
+        """Whether its published weights are on this machine, or none are needed; nothing is downloaded."""
+        return not self.hub_id or bool(cached_files(self.hub_id, HUB_FILES, self.revision))
+
+
+BACKENDS: dict[str, Backend] = {
+    row.name: row
+    for row in (
+        Backend(
+            name="mast3r",
+            reconstruct=_dust3r,
+            licence=f"{CC_BY_NC_SA}, and the licences of its training data (its CHECKPOINTS_NOTICE)",
+            metric=True,
+            auto=True,
+            tests_camera=False,
+            options=("weights", "pair_graph"),
+            hub_id="naver/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric",
+            revision="06e7259f34c3060f322df5cb0c7b9094f57e41fc",
+            keeps_order=True,
+            package="torch",
+            install=install("networks"),
+            parameters=689,
+            download_gb=2.8,
+            commercial=False,
+        ),
+        Backend(
+            name="dust3r",
+            reconstruct=_dust3r,
+            licence=CC_BY_NC_SA,
+            auto=True,
+            tests_camera=False,
+            options=("weights", "pair_graph"),
+            selected_by="weights",
+            hub_id="naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt",
+            revision="61c57447d7b0adc8a1a30b2b0adec7a8935aa2a3",
+            keeps_order=True,
+            package="torch",
+            install=install("networks"),
+            parameters=571,
+            download_gb=2.3,
+            commercial=False,
+        ),
+        Backend(
+            name="colmap",
+            reconstruct=_colmap,
+            licence="BSD-3-Clause; XFeat and LightGlue Apache-2.0",
+            auto=True,
+            options=("features", "board"),
+            selected_by="features",
+            accuracy="0.02 mm and 0.002° on the bundled capture (jcr docs results/run)",
+        ),
+        Backend(
+            name="da3",
+            reconstruct=_views_at_once,
+            licence="Apache-2.0",
+            auto=True,
+            tests_camera=False,
+            options=("weights",),
+            hub_id="depth-anything/DA3-BASE",
+            revision="f4a6c9b3c95e41c82048423d3493a81ec3fa810e",
+            package="depth_anything_3",
+            install=INSTALL_DA3,
+            parameters=135,
+            download_gb=0.5,
+            sees_all_views=True,
+        ),
+        Backend(
+            name="da3-small",
+            reconstruct=_views_at_once,
+            licence="Apache-2.0",
+            auto=True,
+            tests_camera=False,
+            options=("weights",),
+            hub_id="depth-anything/DA3-SMALL",
+            revision="e08cab65ca0ec38e7826075418411ab90cab4da3",
+            package="depth_anything_3",
+            install=INSTALL_DA3,
+            parameters=34,
+            download_gb=0.14,
+            sees_all_views=True,
+        ),
+        Backend(
+            name="mapanything",
+            reconstruct=_views_at_once,
+            licence="Apache-2.0",
+            metric=True,
+            auto=True,
+            tests_camera=False,
+            options=("weights",),
+            hub_id="facebook/map-anything-apache",
+            revision="00f9c245bbcb60522d1ed7f9e9d88462c6e3f38a",
+            package="mapanything",
+            install="pip install git+https://github.com/facebookresearch/map-anything",
+            sees_all_views=True,
+        ),
+        Backend(
+            name="direct",
+            reconstruct=_direct,
+            licence="Apache-2.0",
+            auto=True,
+            tests_camera=False,
+            accuracy="0.10 mm and 0.012° on printed, 0.29 mm and 0.023° on plain simulated tables "
+            "(jcr docs plain-tables)",
+        ),
+        Backend(
+            name="marker",
+            reconstruct=_marker,
+            licence="Apache-2.0",
+            metric=True,
+            options=("board",),
+            accuracy="0.7 mm and 0.20° from the reference of a real capture (jcr docs results/real)",
+        ),
+        Backend(
+            name="predictions",
+            reconstruct=_predictions,
+            licence="your network's",
+            metric=None,
+            tests_camera=False,
+            options=("predictions",),
+            selected_by="predictions",
+            keeps_order=True,
+            accuracy="0.74 mm and 0.047° from simulated predictions (jcr docs results/predictions)",
+        ),
+        Backend(
+            name="given",
+            reconstruct=_given,
+            licence="your reconstruction's",
+            options=("cameras", "board"),
+            selected_by="cameras",
+        ),
+    )
+}
+"""By name; `auto` takes the first that it may.
+
+Networks that see pairs, whose uncertainty is known, come first, metric ones before others. COLMAP needs no weights, and
+sees what networks do not. Networks that see all views come after it and before direct alignment: with simulated
+predictions, refined by colours, they are more accurate on plain tables, for more time.
+Direct alignment needs no weights: COLMAP matches what is printed on things, it the colours of plain ones.
+"""
+
+MARKER = "marker"
+"""The back end that uses the board and nothing else."""
+PATHS = ("predictions", "cameras")
+"""Options that name files."""
+
+# The choices of --backend.
+if TYPE_CHECKING:
+    BackendName = str
+else:
+    BackendName = Literal[("auto", *BACKENDS)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructOptions:
+    """What turns images into camera poses."""
+
+    backend: BackendName = "auto"
+    """auto tries the back ends of this list that need no extra input and whose package and weights are on this machine
+    (jcr models), in this order, and the next only if the result is rejected."""
+    _: KW_ONLY
+    board: Annotated[str | None, tyro.conf.arg(metavar="KIND:SIZE")] = None
+    """The board or tags in view, in metres (SIDE where the side is unknown), used beside the features, or alone where
+    these fail (--backend marker: only alone): charuco:7x5:0.030:0.022:DICT_4X4_50, chessboard:9x6:0.025 (inner corners),
+    circles:4x11:0.020, aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
+    features: Literal["auto", "sift", "xfeat"] = "auto"
+    """Features that are matched between images; selects the back end colmap. SIFT, or learned features for little
+    texture (extra match); auto tries sift, then, if the result is rejected and it is installed, xfeat."""
+    seed: int = 0
+    """Same seed, same result on the same machine."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Device on which networks run and the map is trained."""
+    weights: Annotated[str | None, tyro.conf.arg(metavar="PATH_OR_HUB_ID")] = None
+    """A network's weights, as path or hub id; unset: the published ones. With --backend auto they must be DUSt3R's or
+    MASt3R's."""
+    predictions: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """A network's output as an npz file (jcr docs predictions); selects the back end predictions."""
+    cameras: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
+    """Camera poses from another tool, a COLMAP model; selects the back end given."""
+    pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
+    """Pairs of images that dust3r and mast3r process; robot leaves out pairs without a common view."""
+
+    def with_absolute_paths(self) -> "ReconstructOptions":
+        """The same with paths that hold in every working folder."""
+        paths = {name: path.resolve() for name in PATHS if isinstance(path := getattr(self, name), Path)}
+        return replace(self, **paths)
+
+    def as_json(self) -> dict[str, Any]:
+        """The fields as JSON knows them; paths as text that holds in every working folder."""
+        values = asdict(self.with_absolute_paths())
+        return {name: str(x) if isinstance(x, Path) else x for name, x in values.items()}
+
+
+def check_board(options: ReconstructOptions) -> None:
+    """Raise InputError, before any work, for a --board that names none."""
+    if options.board is not None:
+        from jcr.boards.detection import boards
+
+        boards(options.board)
+
+
+def reconstruct(
+    capture: Capture, options: ReconstructOptions | None = None, progress: Progress | None = None
+) -> Reconstruction:
+    """The capture reconstructed by the back end that `options` names.
+
+    Raises InputError for a back end that is not there, RejectedError when it finds too little.
+    """
+    options = options or ReconstructOptions()
+    row = BACKENDS[candidates(options)[0]]
+    if not row.is_installed():
+        raise InputError(
+            f"--backend {row.name} needs {row.package}, which is not installed: {row.install}"
+            + (
+                f"; then {weights_command(row)}"
+                if row.hub_id and not row.has_weights()
+                else ", or choose another"
+            )
+        )
+    order = np.arange(len(capture)) if row.keeps_order else order_by_pose(capture.base_from_gripper)
+    in_order = replace(
+        capture,
+        images=tuple(capture.images[k] for k in order),
+        base_from_gripper=capture.base_from_gripper[order],
+    )
+    made = row.reconstruct(in_order, replace(options, backend=row.name), progress)
+    if options.board is not None and row.name != MARKER:
+        from jcr.boards.corners import with_boards
+
+        made = with_boards(in_order, made, options.board, progress)
+    return _of_capture(made, order)
+
+
+def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Reconstruction:
+    """The reconstruction with its images in the capture's own order; row k was taken as order[k]."""
+    image_index = order[reconstruction.image_index]
+    rows = np.argsort(image_index)
+    row_of = np.argsort(rows)
+    tracks, evidence = reconstruction.tracks, reconstruction.evidence
+    if evidence is not None:
+        numbers = (6 * rows[:, None] + np.arange(6)).ravel()
+        evidence = CameraEvidence(
+            evidence.recon_from_camera[rows], evidence.covariance[np.ix_(numbers, numbers)]
+        )
+    return replace(
+        reconstruction,
+        image_index=image_index[rows],
+        recon_from_camera=reconstruction.recon_from_camera[rows],
+        pointmaps=None if reconstruction.pointmaps is None else reconstruction.pointmaps.of_rows(rows),
+        tracks=replace(tracks, image=row_of[tracks.image], boards=_in_order(tracks.boards, row_of)),
+        evidence=evidence,
+    )
+
+
+def _in_order(boards: Boards | None, row_of: Int[ndarray, " m"]) -> Boards | None:
+    if boards is None:
+        return None
+    return replace(boards, elsewhere=tuple(sorted(row_of[list(boards.elsewhere)].tolist())))
+
+
+def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
+    """What `auto` stands for here, the best first, or the one back end that was asked for.
+
+    An option that only one back end uses selects that one. A network whose weights were named is followed by the best
+    back end that needs none, and one that uses a board beside its features by the board alone. Raises InputError for
+    a back end that is not there, for options that select different ones, and for an option that none of the answer
+    uses.
+    """
+    given = _given_options(options)
+    selecting = [row for row in BACKENDS.values() if row.selected_by in given]
+    if options.backend != "auto":
+        names = (options.backend,)
+        if options.backend not in BACKENDS:
+            raise InputError(
+                f"--backend {options.backend}: no such back end; there are {', '.join(BACKENDS)}"
+            )
+    elif len(selecting) > 1:
+        raise InputError(
+            f"{' and '.join(_flag(row.selected_by) for row in selecting)} select different back ends "
+            f"({', '.join(row.name for row in selecting)}); give one of them"
+        )
+    else:
+        allowed = [row for row in BACKENDS.values() if row.auto]
+        beside = "board" in given
+        if not selecting:
+            allowed = [row for row in allowed if row.is_installed() and row.has_weights()]
+            names = tuple(row.name for row in allowed if not beside or "board" in row.options)
+        elif selecting[0].hub_id:
+            names = (selecting[0].name, next(row.name for row in allowed if not row.hub_id))
+        else:
+            names = (selecting[0].name,)
+        if beside and "board" in BACKENDS[names[0]].options:
+            names = (*names, MARKER)
+    for name, value in given.items():
+        if not any(name in BACKENDS[chosen].options for chosen in names):
+            users = [row.name for row in BACKENDS.values() if name in row.options]
+            raise InputError(
+                f"{_flag(name)} {value}: the back end here ({', '.join(names)}) does not use it; leave it out, or "
+                f"give --backend {' or '.join(users)}"
+            )
+    return names
+
+
+def tries(options: ReconstructOptions) -> list[ReconstructOptions]:
+    """The options of every attempt that `auto` may make, the best first.
+
+    Of the candidates the two best, where one network that sees all views does not count, and no second such one; COLMAP
+    with SIFT, then with learned features where their weights are installed. Raises as `candidates` does.
+    """
+    names = candidates(options)
+    networks = [name for name in names if BACKENDS[name].sees_all_views]
+    asked = [name for name in names if name not in networks[1:]]
+    made = []
+    for one in (for_backend(options, name) for name in asked[: 3 if networks else 2]):
+        made.append(one)
+        if (
+            one.backend == "colmap"
+            and one.features == "auto"
+            and options.backend == "auto"
+            and xfeat_is_installed()
+        ):
+            made[-1:] = [replace(one, features="sift"), replace(one, features="xfeat")]
+    return made
+
+
+def for_backend(options: ReconstructOptions, name: BackendName) -> ReconstructOptions:
+    """The options as one of `candidates` takes them: without what is meant for another."""
+    unused = _given_options(options).keys() - set(BACKENDS[name].options)
+    defaults = {field.name: field.default for field in fields(options) if field.name in unused}
+    return replace(options, backend=name, **defaults)
+
+
+def with_cameras_of(capture: Capture, options: ReconstructOptions) -> ReconstructOptions:
+    """The options with the capture's own camera poses, where it has some and nothing else was asked for."""
+    if capture.cameras is None or options.cameras is not None:
+        return options
+    selecting = {row.selected_by for row in BACKENDS.values()} & _given_options(options).keys()
+    free = not selecting if options.backend == "auto" else "cameras" in BACKENDS[options.backend].options
+    return replace(options, cameras=capture.cameras.resolve()) if free else options
+
+
+def weights_of(options: ReconstructOptions) -> Weights:
+    """The weights of the network that `options` names: a path that was given, or what `jcr models get` downloaded.
+
+    Nothing is downloaded. Raises InputError, with the command that gets them, where they are not on this machine.
+    """
+    row = BACKENDS[options.backend]
+    name = options.weights or row.hub_id
+    published = next((other for other in BACKENDS.values() if other.hub_id == name), None)
+    licence = (
+        published.licence
+        if published
+        else f"unknown, ask who made the file; that of {row.hub_id} is {row.licence}"
+    )
+    if options.weights is not None and Path(name).exists():
+        return Weights(Path(name), name, licence)
+    if cached := cached_files(name, HUB_FILES, published and published.revision):
+        return Weights(cached[0].parent, name, licence)
+    if published:
+        raise InputError(f"{name}: not on this machine; {weights_command(published)}")
+    remedy = "give a file, a folder or a hub id (jcr models)"
+    if HUB_ID.fullmatch(name) and Path(name).suffix not in (".pth", ".pt", ".safetensors"):
+        remedy = f"jcr models get {name} downloads them"
+    raise InputError(f"--weights {name}: no such weights on this machine; {remedy}")
+
+
+def weights_command(row: Backend) -> str:
+    """How to get the published weights of a network."""
+    size = f" ({row.download_gb:g} GB)" if row.download_gb else ""
+    licence = "" if row.commercial else ", non-commercial"
+    return f"jcr models get {row.name} downloads {row.hub_id}{size}{licence}"
+
+
+def _given_options(options: ReconstructOptions) -> dict[str, Any]:
+    """Those that some back ends do not use, where they are not what they are unset."""
+    own = {name for row in BACKENDS.values() for name in row.options}
+    values = {field.name: getattr(options, field.name) for field in fields(options) if field.name in own}
+    unset = {field.name: field.default for field in fields(options)}
+    return {name: value for name, value in values.items() if value != unset[name]}
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def device_of(options: ReconstructOptions) -> str:
+    """cuda or cpu; `auto` is cuda where there is one. InputError when cuda is asked for and absent."""
+    if options.device == "cpu" or (options.device == "auto" and not is_installed("torch")):
+        return "cpu"
+    torch = extra("torch", "networks", "--device cuda")
+    if options.device == "cuda" and not torch.cuda.is_available():
+        raise InputError("--device cuda: this machine has no CUDA device that torch sees; use --device cpu")
+    if options.device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    return options.device

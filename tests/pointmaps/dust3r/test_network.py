@@ -1,0 +1,243 @@
+"""The network against outputs of the published one, on weights derived from each tensor's name."""
+
+import importlib.util
+import json
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from jcr.allocator import give_back
+from places import SHARED
+
+if TYPE_CHECKING:
+    import torch
+
+    from jcr.pointmaps.dust3r.network import Dust3r, Pointmap
+
+pytestmark = pytest.mark.slow
+
+OF_DUST3R = SHARED / "dust3r"
+FIXTURES = OF_DUST3R / "fixtures"
+TOLERANCE = {"rtol": 1e-4, "atol": 2e-5}
+
+if not FIXTURES.is_dir():
+    pytest.skip(f"the fixtures of the published network are not in {FIXTURES}", allow_module_level=True)
+
+
+@cache
+def seeded_weights() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("seeded_weights", OF_DUST3R / "seeded_weights.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@cache
+def seeded_network(config: str, seed: int) -> "Dust3r":
+    import torch
+
+    from jcr.pointmaps.dust3r.network import Dust3r
+
+    with torch.device("meta"):
+        network = Dust3r(**json.loads(config))
+    weights = seeded_weights().fill(network.state_dict(), seed)
+    network.load_state_dict({key: torch.from_numpy(value) for key, value in weights.items()}, assign=True)
+    return network.eval()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def networks_given_back() -> Iterator[None]:
+    """The published network holds 2.3 GB, which the tests that follow in the process need not carry along."""
+    yield
+    seeded_network.cache_clear()
+    give_back()
+
+
+@pytest.fixture
+def inference_mode() -> Iterator[None]:
+    import torch
+
+    with torch.inference_mode():
+        yield
+
+
+def fixture(name: str) -> "tuple[dict[str, torch.Tensor], Dust3r]":
+    import torch
+
+    arrays = dict(np.load(FIXTURES / f"{name}.npz"))
+    network = seeded_network(str(arrays.pop("cfg")), int(arrays.pop("weight_seed")))
+    return {key: torch.from_numpy(value) for key, value in arrays.items()}, network
+
+
+def pointmaps(network: "Dust3r", truth: "dict[str, torch.Tensor]") -> "tuple[Pointmap, Pointmap]":
+    """Pointmaps of a batch in which the published network lays portrait images down: each row is shown as it stands."""
+    import torch
+
+    from jcr.pointmaps.dust3r.network import Pointmap
+
+    rows = []
+    for row in range(len(truth["img1"])):
+        images, lies = [], []
+        for view in ("1", "2"):
+            image, shape = truth[f"img{view}"][row : row + 1], truth[f"true_shape{view}"][row].tolist()
+            lies.append(list(image.shape[2:]) != shape)
+            images.append(image.mT if lies[-1] else image)
+        for_row = network(*images)
+        rows.append(
+            [
+                (view.points.transpose(1, 2), view.confidence.mT) if lying else (view.points, view.confidence)
+                for view, lying in zip(for_row, lies, strict=True)
+            ]
+        )
+    return tuple(
+        Pointmap(*(torch.cat(parts) for parts in zip(*view, strict=True))) for view in zip(*rows, strict=True)
+    )
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *sorted(path.stem for path in FIXTURES.glob("tiny_*.npz")),
+        pytest.param("vitl512dpt_48x64", marks=pytest.mark.slow),
+        pytest.param("vitl512dpt_160x224", marks=pytest.mark.slow),
+    ],
+)
+@pytest.mark.usefixtures("inference_mode")
+def test_pointmaps_equal_the_published_network(name: str) -> None:
+    import torch
+
+    truth, network = fixture(name)
+    view1, view2 = pointmaps(network, truth)
+    torch.testing.assert_close(view1.points, truth["pts3d"], **TOLERANCE)
+    torch.testing.assert_close(view1.confidence, truth["conf"], **TOLERANCE)
+    torch.testing.assert_close(view2.points, truth["pts3d_in_other_view"], **TOLERANCE)
+    torch.testing.assert_close(view2.confidence, truth["conf2"], **TOLERANCE)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "tiny_linear_portrait_64x48_b2",
+        "tiny_dpt_mixed_48x64_64x48",
+        "tiny_dpt12_48x64_b1",
+        pytest.param("vitl512dpt_48x64", marks=pytest.mark.slow),
+    ],
+)
+@pytest.mark.usefixtures("inference_mode")
+def test_tokens_equal_the_published_network(name: str) -> None:
+    import torch
+
+    from jcr.pointmaps.dust3r.network import grid_positions
+
+    truth, network = fixture(name)
+    features1, features2 = network.encode(truth["img1"]), network.encode(truth["img2"])
+    torch.testing.assert_close(features1.tokens, truth["enc1"], **TOLERANCE)
+    torch.testing.assert_close(features2.tokens, truth["enc2"], **TOLERANCE)
+    assert torch.equal(grid_positions(features1.grid, torch.device("cpu")), truth["pos1"][0])
+    layers1, layers2 = network.decoder_layers(features1, features2)
+    for layer in truth["hooks"][truth["hooks"] > 0].tolist():
+        torch.testing.assert_close(layers1[layer], truth[f"dec1_{layer}"], **TOLERANCE)
+        torch.testing.assert_close(layers2[layer], truth[f"dec2_{layer}"], **TOLERANCE)
+
+
+@pytest.mark.parametrize("keys", sorted(FIXTURES.glob("*_keys.tsv")), ids=lambda path: path.stem)
+def test_state_dict_has_the_published_keys_and_shapes(keys: Path) -> None:
+    import torch
+
+    from jcr.pointmaps.dust3r.network import Dust3r
+
+    if keys.stem.startswith("vitl"):
+        config = json.loads((FIXTURES / "vitl512dpt_config.json").read_text())
+    else:
+        arrays = np.load(FIXTURES / f"{keys.stem.removesuffix('_keys')}_48x64_b1.npz")
+        config = json.loads(str(arrays["cfg"]))
+    with torch.device("meta"):
+        state = Dust3r(**config).state_dict()
+    published = dict(line.split("\t")[:2] for line in keys.read_text().splitlines())
+    assert {key: str(list(tensor.shape)) for key, tensor in state.items()} == published
+
+
+def test_rotary_positions_and_activations_equal_the_published_ones() -> None:
+    import torch
+
+    from jcr.pointmaps.dust3r.network import pointmap, rotary_embedding, rotate
+
+    units = {key: torch.from_numpy(value) for key, value in np.load(FIXTURES / "units.npz").items()}
+    for x, position, out in zip(units["rope_in"], units["rope_pos"], units["rope_out"], strict=True):
+        rotated = rotate(x[None], rotary_embedding(position, x.shape[-1], 100.0))
+        torch.testing.assert_close(rotated[0], out, rtol=1e-5, atol=1e-6)
+    raw = torch.cat([units["depth_in"], units["conf_in"][..., None]], -1).permute(0, 3, 1, 2)
+    view = pointmap(raw)
+    torch.testing.assert_close(view.points, units["depth_out"], rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(view.confidence, units["conf_out"], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.usefixtures("inference_mode")
+def test_a_batch_of_pairs_equals_its_pairs_one_by_one() -> None:
+    import torch
+
+    from jcr.pointmaps.dust3r.network import Features
+
+    truth, network = fixture("tiny_dpt_portrait_64x48_b2")
+    whole = network.encode(truth["img1"])
+    for row in range(2):
+        alone = Features(whole.tokens[row : row + 1], whole.grid)
+        swapped = Features(whole.tokens[1 - row : 2 - row], whole.grid)
+        views = network.decode(alone, swapped)
+        together = network.decode(whole, Features(whole.tokens.flip(0), whole.grid))
+        for view, batched in zip(views, together, strict=True):
+            torch.testing.assert_close(view.points[0], batched.points[row], **TOLERANCE)
+
+
+@pytest.mark.parametrize("name", ["tiny_dpt12_mixed_48x64_64x48", "tiny_linear_48x64_b1"])
+@pytest.mark.usefixtures("inference_mode")
+def test_features_made_for_many_pairs_give_the_same_pointmaps(name: str) -> None:
+    import torch
+
+    truth, network = fixture(name)
+    kept1, kept2 = (network.encode(truth[image], many_pairs=True) for image in ("img1", "img2"))
+    assert (kept1.finest[0] is None) == ("linear" in name)
+    view1, view2 = network.decode(kept1, kept2)
+    torch.testing.assert_close(view1.points, truth["pts3d"], **TOLERANCE)
+    torch.testing.assert_close(view2.points, truth["pts3d_in_other_view"], **TOLERANCE)
+
+
+@pytest.mark.usefixtures("inference_mode")
+def test_bfloat16_stays_near_float32_and_returns_float32() -> None:
+    import torch
+
+    truth, network = fixture("tiny_dpt12_48x64_b1")
+    network.mixed_precision = True
+    try:
+        view, _ = network(truth["img1"], truth["img2"])
+    finally:
+        network.mixed_precision = None
+    assert view.points.dtype == torch.float32
+    error = (view.points - truth["pts3d"]).norm(dim=-1) / truth["pts3d"].norm(dim=-1)
+    # Eight bits through 15 blocks leave a few percent where no training has taught the weights to be smooth.
+    assert 0 < error.median() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("head_type", "catmlp"), ("pos_embed", "cosine"), ("depth_mode", ["linear"]), ("patch_size", 14)],
+)
+def test_a_configuration_of_another_network_is_refused(field: str, value: object) -> None:
+    from jcr.pointmaps.dust3r.network import Dust3r
+
+    with pytest.raises(ValueError, match=field):
+        Dust3r(**{field: value})
+
+
+def test_an_image_that_is_no_whole_number_of_patches_is_refused() -> None:
+    import torch
+
+    _, network = fixture("tiny_linear_48x64_b1")
+    with pytest.raises(ValueError, match="multiples of 16"):
+        network.encode(torch.zeros(1, 3, 50, 64))

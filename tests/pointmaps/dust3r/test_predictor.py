@@ -1,0 +1,277 @@
+"""Test the pair graphs, the file of pairs, and the prediction of pairs with little memory."""
+
+import dataclasses
+import logging
+import zipfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.synthetic_pairs import write_pairs
+from jcr.errors import InputError
+from jcr.geometry import inverse, transform
+from jcr.pointmaps.dust3r.pair_graph import complete_pairs, overlapping_pairs, window_pairs
+from jcr.pointmaps.grid import PreparedImages, image_grid
+from jcr.pointmaps.pairs import PairPredictions, read_pairs
+from jcr.records import Intrinsics
+
+if TYPE_CHECKING:
+    from jcr.pointmaps.dust3r.weights import LoadedNetwork
+
+pytestmark = pytest.mark.slow
+
+NAMES = ("a.png", "b.png", "c.png", "d.png")
+
+
+@pytest.fixture(scope="module")
+def loaded() -> "LoadedNetwork":
+    import torch
+
+    from jcr.pointmaps.dust3r.network import Dust3r
+    from jcr.pointmaps.dust3r.weights import LoadedNetwork
+
+    torch.manual_seed(0)
+    network = Dust3r(
+        enc_embed_dim=32, enc_depth=2, enc_num_heads=2, dec_embed_dim=32, dec_depth=2, dec_num_heads=2
+    )
+    return LoadedNetwork(network.eval().requires_grad_(False), is_metric=True)
+
+
+@pytest.fixture(scope="module")
+def images() -> PreparedImages:
+    grid = dataclasses.replace(image_grid((640, 480)), size=(64, 48))
+    colors = np.random.default_rng(0).integers(0, 256, (4, 48, 64, 3), dtype=np.uint8)
+    return PreparedImages(colors=colors, grid=grid, intrinsics_of_capture=None, pinhole=None)
+
+
+def predicted(loaded: "LoadedNetwork", images: PreparedImages) -> PairPredictions:
+    from jcr.pointmaps.dust3r.predictor import predict_pairs
+
+    return predict_pairs(loaded, images, NAMES, np.tile(np.eye(4), (4, 1, 1)))[0]
+
+
+def test_pair_graphs() -> None:
+    assert complete_pairs(3).tolist() == [[1, 0], [2, 0], [2, 1], [0, 1], [0, 2], [1, 2]]
+    assert window_pairs(4, 1).tolist() == [[1, 0], [2, 1], [3, 2], [0, 1], [1, 2], [2, 3]]
+    assert len(window_pairs(5, 9)) == 20
+
+
+def test_each_pair_is_what_the_network_shows_of_its_two_images(
+    loaded: "LoadedNetwork", images: PreparedImages
+) -> None:
+    import torch
+
+    pairs = predicted(loaded, images)
+    assert pairs.edges.tolist() == complete_pairs(4).tolist()
+    assert pairs.is_metric and pairs.images == NAMES
+    tensors = (torch.from_numpy(images.colors).permute(0, 3, 1, 2) / 255 - 0.5) / 0.5
+    for e, (first, second) in enumerate(pairs.edges):
+        with torch.inference_mode():
+            view1, view2 = loaded.network(tensors[first, None], tensors[second, None])
+        np.testing.assert_allclose(pairs.pts3d[e], view1.points[0], rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(pairs.conf2[e], view2.confidence[0], rtol=1e-4, atol=1e-5)
+
+
+def test_every_image_is_encoded_once(
+    loaded: "LoadedNetwork", images: PreparedImages, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    encoded, decoded = [], []
+    encode, decode = loaded.network.encode, loaded.network.decode
+    monkeypatch.setattr(loaded.network, "encode", lambda x, **how: encoded.append(len(x)) or encode(x, **how))
+    monkeypatch.setattr(loaded.network, "decode", lambda a, b: decoded.append(len(a.tokens)) or decode(a, b))
+    predicted(loaded, images)
+    assert (sum(encoded), sum(decoded)) == (4, 12)
+
+
+def test_out_of_memory_halves_the_batch_and_reports_it(
+    loaded: "LoadedNetwork",
+    images: PreparedImages,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    import torch
+
+    from jcr.pointmaps.dust3r import predictor
+
+    monkeypatch.setitem(predictor.MAX_BATCH, "cpu", 8)
+    decode = loaded.network.decode
+    batches = []
+
+    def decode_up_to_three(a, b):
+        if len(a.tokens) > 3:
+            raise torch.cuda.OutOfMemoryError("out of memory")
+        batches.append(len(a.tokens))
+        return decode(a, b)
+
+    monkeypatch.setattr(loaded.network, "decode", decode_up_to_three)
+    with caplog.at_level(logging.WARNING):
+        pairs = predicted(loaded, images)
+    assert batches == [2] * 6
+    assert "going on with 2 pairs at a time" in caplog.text
+    monkeypatch.undo()
+    undisturbed = predicted(loaded, images)
+    np.testing.assert_allclose(pairs.pts3d, undisturbed.pts3d, rtol=1e-4, atol=1e-5)
+
+
+def test_a_gpu_too_small_for_one_pair_hands_over_to_the_cpu_and_reports_it(
+    loaded: "LoadedNetwork",
+    images: PreparedImages,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    import torch
+
+    from jcr.pointmaps.dust3r import predictor
+    from jcr.pointmaps.dust3r.network import Dust3r
+    from jcr.pointmaps.dust3r.predictor import predict_pairs
+
+    monkeypatch.setattr(Dust3r, "device", torch.device("cuda"))
+    encode = predictor._Predictor._encode
+    tried = []
+
+    def encode_on_the_cpu_alone(self, rows):
+        if self.device.type == "cuda":
+            tried.append(len(rows))
+            raise torch.cuda.OutOfMemoryError("out of memory")
+        return encode(self, rows)
+
+    monkeypatch.setattr(predictor._Predictor, "_encode", encode_on_the_cpu_alone)
+    monkeypatch.setitem(predictor.MAX_BATCH, "cuda", 4)
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    with caplog.at_level(logging.WARNING):
+        pairs, notes = predict_pairs(loaded, images, NAMES, poses)
+    assert tried == [4, 2, 1]
+    assert [note.split(":")[1] for note in notes] == [
+        " going on with 2 pairs at a time",
+        " going on with 1 pairs at a time",
+        " going on, slowly, on the CPU",
+    ]
+    assert all(note in caplog.text for note in notes)
+    monkeypatch.undo()
+    undisturbed = predicted(loaded, images)
+    np.testing.assert_allclose(pairs.pts3d, undisturbed.pts3d, rtol=1e-4, atol=1e-5)
+
+
+def test_file_round_trip_and_faults(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    edges = complete_pairs(3)
+    pairs = PairPredictions(
+        edges=edges,
+        pts3d=rng.normal(size=(6, 8, 12, 3)).astype(np.float32),
+        conf=rng.uniform(1, 5, (6, 8, 12)).astype(np.float32),
+        pts3d_in_other_view=rng.normal(size=(6, 8, 12, 3)).astype(np.float32),
+        conf2=rng.uniform(1, 5, (6, 8, 12)).astype(np.float32),
+        images=NAMES[:3],
+        colors=rng.integers(0, 256, (3, 8, 12, 3), dtype=np.uint8),
+        intrinsics=Intrinsics(10.0, 10.5, 5.5, 3.5, 12, 8),
+        grid=dataclasses.replace(image_grid((640, 480)), size=(12, 8)),
+        is_metric=True,
+    )
+    path = tmp_path / "pairs.npz"
+    write_pairs(path, pairs)
+    back = read_pairs(path)
+    for field in dataclasses.fields(pairs):
+        np.testing.assert_array_equal(getattr(back, field.name), getattr(pairs, field.name))
+
+    arrays = {name: np.array(value) for name, value in np.load(path).items()}
+    spoilt = {
+        "no array 'conf2'": {"conf2": None},
+        "asks for": {"conf": arrays["conf"][:, :4]},
+        "not finite": {"pts3d": np.where(arrays["pts3d"] > 2.5, np.nan, arrays["pts3d"])},
+        "negative": {"conf": arrays["conf"] - 3},
+        "must join two": {"edges": edges + 1},
+        "must be integers": {"edges": edges / 1.0},
+        "fx, fy, cx, cy": {"intrinsics": np.zeros(4)},
+        "grid must be": {"grid": np.zeros((4, 2), int)},
+        "colors must be": {"colors": arrays["colors"][:2]},
+        "it needs 4 dimensions": {"pts3d": arrays["pts3d"][0]},
+    }
+    for message, change in spoilt.items():
+        np.savez(path, **{k: v for k, v in {**arrays, **change}.items() if v is not None})
+        with pytest.raises(InputError, match=message) as caught:
+            read_pairs(path)
+        assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+    path.write_bytes(path.read_bytes()[:-300])
+    with pytest.raises(InputError, match="no readable npz"):
+        read_pairs(path)
+    with zipfile.ZipFile(
+        path, "w"
+    ) as archive:  # NumPy reads this without an error where the magic is damaged
+        archive.writestr("edges.npy", b"\x93NUNPY and so on")
+    with pytest.raises(InputError, match="no readable npz"):
+        read_pairs(path)
+    np.savez(path, edges=np.array([{}], dtype=object))
+    with pytest.raises(InputError, match="no readable npz"):
+        read_pairs(path)
+    with pytest.raises(InputError, match="no such file"):
+        read_pairs(tmp_path / "absent.npz")
+
+
+def chain_over_a_table(base_from_camera: np.ndarray, noise: float) -> PairPredictions:
+    """Pairs of neighbours that look at the plane z = 0, each at a scale of its own."""
+    rng = np.random.default_rng(1)
+    height, width, focal = 24, 32, 32.0
+    v, u = np.mgrid[:height, :width]
+    rays = np.stack([(u - 15.5) / focal, (v - 11.5) / focal, np.ones((height, width))], -1)
+    edges = window_pairs(len(base_from_camera), 1)
+    own, other = [], []
+    for first, second in edges:
+        scale = rng.uniform(0.5, 2)
+        for image, out in ((first, own), (second, other)):
+            to_base = base_from_camera[image]
+            depth = -to_base[2, 3] / (rays @ to_base[2, :3])
+            relative = inverse(base_from_camera[first]) @ to_base
+            points = (rays * depth[..., None]) @ relative[:3, :3].T + relative[:3, 3]
+            out.append(scale * (points + noise * rng.normal(size=points.shape)))
+    one = np.ones((len(edges), height, width), np.float32)
+    return PairPredictions(
+        edges=edges,
+        pts3d=np.array(own, np.float32),
+        conf=one,
+        pts3d_in_other_view=np.array(other, np.float32),
+        conf2=one,
+    )
+
+
+def test_robot_poses_leave_out_exactly_the_pairs_without_a_common_view() -> None:
+    rng = np.random.default_rng(0)
+    count = 14
+    gripper_from_camera = transform(
+        Rotation.from_rotvec([0.3, -0.2, 1.2]).as_matrix(), np.array([0.05, 0.02, 0.1])
+    )
+    down = Rotation.from_euler("x", 180, degrees=True)
+    tilt = Rotation.from_rotvec(rng.normal(scale=0.2, size=(count, 3)))
+    x = np.linspace(0, 2.2, count)
+    centers = np.stack([x, 0.05 * rng.normal(size=count), 0.4 + 0.03 * rng.normal(size=count)], -1)
+    base_from_camera = transform((tilt * down).as_matrix(), centers)
+    base_from_gripper = base_from_camera @ inverse(gripper_from_camera)
+    edges, note = overlapping_pairs(chain_over_a_table(base_from_camera, noise=0.002), base_from_gripper)
+
+    kept = {tuple(edge) for edge in edges.tolist()}
+    assert len(kept) < 0.6 * count * (count - 1) and "share no view" in note
+    distance = np.abs(np.subtract.outer(x, x))
+    # At 0.4 m a view is 0.4 m wide; views no farther apart than that overlap, however they are tilted.
+    assert kept >= {tuple(edge) for edge in np.argwhere((distance > 0) & (distance < 0.3)).tolist()}
+    assert kept == {(second, first) for first, second in kept}
+    assert all(distance[edge] < 1.4 for edge in kept)
+
+
+def test_all_pairs_are_kept_when_the_motions_do_not_tell_where_the_camera_looks() -> None:
+    count = 6
+    rotation = Rotation.from_euler("z", np.linspace(0, 60, count)[:, None], degrees=True)
+    down = Rotation.from_euler("x", 180, degrees=True)
+    base_from_camera = transform(
+        (rotation * down).as_matrix(), np.array([[0.3 * k, 0, 0.4] for k in range(count)])
+    )
+    edges, note = overlapping_pairs(chain_over_a_table(base_from_camera, noise=0.0), base_from_camera)
+    assert len(edges) == count * (count - 1) and "less than two axes" in note
+    rng = np.random.default_rng(3)
+    shuffled = transform(Rotation.random(count, rng=rng).as_matrix(), rng.normal(size=(count, 3)))
+    base_from_camera[:, :3, :3] = (
+        Rotation.from_rotvec(rng.normal(scale=0.2, size=(count, 3))) * rotation * down
+    ).as_matrix()
+    edges, note = overlapping_pairs(chain_over_a_table(base_from_camera, noise=0.0), shuffled)
+    assert len(edges) == count * (count - 1) and "do not agree with the robot" in note

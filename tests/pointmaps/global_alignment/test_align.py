@@ -1,0 +1,336 @@
+"""Global alignment against the truth of synthetic pairs: accuracy, gauge, wrong pairs, graphs, bad input."""
+
+import importlib.util
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks import align_pairs
+from benchmarks.synthetic_pairs import PairErrors, PairTruth, synthetic_pairs, write_pairs
+from jcr.errors import InputError, RejectedError
+from jcr.geometry import apply_similarity, fit_similarity, retract, rotation_between_deg
+from jcr.pointmaps.dust3r.pair_graph import complete_pairs, window_pairs
+from jcr.pointmaps.global_alignment.align import global_align
+from jcr.pointmaps.global_alignment.alignment import Alignment, AlignOptions, pinhole_of
+from jcr.pointmaps.global_alignment.gauss_newton import Problem, gauss_newton
+from jcr.pointmaps.global_alignment.normal_equations import (
+    ImageEquations,
+    Layout,
+    PairTies,
+    ReducedEquations,
+)
+from jcr.pointmaps.global_alignment.pointmap_residuals import State
+from jcr.records import Intrinsics
+from places import SHARED
+
+SMALL = (48, 36)
+NO_ERRORS = PairErrors(pixel=0.0, warp=0.0, outliers=0.0)
+
+
+def errors(result: Alignment, truth: PairTruth) -> tuple[float, float]:
+    """Mean error of the cameras, mm and degrees, after the best similarity."""
+    true, found = truth.base_from_camera, result.recon_from_camera
+    base_from_recon, scale = fit_similarity(true[:, :3, 3], found[:, :3, 3])
+    centers = apply_similarity(base_from_recon, scale, found[:, :3, 3])
+    rotation = rotation_between_deg(base_from_recon[:3, :3] @ found[:, :3, :3], true[:, :3, :3])
+    return 1e3 * float(np.linalg.norm(centers - true[:, :3, 3], axis=1).mean()), float(rotation.mean())
+
+
+@pytest.mark.parametrize("focal", ["shared", "own"])
+def test_exact_predictions_give_the_exact_scene(focal):
+    predictions, truth = synthetic_pairs(complete_pairs(5), SMALL, NO_ERRORS)
+    result = global_align(predictions, AlignOptions(focal=focal))
+    mm, deg = errors(result, truth)
+    assert mm < 1e-3
+    assert deg < 1e-4
+    np.testing.assert_allclose(result.focal_px, truth.intrinsics.fx, rtol=1e-6)
+    # Metres per recon unit, from the pairs' units and scales, from the depth: one and the same.
+    unit = 1 / (result.pair_scale * truth.pair_unit)
+    np.testing.assert_allclose(unit, unit[0], rtol=1e-5)
+    np.testing.assert_allclose(result.depth * unit[0], truth.depth, rtol=1e-4)
+    assert np.prod(result.pair_scale) == pytest.approx(1, rel=1e-6)
+    np.testing.assert_array_equal(result.recon_from_camera[0], np.eye(4))
+    assert result.pair_residual.max() < 2e-4
+    assert result.notes == ()
+
+
+def test_points_in_recon_are_the_surface():
+    predictions, truth = synthetic_pairs(complete_pairs(3), SMALL, NO_ERRORS)
+    result = global_align(predictions)
+    base_from_recon, scale = fit_similarity(
+        truth.base_from_camera[:, :3, 3], result.recon_from_camera[:, :3, 3]
+    )
+    # Three centres leave the fit a plane's worth of play; the surface itself does not.
+    k = truth.intrinsics
+    y, x = np.mgrid[: SMALL[1], : SMALL[0]]
+    ray = np.stack([(x - k.cx) / k.fx, (y - k.cy) / k.fy, np.ones_like(x, float)], axis=-1)
+    for pose, depth, points in zip(
+        truth.base_from_camera, truth.depth, result.points_in_recon(), strict=True
+    ):
+        in_base = (ray * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
+        found = apply_similarity(base_from_recon, scale, points.astype(float))
+        np.testing.assert_allclose(found, in_base, atol=2e-4)
+
+
+@pytest.mark.slow
+def test_fast_beats_adam_and_both_are_near_the_truth():
+    predictions, truth = synthetic_pairs(complete_pairs(4), (32, 24), seed=1)
+    fast = errors(global_align(predictions), truth)
+    from benchmarks.adam import align_adam
+
+    adam = errors(align_adam(predictions), truth)
+    assert adam[0] < 4
+    assert adam[1] < 0.4
+    assert fast[0] < adam[0] / 2
+    assert fast[1] < adam[1]
+
+
+def test_one_step_from_near_the_truth_is_almost_all_the_way():
+    # A wrong block of the normal equations leaves the fixed point and spoils the step towards it.
+    predictions, truth = synthetic_pairs(complete_pairs(4), SMALL, NO_ERRORS)
+    problem = Problem(predictions, pinhole_of(predictions, AlignOptions()), True)
+    images = problem.observe_all(300)
+    log_depth = [np.log(_depth_at(truth, o)) for o in images]
+    rng = np.random.default_rng(0)
+    nudge = 2e-3 * rng.normal(size=(4, 6))
+    nudge[0] = 0
+    log_unit = -np.log(truth.pair_unit)
+    scale_nudge = 2e-3 * rng.normal(size=len(log_unit))
+    start = State(
+        recon_from_camera=retract(truth.base_from_camera, nudge),
+        log_focal=np.full(4, np.log(truth.intrinsics.fx) + 2e-3),
+        log_pair_scale=log_unit + scale_nudge - scale_nudge.mean(),
+        pair_error=np.zeros((12, 6)),
+        log_depth=[exact + 2e-3 * rng.normal(size=exact.shape) for exact in log_depth],
+    )
+    one_step = gauss_newton(images, start, Layout(4, 12, 1), np.full(6, 1e-5), np.inf).state
+    for name, exact in (
+        ("recon_from_camera", truth.base_from_camera),
+        ("log_focal", np.log(truth.intrinsics.fx)),
+        ("log_pair_scale", log_unit),
+        ("log_depth", log_depth),
+    ):
+        before, after = (
+            np.abs(np.subtract(getattr(state, name), exact)).max() for state in (start, one_step)
+        )
+        assert after < before / 30, name
+
+
+def _depth_at(truth, observations):
+    x = observations.pixel_offset[0] + truth.intrinsics.cx
+    y = observations.pixel_offset[1] + truth.intrinsics.cy
+    return truth.depth[observations.image, y.round().astype(int), x.round().astype(int)]
+
+
+def test_the_unit_of_a_pair_changes_its_scale_and_nothing_else():
+    predictions, _ = synthetic_pairs(complete_pairs(4), SMALL)
+    factor = np.exp(np.random.default_rng(3).normal(0, 1, 12)).astype(np.float32)
+    factor /= np.exp(np.log(factor).mean())
+    rescaled = replace(
+        predictions,
+        pts3d=predictions.pts3d * factor[:, None, None, None],
+        pts3d_in_other_view=predictions.pts3d_in_other_view * factor[:, None, None, None],
+    )
+    one, other = global_align(predictions), global_align(rescaled)
+    np.testing.assert_allclose(other.recon_from_camera, one.recon_from_camera, atol=1e-4)
+    np.testing.assert_allclose(other.pair_scale * factor, one.pair_scale, rtol=1e-3)
+
+
+@pytest.mark.parametrize("spoil", [{"wrong_pairs": 5}, {"noise_pairs": 5}])
+def test_wrong_pairs_are_outvoted_and_named(spoil):
+    spoilt, truth = synthetic_pairs(complete_pairs(6), SMALL, PairErrors(**spoil), seed=2)
+    result = global_align(replace(spoilt, images=tuple("abcdef")))
+    mm, deg = errors(result, truth)
+    assert mm < 1
+    assert deg < 0.1
+    worst = np.argsort(result.pair_residual)[-5:]
+    assert set(worst) == set(truth.spoilt)
+    assert len(result.notes) == 1
+    assert result.notes[0].startswith("5 of 30 pairs")
+
+
+@pytest.mark.parametrize(
+    "edges",
+    [window_pairs(8, 2), window_pairs(6, 1), np.array([(i, j) for i in range(5) for j in range(i + 1, 5)])],
+    ids=["window", "chain", "one way"],
+)
+def test_incomplete_graphs(edges):
+    # One way: the last image is never first, so that its depth comes from other cameras' views alone.
+    predictions, truth = synthetic_pairs(edges, SMALL, seed=4)
+    mm, deg = errors(global_align(predictions), truth)
+    assert mm < 2
+    assert deg < 0.2
+
+
+def test_images_that_no_pair_reaches_are_named():
+    edges = np.array([[0, 1], [1, 0], [2, 3], [3, 2]])
+    predictions, _ = synthetic_pairs(edges, SMALL)
+    with pytest.raises(InputError, match="no chain of pairs joins c, d "):
+        global_align(replace(predictions, images=tuple("abcd")))
+
+
+def test_non_square_pixels_and_a_principal_point_off_the_middle_are_fixed():
+    given = Intrinsics(46.0, 41.0, 21.0, 19.5, *SMALL)
+    predictions, truth = synthetic_pairs(complete_pairs(4), SMALL, intrinsics=given)
+    result = global_align(predictions)
+    np.testing.assert_allclose(result.focal_px, np.tile([46.0, 41.0], (4, 1)))
+    assert result.principal_point_px == (21.0, 19.5)
+    mm, deg = errors(result, truth)
+    assert mm < 1
+    assert deg < 0.1
+    free = global_align(predictions, AlignOptions(focal="shared"))
+    np.testing.assert_allclose(free.focal_px[:, 0], 46.0, rtol=2e-3)
+    np.testing.assert_allclose(free.focal_px[:, 1] / free.focal_px[:, 0], 41 / 46)
+
+
+def test_principal_point_comes_from_the_option_then_the_file_then_the_middle():
+    predictions, _ = synthetic_pairs(complete_pairs(2), SMALL)
+    assert pinhole_of(predictions, AlignOptions()).principal_point_px == (24, 18)
+    known = replace(predictions, intrinsics=Intrinsics(40.0, 40.0, 22.0, 17.0, *SMALL))
+    assert pinhole_of(known, AlignOptions()).principal_point_px == (22, 17)
+    asked = AlignOptions(principal_point_px=(23.5, 17.5))
+    assert pinhole_of(known, asked).principal_point_px == (23.5, 17.5)
+    with pytest.raises(InputError, match="carry no intrinsics"):
+        global_align(predictions, AlignOptions(focal="given"))
+
+
+@pytest.mark.parametrize("network", ["from 1 up", "from 0 to 1"])
+def test_pixels_without_confidence_do_not_count(network):
+    # More than half of each image is rubbish, as sky is.
+    predictions, truth = synthetic_pairs(complete_pairs(4), SMALL)
+    rubbish = np.random.default_rng(0).normal(0, 1, (12, 36, 28, 3)).astype(np.float32)
+    nothing = 1.0 if network == "from 1 up" else 0.0
+    for points, conf in (
+        (predictions.pts3d, predictions.conf),
+        (predictions.pts3d_in_other_view, predictions.conf2),
+    ):
+        points[:, :, :28] = rubbish
+        if nothing == 0.0:
+            conf /= conf.max() * 1.01
+        conf[:, :, :28] = nothing
+    result = global_align(predictions)
+    mm, deg = errors(result, truth)
+    assert mm < 1.5
+    assert deg < 0.15
+    assert np.isfinite(result.depth).all()
+    assert result.confidence[:, :, :28].max() <= nothing + 1e-6
+    assert result.confidence[:, :, 28:].mean() > nothing + 0.1
+
+
+def test_senseless_options_are_refused():
+    predictions, _ = synthetic_pairs(complete_pairs(2), SMALL)
+    with pytest.raises(InputError, match="alignment needs 50"):
+        global_align(predictions, AlignOptions(pixels=1))
+
+
+def test_predictions_that_are_noise_are_called_useless():
+    predictions, _ = synthetic_pairs(complete_pairs(3), SMALL, PairErrors(noise_pairs=6))
+    try:
+        said = global_align(predictions).warnings
+    except RejectedError as refusal:
+        said = (str(refusal),)
+    assert any("nothing can be built on them" in note or "too little in common" in note for note in said)
+
+
+def test_same_input_same_output():
+    predictions, _ = synthetic_pairs(complete_pairs(4), SMALL)
+    one, other = global_align(predictions), global_align(predictions)
+    np.testing.assert_array_equal(one.recon_from_camera, other.recon_from_camera)
+    np.testing.assert_array_equal(one.depth, other.depth)
+
+
+def command(*arguments: str) -> int:
+    """Return the exit status of `python -m benchmarks align`."""
+    return align_pairs.main(arguments)
+
+
+def test_command_reads_aligns_and_writes(tmp_path, capsys):
+    predictions, truth = synthetic_pairs(complete_pairs(3), SMALL)
+    write_pairs(tmp_path / "pairs.npz", predictions)
+    result = tmp_path / "new" / "aligned.npz"
+    assert command(str(tmp_path / "pairs.npz"), str(result)) == 0
+    assert json.loads(capsys.readouterr().out)["seconds"] > 0
+    with np.load(result) as file:
+        assert file["poses"].shape == (3, 4, 4)
+        assert file["depth"].shape == (3, 36, 48)
+        np.testing.assert_allclose(file["focals"], truth.intrinsics.fx, rtol=2e-3)
+
+
+def _without(key):
+    return lambda arrays: arrays.pop(key)
+
+
+def _set(key, index, value):
+    def spoil(arrays):
+        arrays[key][index] = value
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (_without("conf2"), "conf2"),
+        (_set("pts3d", (1, 2, 3, 0), np.nan), "pts3d"),
+        (_set("edges", (0, 1), 7), "edges"),
+        (_set("conf", (0, 0, 0), -1), "conf"),
+        (lambda arrays: arrays.update(pts3d=arrays["pts3d"][:, :-1]), "shape"),
+    ],
+    ids=["missing", "nan", "edge out of range", "negative", "shape"],
+)
+def test_command_shows_what_is_wrong_with_a_file(tmp_path, spoil, said):
+    predictions, _ = synthetic_pairs(complete_pairs(2), SMALL)
+    names = ("edges", "pts3d", "conf", "pts3d_in_other_view", "conf2")
+    arrays = {name: getattr(predictions, name) for name in names} | {"images": np.array(["a", "b"])}
+    spoil(arrays)
+    np.savez(tmp_path / "pairs.npz", **arrays)
+    with pytest.raises(InputError, match=said) as caught:
+        command(str(tmp_path / "pairs.npz"), str(tmp_path / "out.npz"))
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out.npz").exists()
+
+
+def test_command_refuses_a_truncated_file(tmp_path):
+    predictions, _ = synthetic_pairs(complete_pairs(2), SMALL)
+    whole = tmp_path / "pairs.npz"
+    write_pairs(whole, predictions)
+    whole.write_bytes(whole.read_bytes()[:-2000])
+    with pytest.raises(InputError, match=f"^{whole}"):
+        command(str(whole), str(tmp_path / "out.npz"))
+
+
+def test_yardstick(tmp_path):
+    script = SHARED / "align" / "make_synthetic.py"
+    if not script.is_file():
+        pytest.skip("the alignment yardstick is not on this machine")
+    spec = importlib.util.spec_from_file_location("make_synthetic", script)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    made = module.make(128, 96, 6, seed=0)
+    np.savez(tmp_path / "pairs.npz", **made)
+    assert command(str(tmp_path / "pairs.npz"), str(tmp_path / "out.npz")) == 0
+    with np.load(tmp_path / "out.npz") as file:
+        true, found = made["gt_poses"], file["poses"]
+        world_from_recon, scale = fit_similarity(true[:, :3, 3], found[:, :3, 3])
+        centers = apply_similarity(world_from_recon, scale, found[:, :3, 3])
+        rotation = rotation_between_deg(world_from_recon[:3, :3] @ found[:, :3, :3], true[:, :3, :3])
+        # What the published aligner reaches with 10 images.
+        assert 1e3 * np.linalg.norm(centers - true[:, :3, 3], axis=1).mean() < 0.84
+        assert rotation.mean() < 0.091
+        np.testing.assert_allclose(file["focals"], made["gt_focal"], rtol=9e-4)
+        assert np.median(np.abs(file["depth"] * scale / made["gt_depth"] - 1)) < 3e-3
+
+
+def test_pairs_whose_errors_cannot_be_solved_for_are_rejected(monkeypatch: pytest.MonkeyPatch):
+    """A network with random weights, 40 images and near pairs alone, gave such equations."""
+
+    def singular(equations: ImageEquations, ties: PairTies) -> ReducedEquations:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr(ImageEquations, "reduced", singular)
+    predictions, _ = synthetic_pairs(complete_pairs(3), (32, 24))
+    with pytest.raises(RejectedError, match="too little in common"):
+        global_align(predictions)

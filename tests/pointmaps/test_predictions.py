@@ -1,0 +1,321 @@
+"""Back ends that take pointmaps: from a file, and from a model of MapAnything's interface."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from numpy import ndarray
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from jcr import reconstruct as backends
+from jcr.errors import InputError
+from jcr.geometry import apply, fit_similarity, inverse, rotation_between_deg, transform
+from jcr.hub import Weights
+from jcr.pointmaps import predictions
+from jcr.pointmaps.pairs import pairs_from_arrays
+from jcr.pointmaps.predictions import reconstruct_predictions
+from jcr.reconstruct import ReconstructOptions
+from jcr.records import Capture, Intrinsics, Reconstruction
+from places import SHARED
+
+if TYPE_CHECKING:
+    import torch
+
+ALIGN = SHARED / "align"
+COUNT, WIDTH, HEIGHT = 5, 128, 96
+
+if not ALIGN.is_dir():
+    pytest.skip(f"the generator of synthetic predictions is not in {ALIGN}", allow_module_level=True)
+
+
+@pytest.fixture(scope="module")
+def truth() -> dict[str, Any]:
+    """Pairwise predictions of a table scene and its geometry; the grid's principal point is (W/2, H/2)."""
+    spec = importlib.util.spec_from_file_location("make_synthetic", ALIGN / "make_synthetic.py")
+    assert spec is not None and spec.loader is not None
+    generator = importlib.util.module_from_spec(spec)
+    sys.modules["make_synthetic"] = generator
+    spec.loader.exec_module(generator)
+    made = generator.make(WIDTH, HEIGHT, COUNT, seed=1)
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    focal = made["gt_focal"]
+    rays = np.stack([(u - WIDTH / 2) / focal, (v - HEIGHT / 2) / focal, np.ones((HEIGHT, WIDTH))], -1)
+    depth = np.asarray(made["gt_depth"], np.float64)
+    made["rays"] = rays
+    made["points"] = np.array(
+        [apply(pose, rays * z[..., None]) for pose, z in zip(made["gt_poses"], depth, strict=True)]
+    )
+    return made
+
+
+@pytest.fixture
+def capture(tmp_path: Path, truth: dict[str, Any]) -> Capture:
+    """Images five times the size of the grid, with a intrinsics, taken by a camera on a gripper."""
+    names = tuple(f"{k}.png" for k in range(COUNT))
+    for k, name in enumerate(names):
+        Image.new("RGB", (5 * WIDTH, 5 * HEIGHT), (40 * k, 0, 0)).save(tmp_path / name)
+    gripper_from_camera = transform(
+        Rotation.from_rotvec([0.2, 0.1, 1.5]).as_matrix(), np.array([0.03, 0.05, 0.1])
+    )
+    focal = 5 * truth["gt_focal"]
+    intrinsics = Intrinsics(focal, focal, 2.5 * WIDTH + 2, 2.5 * HEIGHT + 2, 5 * WIDTH, 5 * HEIGHT)
+    base_from_gripper = truth["gt_poses"] @ inverse(gripper_from_camera)
+    return Capture(
+        folder=tmp_path,
+        images=names,
+        base_from_gripper=base_from_gripper,
+        image_size=(5 * WIDTH, 5 * HEIGHT),
+        intrinsics=intrinsics,
+    )
+
+
+def pair_arrays(truth: dict[str, Any]) -> dict[str, ndarray]:
+    return {name: truth[name] for name in ("edges", "pts3d", "conf", "pts3d_in_other_view", "conf2")}
+
+
+def pointmap_arrays(truth: dict[str, Any]) -> dict[str, ndarray]:
+    """In a frame and at a scale of their own."""
+    recon_from_base = transform(
+        Rotation.from_rotvec([1.0, -0.5, 0.3]).as_matrix(), np.array([3.0, 1.0, -2.0])
+    )
+    poses = recon_from_base @ truth["gt_poses"]
+    poses[:, :3, 3] *= 2.5
+    points = 2.5 * apply(recon_from_base, truth["points"])
+    return {"recon_from_camera": poses, "points_in_recon": points, "confidence": np.ones(points.shape[:3])}
+
+
+def reconstructed(capture: Capture, arrays: dict[str, Any]) -> Reconstruction:
+    path = capture.folder / "predictions.npz"
+    np.savez(path, **arrays)
+    return reconstruct_predictions(capture, path)
+
+
+def assert_poses(result: Reconstruction, truth: ndarray, millimetres: float, degrees: float) -> None:
+    centers = truth[:, :3, 3]
+    base_from_recon, scale = fit_similarity(centers, result.recon_from_camera[:, :3, 3])
+    found = apply(base_from_recon, scale * result.recon_from_camera[:, :3, 3])
+    assert 1e3 * np.linalg.norm(found - centers, axis=1).max() < millimetres
+    rotation = base_from_recon[:3, :3] @ result.recon_from_camera[:, :3, :3]
+    assert rotation_between_deg(rotation, truth[:, :3, :3]).max() < degrees
+
+
+def assert_tracks(result: Reconstruction, median_px: float) -> None:
+    """In original pixels, by the reconstruction's own geometry."""
+    tracks, intrinsics = result.tracks, result.intrinsics
+    camera_from_recon = inverse(result.recon_from_camera)
+    x_in_camera = np.array(
+        [
+            apply(camera_from_recon[i], tracks.points_in_recon[p])
+            for i, p in zip(tracks.image, tracks.point, strict=True)
+        ]
+    )
+    projected = x_in_camera @ intrinsics.matrix.T
+    error = np.linalg.norm(projected[:, :2] / projected[:, 2:] - tracks.x_px, axis=1)
+    assert len(error) > 500 and np.median(error) < median_px
+
+
+def test_pairwise_pointmaps_give_poses_and_tracks(capture: Capture, truth: dict[str, Any]) -> None:
+    result = reconstructed(capture, pair_arrays(truth))
+    assert result.backend == "predictions" and result.image_index.tolist() == list(range(COUNT))
+    assert result.intrinsics == capture.intrinsics
+    assert result.dense.points_in_recon.shape == (COUNT, HEIGHT, WIDTH, 3)
+    np.testing.assert_allclose(result.dense.intrinsics.cx, WIDTH / 2, atol=1e-9)
+    assert (result.dense.colors[:, 0, 0, 0] == 40 * np.arange(COUNT)).all()
+    assert_poses(result, truth["gt_poses"], millimetres=3, degrees=0.3)
+    assert_tracks(result, median_px=2.5)
+
+
+def test_images_are_found_by_name_in_any_order(capture: Capture, truth: dict[str, Any]) -> None:
+    order = np.array([3, 0, 4, 1])  # the file's images; image 2 of the capture is missing
+    new = np.full(COUNT, -1)
+    new[order] = np.arange(4)
+    kept = (new[truth["edges"]] >= 0).all(1)
+    arrays = {name: values[kept] for name, values in pair_arrays(truth).items()}
+    arrays |= {"edges": new[arrays["edges"]], "images": np.array([capture.images[k] for k in order])}
+    result = reconstructed(capture, arrays)
+    assert result.image_index.tolist() == [0, 1, 3, 4]
+    assert (result.dense.colors[:, 0, 0, 0] == [0, 40, 120, 160]).all()
+    assert_poses(result, truth["gt_poses"][[0, 1, 3, 4]], millimetres=4, degrees=0.4)
+
+    pointmaps = {name: values[order] for name, values in pointmap_arrays(truth).items()}
+    result = reconstructed(capture, pointmaps | {"images": arrays["images"]})
+    assert result.image_index.tolist() == [0, 1, 3, 4]
+    assert_poses(result, truth["gt_poses"][[0, 1, 3, 4]], millimetres=1e-3, degrees=1e-4)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_pointmaps_in_one_frame_keep_their_poses(
+    capture: Capture, truth: dict[str, Any], known: bool
+) -> None:
+    if not known:
+        capture = Capture(
+            folder=capture.folder,
+            images=capture.images,
+            base_from_gripper=capture.base_from_gripper,
+            image_size=capture.image_size,
+            intrinsics=None,
+        )
+    result = reconstructed(capture, pointmap_arrays(truth))
+    assert_poses(result, truth["gt_poses"], millimetres=1e-3, degrees=1e-4)
+    assert_tracks(result, median_px=0.3)
+    # Unknown, the camera model comes out of the points.
+    assert result.intrinsics.fx == pytest.approx(5 * truth["gt_focal"], rel=1e-4)
+    assert result.intrinsics.cx == pytest.approx(2.5 * WIDTH + 2, abs=0.05)
+
+
+def test_a_distorted_intrinsics_is_used_with_intrinsics_and_given_up_without(
+    capture: Capture, truth: dict[str, Any]
+) -> None:
+    intrinsics = Intrinsics(600.0, 600.0, 320.0, 240.0, 640, 480, (-0.1, 0.02, 0.0, 0.0, 0.0))
+    distorted = Capture(
+        folder=capture.folder,
+        images=capture.images,
+        base_from_gripper=capture.base_from_gripper,
+        image_size=(640, 480),
+        intrinsics=intrinsics,
+    )
+    seen = np.array([truth["gt_focal"], truth["gt_focal"], WIDTH / 2, HEIGHT / 2])
+    arrays = pointmap_arrays(truth)
+    assert reconstructed(distorted, arrays | {"intrinsics": seen}).intrinsics == intrinsics
+    result = reconstructed(distorted, arrays)
+    assert result.intrinsics.distortion == (0.0,) * 5 and "distorted images" in result.warnings[0]
+
+
+def test_faults_in_a_file_are_named(capture: Capture, truth: dict[str, Any]) -> None:
+    pairs, pointmaps = pair_arrays(truth), pointmap_arrays(truth)
+    flipped = pointmaps["recon_from_camera"].copy()
+    flipped[2, :3, 0] *= -1
+    far = pointmaps["points_in_recon"].copy()
+    far[1, 4, 4] = np.inf
+    for message, arrays in {
+        "holds neither 'edges'": {"points": np.zeros(3)},
+        "no array 'conf2'": {**pairs, "conf2": None},
+        "6 names for 5 images": {**pointmaps, "images": np.array(list("abcdef"))},
+        "no image 'x.png' in the capture": {**pointmaps, "images": np.array([*capture.images[:4], "x.png"])},
+        "2 images, the capture has 5": {name: values[:2] for name, values in pointmaps.items()},
+        "camera_from_recon": {**pointmaps, "recon_from_camera": inverse(pointmaps["recon_from_camera"])},
+        "poses and points of one frame": {**pointmaps, "points_in_recon": pointmaps["points_in_recon"][::-1]},
+        r"recon_from_camera\[2\]: a reflection": {**pointmaps, "recon_from_camera": flipped},
+        "points_in_recon is not finite": {**pointmaps, "points_in_recon": far},
+        "confidence is negative": {**pointmaps, "confidence": -pointmaps["confidence"]},
+        "confidence asks for": {**pointmaps, "confidence": pointmaps["confidence"][:, 1:]},
+        "in 4 dimensions": {**pointmaps, "points_in_recon": pointmaps["points_in_recon"][0]},
+        "no array 'confidence'": {**pointmaps, "confidence": None},
+        "array 'grid'": {
+            name: values[:, :, :60] if values.ndim > 3 else values for name, values in pointmaps.items()
+        }
+        | {"confidence": pointmaps["confidence"][:, :, :60]},
+        "made from images of 320x240": {
+            **pointmaps,
+            "grid": np.array([[320, 240], [128, 96], [0, 0], [128, 96]]),
+        },
+    }.items():
+        with pytest.raises(InputError, match=message) as caught:
+            reconstructed(capture, {name: values for name, values in arrays.items() if values is not None})
+        assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match="no such file"):
+        reconstruct_predictions(capture, capture.folder / "absent.npz")
+
+
+@pytest.mark.slow
+def test_a_network_gives_the_same_record(
+    capture: Capture, truth: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The dust3r back end around synthetic predictions on the grid it prepared."""
+    from jcr.pointmaps.dust3r import dust3r
+    from jcr.pointmaps.dust3r.dust3r import Dust3rOptions
+
+    made = pairs_from_arrays(pair_arrays(truth), "synthetic")
+
+    def predict(capture: Capture, options: object, progress: object) -> tuple:
+        images = predictions._images(capture, np.arange(COUNT), {}, (WIDTH, HEIGHT), "synthetic")
+        return images, made, ("weights X: licence Y",)
+
+    monkeypatch.setattr(dust3r, "predict", predict)
+    options = Dust3rOptions(weights=Weights(Path("X"), "X", "Y"))
+    result = dust3r.reconstruct_dust3r(capture, options)
+    assert result.backend == "dust3r" and "weights X: licence Y" in result.notes
+    assert_poses(result, truth["gt_poses"], millimetres=3, degrees=0.3)
+    unknown = Capture(
+        folder=capture.folder,
+        images=capture.images,
+        base_from_gripper=capture.base_from_gripper,
+        image_size=capture.image_size,
+    )
+    found = dust3r.reconstruct_dust3r(unknown, options).intrinsics
+    # The principal point stays where the network has it; the focal length is aligned.
+    assert found.fx == pytest.approx(5 * truth["gt_focal"], rel=0.01)
+    assert (found.cx, found.cy) == pytest.approx((2.5 * WIDTH + 2, 2.5 * HEIGHT + 2))
+
+
+class FakeMapAnything:
+    """Answers with the true geometry on the grid it is shown, as the package's model would."""
+
+    def __init__(self, truth: dict[str, Any]) -> None:
+        self.truth = truth
+        self.views: list[dict[str, Any]] = []
+
+    def infer(self, views: list[dict[str, Any]], **options: Any) -> "list[dict[str, torch.Tensor]]":
+        import torch
+
+        self.views = views
+        assert options["apply_mask"] is False
+        answers = []
+        for view, pose in zip(views, self.truth["gt_poses"], strict=True):
+            height, width = view["img"].shape[2:]
+            matrix = view["intrinsics"][0].double().numpy()
+            v, u = np.mgrid[:height, :width]
+            pixels = np.stack([u, v, np.ones((height, width))], -1)
+            rays = pixels @ np.linalg.inv(matrix).T
+            depth = -pose[2, 3] / (rays @ pose[2, :3])  # the plane z = 0
+            depth = np.where((depth > 0) & (depth < 1), depth, 1)
+            answers.append(
+                {
+                    "pts3d": torch.tensor(apply(pose, rays * depth[..., None]))[None].float(),
+                    "camera_poses": torch.tensor(pose)[None].float(),
+                    "conf": torch.ones(1, height, width),
+                    "mask": torch.tensor(depth < 1)[None, ..., None],
+                    "intrinsics": view["intrinsics"],
+                }
+            )
+        return answers
+
+
+@pytest.mark.slow
+def test_an_any_view_model_is_given_our_intrinsics(capture: Capture, truth: dict[str, Any]) -> None:
+    from functools import partial
+
+    from jcr.pointmaps import mapanything
+    from jcr.pointmaps.any_view import ViewsOptions, reconstruct_views_at_once
+
+    model = FakeMapAnything(truth)
+    options = ViewsOptions(
+        backend="mapanything",
+        load=lambda weights, device: partial(mapanything.predict, model),
+        weights=Weights(Path("X"), "X", "Apache-2.0"),
+    )
+    result = reconstruct_views_at_once(capture, options)
+    view = model.views[0]
+    assert view["img"].shape == (1, 3, 378, 518) and view["data_norm_type"] == ["dinov2"]
+    assert view["img"][0, 1].mean() == pytest.approx(-0.456 / 0.224, abs=1e-5)
+    assert view["intrinsics"][0, 0, 0] == pytest.approx(capture.intrinsics.fx * 518 / 640)
+    assert result.is_metric and result.intrinsics == capture.intrinsics
+    assert_poses(result, truth["gt_poses"], millimetres=1e-2, degrees=1e-3)
+    assert_tracks(result, median_px=0.3)
+    assert (result.dense.confidence == 0).any()
+    # One colour an image: no match confirms the cameras, which keep the errors that such models are known for.
+    assert any("too few matches by colour" in note for note in result.notes)
+    assert result.evidence is not None
+    std = np.sqrt(np.diag(result.evidence.covariance)).reshape(-1, 6)
+    assert (std[0] == 0).all() and np.degrees(std[1:, 3:]).min() > 1
+
+
+def test_mapanything_that_is_not_installed_shows_how_to_get_it(capture: Capture) -> None:
+    if importlib.util.find_spec("mapanything"):
+        pytest.skip("the mapanything package is installed here")
+    with pytest.raises(InputError, match="pip install git"):
+        backends.reconstruct(capture, ReconstructOptions(backend="mapanything"))
