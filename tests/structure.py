@@ -22,7 +22,7 @@ from fuzz_targets import NAMES, SIZE, small_capture, sound_run
 from jcr.batch import STATE as BATCH
 from jcr.batch import _finished
 from jcr.calibration.known_transform import read_hand_eye
-from jcr.capture.added import read_added, read_pose
+from jcr.capture.added import read_added
 from jcr.capture.camera_info import read_camera_info
 from jcr.capture.formats import capture_json
 from jcr.capture.options import ReadOptions
@@ -212,11 +212,8 @@ def _of_runs(folder: Path, capture: Capture, in_file: Any, found: dict[str, Docu
     added.mkdir(parents=True)
     (added / "000.png").write_bytes((capture.folder / capture.images[0]).read_bytes())
     frames = [{"image": "000.png", "base_from_gripper": np.eye(4).tolist()}]
-    as_json(added / "added.json", {"capture": str(capture.folder.resolve()), "frames": frames})
-    in_file("added.json", added / "added.json", lambda: read_added(added.parent, capture))
-    pose = folder / "pose.json"
-    as_json(pose, {"base_from_gripper": np.eye(4).tolist()})
-    in_file("pose.json", pose, lambda: read_pose(pose))
+    as_json(added / "capture.json", {"added_to": str(capture.folder.resolve()), "frames": frames})
+    in_file("added/capture.json", added / "capture.json", lambda: read_added(added.parent, capture))
     names = folder / "names.json"
     as_json(names, {"1": "mug", "2": "box"})
     in_file("labels/names.json", names, lambda: _read_names(names))

@@ -17,6 +17,7 @@ from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.poses import calibrate_poses as calibrate_poses_stage
 from jcr.calibration.poses import is_one
 from jcr.capture.added import read_added, with_images
+from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
 from jcr.cell.added import camera_of, keep_camera, read_added_cameras
 from jcr.errors import InputError, RejectedError
@@ -160,12 +161,13 @@ def build_map(
     map: MapOptions | Mapping[str, Any] | None = None,
     segment: SegmentOptions | Mapping[str, Any] | None = None,
     *,
-    add: Sequence[tuple[str | Path, str | Path]] = (),
+    add: Sequence[str | Path] = (),
+    read: ReadOptions | Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> RunResult:
     """Build cloud, map and report again, from the capture and the calibration of the run folder `out`.
 
-    `add` are further images, oldest first, each with a file of its base_from_gripper. They change the map but not the
+    `add` are captures of further images, oldest first, read with the options `read`. They change the map but not the
     calibration, and are used in every later map of the folder. Dense depth is estimated if the folder has none.
     """
     from jcr.mapping import require_map
@@ -180,9 +182,9 @@ def build_map(
     require_map(options.depth)
     capture = before.capture()
     with locked(Path(out)) as folder:
-        added = with_images(
-            read_added(folder.path, capture), [(Path(image), Path(pose)) for image, pose in add]
-        )
+        added = read_added(folder.path, capture)
+        for path in add:
+            added = with_images(added, Path(path), checked_options(read, ReadOptions))
         result = stages.calibrated(capture, folder, options, progress or silent)
         return _after_calibration(result, added, folder, options, progress or silent)
 

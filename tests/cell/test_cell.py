@@ -428,7 +428,7 @@ def test_images_of_two_sizes_are_not_one_camera(folder: Path):
             camera_of(name, [folder / "0.png"], None, ())
 
 
-@pytest.mark.parametrize("name", ["added/added.json", "cameras/cameras.json", "cameras.json"])
+@pytest.mark.parametrize("name", ["added/capture.json", "cameras/cameras.json", "cameras.json"])
 @pytest.mark.parametrize("fault", ["pipe", "folder", "link", "text", "number", "parent"])
 def test_what_has_the_name_of_a_file_of_the_run_is_not_taken_for_none(
     folder: Path, tmp_path: Path, name: str, fault: str
@@ -436,7 +436,7 @@ def test_what_has_the_name_of_a_file_of_the_run_is_not_taken_for_none(
     (folder / "capture.json").write_text(json.dumps(content()))
     capture, run = read(folder), tmp_path / "run"
     readers = {
-        "added/added.json": lambda: read_added(run, capture),
+        "added/capture.json": lambda: read_added(run, capture),
         "cameras/cameras.json": lambda: read_added_cameras(run, capture),
         "cameras.json": lambda: read_cameras(run),
     }

@@ -116,8 +116,7 @@ def test_many_entries_of_any_kind_are_refused_at_once(tmp_path: Path, what: str)
         ("capture.json, gone on with", ("frames", 3, "joints"), {"a": [{}]}),
         ("camera_info.yaml", ("distortion_model",), "plumb\0bob"),
         ("camera_info.yaml", ("distortion_model",), {"a": [{}]}),
-        ("added.json", ("capture",), "a\0b"),
-        ("pose.json", ("base_from_gripper",), "\x1b[2J"),
+        ("added/capture.json", ("added_to",), "a\0b"),
     ],
 )
 def test_what_further_values_found_stays_closed(

@@ -1,6 +1,5 @@
 """Images added to a calibrated run, of scenes in which a thing was taken away or put down."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,11 +9,13 @@ import numpy as np
 import pytest
 
 from jcr.camera import rays, resized, undistort_image
-from jcr.capture.added import read_added, read_pose, with_images, write_added
-from jcr.capture.images import read_image
+from jcr.capture.added import read_added, with_images, write_added
+from jcr.capture.formats import capture_json
+from jcr.capture.images import encode_png, read_image
 from jcr.capture.read import read_capture
 from jcr.depth.added import extend
 from jcr.errors import InputError
+from jcr.files import write_bytes
 from jcr.geometry import inverse, scale_translation, transform
 from jcr.records import (
     BOTH,
@@ -145,14 +146,15 @@ def added_views(
     folder: Path, truth: Truth, capture: Capture, scene: Scene, base_from_camera: np.ndarray
 ) -> Capture:
     """Images of a scene from new places, added to a run in `folder`."""
-    pairs = []
-    for k, view in enumerate(render(scene, truth.intrinsics, base_from_camera, with_truth=False)):
-        image, pose = folder / f"new{k}.png", folder / f"new{k}.json"
-        cv2.imwrite(str(image), view.image[..., ::-1])
-        base_from_gripper = base_from_camera[k] @ inverse(truth.gripper_from_camera)
-        pose.write_text(json.dumps(base_from_gripper.tolist()))
-        pairs.append((image, pose))
-    return with_images(read_added(folder, capture), pairs)
+    new = folder / f"new{len(list(folder.glob('new*')))}"
+    names = tuple(f"{k}.png" for k in range(len(base_from_camera)))
+    for name, view in zip(
+        names, render(scene, truth.intrinsics, base_from_camera, with_truth=False), strict=True
+    ):
+        write_bytes(new / name, encode_png(view.image))
+    poses = base_from_camera @ inverse(truth.gripper_from_camera)
+    capture_json.write(new, replace(capture, images=names, base_from_gripper=poses, joints=None, depths=None))
+    return with_images(read_added(folder, capture), new)
 
 
 def mapped(truth: Truth, capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye) -> "SceneMap":
@@ -255,38 +257,16 @@ def test_added_images_are_kept_and_wrong_ones_refused(truth: Truth, capture: Cap
     again = read_added(tmp_path, capture)
     assert again.images == added.images
     assert np.allclose(again.base_from_gripper, truth.base_from_gripper[:1])
-    image, pose = tmp_path / "new0.png", tmp_path / "new0.json"
     with pytest.raises(InputError, match="added before"):
-        with_images(again, [(image, pose)])
-    small = tmp_path / "small.png"
-    cv2.imwrite(str(small), np.zeros((30, 40, 3), np.uint8))
+        with_images(again, tmp_path / "new0")
+    small = tmp_path / "small"
+    write_bytes(small / "0.png", encode_png(np.zeros((30, 40, 3), np.uint8)))
+    one = Capture(folder=small, images=("0.png",), base_from_gripper=np.eye(4)[None], image_size=(40, 30))
+    capture_json.write(small, one)
     with pytest.raises(InputError, match="40x30"):
-        with_images(again, [(small, pose)])
+        with_images(again, small)
     with pytest.raises(InputError, match="another folder"):
         read_added(tmp_path, replace(capture, folder=tmp_path))
     (tmp_path / "added" / again.images[0]).unlink()
-    with pytest.raises(InputError, match="is gone"):
+    with pytest.raises(InputError, match="no such image"):
         read_added(tmp_path, capture)
-
-
-def test_poses_are_read_from_json_npy_and_text(tmp_path: Path):
-    pose = transform(np.eye(3), np.array([0.4, -0.1, 0.5]))
-    files = {name: tmp_path / name for name in ("a.json", "b.json", "c.npy", "d.txt")}
-    files["a.json"].write_text(json.dumps(pose.tolist()))
-    files["b.json"].write_text(json.dumps({"base_from_gripper": pose.tolist()}))
-    np.save(files["c.npy"], pose)
-    np.savetxt(files["d.txt"], pose, delimiter=", ")
-    for file in files.values():
-        assert np.allclose(read_pose(file), pose), file
-    wrong = tmp_path / "e.json"
-    for value, message in (
-        ((np.diag([1000.0, 1000, 1000, 1]) @ pose).tolist(), "no rotation"),
-        (transform(np.eye(3), np.array([400.0, -100, 500])).tolist(), "millimetres"),
-        ([[1, 2], [3, 4]], "4x4"),
-        ({"pose": 1}, "base_from_gripper"),
-    ):
-        wrong.write_text(json.dumps(value))
-        with pytest.raises(InputError, match=message):
-            read_pose(wrong)
-    with pytest.raises(InputError, match="no such pose file"):
-        read_pose(tmp_path / "none.json")

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import tyro
 
+from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output
 from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
@@ -19,15 +20,16 @@ class Arguments:
       jcr map out/tabletop --preset paper
       jcr map out/tabletop --segments labels
       jcr map out/tabletop --workspace 0.2 -0.4 -0.05 0.9 0.4 0.6
-      jcr map out/tabletop --add left.png left.json --add right.png right.json
+      jcr map out/tabletop --add captures/later
     """
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of a run."""
-    add: tyro.conf.UseAppendAction[tuple[tuple[Path, Path], ...]] = ()
-    """A new image, and a file with its base_from_gripper (4x4 in metres: .json, .npy, or text); repeat for more, oldest
-    first. The calibration is not changed. What a new image sees through is removed from the map; a new object needs two
-    new images. They are kept for every later map of the run (OUT/added)."""
+    add: Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(metavar="CAPTURE")] = ()
+    """A capture of new images, in any format; repeat for more, oldest first. The calibration is not changed. What a new
+    image sees through is removed from the map; a new object needs two new images. They are kept for every later map of
+    the run (OUT/added)."""
+    read: ReadOptions = field(default_factory=ReadOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
     segment: SegmentOptions = field(default_factory=SegmentOptions)
@@ -46,6 +48,7 @@ def main(arguments: Arguments) -> int:
             arguments.map,
             arguments.segment,
             add=arguments.add,
+            read=arguments.read,
             progress=progress,
         )
     map, report = result.out / "map.safetensors", result.out / "report.html"
