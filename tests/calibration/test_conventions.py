@@ -15,7 +15,7 @@ from jcr.calibration.conventions import (
     better_reading,
     convention_finding,
 )
-from jcr.capture.names import paired_by_name
+from jcr.capture.pairing import paired_by_name
 from jcr.geometry import inverse, transform
 from jcr.records.words import sentence
 from simulation.problems import hand_eye_problem

@@ -1,6 +1,7 @@
 """Reading a capture: what is sound is read as it is, and each fault is named with its place and remedy."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -184,43 +185,11 @@ FAULTS = {
     "key twice": (lambda c: (c / "capture.json").write_text('{"frames": [], "frames": []}'), "appears twice"),
     "a list": (lambda c: (c / "capture.json").write_text("[]"), 'no list "frames"'),
     "two frames": (lambda c: edit(c, lambda j: j.update(frames=j["frames"][:2])), "2 frames; at least 3"),
-    "image missing": (lambda c: (c / "images/01.jpg").unlink(), r"01\.jpg: no such image"),
-    "image truncated": (truncate, r"01\.jpg: not a readable image"),
-    "image empty": (lambda c: (c / "images/01.jpg").write_bytes(b""), r"01\.jpg: not a readable image"),
-    "text as image": (lambda c: (c / "images/01.jpg").write_text("hello"), r"01\.jpg: not a readable image"),
-    "wrong size": (shrink, r"01\.jpg: 320x240 pixels, but images/00\.jpg has 640x480"),
-    "same image": (
-        lambda c: shutil.copy(c / "images/00.jpg", c / "images/01.jpg"),
-        r"01\.jpg: the same image as images/00\.jpg",
-    ),
-    "pose missing": (
-        lambda c: edit(c, lambda j: j["frames"][1].pop("base_from_gripper")),
-        r"4 images but 3 gripper poses; add base_from_gripper to images/01\.jpg",
-    ),
     "image name missing": (
         lambda c: edit(c, lambda j: j["frames"][1].pop("image")),
         'frame 1 has no "image"',
     ),
-    "image twice": (
-        lambda c: edit(c, lambda j: j["frames"][1].update(image="images/00.jpg")),
-        "more than once",
-    ),
     "millimetres": (lambda c: edit(c, lambda j: scale_all(j, 1000)), "look like millimetres"),
-    "pose of NaN": (lambda c: edit(c, lambda j: set_pose(j, np.full((4, 4), np.nan))), "frame 1 .*NaN"),
-    "pose scaled": (
-        lambda c: edit(c, lambda j: set_pose(j, pose(j) @ np.diag([2, 2, 2, 1]))),
-        "frame 1 .*scaled by 2",
-    ),
-    "pose reflected": (
-        lambda c: edit(c, lambda j: set_pose(j, pose(j) @ np.diag([1, 1, -1, 1]))),
-        "frame 1 .*reflection",
-    ),
-    "pose transposed": (lambda c: edit(c, lambda j: set_pose(j, pose(j).T)), "frame 1 .*transposed"),
-    "pose of three rows": (lambda c: edit(c, lambda j: set_pose(j, pose(j)[:3])), r"shape \(3, 4\)"),
-    "pose of words": (
-        lambda c: edit(c, lambda j: j["frames"][1].update(base_from_gripper="here")),
-        "frame 1 .*4x4",
-    ),
     "intrinsics outside": (
         lambda c: edit(c, lambda j: j["intrinsics"].update(cx=900)),
         "outside the 640x480",
@@ -244,6 +213,42 @@ FAULTS = {
     ),
     "link outside": (link_out, "leads out"),
 }
+"""Faults of the capture."""
+FRAME_FAULTS = {
+    "image missing": (lambda c: (c / "images/01.jpg").unlink(), r"01\.jpg: no such image"),
+    "image truncated": (truncate, r"01\.jpg: not a readable image"),
+    "image empty": (lambda c: (c / "images/01.jpg").write_bytes(b""), r"01\.jpg: not a readable image"),
+    "text as image": (lambda c: (c / "images/01.jpg").write_text("hello"), r"01\.jpg: not a readable image"),
+    "wrong size": (shrink, r"01\.jpg: 320x240 pixels, but images/00\.jpg has 640x480"),
+    "same image": (
+        lambda c: shutil.copy(c / "images/00.jpg", c / "images/01.jpg"),
+        r"01\.jpg: the same image as images/00\.jpg",
+    ),
+    "pose missing": (
+        lambda c: edit(c, lambda j: j["frames"][1].pop("base_from_gripper")),
+        r"frame 1 \(images/01\.jpg\) is missing; add the gripper pose",
+    ),
+    "image twice": (
+        lambda c: edit(c, lambda j: j["frames"][1].update(image="images/00.jpg")),
+        "same image as images/00",
+    ),
+    "pose of NaN": (lambda c: edit(c, lambda j: set_pose(j, np.full((4, 4), np.nan))), "frame 1 .*NaN"),
+    "pose scaled": (
+        lambda c: edit(c, lambda j: set_pose(j, pose(j) @ np.diag([2, 2, 2, 1]))),
+        "frame 1 .*scaled by 2",
+    ),
+    "pose reflected": (
+        lambda c: edit(c, lambda j: set_pose(j, pose(j) @ np.diag([1, 1, -1, 1]))),
+        "frame 1 .*reflection",
+    ),
+    "pose transposed": (lambda c: edit(c, lambda j: set_pose(j, pose(j).T)), "frame 1 .*transposed"),
+    "pose of three rows": (lambda c: edit(c, lambda j: set_pose(j, pose(j)[:3])), r"shape \(3, 4\)"),
+    "pose of words": (
+        lambda c: edit(c, lambda j: j["frames"][1].update(base_from_gripper="here")),
+        "frame 1 .*4x4",
+    ),
+}
+"""Faults of frame 1 alone."""
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -254,6 +259,41 @@ def test_each_fault_is_one_line_with_place_and_remedy(capture: Path, fault: str)
         jcr.read_capture(capture)
     assert "\n" not in str(error.value)
     assert str(capture) in str(error.value)
+
+
+@pytest.mark.parametrize("fault", FRAME_FAULTS)
+def test_a_frame_that_cannot_be_used_is_left_out_with_its_place_and_remedy(capture: Path, fault: str):
+    plant, words = FRAME_FAULTS[fault]
+    plant(capture)
+    read = jcr.read_capture(capture)
+    assert read.images == ("images/00.jpg", "images/02.jpg", "images/03.jpg")
+    assert len(read.base_from_gripper) == 3
+    (note,) = read.notes
+    assert re.search(f"left out: .*{words}", note) and "\n" not in note and str(capture) in note
+
+
+def test_frames_with_one_fault_are_refused_together(capture: Path):
+    for k in (1, 3):
+        (capture / f"images/0{k}.jpg").unlink()
+    with pytest.raises(
+        jcr.InputError, match=r"no such image.*2 of 4 frames cannot be used: images/01.jpg, images/03.jpg"
+    ):
+        jcr.read_capture(capture)
+
+
+def test_joints_and_other_cameras_stay_with_the_frames_that_are_used(capture: Path):
+    content = json.loads((capture / "capture.json").read_text())
+    set_joints(content, JOINTS)
+    set_pose(content, np.full((4, 4), np.nan), 1)
+    for k in range(4):
+        Image.new("RGB", (32, 24), (60 * k, 0, 0)).save(capture / f"{k}.png")
+    content["cameras"] = {"second": {"mount": "gripper", "images": ["0.png", "1.png", None, "3.png"]}}
+    (capture / "capture.json").write_text(json.dumps(content))
+    read = jcr.read_capture(capture)
+    assert read.joints is not None and read.joints.tolist() == [JOINTS[k] for k in (0, 2, 3)]
+    (second,) = read.others
+    assert second.images == ("0.png", "3.png")
+    assert second.frame is not None and second.frame.tolist() == [0, 2]
 
 
 @pytest.mark.slow
@@ -305,10 +345,7 @@ def test_options_that_a_capture_json_is_not_read_by_are_noted(capture: Path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda c: set_joints(c, [*JOINTS[:3], None]), r"no joints at images/03.jpg; give them for all"),
-        (lambda c: set_joints(c, [*JOINTS[:3], JOINTS[3][:5]]), r"frame 3 .*: 5 angles, but frame 0 has 6"),
-        (lambda c: set_joints(c, [*JOINTS[:3], [float("nan")] * 6]), r"must be a list of finite angles"),
-        (lambda c: set_joints(c, [*JOINTS[:3], "0 1 2"]), r"not numbers; write a list"),
+        (lambda c: set_joints(c, [*JOINTS[:2], None, None]), r"frame 2 .*: no joints; give them for all"),
         (lambda c: set_joints(c, [[90.0] * 6] * 4), r"up to 90 rad; these look like degrees"),
         (lambda c: (set_joints(c, JOINTS), c.update(robot="panda")), r"6 joints, but a panda has 7"),
         (lambda c: c.update(urdf="../arm.urdf"), r"leads out of"),
@@ -321,3 +358,19 @@ def test_joints_that_cannot_be_are_refused_in_one_line(capture: Path, change, me
     with pytest.raises(jcr.InputError, match=message) as error:
         jcr.read_capture(capture)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        (None, r"frame 3 .*: no joints; give them for all"),
+        (JOINTS[3][:5], r"frame 3 .*: 5 angles, but the first frame has 6"),
+        ([float("nan")] * 6, r"must be a list of finite angles"),
+        ("0 1 2", r"not numbers; write a list"),
+    ],
+)
+def test_a_frame_with_unusable_joints_is_left_out(capture: Path, row, words: str):
+    edit(capture, lambda c: set_joints(c, [*JOINTS[:3], row]))
+    read = jcr.read_capture(capture)
+    assert read.joints is not None and read.joints.tolist() == JOINTS[:3]
+    assert re.search(words, read.notes[0])

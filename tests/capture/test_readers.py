@@ -1,20 +1,23 @@
 """One capture in every format is read as the same capture; each fault is named with its place and remedy."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from scipy.spatial.transform import Rotation
 
 import capture_writers as writers
 import jcr
 from in_process import run_jcr
 from jcr.capture.formats import capture_json, colmap
 from jcr.capture.options import ReadOptions
+from jcr.capture.pairing import stamp_ns
 from jcr.capture.plain_files import read_npy, read_yaml
-from jcr.capture.pose_table import stamp_ns
 from jcr.capture.read import FORMATS, format_of, read_source
 from jcr.capture.robot_poses import CONVENTIONS, poses_from_numbers
 from jcr.cli.query import read_points
@@ -98,7 +101,7 @@ def test_samples_of_markers_are_solved_without_images(name: str, tmp_path: Path,
     write = writers.write_moveit if name == "moveit" else writers.write_easy_handeye2
     cameras = scale_translation(problem.recon_from_camera, problem.scale)
     path = write(tmp_path, problem.base_from_gripper, cameras)
-    assert format_of(path) == name
+    assert format_of(path) == "samples"
     pairs = read_source(path)
     assert isinstance(pairs, PosePairs) and pairs.is_metric
     assert_same_calibration(pairs.base_from_gripper, pairs.recon_from_camera, problem)
@@ -156,6 +159,83 @@ def test_known_poses_of_controllers():
         np.array([[1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1, 0, 0.3, 0, 0.5, 1.0]]), "franka", "auto", ""
     )
     assert np.allclose(franka[0, :3, 3], [0.3, 0, 0.5])
+
+
+def named(keys: str, values: np.ndarray) -> dict[str, float]:
+    return dict(zip(keys, values.tolist(), strict=True))
+
+
+POSE_FORMS = {
+    "geometry_msgs/Pose": lambda pose, q, v: {
+        "position": named("xyz", pose[:3, 3]), "orientation": named("xyzw", q)
+    },
+    "geometry_msgs/PoseStamped": lambda pose, q, v: {
+        "header": {"stamp": {"sec": 1, "nanosec": 5}, "frame_id": "base_link"},
+        "pose": {"position": named("xyz", pose[:3, 3]), "orientation": named("xyzw", q)},
+    },
+    "geometry_msgs/PoseWithCovariance": lambda pose, q, v: {
+        "pose": {"position": named("xyz", pose[:3, 3]), "orientation": named("xyzw", q)}, "covariance": [0.0] * 36
+    },
+    "geometry_msgs/Transform": lambda pose, q, v: {
+        "translation": named("xyz", pose[:3, 3]), "rotation": named("xyzw", q)
+    },
+    "quaternion list": lambda pose, q, v: {"t": pose[:3, 3].tolist(), "quaternion": q.tolist()},
+    "quaternion list, w first": lambda pose, q, v: {"xyz": pose[:3, 3].tolist(), "quat_wxyz": q[[3, 0, 1, 2]].tolist()},
+    "rotation vector": lambda pose, q, v: {"tvec": pose[:3, 3].tolist(), "rvec": v.tolist()},
+    "rotation matrix": lambda pose, q, v: {"R": pose[:3, :3].tolist(), "t": pose[:3, 3].tolist()},
+    "matrix": lambda pose, q, v: {"base_from_gripper": pose.tolist()},
+    "matrix of 16": lambda pose, q, v: {"pose": pose.ravel().tolist()},
+    "bare matrix": lambda pose, q, v: pose.tolist(),
+    "columns": lambda pose, q, v: named(["x", "y", "z", "qx", "qy", "qz", "qw"], np.append(pose[:3, 3], q)),
+    "easy_handeye2": lambda pose, q, v: {
+        "robot": {"translation": named("xyz", pose[:3, 3]), "rotation": named("xyzw", q)},
+        "tracking": {"translation": named("xyz", np.ones(3)), "rotation": named("xyzw", np.eye(4)[3])},
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".json"])
+@pytest.mark.parametrize("form", POSE_FORMS)
+def test_lists_of_poses_are_recognised_by_their_content(
+    form: str, suffix: str, tmp_path: Path, capture: Capture
+):
+    writers.copy_images(capture, tmp_path)
+    writers.write_camera_info(capture, tmp_path)
+    entries = []
+    for pose in capture.base_from_gripper:
+        rotation = Rotation.from_matrix(pose[:3, :3])
+        entries.append(POSE_FORMS[form](pose, rotation.as_quat(), rotation.as_rotvec()))
+    file = tmp_path / f"poses{suffix}"
+    write = json.dumps if suffix == ".json" else yaml.safe_dump
+    for content in (entries, {"poses": entries}, dict(zip(capture.images, entries, strict=True))):
+        file.write_text(write(content))
+        assert_same(jcr.read_capture(tmp_path), capture)
+    if isinstance(entries[0], dict) and form != "columns":
+        content = [entry | {"image": name} for name, entry in zip(capture.images, entries, strict=True)]
+        file.write_text(write(content[::-1]))
+        got = jcr.read_capture(tmp_path)
+        assert got.images == capture.images[::-1]
+        assert np.allclose(got.base_from_gripper, capture.base_from_gripper[::-1], atol=1e-9)
+
+
+def test_messages_as_ros2_topic_echo_prints_them_are_read(tmp_path: Path, capture: Capture):
+    writers.copy_images(capture, tmp_path)
+    writers.write_camera_info(capture, tmp_path)
+    rows = writers.rows_as("quat-xyzw", capture.base_from_gripper)
+    documents = [
+        POSE_FORMS["geometry_msgs/Pose"](np.block([[np.eye(3), row[:3, None]]]), row[3:], None)
+        for row in rows
+    ]
+    (tmp_path / "poses.yaml").write_text("".join(f"{yaml.safe_dump(one)}---\n" for one in documents))
+    assert_same(jcr.read_capture(tmp_path), capture)
+
+
+def test_a_list_entry_without_a_pose_is_named(tmp_path: Path, capture: Capture):
+    writers.copy_images(capture, tmp_path)
+    for entry in ({"orientation": [0, 0, 0, 1]}, {"tool": "none"}, 7, [[1, 2], [3, 4]]):
+        (tmp_path / "poses.json").write_text(json.dumps([entry] * 12))
+        with pytest.raises(jcr.InputError, match=r"poses\.json: .*(no pose|contain no pose)"):
+            jcr.read_capture(tmp_path)
 
 
 def test_units_in_the_names_of_columns_are_believed(tmp_path: Path, capture: Capture):
@@ -235,16 +315,6 @@ FAULTS = {
         {},
         "row 3 has 7 columns, not 8",
     ),
-    "word for a number": (
-        lambda f: edit_line(f, 2, lambda line: line.rsplit(",", 1)[0] + ",here"),
-        {},
-        "row 2, column qw: 'here' is not a number",
-    ),
-    "NaN": (
-        lambda f: edit_line(f, 2, lambda line: line.rsplit(",", 1)[0] + ",nan"),
-        {},
-        "pose 2 holds NaN",
-    ),
     "image not there": (
         lambda f: edit_line(f, 1, lambda line: "images/99.jpg" + line[line.index(",") :]),
         {},
@@ -254,11 +324,6 @@ FAULTS = {
         lambda f: edit_line(f, 1, lambda line: "../99.jpg" + line[line.index(",") :]),
         {},
         "leads out of",
-    ),
-    "quaternion not of unit length": (
-        lambda f: edit_line(f, 1, lambda line: ",".join([*line.split(",")[:4], "1", "1", "0", "0"])),
-        {},
-        r"quaternion of pose 1 has length 1\.414",
     ),
     "millimetres": (
         lambda f: scaled(f.parent, "rpy", RPY, 1e3),
@@ -313,6 +378,34 @@ FAULTS = {
         "not YAML",
     ),
 }
+ROW_FAULTS = {
+    "word for a number": (
+        lambda f: edit_line(f, 2, lambda line: line.rsplit(",", 1)[0] + ",here"),
+        {},
+        "row 2, column qw: 'here' is not a number",
+    ),
+    "NaN": (
+        lambda f: edit_line(f, 2, lambda line: line.rsplit(",", 1)[0] + ",nan"),
+        {},
+        "pose 2 holds NaN",
+    ),
+    "quaternion not of unit length": (
+        lambda f: edit_line(f, 1, lambda line: ",".join([*line.split(",")[:4], "1", "1", "0", "0"])),
+        {},
+        r"quaternion of pose 1 has length 1\.414",
+    ),
+}
+ROW_FAULTS |= {
+    "far": (
+        lambda f: edit_line(
+            f, 2, lambda line: ",".join([*line.split(",")[:3], "812.5", *line.split(",")[4:]])
+        ),
+        {},
+        "pose 2 is 812.5 m from the base",
+    ),
+    "image": (lambda f: (f.parent / "images/01.jpg").unlink(), {}, "no such image"),
+}
+"""Faults of one row alone."""
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -323,6 +416,17 @@ def test_faults_of_tables_are_named(fault: str, tmp_path: Path, capture: Capture
     with pytest.raises(jcr.InputError, match=words) as caught:
         jcr.read_capture(tmp_path, ReadOptions(**options))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("fault", ROW_FAULTS)
+def test_a_row_that_holds_no_pose_is_left_out_with_its_reason(fault: str, tmp_path: Path, capture: Capture):
+    spoil, _, words = ROW_FAULTS[fault]
+    spoil(writers.write_table(tmp_path, capture))
+    got = jcr.read_capture(tmp_path)
+    row = 0 if "quaternion" in fault else 1
+    assert got.images == capture.images[:row] + capture.images[row + 1 :]
+    assert np.allclose(got.base_from_gripper, np.delete(capture.base_from_gripper, row, 0), atol=1e-9)
+    assert any(re.search(f"left out: .*{words}", note) for note in got.notes)
 
 
 def test_counts_that_differ_are_named(tmp_path: Path, capture: Capture):
@@ -350,10 +454,10 @@ def test_faults_of_samples_are_named(tmp_path: Path, problem: HandEyeProblem):
     assert "taken as eye_in_hand" in empty.notes[0]
     with pytest.raises(jcr.InputError, match="look like millimetres"):
         read_source(writers.write_moveit(tmp_path, scale_translation(gripper, 1e3), camera))
-    with pytest.raises(jcr.InputError, match="2 samples"):
+    with pytest.raises(jcr.InputError, match="2 frames; at least 3"):
         read_source(writers.write_moveit(tmp_path, gripper[:2], camera[:2]))
-    (tmp_path / "samples.yaml").write_text("- effector_wrt_world: [1, 2]\n")
-    with pytest.raises(jcr.InputError, match="sample 1: effector_wrt_world must be 16 numbers"):
+    (tmp_path / "samples.yaml").write_text("- {effector_wrt_world: [1, 2], object_wrt_sensor: [1]}\n")
+    with pytest.raises(jcr.InputError, match="effector_wrt_world: 2 columns of numbers without names"):
         read_source(tmp_path / "samples.yaml")
 
 

@@ -16,8 +16,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.capture.camera_json import intrinsics_as_json, read_intrinsics_of_size, read_std, std_as_json
-from jcr.capture.checks import first_few, image_sizes, read_rigid, require_images
-from jcr.capture.plain_files import shown
+from jcr.capture.checks import image_sizes, other_size, read_rigid, require_frames
+from jcr.capture.plain_files import contained, first_few, shown
 from jcr.errors import InputError
 from jcr.records import Capture, CellCamera, Mount
 
@@ -26,8 +26,11 @@ NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
 MOUNTS: tuple[Mount, ...] = ("gripper", "base")
 
 
-def with_cameras(capture: Capture, cameras: Any, file: Path) -> Capture:
-    """The capture with the cameras of "cameras"; InputError where they cannot be."""
+def with_cameras(capture: Capture, cameras: Any, file: Path, used: Sequence[bool] | None = None) -> Capture:
+    """Return the capture with the cameras of "cameras"; InputError where they cannot be.
+
+    `used` tells for each frame of the file whether the capture has it, all by default.
+    """
     if cameras is None:
         return capture
     if not isinstance(cameras, dict) or not all(isinstance(camera, dict) for camera in cameras.values()):
@@ -53,7 +56,7 @@ def with_cameras(capture: Capture, cameras: Any, file: Path) -> Capture:
                 )
             capture = replace(capture, camera_name=name, mount=camera["mount"])
         else:
-            others.append(_camera(name, camera, capture, where))
+            others.append(_camera(name, camera, capture, where, used))
     if twice := {name for name in (camera.name for camera in others) if name == capture.camera_name}:
         raise InputError(
             f"{file}: camera {first_few(sorted(twice))} is the frames' own; give the other another name"
@@ -82,7 +85,9 @@ def _check(name: str, camera: dict[str, Any], where: str) -> None:
         )
 
 
-def _camera(name: str, camera: dict[str, Any], capture: Capture, where: str) -> CellCamera:
+def _camera(
+    name: str, camera: dict[str, Any], capture: Capture, where: str, used: Sequence[bool] | None
+) -> CellCamera:
     arm, poses, frame = camera.get("arm"), None, None
     if arm is not None:
         images, poses = _frames(camera["frames"], str(arm), where)
@@ -94,23 +99,24 @@ def _camera(name: str, camera: dict[str, Any], capture: Capture, where: str) -> 
             raise InputError(f"{where}: images must be a list of paths")
         images = [image for image in listed if image is not None]
         if camera["mount"] == "gripper":
-            if len(listed) != len(capture):
+            used = [True] * len(capture) if used is None else used
+            if len(listed) != len(used):
                 raise InputError(
-                    f"{where}: {len(listed)} images for {len(capture)} frames; give one for each, or null"
+                    f"{where}: {len(listed)} images for {len(used)} frames; give one for each, or null"
                 )
-            frame = np.flatnonzero([image is not None for image in listed])
+            of_frames = [image for image, is_used in zip(listed, used, strict=True) if is_used]
+            images = [image for image in of_frames if image is not None]
+            frame = np.flatnonzero([image is not None for image in of_frames])
     if not images:
         raise InputError(f"{where}: no images; list some, or remove the camera")
-    require_images(capture.folder, images, where)
+    require_frames(len(images), where, 0)
+    for image in images:
+        contained(capture.folder, image, where)
     if len(set(images)) < len(images) or set(images) & set(capture.images):
         raise InputError(f"{where}: an image is named twice, or is one of the frames' own")
     sizes = image_sizes(capture.folder, images)
-    if len(set(sizes)) > 1:
-        k = next(k for k, size in enumerate(sizes) if size != sizes[0])
-        raise InputError(
-            f"{where}: {images[k]} has {sizes[k][0]}x{sizes[k][1]} pixels, {images[0]} {sizes[0][0]}x{sizes[0][1]}; "
-            "all images of a camera must have one size"
-        )
+    if other := [k for k, size in enumerate(sizes) if size != sizes[0]]:
+        raise other_size(f"{where}: {images[other[0]]}", sizes[other[0]], sizes[0], images[0])
     intrinsics = read_intrinsics_of_size(camera.get("intrinsics"), sizes[0], where)
     std = read_std(camera.get("intrinsics_std"), intrinsics, where)
     return CellCamera(

@@ -1,9 +1,8 @@
 """What every reader of captures demands, whatever the format: sound files, rigid metres, one camera."""
 
 import hashlib
-import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,69 +12,87 @@ from numpy import ndarray
 
 from jcr.capture.images import ROTATED, HowStored, read_image, read_stored
 from jcr.capture.options import MAX_FRAMES, MIN_FRAMES
-from jcr.capture.plain_files import LONGEST, contained
-from jcr.capture.robot_poses import likely_unit
+from jcr.capture.plain_files import contained, first_few
+from jcr.capture.robot_poses import METRES_LIMIT, far_rows, likely_unit, tolerated
 from jcr.errors import InputError
 from jcr.geometry import require_rigid, step_between
 from jcr.records import COEFFICIENTS, Capture, DistortionModel, Finding, Intrinsics, Kind, coefficients_of
 
-NAMED = 10
-"""Images that a message names; of more it gives the number."""
 MIRRORED = (2, 4, 5, 7)
 SAME_POSE = (0.5e-3, np.radians(0.05))
 """m, rad: within this, poses are one at which the arm rests."""
-MAX_REACH = 10.0
-"""Metres; no arm reaches farther from its base, so larger numbers are millimetres."""
 
 
 def checked_capture(
-    folder: Path, images: Sequence[str], base_from_gripper: Float[ndarray, "n 4 4"], where: str
-) -> Capture:
-    """A capture of `images` in `folder`, without intrinsics; InputError as `jcr.read_capture` has it.
+    folder: Path,
+    images: Sequence[str],
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    where: str,
+    faults: Mapping[int, str] | None = None,
+) -> tuple[Capture, list[int]]:
+    """Return a capture of `images` in `folder`, without intrinsics, and its rows among the images and poses.
 
-    `where` begins the messages: the file that names the images. One image will do here.
+    Every image is decoded once. A few frames that cannot be used are left out with a note: those of `faults` (row to
+    message), and images that are missing, damaged, of another size, or there twice. Raises InputError where more of
+    them cannot be used; `where` begins the messages, the file that names the images. One image will do here.
     """
-    if not images:
-        require_frames(0, where)
-    require_images(folder, images, where)
-    check_metres(base_from_gripper, where)
-    size, stored = _decoded(folder, images)
-    return Capture(
+    require_frames(len(images), where, at_least=1)
+    for k, name in enumerate(images):
+        contained(folder, name, f"{where}: frame {k}")
+    found = dict(faults or {})
+    far, _, many = far_rows(base_from_gripper[:, :3, 3])
+    if many:
+        check_metres(base_from_gripper[far], where)
+    for k in far:
+        found[k] = (
+            f"{where}: the pose of {images[k]} is over {METRES_LIMIT:.0f} m from the base; record it again"
+        )
+    stored = _decoded(folder, images, found)
+    rows = [k for k in range(len(images)) if k not in found]
+    if found and (len(found) > tolerated(len(images)) or len(rows) < min(MIN_FRAMES, len(images))):
+        others = (
+            f" ({len(found)} of {len(images)} frames cannot be used: {first_few([images[k] for k in found])})"
+        )
+        raise InputError(found[min(found)] + (others if len(found) > 1 else ""))
+    kept = [images[k] for k in rows]
+    capture = Capture(
         folder=folder,
-        images=tuple(images),
-        base_from_gripper=base_from_gripper,
-        image_size=size,
-        orientation=_common_orientation(folder, images, stored),
-        bits=tuple(sorted({one.bits for one in stored})),
+        images=tuple(kept),
+        base_from_gripper=base_from_gripper[rows],
+        image_size=stored[rows[0]][0],
+        orientation=_common_orientation(folder, kept, [stored[k][1] for k in rows]),
+        bits=tuple(sorted({stored[k][1].bits for k in rows})),
+        notes=tuple(f"left out: {found[k]}" for k in sorted(found)),
     )
+    return capture, rows
 
 
-def require_images(folder: Path, images: Sequence[str], where: str) -> None:
-    """InputError where images are named twice, not there, too many or out of the folder: before anything takes long."""
-    twice = [name for name, count in Counter(images).items() if count > 1]
-    if twice:
-        raise InputError(
-            f"{where}: names {first_few(sorted(twice))} more than once; keep one frame per image"
-        )
-    rows = [k for k, name in enumerate(images) if not os.path.exists(folder / name)]
-    if not rows:
-        require_frames(len(images), where, 0)
-    for k in rows[:NAMED] or range(len(images)):
-        contained(folder, images[k], f"{where}: frame {k}")
-    missing = [images[k] for k in rows]
-    if len(missing) == 1:
-        raise InputError(f"{folder / missing[0]}: no such image; correct its name in {where} or add the file")
-    if missing:
-        raise InputError(
-            f"{where}: {len(missing)} of {len(images)} images are not there: {first_few(missing)}; correct the names "
-            "or add the files"
-        )
-
-
-def first_few(names: Sequence[str]) -> str:
-    """The first names, and how many more there are."""
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return ", ".join(name[:LONGEST] for name in names[:NAMED]) + more
+def _decoded(
+    folder: Path, images: Sequence[str], found: dict[int, str]
+) -> dict[int, tuple[tuple[int, int], HowStored]]:
+    """Return size (px) and storage of each image, decoded once; images that cannot be used are added to `found`."""
+    stored, digests = dict[int, tuple[tuple[int, int], HowStored]](), dict[bytes, int]()
+    for k in range(len(images)):
+        if k in found:
+            continue
+        try:
+            pixels, how = read_stored(folder / images[k])
+        except InputError as error:
+            found[k] = str(error)
+            continue
+        stored[k] = (pixels.shape[1], pixels.shape[0]), how
+        same = digests.setdefault(hashlib.sha256(pixels.tobytes()).digest(), k)
+        if same != k:
+            found[k] = (
+                f"{folder / images[k]}: the same image as {images[same]}; drop one of the frames or take it again"
+            )
+    sizes = {k: size for k, (size, _) in stored.items()}
+    for k, size in sizes.items():
+        (usual, _), *_ = Counter(sizes.values()).most_common(1)
+        if size != usual:
+            like = images[next(j for j in sizes if sizes[j] == usual)]
+            found[k] = str(other_size(f"{folder / images[k]}", size, usual, like))
+    return stored
 
 
 def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
@@ -144,9 +161,9 @@ def read_rigid(value: Any, where: str) -> Float[ndarray, "4 4"]:
 
 
 def check_metres(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None:
-    """InputError when positions are too far from the base to be metres."""
-    farthest = float(np.abs(base_from_gripper[:, :3, 3]).max())
-    if farthest > MAX_REACH:
+    """Raise InputError where a gripper pose is too far from the base to be in metres."""
+    far, farthest, _ = far_rows(base_from_gripper[:, :3, 3])
+    if far:
         name, short, a_metre = likely_unit(farthest)
         raise InputError(
             f"{where}: the gripper is up to {farthest:.4g} from the base; these look like {name}: "
@@ -154,27 +171,12 @@ def check_metres(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None
         )
 
 
-def _decoded(folder: Path, images: Sequence[str]) -> tuple[tuple[int, int], list[HowStored]]:
-    """The common size (px) of all images and how each is stored; every image is decoded once: a truncated one is found
-    now, not after minutes of matching."""
-    sizes, digests, how_stored = {}, {}, []
-    for name in images:
-        pixels, stored = read_stored(folder / name)
-        how_stored.append(stored)
-        sizes[name] = (pixels.shape[1], pixels.shape[0])
-        same = digests.setdefault(hashlib.sha256(pixels.tobytes()).digest(), name)
-        if same != name:
-            raise InputError(
-                f"{folder / name}: the same image as {same}; drop one of the frames or take it again"
-            )
-    first = sizes[images[0]]
-    for name, size in sizes.items():
-        if size != first:
-            raise InputError(
-                f"{folder / name}: {size[0]}x{size[1]} pixels, but {images[0]} has {first[0]}x{first[1]}; "
-                "all images must come from one camera at one resolution"
-            )
-    return first, how_stored
+def other_size(what: str, size: tuple[int, int], expected: tuple[int, int], whose: str) -> InputError:
+    """Return the error of an image, depth image or intrinsics of another resolution than the images'."""
+    return InputError(
+        f"{what}: {size[0]}x{size[1]} pixels, but {whose} has {expected[0]}x{expected[1]}; take all with one camera at "
+        "one resolution"
+    )
 
 
 def image_sizes(folder: Path, images: Sequence[str]) -> list[tuple[int, int]]:

@@ -12,7 +12,7 @@ MAX_FRAMES = 1000
 """More is a video: every image is compared with others, and every pose's errors with all the others'."""
 
 FormatName = Literal[
-    "auto", "capture", "table", "moveit", "easy_handeye2", "colmap", "bag", "lerobot",
+    "auto", "capture", "table", "samples", "colmap", "bag", "lerobot",
 ]  # fmt: skip
 ConventionName = Literal[
     "auto", "matrix", "quat-xyzw", "quat-wxyz", "rotation-vector", "rpy", "ur", "franka", "xarm", "xarm-axis-angle",
@@ -32,7 +32,7 @@ class ReadOptions:
     pose_inverted: bool = False
     """The poses are gripper_from_base, the base in the gripper frame: invert them."""
     poses: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Table of gripper poses; unset: poses.csv, .tsv, .txt or .npy beside the images."""
+    """File of gripper poses; unset: poses.csv, .tsv, .txt, .npy, .yaml or .json beside the images."""
     camera_info: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """ROS camera_info YAML with the intrinsics; unset: camera_info.yaml beside the images, if there is one."""
     format: FormatName = "auto"

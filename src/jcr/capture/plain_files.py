@@ -3,6 +3,7 @@
 import json
 import os
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,8 @@ LONGEST = 255
 """Bytes of a file's name that file systems take."""
 MAX_YAML = 4_000_000
 """Characters: more takes long to read, and is no capture."""
+NAMED = 10
+"""Names that a message lists; of more it gives the number."""
 LONGEST_SHOWN = 80
 """Characters of a value that a message quotes."""
 
@@ -55,7 +58,7 @@ def read_text(file: Path) -> str:
 
 
 def read_yaml(file: Path) -> Any:
-    """The content of a YAML file, plain data alone; InputError when it is none."""
+    """Return the plain data of a YAML file, a list of several documents; InputError when it is none."""
     import yaml
 
     try:
@@ -69,7 +72,8 @@ def read_yaml(file: Path) -> Any:
             f"{file}: {len(text) / 1e6:.0f} MB of YAML; {MAX_YAML // 1_000_000} MB at most, which hold 1000 samples"
         )
     try:
-        return yaml.load(text, Loader=SafeLoader)
+        documents = [one for one in yaml.load_all(text, Loader=SafeLoader) if one is not None]
+        return documents[0] if len(documents) == 1 else documents or None
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         place = f" at line {mark.line + 1}" if mark else ""
@@ -109,6 +113,12 @@ def shown(value: object) -> str:
     """A value of a file as a message may quote it: one that is long is cut."""
     text = repr(value)
     return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}… ({len(text)} characters)"
+
+
+def first_few(names: Sequence[str]) -> str:
+    """Return the first names, and how many more there are."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(name[:LONGEST] for name in names[:NAMED]) + more
 
 
 def first_fault(error: "ValidationError") -> str:

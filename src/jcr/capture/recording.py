@@ -67,7 +67,8 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
         recording.options.frames,
     )
     images, depths = _written(recording, rows, into, report)
-    capture = checked_capture(into, images, recording.base_from_gripper[rows], source)
+    capture, kept = checked_capture(into, images, recording.base_from_gripper[rows], source)
+    rows, depths = rows[kept], [depths[k] for k in kept]
     if recording.joints is not None:
         capture = replace(capture, joints=recording.joints[rows], urdf=recording.options.urdf)
     if any(depths):
@@ -75,7 +76,7 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
     return replace(
         capture,
         intrinsics=recording.intrinsics_of_size(capture.image_size),
-        notes=(f"{len(rows)} of {len(fresh)} frames chosen", *notes, *remarks),
+        notes=(f"{len(rows)} of {len(fresh)} frames chosen", *notes, *remarks, *capture.notes),
     )
 
 

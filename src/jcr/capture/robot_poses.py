@@ -1,5 +1,6 @@
 """Poses as robots and their controllers write them: rows of numbers to transforms, and nothing of files."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,41 +117,66 @@ def numbers_from_poses(
 
 
 def poses_from_numbers(
-    numbers: Float[ndarray, "n k"], convention: str, units: UnitsName, where: str
+    numbers: Float[ndarray, "n k"],
+    convention: str,
+    units: UnitsName,
+    where: str,
+    faults: dict[int, str] | None = None,
 ) -> Float[ndarray, "n 4 4"]:
-    """base_from_gripper (n,4,4) from rows in a convention's columns; `units` other than auto override its own.
+    """Return base_from_gripper (n,4,4) of rows in a convention's columns; `units` other than auto override its own.
 
-    Raises InputError on numbers that are no pose, and on units that cannot be meant.
+    Raises InputError on units that cannot be meant. A row that is no pose raises InputError too; where `faults` are
+    given, a few such rows are NaN and their messages are added.
     """
     form = CONVENTIONS[convention]
-    sound = (np.abs(numbers) < HUGE).all(1)
-    if not sound.all():
-        row = int(np.argmin(sound))
-        raise InputError(
-            f"{where}: pose {row + 1} holds NaN or infinity (or beyond {HUGE:.0e}); record it again or drop the row"
-        )
-    position_unit, angle_unit = _in_metres_and_radians(form, units)
+    unit_m, _ = _in_metres_and_radians(form, units)
+    found = dict(faults or {})
+    for row in np.flatnonzero(~(np.abs(numbers) < HUGE).all(1)).tolist():
+        text = f"holds NaN or infinity (or beyond {HUGE:.0e}); record it again or drop the row"
+        found.setdefault(row, f"{where}: pose {row + 1} {text}")
+    rows = [row for row in range(len(numbers)) if row not in found]
+    poses, position = np.full((len(numbers), 4, 4), np.nan), np.full((len(numbers), 3), np.nan)
+    matrices = None
     if form.rotation in ("rows", "columns"):
-        matrices = _matrices(numbers.reshape(-1, 4, 4), form, where)
-        matrices[:, :3, 3] *= position_unit
-        _check_position(matrices[:, :3, 3], position_unit, units, where)
-        rigid = [require_rigid(matrix, f"{where}: pose {i + 1}") for i, matrix in enumerate(matrices)]
-        return np.reshape(rigid, (-1, 4, 4))
-    position, rest = numbers[:, :3] * position_unit, numbers[:, 3:]
-    _check_position(position, position_unit, units, where)
-    if form.rotation in QUATERNIONS:
-        _check_quaternion(rest, where)
-        rotation = Rotation.from_quat(rest[:, QUATERNIONS[form.rotation]])
-        return transform(rotation.as_matrix(), position)
-    _check_angles(rest, angle_unit, units, where)
-    angles = rest * angle_unit
-    vector = form.rotation == "rotvec"
-    rotation = Rotation.from_rotvec(angles) if vector else Rotation.from_euler(form.rotation, angles)
-    return transform(rotation.as_matrix(), position)
+        matrices = _matrices(numbers[rows].reshape(-1, 4, 4), form, where)
+        matrices[:, :3, 3] *= unit_m
+    position[rows] = numbers[rows, :3] * unit_m if matrices is None else matrices[:, :3, 3]
+    _check_position(position, unit_m, units, where, found)
+    if matrices is None:
+        rotation = _rotations(numbers[rows, 3:], form, units, where, rows, found)
+        poses[rows] = transform(rotation.as_matrix(), position[rows])
+    for row, matrix in zip(rows, () if matrices is None else matrices, strict=matrices is not None):
+        try:
+            poses[row] = require_rigid(matrix, f"{where}: pose {row + 1}")
+        except InputError as error:
+            found[row] = str(error)
+    if found and (faults is None or len(found) > tolerated(len(numbers))):
+        raise InputError(found[min(found)])
+    if faults is not None:
+        faults |= found
+    poses[list(found)] = np.nan
+    return poses
+
+
+def tolerated(count: int) -> int:
+    """Return how many of a number of frames may be left out as faulty; more of them have a common cause."""
+    return max(1, count // 4)
+
+
+def likely_unit(farthest: float) -> tuple[str, str, int]:
+    """Return the unit of positions too far away for metres: its name, its sign, and how many are a metre."""
+    return ("centimetres", "cm", 100) if farthest < 1000 * LEAST_REACH else ("millimetres", "mm", 1000)
+
+
+def far_rows(position: Float[ndarray, "n 3"]) -> tuple[list[int], float, bool]:
+    """Return the rows that are too far from the base for metres, the farthest distance, and whether they are many."""
+    distance = np.linalg.norm(np.nan_to_num(position), axis=1)
+    rows = np.flatnonzero(distance > METRES_LIMIT).tolist()
+    return rows, float(distance.max(initial=0.0)), len(rows) > tolerated(len(distance))
 
 
 def _matrices(numbers: Float[ndarray, "n 4 4"], form: Convention, where: str) -> Float[ndarray, "n 4 4"]:
-    """A copy by rows; InputError where numbers that should be rows are columns."""
+    """Return a copy by rows; InputError where numbers that should be rows are columns."""
     if form.rotation == "columns":
         return np.swapaxes(numbers, 1, 2).copy()
     last = [0, 0, 0, 1]
@@ -162,36 +188,53 @@ def _matrices(numbers: Float[ndarray, "n 4 4"], form: Convention, where: str) ->
     return numbers.copy()
 
 
+def _rotations(
+    numbers: Float[ndarray, "n r"],
+    form: Convention,
+    units: UnitsName,
+    where: str,
+    row_of: Sequence[int],
+    found: dict[int, str],
+) -> Rotation:
+    """Return the rotations of quaternions, vectors or angles; rows whose quaternion has no unit length go to `found`."""
+    if form.rotation not in QUATERNIONS:
+        unit = _in_metres_and_radians(form, units)[1]
+        _check_angles(numbers, unit, units, where)
+        if form.rotation == "rotvec":
+            return Rotation.from_rotvec(numbers * unit)
+        return Rotation.from_euler(form.rotation, numbers * unit)
+    quaternion = numbers[:, QUATERNIONS[form.rotation]]
+    length = np.linalg.norm(quaternion, axis=1)
+    wrong = np.abs(length - 1) > QUATERNION_TOLERANCE
+    for k in np.flatnonzero(wrong).tolist():
+        found[row_of[k]] = (
+            f"{where}: the quaternion of pose {row_of[k] + 1} has length {length[k]:.4g}, not 1; check which columns "
+            "are the quaternion, and say how it is written (--pose-convention quat-xyzw or quat-wxyz)"
+        )
+    return Rotation.from_quat(np.where(wrong[:, None], [0.0, 0.0, 0.0, 1.0], quaternion))
+
+
 def _in_metres_and_radians(form: Convention, units: UnitsName) -> tuple[float, float]:
-    """Metres per unit of position, radians per unit of angle."""
+    """Return metres per unit of position, radians per unit of angle."""
     length, angle = form.units(units)
     return METRES[length], np.radians(1.0) if angle == "deg" else 1.0
 
 
-def likely_unit(farthest: float) -> tuple[str, str, int]:
-    """The unit of positions up to so far from the base, too far for metres; its sign, and how many are a metre."""
-    return ("centimetres", "cm", 100) if farthest < 1000 * LEAST_REACH else ("millimetres", "mm", 1000)
-
-
-def _check_quaternion(quaternion: Float[ndarray, "n 4"], where: str) -> None:
-    length = np.linalg.norm(quaternion, axis=1)
-    off = np.abs(length - 1) > QUATERNION_TOLERANCE
-    if off.any():
-        row = int(off.argmax())
-        raise InputError(
-            f"{where}: the quaternion of pose {row + 1} has length {length[row]:.4g}, not 1; check which columns "
-            "are the quaternion, and say how it is written (--pose-convention quat-xyzw or quat-wxyz)"
-        )
-
-
-def _check_position(position: Float[ndarray, "n 3"], unit: float, units: UnitsName, where: str) -> None:
-    farthest = float(np.linalg.norm(position, axis=1).max(initial=0.0))
-    if farthest > METRES_LIMIT:
+def _check_position(
+    position: Float[ndarray, "n 3"], unit: float, units: UnitsName, where: str, found: dict[int, str]
+) -> None:
+    """Raise InputError where most positions cannot be in the unit; a single one that is too far goes to `found`."""
+    far, farthest, many = far_rows(position)
+    if many or len(position) == 1 and far:
         name, short, _ = likely_unit(farthest)
         raise InputError(
             f"{where}: the gripper is up to {farthest / unit:.4g} from the base; these look like {name}: "
             f"add --pose-units {short}-rad (or {short}-deg where angles are in degrees)"
         )
+    for row in far:
+        distance = float(np.linalg.norm(position[row]))
+        text = f"pose {row + 1} is {distance:.4g} m from the base, the others are nearer; record it again"
+        found.setdefault(row, f"{where}: {text}")
     if units == "auto" and unit < 1 and 0 < farthest < METRES_LIMIT * unit:
         raise InputError(
             f"{where}: the gripper is at most {farthest / unit:.4g} from the base, too near for this convention's "

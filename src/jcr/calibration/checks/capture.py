@@ -5,7 +5,7 @@ from dataclasses import replace
 from jcr.calibration.case import Case, Checked
 from jcr.calibration.conventions import better_reading, convention_finding
 from jcr.capture.checks import how_rotated
-from jcr.capture.names import paired_by_name
+from jcr.capture.pairing import paired_by_name
 from jcr.estimation.observability import observability
 from jcr.records import Finding, Kind
 

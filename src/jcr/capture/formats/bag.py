@@ -11,6 +11,7 @@ from jaxtyping import Float, Int, UInt8, UInt16
 from numpy import ndarray
 
 from jcr.capture.camera_info import intrinsics_of_ros, read_camera_info
+from jcr.capture.formats import Format
 from jcr.capture.joints import JointTrack, read_arm
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import speed
@@ -25,10 +26,16 @@ from jcr.records import Capture, Intrinsics
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO, JOINTS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+SUFFIXES = (".bag", ".mcap", ".db3")
 ALIGNED = "aligned_depth"
 """Part of the names of topics whose depth has the pixels of the colour image (realsense2_camera)."""
 SAME_MOMENT_NS = 20_000_000
 """Largest difference between the stamps of the colour and the depth image of one exposure, ns."""
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a path is a bag: a folder with a metadata.yaml, or a file."""
+    return (path / "metadata.yaml").is_file() or path.suffix.lower() in SUFFIXES
 
 
 def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
@@ -165,6 +172,8 @@ def _opened(path: Path) -> Iterator[Any]:
         standard = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
         reader = highlevel.AnyReader([path], default_typestore=standard)
         reader.open()
+        if not all(isinstance(name, str) for c in reader.connections for name in (c.topic, c.msgtype)):
+            raise ValueError("its metadata has a topic without a name")
     except Exception as error:  # each storage raises its own errors, SQLite, YAML and struct among them
         raise InputError(
             f"{path}: not a readable bag ({error}); check that it was closed and is whole"
@@ -270,3 +279,6 @@ def _stamp(message: Any, log_ns: int) -> int:
     """Return the stamp (ns) of a message; the time of its recording for drivers that leave the stamp empty."""
     stamp = message.header.stamp
     return stamp.sec * 10**9 + stamp.nanosec or log_ns
+
+
+FORMAT = Format(name="bag", about="a ROS 1 or ROS 2 bag", recognises=is_bag, read=read, recording=True)

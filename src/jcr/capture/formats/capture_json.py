@@ -11,8 +11,9 @@ from numpy import ndarray
 
 from jcr.capture.camera_json import intrinsics_as_json, read_intrinsics, read_std, std_as_json
 from jcr.capture.cell_cameras import cameras_as_json, with_cameras
-from jcr.capture.checks import checked_capture, first_few, read_rigid, require_frames, require_images
+from jcr.capture.checks import checked_capture, read_rigid, require_frames
 from jcr.capture.depth_images import depth_of_frames
+from jcr.capture.formats import Format
 from jcr.capture.options import MAX_FRAMES, ReadOptions
 from jcr.capture.plain_files import contained, read_json, shown
 from jcr.capture.robot_poses import CONVENTIONS
@@ -42,24 +43,22 @@ def read(path: Path, options: ReadOptions | None = None) -> Capture:
     content = read_json(file)
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
         raise InputError(f'{file}: has no list "frames"; expected {{"frames": [...], "intrinsics": ...}}')
-    frames = content["frames"]
+    frames, faults = content["frames"], dict[int, str]()
     require_frames(len(frames), str(file), 0)
     images = [_image_name(frame, i, file) for i, frame in enumerate(frames)]
-    require_images(folder, images, str(file))
-    without_pose = [
-        name for name, frame in zip(images, frames, strict=True) if "base_from_gripper" not in frame
-    ]
-    if without_pose:
-        raise InputError(
-            f"{file}: {len(images)} images but {len(images) - len(without_pose)} gripper poses; "
-            f"add base_from_gripper to {first_few(without_pose)}"
-        )
-    poses = [
-        read_rigid(frame["base_from_gripper"], f"{file}: base_from_gripper of frame {i} ({name})")
-        for i, (name, frame) in enumerate(zip(images, frames, strict=True))
-    ]
-    capture = checked_capture(folder, images, np.reshape(poses, (-1, 4, 4)), str(file))
-    joints = _joints(frames, images, file)
+    poses, joints = np.full((len(frames), 4, 4), np.nan), _joints(frames, images, file, faults)
+    for i, (name, frame) in enumerate(zip(images, frames, strict=True)):
+        where = f"{file}: base_from_gripper of frame {i} ({name})"
+        try:
+            if "base_from_gripper" not in frame:
+                raise InputError(f"{where} is missing; add the gripper pose")
+            poses[i] = read_rigid(frame["base_from_gripper"], where)
+        except InputError as error:
+            faults.setdefault(i, str(error))
+    capture, rows = checked_capture(folder, images, poses, str(file), faults)
+    joints = None if joints is None else joints[rows]
+    used = [i in rows for i in range(len(frames))]
+    frames = [frames[i] for i in rows]
     robot, notes = _robot(content.get("robot"), joints, file)
     intrinsics = read_intrinsics(content.get("intrinsics"), capture.image_size, file)
     convention = content.get("pose_convention")
@@ -68,13 +67,13 @@ def read(path: Path, options: ReadOptions | None = None) -> Capture:
         pose_convention=convention if isinstance(convention, str) and convention in CONVENTIONS else None,
         intrinsics=intrinsics,
         intrinsics_std=read_std(content.get("intrinsics_std"), intrinsics, file),
-        notes=notes,
+        notes=(*capture.notes, *notes),
         joints=joints,
         robot=robot,
         urdf=_urdf(content.get("urdf"), file),
         depths=depth_of_frames(frames, folder, str(file)),
     )
-    return with_cameras(capture, content.get("cameras"), file)
+    return with_cameras(capture, content.get("cameras"), file, used)
 
 
 def unused_options(options: ReadOptions) -> str | None:
@@ -142,22 +141,31 @@ def kept(capture: Capture, folder: Path) -> Capture:
     return replace(read(folder), cameras=capture.cameras, notes=capture.notes)
 
 
-def _joints(frames: list[Any], images: list[str], file: Path) -> Float[ndarray, "n dof"] | None:
-    """Joint angles (rad) of all frames, or None where no frame has them; InputError where some lack them."""
-    with_joints = [frame.get("joints") is not None for frame in frames]
-    if not any(with_joints):
-        return None
-    if not all(with_joints):
-        without = [name for name, has in zip(images, with_joints, strict=True) if not has]
-        raise InputError(f"{file}: no joints at {first_few(without)}; give them for all frames or for none")
-    rows = []
+def _joints(
+    frames: list[Any], images: list[str], file: Path, faults: dict[int, str]
+) -> Float[ndarray, "n dof"] | None:
+    """Return joint angles (rad) of all frames, None where no frame has them; frames that lack some are `faults`."""
+    rows = dict[int, Float[ndarray, " dof"]]()
     for i, (name, frame) in enumerate(zip(images, frames, strict=True)):
         where = f"{file}: joints of frame {i} ({name})"
-        row = read_joints(frame["joints"], where)
-        if rows and len(row) != len(rows[0]):
-            raise InputError(f"{where}: {len(row)} angles, but frame 0 has {len(rows[0])}; give all of each")
-        rows.append(row)
-    return np.stack(rows)
+        if frame.get("joints") is None:
+            faults[i] = f"{where}: no joints; give them for all frames or for none"
+            continue
+        try:
+            rows[i] = read_joints(frame["joints"], where)
+        except InputError as error:
+            faults[i] = str(error)
+            continue
+        count = len(next(iter(rows.values())))
+        if len(rows[i]) != count:
+            faults[i] = f"{where}: {len(rows[i])} angles, but the first frame has {count}; give all of each"
+    if not rows and all(frame.get("joints") is None for frame in frames):
+        faults.clear()
+        return None
+    joints = np.full((len(frames), len(next(iter(rows.values()), ()))), np.nan)
+    for i in rows.keys() - faults.keys():
+        joints[i] = rows[i]
+    return joints
 
 
 def read_joints(value: Any, where: str) -> Float[ndarray, " dof"]:
@@ -206,3 +214,14 @@ def _image_name(frame: Any, index: int, file: Path) -> str:
     if not isinstance(frame, dict) or not isinstance(frame.get("image"), str):
         raise InputError(f'{file}: frame {index} has no "image"; give the image\'s path as text')
     return frame["image"]
+
+
+def _is_capture(path: Path) -> bool:
+    """Return whether a path is a folder with a capture.json, or a JSON file with frames."""
+    if path.suffix.lower() != ".json" or not path.is_file():
+        return (path / FILE).is_file()
+    content = {} if path.name == FILE else read_json(path)
+    return path.name == FILE or (isinstance(content, dict) and "frames" in content)
+
+
+FORMAT = Format(name="capture", about="a folder with capture.json", recognises=_is_capture, read=read)

@@ -14,8 +14,10 @@ from numpy import ndarray
 
 from jcr.camera import HALF_PIXEL
 from jcr.capture.checks import checked_capture, checked_intrinsics
-from jcr.capture.formats.table import gripper_poses
+from jcr.capture.formats import Format
+from jcr.capture.formats.table import find_table, read_pose_table
 from jcr.capture.options import ReadOptions
+from jcr.capture.pairing import rows_of_images
 from jcr.capture.plain_files import contained
 from jcr.errors import InputError
 from jcr.geometry import inverse, transform
@@ -58,9 +60,17 @@ def read(path: Path, options: ReadOptions) -> Capture:
     for name in names:
         beside = f"images/{name}"
         located.append(beside if contained(root, beside, str(folder)).is_file() else name)
-    known, poses, notes = gripper_poses(root, located, options)
-    capture = checked_capture(root, [located[k] for k in known], poses, str(folder))
-    intrinsics = _common_intrinsics(model, {names[k] for k in known}, folder, capture.image_size)
+    file = options.poses or find_table(root)
+    if file is None:
+        raise InputError(f"{root}: the cameras' poses are here, but no gripper poses; give --poses TABLE")
+    table = read_pose_table(file, options)
+    known, rows, notes = rows_of_images(table, file, located)
+    faults = {k: table.faults[row] for k, row in enumerate(rows) if row in table.faults}
+    poses = table.base_from_gripper[rows]
+    capture, kept = checked_capture(root, [located[k] for k in known], poses, str(folder), faults)
+    of_capture = {names[known[k]] for k in kept}
+    intrinsics = _common_intrinsics(model, of_capture, folder, capture.image_size)
+    notes = (*notes, *capture.notes)
     return replace(capture, intrinsics=intrinsics, source=folder, cameras=folder, notes=notes)
 
 
@@ -164,3 +174,11 @@ def _intrinsics(camera: "pycolmap.Camera", folder: Path, size: tuple[int, int]) 
     model: DistortionModel = "fisheye" if "FISHEYE" in name else "rational" if any(rest[5:]) else "pinhole"
     distortion = [value.get(key, 0.0) for key in COEFFICIENTS[model]]
     return checked_intrinsics([*focals, *centre], distortion, size, str(folder), model)
+
+
+FORMAT = Format(
+    name="colmap",
+    about="a COLMAP model and gripper poses",
+    recognises=lambda path: find_model(path) is not None,
+    read=read,
+)

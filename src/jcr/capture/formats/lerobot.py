@@ -13,10 +13,11 @@ from numpy import ndarray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from jcr.capture.camera_info import read_camera_info
+from jcr.capture.formats import Format
+from jcr.capture.formats.table import PoseColumns, poses_of_columns
 from jcr.capture.joints import read_arm
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, first_fault, read_json
-from jcr.capture.pose_table import poses_of_columns
 from jcr.capture.pose_track import pose_track, speed
 from jcr.capture.recording import Recording, capture_of_recording
 from jcr.capture.robot_poses import CONVENTIONS
@@ -321,9 +322,18 @@ def _poses(
     if state.shape[1] < len(names):
         raise InputError(f"{where}: {state.shape[1]} numbers, a pose of this convention has {len(names)}")
     texts = {name: tuple(repr(float(value)) for value in state[:, k]) for k, name in enumerate(names)}
-    return poses_of_columns(texts, frozenset(), options, where), None
+    return poses_of_columns(PoseColumns(cells=texts), options, where), None
 
 
 def _speed(episode: Episode, poses: Float[ndarray, "n 4 4"]) -> Float[ndarray, " n"]:
     stamps = np.round(1e9 * episode.time_s).astype(np.int64)
     return speed(pose_track(stamps, poses).at, stamps)
+
+
+FORMAT = Format(
+    name="lerobot",
+    about="a LeRobot data set",
+    recognises=lambda path: (path / INFO).is_file(),
+    read=read,
+    recording=True,
+)

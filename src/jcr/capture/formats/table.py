@@ -1,180 +1,341 @@
-"""Images and a table of gripper poses: which image belongs to which row."""
+"""Images and a file of gripper poses: CSV and other tables, NumPy arrays, UR's p[…], YAML and JSON lists."""
 
-from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path, PureWindowsPath
+import csv
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import get_args
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.capture.camera_info import FILE, read_camera_info
-from jcr.capture.checks import checked_capture
+from jcr.capture.checks import checked_capture, require_frames
 from jcr.capture.depth_images import depth_beside
-from jcr.capture.names import natural
-from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import contained
-from jcr.capture.pose_table import PoseTable, read_pose_table, stamp_ns
-from jcr.capture.pose_track import pose_track
-from jcr.capture.table_cells import SUFFIXES, is_number
+from jcr.capture.formats import Format, pose_lists
+from jcr.capture.options import ConventionName, ReadOptions, UnitsName
+from jcr.capture.pairing import pair_with_images, stamp_ns
+from jcr.capture.plain_files import read_npy, read_text, shown
+from jcr.capture.robot_poses import CONVENTIONS, poses_from_numbers
 from jcr.errors import InputError
 from jcr.records import Capture
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+TEXTS = (".csv", ".tsv", ".txt")
+SUFFIXES = (*TEXTS, ".npy", *pose_lists.SUFFIXES)
 TABLES = tuple(f"{stem}{suffix}" for stem in ("poses", "gripper_poses", "robot_poses") for suffix in SUFFIXES)
+_IMAGE = (
+    "image", "image_name", "image_path", "file", "filename", "file_name", "file_path", "name", "picture",
+)  # fmt: skip
+_STAMP = ("timestamp", "stamp", "time", "t")
+_SHOWN: tuple[ConventionName, ...] = ("quat-xyzw", "rpy", "kuka", "fanuc", "abb", "matrix")
+"""Conventions that the names of columns give away; rx, ry, rz may be a rotation vector or angles."""
+_LAST_ROW = {"m30": "0", "m31": "0", "m32": "0", "m33": "1"}
+_PREFIXES = {
+    "{axis}": ("t", "t_", "p", "p_", "pos_", "position_", "translation_"),
+    "q{axis}": ("q_", "quat_", "quaternion_", "orientation_", "rotation_"),
+    "r{axis}": ("rvec_", "rotvec_", "r_", "ur_"),
+}
+_ALIASES = {
+    f"{prefix}{axis}": name.format(axis=axis)
+    for name, prefixes in _PREFIXES.items()
+    for prefix in prefixes
+    for axis in ("xyzw" if name == "q{axis}" else "xyz")
+}
+_EXPLICIT: dict[str, ConventionName] = {
+    "ur_x": "ur", "rvec_x": "rotation-vector", "rotvec_x": "rotation-vector",
+}  # fmt: skip
+"""Conventions of columns whose names alone tell what rx, ry, rz are; `ur_` is what UR's p[…] is read into."""
+_UR_POSE = re.compile(r"\bp\s*\[([^\]]*)\]")
+_UNIT = re.compile(r"^(.+?)(?:_|_?[\[(])(mm|cm|m|deg|rad|s|ns)[\])]?$")
+_DECIMAL_COMMA = re.compile(r"^([+-]?\d+),(\d+(?:[eE][+-]?\d+)?)$")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseColumns:
+    """Columns of a file of poses as text."""
+
+    cells: dict[str, tuple[str, ...]]
+    """By the columns' names: lower case, without units; tx, pos_x, q_x … as x and qx."""
+    units: frozenset[str] = frozenset()
+    """Units that the names give: of mm, cm, m, deg, rad."""
+    convention: ConventionName = "auto"
+    """Convention that the notation gives away: UR's p[…], rvec."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseTable:
+    """Rows of a file of gripper poses."""
+
+    base_from_gripper: Float[ndarray, "n 4 4"]
+    images: tuple[str, ...] | None
+    """Names as they stand in the file."""
+    stamp_ns: Int[ndarray, " n"] | None
+    convention: str
+    """A name of CONVENTIONS."""
+    faults: Mapping[int, str]
+    """Messages of the rows that hold no pose; their poses are NaN."""
 
 
 def read(path: Path, options: ReadOptions) -> Capture:
-    """The capture of a table, or of a folder that holds one; images in the same folder or in images/."""
+    """Read a file of poses, or a folder that holds one; the images are in the same folder or in images/."""
     file = options.poses or find_table(path)
     if file is None:
         raise InputError(f"{path}: holds no table of poses ({', '.join(TABLES[:4])}); name it with --poses")
     folder = path if path.is_dir() else path.parent
     table = read_pose_table(file, options)
-    images, poses, notes = _paired(folder, file, table, options)
-    capture = checked_capture(folder, images, poses, str(file))
-    depths = depth_beside(folder, images)
-    capture = replace(with_camera_info(capture, options), source=file, notes=notes, depths=depths)
-    return replace(capture, pose_convention=table.convention)
+    images, poses, notes = pair_with_images(folder, file, table, options)
+    capture, _ = checked_capture(folder, images, poses, str(file), table.faults)
+    depths = depth_beside(folder, capture.images)
+    capture = replace(capture, source=file, notes=(*notes, *capture.notes), depths=depths)
+    return replace(with_camera_info(capture, options), pose_convention=table.convention)
 
 
 def find_table(path: Path) -> Path | None:
-    """The table of poses that a path is or holds, if there is one."""
+    """Return the file of poses that a path is or holds; None where there is none."""
     if path.is_file():
         return path
     return next((path / name for name in TABLES if (path / name).is_file()), None)
 
 
 def with_camera_info(capture: Capture, options: ReadOptions) -> Capture:
-    """The capture with the intrinsics of a camera_info YAML, where there is one and it has none yet."""
+    """Return the capture with the intrinsics of a camera_info YAML, where there is one and it has none yet."""
     file = options.camera_info or capture.folder / FILE
     if options.camera_info is None and (capture.intrinsics is not None or not file.is_file()):
         return capture
     return replace(capture, intrinsics=read_camera_info(file, capture.image_size))
 
 
-def gripper_poses(
-    folder: Path, images: Sequence[str], options: ReadOptions
-) -> tuple[list[int], Float[ndarray, "m 4 4"], tuple[str, ...]]:
-    """Rows of `images` that a table of gripper poses knows, their poses, and a note of those it does not know.
-
-    Raises InputError when there is no table or it does not belong to these images.
-    """
-    file = options.poses or find_table(folder)
-    if file is None:
-        raise InputError(f"{folder}: the cameras' poses are here, but no gripper poses; give --poses TABLE")
-    table = read_pose_table(file, options)
-    if table.images is None:
-        if len(table.base_from_gripper) != len(images):
-            raise InputError(
-                f"{file}: {len(table.base_from_gripper)} poses for {len(images)} images; add a column with the "
-                "images' names"
-            )
-        return list(range(len(images))), table.base_from_gripper, ()
-    row_of = {_plain(name): row for row, name in enumerate(table.images)}
-    if len(row_of) < len(table.images):
-        raise InputError(f"{file}: names an image more than once; keep one row per image")
-    known = [k for k, name in enumerate(images) if _plain(name) in row_of]
-    if not known:
-        raise InputError(
-            f"{file}: lists none of the images; it lists {table.images[0]}, the images are called {images[0]}"
-        )
-    rows = [row_of[_plain(images[k])] for k in known]
-    notes = ()
-    if unknown := len(images) - len(known):
-        notes = (f"{unknown} of {len(images)} images have no gripper pose in {file.name}: left out",)
-    return known, table.base_from_gripper[rows], notes
-
-
-def _plain(name: str) -> str:
-    """An image's name without folder and ending: tools differ in both."""
-    return Path(name).stem
-
-
-def _paired(
-    folder: Path, file: Path, table: PoseTable, options: ReadOptions
-) -> tuple[list[str], Float[ndarray, "n 4 4"], tuple[str, ...]]:
-    if table.images is not None:
-        located = _located(folder, table.images, file)
-        notes = _without_pose(folder, located, file)
-        named = zip(table.images, located, strict=True)
-        if other := [(name, found) for name, found in named if found not in (name, f"images/{name}")]:
-            found = " is ".join(other[0])
-            notes = (f"{len(other)} names in {file.name} are not those of files: {found}, and so on", *notes)
-        return located, table.base_from_gripper, notes
-    taken = image_names(folder)
-    if not taken:
-        raise InputError(f"{folder}: holds no images, nor does {folder / 'images'}; put them there")
-    stems = [Path(name).stem for name in taken]
-    if table.stamp_ns is not None and all(map(is_number, stems)):
-        stamps = np.array(
-            [stamp_ns(stem, str(folder / name)) for stem, name in zip(stems, taken, strict=True)]
-        )
-        if (stamps >= table.stamp_ns.min()).any() and (stamps <= table.stamp_ns.max()).any():
-            poses, gap_ns = pose_track(table.stamp_ns, table.base_from_gripper).at(stamps)
-            fresh = gap_ns <= 1e6 * options.max_gap_ms
-            if not fresh.all():
-                stale = int(gap_ns.argmax())
-                raise InputError(
-                    f"{file}: no pose within {options.max_gap_ms:.0f} ms around {taken[stale]}; drop that image "
-                    "or raise --max-gap-ms"
-                )
-            return taken, poses, (f"poses interpolated at the {len(taken)} images' time stamps",)
-    if len(taken) != len(table.base_from_gripper):
-        raise InputError(
-            f"{file}: {len(table.base_from_gripper)} poses for {len(taken)} images in {folder} "
-            f"({taken[0]} … {taken[-1]}), and no column says which belongs to which; add a column image with "
-            "their names"
-        )
-    how = f"rows paired with images in order of their names: {taken[0]} … {taken[-1]}"
-    return taken, table.base_from_gripper, (how,)
-
-
-def _without_pose(folder: Path, named: list[str], file: Path) -> tuple[str, ...]:
-    """A note on images that the table does not name; InputError where it names images that are not there."""
-    here = [name for name in image_names(folder) if name not in named]
-    left_out = (
-        f"{len(here)} images have no pose in {file.name} and are left out: {_listed(here)}" if here else ""
+def read_pose_table(file: Path, options: ReadOptions) -> PoseTable:
+    """Read the poses of a file; InputError naming the column at fault, or the option that it needs."""
+    columns = read_columns(file, options)
+    image = next((columns.cells[name] for name in _IMAGE if name in columns.cells), None)
+    stamp = next((columns.cells[name] for name in _STAMP if name in columns.cells), None)
+    require_frames(0 if image is None else len(image), str(file), 0)
+    faults = dict[int, str]()
+    convention = convention_of(columns, options, str(file))
+    poses = poses_of_columns(columns, replace(options, pose_convention=convention), str(file), faults)
+    stamps = None if stamp is None else np.array([stamp_ns(text, str(file)) for text in stamp])
+    return PoseTable(
+        base_from_gripper=poses, images=image, stamp_ns=stamps, convention=convention, faults=faults
     )
-    absent = [name for name in named if not (folder / name).is_file()]
-    if absent:
+
+
+def convention_of(columns: PoseColumns, options: ReadOptions, where: str) -> ConventionName:
+    """Return the convention of named columns: the one of the options, or the one that the names show."""
+    if options.pose_convention != "auto" or columns.convention != "auto":
+        return options.pose_convention if options.pose_convention != "auto" else columns.convention
+    for name in _SHOWN:
+        if set(CONVENTIONS[name].columns) - set(_LAST_ROW) <= columns.cells.keys():
+            return name
+    if {"rx", "ry", "rz"} <= columns.cells.keys():
         raise InputError(
-            f"{file}: names {len(absent)} of {len(named)} images that are not in {folder}: {_listed(absent)}; add them "
-            f"or drop their rows{' (' + left_out + ')' if here else ''}"
+            f"{where}: columns rx, ry, rz may be a rotation vector (--pose-convention ur) or angles about fixed axes "
+            "(--pose-convention yaskawa); say which"
         )
-    return (left_out,) if here else ()
+    raise InputError(
+        f"{where}: its columns ({', '.join(columns.cells)}) contain no pose; name them x, y, z and qx, qy, qz, qw or "
+        "roll, pitch, yaw, or give --pose-convention"
+    )
 
 
-def _listed(names: list[str]) -> str:
-    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+def poses_of_columns(
+    columns: PoseColumns, options: ReadOptions, where: str, faults: dict[int, str] | None = None
+) -> Float[ndarray, "n 4 4"]:
+    """Return base_from_gripper (n,4,4); rows that hold no pose raise InputError, or are NaN and named in `faults`."""
+    convention = convention_of(columns, options, where)
+    wanted = CONVENTIONS[convention].columns
+    cells, rows = columns.cells, len(next(iter(columns.cells.values())))
+    if set(_LAST_ROW) <= set(wanted) and not set(_LAST_ROW) & set(cells):
+        cells = cells | {name: (cell,) * rows for name, cell in _LAST_ROW.items()}
+    missing = [name for name in wanted if name not in cells]
+    if missing:
+        raise InputError(
+            f"{where}: no column {', '.join(missing)}, which --pose-convention {convention} needs; "
+            f"it has {', '.join(cells)}"
+        )
+    numbers = np.full((rows, len(wanted)), np.nan)
+    for k, name in enumerate(wanted):
+        for row, cell in enumerate(cells[name]):
+            if is_number(cell):
+                numbers[row, k] = float(cell)
+            else:
+                fault = (
+                    f"row {row + 1}, column {name}: {shown(cell)} is not a number; correct or drop the row"
+                )
+                if faults is None:
+                    raise InputError(f"{where}: {fault}")
+                faults.setdefault(row, fault)
+    return poses_from_numbers(numbers, convention, _units(convention, columns.units, options), where, faults)
 
 
-def _located(folder: Path, names: Sequence[str], file: Path) -> list[str]:
-    """The images' paths in the folder: as written, in images/, or by their own names whatever folder, case and ending.
-
-    A name that more than one image has decides nothing.
-    """
-    own: dict[str, list[str]] = {}
-    for image in image_names(folder):
-        for key in {Path(image).name.casefold(), Path(image).stem.casefold()}:
-            own.setdefault(key, []).append(image)
-    found = []
-    for name in names:
-        plain = PureWindowsPath(name).name  # which takes both kinds of slashes
-        like = own.get(plain.casefold()) or own.get(Path(plain).stem.casefold()) or []
-        if (folder / "images" / name).is_file() and not (folder / name).is_file():
-            found.append(f"images/{name}")
-        elif len(like) == 1 and not (folder / name).is_file():
-            found.append(like[0])
-        else:
-            contained(folder, name, str(file))
-            found.append(name)
-    return found
+def is_number(cell: str) -> bool:
+    """Return whether a cell is a number, as Python's own floats are written."""
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
-def image_names(folder: Path) -> list[str]:
-    """Images of a folder, or of its images/, as people count: img2 before img10."""
-    inside = folder / "images" if (folder / "images").is_dir() else folder
-    files = [file for file in inside.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
-    names = [str(file.relative_to(folder)) for file in files]
-    return sorted(names, key=natural)
+def _units(convention: str, named: frozenset[str], options: ReadOptions) -> UnitsName:
+    """Return the units of the options, else of the columns' names, and for the rest of the convention."""
+    if options.pose_units != "auto" or not named:
+        return options.pose_units
+    length, angle = CONVENTIONS[convention].units()
+    length = next((unit for unit in ("mm", "cm", "m") if unit in named), length)
+    angle = next((unit for unit in ("deg", "rad") if unit in named), angle)
+    return next(units for units in get_args(UnitsName) if units == f"{length}-{angle}")
+
+
+def read_columns(file: Path, options: ReadOptions) -> PoseColumns:
+    """Read the named columns of a file."""
+    if file.suffix in pose_lists.SUFFIXES:
+        entries = pose_lists.read_entries(pose_lists.read_content(file), str(file))
+        return columns_of_entries(entries, options, str(file))
+    header, rows = _read_rows(file)
+    return _columns(header, rows, options, str(file))
+
+
+def columns_of_entries(entries: Sequence[pose_lists.Entry], options: ReadOptions, where: str) -> PoseColumns:
+    """Return the named columns of a list's entries; a cell that an entry lacks is empty, which is no number."""
+    first = entries[0]
+    if isinstance(first, list):
+        return _columns(None, [entry if isinstance(entry, list) else [] for entry in entries], options, where)
+    rows = [[entry.get(name, "") if isinstance(entry, dict) else "" for name in first] for entry in entries]
+    return _columns(list(first), rows, options, where)
+
+
+def _columns(
+    header: Sequence[str] | None, rows: list[list[str]], options: ReadOptions, where: str
+) -> PoseColumns:
+    """Return columns by their names; InputError where a row has too many or too few cells."""
+    if not rows:
+        raise InputError(f"{where}: holds no poses; expected one row per image")
+    width = len(header or rows[0])
+    for number, row in enumerate(rows, start=1):
+        if len(row) != width:
+            raise InputError(
+                f"{where}: row {number} has {len(row)} columns, not {width}; complete or drop it"
+            )
+    cells = [tuple(column) for column in zip(*rows, strict=True)]
+    if header is None:
+        return PoseColumns(cells=_named(where, cells, options))
+    names, units = zip(*(_name_and_unit(cell) for cell in header), strict=True)
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise InputError(f"{where}: two columns are named {', '.join(sorted(twice))}; keep one")
+    convention: ConventionName = "auto"
+    for cell in header:
+        convention = _EXPLICIT.get(cell, convention)
+    return PoseColumns(
+        cells=dict(zip(names, cells, strict=True)),
+        units=frozenset(units) - {"", "s", "ns"},
+        convention=convention,
+    )
+
+
+def _named(where: str, columns: list[tuple[str, ...]], options: ReadOptions) -> dict[str, tuple[str, ...]]:
+    """Name columns without a header: an image's name in front, or a stamp, and then those of the convention."""
+    named = dict[str, tuple[str, ...]]()
+    if not is_number(columns[0][0]):
+        named["image"] = columns.pop(0)
+    convention = options.pose_convention
+    if convention == "auto":
+        # Eight numbers are TUM's: timestamp tx ty tz qx qy qz qw.
+        convention = {8: "quat-xyzw", 12: "matrix", 16: "matrix"}.get(len(columns))
+    if convention is None:
+        raise InputError(
+            f"{where}: {len(columns)} columns of numbers without names; add a header (x,y,z,qx,qy,qz,qw) or say how "
+            f"a pose is written with --pose-convention ({', '.join(CONVENTIONS)})"
+        )
+    wanted = CONVENTIONS[convention].columns
+    if len(wanted) == 16 and len(columns) in (12, 13):
+        wanted = tuple(name for name in wanted if name not in _LAST_ROW)
+    if len(columns) == len(wanted) + 1:
+        named["timestamp"] = columns.pop(0)
+    if len(columns) != len(wanted):
+        raise InputError(
+            f"{where}: {len(columns)} columns of numbers; --pose-convention {convention} has {len(wanted)}: "
+            f"{', '.join(wanted)}"
+        )
+    return named | dict(zip(wanted, columns, strict=True))
+
+
+def _read_rows(file: Path) -> tuple[Sequence[str] | None, list[list[str]]]:
+    """Read the header, None where there is none, and the cells of every row."""
+    if file.suffix == ".npy":
+        return _rows_of_array(file)
+    lines = [line.strip() for line in read_text(file).splitlines() if line.strip()]
+    comments = [line.lstrip("# ") for line in lines if line.startswith("#")]
+    lines = [line for line in lines if not line.startswith("#")]
+    if any(map(_UR_POSE.search, lines)):
+        return _rows_of_ur(file, lines)
+    separator = next((mark for mark in "\t;," if lines and mark in lines[0]), None)
+    try:
+        rows = [
+            line.split()
+            if separator is None
+            else next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+            for line in lines
+        ]
+    except csv.Error as error:
+        raise InputError(f"{file}: not a table ({error}); save it as CSV") from None
+    rows = [[cell.strip().strip('"') for cell in row] for row in rows]
+    if separator != ",":  # as spreadsheets write numbers where the comma is the decimal mark
+        rows = [[_DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in row] for row in rows]
+    if rows and not any(map(is_number, rows[0])):
+        return rows[0], rows[1:]
+    # TUM and ethz-asl write the names of their columns as a comment.
+    for comment in reversed(comments):
+        cells = [cell for cell in re.split(r"[,;\s]+", comment) if cell]
+        if rows and len(cells) == len(rows[0]) and set("xyz") <= {_name_and_unit(cell)[0] for cell in cells}:
+            return cells, rows
+    return None, rows
+
+
+def _rows_of_ur(file: Path, lines: list[str]) -> tuple[Sequence[str], list[list[str]]]:
+    """Return the cells of poses as URScript writes them, p[x, y, z, rx, ry, rz], and of the name or stamp before."""
+    rows = list[list[str]]()
+    for number, line in enumerate(lines, start=1):
+        match = _UR_POSE.search(line)
+        if match is None and not rows:
+            continue  # a header
+        numbers = [] if match is None else [cell.strip() for cell in match[1].split(",")]
+        before = (
+            [] if match is None else re.split(r"[,;\t\s]+", line[: match.start()].strip(" \t,;\"'=:"))[:1]
+        )
+        rows.append([cell for cell in before if cell] + numbers)
+        if len(numbers) != 6 or len(rows[-1]) != len(rows[0]):
+            raise InputError(
+                f"{file}: line {number} holds no p[x, y, z, rx, ry, rz] as the others: {shown(line)}; correct or drop it"
+            )
+    first = () if len(rows[0]) == 6 else ("timestamp" if is_number(rows[0][0]) else "image",)
+    return (*first, "x", "y", "z", "ur_x", "ur_y", "ur_z"), rows
+
+
+def _rows_of_array(file: Path) -> tuple[Sequence[str] | None, list[list[str]]]:
+    """Return the cells of a NumPy array: a structured one has a header, matrices are rows of their numbers."""
+    array = read_npy(file)
+    if array.dtype.names is not None and array.ndim == 1:
+        return array.dtype.names, [[str(value) for value in row] for row in array.tolist()]
+    if array.dtype.kind not in "fiu" or array.ndim not in (2, 3) or not array.size:
+        raise InputError(f"{file}: no table of numbers; save (n,4,4) matrices or (n,k) rows with numpy.save")
+    return None, [[repr(value) for value in row] for row in array.reshape(len(array), -1).tolist()]
+
+
+def _name_and_unit(cell: str) -> tuple[str, str]:
+    plain = re.sub(r"[\s.]+", "_", cell.strip().strip('"').lower()).strip("_")
+    match = _UNIT.match(plain)
+    name, unit = match.groups() if match else (plain, "")
+    return _ALIASES.get(name, name), unit
+
+
+FORMAT = Format(
+    name="table",
+    about="images and a table or list of gripper poses",
+    recognises=lambda path: (file := find_table(path)) is not None and file.suffix.lower() in SUFFIXES,
+    read=read,
+)

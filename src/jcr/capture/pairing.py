@@ -1,0 +1,188 @@
+"""Pairing of gripper poses with images: by the images' names, by their time stamps, or by their order."""
+
+import re
+from collections.abc import Sequence
+from decimal import Decimal
+from pathlib import Path, PureWindowsPath
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.capture.options import ReadOptions
+from jcr.capture.plain_files import contained, first_few, shown
+from jcr.capture.pose_track import pose_track
+from jcr.errors import InputError
+
+if TYPE_CHECKING:
+    from jcr.capture.formats.table import PoseTable
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+_LATEST_NS = np.iinfo(np.int64).max
+"""The last nanosecond that fits 64 bits, in the year 2262."""
+Paired = tuple[list[str], Float[ndarray, "n 4 4"], tuple[str, ...]]
+"""Images relative to the folder, their base_from_gripper, and notes on the pairing."""
+
+
+def pair_with_images(folder: Path, file: Path, table: "PoseTable", options: ReadOptions) -> Paired:
+    """Pair the rows of a file of poses with the images of a folder; InputError where they cannot be paired."""
+    if table.images is not None:
+        return _paired_by_name(folder, file, table)
+    taken = image_names(folder)
+    if not taken:
+        raise InputError(f"{folder}: holds no images, nor does {folder / 'images'}; put them there")
+    if table.stamp_ns is not None and (paired := _paired_by_time(folder, file, table, taken, options)):
+        return paired
+    if len(taken) != len(table.base_from_gripper):
+        raise InputError(
+            f"{file}: {len(table.base_from_gripper)} poses for {len(taken)} images in {folder} "
+            f"({taken[0]} … {taken[-1]}), and no column says which belongs to which; add a column image with "
+            "their names"
+        )
+    how = f"rows paired with images in order of their names: {taken[0]} … {taken[-1]}"
+    return taken, table.base_from_gripper, (how,)
+
+
+def rows_of_images(
+    table: "PoseTable", file: Path, images: Sequence[str]
+) -> tuple[list[int], list[int], tuple[str, ...]]:
+    """Return which of the `images` a file of poses knows, by their names without folder and ending, and their rows.
+
+    Without names the rows are those of the images. Raises InputError where the file does not belong to the images.
+    """
+    every = list(range(len(images)))
+    if table.images is None:
+        if len(table.base_from_gripper) != len(images):
+            raise InputError(
+                f"{file}: {len(table.base_from_gripper)} poses for {len(images)} images; add a column with the "
+                "images' names"
+            )
+        return every, every, ()
+    row_of = {Path(name).stem: row for row, name in enumerate(table.images)}
+    if len(row_of) < len(table.images):
+        raise InputError(f"{file}: names an image more than once; keep one row per image")
+    known = [k for k in every if Path(images[k]).stem in row_of]
+    if not known:
+        raise InputError(
+            f"{file}: lists none of the images; it lists {table.images[0]}, the images are called {images[0]}"
+        )
+    notes = ()
+    if unknown := len(images) - len(known):
+        notes = (f"{unknown} of {len(images)} images have no gripper pose in {file.name}: left out",)
+    return known, [row_of[Path(images[k]).stem] for k in known], notes
+
+
+def paired_by_name(
+    names: Sequence[str], poses: Float[ndarray, "n 4 4"]
+) -> dict[bool, Float[ndarray, "n 4 4"]]:
+    """Return the poses as if listed in the order of the names as numbers (True) or as text (False).
+
+    `names` and `poses` are in order; an order that pairs the same rows is left out.
+    """
+    found = {}
+    for by_number in (True, False):
+        order = sorted(range(len(names)), key=lambda k: natural(names[k]) if by_number else names[k])
+        if order != list(range(len(names))):
+            found[by_number] = np.empty_like(poses)
+            found[by_number][order] = poses
+    return found
+
+
+def natural(name: str) -> list[tuple[int, str]]:
+    """Return a key that sorts names as numbers: img2 before img10."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def image_names(folder: Path) -> list[str]:
+    """Return the images of a folder, or of its images/, in the order of their names as numbers."""
+    inside = folder / "images" if (folder / "images").is_dir() else folder
+    files = [file for file in inside.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
+    return sorted((str(file.relative_to(folder)) for file in files), key=natural)
+
+
+def stamp_ns(text: str, where: str) -> int:
+    """Return a time stamp in nanoseconds; seconds, milli-, micro- and nanoseconds are distinguished by their size.
+
+    Exact: a float holds 16 of the 19 digits that nanoseconds since 1970 have.
+    """
+    try:
+        value = Decimal(text)
+        size = abs(value)
+        if not size < 10**20:
+            raise ValueError
+        unit_ns = 10**9 if size < 10**11 else 10**6 if size < 10**14 else 10**3 if size < 10**17 else 1
+        if not -_LATEST_NS <= (stamp := int(value * unit_ns)) <= _LATEST_NS:
+            raise ValueError
+        return stamp
+    except (ArithmeticError, ValueError):  # of Decimal each has its own name
+        raise InputError(f"{where}: {shown(text)} is not a time stamp; give seconds or nanoseconds") from None
+
+
+def _paired_by_name(folder: Path, file: Path, table: "PoseTable") -> Paired:
+    assert table.images is not None
+    located = _located(folder, table.images, file)
+    named = set(located)
+    here = [name for name in image_names(folder) if name not in named]
+    left_out = (
+        f"{len(here)} images have no pose in {file.name} and are left out: {first_few(here)}" if here else ""
+    )
+    absent = [name for name in located if not (folder / name).is_file()]
+    if len(absent) == len(located) or (absent and here):
+        raise InputError(
+            f"{file}: names {len(absent)} of {len(located)} images that are not in {folder}: {first_few(absent)}; add "
+            f"them or drop their rows{' (' + left_out + ')' if here else ''}"
+        )
+    pairs = zip(table.images, located, strict=True)
+    other = [(name, found) for name, found in pairs if found not in (name, f"images/{name}")]
+    notes = [left_out] if here else []
+    if other:
+        found = " is ".join(other[0])
+        notes.insert(0, f"{len(other)} names in {file.name} are not those of files: {found}, and so on")
+    return located, table.base_from_gripper, tuple(notes)
+
+
+def _paired_by_time(
+    folder: Path, file: Path, table: "PoseTable", taken: list[str], options: ReadOptions
+) -> Paired | None:
+    """Interpolate the poses at images that are named by their time stamps; None where they are not."""
+    assert table.stamp_ns is not None
+    try:
+        stamps = np.array([stamp_ns(Path(name).stem, str(folder / name)) for name in taken])
+    except InputError:
+        return None
+    if not ((stamps >= table.stamp_ns.min()) & (stamps <= table.stamp_ns.max())).any():
+        return None
+    sound = np.isfinite(table.base_from_gripper).all((1, 2))
+    poses, gap_ns = pose_track(table.stamp_ns[sound], table.base_from_gripper[sound]).at(stamps)
+    fresh = gap_ns <= 1e6 * options.max_gap_ms
+    if not fresh.all():
+        stale = int(gap_ns.argmax())
+        raise InputError(
+            f"{file}: no pose within {options.max_gap_ms:.0f} ms around {taken[stale]}; drop that image "
+            "or raise --max-gap-ms"
+        )
+    return taken, poses, (f"poses interpolated at the {len(taken)} images' time stamps",)
+
+
+def _located(folder: Path, names: Sequence[str], file: Path) -> list[str]:
+    """Return the images of the folder that the names mean, of tools that write other folders, slashes and endings.
+
+    A name that more than one image has decides nothing.
+    """
+    own: dict[str, list[str]] = {}
+    for image in image_names(folder):
+        for key in {Path(image).name.casefold(), Path(image).stem.casefold()}:
+            own.setdefault(key, []).append(image)
+    found = []
+    for name in names:
+        plain = PureWindowsPath(name).name  # which takes both kinds of slashes
+        like = own.get(plain.casefold()) or own.get(Path(plain).stem.casefold()) or []
+        if (folder / "images" / name).is_file() and not (folder / name).is_file():
+            found.append(f"images/{name}")
+        elif len(like) == 1 and not (folder / name).is_file():
+            found.append(like[0])
+        else:
+            contained(folder, name, str(file))
+            found.append(name)
+    return found
