@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from jcr.allocator import give_back
 from jcr.calibration.calibration_json import CalibrationFile
+from jcr.depth.measured import with_measured_depth
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError
 from jcr.progress import Progress
@@ -14,7 +15,6 @@ from jcr.records import Capture, PointCloud
 from jcr.results import RunOptions, RunResult
 from jcr.scene.cloud import point_cloud
 from jcr.scene.map_file import require_packages
-from jcr.scene.measured_depth import with_measured_depth
 from jcr.segments.measure import Measured, measure
 from jcr.segments.segments import image_labels, label_cloud
 from jcr.segments.tabletop import Support, support_plane

@@ -15,6 +15,7 @@ from jcr.camera import rays
 from jcr.capture.depth_images import read_depth
 from jcr.capture.images import encode_png
 from jcr.capture.read import read_capture
+from jcr.depth.measured import with_measured_depth
 from jcr.errors import InputError
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.files import write_bytes
@@ -30,7 +31,6 @@ from jcr.records import (
     ScaleEvidence,
     Tracks,
 )
-from jcr.scene.measured_depth import with_measured_depth
 
 INTRINSICS = Intrinsics(FOCAL_PX, FOCAL_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
 OFF, NOISE_PER_M, SCALE = 1.03, 0.004, 0.1

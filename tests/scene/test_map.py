@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from scipy.special import expit
 
 import analytic_scene
 from analytic_scene import BALL_CENTER, BALL_RADIUS, BOX_CENTER, BOX_HALF, WORKSPACE, signed_distance
@@ -207,6 +208,69 @@ def test_the_papers_networks_learn_all_three(cloud: PointCloud):
     color_error = np.abs(scene.query(surface).color - analytic_scene.true_color(surface)).mean()
     assert color_error < 0.1  # the mean colour alone is off by 0.29
     assert (scene.query(surface).label == cloud.label[:20_000]).mean() > 0.97
+
+
+def test_the_published_representation_is_plain_torch_and_learns_the_scene(cloud: PointCloud):
+    import torch
+
+    from jcr.scene.paper import PaperField, train_paper
+
+    box = torch.tensor([[0.0, -1.0, 0.0], [2.0, 1.0, 1.0]])
+    field, x = PaperField(box, 3, torch.Generator().manual_seed(1)), torch.rand(50, 3)
+    angle = torch.cat(
+        [(x - box.mean(0)).T * np.pi * 2.0**k for k in range(10)]
+    )  # the longest side spans [-1, 1]
+    encoded = torch.cat([angle.sin(), angle.cos()]).T
+    plain = torch.nn.Sequential(field.hidden, torch.nn.ReLU(), field.output)
+    torch.testing.assert_close(field(x), plain(encoded), rtol=1e-4, atol=1e-4)
+    assert field.hidden.weight.shape == (256, 60) and field.output.weight.shape == (3, 256)
+
+    before = torch.get_rng_state()
+    fields = train_paper(cloud, steps=400)
+    assert (torch.get_rng_state() == before).all()
+    surface = torch.tensor(cloud.points_in_base[:20_000], dtype=torch.float32)
+    points = uniform(100_000)
+    free = torch.tensor(points[signed_distance(points) > 0.03], dtype=torch.float32)
+    assert (fields["occupancy"](surface) > 0).float().mean() > 0.85
+    assert (fields["occupancy"](free) < 0).float().mean() > 0.9
+    color = analytic_scene.true_color(cloud.points_in_base[:20_000])
+    assert np.abs(fields["color"](surface).numpy() - color).mean() < 0.12
+    assert (fields["label"](surface).argmax(1).numpy() == cloud.label[:20_000]).mean() > 0.95
+    doubted = replace(cloud, confidence=np.where(np.arange(len(cloud.label)) < 100, 1.0, 1e-3))
+    assert not torch.equal(
+        train_paper(doubted, True, 2)["color"](surface), train_paper(cloud, True, 2)["color"](surface)
+    )
+
+
+def test_building_a_map_leaves_torchs_seed_and_threads_alone(cloud: PointCloud):
+    import torch
+
+    from jcr.scene.build import build_scene
+
+    threads, state = torch.get_num_threads(), torch.get_rng_state()
+    one = build_scene(cloud, OPTIONS)
+    assert torch.get_num_threads() == threads and (torch.get_rng_state() == state).all()
+    torch.rand(7)
+    two, x = build_scene(cloud, OPTIONS), uniform(1000)
+    raw = one.field(x)
+    assert {name: value.shape[1] for name, value in raw.items()} == {
+        "occupancy": 1,
+        "color": 3,
+        "label": len(analytic_scene.LABELS),
+    }
+    for name, value in two.field(x).items():
+        np.testing.assert_array_equal(value, raw[name])
+    seen = ~one.query(x).unknown
+    np.testing.assert_allclose(expit(raw["occupancy"][seen, 0]), one.query(x).occupancy[seen], atol=1e-6)
+
+
+def test_a_map_moved_to_another_device_is_a_copy(scene: "SceneMap"):
+    moved = scene.to("cpu")
+    assert moved.fields is not scene.fields
+    for one, two in zip(moved.fields.parameters(), scene.fields.parameters(), strict=True):
+        assert one.data_ptr() != two.data_ptr()
+    x = uniform(1000)
+    np.testing.assert_array_equal(moved.query(x).occupancy, scene.query(x).occupancy)
 
 
 def test_reliable_points_weigh_more(cloud: PointCloud):

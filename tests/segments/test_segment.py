@@ -203,6 +203,19 @@ def test_without_a_plane_there_are_no_segments_and_it_reports_it(rng: np.random.
         support_plane(cloud_of(rng, ball[:10]))
 
 
+def test_a_tray_full_of_parts_without_a_bare_plane_gives_a_note(rng: np.random.Generator):
+    """Between parts that stand side by side, a few points of the tray are seen along one line."""
+    parts = [box(rng, (0.05, 0.05, 0.03 + 0.001 * k), (0.055 * (k % 5), 0.055 * (k // 5))) for k in range(25)]
+    tray = rng.uniform((-0.03, -0.0275, 0.0), (0.25, -0.0273, 0.0), (600, 3))
+    full = cloud_of(rng, tray, *parts)
+    plane = support_plane(cloud_of(rng, table(rng), *parts))
+    plane = replace(plane, on_plane=np.abs(full.points_in_base[:, 2]) < 1e-3)
+    cloud, notes = label_cloud(full, SegmentOptions(), plane)
+    assert cloud.label_names == ("none",) and "no bare part of the support plane" in notes[0]
+    with pytest.raises(InputError, match="no bare part"):
+        label_cloud(full, SegmentOptions(segments="tabletop"), plane)
+
+
 def test_labels_that_came_with_the_images_are_kept_and_measured(rng: np.random.Generator):
     things = table(rng), box(rng, (0.1, 0.1, 0.05), (-0.1, 0)), box(rng, (0.05, 0.05, 0.08), (0.1, 0))
     label = np.repeat([7, 3, 5], [len(part) for part in things])

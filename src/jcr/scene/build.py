@@ -2,15 +2,14 @@
 
 import math
 import time
-from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import contextmanager
 from functools import partial
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from numpy import ndarray
+from threadpoolctl import threadpool_limits
 
 from jcr.errors import InputError
 from jcr.progress import Progress, silent
@@ -37,7 +36,6 @@ def build_scene(
     """
     options = options or MapOptions()
     recipe = RECIPES[options.preset]
-    torch.manual_seed(options.map_seed)
     for numbers in (cloud.points_in_base, cloud.camera_centers_in_base, cloud.confidence, cloud.margin):
         if not np.isfinite(numbers).all():
             raise InputError(
@@ -60,7 +58,8 @@ def build_scene(
         carved = time.perf_counter()
         lattices = feature_lattices(seen) if recipe.grids else []
         shapes = _field_shapes(rays, len(cloud.label_names), recipe)
-        fields = Fields(shapes, seen.box, lattices).to(device)
+        generator = torch.Generator().manual_seed(options.map_seed)
+        fields = Fields(shapes, seen.box, lattices, generator).to(device)
         steps = list(pool.map(fit, fields.of))
         history = {
             "preset": options.preset,
@@ -103,17 +102,15 @@ def feature_lattices(seen: SeenGrid) -> list[Lattice]:
     ]
 
 
-@contextmanager
-def threads_of_one_core(device: torch.device) -> Iterator[Executor]:
-    """A thread for each core, in which torch works without threads of its own; one on a GPU.
+def threads_of_one_core(device: torch.device) -> Executor:
+    """Return a pool with a thread for each core, in which torch starts no further threads; one thread on a GPU.
 
-    Torch's own wait for each other, spinning, after each of thousands of short operations: where another process takes
-    one core, the training that should last a second lasted a minute.
+    Torch's own threads wait for each other, spinning, after each of thousands of short operations: where another
+    process took one core, a training of one second lasted a minute. The limit holds in the pool's threads alone.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with ThreadPoolExecutor(threads if device.type == "cpu" else 1) as pool:
-            yield pool
-    finally:
-        torch.set_num_threads(threads)
+
+    def limit() -> None:
+        torch.zeros(1)  # torch sets its number of threads at a thread's first operation
+        threadpool_limits(1, user_api="openmp")
+
+    return ThreadPoolExecutor(torch.get_num_threads() if device.type == "cpu" else 1, initializer=limit)

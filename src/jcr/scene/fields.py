@@ -7,7 +7,7 @@ are metres of the base frame; each encoding scales them by itself.
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -164,10 +164,25 @@ class SpreadEncoding:
         return torch.cat(parts)
 
 
-class Field(nn.Module):
-    """Properties at every place: logits of occupancy and labels, plain values of all else."""
+def linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Linear:
+    """Return a layer initialised as torch.nn.Linear does, from a generator of its own."""
+    layer, bound = cast(nn.Linear, nn.utils.skip_init(nn.Linear, inputs, outputs)), inputs**-0.5
+    nn.init.uniform_(layer.weight, -bound, bound, generator=generator)
+    nn.init.uniform_(layer.bias, -bound, bound, generator=generator)
+    return layer
 
-    def __init__(self, shape: FieldShape, box: Float[Tensor, "2 3"], lattices: Sequence[Lattice]) -> None:
+
+class Field(nn.Module):
+    """Properties as functions of position: logits of occupancy and labels, plain values of other properties."""
+
+    def __init__(
+        self,
+        shape: FieldShape,
+        box: Float[Tensor, "2 3"],
+        lattices: Sequence[Lattice],
+        generator: torch.Generator | None = None,
+    ) -> None:
+        """Initialise the layers from `generator`."""
         super().__init__()
         self.encoding = (
             SinusoidalEncoding(shape.frequencies, box)
@@ -175,8 +190,10 @@ class Field(nn.Module):
             else GridEncoding([lattices[k] for k, _ in shape.grids], [n for _, n in shape.grids])
         )
         self.spread: SpreadEncoding | None = None
-        self.hidden = nn.Linear(self.encoding.features, shape.hidden)
-        self.heads = nn.ModuleDict({name: nn.Linear(shape.hidden, n) for name, n in shape.heads.items()})
+        self.hidden = linear(self.encoding.features, shape.hidden, generator)
+        self.heads = nn.ModuleDict(
+            {name: linear(shape.hidden, n, generator) for name, n in shape.heads.items()}
+        )
         # Mean and deviation of plain values, whose unit is anyone's: the heads learn them standardised.
         self.standard = nn.ParameterDict(
             {
@@ -215,12 +232,17 @@ class Fields(nn.Module):
     """All fields of a map, one for all properties or one for each, and the lattices they share."""
 
     def __init__(
-        self, shapes: Sequence[FieldShape], box: Float[Tensor, "2 3"], lattices: Sequence[Lattice]
+        self,
+        shapes: Sequence[FieldShape],
+        box: Float[Tensor, "2 3"],
+        lattices: Sequence[Lattice],
+        generator: torch.Generator | None = None,
     ) -> None:
+        """Initialise the layers from `generator`, field by field."""
         super().__init__()
         self.shapes = tuple(shapes)
         self.lattices = nn.ModuleList(lattices)
-        self.of = nn.ModuleList(Field(shape, box, lattices) for shape in shapes)
+        self.of = nn.ModuleList(Field(shape, box, lattices, generator) for shape in shapes)
 
     def forward(self, x_in_base: Float[Tensor, "n 3"], names: Collection[str]) -> dict[str, Tensor]:
         """Outputs (n, outputs) of the named heads at points (n,3)."""

@@ -10,17 +10,16 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.ndimage import distance_transform_edt
-from scipy.sparse import csr_array
-from scipy.spatial import KDTree
 
 from jcr.errors import InputError
 from jcr.geometry import apply, rotation_exp, transform
+from jcr.scene.spheres import cover_with_spheres
 
 if TYPE_CHECKING:
     import trimesh
 
-VOXELS, CANDIDATES = 100_000, 1000
-"""At most this many in a shape's bounding box; and of these, drawn as centres of spheres at a time."""
+VOXELS = 100_000
+"""Largest number of voxels in the bounding box of a shape."""
 
 JointValues = Float[ndarray, "*batch dof"] | Mapping[str, Float[ndarray, "*batch"] | float]
 
@@ -205,11 +204,10 @@ def _joints(robot: Any, links: tuple[str, ...], path: Path) -> tuple[RobotJoint,
 def spheres_of_shape(
     shape: "trimesh.Trimesh", link_from_shape: Float[ndarray, "4 4"], excess: float
 ) -> tuple[Float[ndarray, "s 3"], Float[ndarray, " s"]]:
-    """Centres (s,3) in the link and radii (s,) of spheres that together hold all of a solid shape.
+    """Return centres (s,3) in the link and radii (s,) m of spheres that together hold a solid shape.
 
-    A ball about an inner place, larger by `excess` (m) than its depth, sticks out of the shape by no more, but
-    for half a voxel of the search (a sixth of the excess, for shapes up to 15 cm). Of such balls, always the
-    one that holds most of what none holds yet is taken (greedy set cover).
+    They stick out of it by at most `excess` (m) and half a voxel of the search: a sixth of the excess, for shapes up to
+    15 cm.
     """
     from trimesh.primitives import Sphere  # half a second, and maps of captures without a URDF do without
 
@@ -218,27 +216,9 @@ def spheres_of_shape(
         return apply(link_from_shape, np.asarray(ball.center)[None]), np.array([float(ball.radius)])
     pitch = max(excess / 3, float(np.prod(shape.extents) / VOXELS) ** (1 / 3))
     voxels = cast(Any, shape.voxelized(pitch)).fill()
-    points = np.asarray(voxels.points)
     solid = np.pad(voxels.matrix, 1)
-    depth = pitch * np.asarray(distance_transform_edt(solid))[solid]
-    radius = depth - pitch / 2 + excess
-    slack = pitch * np.sqrt(3) / 2  # the solid may fill the whole of each voxel
-
-    draw, tree = np.random.default_rng(0), KDTree(points)
-    missing, chosen = np.ones(len(points), bool), []
-    while missing.any():
-        of = np.flatnonzero(missing)
-        candidates = draw.choice(of, min(CANDIDATES, len(of)), replace=False)
-        fixed = tree.query_ball_point(points[candidates], radius[candidates] - slack)
-        rows = np.repeat(np.arange(len(candidates)), [len(row) for row in fixed])
-        holds = csr_array(
-            (np.ones(len(rows), np.float32), (rows, np.concatenate(fixed))), (len(fixed), len(points))
-        )
-        while True:
-            gain = holds @ missing.astype(np.float32)
-            best = int(gain.argmax())
-            if gain[best] == 0:
-                break
-            chosen.append(candidates[best])
-            missing[fixed[best]] = False
-    return apply(link_from_shape, points[chosen]), radius[chosen]
+    depth = np.asarray(distance_transform_edt(solid))
+    distance = np.where(solid, pitch * (0.5 - depth), np.inf)
+    index, radii = cover_with_spheres(distance, pitch, excess)
+    centers = apply(np.asarray(voxels.transform), index - 1.0)
+    return apply(link_from_shape, centers), radii

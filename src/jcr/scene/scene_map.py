@@ -1,5 +1,6 @@
 """The map a planner asks: is this free, how far is the nearest surface, what is there, has anyone looked."""
 
+import copy
 import json
 import threading
 from dataclasses import asdict
@@ -78,9 +79,20 @@ class SceneMap:
         return 2 * self.seen.cell
 
     def to(self, device: str) -> "SceneMap":
-        """The same map on another device, e.g. "cuda"."""
+        """Return a copy of the map on another device, e.g. "cuda"."""
         seen = SeenGrid(self.seen.lower.to(device), self.seen.cell, self.seen.state.to(device))
-        return SceneMap(self.fields.to(device), seen, self.label_names, self.history)
+        return SceneMap(copy.deepcopy(self.fields).to(device), seen, self.label_names, self.history)
+
+    def field(self, x_in_base: Float[ndarray, "n 3"] | Float[Tensor, "n 3"]) -> dict[str, Any]:
+        """Return the raw answers of the networks at points (n,3) m: (n,outputs) for each of `properties`.
+
+        Occupancy and labels are logits, other properties plain values; unseen space is not considered.
+        """
+        x = self._points(x_in_base, "points")
+        answers = in_chunks(lambda x: tuple(self.fields(x, self.properties).values()), x)
+        if not isinstance(x_in_base, Tensor):
+            answers = tuple(answer.cpu().numpy() for answer in answers)
+        return dict(zip(self.properties, answers, strict=True))
 
     def query(
         self, x_in_base: Float[ndarray, "n 3"] | Float[Tensor, "n 3"], unknown: Unknown = "report"

@@ -16,7 +16,12 @@ from jcr.scene.seen import SeenGrid
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """What a preset is made of."""
+    """Networks and samples of a preset.
+
+    The preset "paper" has the encoding, the hidden layer and the uniform negatives of the paper (`scene/paper.py`), but
+    one network for all properties of surfaces, points weighted by confidence, a learning rate that falls until the
+    validation loss stops falling, and bfloat16 where the processor has it.
+    """
 
     hidden: int
     frequencies: int

@@ -175,6 +175,11 @@ def _objects(
     count = np.bincount(part)
     # What mostly stands beside the bare plane is background, such as a wall; what is too small is noise.
     plane_xy = x_in_support[bare, :2]
+    if bare.sum() < FEWEST or np.linalg.eigvalsh(np.cov(plane_xy.T))[0] < PATCH**2 / 12:
+        raise InputError(
+            "no bare part of the support plane is in view, so objects cannot be told from what lies beside it; leave a "
+            "hand's width of it free, or give label images"
+        )
     outline = Delaunay(plane_xy[ConvexHull(plane_xy).vertices])
     beside = np.bincount(part, outline.find_simplex(x_in_support[:, :2]) < 0) / np.maximum(count, 1)
     span = np.array(
