@@ -18,7 +18,7 @@ from jcr.calibration.robot_errors import errors_of, robot_errors
 from jcr.calibration.seen import within_95
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
-from jcr.check import QUICK, check, spread_rows
+from jcr.check import QUICK, check_capture, spread_rows
 from jcr.errors import RejectedError
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.pipeline import calibrate as run_calibrate
@@ -105,7 +105,7 @@ def _cells(row: Row) -> list[str]:
 def of_capture(folder: Path) -> Row | None:
     """Of images on disk; None where the calibration is rejected."""
     capture = read_capture(folder)
-    found = check(capture)
+    found = check_capture(capture)
     try:
         with tempfile.TemporaryDirectory() as out:
             result = run_calibrate(capture, out)

@@ -14,7 +14,7 @@ import numpy as np
 
 import jcr
 from jcr.capture.options import ReadOptions
-from jcr.check import check
+from jcr.check import check_capture
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))  # of the checkout, for what is simulated
 from simulation.ros_bag import write_bag
@@ -38,7 +38,7 @@ for name, pose in zip(capture.images, capture.base_from_gripper, strict=True):
     print(f"{name}: gripper at {np.array2string(pose[:3, 3], precision=3)} m")
 
 # Before the half minute of a calibration: do these motions show everything, and how exact will it be?
-found = check(capture, look=False)
+found = check_capture(capture, look=False)
 print(f"motions show everything: {found.observability.observable}")
 if found.expected is not None:
     print(f"to be expected: a seen point within {found.expected.seen.within_95_mm:.1f} mm (95 % of errors)")

@@ -31,7 +31,7 @@ def test_the_api_is_listed_and_every_name_of_it_is_there():
     assert set(jcr.__all__) <= set(dir(jcr)) and "__version__" in dir(jcr)
     assert all(hasattr(jcr, name) for name in dir(jcr))
     assert len(set(jcr.__all__)) == len(jcr.__all__)
-    with pytest.raises(AttributeError, match="no attribute 'calibrated'"):
+    with pytest.raises(AttributeError, match="No jcr attribute calibrated"):
         _ = jcr.calibrated  # pyright: ignore[reportAttributeAccessIssue]
 
 

@@ -318,9 +318,14 @@ def test_a_new_image_of_a_fixed_camera_shows_whether_it_rotated(
         now_from_then = k @ rotation_exp(np.radians(deg) * np.array([0.6, -0.64, 0.48])) @ np.linalg.inv(k)
         seen = cv2.warpPerspective(image, now_from_then, image.shape[1::-1], flags=cv2.INTER_CUBIC)
         noise = np.random.default_rng(3).normal(0, 2, image.shape)
-        cv2.imwrite(str(tmp_path / "today.png"), np.clip(seen + noise, 0, 255).astype(np.uint8))
+        today = write_capture(tmp_path / f"today{deg}", capture, capture.base_from_gripper, [10])
+        new = np.clip(seen + noise, 0, 255).astype(np.uint8)
+        cv2.imwrite(str(today.folder / "overhead_today.png"), new)
+        facts = json.loads((today.folder / "capture.json").read_text())
+        facts["cameras"] = {"overhead": {"mount": "base", "images": ["overhead_today.png"]}}
+        (today.folder / "capture.json").write_text(json.dumps(facts))
         capsys.readouterr()
-        status = dispatch(["verify", str(run), str(tmp_path / "today.png"), "--camera", "overhead", "--json"])
-        found = json.loads(capsys.readouterr().out)
+        status = dispatch(["verify", str(run), str(today.folder), "--json"])
+        found = json.loads(capsys.readouterr().out)["cameras"]["overhead"]
         assert (status, found["moved"]) == ((3, True) if deg else (0, False))
         assert np.linalg.norm(found["drift_deg"]) == pytest.approx(deg, abs=0.06)

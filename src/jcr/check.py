@@ -9,12 +9,10 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.boards.proposal import proposed
-from jcr.calibration.adjust import adjusted
 from jcr.calibration.case import Case
 from jcr.calibration.checks.left_out import left_out_poses
 from jcr.calibration.checks.robot import angle_finding
 from jcr.calibration.checks.views import as_causes, view_findings
-from jcr.calibration.conventions import better_reading, convention_finding
 from jcr.calibration.expected import (
     FEWEST,
     Ahead,
@@ -25,17 +23,17 @@ from jcr.calibration.expected import (
     assumed_of_poses,
     typical_camera,
 )
-from jcr.calibration.fit import fitted
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.poses import is_one
+from jcr.calibration.poses import calibrate_poses, is_one
 from jcr.calibration.robot_errors import RobotErrors, errors_of, robot_errors
 from jcr.calibration.stage import checked
 from jcr.camera import fold_distance_px
 from jcr.capture.images import brightness_and_sharpness, exposure_fault, read_image
+from jcr.capture.options import MIN_FRAMES
 from jcr.capture.read import read_source
 from jcr.errors import RejectedError
 from jcr.estimation.foreseen import ForeseenCamera
-from jcr.estimation.hand_eye import SCALE_STD, solve_hand_eye
+from jcr.estimation.hand_eye import SCALE_STD
 from jcr.estimation.observability import observability
 from jcr.estimation.residuals import angle_ratio
 from jcr.geometry import largest_motion
@@ -48,7 +46,6 @@ from jcr.records import (
     NextPose,
     Observability,
     PosePairs,
-    Reconstruction,
     Verdict,
 )
 from jcr.records.findings import CAMERA, without_consequences
@@ -97,7 +94,7 @@ class Examination:
         return "accepted" if self.hand_eye is None else self.hand_eye.verdict
 
 
-def check(
+def check_capture(
     capture: Capture | PosePairs | str | Path,
     suggest: int = 0,
     look: bool = True,
@@ -303,15 +300,9 @@ def _compare_registered(
             board = proposed([read_image(capture.folder / name) for name in capture.images])
         return _Compared(faults=(str(error),), remarks=() if board is None else (sentence(board),))
     rows = found.image_index
-    mm_deg = None if robot_noise is None else (1e3 * robot_noise[0], float(np.degrees(robot_noise[1])))
-    options_then = CalibrateOptions(robot_noise=mm_deg)
-    if size_px is None:
-        case = checked(capture, found, options_then, robot.of(rows))
-        shown = _compare_by_calibration(capture, case)
-    else:
-        case = fitted(capture, found, options_then, robot.of(rows))
-        case = adjusted(case) if case.hand_eye.converged else case
-        shown = _compare_poses(capture.base_from_gripper[rows], found, case.hand_eye)
+    options_then = CalibrateOptions(robot_noise=_mm_deg(robot_noise))
+    case = checked(capture, found, options_then, robot.of(rows))
+    shown = _compare_by_calibration(capture, case)
     return replace(
         shown,
         remarks=(*shown.remarks, *found.notes),
@@ -325,40 +316,46 @@ def _compare_by_calibration(capture: Capture, case: Case) -> _Compared:
     hand_eye = case.hand_eye
     if hand_eye.converged:
         hand_eye = hand_eye.with_findings(*left_out_poses(capture, case.reconstruction, hand_eye))
-    ratio, said = hand_eye.robot.angle_ratio, without_consequences(hand_eye.findings)
+    ratio, (faults, remarks) = hand_eye.robot.angle_ratio, _reasons(hand_eye)
     return _Compared(
         hand_eye=hand_eye,
         ratio=None if ratio is None or not hand_eye.converged else (ratio.ratio, ratio.std),
-        faults=tuple(sentence(one) for one in said if one.severity == "rejects"),
-        remarks=tuple(sentence(one) for one in said if one.severity == "warns"),
+        faults=faults,
+        remarks=remarks,
     )
 
 
 def _compare_pairs(pairs: PosePairs, noise: tuple[float, float] | None) -> _Compared:
-    """Gripper poses compared with camera poses that were given."""
-    gripper, camera = pairs.base_from_gripper, pairs.recon_from_camera
-    hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise)
-    assumptions = None
+    """Compare gripper poses with camera poses that were given, by the calibration of both."""
+    hand_eye = calibrate_poses(pairs, CalibrateOptions(robot_noise=_mm_deg(noise)))
+    used, ratio, assumptions = hand_eye.inliers, None, None
+    gripper, camera = pairs.base_from_gripper[used], pairs.recon_from_camera[used]
     if hand_eye.converged:
         scale_std = SCALE_STD if pairs.is_metric and is_one(hand_eye) else None
-        assumptions = assumed_of_poses(hand_eye, gripper[hand_eye.inliers], scale_std)
-    shown = _compare_poses(gripper, pairs, hand_eye)
-    return replace(shown, registered=np.flatnonzero(hand_eye.inliers), assumptions=assumptions)
+        assumptions = assumed_of_poses(hand_eye, gripper, scale_std)
+        ratio = angle_ratio(gripper, camera) if len(gripper) >= MIN_FRAMES else None
+    faults, remarks = _reasons(hand_eye)
+    return _Compared(
+        hand_eye=hand_eye,
+        ratio=ratio,
+        faults=faults,
+        remarks=remarks,
+        registered=np.flatnonzero(used),
+        assumptions=assumptions,
+    )
 
 
-def _compare_poses(
-    used: Float[ndarray, "m 4 4"],
-    found: Reconstruction | PosePairs,
-    hand_eye: HandEye,
-) -> _Compared:
-    camera, ratio = found.recon_from_camera, None
-    reading = better_reading(used, camera)
-    faults = [] if reading is None else [sentence(convention_finding(reading))]
-    faults += [warning for warning in hand_eye.warnings if not hand_eye.converged]
-    remarks = [warning for warning in hand_eye.warnings if hand_eye.converged]
-    if hand_eye.converged and hand_eye.inliers.sum() >= 3:
-        ratio = angle_ratio(used[hand_eye.inliers], camera[hand_eye.inliers])
-    return _Compared(hand_eye=hand_eye, ratio=ratio, faults=tuple(faults), remarks=tuple(remarks))
+def _reasons(hand_eye: HandEye) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the sentences of the findings that reject, and of those that warn."""
+    said = without_consequences(hand_eye.findings)
+    rejects, warns = (
+        tuple(sentence(one) for one in said if one.severity == severity) for severity in ("rejects", "warns")
+    )
+    return rejects, warns
+
+
+def _mm_deg(noise: tuple[float, float] | None) -> tuple[float, float] | None:
+    return None if noise is None else (1e3 * noise[0], float(np.degrees(noise[1])))
 
 
 def _brightness_and_sharpness_of_each(capture: Capture) -> tuple[Float[ndarray, " n"], Float[ndarray, " n"]]:

@@ -16,7 +16,7 @@ from jcr.calibration.robot_errors import of_poses, robot_errors
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
 from jcr.capture.read import read_source
-from jcr.cell.added import camera_of, read_added_cameras
+from jcr.cell.added import read_added_cameras
 from jcr.distributions import chi2
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.absolute_pose import CameraPose
@@ -25,10 +25,10 @@ from jcr.estimation.wrist import pose_problem
 from jcr.geometry import Poses, step_between
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
-from jcr.reconstruct import ReconstructOptions, reconstruct
-from jcr.records import Capture, PosePairs, Reconstruction, Verdict
+from jcr.reconstruct import reconstruct
+from jcr.records import Capture, CellCamera, HandEye, PosePairs, Reconstruction, Verdict
 from jcr.records.words import sentence
-from jcr.run_folder import RunFolder
+from jcr.run_folder import MadeWith, RunFolder
 from jcr.sfm.register import register
 
 ROUNDING = 1e-9
@@ -67,6 +67,8 @@ class Verification:
     how: str
     fixed: str | None = None
     """Name of the camera, where it is a fixed one; the drift is then along axes of the base."""
+    others: tuple["Verification", ...] = ()
+    """Fixed cameras of the run that the new capture has images of."""
 
     @property
     def drift_m(self) -> float:
@@ -112,7 +114,7 @@ class Verification:
         return f"the camera has moved on the gripper; {anew}"
 
 
-def verify(
+def verify_run(
     out: str | Path,
     new: Capture | str | Path,
     options: VerifyOptions | Mapping[str, Any] | None = None,
@@ -143,15 +145,15 @@ def verify(
             for name, place in zip(new.images, located, strict=True) if not isinstance(place, CameraPose)]  # fmt: skip
     options_then = folder.options()
     if len(lost) < len(new):
-        return _in_old_scene(
-            (calibration, capture, reconstruction, options_then.calibrate), new, located, lost, options
-        )
+        then = (calibration, capture, reconstruction, options_then.calibrate)
+        found = _in_old_scene(then, new, located, lost, options)
+        return replace(found, others=_fixed_cameras(folder, then[1:], new, options, progress))
     if len(new) < MIN_TO_RECALIBRATE:
         raise RejectedError(
             f"cannot tell: {'; '.join(lost)}; take images of the scene that was calibrated on, or "
             f"{MIN_TO_RECALIBRATE} or more of another one"
         )
-    return _by_recalibration(calibration, new, options_then.reconstruct, options, progress)
+    return _by_recalibration(calibration, new, options_then, options, progress)
 
 
 def _read(new: Capture | str | Path) -> Capture:
@@ -174,12 +176,16 @@ def _calibrated_on(folder: RunFolder, calibration: CalibrationFile, new: Capture
         raise InputError(
             f"{capture.folder}: has changed since {folder.path} was made; run `jcr calibrate` again"
         )
-    if new.image_size != capture.image_size:
-        raise InputError(
-            f"{new.folder}: images of {new.image_size[0]}x{new.image_size[1]} pixels, the calibration is for "
-            f"{capture.image_size[0]}x{capture.image_size[1]}; take them with the same camera and resolution"
-        )
+    _require_size(new.folder, new.image_size, capture.image_size)
     return capture
+
+
+def _require_size(folder: Path, now: tuple[int, int], then: tuple[int, int]) -> None:
+    if now != then:
+        raise InputError(
+            f"{folder}: images of {now[0]}x{now[1]} pixels, the calibration is for {then[0]}x{then[1]}; take them with "
+            "the same camera and resolution"
+        )
 
 
 def _in_old_scene(
@@ -210,62 +216,71 @@ def _in_old_scene(
     return _judged(found, options, tuple(new.images[k] for k in shared), notes, "in the old scene")
 
 
-def verify_camera(
-    out: Path,
-    name: str,
-    files: Sequence[Path],
-    options: VerifyOptions = VerifyOptions(),
-    progress: Progress | None = None,
-) -> Verification:
-    """Hold the place of a fixed camera of the run folder `out` against new images of the same scene by it.
+def _fixed_cameras(
+    folder: RunFolder,
+    calibrated: tuple[Capture, Reconstruction, CalibrateOptions],
+    new: Capture,
+    options: VerifyOptions,
+    progress: Progress | None,
+) -> tuple[Verification, ...]:
+    """Compare the place of each fixed camera of the run with its new images, where `new` has some.
 
-    Both places are found together, so that what the wrist camera's calibration leaves open moves them alike. Raises
-    InputError where the run has placed no fixed camera of that name, or the images cannot be its; RejectedError
-    where they share too few features with the scene.
+    The places before and now are estimated together, so that the errors of the wrist camera move both alike. Raises
+    RejectedError where the images share too few features with the scene.
     """
-    from jcr.cell.stage import place_cameras  # pycolmap, which help need not wait for
-
-    folder = RunFolder(out)
-    _, reconstruction = folder.calibrated()
-    capture, made_with, cameras = folder.capture(), folder.options(), folder.cameras()
+    capture, reconstruction, calibrate_options = calibrated
+    cameras = folder.cameras()
     others = {camera.name: camera for camera in (*capture.others, *read_added_cameras(folder.path, capture))}
     placed = {
         one.name: one.intrinsics.record()
         for one in ([] if cameras is None else cameras.cameras)
         if one.converged and one.mount == "base" and one.intrinsics is not None and one.name in others
     }
-    if name not in placed:
-        there = ", ".join(placed) or "none"
-        raise InputError(f"--camera {name}: {out} has placed no fixed camera of that name; there are {there}")
-    own = others[name]
-    _require_new(
-        {str(file): read_image(file) for file in files},
-        _images(own.folder or capture.folder, own.images),
-    )
-    # One camera took both: what is wrong with its intrinsics moves both places alike.
-    known = placed[name]
-    exact = np.zeros(4 + len(known.distortion))
-    then = replace(others[name], intrinsics=known, intrinsics_std=exact)
-    now = camera_of(f"{name[:60]}_now", files, None, ())
-    if now.image_size != then.image_size:
-        raise InputError(
-            f"{files[0]}: {now.image_size[0]}x{now.image_size[1]} pixels, but {name} has "
-            f"{then.image_size[0]}x{then.image_size[1]}; take it with the same camera and resolution"
+    found = []
+    for camera in new.others:
+        if camera.name not in placed:
+            continue
+        own = others[camera.name]
+        taken_now = _images(camera.folder or new.folder, camera.images)
+        _require_new(taken_now, _images(own.folder or capture.folder, own.images))
+        _require_size(new.folder, camera.image_size, own.image_size)
+        # One camera took both: an error of its intrinsics moves both places alike.
+        known = {
+            "intrinsics": placed[camera.name],
+            "intrinsics_std": np.zeros(4 + len(placed[camera.name].distortion)),
+        }
+        now = replace(camera, name=f"{camera.name[:60]}_now", folder=camera.folder or new.folder, **known)
+        both = [replace(own, **known), now]
+        hand_eye = calibrate(capture, reconstruction, calibrate_options)
+        found.append(
+            _place_twice(capture, both, (reconstruction, hand_eye), calibrate_options, options, progress)
         )
-    now = replace(now, intrinsics=known, intrinsics_std=exact)
-    hand_eye = calibrate(capture, reconstruction, made_with.calibrate)
-    found = place_cameras(capture, [then, now], reconstruction, hand_eye, made_with.calibrate, progress)
-    for camera in found.cameras:
+    return tuple(found)
+
+
+def _place_twice(
+    capture: Capture,
+    cameras: Sequence[CellCamera],
+    calibrated: tuple[Reconstruction, HandEye],
+    calibrate_options: CalibrateOptions,
+    options: VerifyOptions,
+    progress: Progress | None,
+) -> Verification:
+    """Compare the two places of one camera, before and now."""
+    from jcr.cell.stage import place_cameras  # pycolmap, which help need not wait for
+
+    placed = place_cameras(capture, cameras, *calibrated, calibrate_options, progress)
+    for camera in placed.cameras:
         if camera.parent_from_camera is None:
             raise RejectedError(f"cannot tell: {camera.doubt}")
-    assert found.answer is not None
-    before, after = found.of[name], found.of[now.name]
-    j = found.answer.derivative(after) - found.answer.derivative(before)
-    covariance = j @ found.answer.covariance @ j.T
-    offset = step_between(before(found.answer.state), after(found.answer.state))
-    notes = tuple(text for camera in found.cameras for text in camera.warnings)
-    images = tuple(str(file) for file in files)
-    return replace(_of_two(offset, covariance, options, images, notes, "in the mapped scene"), fixed=name)
+    assert placed.answer is not None
+    before, after = (placed.of[camera.name] for camera in cameras)
+    j = placed.answer.derivative(after) - placed.answer.derivative(before)
+    covariance = j @ placed.answer.covariance @ j.T
+    offset = step_between(before(placed.answer.state), after(placed.answer.state))
+    notes = tuple(text for camera in placed.cameras for text in camera.warnings)
+    found = _of_two(offset, covariance, options, cameras[1].images, notes, "in the mapped scene")
+    return replace(found, fixed=cameras[0].name)
 
 
 def _images(folder: Path, names: Sequence[str]) -> dict[str, UInt8[ndarray, "h w 3"]]:
@@ -360,7 +375,7 @@ def _is_moved(offset: Float[ndarray, "6"], p_value: float, options: VerifyOption
 def _by_recalibration(
     calibration: CalibrationFile,
     new: Capture,
-    reconstruct_options: ReconstructOptions,
+    options_then: MadeWith,
     options: VerifyOptions,
     progress: Progress | None,
 ) -> Verification:
@@ -368,8 +383,8 @@ def _by_recalibration(
     assert calibration.uncertainty is not None  # a converged calibration has one
     if calibration.intrinsics is not None:
         new = replace(new, intrinsics=calibration.intrinsics.record())
-    reconstruction = reconstruct(new, reconstruct_options, progress)
-    hand_eye = calibrate(new, reconstruction)
+    reconstruction = reconstruct(new, options_then.reconstruct, progress)
+    hand_eye = calibrate(new, reconstruction, options_then.calibrate)
     if not hand_eye.converged:
         raise RejectedError(f"cannot tell: a new calibration from these images failed ({hand_eye.doubt})")
     before = np.array(calibration.gripper_from_camera)

@@ -15,7 +15,7 @@ from jcr.calibration.calibration_json import CalibrationFile, calibration_file
 from jcr.calibration.expected import Ahead, assumed, expected, typical_camera
 from jcr.calibration.poses import calibrate_poses
 from jcr.calibration.robot_errors import errors_of
-from jcr.check import check
+from jcr.check import check_capture
 from jcr.estimation.next_poses import assumed_camera
 from jcr.geometry import transform
 from jcr.records import Intrinsics, NextPose, PosePairs
@@ -36,7 +36,7 @@ def test_what_is_expected_is_what_is_reported():
 @pytest.mark.slow
 def test_check_expects_of_the_bundled_capture_what_its_run_reports(tabletop: Path, done: Path):
     uncertainty = CalibrationFile.model_validate_json((done / "calibration.json").read_text()).uncertainty
-    found = check(tabletop).expected
+    found = check_capture(tabletop).expected
     assert uncertainty is not None and uncertainty.seen is not None and found is not None
     assert abs(np.log(found.seen.within_95_mm / uncertainty.seen.within_95_mm)) < WITHIN
     assert abs(np.log(found.seen.rotation_95_deg / uncertainty.seen.rotation_95_deg)) < WITHIN
@@ -59,12 +59,16 @@ def views(tabletop: Path, folder: Path, rows: list[int], blurred: list[int]) -> 
 
 
 def test_blurred_images_better_nothing(tabletop: Path, tmp_path: Path):
-    sharp = check(views(tabletop, tmp_path / "sharp", [0, 2, 4, 6], []), look=False)
-    more = check(views(tabletop, tmp_path / "more", [0, 2, 4, 6, 8, 10], [8, 10]), suggest=1, look=False)
+    sharp = check_capture(views(tabletop, tmp_path / "sharp", [0, 2, 4, 6], []), look=False)
+    more = check_capture(
+        views(tabletop, tmp_path / "more", [0, 2, 4, 6, 8, 10], [8, 10]), suggest=1, look=False
+    )
     assert more.counted.tolist() == [0, 1, 2, 3] and sharp.expected is not None and more.expected is not None
     assert np.allclose(more.expected.std, sharp.expected.std)
     assert more.suggestions[0].like in (0, 1, 2, 3)
-    taken_again = check(views(tabletop, tmp_path / "again", [0, 2, 4, 6, 8, 10], []), look=False).expected
+    taken_again = check_capture(
+        views(tabletop, tmp_path / "again", [0, 2, 4, 6, 8, 10], []), look=False
+    ).expected
     assert taken_again is not None
     assert taken_again.seen.within_95_mm < 0.9 * sharp.expected.seen.within_95_mm
 

@@ -55,7 +55,7 @@ class Arguments:
 def main(arguments: Arguments) -> int:
     """Examine the capture and print what was found."""
     from jcr.calibration.options import CalibrateOptions, check_options
-    from jcr.check import check
+    from jcr.check import check_capture
     from jcr.errors import InputError, RejectedError
     from jcr.progress import progress_bars
 
@@ -67,7 +67,7 @@ def main(arguments: Arguments) -> int:
         progress_bars() as progress,
         looked_at(arguments.capture, arguments.read, progress) as capture,
     ):
-        found = check(
+        found = check_capture(
             capture,
             arguments.suggest,
             not arguments.poses_only,

@@ -22,21 +22,18 @@ class Arguments:
 
     OUT is the run folder of the calibration; its capture must still be at its old path. CAPTURE is a capture in any
     format with one or more new images of the same scene (two or three distinguish a moved camera from a moved table),
-    or with five or more images of another scene. The exit status is 3 if something has moved, or if the images cannot
-    decide.
+    or with five or more images of another scene. Fixed cameras of the run that CAPTURE names in `cameras` are tested
+    too. The exit status is 3 if something has moved, or if the images cannot decide.
 
     examples:
       jcr verify out/table captures/this-morning
       jcr verify out/table captures/this-morning --tolerance 1 0.1 --json
-      jcr verify out/table overhead_today.png --camera overhead
     """
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of the run that calibrated the camera."""
     capture: Annotated[Path, tyro.conf.Positional]
     """The new images and their poses: a capture folder, or another format (jcr docs captures)."""
-    camera: str | None = None
-    """Test this fixed camera of the run instead; CAPTURE is then a new image from it, of the same scene."""
     read: ReadOptions = field(default_factory=ReadOptions)
     verify: VerifyOptions = field(default_factory=VerifyOptions)
     output: Output = field(default_factory=Output)
@@ -44,35 +41,25 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Verify and print what to do."""
+    from jcr.errors import RejectedError
     from jcr.progress import progress_bars
-    from jcr.verify import verify, verify_camera
+    from jcr.verify import verify_run
 
-    if arguments.camera is not None:
-        with progress_bars() as progress:
-            return _print_found(
-                verify_camera(
-                    arguments.out, arguments.camera, [arguments.capture], arguments.verify, progress
-                ),
-                arguments.output,
-            )
     with (
         progress_bars() as progress,
         looked_at(arguments.capture, arguments.read, progress, at_least=1) as new,
     ):
         capture = with_images(new, arguments.capture, "which verify needs")
-        found = verify(arguments.out, capture, arguments.verify, progress)
-    return _print_found(found, arguments.output)
-
-
-def _print_found(found: "Verification", output: Output) -> int:
-    """Print it; RejectedError where something has moved."""
-    from jcr.errors import RejectedError
-
-    output.result(_as_text(found), _as_json(found))
-    for note in found.notes:
-        warn(note)
-    if found.moved:
-        raise RejectedError(found.advice)
+        found = verify_run(arguments.out, capture, arguments.verify, progress)
+    cameras = (found, *found.others)
+    facts = _as_json(found) | {"cameras": {one.fixed: _as_json(one) for one in found.others}}
+    arguments.output.result("".join(map(_as_text, cameras)), facts)
+    for one in cameras:
+        for note in one.notes:
+            warn(note)
+    for one in cameras:
+        if one.moved:
+            raise RejectedError(one.advice)
     return 0
 
 

@@ -18,7 +18,7 @@ corrected gripper poses, a firm mount, the arm's name or joint angles; or nothin
 Verdict = Literal["accepted", "accepted with warnings", "rejected"]
 
 
-class Kind(StrEnum):
+class FindingKind(StrEnum):
     """Every kind of finding there is."""
 
     UNOBSERVABLE = "unobservable motion"
@@ -84,6 +84,9 @@ class Kind(StrEnum):
     FRAME_REPEATED = "image repeats another"
     SIZE_DIFFERS = "image size differs"
     CLOCK_JUMPS = "clock jumps back"
+
+
+Kind = FindingKind
 
 
 @dataclass(frozen=True, kw_only=True)
