@@ -87,13 +87,10 @@ def test_notebooks_show_records_as_tables(tabletop: Path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "first", ["import jcr.estimation.wrist as b, jcr.estimation.hand_eye as s", "import jcr; jcr.calibrate"]
-)
+@pytest.mark.parametrize("first", ["import jcr.pipeline, jcr.check, jcr.verify", "import jcr; jcr.calibrate"])
 def test_packages_and_functions_have_names_of_their_own(first: str):
     done = python(
-        f"{first}\nimport jcr.estimation.wrist as b, jcr.estimation.hand_eye as s, jcr\n"
-        "assert jcr.calibrate is jcr.pipeline.calibrate and s.solve_hand_eye is jcr.solve_hand_eye and b.adjust"
+        f"{first}\nimport jcr\nassert jcr.calibrate is jcr.pipeline.calibrate and jcr.run is jcr.pipeline.run"
     )
     assert done.returncode == 0, done.stderr
 
@@ -105,6 +102,7 @@ def test_others_write_pngs_and_archives_where_jcr_came_first():
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_an_import_of_pycolmap_before_jcr_is_warned_of():
     assert "import jcr first" in python("import pycolmap, jcr").stderr
     assert "import jcr first" not in python("import jcr, pycolmap").stderr

@@ -37,6 +37,7 @@ from .records import Finding as Finding
 from .records import FindingKind as FindingKind
 from .records import HandEye as HandEye
 from .records import Intrinsics as Intrinsics
+from .records import LeaveOneOut as LeaveOneOut
 from .records import NextPose as NextPose
 from .records import Observability as Observability
 from .records import PointCloud as PointCloud
