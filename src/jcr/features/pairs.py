@@ -1,43 +1,57 @@
-"""Which pairs of images to match: all of a few images, of many those that are near or see the same."""
+"""Choice of the pairs of images to match: all of a few images, of many those that are near or see the same points."""
 
 import math
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.camera import project
 from jcr.features.epipolar import scene_points, translation_of_x
 from jcr.features.gate import Gate, Key
 from jcr.features.verify import View
-from jcr.geometry import apply, inverse, motion_length
+from jcr.geometry import apply, inverse, motion_length, rotation_angle
 from jcr.records import Intrinsics
 
 FIRST_NEIGHBOURS, NEIGHBOURS = 4, 8
-"""Of an image, by the way between grippers: from which X is sought, and where these do not show it."""
+"""Numbers of partners of an image by the gripper's motion: to find X, and where these do not show it."""
 FEW = 16
-"""A capture of so few images has every pair matched at once: cheap, and a pair that only happens to match ties a camera
-whose others are far (doosan_bench: one camera 12 mm from its gripper with the nearest alone, 7 mm with every pair)."""
+"""Largest number of images of which every pair is matched at once. It is cheap, and a pair that happens to match may
+tie a camera that is far from all others (doosan_bench: 12 mm from its gripper with the nearest alone, 7 mm with all)."""
 PARTNERS = 8
-"""Of an image, by what both see, once X is known."""
+"""Number of partners of an image by the points that both see, once X is known."""
 WIDEST = math.radians(60)
-"""Between two viewing directions: nothing matches beyond."""
+"""Largest angle between two viewing directions; nothing matches beyond."""
 LEAST_COMMON = 0.25
-"""Share of the scene in an image that the other must see, too."""
+"""Least share of the scene in an image that the other must see, too."""
+SAME_VIEWPOINT = 5e-3, math.radians(1)
+"""m, rad: images between which the gripper moved by less repeat one viewpoint, and show no parallax."""
 
 
 def all_pairs(n: int) -> list[Key]:
-    """Every pair of n images."""
+    """Return every pair of n images."""
     return [(i, j) for i in range(n) for j in range(i + 1, n)]
 
 
 def near_pairs(motion: Float[ndarray, "n n 4 4"], neighbours: int) -> list[Key]:
-    """The nearest neighbours of every image by the gripper's way; in proportion to n."""
-    return _best(-np.asarray(motion_length(motion)), neighbours)
+    """Return the pairs of every image with its nearest viewpoints by the gripper's motion, in proportion to n."""
+    return _best(-np.asarray(motion_length(motion)), neighbours, viewpoints(motion))
+
+
+def viewpoints(motion: Float[ndarray, "n n 4 4"]) -> Int[ndarray, " n"]:
+    """Return the row of the first image of each image's viewpoint."""
+    metres, radians = SAME_VIEWPOINT
+    way = np.linalg.norm(motion[..., :3, 3], axis=-1)
+    same = (way < metres) & (np.asarray(rotation_angle(motion[..., :3, :3])) < radians)
+    first = np.arange(len(motion))
+    for row in range(len(motion)):
+        if first[row] == row:
+            first[(first > row) & same[row]] = row
+    return first
 
 
 def seen_in_common(view: View, found: Gate, motion: Float[ndarray, "n n 4 4"]) -> list[Key]:
-    """The partners of every image with which it shares most of the scene, by X and the points seen so far."""
+    """Return the pairs of every image with the viewpoints that share most of its scene, by X and the points so far."""
     x = translation_of_x(found, motion)
     if x is None:
         return []
@@ -53,27 +67,30 @@ def seen_in_common(view: View, found: Gate, motion: Float[ndarray, "n n 4 4"]) -
     toward = first_from_camera[:, :3, 2]
     between = np.arccos(np.clip(toward @ toward.T, -1, 1))
     score = np.where((between < WIDEST) & (share > LEAST_COMMON), share * np.cos(between), -np.inf)
-    return _best(score, PARTNERS)
+    return _best(score, PARTNERS, viewpoints(motion))
 
 
 def _in_image(intrinsics: Intrinsics, x_in_camera: Float[ndarray, "p 3"]) -> Bool[ndarray, " p"]:
-    """Which points an image shows."""
+    """Test which points an image shows."""
     inside = x_in_camera[:, 2] > 0
     x_px = project(intrinsics, x_in_camera[inside])
     inside[inside] = ((x_px > -0.5) & (x_px < [intrinsics.width - 0.5, intrinsics.height - 0.5])).all(1)
     return inside
 
 
-def _best(score: Float[ndarray, "n n"], count: int) -> list[Key]:
-    """The `count` partners of every image with the highest finite scores, as pairs."""
-    score = score.copy()
-    np.fill_diagonal(score, -np.inf)
-    order = np.argsort(-score, axis=1, kind="stable")[:, :count]
-    return sorted(
-        {
-            (min(i, int(j)), max(i, int(j)))
-            for i, partners in enumerate(order)
-            for j in partners
-            if np.isfinite(score[i, j])
-        }
-    )
+def _best(score: Float[ndarray, "n n"], count: int, viewpoint: Int[ndarray, " n"]) -> list[Key]:
+    """Return pairs of every image with the `count` other viewpoints of highest finite score, one image of each.
+
+    Repeats of a viewpoint take different images of another one, so that all are tied together and average their noise.
+    """
+    repeat = np.array([(viewpoint[:row] == of).sum() for row, of in enumerate(viewpoint)])
+    pairs = set()
+    for i, of_image in enumerate(score):
+        order = np.argsort(-of_image, kind="stable")
+        order = order[np.isfinite(of_image[order]) & (viewpoint[order] != viewpoint[i])]
+        best = viewpoint[order][np.sort(np.unique(viewpoint[order], return_index=True)[1])]
+        for rank, other in enumerate(best[:count]):
+            images = np.flatnonzero(viewpoint == other)
+            j = int(images[(repeat[i] + rank) % len(images)])
+            pairs.add((min(i, j), max(i, j)))
+    return sorted(pairs)
