@@ -1,6 +1,10 @@
 """LeRobot data sets, v2.1 and v3.0: the right images with the right poses, out of AV1 videos."""
 
+import fcntl
 import json
+import os
+import shutil
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -13,7 +17,7 @@ import jcr
 from jcr.capture.images import read_image
 from jcr.capture.joints import read_arm
 from jcr.capture.options import ReadOptions
-from jcr.records import Capture
+from jcr.records import Capture, Intrinsics
 from simulation.problems import HandEyeProblem, hand_eye_problem
 
 pytestmark = [
@@ -168,9 +172,58 @@ def test_what_is_not_in_the_set_is_listed(tmp_path: Path, small: Path, options: 
     assert not (tmp_path / "frames").exists()
 
 
-def test_damaged_sets_are_one_line(tmp_path: Path, small: Path, tabletop: Path):
-    import shutil
+def test_an_edited_set_or_camera_info_is_read_again(tmp_path: Path, small: Path, tabletop: Path):
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
+    path, into = shutil.copytree(small, tmp_path / "set"), tmp_path / "frames"
+    bundled = jcr.read_capture(tabletop)
+    intrinsics = Intrinsics(150.0, 150.0, 80.0, 60.0, 160, 120)
+    writers.write_camera_info(replace(bundled, intrinsics=intrinsics), tmp_path)
+    options = ReadOptions(frames=4, camera_info=tmp_path / "camera_info.yaml")
+    first = jcr.read_capture(path, options, into=into)
+    stamp = (into / first.images[0]).stat().st_mtime_ns
+    jcr.read_capture(path, options, into=into)
+    assert (into / first.images[0]).stat().st_mtime_ns == stamp
+    file = next(path.rglob("data/**/*.parquet"))
+    table = pq.read_table(file)
+    states = [[state[0] + 0.25, *state[1:]] for state in table[DROID].to_pylist()]
+    pq.write_table(table.set_column(table.column_names.index(DROID), DROID, pa.array(states)), file)
+    edited = jcr.read_capture(path, options, into=into)
+    moved = edited.base_from_gripper[:, :3, 3] - first.base_from_gripper[:, :3, 3]
+    np.testing.assert_allclose(moved, np.tile([0.25, 0, 0], (4, 1)), atol=1e-9)
+    writers.write_camera_info(replace(bundled, intrinsics=replace(intrinsics, fx=170.0)), tmp_path)
+    again = jcr.read_capture(path, options, into=into)
+    assert again.intrinsics is not None and again.intrinsics.fx == 170.0
+
+
+def test_a_second_extraction_into_the_same_folder_is_refused(tmp_path: Path, small: Path):
+    into = tmp_path / "frames"
+    into.mkdir()
+    lock = os.open(into, os.O_RDONLY)
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    with pytest.raises(jcr.InputError, match="another jcr extracts a recording there"):
+        jcr.read_capture(small, ReadOptions(frames=4), into=into)
+    os.close(lock)
+    assert len(jcr.read_capture(small, ReadOptions(frames=4), into=into)) == 4
+
+
+def test_states_of_different_lengths_are_one_line(tmp_path: Path, small: Path):
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    path = shutil.copytree(small, tmp_path / "set")
+    file = next(path.rglob("data/**/*.parquet"))
+    table = pq.read_table(file)
+    states = table[DROID].to_pylist()
+    states[3] = states[3][:4]
+    pq.write_table(table.set_column(table.column_names.index(DROID), DROID, pa.array(states)), file)
+    with pytest.raises(jcr.InputError, match="rows of different lengths") as caught:
+        jcr.read_capture(path, into=tmp_path / "frames")
+    assert "\n" not in str(caught.value)
+
+
+def test_damaged_sets_are_one_line(tmp_path: Path, small: Path, tabletop: Path):
     video, data = (
         "videos/chunk-000/observation.images.wrist/episode_000000.mp4",
         "data/chunk-000/episode_000000.parquet",

@@ -123,6 +123,20 @@ def test_joints_move_the_spheres_as_the_urdf_shows(urdf: Path):
     assert np.allclose(robot.radii[at["tip"]], 0.02)
 
 
+def test_a_changed_mesh_is_loaded_again(urdf: Path, tmp_path: Path):
+    import trimesh
+
+    from jcr.scene.robot import load_robot
+
+    shutil.copytree(urdf.parent, tmp_path / "robot")
+    copy = tmp_path / "robot" / urdf.name
+    before = load_robot(copy)
+    assert load_robot(copy) is before
+    trimesh.creation.icosphere(radius=30.0).export(copy.parent / "wedge.stl")
+    after = load_robot(copy)
+    assert after.radii.max() > 1.5 * before.radii[before.link == before.links.index("slide")].max()
+
+
 def test_yourdfpy_puts_the_links_at_the_same_places(urdf: Path):
     import yourdfpy
 

@@ -1,4 +1,4 @@
-"""The chain of revolute joints in a URDF, as the kinematics of an arm."""
+"""Chains of joints in a URDF."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,17 +19,19 @@ ANY_ANGLE = (-2 * np.pi, 2 * np.pi)
 
 
 def read_chain(file: Path, dof: int) -> Arm:
-    """The arm of `dof` joints in a URDF file; its gripper frame is the link behind the last joint.
+    """Read the arm of `dof` joints in a URDF file; its gripper frame is the link behind the last joint.
 
-    InputError where the file is no URDF, has no such chain or several, or has a joint in it that does not rotate.
+    Raises InputError where the file is no URDF, has no such chain or several, or has a joint in it that does not
+    rotate.
     """
-    return chain_of(load_urdf(file, build_scene_graph=False), dof, str(file))
+    return chain_of(load_urdf(file), dof, str(file))
 
 
-def load_urdf(file: Path, build_scene_graph: bool) -> "yourdfpy.URDF":
-    """The robot of a URDF file, without its meshes.
+def load_urdf(file: Path) -> "yourdfpy.URDF":
+    """Read the robot of a URDF file, without its meshes.
 
-    InputError where the file is none, or where its joints are not finite and rigid or lead back to where they began.
+    Raises InputError where the file is none, or where its joints are not finite and rigid or lead back to where they
+    began.
     """
     import lxml.etree as etree  # pyright: ignore[reportMissingImports]
     import yourdfpy
@@ -38,12 +40,10 @@ def load_urdf(file: Path, build_scene_graph: bool) -> "yourdfpy.URDF":
         # yourdfpy repairs what is no XML, with two lines of its own on stderr.
         etree.fromstring(read_text(file).encode(), etree.XMLParser(resolve_entities=False, no_network=True))
         urdf = yourdfpy.URDF.load(file, load_meshes=False, build_scene_graph=False)
-        by_child = {joint.child: joint for joint in urdf.robot.joints}
         for joint in urdf.robot.joints:
             _check(joint, f"{file}: joint {joint.name}")
-            _chain(by_child, joint.child)
-        if build_scene_graph:
-            urdf = yourdfpy.URDF.load(file, load_meshes=False, build_scene_graph=True)
+            joints_to(urdf, joint.child)
+            source_of(urdf, joint)
     except InputError:
         raise
     except Exception as error:  # the parser raises whatever its XML library does
@@ -51,38 +51,9 @@ def load_urdf(file: Path, build_scene_graph: bool) -> "yourdfpy.URDF":
     return urdf
 
 
-def _check(joint: "yourdfpy.Joint", where: str) -> None:
-    if joint.origin is not None:
-        if np.shape(joint.origin) != (4, 4):
-            raise InputError(f"{where}: its origin is no position and angles; correct it there")
-        require_rigid(joint.origin, f"{where}: origin")
-    axis = np.asarray(joint.axis, float)
-    if axis.shape != (3,) or not (np.isfinite(axis).all() and np.linalg.norm(axis) > 1e-9):
-        raise InputError(f"{where}: its axis is no direction; correct it there")
-    limit = joint.limit
-    ends = [] if limit is None else [end for end in (limit.lower, limit.upper) if end is not None]
-    if not np.isfinite(ends).all():
-        raise InputError(f"{where}: its limits are not finite; correct them there")
-
-
-def chain_of(urdf: "yourdfpy.URDF", dof: int, where: str) -> Arm:
-    """The arm of `dof` joints in a loaded URDF, as `read_chain`; `where` begins the messages."""
+def joints_to(urdf: "yourdfpy.URDF", link: str) -> list["yourdfpy.Joint"]:
+    """Return the joints from the root of a URDF to a link; InputError where they lead back to it."""
     by_child = {joint.child: joint for joint in urdf.robot.joints}
-    chains = {link.name: _chain(by_child, link.name) for link in urdf.robot.links}
-    # A chain ends with its last moving joint: what is fixed behind that belongs to the gripper.
-    chains = {
-        link: chain
-        for link, chain in chains.items()
-        if chain and chain[-1].type != "fixed" and sum(joint.type != "fixed" for joint in chain) == dof
-    }
-    if len(chains) != 1:
-        found = f"chains to {', '.join(chains)}" if chains else "no chain"
-        raise InputError(f"{where}: {found} with {dof} joints; give as many joints per frame as the arm has")
-    (chain,) = chains.values()
-    return _arm(chain, where)
-
-
-def _chain(by_child: dict, link: str) -> list:
     chain = []
     while link in by_child:
         if len(chain) > len(by_child):
@@ -92,14 +63,39 @@ def _chain(by_child: dict, link: str) -> list:
     return chain
 
 
-def _limits(joint: "yourdfpy.Joint") -> tuple[float, float]:
-    limit = joint.limit
-    if joint.type == "continuous" or limit is None or limit.lower is None or limit.upper is None:
-        return ANY_ANGLE
-    return (limit.lower, limit.upper) if limit.upper > limit.lower else ANY_ANGLE
+def source_of(urdf: "yourdfpy.URDF", joint: "yourdfpy.Joint") -> tuple[str, float, float]:
+    """Return the joint that a joint follows through `mimic`, itself without one, with its factor and offset.
+
+    Raises InputError where joints mimic each other, or one that is not in the URDF.
+    """
+    factor, offset = 1.0, 0.0
+    for _ in range(len(urdf.robot.joints) + 1):
+        if joint.mimic is None:
+            return joint.name, factor, offset
+        multiplier = 1.0 if joint.mimic.multiplier is None else joint.mimic.multiplier
+        offset += factor * (joint.mimic.offset or 0.0)
+        factor *= multiplier
+        if joint.mimic.joint not in urdf.joint_map:
+            raise InputError(
+                f"joint {joint.name} mimics {joint.mimic.joint}, which is not in the URDF; correct it"
+            )
+        joint = urdf.joint_map[joint.mimic.joint]
+    raise InputError(f"joint {joint.name} mimics itself through other joints; correct the URDF")
 
 
-def _arm(chain: list, where: str) -> Arm:
+def chain_of(urdf: "yourdfpy.URDF", dof: int, where: str) -> Arm:
+    """Return the arm of `dof` joints in a loaded URDF, as `read_chain`; `where` begins the messages."""
+    chains = {link.name: joints_to(urdf, link.name) for link in urdf.robot.links}
+    # A chain ends with its last moving joint: links that are fixed behind it belong to the gripper.
+    chains = {
+        link: chain
+        for link, chain in chains.items()
+        if chain and chain[-1].type != "fixed" and sum(joint.type != "fixed" for joint in chain) == dof
+    }
+    if len(chains) != 1:
+        found = f"chains to {', '.join(chains)}" if chains else "no chain"
+        raise InputError(f"{where}: {found} with {dof} joints; give as many joints per frame as the arm has")
+    (chain,) = chains.values()
     frames, axes, limits = [], [], []
     frame: Float[ndarray, "4 4"] = np.eye(4)
     for joint in chain:
@@ -125,3 +121,26 @@ def _arm(chain: list, where: str) -> Arm:
         limits=both,
         rest=rest,
     )
+
+
+def _check(joint: "yourdfpy.Joint", where: str) -> None:
+    """Raise InputError where the origin, axis or limits of a joint cannot be."""
+    if joint.origin is not None:
+        if np.shape(joint.origin) != (4, 4):
+            raise InputError(f"{where}: its origin is no position and angles; correct it there")
+        require_rigid(joint.origin, f"{where}: origin")
+    axis = np.asarray(joint.axis, float)
+    if axis.shape != (3,) or not (np.isfinite(axis).all() and np.linalg.norm(axis) > 1e-9):
+        raise InputError(f"{where}: its axis is no direction; correct it there")
+    limit = joint.limit
+    ends = [] if limit is None else [end for end in (limit.lower, limit.upper) if end is not None]
+    if not np.isfinite(ends).all():
+        raise InputError(f"{where}: its limits are not finite; correct them there")
+
+
+def _limits(joint: "yourdfpy.Joint") -> tuple[float, float]:
+    """Return the limits (rad) of a joint, a turn to either side where it has none."""
+    limit = joint.limit
+    if joint.type == "continuous" or limit is None or limit.lower is None or limit.upper is None:
+        return ANY_ANGLE
+    return (limit.lower, limit.upper) if limit.upper > limit.lower else ANY_ANGLE

@@ -1,5 +1,6 @@
 """A robot as spheres: its URDF's collision shapes covered by spheres, and where joint values put them."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -108,7 +109,7 @@ def load_robot(urdf: str | Path, excess: float = 0.01) -> RobotSpheres:
     """The robot of a URDF file, its collision shapes covered by spheres that stick out by about `excess` (m).
 
     Boxes, cylinders, spheres and meshes; a link without collision shape has no spheres. The result is kept, so
-    that asking again for an unchanged file is quick. Raises InputError where the file or a mesh of it cannot be
+    that the robot of unchanged files is quick to load again. Raises InputError where the file or a mesh of it cannot be
     read, or nothing is there to collide with.
     """
     path = Path(urdf)
@@ -116,11 +117,20 @@ def load_robot(urdf: str | Path, excess: float = 0.01) -> RobotSpheres:
         raise InputError(f"{path}: no such URDF file")
     if not excess > 0:
         raise InputError(f"excess {excess}: give metres above 0, e.g. 0.01")
-    return _load(path.resolve(), path.stat().st_mtime_ns, excess)
+    return _load(path.resolve(), _times_ns(path.resolve()), excess)
+
+
+def _times_ns(path: Path) -> tuple[int, ...]:
+    """Return when the URDF file and each of its meshes that exists were changed."""
+    import yourdfpy
+
+    names = re.findall(r'filename\s*=\s*["\']([^"\']+)', path.read_text("utf-8", errors="replace"))
+    meshes = (Path(yourdfpy.filename_handler_magic(name, dir=path.parent)) for name in names)
+    return tuple(file.stat().st_mtime_ns for file in (path, *meshes) if file.is_file())
 
 
 @lru_cache(maxsize=8)
-def _load(path: Path, changed_ns: int, excess: float) -> RobotSpheres:
+def _load(path: Path, times_ns: tuple[int, ...], excess: float) -> RobotSpheres:
     import yourdfpy
 
     try:

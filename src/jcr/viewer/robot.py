@@ -25,7 +25,7 @@ def read_robot(urdf: Path, capture: Capture) -> "tuple[yourdfpy.URDF, Float[ndar
 
     if not urdf.is_file():
         raise InputError(f"{urdf}: no such URDF file")
-    load_urdf(urdf, build_scene_graph=False)
+    load_urdf(urdf)
     if (joints := capture.joints) is None:
         raise InputError(
             f"{capture.folder}: has no joint values, so the robot's pose is unknown; add `joints` (rad) to each frame "

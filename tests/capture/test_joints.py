@@ -1,0 +1,61 @@
+"""Joint angles of recordings: interpolation across ±π, mimic joints, and the forward kinematics of yourdfpy."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jcr
+from capture_writers import LIMIT, URDF, arm_poses
+from jcr.capture.joints import JointTrack, read_arm
+from jcr.capture.options import ReadOptions
+
+MIMIC = URDF.replace(
+    f'<axis xyz="1 0 0"/>{LIMIT}</joint>',
+    f'<axis xyz="1 0 0"/>{LIMIT}<mimic joint="lift" multiplier="2"/></joint>',
+).replace(
+    f'<axis xyz="0 1 0"/>{LIMIT}</joint>',
+    f'<axis xyz="0 1 0"/>{LIMIT}<mimic joint="pan" offset="0.1"/></joint>',
+    1,
+)
+
+
+def arm_of(folder: Path, text: str, **options):
+    (folder / "arm.urdf").write_text(text)
+    return read_arm(ReadOptions(urdf=folder / "arm.urdf", gripper_frame="tool0", **options))
+
+
+def test_forward_kinematics_agree_with_a_hand_computation(tmp_path: Path):
+    angles = np.random.default_rng(0).uniform(-3, 3, (5, 3))
+    arm = arm_of(tmp_path, URDF)
+    assert arm.joints == ("pan", "lift", "roll")
+    np.testing.assert_allclose(arm.poses(angles), arm_poses(angles), atol=1e-12)
+
+
+@pytest.mark.parametrize("units", ["m-rad", "m-deg"])
+def test_an_angle_that_wraps_is_interpolated_the_shorter_way(tmp_path: Path, units: str):
+    arm = arm_of(tmp_path, URDF, pose_units=units)
+    turn = 360.0 if units == "m-deg" else 2 * np.pi
+    stamps = np.array([0, 10_000_000])
+    pan, still = np.array([0.49, -0.49]) * turn, np.zeros(2)
+    track = JointTrack(arm, (stamps, stamps, stamps), (pan, still, still))
+    poses, gap = track.at(np.array([5_000_000]))
+    np.testing.assert_allclose(poses, arm_poses(np.array([[np.pi, 0, 0]])), atol=1e-12)
+    assert gap.tolist() == [10_000_000]
+
+
+def test_a_joint_that_mimics_a_mimic_follows_the_first(tmp_path: Path):
+    arm = arm_of(tmp_path, MIMIC)
+    assert arm.joints == ("pan",)
+    pan = np.array([[0.3], [-0.2]])
+    np.testing.assert_allclose(
+        arm.poses(pan), arm_poses(np.hstack([pan, pan + 0.1, 2 * (pan + 0.1)])), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    ("joint", "words"), [("roll", "mimics itself"), ("nose", "mimics nose, which is not in the URDF")]
+)
+def test_mimics_that_lead_nowhere_are_refused(tmp_path: Path, joint: str, words: str):
+    with pytest.raises(jcr.InputError, match=words):
+        arm_of(tmp_path, MIMIC.replace('mimic joint="pan"', f'mimic joint="{joint}"'))
