@@ -38,9 +38,20 @@ RATIONAL = Intrinsics(
     612.4, 612.2, 636.8, 367.2, 1280, 720, (0.45, -2.6, 4e-4, -2e-4, 1.6, 0.33, -2.4, 1.5), "rational"
 )
 """About an Azure Kinect's colour camera."""
+PRISM = Intrinsics(
+    612.4,
+    612.2,
+    636.8,
+    367.2,
+    1280,
+    720,
+    (0.45, -2.6, 4e-4, -2e-4, 1.6, 0.33, -2.4, 1.5, 0.02, -0.004, -0.01, 0.003),
+    "thin_prism",
+)
+"""The same camera with a tilted sensor."""
 FISHEYE = Intrinsics(286.0, 286.5, 423.0, 399.0, 848, 800, (-0.0078, 0.045, -0.042, 0.008), "fisheye")
 """About a tracking camera's: its corners see 80° off the axis."""
-MODELS = [WIDE, RATIONAL, FISHEYE]
+MODELS = [WIDE, RATIONAL, PRISM, FISHEYE]
 
 repeatable = settings(derandomize=True, deadline=None, max_examples=40)
 

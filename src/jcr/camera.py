@@ -1,7 +1,8 @@
 """The one camera model: projection and its derivatives, its inverse, resizing and cropping, undistorted images.
 
-OpenCV's pinhole with five distortion coefficients, its rational model with eight ("Camera Calibration and 3D
-Reconstruction") and its fisheye with four (Kannala and Brandt, TPAMI 2006). What a distortion does to rays stands in
+OpenCV's pinhole with five distortion coefficients, its rational model with eight and with a thin prism twelve ("Camera
+Calibration and 3D Reconstruction"), and its fisheye with four (Kannala and Brandt, TPAMI 2006).
+What a distortion does to rays stands in
 `_distorted`, `_slopes`, `_by_coefficients` and, for the fisheye, `_fisheye_rays` alone: no caller knows the model.
 Pixel (0, 0) is the centre of the top-left pixel, so an image of width w spans [-0.5, w - 0.5]. Arrays keep their
 precision: float32 points give float32 pixels.
@@ -58,6 +59,12 @@ def is_distorted(camera: Intrinsics) -> bool:
     return camera.model == "fisheye" or any(camera.distortion)
 
 
+def with_thin_prism(camera: Intrinsics) -> Intrinsics:
+    """Return a pinhole or rational camera as one of the thin prism model that projects alike."""
+    padded = [*camera.distortion, *[0.0] * (len(COEFFICIENTS["thin_prism"]) - len(camera.distortion))]
+    return replace(camera, distortion=coefficients_of(padded), model="thin_prism")
+
+
 def without_distortion(camera: Intrinsics) -> Intrinsics:
     """The pinhole with the same focal lengths and principal point."""
     return replace(camera, distortion=NO_DISTORTION, model="pinhole")
@@ -83,8 +90,7 @@ def unproject(camera: Intrinsics, x_px: Float[ndarray, "*batch 2"]) -> Float[nda
         error = np.stack(_distorted(camera, x, y), axis=-1) - target
         if np.abs(error).max(initial=0.0) < 1e-13:
             break
-        by_x, cross, by_y = _slopes(camera, x, y)
-        slopes = np.stack([by_x, cross, cross, by_y], axis=-1).reshape(*x.shape, 2, 2)
+        slopes = np.stack(_slopes(camera, x, y), axis=-1).reshape(*x.shape, 2, 2)
         found = found - np.linalg.solve(slopes, error[..., None])[..., 0]
     return np.concatenate([found, np.ones_like(found[..., :1])], axis=-1)
 
@@ -93,10 +99,10 @@ def by_point(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Flo
     """Derivatives of `project` by the point."""
     depth = x_in_camera[..., 2]
     x, y = x_in_camera[..., 0] / depth, x_in_camera[..., 1] / depth
-    by_x, cross, by_y = _slopes(camera, x, y)
+    x_by_x, x_by_y, y_by_x, y_by_y = _slopes(camera, x, y)
     out = np.empty((*x.shape, 2, 3), x.dtype)
-    out[..., 0, 0], out[..., 0, 1] = camera.fx * by_x / depth, camera.fx * cross / depth
-    out[..., 1, 0], out[..., 1, 1] = camera.fy * cross / depth, camera.fy * by_y / depth
+    out[..., 0, 0], out[..., 0, 1] = camera.fx * x_by_x / depth, camera.fx * x_by_y / depth
+    out[..., 1, 0], out[..., 1, 1] = camera.fy * y_by_x / depth, camera.fy * y_by_y / depth
     out[..., 2] = -(out[..., 0] * x[..., None] + out[..., 1] * y[..., None])
     return out
 
@@ -121,20 +127,31 @@ def _distorted(camera: Intrinsics, x: Coordinate, y: Coordinate) -> tuple[Coordi
     if camera.model == "fisheye":
         return x * radial, y * radial
     p1, p2 = camera.distortion[2:4]
-    return (
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
-    )
+    x_out = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    y_out = y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+    if camera.model != "thin_prism":
+        return x_out, y_out
+    s1, s2, s3, s4 = list(camera.distortion)[8:]
+    return x_out + r2 * (s1 + s2 * r2), y_out + r2 * (s3 + s4 * r2)
 
 
-def _slopes(camera: Intrinsics, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate, Coordinate]:
-    """Derivatives of `_distorted`: of its x by x, of either by the other (they are equal), of its y by y."""
-    radial, slope = _radial(camera, x * x + y * y)
+def _slopes(
+    camera: Intrinsics, x: Coordinate, y: Coordinate
+) -> tuple[Coordinate, Coordinate, Coordinate, Coordinate]:
+    """Return the derivatives of `_distorted`: of its x by x and by y, then of its y by x and by y."""
+    r2 = x * x + y * y
+    radial, slope = _radial(camera, r2)
     by_x, cross, by_y = radial + 2 * slope * x * x, 2 * slope * x * y, radial + 2 * slope * y * y
     if camera.model == "fisheye":
-        return by_x, cross, by_y
+        return by_x, cross, cross, by_y
     p1, p2 = camera.distortion[2:4]
-    return by_x + 2 * p1 * y + 6 * p2 * x, cross + 2 * (p1 * x + p2 * y), by_y + 6 * p1 * y + 2 * p2 * x
+    by_x, by_y = by_x + 2 * p1 * y + 6 * p2 * x, by_y + 6 * p1 * y + 2 * p2 * x
+    cross = cross + 2 * (p1 * x + p2 * y)
+    if camera.model != "thin_prism":
+        return by_x, cross, cross, by_y
+    s1, s2, s3, s4 = list(camera.distortion)[8:]
+    in_x, in_y = 2 * (s1 + 2 * s2 * r2), 2 * (s3 + 2 * s4 * r2)
+    return by_x + x * in_x, cross + y * in_x, cross + x * in_y, by_y + y * in_y
 
 
 def _radial(camera: Intrinsics, r2: Coordinate) -> tuple[Coordinate, Coordinate]:
@@ -152,7 +169,7 @@ def _radial(camera: Intrinsics, r2: Coordinate) -> tuple[Coordinate, Coordinate]
     slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)
     if not more:
         return radial, slope
-    k4, k5, k6 = more
+    k4, k5, k6 = more[:3]
     below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
     return radial / below, (slope - radial / below * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
 
@@ -168,19 +185,18 @@ def _by_coefficients(
         return np.stack([x * share for share in shares], -1), np.stack([y * share for share in shares], -1)
     above = [r2, r2**2, r2**3]
     below = []
-    if camera.model == "rational":
-        k4, k5, k6 = list(camera.distortion)[5:]
+    if camera.model in ("rational", "thin_prism"):
+        k4, k5, k6 = list(camera.distortion)[5:8]
         denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
         above = [power / denominator for power in above]
         below = [-_radial(camera, r2)[0] * power for power in above]
-    return (
-        np.stack(
-            [x * above[0], x * above[1], xy, r2 + 2 * x * x, x * above[2], *(x * b for b in below)], axis=-1
-        ),
-        np.stack(
-            [y * above[0], y * above[1], r2 + 2 * y * y, xy, y * above[2], *(y * b for b in below)], axis=-1
-        ),
-    )
+    of_x = [x * above[0], x * above[1], xy, r2 + 2 * x * x, x * above[2], *(x * b for b in below)]
+    of_y = [y * above[0], y * above[1], r2 + 2 * y * y, xy, y * above[2], *(y * b for b in below)]
+    if camera.model == "thin_prism":
+        none = np.zeros_like(r2)
+        of_x += [r2, r2 * r2, none, none]
+        of_y += [none, none, r2, r2 * r2]
+    return np.stack(of_x, axis=-1), np.stack(of_y, axis=-1)
 
 
 def _fisheye_rays(camera: Intrinsics, target: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 3"]:
@@ -213,8 +229,8 @@ def fold_distance_px(camera: Intrinsics) -> float | None:
     angle = np.append(np.arange(0, 2 * np.pi, np.radians(2)), to_corners)
     radius = np.linspace(0, _WIDEST_TANGENT, 4001)[:, None]
     ray = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.ones((4001, len(angle)))], axis=-1)
-    by_x, cross, by_y = _slopes(camera, ray[..., 0], ray[..., 1])
-    folded = by_x * by_y <= cross * cross
+    x_by_x, x_by_y, y_by_x, y_by_y = _slopes(camera, ray[..., 0], ray[..., 1])
+    folded = x_by_x * y_by_y <= x_by_y * y_by_x
     x_px = project(camera, ray)
     outside = ((x_px < -0.5) | (x_px > [camera.width - 0.5, camera.height - 0.5])).any(-1)
     # A ray that is still in the frame at the widest angle counts as folded there.

@@ -23,7 +23,7 @@ class IntrinsicsJson(Part):
     fy: Positive
     cx: float
     cy: float
-    distortion: Annotated[list[float], Field(min_length=4, max_length=8)]
+    distortion: Annotated[list[float], Field(min_length=4, max_length=12)]
     width: Pixels
     height: Pixels
     model: DistortionModel = "pinhole"

@@ -13,9 +13,10 @@ from jcr.calibration.checks.camera import is_material, of_some
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_poses
 from jcr.calibration.stage import calibrate
+from jcr.camera import project, unproject
 from jcr.cell.carried import exchanged, refined
 from jcr.estimation.arms import RobotName, arm_named
-from jcr.geometry import inverse, retract, step_between
+from jcr.geometry import apply, inverse, retract, step_between
 from jcr.records import BENT, Capture, Finding, Kind, PosePairs, Reconstruction
 from jcr.records.words import sentence
 from simulation.arms import PresetName
@@ -169,6 +170,32 @@ def test_joint_offsets_and_link_errors_are_not_named_as_a_bent_robot(arm: RobotN
         backend="simulated",
     )
     assert not BENT & {one.kind for one in calibrate(capture, reconstruction).findings}
+
+
+def test_a_thin_prism_becomes_part_of_the_intrinsics():
+    """Without it in the model, the rotation is 2.3° off: a prism and a rotated camera look alike."""
+    found, hand_eye = calibrated(NAMED["thin prism"][0], 3)
+    camera = hand_eye.intrinsics
+    assert (
+        camera is not None and camera.model == "thin_prism" and hand_eye.estimate.intrinsics_std is not None
+    )
+    std = hand_eye.estimate.intrinsics_std[-4:]
+    assert (np.abs(np.array(camera.distortion[-4:]) - [0.02, 0.0, 0.01, 0.0]) < 3 * std).all()
+    assert outcome(found, hand_eye).is_sound
+
+
+def test_an_unmeasured_prism_of_estimated_intrinsics_is_within_sigma():
+    """Here the prism hides in the tangential distortion: the pair places points alike, and ± says how far X is off."""
+    found, hand_eye = calibrated(NAMED["thin prism"][0], 3, estimated=True)
+    step = step_between(hand_eye.gripper_from_camera, found.gripper_from_camera)
+    assert np.degrees(np.linalg.norm(step[3:])) > 1.0 and outcome(found, hand_eye).is_sound
+    camera = hand_eye.intrinsics
+    assert camera is not None
+    ahead = np.array([[0.0, 0.0, 0.5]])
+    # A point half a metre ahead of the true camera, where the calibrated pair places its pixel.
+    pixel = project(found.intrinsics, ahead)
+    placed = apply(hand_eye.gripper_from_camera, 0.5 * unproject(camera, pixel))
+    assert np.linalg.norm(placed - apply(found.gripper_from_camera, ahead)) < 2e-3
 
 
 def test_a_focus_that_varies_is_modelled():

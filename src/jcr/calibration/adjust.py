@@ -14,7 +14,7 @@ from jcr.calibration.consider import with_intrinsics_considered
 from jcr.estimation.equation import predict
 from jcr.estimation.hand_eye import judged
 from jcr.estimation.image_equations import median_reprojection_px
-from jcr.estimation.intrinsics_prior import Camera
+from jcr.estimation.intrinsics_prior import Camera, decentring
 from jcr.estimation.projection import view_of
 from jcr.estimation.residuals import paper_residuals
 from jcr.estimation.score_test import focal_lengths
@@ -25,6 +25,7 @@ from jcr.records import (
     Estimate,
     HandEye,
     ImageResiduals,
+    Intrinsics,
     LeaveOneOut,
     PaperResiduals,
     RobotExamined,
@@ -114,6 +115,26 @@ def estimate_in(found: Solution, scale: float, base_from_recon: Float[ndarray, "
     )
 
 
+def with_decentring(estimate: Estimate, camera: Intrinsics) -> Estimate:
+    """Return an estimate with the uncertainty of a thin prism that nobody measured and no image shows.
+
+    It moves the transform and the intrinsics together, and places no point elsewhere. Cameras of other models than the
+    pinhole have their own coefficients.
+    """
+    budget, cross, known = estimate.budget, estimate.intrinsics_cross, estimate.intrinsics_covariance
+    if camera.model != "pinhole" or budget is None or cross is None or known is None:
+        return estimate
+    steps = decentring(camera, estimate.gripper_from_camera)
+    of_x, of_camera = steps[:7], steps[7:]
+    return replace(
+        estimate,
+        covariance=estimate.covariance + of_x @ of_x.T,
+        budget=replace(budget, intrinsics=budget.intrinsics + of_x @ of_x.T),
+        intrinsics_cross=cross + of_x @ of_camera.T,
+        intrinsics_covariance=known + of_camera @ of_camera.T,
+    )
+
+
 def _considered(case: Case) -> Case:
     """The case with what errors of its given intrinsics do to a fit to poses, which cannot estimate them."""
     made_with_them = case.reconstruction.evidence is None and not case.tracks.from_pointmaps
@@ -135,6 +156,8 @@ def refined_by(case: Case, found: Solution) -> HandEye:
     """The calibration of a case as an adjustment has it; not judged yet."""
     before, used = case.hand_eye.before or case.hand_eye, case.used
     estimate = estimate_of(found, case.tracks)
+    if case.capture.intrinsics is None and estimate.intrinsics is not None:
+        estimate = with_decentring(estimate, estimate.intrinsics)
     x = estimate.gripper_from_camera
     gripper, camera = case.base_from_gripper, case.recon_from_camera
     # Rejected poses are measured against where their cameras show them.

@@ -11,7 +11,14 @@ from numpy import ndarray
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import RobotErrors, of_poses
 from jcr.calibration.seen import Scene, scene_uncertainty
-from jcr.estimation.intrinsics_prior import Camera, camera_about
+from jcr.estimation.intrinsics_prior import (
+    ESTIMATED,
+    MEASURED,
+    PRISM,
+    Camera,
+    camera_about,
+    camera_with_prior,
+)
 from jcr.estimation.points import points_in_base
 from jcr.estimation.problem import LinearPrior
 from jcr.estimation.solve import Solution
@@ -73,8 +80,10 @@ class Case:
     @property
     def camera(self) -> Camera:
         """Camera with the prior of its intrinsics before the calibration."""
-        given = self.capture.intrinsics is not None
-        return camera_about(self.reconstruction.intrinsics, given, self.capture.intrinsics_std)
+        given, found = self.capture.intrinsics, self.reconstruction.intrinsics
+        if found.model == "thin_prism" and (given is None or given.model != found.model):
+            return camera_with_prior(found, {**(ESTIMATED if given is None else MEASURED), **PRISM})
+        return camera_about(found, given is not None, self.capture.intrinsics_std)
 
     @cached_property
     def tracks(self) -> Tracks:

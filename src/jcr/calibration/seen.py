@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.camera import NORMALIZED, by_parameters, by_point, parameters, unproject
+from jcr.camera import NORMALIZED, by_parameters, by_point, parameters, unproject, with_thin_prism
 from jcr.distributions import chi2
 from jcr.estimation.model_error import second_moment_px2
 from jcr.estimation.points import PointsPlaced
@@ -144,13 +144,15 @@ def with_given_intrinsics(
 ) -> WithGivenIntrinsics | None:
     """The pair with intrinsics that were given beside the estimated one, compared at the centre of the image.
 
-    The transform is the mean of the joint distribution where the intrinsics are `given`, of the same model. What such a
+    The transform is the mean of the joint distribution where the intrinsics are `given`, without a thin prism where they
+    have none. What such a
     pair places elsewhere than the estimated one counts as uncertainty. None where nothing was estimated.
     """
     camera, cross = estimate.intrinsics, estimate.intrinsics_cross
     if camera is None or cross is None or estimate.intrinsics_covariance is None:
         return None
-    off = parameters(given) - parameters(camera)
+    same_model = with_thin_prism(given) if camera.model == "thin_prism" else given
+    off = parameters(same_model) - parameters(camera)
     step = cross @ np.linalg.pinv(estimate.intrinsics_covariance, rcond=1e-12, hermitian=True) @ off
     # Who keeps the pair has distances of their own, and no scale.
     step[6] = 0.0

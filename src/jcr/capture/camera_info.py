@@ -64,10 +64,12 @@ def intrinsics_of_ros(
     known = _MODELS.get(model)
     if known is None and not any(coefficients):
         known = "pinhole"
+    if known == "rational" and any(coefficients[8:12]):
+        known = "thin_prism"
     if known is None or any(coefficients[len(COEFFICIENTS[known]) :]):
         raise InputError(
             f"{where}: distortion model {shown(model)} with {len(coefficients)} coefficients; jcr knows plumb_bob (5), "
-            "rational_polynomial (8) and equidistant (4): use rectified images, or calibrate with one of these"
+            "rational_polynomial (8 or 12) and equidistant (4): use rectified images, or calibrate with one of these"
         )
     if known == "rational" and not any(coefficients[5:]):
         known = "pinhole"

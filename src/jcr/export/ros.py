@@ -22,7 +22,12 @@ from jcr.records import COEFFICIENTS, Intrinsics
 PARENT, CHILD, BASE = "tool0", "camera_color_optical_frame", "base_link"
 """Default frame names of gripper, camera and robot base."""
 
-_DISTORTIONS = {"pinhole": "plumb_bob", "rational": "rational_polynomial", "fisheye": "equidistant"}
+_DISTORTIONS = {
+    "pinhole": "plumb_bob",
+    "rational": "rational_polynomial",
+    "thin_prism": "rational_polynomial",
+    "fisheye": "equidistant",
+}
 ROOT_FROM_OPTICAL = transform(Rotation.from_quat([-0.5, 0.5, -0.5, 0.5]).as_matrix().round(), np.zeros(3))
 """REP-103: the root link has x forward, y left, z up; the optical frame z forward, x right, y down."""
 

@@ -87,8 +87,8 @@ def write_nerfstudio(
 
 def _nerfstudio_camera(intrinsics: Intrinsics) -> dict[str, str | float]:
     """Return the camera model of transforms.json and its parameters."""
-    if intrinsics.model == "rational":
-        raise InputError("nerfstudio has no rational distortion model; export with --undistort")
+    if intrinsics.model in ("rational", "thin_prism"):
+        raise InputError(f"nerfstudio has no {intrinsics.model} distortion model; export with --undistort")
     plain = intrinsics.model == "pinhole" and not any(intrinsics.distortion)
     return {
         "camera_model": "PINHOLE"
@@ -127,6 +127,8 @@ def write_colmap(
 
 def _colmap_model(views: PosedImages, names: list[str], intrinsics: Intrinsics) -> pycolmap.Reconstruction:
     """Return the COLMAP model of the images with these names and intrinsics, tracks included."""
+    if intrinsics.model == "thin_prism":
+        raise InputError("COLMAP has no thin_prism distortion model; export with --undistort")
     model = pycolmap.Reconstruction()
     camera = camera_of(intrinsics, known=True)
     camera.camera_id = 1

@@ -11,22 +11,25 @@ from numpy import ndarray
 
 from jcr.records.notebook import table
 
-DistortionModel = Literal["pinhole", "rational", "fisheye"]
+DistortionModel = Literal["pinhole", "rational", "thin_prism", "fisheye"]
 COEFFICIENTS: dict[DistortionModel, tuple[str, ...]] = {
     "pinhole": ("k1", "k2", "p1", "p2", "k3"),
     "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "thin_prism": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4"),
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
-"""Of each distortion, in OpenCV's order; ROS calls them plumb_bob, rational_polynomial and equidistant."""
+"""Coefficients of each distortion in OpenCV's order; ROS calls them plumb_bob, rational_polynomial (with 8 or 12) and
+equidistant."""
 Coefficients = (
     tuple[float, float, float, float]
     | tuple[float, float, float, float, float]
     | tuple[float, float, float, float, float, float, float, float]
+    | tuple[float, float, float, float, float, float, float, float, float, float, float, float]
 )
 
 
 def coefficients_of(values: Iterable[float]) -> Coefficients:
-    """Four, five or eight numbers as a model has them."""
+    """Return four, five, eight or twelve numbers as a model has them."""
     return cast(Coefficients, tuple(float(value) for value in values))
 
 

@@ -533,8 +533,8 @@ _TEXT: dict[Kind, Words] = {
         "of a moving camera"
     ),
     Kind.THIN_PRISM: (
-        "the images show a thin-prism distortion of up to {value:.1f} ± {std} px ({chance}), for which the intrinsics "
-        "have no coefficients: the sensor is tilted, or the optics are decentred"
+        "the images show a thin-prism distortion of up to {value:.1f} ± {std} px ({chance}): the sensor is tilted, or "
+        "the optics are decentred"
     ),
     Kind.CENTRE_SAGS: (
         "the principal point moves with gravity, by {value:.1f} ± {std} px when it lies in the image ({chance}): the "
@@ -649,9 +649,7 @@ _REMEDY: dict[Kind, Words] = {
     Kind.ZOOM: "calibrate the images before or after it, or --focus varies",
     Kind.ROLLING_SHUTTER: AT_REST,
     Kind.ROLLING_SHUTTER_BY_IMAGE: AT_REST,
-    Kind.THIN_PRISM: (
-        "undistort the images with OpenCV's thin prism model (CALIB_THIN_PRISM_MODEL) and give the intrinsics of these"
-    ),
+    Kind.THIN_PRISM: "use the transform with the estimated intrinsics, which have the thin prism coefficients s1 to s4",
     Kind.CENTRE_SAGS: "switch image stabilisation off, or fix the optics",
     Kind.INTRINSICS: CALIBRATE_INTRINSICS,
     Kind.SLIP: _one_part,

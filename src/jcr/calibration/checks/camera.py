@@ -95,6 +95,15 @@ class CameraEffect:
     after: int = 0
     """Image before a change."""
 
+    def with_parameters(self, before: int, now: int) -> "CameraEffect":
+        """Return the effect on a camera of `now` parameters, the first of which are the `before` that it has now."""
+        more = np.zeros((now - before, 1))
+        free, beside = (
+            np.concatenate([of[:before], more.repeat(of.shape[1], axis=1), of[before:]])
+            for of in (self.free, self.beside)
+        )
+        return replace(self, free=free, beside=beside)
+
     @property
     def both(self) -> Float[ndarray, "e r"]:
         """All that it frees."""

@@ -29,6 +29,7 @@ from jcr.calibration.checks.camera import (
 )
 from jcr.calibration.checks.given_intrinsics import intrinsics_contradiction
 from jcr.calibration.checks.imaged import Imaged, of_case
+from jcr.camera import parameters, with_thin_prism
 from jcr.estimation.components import most_likely
 from jcr.estimation.equation import SCALE, UNKNOWNS, columns_of_arm
 from jcr.estimation.hand_eye import MAX_NOISE, judged
@@ -283,13 +284,20 @@ def with_effects(
     """Adjust a case with the effects on camera and arm free, and return the findings with the shifts that remain.
 
     The calibration stays that of the effective transform, which predicts best from the poses as they are reported. How
-    far it is from that of the true poses, and what the scale may be off by, counts as uncertainty. Return None where
-    there is no effect that the model can carry.
+    far it is from that of the true poses, and what the scale may be off by, counts as uncertainty. A thin prism becomes
+    part of the intrinsics. Return None where there is no effect that the model can carry.
     """
     strains = [row for row in state.poses if row.kind in BENT]
     if not strains and not any(one.kind in CAMERA for one in findings):
         return None, findings
-    combinations = np.concatenate([one.both for one in state.found], axis=1) if state.found else None
+    found = list(state.found)
+    if any(one.kind is Kind.THIN_PRISM for one in found) and state.camera.model != "fisheye":
+        camera = with_thin_prism(case.reconstruction.intrinsics)
+        reconstruction = replace(case.reconstruction, intrinsics=camera)
+        case = replace(case, reconstruction=reconstruction, adjusted=None)
+        own, own_now = len(parameters(state.camera)), len(parameters(camera))
+        found = [one.with_parameters(own, own_now) for one in found if one.kind is not Kind.THIN_PRISM]
+    combinations = np.concatenate([one.both for one in found], axis=1) if found else None
     bent = np.concatenate([row.prior_std * row.columns for row in strains], axis=1) if strains else None
     adjusted = adjust_case(case, combinations=combinations, confirmed_errors=bent)
     straight = [np.zeros(7)] * len(strains)
