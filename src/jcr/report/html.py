@@ -1,4 +1,4 @@
-"""report.html: one file that with the verdict on a calibration, its numbers to copy, and what was found."""
+"""report.html: one file with the verdict on a calibration, the transform to copy, and the evidence."""
 
 from collections.abc import Iterable
 from datetime import UTC, datetime
@@ -20,8 +20,9 @@ from jcr.report.residual_bars import residuals_section
 from jcr.report.scene3d import scene_section
 from jcr.report.seen import seen_section
 from jcr.report.transform import transform_section
-from jcr.report.verdict import failure_section, head
+from jcr.report.verdict import failure_section, head, notes_section
 from jcr.results import PosesResult, RunResult
+from jcr.rounding import significant
 from jcr.scene.samples import sample_surface
 
 SURFACE_POINTS = 80_000
@@ -30,18 +31,20 @@ UNNAMED = {Path(name).stem for name in (*TABLES, "capture.json", "metadata.yaml"
 """Files that are called so in every capture."""
 LINKS = {
     "warnings": "Warnings",
-    "notes": "Notes",
     "transform": "Transform",
-    "seen": "Seen points",
-    "cameras": "Cameras",
-    "view": "3D",
+    "view": "3D view",
     "images": "Images",
+    "cameras": "Cameras",
+    "seen": "Point uncertainty",
     "residuals": "Residuals",
-    "uncertainty": "Uncertainty",
+    "uncertainty": "Motion and poses to add",
     "objects": "Objects",
+    "notes": "Notes",
     "details": "Details",
 }
-"""Texts of the links to the sections, by the sections' names."""
+"""Texts of the links to the sections, and headings of the collapsed ones, by the sections' names."""
+OPEN = {"verdict", "failure", "tiles", "warnings", "transform", "view", "images"}
+"""Sections that are not collapsed."""
 
 
 def report_html(result: RunResult, options: Options | None = None) -> str:
@@ -58,6 +61,7 @@ def report_html(result: RunResult, options: Options | None = None) -> str:
             transform_section(result.hand_eye, "base"),
             images_section(result),
             residuals_section(result),
+            *notes_section(calibration),
             details_section(calibration, options or {}),
         ]
         return _page(about, origin(capture.folder), calibration, sections)
@@ -67,15 +71,16 @@ def report_html(result: RunResult, options: Options | None = None) -> str:
     sections = [
         *head(calibration),
         transform_section(result.hand_eye),
-        seen_section(result),
-        None if result.cameras is None else cameras_section(result.cameras),
         scene_section(result, base_from_camera, surface),
         images_section(result),
+        None if result.cameras is None else cameras_section(result.cameras),
+        seen_section(result),
         residuals_section(result),
         motion_section(result),
         None
         if scene is None or result.measured is None
         else objects_section(result.measured, scene.label_names),
+        *notes_section(calibration),
         details_section(
             calibration, options or {}, result.reconstruction, None if scene is None else scene.history
         ),
@@ -91,6 +96,7 @@ def poses_report_html(result: PosesResult, options: Options | None = None) -> st
         transform_section(result.hand_eye),
         residuals_section(result),
         motion_section(result),
+        *notes_section(calibration),
         details_section(calibration, options or {}),
     ]
     return _page("poses given, no images", result.pairs.source, calibration, sections)
@@ -115,6 +121,17 @@ def _about_capture(capture: Capture, options: Options) -> str:
     return f"{arm} · {capture.camera_name} camera, {width} × {height} px, intrinsics {given}"
 
 
+def _about_intrinsics(calibration: CalibrationFile) -> list[str]:
+    """Return a line with the intrinsics that belong to the transform; none where they are unknown."""
+    if (found := calibration.intrinsics) is None:
+        return []
+    focal, centre = (f" ± {significant(max(found.std[k : k + 2]))}" if found.std else "" for k in (0, 2))
+    return [
+        f"fx {found.fx:.2f}, fy {found.fy:.2f}{focal} · cx {found.cx:.2f}, cy {found.cy:.2f}{centre} px · {found.model} "
+        f"distortion {', '.join(f'{value:.4g}' for value in found.distortion)}"
+    ]
+
+
 def _page(about: str, source: Path, calibration: CalibrationFile, sections: Iterable[Section | None]) -> str:
     """The whole page; `source` is the capture as the user named it."""
     # The table or the bag's metadata are called alike in every capture: their folder has the name.
@@ -124,8 +141,9 @@ def _page(about: str, source: Path, calibration: CalibrationFile, sections: Iter
     shown = [section for section in sections if section is not None]
     content = {
         "name": printable(named.resolve().name),
-        "about": [about, run, printable(str(source))],
+        "about": [about, *_about_intrinsics(calibration), run, printable(str(source))],
         "sections": shown,
+        "open": OPEN,
         "links": {one.name: LINKS[one.name] for one in shown if one.name in LINKS},
     }
     return render("report.html", content)

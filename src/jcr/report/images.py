@@ -23,6 +23,8 @@ LARGEST, SMALLEST, PIXELS = 1024, 160, 6e6
 """Pixels across of the images, and of all together at most, which is about a megabyte; they open large."""
 MARKS, MAGNIFIED = 120, 20
 """Features drawn over each image, and how many times their reprojection errors are drawn longer."""
+SHOWN = 12
+"""Images that are not collapsed."""
 GRID = 17
 """Points to a side at which the pixels of an image's file are given; between them they are interpolated."""
 
@@ -75,6 +77,7 @@ def _section(cards: Sequence[dict[str, Any]], capture: Capture, intrinsics: Intr
     width, height = capture.image_size
     content = {
         "cards": cards,
+        "shown": SHOWN,
         "is_calibrated": intrinsics is not None,
         "rejected": sum(card["rejected"] is not None for card in cards),
         "magnified": MAGNIFIED,

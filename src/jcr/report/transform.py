@@ -17,6 +17,7 @@ from jcr.export.ros import (
 from jcr.geometry import roll_pitch_yaw
 from jcr.records import COVARIANCE_ORDER, HandEye, Mount
 from jcr.report.render import Section
+from jcr.report.sketch import sketch
 from jcr.rounding import significant
 
 FIXED_AXES = "fixed axes x, y, z: R = Rz(yaw)·Ry(pitch)·Rx(roll)"
@@ -42,12 +43,14 @@ def transform_section(hand_eye: HandEye, mount: Mount = "gripper") -> Section:
         parent=parent, child=CHILD, parent_from_child=x, base=BASE, intrinsics=hand_eye.intrinsics
     )
     content = {
+        "sketch": sketch(x, hand_eye.intrinsics, mount),
         "mount": mount,
         "parent": parent,
         "child": CHILD,
         "rejected": not hand_eye.converged,
         "matrix": "\n".join("".join(f"{value:>10.6f}" for value in row) for row in x[:3]),
         "copied_matrix": "[" + ",\n ".join(json.dumps(row) for row in x.tolist()) + "]",
+        "along": f"±{along} mm",
         "about": about,
         "notations": [
             {

@@ -1,30 +1,34 @@
-"""The head of the report: whether to use the calibration, or why there is none, and its main numbers."""
+"""Head of the report: verdict with its reason, main numbers, and the reason of a failure."""
 
 from collections.abc import Iterator
 
 from jcr.calibration.calibration_json import CalibrationFile
-from jcr.calibration.words import leave_one_out_text, pixels
+from jcr.calibration.words import leave_one_out_text
 from jcr.records import Kind, verdict_of
 from jcr.records.words import SHORT, reached_in_words, remedy, sentence, text
 from jcr.report.render import Section
 from jcr.rounding import significant
 
 Tile = tuple[str, str, str, bool]
-"""What it is, the number, what there is to know of it, and whether it is one of the main numbers."""
+"""Name, number, remark, and whether it is one of the main numbers."""
 
 
 def head(calibration: CalibrationFile) -> list[Section]:
-    """Verdict, main numbers, warnings and notes."""
-    remarks = {"warnings": calibration.remarks, "notes": calibration.notes}
-    return [
+    """Return the sections of verdict, main numbers and warnings."""
+    sections = [
         Section("verdict", _verdict(calibration)),
         Section("tiles", {"tiles": list(_tiles(calibration))}),
-        *(Section(name, {"remarks": found}) for name, found in remarks.items() if found),
     ]
+    return sections + [Section("warnings", {"remarks": calibration.remarks})] * bool(calibration.remarks)
+
+
+def notes_section(calibration: CalibrationFile) -> list[Section]:
+    """Return the section of the notes; none where there are none."""
+    return [Section("notes", {"remarks": calibration.notes})] * bool(calibration.notes)
 
 
 def failure_section(calibration: CalibrationFile) -> Section:
-    """What is wrong in one sentence, what to do, and how each back end failed that was tried."""
+    """Return the fault, its remedies, and the reason why each back end failed."""
     failed, *others = calibration.findings
     remedies = [sentence(one) for one in others if one.kind is Kind.BOARD_IN_VIEW]
     remedies += filter(None, [remedy(failed)])
@@ -45,6 +49,7 @@ def failure_section(calibration: CalibrationFile) -> Section:
 
 
 def _verdict(calibration: CalibrationFile) -> dict[str, str]:
+    """Return the verdict, its reason and colour, and a sentence on the leave-one-out error."""
     required, short = calibration.requirement, calibration.short
     if calibration.doubt is not None:
         kind, reason = "bad", calibration.doubt
@@ -54,51 +59,58 @@ def _verdict(calibration: CalibrationFile) -> dict[str, str]:
     else:
         kind = "good"
         reason = "nothing contradicts it" if required is None else reached_in_words(required)
-    believe = _leave_one_out(calibration)
+    evidence = _leave_one_out(calibration)
     if calibration.uncertainty is not None:
-        believe += f" Least certain is the translation {calibration.uncertainty.worst} (one σ)."
+        evidence += f" Largest uncertainty of the translation: {calibration.uncertainty.worst} (1 σ)."
     verdict = verdict_of(calibration.findings).capitalize()
-    return {"kind": kind, "verdict": verdict, "reason": reason, "believe": believe}
+    return {"kind": kind, "verdict": verdict, "reason": reason, "evidence": evidence}
 
 
 def _leave_one_out(calibration: CalibrationFile) -> str:
-    """How far the leave-one-out error supports the verdict."""
+    """Return a sentence on the leave-one-out error and its limits."""
     if (held_out := calibration.held_out) is None:
-        return "There were too few images to leave one out and see how well the others predict it."
-    error = leave_one_out_text(held_out)
+        return "There were too few images for a leave-one-out error."
+    error = f"Leave-one-out error {leave_one_out_text(held_out)} ({held_out.how})"
     if not calibration.observability.observable:
-        # An error along a direction that is unobservable changes no prediction.
-        return f"Its leave-one-out error of {error} is no comfort: what is unobservable, no image can contradict."
+        return f"{error}; it does not support the result, because no image can contradict an unobservable direction."
     if not calibration.converged:
-        return (
-            f"Its leave-one-out error of {error} is no comfort: it is blind to what is wrong with all images."
-        )
+        return f"{error}; it does not support the result, because it cannot show errors common to all images."
     return (
-        f"Beside it the leave-one-out error: {error} ({held_out.how}). It is of one pose, with the robot pose noise in "
-        "it, and blind to what all images share, such as intrinsics that are a little wrong."
+        f"{error}. It includes the robot pose noise and cannot show errors common to all images, such as slightly wrong "
+        "intrinsics."
     )
 
 
 def _tiles(calibration: CalibrationFile) -> Iterator[Tile]:
-    if (uncertainty := calibration.uncertainty) is not None:
-        direction, _, size = uncertainty.worst.partition(": ")
-        worst_deg = significant(max(uncertainty.rotation_std_deg))
-        if (seen := uncertainty.seen) is not None:
-            far = significant(1e-3 * seen.distance_mm)
-            where = f"at {far} m, 95 % of errors; {significant(seen.ray_95_deg)}° of its ray"
-            yield "A seen point", f"{significant(seen.within_95_mm)} mm", where, True
-        yield "Translation, 1 σ", size, f"of the camera; worst {direction}", True
-        yield "Rotation, 1 σ", f"±{worst_deg}°", "of the camera; worst about an axis of the gripper", True
-    if (held_out := calibration.held_out) is not None:
-        degrees = f"{significant(held_out.rotation_deg)}°{pixels(held_out).replace(', ', ' · ')}"
-        yield "Leave-one-out error", f"{significant(held_out.translation_mm)} mm", degrees, False
+    """Yield four tiles: accuracy of a point at the image centre and in a corner, images used, scale."""
+    uncertainty, required = calibration.uncertainty, calibration.requirement
+    if required is not None:
+        name = {"seen": "Point at the image centre", "camera": "Camera", "scene": "Mapped point"}[required.at]
+        far = f"at {significant(1e-3 * required.distance_mm)} m, " if required.distance_mm else ""
+        yield (
+            name,
+            f"{significant(required.reached_mm)} mm",
+            f"{far}{significant(required.reached_deg)}°; 95 %",
+            True,
+        )
+    if uncertainty is not None and (seen := uncertainty.seen) is not None:
+        degrees = significant(seen.corners.rotation_95_deg)
+        yield (
+            "Point in the image corner",
+            f"{significant(seen.corners.within_95_mm)} mm",
+            f"{degrees}°; 95 %",
+            True,
+        )
+    elif uncertainty is not None:
+        degrees = significant(max(uncertainty.rotation_std_deg))
+        yield "Rotation of the camera", f"±{degrees}°", "1 σ, worst axis", True
+    used, count = calibration.images_used, len(calibration.images)
+    yield "Images used", f"{used} of {count}", f"{count - used} rejected" if used < count else "", True
     if uncertainty is not None and calibration.scale is not None:
         percent = significant(uncertainty.scale_std_percent)
-        yield "Scale", significant(calibration.scale, 4), f"m per unit, ±{percent}\u00a0%", False
-    used, all_images = calibration.images_used, len(calibration.images)
-    rejected = f"{all_images - used} rejected" if used < all_images else ""
-    yield "Images used", f"{used} of {all_images}", rejected, False
-    if (noise := calibration.robot_noise) is not None:
-        how = "estimated" if noise.estimated else "as given"
-        degrees = f"{significant(noise.rotation_deg)}° per axis, {how}"
-        yield "Robot pose noise, 1 σ", f"{significant(noise.translation_mm)} mm", degrees, False
+        yield (
+            "Scale",
+            f"±{percent}\u00a0%",
+            f"{significant(calibration.scale, 4)} m per unit of the images",
+            True,
+        )

@@ -1,4 +1,4 @@
-// Copy buttons: each carries what it copies.
+// Copy buttons, each with the text that it copies; links and printing open collapsed sections.
 "use strict";
 async function copyText(text) {
   try {
@@ -20,3 +20,10 @@ document.querySelectorAll("button[data-copy]").forEach((button) => {
     setTimeout(() => { button.textContent = label; }, 1500);
   });
 });
+const openLinked = () => {
+  const linked = location.hash && document.getElementById(decodeURIComponent(location.hash.slice(1)));
+  if (linked && linked.tagName === "DETAILS") linked.open = true;
+};
+addEventListener("hashchange", openLinked);
+addEventListener("beforeprint", () => document.querySelectorAll("details").forEach((one) => { one.open = true; }));
+openLinked();
