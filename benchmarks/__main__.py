@@ -111,7 +111,7 @@ def _machine() -> str:
 
 if __name__ == "__main__":
     try:
-        if sys.argv[1:2] == ["align"] and any(argument.endswith(".npz") for argument in sys.argv[2:]):
+        if sys.argv[1:2] == ["align"]:
             align_pairs = import_module("benchmarks.align_pairs")
             sys.exit(align_pairs.main(sys.argv[2:]))
         sys.exit(main(tyro.cli(Arguments, prog="python -m benchmarks")))

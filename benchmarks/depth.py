@@ -12,7 +12,7 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 
 from benchmarks.map import places_to_ask, score
-from benchmarks.table1 import WEBCAM
+from benchmarks.peers import WEBCAM
 from jcr.calibration.stage import calibrate
 from jcr.camera import project, rays
 from jcr.capture.read import read_capture

@@ -1,4 +1,4 @@
-"""`benchmarks speed`: processor time of every stage, beside COLMAP alone on the same images in the same minutes."""
+"""`benchmarks speed`: processor time of jobs and stages beside COLMAP alone, and growth with the number of images."""
 
 import json
 import os
@@ -7,108 +7,145 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.page import apart, table
 from jcr.errors import InputError
 
 CAPTURE = Path("examples/tabletop")
 REPEATS = 3
-IMAGES = (15, 36, 50, 100)
-ALONE, ALL_OF_IT, CALIBRATED, KEPT, STARTED = (
+SIZES, OBSERVED = (8, 16, 32, 64), (15, 50, 100)
+"""Numbers of rendered images, and of images of simulated observations."""
+ALONE, ALL, CALIBRATED, KEPT, MISSING = (
     "COLMAP alone",
     "`jcr run`",
     "`jcr calibrate`",
     "`jcr calibrate`, reconstruction kept",
-    "`jcr calibrate` of a folder that is not there",
+    "`jcr calibrate` of a missing folder",
 )
-STAGES: tuple[str, ...] = ("reconstruct", "calibrate", "densify", "map", "report")
+STAGES = ("reconstruct", "calibrate", "densify", "map", "report")
 
 
 @dataclass(frozen=True)
 class Spent:
-    """What one process took."""
+    """Resources of one process."""
 
     processor_s: float
     """Of all threads, in the program and in the system."""
     wall_s: float
     peak_mib: float
+    """Resident set."""
 
 
 def run() -> str:
-    """Markdown: medians of a few rounds in which every job runs once, a process each."""
+    """Return the page in Markdown: medians of a few rounds in which every job runs once, a process each."""
     if not (CAPTURE / "capture.json").is_file():
         raise InputError(f"bench speed: {CAPTURE} is not here; run it in the root of the project")
     spent: dict[str, list[Spent]] = {}
     stages: list[dict[str, float]] = []
+    off = ""
     for _ in range(REPEATS):
         with tempfile.TemporaryDirectory() as place:
             for name, one in _jobs(Path(place)):
                 spent.setdefault(name, []).append(one)
             stages.append(json.loads((Path(place) / "stages.json").read_text()))
-    grown = [_calibration(count) for count in IMAGES]
-    return page(spent, stages, grown)
-
-
-def page(
-    spent: Mapping[str, list[Spent]],
-    stages: list[dict[str, float]],
-    grown: list[tuple[int, int, float]],
-) -> str:
-    """Markdown of what was measured."""
-    of = {name: _median(each) for name, each in spent.items()}
-    alone = of[ALONE].processor_s
-    times = {name: one.processor_s / alone for name, one in of.items()}
+            off = _error(CAPTURE, Path(place) / "whole")
+    of = {
+        name: Spent(*np.median([_numbers(one) for one in each], axis=0).tolist())
+        for name, each in spent.items()
+    }
+    alone, grown = of[ALONE].processor_s, _growth()
+    first, last = grown[0], grown[-1]
     lines = [
-        f"> `jcr run` on {CAPTURE} takes {of[ALL_OF_IT].processor_s:.1f} s of processor, {times[ALL_OF_IT]:.1f} times "
-        f"COLMAP alone on the same images; `jcr calibrate` {times[CALIBRATED]:.1f} times.",
+        f"> `jcr run` on {CAPTURE} takes {of[ALL].processor_s:.1f} s of processor, "
+        f"{of[ALL].processor_s / alone:.1f} times COLMAP alone on the same images, {of[ALL].wall_s:.0f} s of time and "
+        f"{of[ALL].peak_mib / 1024:.1f} GiB, and is {off} off the truth; `jcr calibrate` "
+        f"{of[CALIBRATED].processor_s / alone:.1f} times.",
+        f"> From {first['images']} to {last['images']} images processor time grows "
+        f"{last['processor_s'] / first['processor_s']:.1f} times.",
         "",
-        f"Medians of {REPEATS} rounds in which every job ran once, a process each. Processor seconds: of all threads, "
-        "in the program and in the system. *COLMAP alone*: features, exhaustive matching and mapping, with its options.",
+        f"Medians of {REPEATS} rounds. *COLMAP alone*: features, exhaustive matching and mapping, with its defaults.",
         "",
-        "| job | processor, s | times COLMAP | wall, s | peak, MiB |",
-        "|---" * 5 + "|",
-        *(
-            f"| {name} | {one.processor_s:.1f} | {times[name]:.2f} | {one.wall_s:.1f} | {one.peak_mib:.0f} |"
-            for name, one in of.items()
+        *table(
+            "job | processor, s | times COLMAP | wall, s | peak, GiB",
+            (
+                [
+                    name,
+                    *(
+                        f"{x:.2f}"
+                        for x in (one.processor_s, one.processor_s / alone, one.wall_s, one.peak_mib / 1024)
+                    ),
+                ]
+                for name, one in of.items()
+            ),
         ),
         "",
-        "| stage of `jcr run` | processor, s |",
-        "|---|---|",
-        *(f"| {name} | {np.median([one[name] for one in stages]):.2f} |" for name in STAGES),
+        *table(
+            "stage of `jcr run` | processor, s",
+            ([name, f"{np.median([one[name] for one in stages]):.2f}"] for name in STAGES),
+        ),
+        "",
+        "Rendered images of 640x480, SIFT, reconstruction without dense depth, and calibration:",
+        "",
+        *table(
+            "images | registered | processor, s | peak, MiB | off, mm",
+            (
+                [
+                    one["images"],
+                    one["registered"],
+                    *(f"{one[key]:.2f}" for key in ("processor_s", "peak_mib", "off_mm")),
+                ]
+                for one in grown
+            ),
+        ),
         "",
         "Calibration of simulated observations, 500 points over the table, no reconstruction:",
         "",
-        "| images | observations | processor, s |",
-        "|---|---|---|",
-        *(f"| {images} | {observations} | {seconds:.2f} |" for images, observations, seconds in grown),
+        *table("images | observations | processor, s", map(_calibration, OBSERVED)),
     ]
     return "\n".join(lines) + "\n"
 
 
+def _numbers(one: Spent) -> tuple[float, float, float]:
+    return one.processor_s, one.wall_s, one.peak_mib
+
+
+def _wall_and_peak(one: Spent) -> tuple[str, str]:
+    return f"{one.wall_s:.1f}", f"{one.peak_mib / 1024:.2f}"
+
+
+def _error(capture: Path, out: Path) -> str:
+    """Return the distance of a run's transform from the truth in words."""
+    from jcr.calibration.known_transform import read_hand_eye
+
+    found, true = (read_hand_eye(path).gripper_from_camera for path in (out, capture / "reference.json"))
+    mm, deg = apart(found, true)
+    return f"{mm:.2f} mm and {deg:.3f}°"
+
+
 def _jobs(place: Path) -> Iterator[tuple[str, Spent]]:
-    """Every job once."""
-    program, command = [sys.executable, "-c"], [sys.executable, "-m", "jcr"]
-    jcr = [*command, "calibrate"]
-    kept = str(place / "kept")
-    yield (
-        ALONE,
-        _spent([*program, f"from benchmarks.speed import colmap_alone; colmap_alone({str(place)!r})"]),
-    )
-    yield ALL_OF_IT, _spent([*command, "run", str(CAPTURE), str(place / "whole"), "--quiet"])
-    by_stage = f"from benchmarks.speed import run_by_stage; run_by_stage({str(place)!r})"
-    _spent([*program, f"from jcr.cli import wait_asleep; wait_asleep(); {by_stage}"])
-    yield CALIBRATED, _spent([*jcr, str(CAPTURE), kept, "--quiet"])
-    (place / "kept" / "calibration.json").unlink()
-    yield KEPT, _spent([*jcr, str(CAPTURE), kept, "--quiet"])
-    yield STARTED, _spent([*jcr, str(place / "nothing"), str(place / "none")], status=2)
+    """Run every job once."""
+    jcr, kept = [sys.executable, "-m", "jcr"], place / "kept"
+    yield ALONE, _spent(_call(f"colmap_alone({str(place)!r})"))
+    yield ALL, _spent([*jcr, "run", str(CAPTURE), str(place / "whole"), "--quiet"])
+    _spent(_call(f"run_by_stage({str(place)!r})"))
+    yield CALIBRATED, _spent([*jcr, "calibrate", str(CAPTURE), str(kept), "--quiet"])
+    (kept / "calibration.json").unlink()
+    yield KEPT, _spent([*jcr, "calibrate", str(CAPTURE), str(kept), "--quiet"])
+    yield MISSING, _spent([*jcr, "calibrate", str(place / "nothing"), str(place / "none")], status=2)
+
+
+def _call(function: str) -> list[str]:
+    """Return the command that calls a function of this module in a process of its own."""
+    return [sys.executable, "-c", f"from benchmarks import speed; speed.{function}"]
 
 
 def _spent(command: list[str], status: int = 0) -> Spent:
-    """Of one process, which must end with this status."""
+    """Run one process, which must end with this status."""
     begun = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     _, ended, usage = os.wait4(process.pid, 0)
@@ -118,12 +155,8 @@ def _spent(command: list[str], status: int = 0) -> Spent:
     return Spent(usage.ru_utime + usage.ru_stime, time.perf_counter() - begun, usage.ru_maxrss / 1024)
 
 
-def _median(each: list[Spent]) -> Spent:
-    return Spent(*np.median([(one.processor_s, one.wall_s, one.peak_mib) for one in each], axis=0).tolist())
-
-
 def colmap_alone(place: str) -> None:
-    """In a process of its own: features, exhaustive matching and mapping of the capture's images by COLMAP."""
+    """Extract features, match exhaustively and map the capture's images by COLMAP, in a process of its own."""
     import pycolmap
 
     images, database, cpu = Path(place) / "images", Path(place) / "database.db", pycolmap.Device.cpu
@@ -136,12 +169,12 @@ def colmap_alone(place: str) -> None:
 
 
 def run_by_stage(place: str) -> None:
-    """In a process of its own: what `jcr run` does, and the processor seconds of its stages in a file."""
+    """Run all stages in a process of its own, and write the processor seconds of each into stages.json."""
     import jcr
     from jcr import attempts, stages
     from jcr.report import html
 
-    spent = dict.fromkeys(STAGES, 0.0)
+    spent: dict[str, float] = dict.fromkeys(STAGES, 0.0)
     parts = (
         (attempts, "reconstruct", "reconstruct"),
         (attempts, "calibrate", "calibrate"),
@@ -156,7 +189,7 @@ def run_by_stage(place: str) -> None:
 
 
 def _timed(function: Callable, spent: dict[str, float], name: str) -> Callable:
-    """The function, whose processor seconds are added up under a name."""
+    """Return the function with its processor seconds added up under a name."""
 
     def timed(*arguments, **options):
         begun = time.process_time()
@@ -167,11 +200,41 @@ def _timed(function: Callable, spent: dict[str, float], name: str) -> Callable:
     return timed
 
 
-def _calibration(images: int) -> tuple[int, int, float]:
-    """Images, observations, and the processor seconds of their calibration."""
-    from benchmarks.attack import reconstructed
+def _growth() -> list[dict[str, float]]:
+    """Return what reconstruction and calibration of more and more rendered images take, a process each."""
+    from simulation.capture import SimulateOptions, simulate
+
+    found = []
+    with tempfile.TemporaryDirectory() as folder:
+        capture, facts = Path(folder) / "capture", Path(folder) / "facts.json"
+        simulate(capture, SimulateOptions(images=max(SIZES), robot_noise=(0.2, 0.05), truth="scene"))
+        for count in SIZES:
+            spent = _spent(_call(f"reconstruct_first({str(capture)!r}, {count}, {str(facts)!r})"))
+            found.append(json.loads(facts.read_text()) | vars(spent))
+    return found
+
+
+def reconstruct_first(folder: str, count: int, facts: str) -> None:
+    """Reconstruct and calibrate the first images of a capture, and write the result to `facts`."""
+    from jcr.calibration.known_transform import read_hand_eye
     from jcr.calibration.stage import calibrate
-    from simulation.faults import faulty_capture
+    from jcr.capture.read import read_capture
+    from jcr.sfm.colmap import reconstruct_colmap
+
+    whole = read_capture(Path(folder))
+    capture = replace(whole, images=whole.images[:count], base_from_gripper=whole.base_from_gripper[:count])
+    made = reconstruct_colmap(capture)
+    reference = read_hand_eye(Path(folder) / "reference.json").gripper_from_camera
+    off_mm, _ = apart(calibrate(capture, made).gripper_from_camera, reference)
+    Path(facts).write_text(
+        json.dumps({"images": count, "registered": len(made.image_index), "off_mm": off_mm})
+    )
+
+
+def _calibration(images: int) -> tuple[int, int, str]:
+    """Return images, observations, and the median processor seconds of their calibration."""
+    from jcr.calibration.stage import calibrate
+    from simulation.faults import faulty_capture, reconstructed
 
     seconds, count = [], 0
     for seed in range(REPEATS):
@@ -180,4 +243,4 @@ def _calibration(images: int) -> tuple[int, int, float]:
         begun = time.process_time()
         calibrate(*made)
         seconds.append(time.process_time() - begun)
-    return images, count, float(np.median(seconds))
+    return images, count, f"{np.median(seconds):.2f}"

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.attack import CASES, IMAGES, calibrated, reconstructed
 from benchmarks.cameras import COUNT, answered, wanted
+from benchmarks.faults import IMAGES, OBSERVED, calibrated
 from jcr.calibration.stage import calibrate
 from jcr.estimation.arms import arm_named
 from jcr.estimation.hand_eye import solve_hand_eye
@@ -25,7 +25,7 @@ from jcr.records import HandEye
 from jcr.run_folder import RunFolder
 from simulation.boards import Sheet, with_sheet
 from simulation.cells import Kind, cell_problem
-from simulation.faults import Faults, faulty_capture
+from simulation.faults import Faults, faulty_capture, reconstructed
 from simulation.problems import bent_problem, hand_eye_problem
 
 Record = dict[str, Any]
@@ -41,15 +41,16 @@ def cases(runs: Path) -> Iterator[tuple[str, Callable[[], Record]]]:
     """Yield the name of each problem and a function that solves it."""
     for folder in sorted(path.parent for path in runs.glob("*/reconstruction.npz")):
         yield f"capture {folder.name}", lambda folder=folder: _record_run(folder)
-    for k, case in enumerate(CASES):
+    for k, case in enumerate(OBSERVED):
         name = f"fault {k} {case.what}"
-        yield name, lambda case=case: _record(calibrated(case.faults, 0, estimated=case.estimated)[1])
+        assert isinstance(case.fault, Faults)
+        yield name, lambda case=case, faults=case.fault: _record(calibrated(faults, 0, given=case.given)[1])
     for seed in range(3):
         estimated = seed % 2 == 1
         yield (
             f"clean {seed}",
             lambda seed=seed, estimated=estimated: _record(
-                calibrated(Faults(), 1000 + seed, (8, 12, 20)[seed], estimated=estimated)[1]
+                calibrated(Faults(), 1000 + seed, (8, 12, 20)[seed], given=not estimated)[1]
             ),
         )
     yield "sheet, bent", lambda: _record(_with_sheet(Sheet(bend_m=2e-3)))

@@ -4,6 +4,7 @@ What is reported is what a user would have; what was is what the fault made of i
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -12,15 +13,20 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from jcr.camera import NO_DISTORTION, parameter_names, parameters, project, with_parameters, zoomed
+from jcr.estimation.equation import predict
+from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, camera_with_prior
 from jcr.estimation.known_scale import fit_known_scale
+from jcr.estimation.wrist import adjust_wrist
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.records import Intrinsics, Tracks
+from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 from simulation.arms import EFFECTIVE_NOISE, EFFECTIVE_POSES
 from simulation.poses import gripper_poses, random_hand_eye
 from simulation.problems import TARGET_IN_BASE, disturbed
 
 INTRINSICS = Intrinsics(620.0, 620.0, 319.5, 239.5, 640, 480, NO_DISTORTION)
 """What the user believes the camera to be."""
+LOOSE = (3.0, 3.0)
+"""m, rad: gripper poses by which structure from motion is hardly held."""
 POINTS, NOISE_PX = 500, 0.4
 """On the table and what stands on it, and one sigma of their observations."""
 LOW, HIGH = np.array([0.2, -0.3, 0.0]), np.array([0.8, 0.3, 0.15])
@@ -201,3 +207,31 @@ def late(true: Float[ndarray, "n 4 4"], delay_s: float, view_s: float) -> Float[
     position = CubicSpline(at, true[:, :3, 3])(later)
     rotation = RotationSpline(at, Rotation.from_matrix(true[:, :3, :3]))(later)
     return transform(rotation.as_matrix(), position)
+
+
+def reconstructed(found: FaultyCapture, estimated: bool) -> tuple[Capture, Reconstruction]:
+    """Return the capture, and the reconstruction that structure from motion gives of its observations.
+
+    The intrinsics are the believed ones, or `estimated`.
+    """
+    cameras, m = found.base_from_camera, len(found.base_from_camera)
+    start = np.eye(4), 1.0, np.eye(4)
+    free = camera_with_prior(found.intrinsics, ESTIMATED if estimated else FIXED)
+    sfm = adjust_wrist(cameras, start, cameras, free, found.tracks, noise=LOOSE)
+    state = sfm.state
+    intrinsics, x = sfm.problem.intrinsics(state)[0], state.x[0]
+    rigs = predict(x, state.scale, state.z[0], state.world_from_rig)
+    capture = Capture(
+        folder=Path("."),
+        images=tuple(f"{k:02d}.png" for k in range(m)),
+        base_from_gripper=found.base_from_gripper,
+        image_size=(INTRINSICS.width, INTRINSICS.height),
+        intrinsics=None if estimated else found.intrinsics,
+    )
+    return capture, Reconstruction(
+        image_index=np.arange(m),
+        recon_from_camera=rigs @ x,
+        intrinsics=intrinsics,
+        tracks=found.tracks,
+        backend="simulated",
+    )

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.predictions import end_to_end
+from benchmarks.pointmaps import end_to_end
 from jcr.errors import InputError
 from jcr.records import Intrinsics
 from simulation.render import render

@@ -34,7 +34,7 @@ def _name(path: Path) -> str:
 
 
 def page(name: str) -> str:
-    """The Markdown of a page by its name (`captures`, `results/run`); InputError where there is no such page."""
+    """The Markdown of a page by its name (`captures`, `results/speed`); InputError where there is no such page."""
     found = pages()
     if name not in found:
         there = ", ".join(other for other in found if "/" not in other) or "none on this machine"

@@ -199,7 +199,7 @@ BACKENDS: dict[str, Backend] = {
             auto=True,
             options=("features", "board"),
             selected_by="features",
-            accuracy="0.02 mm and 0.002° on the bundled capture (jcr docs results/run)",
+            accuracy="0.02 mm and 0.002° on the bundled capture (jcr docs results/speed)",
         ),
         Backend(
             name="da3",
@@ -271,7 +271,7 @@ BACKENDS: dict[str, Backend] = {
             options=("predictions",),
             selected_by="predictions",
             keeps_order=True,
-            accuracy="0.74 mm and 0.047° from simulated predictions (jcr docs results/predictions)",
+            accuracy="0.74 mm and 0.047° from simulated predictions (jcr docs results/pointmaps)",
         ),
         Backend(
             name="given",

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.attack import reconstructed
 from jcr.boards import corners
 from jcr.boards.detection import Board, Sighting, boards, is_of_unknown_size, side_of
 from jcr.calibration.stage import calibrate
@@ -15,7 +14,7 @@ from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Capture, Kind, Reconstruction
 from jcr.records.words import sentence
-from simulation.faults import Faults, FaultyCapture, faulty_capture
+from simulation.faults import Faults, FaultyCapture, faulty_capture, reconstructed
 
 pytestmark = pytest.mark.slow
 

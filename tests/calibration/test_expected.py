@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.expected import FACTOR, simulated
+from benchmarks.coverage import FACTOR, predicted
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file
 from jcr.calibration.expected import Ahead, assumed, expected, typical_camera
 from jcr.calibration.poses import calibrate_poses
@@ -27,9 +27,8 @@ WITHIN = np.log(FACTOR)
 @pytest.mark.slow
 def test_what_is_expected_is_what_is_reported():
     """Arms of several kinds, six to twenty images, intrinsics given, wrong and unknown."""
-    rows = simulated(5)
-    ratios = np.log([row.ratios for row in rows])
-    assert len(rows) == 5 and (np.abs(ratios) < WITHIN).all(), np.exp(ratios)
+    ratios = np.log(predicted(5))
+    assert len(ratios) == 5 and (np.abs(ratios) < WITHIN).all(), np.exp(ratios)
     assert (np.abs(np.median(ratios, axis=0)) < np.log(1.25)).all()
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.attack import calibrated, outcome, reconstructed
+from benchmarks.faults import calibrated, outcome
 from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.checks.camera import is_material, of_some
 from jcr.calibration.options import CalibrateOptions
@@ -20,7 +20,7 @@ from jcr.geometry import apply, inverse, retract, step_between
 from jcr.records import BENT, Capture, Finding, Kind, PosePairs, Reconstruction
 from jcr.records.words import sentence
 from simulation.arms import PresetName
-from simulation.faults import INTRINSICS, Faults, faulty_capture
+from simulation.faults import INTRINSICS, Faults, faulty_capture, reconstructed
 from simulation.problems import INTRINSICS as OBSERVED_BY
 from simulation.problems import bent_problem, hand_eye_problem, observed
 
@@ -148,7 +148,7 @@ def test_what_given_intrinsics_may_be_off_is_within_sigma_unsaid(seed: int):
 @pytest.mark.parametrize("estimated", [False, True])
 def test_nothing_is_named_where_nothing_is_wrong(estimated: bool):
     for seed in range(3):
-        _, hand_eye = calibrated(Faults(), seed, (8, 12, 16)[seed], estimated)
+        _, hand_eye = calibrated(Faults(), seed, (8, 12, 16)[seed], not estimated)
         assert hand_eye.warnings == ()
 
 

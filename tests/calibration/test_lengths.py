@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.attack import reconstructed
 from jcr.calibration import fit
 from jcr.calibration.checks import lengths
 from jcr.calibration.checks.lengths import Length, contradiction, finding_of
@@ -15,7 +14,7 @@ from jcr.geometry import step_between
 from jcr.records import DepthCheck, Finding, HandEye, Kind
 from jcr.records.words import sentence
 from simulation.boards import Sheet, with_sheet
-from simulation.faults import Faults, faulty_capture
+from simulation.faults import Faults, faulty_capture, reconstructed
 
 pytestmark = pytest.mark.slow
 

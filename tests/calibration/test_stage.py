@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.attack import reconstructed
 from jcr.calibration import adjust as adjust_stage
 from jcr.calibration import case
 from jcr.calibration.stage import calibrate
@@ -14,7 +13,7 @@ from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.estimation.wrist import adjust_wrist
 from jcr.geometry import retract, step_between
 from jcr.records import Kind, Tracks
-from simulation.faults import faulty_capture
+from simulation.faults import faulty_capture, reconstructed
 
 
 @pytest.mark.slow

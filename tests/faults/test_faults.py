@@ -22,7 +22,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.attack import reconstructed
 from jcr import attempts, pipeline, run_folder
 from jcr.calibration.calibration_json import read_calibration
 from jcr.calibration.checks import capture as capture_checks
@@ -34,7 +33,7 @@ from jcr.estimation.kinematics import forward_kinematics
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
 from jcr.records import Capture, Reconstruction
 from jcr.run_folder import RunFolder
-from simulation.faults import Faults, faulty_capture
+from simulation.faults import Faults, faulty_capture, reconstructed
 from simulation.problems import hand_eye_problem
 
 SIZE = (96, 72)

@@ -187,7 +187,7 @@ def test_each_fault_is_named_at_the_image_where_it_happens(resumed: LiveCalibrat
     wrong = pose @ transform(rotation_exp(np.radians([3.0, 8.0, 0.0])), np.array([0.03, 0.0, 0.02]))
     begun = time.process_time()
     contradicted = resumed.add(image, wrong, time_s=9.0)
-    # 3 s are asked of image 12 at 640x480 (docs/results/live_real.md); others use this machine, and shapes are checked.
+    # 3 s are asked of image 12 at 640x480 (docs/results/live.md); others use this machine, and shapes are checked.
     assert len(contradicted.images) == 13 and time.process_time() - begun < 6
     assert contradicted.added in contradicted.registered
     found = against(contradicted)

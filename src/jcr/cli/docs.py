@@ -16,7 +16,7 @@ class Arguments:
     examples:
       jcr docs
       jcr docs captures
-      jcr docs results/run
+      jcr docs results/speed
     """
 
     name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PAGE]")] = None

@@ -7,7 +7,7 @@ come from one printer, so they share l. A board bends and is stretched in a few 
 independent from corner to corner.
 
 How large each is: with the shape free, ten real boards of 100 to 250 mm leave 0.05 to 0.25 mm about a surface of second
-order, their triangulation included (docs/results/check_points.md), and sheets bend by up to 3.6 mm, which the corners
+order, their triangulation included (docs/results/real.md), and sheets bend by up to 3.6 mm, which the corners
 show to a few hundredths: the prior of the bend decides only where they show little.
 """
 

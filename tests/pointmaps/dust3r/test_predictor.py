@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from benchmarks.synthetic_pairs import write_pairs
 from scipy.spatial.transform import Rotation
 
-from benchmarks.synthetic_pairs import write_pairs
 from jcr.errors import InputError
 from jcr.geometry import inverse, transform
 from jcr.pointmaps.dust3r.pair_graph import complete_pairs, overlapping_pairs, window_pairs

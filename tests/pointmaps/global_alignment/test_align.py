@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from benchmarks import align_pairs
-from benchmarks.synthetic_pairs import PairErrors, PairTruth, synthetic_pairs, write_pairs
 from jcr.errors import InputError, RejectedError
 from jcr.geometry import apply_similarity, fit_similarity, retract, rotation_between_deg
 from jcr.pointmaps.dust3r.pair_graph import complete_pairs, window_pairs
@@ -24,6 +23,7 @@ from jcr.pointmaps.global_alignment.normal_equations import (
 from jcr.pointmaps.global_alignment.pointmap_residuals import State
 from jcr.records import Intrinsics
 from places import SHARED
+from simulation.pairs import PairErrors, PairTruth, synthetic_pairs, write_pairs
 
 SMALL = (48, 36)
 NO_ERRORS = PairErrors(pixel=0.0, warp=0.0, outliers=0.0)

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.synthetic_pairs import PairErrors, synthetic_pairs
 from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.stage import calibrate
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
@@ -18,6 +17,7 @@ from jcr.pointmaps.pairs import PairPredictions
 from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Capture, HandEye, Reconstruction
 from jcr.records.words import network_scale
+from simulation.pairs import PairErrors, synthetic_pairs
 
 SIZE = (48, 36)
 FEW_PIXELS = AlignOptions(pixels=432)

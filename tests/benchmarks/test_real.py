@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks import check_points
-from benchmarks.check_points import Corners, WristCamera, measure, pixels_of, predicted
+from benchmarks import real
+from benchmarks.real import Corners, WristCamera, measure, pixels_of, predicted
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.records import Intrinsics
 from simulation.problems import TARGET_IN_BASE, HandEyeProblem, hand_eye_problem
@@ -33,26 +33,27 @@ def test_an_exact_calibration_scatters_by_the_noise_of_pixels_and_a_wrong_focal_
     exact = measure(camera, corners)
     depth = np.linalg.norm(camera.base_from_camera[:, :3, 3] - TARGET_IN_BASE, axis=1)
     lateral = np.sqrt(2) * NOISE_PX * np.sqrt((depth**2).mean()) / CAMERA.fx
-    assert exact.lateral == pytest.approx(lateral, rel=0.15)
+    # The noise of the distance along the ray comes in addition.
+    assert lateral < exact.scatter < 2 * lateral
     assert exact.side == pytest.approx(1.0, abs=5e-4)
     assert exact.flat < 1e-4
     wrong = replace(camera, intrinsics=replace(CAMERA, fx=1.01 * CAMERA.fx, fy=1.01 * CAMERA.fy))
     off = measure(wrong, corners)
     # Lengths across the ray are wrong by it, distances are not: the robot's metre gives those.
     assert off.side == pytest.approx(0.99, abs=5e-4)
-    assert off.lateral > 2 * exact.lateral
+    assert off.scatter > 1.5 * exact.scatter
 
 
 def test_a_sheet_that_bends_is_not_flat_and_scatters_no_more():
     problem = hand_eye_problem(np.random.default_rng(3), 10)
     flat, bent = (measure(*seen(problem, bend)) for bend in (0.0, 0.003))
-    assert bent.flat > 8e-4 and bent.unbent < 1e-4
-    assert bent.scatter == pytest.approx(flat.scatter, rel=0.05)
+    assert bent.flat > 8e-4 > 4 * flat.flat
+    assert bent.scatter < 1.1 * flat.scatter
 
 
 @pytest.mark.slow
 def test_the_scatter_is_predicted_from_what_a_calibration_states(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(check_points, "DRAWS", 40)
+    monkeypatch.setattr(real, "DRAWS", 40)
     ratios = []
     for seed in range(3):
         problem = hand_eye_problem(np.random.default_rng(seed), 12, robot_noise=(4e-4, 1e-3))
@@ -64,5 +65,5 @@ def test_the_scatter_is_predicted_from_what_a_calibration_states(monkeypatch: py
             base_from_gripper=problem.base_from_gripper,
         )
         draws = predicted(found, hand_eye, corners, NOISE_PX)
-        ratios.append(measure(found, corners).scatter / np.sqrt((draws["scatter"] ** 2).mean()))
+        ratios.append(measure(found, corners).scatter / np.sqrt((np.array(draws) ** 2).mean()))
     assert 0.7 < np.median(ratios) < 1.4

@@ -1,0 +1,295 @@
+"""`benchmarks faults`: captures with one fault each, and captures without one: detections, silent errors, false alarms.
+
+Two tables. Observations: gripper poses and image points of simulated faults through structure from motion and the
+calibration stage. Images: rendered images with one fault through all of `jcr calibrate`, so that features, mapper and
+the selection of a back end take part.
+"""
+
+import tempfile
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.special import chdtrc
+
+import jcr
+from benchmarks.page import mm_deg, table
+from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.stage import calibrate
+from jcr.errors import InputError, RejectedError
+from jcr.geometry import step_between
+from jcr.records import CAMERA, Finding, HandEye, Kind
+from simulation import image_faults as make
+from simulation.faults import Faults, FaultyCapture, faulty_capture, reconstructed
+from simulation.image_faults import IMAGES as FEW_IMAGES
+from simulation.image_faults import Fault
+from simulation.rendered import Rendered, rendered
+
+IMAGES, SCENES = 12, 5
+"""Images of a capture of observations, and rendered scenes."""
+DRAWS, CLEAN, CLEAN_IMAGES = 2, 70, 5
+"""Captures per fault (observations), and captures without a fault of each kind."""
+SIGMAS, JOINT_P = 3.0, 0.0027
+"""Largest error on an axis in stated standard deviations, and least joint chance, of an error that is stated rightly."""
+FOCUS = frozenset({Kind.FOCUS_BY_DISTANCE, Kind.FOCUS_BY_IMAGE})
+ZOOM = frozenset({Kind.ZOOM, Kind.FOCUS_BY_IMAGE})
+SHUTTER = frozenset({Kind.ROLLING_SHUTTER, Kind.ROLLING_SHUTTER_BY_IMAGE})
+INTRINSICS = frozenset({Kind.INTRINSICS})
+MOVED = frozenset({Kind.SLIP, Kind.DRIFT})
+ORDER = frozenset({Kind.POSE_CONVENTION, Kind.DELAY, Kind.POSES_SWAPPED})
+ONE_POSE = frozenset({Kind.POSES_SWAPPED, Kind.POSE_CONTRADICTS_IMAGE})
+ROBOT = frozenset({Kind.SYSTEMATIC_ERRORS, Kind.JOINT_OFFSETS, Kind.LENGTHS, Kind.BASE_LEANS, Kind.TOOL_SAGS})
+SCALE_ALONE = "positions 1 % too long"
+"""Fault that no image shows: scale comes from the robot."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """Row of a table: a fault, and the kinds of finding that name it."""
+
+    what: str
+    fault: Faults | Fault
+    named_by: frozenset[Kind] = frozenset()
+    """Any of these; images left out name their own fault, too."""
+    given: bool = True
+    """Whether intrinsics are given."""
+
+
+SLIP = (3.6e-3, float(np.radians(1.1)))
+OBSERVED = (
+    Case(
+        "focal length grows by 1 % from the nearest view to the farthest",
+        Faults(focal_by_distance=0.01),
+        FOCUS,
+    ),
+    Case("by 4 %", Faults(focal_by_distance=0.04), FOCUS),
+    Case("by 2 %, intrinsics estimated", Faults(focal_by_distance=0.02), FOCUS, given=False),
+    Case("focal length scatters by 2 %", Faults(focal_scatter=0.02), FOCUS),
+    Case("zoom by 3 % in the second half", Faults(zoom=0.03), ZOOM),
+    Case("principal point 12 px off in x", Faults(intrinsics=(("cx", 12.0),)), INTRINSICS),
+    Case("k1 of -0.03 ignored", Faults(intrinsics=(("k1", -0.03),)), INTRINSICS),
+    Case("fx alone 3 % off", Faults(intrinsics=(("fx", -18.6),)), INTRINSICS),
+    Case("rolling shutter, 15 px in x", Faults(rolling_px=15.0), SHUTTER),
+    Case("mount slips by 1 mm 0.3° midway", Faults(slip=(1e-3, float(np.radians(0.3)))), MOVED),
+    Case("by 3.6 mm 1.1° midway", Faults(slip=SLIP), MOVED),
+    Case("by 3.6 mm 1.1° after two thirds", Faults(slip=SLIP, slip_after=0.67), MOVED),
+    Case("poses read 100 ms late, 3 s from view to view", Faults(delay_s=0.1, view_s=3.0), ORDER),
+    Case("positions along z 4 % too long", Faults(lengths=(0.0, 0.0, 0.04)), ROBOT),
+    Case("the stand leans by 4° per metre of reach", Faults(tilt_by_reach=float(np.radians(4))), ROBOT),
+    Case("the tool sags by 1.1° where it is level", Faults(sag=0.02), ROBOT),
+    Case(SCALE_ALONE, Faults(pose_scale=1.01)),
+)
+EXCHANGED = np.r_[0:3, 6, 4:6, 3, 7:FEW_IMAGES]
+RENDERED = (
+    Case(
+        "focal length grows by 2 % from the nearest view to the farthest", Fault(make.breathing(0.02)), FOCUS
+    ),
+    Case("by 8 %", Fault(make.breathing(0.08)), FOCUS),
+    Case("zoom by 3 % midway", Fault(make.zoomed_midway(0.03)), ZOOM),
+    Case("digital zoom of 1.11, intrinsics unchanged", Fault(make.zoomed(1.11)), INTRINSICS),
+    Case("k1 of -0.1 missing", Fault(make.distorted(-0.1)), INTRINSICS),
+    Case("principal point 40 px off", Fault(make.off_centre(32.0, -24.0)), INTRINSICS),
+    Case("rolling shutter, 24 px", Fault(make.rolling(24.0)), SHUTTER),
+    Case("stabiliser moves the image by 3 px", Fault(make.stabilised(3.0)), CAMERA),
+    Case("thin prism, 0.04", Fault(make.thin_prism(0.04)), CAMERA),
+    Case("focal length given 3 % too long", Fault(change=make.given(fx=1.03, fy=1.03)), INTRINSICS),
+    Case("images of half the resolution", Fault(change=make.halved), INTRINSICS),
+    Case("mirrored images", Fault(make.mirrored), ORDER),
+    Case("mount slips by 3.6 mm 1.1°", Fault(change=make.slipped(3.6, 1.1)), MOVED),
+    Case("base pushed by 20 mm 2° midway", Fault(change=make.bumped(20.0, 2.0)), MOVED),
+    Case("poses read 400 ms late", Fault(change=make.delayed(0.4, 6.0)), ORDER),
+    Case("images sorted by name as text", Fault(change=make.sorted_as_text), ORDER),
+    Case("one pose 5 mm 1° off", Fault(change=make.one_off(5.0, 1.0, 4), wrong=(4,)), ONE_POSE),
+    Case("two poses exchanged", Fault(change=make.reordered(EXCHANGED), wrong=(3, 6)), ONE_POSE),
+    Case("a frame that is repeated", Fault(change=make.repeated(4, (5,)), wrong=(5,)), ONE_POSE),
+    Case("objects pushed by 6 cm midway", Fault(pushed=True)),
+    Case("exposure and white balance differ by 30 %", Fault(change=make.exposed(0.3))),
+    Case("two images blurred by 9 px", Fault(change=make.blurred(9, (2, 6)))),
+    Case("tool sags by 4 mm 1°", Fault(change=make.sagging(4.0, 1.0)), ROBOT),
+    Case(SCALE_ALONE, Fault(change=make.stretched(1.01, 1.01, 1.01)), ROBOT),
+)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Result of one capture against the truth."""
+
+    accepted: bool
+    kinds: frozenset[Kind] = frozenset()
+    """Kinds of the findings that warn or reject."""
+    left_out: frozenset[int] = frozenset()
+    """Rows of images that the result does not use."""
+    mm: float = np.nan
+    deg: float = np.nan
+    sigmas: float = np.nan
+    """Largest error on an axis of X in stated standard deviations."""
+    joint_p: float = np.nan
+    """Chance of that error or more, all six axes together."""
+    refused: bool = False
+    """Whether the input was refused, with what, where and the remedy."""
+
+    @property
+    def is_within(self) -> bool:
+        """Whether the capture is accepted and as near the truth as stated."""
+        return self.accepted and self.sigmas <= SIGMAS and self.joint_p >= JOINT_P
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether the capture is rejected, or within three standard deviations on every axis."""
+        return not self.accepted or self.sigmas <= SIGMAS
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether the capture is accepted without a warning and farther off than stated."""
+        return self.accepted and not self.is_within and not self.kinds
+
+    def is_named(self, case: Case) -> bool:
+        """Return whether the answer names the fault, or leaves the wrong images out."""
+        wrong = case.fault.wrong if isinstance(case.fault, Fault) else ()
+        return (
+            self.refused or bool(self.kinds & case.named_by) or (bool(wrong) and self.left_out >= set(wrong))
+        )
+
+
+def run() -> str:
+    """Return the page in Markdown: claims, the two tables of faults, and false alarms."""
+    observed = {case: [outcome(*calibrated(case.fault, k, given=case.given)) for k in range(DRAWS)]
+                for case in OBSERVED if isinstance(case.fault, Faults)}  # fmt: skip
+    images = {
+        case: [through_images(1, case.fault, case.given)]
+        for case in RENDERED
+        if isinstance(case.fault, Fault)
+    }
+    clean = [_clean(seed) for seed in range(CLEAN)]
+    clean_images = [through_images(1000 + k, Fault(), k % 2 == 0) for k in range(CLEAN_IMAGES)]
+    return page(observed, images, clean, clean_images)
+
+
+def calibrated(
+    faults: Faults,
+    seed: int,
+    images: int = IMAGES,
+    given: bool = True,
+    options: CalibrateOptions | None = None,
+) -> tuple[FaultyCapture, HandEye]:
+    """Draw a capture of observations with these faults and calibrate it."""
+    found = faulty_capture(np.random.default_rng([seed, images]), images, faults)
+    return found, calibrate(*reconstructed(found, not given), options)
+
+
+def outcome(found: FaultyCapture, hand_eye: HandEye) -> Outcome:
+    """Compare a calibration with the camera's place before and after a slip, whichever is farther."""
+    return _judged(hand_eye, (found.gripper_from_camera, found.gripper_from_camera_after), frozenset())
+
+
+def _clean(seed: int) -> Outcome:
+    """Calibrate a capture without a fault: 8 to 20 images, robots of 0.1 to 0.45 mm, intrinsics given and estimated."""
+    size = 2.0 ** (seed % 4 - 1)
+    faults = Faults(robot_noise=(1e-4 * size + 5e-5, 3e-4 * size))
+    return outcome(*calibrated(faults, 1000 + seed, (8, 12, 20)[seed % 3], given=seed % 2 == 0))
+
+
+@cache
+def _scene(number: int) -> Rendered:
+    """Render a scene once."""
+    return rendered(number)
+
+
+def through_images(seed: int, fault: Fault, given: bool) -> Outcome:
+    """Draw a capture of images with a fault and run `jcr calibrate` on it."""
+    capture = make.draw(_scene(seed % SCENES), seed, fault, given=given)
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            result = jcr.calibrate(make.write(capture, Path(folder) / "capture"), Path(folder) / "out")
+        except InputError:
+            return Outcome(False, refused=True)
+        except RejectedError:
+            return Outcome(False, frozenset({Kind.NO_RECONSTRUCTION}))
+    used = result.reconstruction.image_index[result.hand_eye.inliers].tolist()
+    return _judged(
+        result.hand_eye, capture.gripper_from_camera, frozenset(range(len(capture.images))) - set(used)
+    )
+
+
+def _judged(hand_eye: HandEye, truths: Iterable[Float[ndarray, "4 4"]], left_out: frozenset[int]) -> Outcome:
+    """Compare a calibration with the truth that is farthest from it."""
+    covariance = hand_eye.covariance[:6, :6]
+    std = np.sqrt(np.diag(covariance))
+    steps = [step_between(hand_eye.gripper_from_camera, x) for x in truths]
+    step = max(steps, key=lambda one: float(np.abs(one / std).max()))
+    joint_p = float(chdtrc(6, step @ np.linalg.solve(covariance, step)))
+    kinds = frozenset(finding.kind for finding in _warnings(hand_eye.findings))
+    return Outcome(
+        hand_eye.converged, kinds, left_out, *mm_deg(step), float(np.abs(step / std).max()), joint_p
+    )
+
+
+def _warnings(findings: Iterable[Finding]) -> list[Finding]:
+    """Return the findings that a user reads as a warning; insufficient accuracy is no fault."""
+    return [one for one in findings if one.severity != "informs" and one.kind is not Kind.NOT_EXACT_ENOUGH]
+
+
+Rows = dict[Case, list[Outcome]]
+
+
+def page(observed: Rows, images: Rows, clean: Sequence[Outcome], clean_images: Sequence[Outcome]) -> str:
+    """Return the page of measured captures in Markdown."""
+    lines = [
+        _claim("observations", observed, clean),
+        _claim("images through `jcr calibrate`", images, clean_images),
+        "",
+        "*named*: a finding that warns or rejects names the fault, or the wrong images are left out. *within 3 σ*: "
+        "accepted, on every axis and jointly (p > 0.27 %). *warned*: accepted with a warning and farther off. "
+        "**silent**: accepted without a warning and farther off. A camera that moved is compared before and after, "
+        "whichever is farther. Positions too long in one proportion change nothing that an image shows.",
+    ]
+    for title, rows in (
+        (
+            f"Observations: {IMAGES} images, 500 points with 0.4 px, robot pose noise 0.3 mm and 0.06°",
+            observed,
+        ),
+        (f"Images: {FEW_IMAGES} of 640x480, rendered scenes and arms with typical systematic errors", images),
+    ):
+        head = "fault | captures | named | as | rejected | within 3 σ | warned | silent | off, median: mm | ° | σ"
+        lines += ["", f"## {title}", "", *table(head, (_cells(case, row) for case, row in rows.items()))]
+    return "\n".join(lines) + "\n"
+
+
+def _claim(what: str, rows: Rows, clean: Sequence[Outcome]) -> str:
+    every = [one for case, row in rows.items() if case.what != SCALE_ALONE for one in row]
+    silent = [case.what for case, row in rows.items() if any(one.is_silent for one in row)]
+    alarms = [one for one in clean if one.kinds]
+    return (
+        f"> One fault each, {what}: of {len(every)} captures {sum(not one.accepted for one in every)} are rejected, "
+        f"{sum(one.is_within for one in every)} accepted within 3 σ, "
+        f"{sum(one.accepted and not one.is_within and bool(one.kinds) for one in every)} accepted with a warning and "
+        f"farther off, {sum(one.is_silent for one in every)} silently wrong; "
+        f"silent anywhere: {', '.join(silent) or 'none'}. Of {len(clean)} captures without a fault {len(alarms)} are "
+        f"called faulty and {sum(not one.is_sound for one in clean)} are accepted beyond 3 σ."
+    )
+
+
+def _cells(case: Case, row: Sequence[Outcome]) -> list[object]:
+    kinds = Counter(str(kind) for one in row for kind in one.kinds).most_common(3)
+    has_name = case.named_by or (isinstance(case.fault, Fault) and case.fault.wrong)
+    silent = sum(one.is_silent for one in row)
+    kept = [(one.mm, one.deg, one.sigmas) for one in row if np.isfinite(one.mm)]
+    mm, deg, sigmas = np.median(kept, axis=0) if kept else (np.nan,) * 3
+    return [
+        case.what,
+        len(row),
+        sum(one.is_named(case) for one in row) if has_name else "–",
+        ", ".join(f"{name} {count}" for name, count in kinds),
+        sum(not one.accepted for one in row),
+        sum(one.is_within for one in row),
+        sum(one.accepted and not one.is_within and not one.is_silent for one in row),
+        f"**{silent}**" if silent else 0,
+        f"{mm:.1f}",
+        f"{deg:.2f}",
+        f"{sigmas:.1f}",
+    ]
