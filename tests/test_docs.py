@@ -26,7 +26,12 @@ from simulation.__main__ import Arguments as SimulationArguments
 
 SOURCE = ROOT / "src" / "jcr"
 # Pages of results show the command of the day on which they were measured.
-MANUAL = [page for page in sorted((ROOT / "docs").rglob("*.md")) if page.parent.name != "results"]
+MADE = {"api.md", "cli.md", "formats.md"}
+MANUAL = [
+    page
+    for page in sorted((ROOT / "docs").rglob("*.md"))
+    if page.parent.name != "results" and page.name not in MADE
+]
 PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "examples/README.md")),
     *MANUAL,
