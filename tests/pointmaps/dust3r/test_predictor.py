@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from benchmarks.synthetic_pairs import write_pairs
 from scipy.spatial.transform import Rotation
 
 from jcr.errors import InputError
@@ -17,6 +16,7 @@ from jcr.pointmaps.dust3r.pair_graph import complete_pairs, overlapping_pairs, w
 from jcr.pointmaps.grid import PreparedImages, image_grid
 from jcr.pointmaps.pairs import PairPredictions, read_pairs
 from jcr.records import Intrinsics
+from simulation.pairs import write_pairs
 
 if TYPE_CHECKING:
     from jcr.pointmaps.dust3r.weights import LoadedNetwork
