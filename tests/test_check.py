@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+import capture_writers as writers
 import jcr
 from conftest import shrunk_capture
 from jcr.calibration.checks.left_out import left_out_poses
@@ -138,6 +139,22 @@ def test_images_of_which_none_registers_are_no_good_capture(tabletop: Path, tmp_
     assert dispatch(["check", str(written(tmp_path / "noise", noise, frames))]) == 3
     said = capsys.readouterr()
     assert "registered 0 of 3 images" in said.err and "good to calibrate" not in said.out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("convention", ["ur", "yaskawa"])
+def test_columns_rx_ry_rz_are_read_as_the_images_show(
+    convention: str, tabletop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    capture = jcr.read_capture(tabletop)
+    few = replace(capture, images=capture.images[:8], base_from_gripper=capture.base_from_gripper[:8])
+    writers.write_table(tmp_path, few, convention, "image,x,y,z,rx,ry,rz")
+    with pytest.raises(jcr.InputError, match=r"say which, or find out from the images with jcr check"):
+        jcr.read_capture(tmp_path)
+    assert dispatch(["check", str(tmp_path), "--json"]) == 0
+    said = capsys.readouterr().out
+    (note,) = (remark for remark in json.loads(said)["remarks"] if "rx, ry, rz" in remark)
+    assert f"read with --pose-convention {convention}: these poses agree" in note and "jcr check" not in said
 
 
 def test_one_pose_in_every_row_is_refused(tabletop: Path, tmp_path: Path):

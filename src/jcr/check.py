@@ -1,6 +1,7 @@
 """Judging a capture before any heavy work: files, motion, what it shows, what to add, how it was written."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,15 +29,16 @@ from jcr.calibration.poses import calibrate_poses, is_one
 from jcr.calibration.robot_errors import RobotErrors, errors_of, robot_errors
 from jcr.calibration.stage import checked
 from jcr.camera import fold_distance_px
+from jcr.capture.formats.table import OpenConventionError, possible_options
 from jcr.capture.images import brightness_and_sharpness, exposure_fault, read_image
-from jcr.capture.options import MIN_FRAMES
-from jcr.capture.read import read_source
-from jcr.errors import RejectedError
+from jcr.capture.options import MIN_FRAMES, ReadOptions
+from jcr.capture.read import read_capture, read_source
+from jcr.errors import InputError, RejectedError
 from jcr.estimation.foreseen import ForeseenCamera
-from jcr.estimation.hand_eye import SCALE_STD
+from jcr.estimation.hand_eye import SCALE_STD, solve_hand_eye
 from jcr.estimation.observability import observability
 from jcr.estimation.residuals import angle_ratio
-from jcr.geometry import largest_motion
+from jcr.geometry import ARM, largest_motion
 from jcr.progress import Progress
 from jcr.records import (
     Capture,
@@ -53,6 +55,8 @@ from jcr.records.words import remedy, sentence, unobservable
 from jcr.sfm.colmap import reconstruct_colmap
 from jcr.sfm.options import ColmapOptions
 
+CLEARER = 3.0
+"""Factor by which poses in one convention must fit the images better than in the others."""
 QUICK, QUICK_SIZE_PX = 8, 800
 """Images that tell in seconds whether the poses are theirs, and the long side at which they do."""
 
@@ -114,7 +118,7 @@ def check_capture(
     poses and joint angles contradict each other.
     """
     if isinstance(capture, str | Path):
-        capture = read_source(capture)
+        capture = read_and_compare(capture, progress=progress)
     alone, shown = _examine_alone(capture), _Compared()
     if isinstance(capture, PosePairs):
         shown = _compare_pairs(capture, robot_noise)
@@ -265,6 +269,63 @@ def _compare_with_images(
         if agree and not shown.faults and shown.registered is not None and len(shown.registered) == QUICK:
             return replace(shown, registered=None)
     return _compare_registered(capture, robot, robot_noise, seed, progress)
+
+
+def read_and_compare(
+    path: str | Path,
+    options: ReadOptions | None = None,
+    *,
+    into: str | Path | None = None,
+    progress: Progress | None = None,
+) -> Capture | PosePairs:
+    """Read a capture; where its file leaves open how the poses are written, as its images show.
+
+    Raises InputError where the images do not tell either.
+    """
+    try:
+        return read_source(path, options, into=into, progress=progress)
+    except OpenConventionError:
+        read = list[tuple[Capture, ReadOptions]]()
+        for possible in possible_options(options or ReadOptions()):
+            for one in possible:
+                with suppress(InputError):
+                    read.append((read_capture(path, one), one))
+                    break
+        found = _best_fit(read, progress)
+        if found is None:
+            raise InputError(
+                f"{path}: columns rx, ry, rz may be a rotation vector or angles, and the images do not tell which; add "
+                "--pose-convention ur or --pose-convention yaskawa"
+            ) from None
+        return found
+
+
+def _best_fit(read: list[tuple[Capture, ReadOptions]], progress: Progress | None) -> Capture | None:
+    """Return the capture whose poses agree with the images far better than those of the others, with a note."""
+    if not read:
+        return None
+    rows = spread_rows(len(read[0][0]))
+    few = _of_rows(read[0][0], rows)
+    try:
+        found = reconstruct_colmap(few, ColmapOptions(working_size_px=QUICK_SIZE_PX), progress)
+    except RejectedError:
+        return None
+    fits = []
+    for capture, options in read:
+        gripper = capture.base_from_gripper[rows][found.image_index]
+        noise = solve_hand_eye(gripper, found.recon_from_camera).robot_noise
+        off = f"{1e3 * noise.translation:.2g} mm and {np.degrees(noise.rotation):.2g}°"
+        fits.append((float(noise.translation + ARM * noise.rotation), off, capture, options))
+    (best, off, capture, options), *others = sorted(fits, key=lambda fit: fit[0])
+    if others and others[0][0] < CLEARER * best:
+        return None
+    units = "" if options.pose_units == "auto" else f" --pose-units {options.pose_units}"
+    worse = "".join(f", those of {one.pose_convention} only to {text}" for _, text, _, one in others)
+    note = (
+        f"columns rx, ry, rz are read with --pose-convention {options.pose_convention}{units}: these poses agree with "
+        f"the images to {off} per axis{worse}; give these options to jcr run"
+    )
+    return replace(capture, notes=(*capture.notes, note))
 
 
 def spread_rows(count: int) -> Int[ndarray, " k"]:

@@ -354,7 +354,7 @@ def test_poses_that_belong_to_other_images_are_rejected():
     problem = hand_eye_problem(rng, 10)
     solved = jcr.solve_hand_eye(problem.base_from_gripper[rng.permutation(10)], problem.recon_from_camera)
     assert not solved.converged
-    assert "jcr check" in " ".join(solved.warnings)
+    assert "how the poses are written" in " ".join(solved.warnings)
 
 
 @pytest.mark.parametrize(

@@ -55,7 +55,7 @@ class Arguments:
 def main(arguments: Arguments) -> int:
     """Examine the capture and print what was found."""
     from jcr.calibration.options import CalibrateOptions, check_options
-    from jcr.check import check_capture
+    from jcr.check import check_capture, read_and_compare
     from jcr.errors import InputError, RejectedError
     from jcr.progress import progress_bars
 
@@ -65,7 +65,7 @@ def main(arguments: Arguments) -> int:
     check_options(options)
     with (
         progress_bars() as progress,
-        looked_at(arguments.capture, arguments.read, progress) as capture,
+        looked_at(arguments.capture, arguments.read, progress, read_and_compare) as capture,
     ):
         found = check_capture(
             capture,

@@ -2,13 +2,13 @@
 
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jcr.capture.options import MIN_FRAMES, ReadOptions
+from jcr.capture.options import ReadOptions
 
 if TYPE_CHECKING:
     from jcr.progress import Progress
@@ -58,11 +58,15 @@ def with_images(found: "Capture | PosePairs", path: Path, needed: str) -> "Captu
 
 @contextmanager
 def looked_at(
-    path: Path, options: ReadOptions, progress: "Progress", at_least: int = MIN_FRAMES
+    path: Path,
+    options: ReadOptions,
+    progress: "Progress",
+    read: Callable[..., Any] | None = None,
+    **more: Any,
 ) -> "Iterator[Capture | PosePairs]":
-    """What lies at a path, a recording's frames put where they vanish afterwards."""
+    """Read what lies at a path with `read`, by default read_source; the frames of a recording vanish afterwards."""
     _announce(path)
     from jcr.capture.read import read_source
 
     with tempfile.TemporaryDirectory(prefix="jcr-capture-") as scratch:
-        yield read_source(path, options, into=scratch, progress=progress, at_least=at_least)
+        yield (read or read_source)(path, options, into=scratch, progress=progress, **more)

@@ -638,8 +638,8 @@ _TEXT: dict[Kind, Words] = {
 _REMEDY: dict[Kind, Words] = {
     Kind.UNOBSERVABLE: _to_observe,
     Kind.FEW_IMAGES: "take 8 or more",
-    Kind.FEW_AGREE: "check that images and poses are paired, and the convention of the poses (jcr check)",
-    Kind.POSES_CONTRADICT_IMAGES: "check the pairing and the convention of the poses (jcr check)",
+    Kind.FEW_AGREE: "check that images and poses are paired, and how the poses are written (jcr docs captures)",
+    Kind.POSES_CONTRADICT_IMAGES: "check the pairing, and how the poses are written (jcr docs captures)",
     Kind.POSE_CONVENTION: _given_remedy,
     Kind.UNCERTAIN: _to_be_sure,
     Kind.LEAVE_ONE_OUT: "add some",

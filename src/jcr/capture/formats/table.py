@@ -79,6 +79,21 @@ class PoseTable:
     """Messages of the rows that hold no pose; their poses are NaN."""
 
 
+class OpenConventionError(InputError):
+    """Error of poses in columns rx, ry, rz, which are written in one of several conventions."""
+
+
+def possible_options(options: ReadOptions) -> list[list[ReadOptions]]:
+    """Return the options that columns rx, ry, rz may need: for each convention those of each unit, first by size."""
+    units = [options.pose_units]
+    if options.pose_units == "auto":
+        units = ["auto", "m-rad", "m-deg", "mm-rad", "mm-deg"]
+    return [
+        [replace(options, pose_convention=convention, pose_units=unit) for unit in units]
+        for convention in ("ur", "yaskawa")
+    ]
+
+
 def read(path: Path, options: ReadOptions) -> Capture:
     """Read a file of poses, or a folder that holds one; the images are in the same folder or in images/."""
     file = options.poses or find_table(path)
@@ -131,9 +146,9 @@ def convention_of(columns: PoseColumns, options: ReadOptions, where: str) -> Con
         if set(CONVENTIONS[name].columns) - set(_LAST_ROW) <= columns.cells.keys():
             return name
     if {"rx", "ry", "rz"} <= columns.cells.keys():
-        raise InputError(
+        raise OpenConventionError(
             f"{where}: columns rx, ry, rz may be a rotation vector (--pose-convention ur) or angles about fixed axes "
-            "(--pose-convention yaskawa); say which"
+            "(--pose-convention yaskawa); say which, or find out from the images with jcr check"
         )
     raise InputError(
         f"{where}: its columns ({', '.join(columns.cells)}) contain no pose; name them x, y, z and qx, qy, qz, qw or "
