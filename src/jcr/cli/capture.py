@@ -3,6 +3,7 @@
 import os
 import sys
 import threading
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,19 +14,17 @@ from jcr.capture.options import ConventionName, UnitsName
 from jcr.cli.output import Output
 from jcr.errors import InputError
 from jcr.estimation.arms import CHOICES, ROBOT_NAMES, RobotName
-from jcr.live.camera import CameraOptions
-from jcr.live.collect import LEAST_IMAGES, CollectOptions
+from jcr.live.cameras import CameraOptions
+from jcr.live.session import LEAST_IMAGES, SessionOptions
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
-    from jcr.live.arm_words import ArmWords
-    from jcr.live.asks import Answer, Ask
-    from jcr.live.calibration import LiveCalibration
-    from jcr.live.collect import LiveCapture
     from jcr.live.folder import LiveFolder
-    from jcr.live.rest import States
-    from jcr.live.server import Listen, Server
+    from jcr.live.notation import Notation
+    from jcr.live.robot import States
+    from jcr.live.server import Listen, LiveServer
+    from jcr.live.session import Answer, LiveSession
     from jcr.results import RunResult
 
 
@@ -73,169 +72,148 @@ class Arguments:
     intrinsics_from: Path | None = None
     """JSON file with the camera's "intrinsics" (a capture.json or calibration.json); unset: those stored in the camera
     (RealSense), otherwise estimated."""
-    collect: CollectOptions = field(default_factory=CollectOptions)
+    collect: SessionOptions = field(default_factory=SessionOptions)
     output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:
-    """Collect until there are enough images, or the calibration is as accurate as required."""
-    from jcr.live.collect import LiveCapture
-    from jcr.live.devices import opened
+    """Take images until there are enough, or the calibration is as accurate as required; calibrate all of them."""
+    from jcr.live.arms import states_of
+    from jcr.live.calibration import LiveCalibration
+    from jcr.live.cameras import open_camera
     from jcr.live.folder import LiveFolder
-    from jcr.live.server import Server
+    from jcr.live.server import LiveServer
+    from jcr.live.session import LiveSession
     from jcr.run_folder import locked
 
     options = arguments.collect
     if options.until_accurate and options.require is None:
         raise InputError("--until-accurate: needs --require MM DEG, the accuracy that is meant")
-    _require_source(arguments.poses)
-    listen = _listen(arguments)
+    states, listen, given = (
+        states_of(arguments.poses),
+        _listen(arguments),
+        _intrinsics(arguments.intrinsics_from),
+    )
+    if states is None and arguments.poses not in ("typed", "http"):
+        raise InputError(f"--poses {arguments.poses}: give ur:HOST, franka:HOST, xarm:HOST, typed or http")
     answers: list[Answer] = []
 
     def tell(answer: "Answer", lines: list[str]) -> None:
+        """Print lines, and keep the answer for --json."""
         answers.append(answer)
         _print("\n".join(lines))
 
-    given = _intrinsics(arguments.intrinsics_from)
-    with locked(arguments.out), opened(arguments.camera, arguments.optics) as camera:
-        live = LiveFolder(arguments.out, given or camera.intrinsics, arguments.robot)
-        calibration, states = _calibration(live, options), _states(arguments)
+    with locked(arguments.out), open_camera(arguments.camera, arguments.optics) as camera:
+        folder = LiveFolder(arguments.out, given or camera.intrinsics, arguments.robot)
+        calibration = LiveCalibration(folder, options={"require": options.require}, reach=options.reach_m)
         gripper = None if states is None else lambda: next(states())
-        capture = LiveCapture(calibration, camera, options, tell, _words(arguments, live), gripper)
+        session = LiveSession(calibration, camera, options, tell, _notation(arguments, folder), gripper)
         try:
-            with Server(capture, listen) as server:
-                _print(f"{len(live.names)} images in {arguments.out}; open {server.address} in a browser")
-                capture.run(_asks(arguments, states, _lines(arguments, capture), server))
-                result = capture.finish()
+            with LiveServer(session, listen, arguments.poses == "http") as server:
+                _print(f"{len(folder.names)} images in {arguments.out}; open {server.address} in a browser")
+                session.run(_source(arguments, session, states, server))
+                result = session.finish()
         finally:
             calibration.close()
-    requirement_met = calibration.progress.requirement_met
-    return _report(arguments, live, answers, result, requirement_met)
+    return _conclude(arguments, folder, answers, result, calibration.progress.requirement_met)
 
 
-def _calibration(live: "LiveFolder", options: CollectOptions) -> "LiveCalibration":
-    from jcr.calibration.options import CalibrateOptions
-    from jcr.live.calibration import LiveCalibration
-
-    return LiveCalibration(live, options=CalibrateOptions(require=options.require), reach=options.reach_m)
-
-
-def _report(
+def _conclude(
     arguments: Arguments,
-    live: "LiveFolder",
+    folder: "LiveFolder",
     answers: "list[Answer]",
     result: "RunResult | None",
     requirement_met: bool,
 ) -> int:
-    """Print what was taken and how exact its calibration is; 3 where that is not what `--until-accurate` waits for."""
+    """Print the result and the next command; return 3 where it is rejected or not what `--until-accurate` requires."""
     from jcr.records.words import reached_in_words, sentence
 
-    out, images = arguments.out, len(live.names)
-    more = "" if images >= LEAST_IMAGES else "; three or more are needed, the same command resumes"
-    text = f"{images} images in {out}{more}; next: jcr {'run' if result else 'check'} {out}\n"
+    out, images = arguments.out, len(folder.names)
     required = None if result is None else result.hand_eye.requirement
+    is_accepted = result is not None and result.converged
+    lines = []
     if result is not None and required is not None:
         rejected = [sentence(one) for one in result.hand_eye.findings if one.severity == "rejects"][:1]
-        verdict = "; ".join([result.verdict, *rejected])
-        text = f"{result.out}: {verdict}\n{reached_in_words(required)}\n{text}"
-    facts = {"capture": str(out), "images": live.names, "answers": answers}
+        lines += [f"{result.out}: {'; '.join([result.verdict, *rejected])}", reached_in_words(required)]
+    lines.append(f"{images} images in {out}")
+    if images < LEAST_IMAGES:
+        lines[-1] += f"; {LEAST_IMAGES} or more are needed: the same command resumes"
+    elif not is_accepted:
+        lines.append(f"next: jcr check {out}")
+    else:
+        lines.append(f"next: jcr run {out} {Path('out') / out.resolve().name}")
+    facts = {"capture": str(out), "images": folder.names, "answers": answers}
     facts["result"] = None if result is None else str(result.out)
     facts["verdict"] = None if result is None else result.verdict
-    arguments.output.result(text, facts)
-    is_accurate = result is not None and result.converged and required is not None and required.met
-    return 3 if arguments.collect.until_accurate and not (is_accurate and requirement_met) else 0
-
-
-def _lines(arguments: Arguments, capture: "LiveCapture") -> "Iterator[str]":
-    """What is typed, without commands; where poses come from elsewhere, a thread of its own reads these."""
-    from jcr.live.commands import HELP, without_commands
-
-    lines = without_commands(sys.stdin, capture.press)
-    if sys.stdin.isatty():
-        _print(HELP)
-    if arguments.poses != "typed":
-        threading.Thread(target=lambda: all(True for _ in lines), daemon=True).start()
-    return lines
+    arguments.output.result("\n".join(lines) + "\n", facts)
+    if arguments.collect.until_accurate:
+        is_met = is_accepted and required is not None and required.met and requirement_met
+        return 0 if is_met else 3
+    return 3 if images >= LEAST_IMAGES and not is_accepted else 0
 
 
 def _print(text: str) -> None:
+    """Print progress on stderr."""
     sys.stderr.write(text + "\n")
     sys.stderr.flush()
 
 
-def _require_source(poses: str) -> None:
-    """Raise InputError where `--poses` is no source, before a camera is opened."""
-    kind, _, address = poses.partition(":")
-    if poses not in ("typed", "http") and not (kind in _SPOKEN and address):
-        raise InputError(f"--poses {poses}: give ur:HOST, franka:HOST, xarm:HOST, typed or http")
+def _source(
+    arguments: Arguments, session: "LiveSession", states: "States | None", server: "LiveServer"
+) -> "Callable[[], None]":
+    """Return the function that requests images where `--poses` says; read typed commands."""
+    from jcr.live.terminal import HELP, typed_poses, without_commands
 
-
-def _states(arguments: Arguments) -> "States | None":
-    """The states of an arm that is watched; None of poses that are typed or sent."""
-    from jcr.live import franka, ur, xarm
-
-    kind, _, address = arguments.poses.partition(":")
-    if kind not in _SPOKEN or not address:
-        return None
-    if kind == "ur":
-        host, port = _address(address, 30003, "--poses ur:")
-        return lambda: ur.states(host, port)
-    module = franka if kind == "franka" else xarm
-    return lambda: module.states(address)
-
-
-def _asks(
-    arguments: Arguments, states: "States | None", lines: "Iterator[str]", server: "Server"
-) -> "Iterator[Ask]":
-    """Yield the requests for images of the source that `--poses` names."""
-    from jcr.live.rest import asks_at_rest
-    from jcr.live.typed import typed_poses
-
+    lines = without_commands(sys.stdin, session.press)
+    if sys.stdin.isatty():
+        _print(HELP)
+    if arguments.poses == "typed":
+        poses = typed_poses(lines, _print, arguments.pose_convention, arguments.pose_units)
+        return lambda: _take_all(session, poses)
+    threading.Thread(target=lambda: all(True for _ in lines), daemon=True).start()
     if states is not None:
         _print(f"move the arm; an image is taken whenever it rests ({arguments.poses.partition(':')[2]})")
-        return asks_at_rest(states)
-    if arguments.poses == "typed":
-        return typed_poses(lines, _print, arguments.pose_convention, arguments.pose_units)
-    samples = server.sampled_poses(arguments.timeout)
+        return lambda: session.watch(states)
     _print(f"waiting for POST http://{server.hosts[0]}/sample with the key {server.key}")
-    return samples
+    return lambda: server.await_samples(arguments.timeout)
+
+
+def _take_all(session: "LiveSession", poses: "Iterator[Any]") -> None:
+    """Take an image at each typed pose."""
+    from jcr.live.robot import RobotState
+
+    for pose in poses:
+        session.take(RobotState(time.monotonic(), pose))
 
 
 def _listen(arguments: Arguments) -> "Listen":
     """Return the address of the server; raise InputError where it is open to others without a token."""
-    from jcr.live.server import LOOPBACK, Listen, checked_listen
+    from jcr.live.arms import address_of
+    from jcr.live.server import Listen
 
     token = arguments.token or os.environ.get("JCR_TOKEN") or None
-    if arguments.listen is None:
-        return checked_listen(Listen(LOOPBACK, arguments.page_port, token, "--page-port"))
-    host, port = _address(arguments.listen, 7464, "--listen ")
-    return checked_listen(Listen(host, port, token, "--listen"))
+    listen = Listen(port=arguments.page_port, token=token)
+    if arguments.listen is not None:
+        listen = Listen(*address_of(arguments.listen, 7464, "--listen "), token, "--listen")
+    listen.check()
+    return listen
 
 
-_SPOKEN: dict[str, ConventionName] = {"ur": "ur", "franka": "franka", "xarm": "xarm"}
-"""How the arms' own pendants and programs write poses."""
-
-
-def _words(arguments: Arguments, live: "LiveFolder") -> "ArmWords":
+def _notation(arguments: Arguments, folder: "LiveFolder") -> "Notation":
+    """Return the notation of printed poses: that of the options, else that of the arm."""
     from jcr.estimation.arms import arm_named
-    from jcr.live.arm_words import ArmWords
+    from jcr.live.arms import NOTATIONS
+    from jcr.live.notation import Notation
 
     convention = arguments.pose_convention
     if convention == "auto":
-        convention = _SPOKEN.get(arguments.poses.partition(":")[0], "auto")
-    name = live.rest.get("robot")
-    arm = arm_named(name) if name in ROBOT_NAMES else None
-    return ArmWords(convention, arguments.pose_units, arm)
-
-
-def _address(text: str, port: int, option: str) -> tuple[str, int]:
-    host, _, number = text.rpartition(":") if ":" in text else (text, "", str(port))
-    if not host or not number.isdigit() or not int(number) < 65536:
-        raise InputError(f"{option}{text}: no address; write HOST:PORT such as 127.0.0.1:{port}")
-    return host, int(number)
+        convention = NOTATIONS.get(arguments.poses.partition(":")[0], "auto")
+    name = folder.rest.get("robot")
+    return Notation(convention, arguments.pose_units, arm_named(name) if name in ROBOT_NAMES else None)
 
 
 def _intrinsics(file: Path | None) -> dict[str, Any] | None:
+    """Return the intrinsics in a JSON file; raise InputError where it has none."""
     from jcr.capture.plain_files import read_json
 
     if file is None:

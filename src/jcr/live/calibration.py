@@ -1,14 +1,16 @@
-"""A calibration that is made while the images are taken: after each image, how exact it is and what is missing."""
+"""Calibration that is updated after each image of a capture, with its accuracy, findings and the next gripper pose."""
 
 import json
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8, UInt16
+from jaxtyping import Float, UInt8, UInt16
 from numpy import ndarray
+from numpy.typing import ArrayLike
 
 from jcr.calibration.case import Case, of_points
 from jcr.calibration.checks.left_out import SAME
@@ -16,42 +18,44 @@ from jcr.calibration.checks.views import STILL as MOVED
 from jcr.calibration.expected import FEWEST, assumed_of
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised
-from jcr.calibration.robot_errors import robot_errors
+from jcr.calibration.robot_errors import RobotErrors, robot_errors
 from jcr.calibration.stage import checked
 from jcr.capture.camera_json import intrinsics_as_json
+from jcr.capture.checks import MAX_REACH, likely_unit, read_rigid
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
-from jcr.errors import RejectedError
+from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
 from jcr.files import read_bytes, write_text
 from jcr.geometry import apply, largest_motion
 from jcr.least_squares import one_blas_thread
-from jcr.live.calibration_progress import Progress, Reached
 from jcr.live.folder import LiveFolder
-from jcr.live.look import STILL, grid
-from jcr.live.next_pose import Reach, Tried, before_calibration, proposed
+from jcr.live.next_pose import Attempts, Reach, propose, propose_before_calibration
+from jcr.live.progress import Progress, Reached
+from jcr.live.stillness import ImageSummary
 from jcr.options import checked_options
-from jcr.records import Capture, Finding, HandEye, Intrinsics, Kind, Tracks, strongest_first
+from jcr.records import Capture, Finding, HandEye, Intrinsics, Kind, Reconstruction, Tracks, strongest_first
 from jcr.sfm.growing import Growing
 
 if TYPE_CHECKING:
     from jcr.results import RunResult
 
 HISTORY = "live/history.json"
-"""In the folder of the capture: how exact the calibration was after each image."""
+"""File in the folder of the capture with the accuracy after each image."""
 OBSERVATIONS = 300, 8000
-"""An image and in all, that take part while images are taken; what more of them add, the calibration at the end has."""
+"""Observations per image and in all that are used while images are taken; the calibration at the end uses all."""
 FEW = 5
-"""Images from which on there is a calibration, or a finding that says what is missing."""
+"""Number of images from which on a missing calibration is a finding."""
 MOST_POINTS = 3000
+"""Largest number of points in `Progress.points_in_base`."""
 
 
 class LiveCalibration:
-    """A calibration that grows with its capture.
+    """Calibration that grows with its capture.
 
-    `folder` is that of the capture, or its LiveFolder; a capture that was begun there is continued, from its files.
-    `intrinsics` are of images as they are given to `add`; None: they are estimated. `robot` names the arm
-    (jcr.estimation.arms.ROBOT_NAMES). `reach` (2,3) is the box (m, base frame) in which gripper poses are proposed.
-    Images and poses are written into the folder as they come, and it can be read by jcr.read_capture at any time.
+    `folder` is the folder of the capture, or its LiveFolder; a capture that was begun there is continued. `intrinsics`
+    are those of the images; None: they are estimated. `robot` names the arm (jcr capture --robot list). `reach` (2,3) is
+    the box (m, base frame) in which gripper poses are proposed. Images and poses are written into the folder when they
+    are added, and jcr.read_capture reads it at any time. Methods may be called from several threads.
     """
 
     def __init__(
@@ -63,11 +67,13 @@ class LiveCalibration:
         options: CalibrateOptions | Mapping[str, Any] | None = None,
         reach: Float[ndarray, "2 3"] | None = None,
     ) -> None:
-        """Raises InputError where the folder holds no capture that can be continued, or an option cannot be."""
+        """Open or begin a capture; raise InputError where it cannot be continued, or an option is wrong."""
         if not isinstance(folder, LiveFolder):
             given = None if intrinsics is None else intrinsics_as_json(intrinsics)
             folder = LiveFolder(Path(folder), given, robot)
         self.live = folder
+        self._lock = threading.RLock()
+        """Held while the capture, the map or the progress is changed."""
         self._options = checked_options(options, CalibrateOptions)
         check_options(self._options)
         name = self._options.robot or folder.rest.get("robot")
@@ -75,251 +81,241 @@ class LiveCalibration:
         self._map: Growing | None = None
         self._mapped: list[str] = []
         self._of_image: dict[str, tuple[Finding, ...]] = {}
-        self._grids: dict[str, Float32[ndarray, "gh gw"]] = {}
         self._history = _read_history(folder.folder / HISTORY)
         self._refused: list[Float[ndarray, "4 4"]] = []
         self._next_pose: Callable[[], dict[str, Any]] = dict
-        """Fields of Progress, of the capture as it was calibrated last and the gripper poses refused since."""
+        """Fields of Progress for the capture as it was calibrated last and the gripper poses refused since."""
         self.progress = Progress(images=tuple(folder.names), history=self._history)
 
     def add(
         self,
-        image: UInt8[ndarray, "h w 3"],
-        base_from_gripper: Float[ndarray, "4 4"],
-        joints: Float[ndarray, " dof"] | None = None,
+        image: ArrayLike,
+        base_from_gripper: ArrayLike,
+        joints: ArrayLike | None = None,
         time_s: float | None = None,
         depth_mm: UInt16[ndarray, "h w"] | None = None,
+        *,
+        color: Literal["rgb", "bgr"] = "rgb",
+        replaces: int | None = None,
     ) -> Progress:
-        """Keep an image (RGB) and the gripper pose at it, and calibrate with it.
+        """Keep an image (h,w,3) uint8 and the gripper pose (4,4) at it, and calibrate with it.
 
-        `joints` are the arm's angles (rad), `time_s` is when the image was taken, `depth_mm` that of a depth camera. An
-        image of another size, or one that repeats an earlier one while the gripper moved, is not kept: `refused` says
-        why, and the rest stays as it was.
+        `joints` are the angles of the arm (rad), `time_s` is the time of the image, `depth_mm` (h,w) the image of a depth
+        camera, `color` the order of channels ("bgr" for OpenCV), `replaces` the index of an image that is removed for
+        this one. An image of another size, one that repeats an earlier one, or a pose in another unit is not kept:
+        `refused` says why, and the capture is unchanged. Raises InputError for arrays that are no image or no pose.
         """
-        refused = self.fault(image, base_from_gripper)
-        if refused is not None:
-            return self._refusing(refused, base_from_gripper)
-        self.live.add(image, base_from_gripper, joints, depth_mm, time_s)
-        return self.update()
+        pixels, pose = checked_image(image, color), checked_pose(base_from_gripper)
+        angles = None if joints is None else np.asarray(joints, np.float64)
+        with self._lock:
+            old = None if replaces is None else self.live.names[replaces]
+            refused = self._refusal(pixels, pose, without=old)
+            if refused is not None:
+                return self._refuse(refused, pose)
+            self.live.add(pixels, pose, angles, depth_mm, time_s, replaces=old)
+            return self.update()
 
     def remove(self, index: int) -> Progress:
-        """Take the image at `index` out of the capture, and calibrate without it."""
-        self.live.remove(self.live.names[index])
-        return self.update()
-
-    def replace(
-        self,
-        index: int,
-        image: UInt8[ndarray, "h w 3"],
-        base_from_gripper: Float[ndarray, "4 4"],
-        joints: Float[ndarray, " dof"] | None = None,
-        time_s: float | None = None,
-        depth_mm: UInt16[ndarray, "h w"] | None = None,
-    ) -> Progress:
-        """Take an image in place of that at `index`: it becomes the last one, for images are in the order of taking.
-
-        Where the new one is refused, the old one stays.
-        """
-        old = self.live.names[index]
-        refused = self.fault(image, base_from_gripper, without=old)
-        if refused is not None:
-            return self._refusing(refused, base_from_gripper)
-        self.live.add(image, base_from_gripper, joints, depth_mm, time_s, replaces=old)
-        return self.update()
+        """Remove the image at `index` from the capture, and calibrate without it."""
+        with self._lock:
+            self.live.remove(self.live.names[index])
+            return self.update()
 
     def undo(self) -> Progress:
-        """Take back the last `add`, `remove` or `replace` since the capture was begun or resumed."""
-        self.live.undo()
-        return self.update()
+        """Take back the last change since the capture was begun or resumed."""
+        with self._lock:
+            self.live.undo()
+            return self.update()
 
     def finish(self, out: str | Path | None = None) -> "RunResult":
-        """The calibration of all images by `jcr.calibrate`, from the features and matches that were found.
+        """Calibrate all images by `jcr.calibrate`, from the features and matches that were found.
 
-        Its run folder is `out`, or the folder `result` of the capture. Raises as `jcr.calibrate` does.
+        `out` is the run folder; None: the folder `result` of the capture. Raises as `jcr.calibrate` does.
         """
         from jcr.pipeline import calibrate
         from jcr.results import RunOptions
         from jcr.run_folder import LIVE
 
-        options = RunOptions(calibrate=self._options)
-        return calibrate(self.live.folder, out or self.live.folder / LIVE, options)
-
-    def fault(
-        self,
-        image: UInt8[ndarray, "h w 3"],
-        base_from_gripper: Float[ndarray, "4 4"],
-        without: str | None = None,
-    ) -> Finding | None:
-        """Why an image would not be kept; None of one that can be. `without` names an image that does not count."""
-        size = (image.shape[1], image.shape[0])
-        if self.live.size not in (None, size):
-            sizes = {"size": "{}x{}".format(*size), "before": "{}x{}".format(*self.live.size)}
-            return Finding(kind=Kind.SIZE_DIFFERS, severity="rejects", mend="images", details=sizes)
-        coarse = grid(image)
-        for one in self.live.images:
-            metres, radians = largest_motion(np.stack([one.base_from_gripper, base_from_gripper]))
-            if one.name == without or (metres < MOVED[0] and radians < MOVED[1]):
-                continue
-            if np.abs(self._grid(one.name) - coarse).mean() < STILL:
-                return Finding(
-                    kind=Kind.FRAME_REPEATED,
-                    severity="rejects",
-                    mend="images",
-                    images=(one.name,),
-                    value=metres,
-                    details={"rotation": radians},
-                )
-        return None
+        with self._lock:
+            options = RunOptions(calibrate=self._options)
+            return calibrate(self.live.folder, out or self.live.folder / LIVE, options)
 
     @one_blas_thread
     def update(self) -> Progress:
-        """Bring the calibration up to what the folder holds: images that were added there, or removed."""
-        capture = self.live.capture()
-        names, before = [] if capture is None else list(capture.images), len(self._mapped)
-        for name in [name for name in self._mapped if name not in names]:
-            self._forget(name)
-        # An image that is back is not the last one: those after it are mapped after it again.
-        same = next(
-            (k for k, pair in enumerate(zip(self._mapped, names, strict=False)) if len(set(pair)) > 1), None
-        )
-        for name in [] if same is None else self._mapped[same:]:
-            self._forget(name)
-        new = [name for name in names if name not in self._mapped]
-        if capture is not None:
-            self._extend(capture)
-        added = new[-1] if new and before <= len(names) else None
-        self._refused.clear()
-        self.progress = self._calibrated(capture, added)
-        return self.progress
-
-    def close(self) -> None:
-        """Remove the working files, and the files of images that were taken out of the capture."""
-        if self._map is not None:
-            self._map.close()
-        self.live.close()
+        """Calibrate the images that the folder holds, after some were added or removed there."""
+        with self._lock:
+            capture = self.live.capture()
+            names, before = [] if capture is None else list(capture.images), len(self._mapped)
+            for name in [name for name in self._mapped if name not in names]:
+                self._forget(name)
+            # An image that is back is not the last one: the images after it are mapped after it again.
+            pairs = enumerate(zip(self._mapped, names, strict=False))
+            same = next((k for k, (mapped, name) in pairs if mapped != name), len(self._mapped))
+            for name in self._mapped[same:]:
+                self._forget(name)
+            new = [name for name in names if name not in self._mapped]
+            if capture is not None:
+                self._extend(capture)
+            added = new[-1] if new and before <= len(names) else None
+            self._refused.clear()
+            self.progress = self._calibrated(capture, added)
+            return self.progress
 
     @one_blas_thread
     def propose_elsewhere(self, base_from_gripper: Float[ndarray, "4 4"]) -> Progress:
-        """The state with a next pose away from a gripper pose at which no image could be kept."""
-        self._refused.append(base_from_gripper)
-        self.progress = replace(self.progress, **self._next_pose())
-        return self.progress
+        """Return the state with a next pose away from a gripper pose at which no image could be kept."""
+        with self._lock:
+            self._refused.append(base_from_gripper)
+            self.progress = replace(self.progress, **self._next_pose())
+            return self.progress
 
-    def _refusing(self, refused: Finding, base_from_gripper: Float[ndarray, "4 4"]) -> Progress:
+    def close(self) -> None:
+        """Remove the working files, and the files of images that were removed from the capture."""
+        with self._lock:
+            if self._map is not None:
+                self._map.close()
+            self.live.close()
+
+    def _refusal(
+        self, image: UInt8[ndarray, "h w 3"], base_from_gripper: Float[ndarray, "4 4"], without: str | None
+    ) -> Finding | None:
+        """Return the reason why an image is not kept, or None; `without` names an image that does not count."""
+        size = (image.shape[1], image.shape[0])
+        if self.live.size not in (None, size):
+            sizes = {"size": "{}x{}".format(*size), "before": "{}x{}".format(*self.live.size)}
+            return Finding.of(Kind.SIZE_DIFFERS, "rejects", "images", **sizes)
+        farthest = float(np.abs(base_from_gripper[:3, 3]).max())
+        if farthest > MAX_REACH:
+            unit, _, a_metre = likely_unit(farthest)
+            return Finding.of(
+                Kind.POSE_UNIT, "rejects", "poses", value=farthest, unit=unit, a_metre=float(a_metre)
+            )
+        new = ImageSummary.of(image)
+        for one in self.live.images:
+            if one.name == without or not new.is_like(self.live.summary(one.name)):
+                continue
+            metres, radians = largest_motion(np.stack([one.base_from_gripper, base_from_gripper]))
+            moved = metres >= MOVED[0] or radians >= MOVED[1]
+            kind = Kind.FRAME_REPEATED if moved else Kind.SAMPLE_REPEATED
+            return Finding.of(kind, "rejects", "images", one.name, value=metres, rotation=radians)
+        return None
+
+    def _refuse(self, refused: Finding, base_from_gripper: Float[ndarray, "4 4"]) -> Progress:
+        """Return the state after an image that is not kept."""
         if refused.kind is Kind.FRAME_REPEATED:
             self.propose_elsewhere(base_from_gripper)
         self.progress = replace(self.progress, added=None, refused=refused)
         return self.progress
 
-    def _grid(self, name: str) -> Float32[ndarray, "gh gw"]:
-        if name not in self._grids:
-            self._grids[name] = grid(read_image(self.live.folder / name))
-        return self._grids[name]
-
     def _forget(self, name: str) -> None:
+        """Remove an image from the map."""
         if self._map is not None:
             self._map.remove(self._mapped.index(name))
         self._mapped.remove(name)
         self._of_image.pop(name, None)
-        self._grids.pop(name, None)
 
     def _extend(self, capture: Capture) -> None:
         """Map the images of a capture that are not mapped yet."""
         for count in range(len(self._mapped) + 1, len(capture) + 1):
             name = capture.images[count - 1]
             image = read_image(capture.folder / name)
-            self._of_image[name] = self._looked_at(name, image)
+            self._of_image[name] = self._image_findings(name, image)
             if self._map is None or self._map.is_to_be_mapped_again:
                 if self._map is not None:
                     self._map.close()
-                # What is there already is mapped at once, as after an interruption.
+                # All remaining images are mapped at once, as after an interruption.
                 self._map = Growing(capture)
-                self._of_image |= {
-                    other: self._looked_at(other, read_image(capture.folder / other))
-                    for other in capture.images[count:]
-                }
+                for other in capture.images[count:]:
+                    self._of_image[other] = self._image_findings(other, read_image(capture.folder / other))
                 self._mapped = list(capture.images)
                 return
             self._map.add(_first(capture, count), image)
             self._mapped.append(name)
 
-    def _looked_at(self, name: str, image: UInt8[ndarray, "h w 3"]) -> tuple[Finding, ...]:
-        """What an image by itself, and when it was taken, say against it."""
+    def _image_findings(self, name: str, image: UInt8[ndarray, "h w 3"]) -> tuple[Finding, ...]:
+        """Return the findings about an image by itself and its time."""
         found = []
         if (width := edge_width(image)) > BLURRED_EDGE:
             edge_px = max(*image.shape[:2], EDGES_AT) * width
-            found.append(
-                Finding(kind=Kind.BLURRED, severity="warns", mend="images", images=(name,), value=edge_px)
-            )
+            found.append(Finding.of(Kind.BLURRED, "warns", "images", name, value=edge_px))
         if (back := self.live.seconds_back(name)) is not None:
-            found.append(
-                Finding(kind=Kind.CLOCK_JUMPS, severity="warns", mend="poses", images=(name,), value=back)
-            )
+            found.append(Finding.of(Kind.CLOCK_JUMPS, "warns", "poses", name, value=back))
         return tuple(found)
 
     def _calibrated(self, capture: Capture | None, added: str | None) -> Progress:
+        """Return the state of the mapped images, calibrated where enough of them registered."""
         names = tuple(self._mapped)
+        if capture is None or self._map is None:
+            self._next_pose = dict
+            return Progress(images=names, added=added, history=self._history)
+        made = self._map.reconstruction()
+        rows = np.zeros(0, int) if made is None else made.image_index
+        robot = robot_errors(capture, self._options)
+        # A model that contradicts the poses gives wrong joint angles.
+        reach = self._reach if robot.unused is None else replace(self._reach, arm=None)
         of_images = [finding for name in names for finding in self._of_image[name]]
         of_images += self._not_registered(names)
-        made = None if self._map is None or not names else self._map.reconstruction()
-        registered = () if made is None else tuple(names[row] for row in made.image_index)
-        state = Progress(images=names, added=added, registered=registered, history=self._history)
-        rows = np.zeros(0, int) if made is None else made.image_index
-        if capture is None:
-            self._next_pose = dict
-        else:
-            self._next_pose = lambda: before_calibration(self._tried(capture, rows), self._reach)
-        if capture is None or made is None or len(registered) < FEWEST:
-            findings = strongest_first([*of_images, *_too_few(len(names))])
-            return replace(state, findings=findings, **self._next_pose())
-        tracks = _longest(made.tracks, min(OBSERVATIONS[0] * len(registered), OBSERVATIONS[1]))
-        made = replace(made, tracks=tracks)
-        robot = robot_errors(capture, self._options).of(made.image_index)
-        try:
-            case = checked(capture, made, self._options, robot)
-        except RejectedError:
-            findings = strongest_first([*of_images, *_too_few(len(names))])
-            return replace(state, findings=findings, **self._next_pose())
-        assumptions = assumed_of(case)
-        hand_eye = advised(
-            case.hand_eye, case.base_from_gripper, self._options, robot, assumptions, case.scene_in_base
+        state = Progress(
+            images=names, added=added, registered=tuple(names[row] for row in rows), history=self._history
         )
-        findings = [*of_images, *_contradicting(case, hand_eye), *hand_eye.findings]
+
+        def attempts() -> Attempts:
+            """Return the attempts with the gripper poses refused until now."""
+            return Attempts(capture, rows, tuple(self._refused))
+
+        calibrated = None
+        if made is not None and len(rows) >= FEWEST:
+            calibrated = self._calibrate(capture, made, robot.of(rows))
+        if calibrated is None:
+            self._next_pose = lambda: propose_before_calibration(attempts(), reach)
+            unused = () if robot.unused is None else (robot.unused,)
+            findings = strongest_first([*of_images, *unused, *_too_few(len(names))])
+            return replace(state, findings=findings, **self._next_pose())
+        case, hand_eye = calibrated
         self._remember(len(names), hand_eye)
-        self._next_pose = lambda: proposed(
-            case, hand_eye, robot, assumptions, self._reach, self._tried(capture, rows)
-        )
+        of_rows, assumptions = robot.of(rows), assumed_of(case)
+        self._next_pose = lambda: propose(case, hand_eye, of_rows, assumptions, reach, attempts())
         return replace(
             state,
             hand_eye=hand_eye,
-            findings=strongest_first(findings),
+            findings=strongest_first([*of_images, *_contradicting(case, hand_eye), *hand_eye.findings]),
             history=self._history,
             points_in_base=_points(case, hand_eye),
             **self._next_pose(),
         )
 
-    def _tried(self, capture: Capture, registered: Int[ndarray, " m"]) -> Tried:
-        return Tried(capture, registered, tuple(self._refused))
+    def _calibrate(
+        self, capture: Capture, made: Reconstruction, robot: RobotErrors
+    ) -> tuple[Case, HandEye] | None:
+        """Return the checked calibration of a reconstruction, `robot` of its images; None where none exists."""
+        most = min(OBSERVATIONS[0] * len(made.image_index), OBSERVATIONS[1])
+        made = replace(made, tracks=_longest(made.tracks, most))
+        try:
+            case = checked(capture, made, self._options, robot)
+        except RejectedError:
+            return None
+        return case, advised(
+            case.hand_eye,
+            case.base_from_gripper,
+            self._options,
+            robot,
+            assumed_of(case),
+            case.scene_in_base,
+        )
 
     def _not_registered(self, names: tuple[str, ...]) -> list[Finding]:
-        """Images that stay out of the map, where there is one or there are enough for one."""
+        """Return a finding for each image outside the map, where there are enough images for a map."""
         if self._map is None or len(names) < FEWEST:
             return []
         inside = set(self._map.registered)
         return [
-            Finding(
-                kind=Kind.NOT_REGISTERED,
-                severity="warns",
-                mend="images",
-                images=(name,),
-                value=float(self._map.matched_with(row)),
-            )
+            Finding.of(Kind.NOT_REGISTERED, "warns", "images", name, value=float(self._map.matched_with(row)))
             for row, name in enumerate(names)
             if row not in inside
         ]
 
     def _remember(self, images: int, hand_eye: HandEye) -> None:
-        """Write how exact the calibration is with this number of images; what was known of more is of others."""
+        """Write the accuracy with this number of images; entries of more images belong to other images."""
         required = hand_eye.requirement
         assert required is not None
         reached = Reached(
@@ -332,17 +328,48 @@ class LiveCalibration:
         write_text(self.live.folder / HISTORY, json.dumps([asdict(one) for one in self._history]) + "\n")
 
 
+def checked_image(image: ArrayLike, color: str = "rgb") -> UInt8[ndarray, "h w 3"]:
+    """Return an image as RGB (h,w,3) uint8, grey ones converted; raise InputError for anything else."""
+    if isinstance(image, str | Path):
+        raise InputError(
+            f"image {image}: is a path; give the pixels, numpy.array(PIL.Image.open(path).convert('RGB'))"
+        )
+    if color not in ("rgb", "bgr"):
+        raise InputError(f'color={color!r}: give "rgb", or "bgr" for images of OpenCV')
+    pixels = np.asarray(image)
+    if pixels.dtype != np.uint8:
+        raise InputError(
+            f"image: {pixels.dtype} values; give uint8 from 0 to 255 "
+            "(of floats from 0 to 1: (255 * image).round().astype(numpy.uint8))"
+        )
+    if pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 1):
+        pixels = np.repeat(pixels.reshape(*pixels.shape[:2], 1), 3, axis=2)
+    if pixels.ndim != 3 or pixels.shape[2] != 3:
+        raise InputError(f"image: shape {pixels.shape}; give (height, width, 3), of RGBA image[..., :3]")
+    return np.ascontiguousarray(pixels[..., ::-1] if color == "bgr" else pixels)
+
+
+def checked_pose(base_from_gripper: ArrayLike) -> Float[ndarray, "4 4"]:
+    """Return a rigid transform (4,4); raise InputError for anything else."""
+    if np.shape(base_from_gripper) == (3, 3):
+        raise InputError(
+            "base_from_gripper: a rotation (3x3) has no translation; give 4x4 with the position in metres"
+        )
+    return read_rigid(base_from_gripper, "base_from_gripper")
+
+
 def _first(capture: Capture, count: int) -> Capture:
+    """Return the capture of the first images."""
     return replace(
         capture, images=capture.images[:count], base_from_gripper=capture.base_from_gripper[:count]
     )
 
 
 def _longest(tracks: Tracks, most: int) -> Tracks:
-    """The points that most images see, until there are `most` observations.
+    """Return the points with the most images, until there are `most` observations.
 
-    Among points of as many images the fraction of a pixel decides: as good as chance, and the same choice of points
-    however the map was grown.
+    Among points with equally many images the fraction of a pixel decides: as good as chance, and independent of the
+    order in which the map was grown.
     """
     count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
     fraction = np.ones(len(count))
@@ -354,26 +381,26 @@ def _longest(tracks: Tracks, most: int) -> Tracks:
 
 
 def _too_few(images: int) -> list[Finding]:
-    """That there is no calibration, and why."""
+    """Return the reason why there is no calibration."""
     if images < FEW:
-        return [Finding(kind=Kind.FEW_IMAGES, severity="informs", mend="images", value=float(images))]
+        return [Finding.of(Kind.FEW_IMAGES, "informs", "images", value=float(images))]
     details = {"text": "fewer than three images are registered", "remedy": "let the views overlap more"}
-    return [Finding(kind=Kind.NO_RECONSTRUCTION, severity="rejects", mend="reconstruction", details=details)]
+    return [Finding.of(Kind.NO_RECONSTRUCTION, "rejects", "reconstruction", **details)]
 
 
 def _contradicting(case: Case, hand_eye: HandEye) -> list[Finding]:
-    """Images whose gripper poses a sound calibration leaves out, and where their cameras show the gripper."""
+    """Return a finding for each image whose gripper pose a sound calibration rejects."""
     if not hand_eye.is_sound:
         return []
     images = hand_eye.images
     return [
-        Finding(
-            kind=Kind.POSE_CONTRADICTS_IMAGE,
-            severity="warns",
-            mend="poses",
-            images=(case.names[row],),
+        Finding.of(
+            Kind.POSE_CONTRADICTS_IMAGE,
+            "warns",
+            "poses",
+            case.names[row],
             value=float(images.translation_residual_m[row]),
-            details={"rotation": float(images.rotation_residual_rad[row])},
+            rotation=float(images.rotation_residual_rad[row]),
         )
         for row in np.flatnonzero(~images.inliers)
         if images.translation_residual_m[row] > SAME[0] or images.rotation_residual_rad[row] > SAME[1]
@@ -381,7 +408,7 @@ def _contradicting(case: Case, hand_eye: HandEye) -> list[Finding]:
 
 
 def _points(case: Case, hand_eye: HandEye) -> Float[ndarray, "p 3"]:
-    """Points of the scene that three or more images see (m, base frame)."""
+    """Return points of the scene that three or more images see (m, base frame)."""
     tracks = case.reconstruction.tracks
     seen = np.flatnonzero(np.bincount(tracks.point, minlength=len(tracks.points_in_recon)) >= 3)
     some = seen[:: max(1, len(seen) // MOST_POINTS)]
@@ -389,7 +416,7 @@ def _points(case: Case, hand_eye: HandEye) -> Float[ndarray, "p 3"]:
 
 
 def _read_history(file: Path) -> tuple[Reached, ...]:
-    """As it was written; nothing of a file that cannot be read, for it decides nothing."""
+    """Return the accuracies as they were written; none of a file that cannot be read, for it decides nothing."""
     try:
         return tuple(Reached(**one) for one in json.loads(read_bytes(file)))
     except (OSError, ValueError, TypeError):

@@ -1,4 +1,4 @@
-"""The capture folder while it grows: whole after every change, so that stopping loses nothing."""
+"""Capture folder that grows image by image and is complete after every change, so that stopping loses nothing."""
 
 import json
 import re
@@ -18,6 +18,7 @@ from jcr.capture.plain_files import contained, read_json
 from jcr.errors import InputError
 from jcr.estimation.arms import ROBOT_NAMES
 from jcr.files import remove_unfinished, write_bytes, write_text
+from jcr.live.stillness import ImageSummary
 from jcr.records import Capture
 
 IMAGES = "images"
@@ -25,35 +26,37 @@ IMAGES = "images"
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TakenImage:
-    """An image of the capture, and what was recorded with it."""
+    """Image of the capture with the data recorded with it."""
 
     name: str
-    """Its file, in the folder."""
+    """File in the folder."""
     base_from_gripper: Float[ndarray, "4 4"]
     joints: Float[ndarray, " dof"] | None
-    """rad; None where they are not known."""
+    """Joint angles (rad); None where they are not known."""
     depth: str | None
-    """The file of a depth camera's image."""
+    """File of a depth camera's image."""
     time_s: float | None
-    """On the camera's clock."""
+    """Time on the camera's clock."""
 
 
 class LiveFolder:
-    """A capture folder whose images are added, replaced and removed; what it holds already is kept.
+    """Capture folder whose images are added, replaced and removed; images that it holds already are kept.
 
-    Changes are made by one thread; others may read at any time. The files of removed images stay until `close`, so that
-    a change can be undone.
+    One thread at a time makes changes; others may read at any time. The files of removed images stay until `close`, so
+    that a change can be undone.
     """
 
     def __init__(self, folder: Path, intrinsics: dict[str, Any] | None = None, robot: str | None = None):
-        """`intrinsics` as capture.json has them. Raises InputError when `folder` cannot be resumed."""
+        """Open or begin a capture; `intrinsics` in the form of capture.json. Raise InputError for unusable folders."""
         self.folder = folder
         self.images: tuple[TakenImage, ...] = ()
         self.intrinsics = intrinsics
         self.size: tuple[int, int] | None = None
         self.rest: dict[str, Any] = {"source": {"program": "jcr capture"}}
+        """Other keys of capture.json."""
         self._earlier: list[tuple[TakenImage, ...]] = []
-        """The images before each change of this session."""
+        """Images before each change of this session."""
+        self._summaries: dict[str, ImageSummary] = {}
         if folder.exists() and not folder.is_dir():
             raise InputError(f"{folder}: is a file; name a folder for the capture")
         if (folder / FILE).exists():
@@ -66,39 +69,40 @@ class LiveFolder:
         self._next_number = self._first_free_number()
 
     def _resume(self, content: Any) -> None:
+        """Take the images and other keys of an existing capture.json."""
         file = self.folder / FILE
         if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
             raise InputError(f'{file}: has no list "frames"; name a new folder for the capture')
-        images = []
-        for row, frame in enumerate(content["frames"]):
-            if not isinstance(frame, dict) or not isinstance(frame.get("image"), str):
-                raise InputError(f"{file}: frame {row} names no image; name a new folder for the capture")
-            where = f"{file}: frame {row}"
-            height, width = read_image(contained(self.folder, frame["image"], where)).shape[:2]
-            self.size = (width, height)
-            angles, depth, time_s = (frame.get(key) for key in ("joints", "depth", "time_s"))
-            images.append(
-                TakenImage(
-                    name=frame["image"],
-                    base_from_gripper=read_rigid(frame.get("base_from_gripper"), where),
-                    joints=None if angles is None else read_joints(angles, f"{where}: joints"),
-                    depth=depth if isinstance(depth, str) else None,
-                    time_s=float(time_s) if isinstance(time_s, int | float) else None,
-                )
-            )
-        self.images = tuple(images)
+        self.images = tuple(self._frame(frame, row) for row, frame in enumerate(content["frames"]))
         self.intrinsics = self.intrinsics or content.get("intrinsics")
         self.rest = {key: content[key] for key in content if key not in ("frames", "intrinsics")}
 
-    @property
-    def names(self) -> list[str]:
-        """Of the images, in the order in which they were taken."""
-        return [one.name for one in self.images]
+    def _frame(self, frame: Any, row: int) -> TakenImage:
+        """Return the image of one entry of "frames", and set the size of images."""
+        where = f"{self.folder / FILE}: frame {row}"
+        if not isinstance(frame, dict) or not isinstance(frame.get("image"), str):
+            raise InputError(f"{where} names no image; name a new folder for the capture")
+        height, width = read_image(contained(self.folder, frame["image"], where)).shape[:2]
+        self.size = (width, height)
+        angles, depth, time_s = (frame.get(key) for key in ("joints", "depth", "time_s"))
+        return TakenImage(
+            name=frame["image"],
+            base_from_gripper=read_rigid(frame.get("base_from_gripper"), where),
+            joints=None if angles is None else read_joints(angles, f"{where}: joints"),
+            depth=depth if isinstance(depth, str) else None,
+            time_s=float(time_s) if isinstance(time_s, int | float) else None,
+        )
 
     @property
-    def poses(self) -> list[Float[ndarray, "4 4"]]:
-        """base_from_gripper of each image."""
-        return [one.base_from_gripper for one in self.images]
+    def names(self) -> list[str]:
+        """Names of the images, in the order in which they were taken."""
+        return [one.name for one in self.images]
+
+    def summary(self, name: str) -> ImageSummary:
+        """Return the summary of an image of the folder."""
+        if name not in self._summaries:
+            self._summaries[name] = ImageSummary.of(read_image(self.folder / name))
+        return self._summaries[name]
 
     def add(
         self,
@@ -109,11 +113,11 @@ class LiveFolder:
         time_s: float | None = None,
         replaces: str | None = None,
     ) -> str:
-        """Keep an image (RGB) and its pose, and return the image's name; capture.json is whole again after.
+        """Write an image (RGB) with its pose and return its name; capture.json is complete again after that.
 
-        `replaces` is an image that is taken out for it. `joints` (rad) are kept when all images have them. Raises
-        InputError where the image's size is not that of the others, and OSError where it cannot be written: the capture
-        is then what it was.
+        `replaces` names an image that is removed. `joints` (rad) are written when all images have them. Raises
+        InputError where the size differs from that of the others, and OSError where a file cannot be written; the
+        capture is then unchanged.
         """
         size = (image.shape[1], image.shape[0])
         if self.size not in (None, size):
@@ -140,21 +144,22 @@ class LiveFolder:
             self._delete(new)
             raise
         self.size = size
+        self._summaries[new.name] = ImageSummary.of(image)
         self._ever[new.name] = new
         self._next_number += 1
         return new.name
 
     def remove(self, name: str) -> None:
-        """Take an image out of the capture."""
+        """Remove an image from the capture."""
         self._change(tuple(one for one in self.images if one.name != name))
 
     @property
     def can_undo(self) -> bool:
-        """Whether this session changed anything that is not undone."""
+        """Whether this session made a change that is not undone."""
         return len(self._earlier) > 0
 
     def undo(self) -> bool:
-        """Take back the last change of this session; whether there was one."""
+        """Take back the last change of this session; return whether there was one."""
         if not self._earlier:
             return False
         self._write(self._earlier[-1])
@@ -162,38 +167,37 @@ class LiveFolder:
         return True
 
     def close(self) -> None:
-        """Delete the files of images that this session took out of the capture: no change can be undone after."""
+        """Delete the files of images that this session removed; no change can be undone after that."""
         for name in self._ever.keys() - set(self.names):
             self._delete(self._ever.pop(name))
         self._earlier.clear()
 
     def _change(self, images: tuple[TakenImage, ...]) -> None:
+        """Write capture.json with these images, and remember the present ones for `undo`."""
         self._write(images)
         self._earlier.append(self.images)
         self.images = images
 
     def _delete(self, one: TakenImage) -> None:
+        """Delete the files of an image."""
         for file in filter(None, (one.name, one.depth)):
             contained(self.folder, file, str(self.folder)).unlink(missing_ok=True)
 
     def seconds_back(self, name: str) -> float | None:
-        """By how much an image was stamped before the one taken before it; None where it was not, or has no stamp.
+        """Return the time by which an image was stamped before its predecessor; None where it was not, or is unknown.
 
-        Another run of the program, which took the images that were there before, may have had another clock.
+        Images of an earlier session may have had another clock.
         """
-        images = self.images
-        row = next((row for row, one in enumerate(images) if one.name == name), 0)
-        before, now = images[row - 1 : row + 1] if row else (None, None)
-        if before is None or now is None:
+        row = self.names.index(name) if name in self.names else 0
+        before, now = self.images[row - 1 : row + 1] if row else (None, None)
+        if before is None or now is None or now.time_s is None or before.time_s is None:
             return None
         if (before.name in self._before_session) != (name in self._before_session):
             return None
-        if now.time_s is None or before.time_s is None or now.time_s > before.time_s:
-            return None
-        return before.time_s - now.time_s
+        return before.time_s - now.time_s if now.time_s <= before.time_s else None
 
     def capture(self) -> Capture | None:
-        """The images so far as a capture, of one image too; None of none. They were checked when they were taken."""
+        """Return the images as a capture, a single one too; None where there is none."""
         images = self.images
         if not images or self.size is None:
             return None
@@ -211,28 +215,28 @@ class LiveFolder:
         )
 
     def _write(self, images: tuple[TakenImage, ...]) -> None:
+        """Write capture.json with these images."""
         joints = _all_joints(images)
         frames: list[dict[str, Any]] = []
         for row, one in enumerate(images):
             frame: dict[str, Any] = {"image": one.name, "base_from_gripper": one.base_from_gripper.tolist()}
-            if joints is not None:
-                frame["joints"] = joints[row].tolist()
-            if one.depth is not None:
-                frame["depth"] = one.depth
-            if one.time_s is not None:
-                frame["time_s"] = one.time_s
-            frames.append(frame)
+            optional = {
+                "joints": None if joints is None else joints[row].tolist(),
+                "depth": one.depth,
+                "time_s": one.time_s,
+            }
+            frames.append(frame | {key: value for key, value in optional.items() if value is not None})
         content = {"frames": frames, "intrinsics": self.intrinsics, **self.rest}
         write_text(self.folder / FILE, json.dumps(content, indent=1) + "\n")
 
     def _first_free_number(self) -> int:
-        """Above all images that are there, those of an interrupted session that no capture.json names included."""
+        """Return a number above those of all image files, files that no capture.json names included."""
         names = [*self.names, *(f"{IMAGES}/{file.name}" for file in (self.folder / IMAGES).glob("*.png"))]
         numbers = [int(match[1]) for name in names if (match := re.match(r"images/(\d+)\.", name))]
         return max(numbers, default=-1) + 1
 
 
 def _all_joints(images: tuple[TakenImage, ...]) -> Float[ndarray, "n dof"] | None:
-    """Joint angles (rad) of all images, or None where one lacks them."""
+    """Return the joint angles (rad) of all images, or None where one lacks them."""
     known = [one.joints for one in images if one.joints is not None]
     return np.stack(known) if known and len(known) == len(images) else None

@@ -1,20 +1,23 @@
-"""What the live page shows of a capture: one record, drawn by the templates and the figures of the report."""
+"""Content of the live page: one record of a session's state, drawn by templates and figures of the report."""
 
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from jaxtyping import UInt8
+from numpy import ndarray
 
 from jcr.calibration.requirement import GRASPING
-from jcr.live.arm_words import ArmWords
-from jcr.live.calibration_progress import Progress
-from jcr.live.calibration_words import faults, next_lines, next_sentence, number_of
-from jcr.live.collect import LiveCapture, Shown
-from jcr.live.folder import LiveFolder
-from jcr.records import Finding, Intrinsics
+from jcr.capture.images import read_image
+from jcr.live.notation import Notation
+from jcr.live.progress import FIRST_ADVICE, Progress, faults, next_lines, next_sentence, number_of
+from jcr.live.session import LiveSession, SessionState
+from jcr.records import Intrinsics
 from jcr.records.words import reached_in_words, sentence
 from jcr.report.figures import Figure, course_figure
 from jcr.report.raster import TRACK_COLOR
@@ -25,149 +28,172 @@ from jcr.rounding import significant
 
 PACKAGE = "jcr.live"
 PARTS = ("head", "next", "course", "images")
-"""Templates of what changes with the capture, each in an element of this name."""
+"""Templates of the parts that change, each in an element of this name."""
 ANY_CAMERA = Intrinsics(600.0, 600.0, 320.0, 240.0, 640, 480)
-"""Drawn where no intrinsics are known."""
+"""Camera that is drawn where no intrinsics are known."""
+NOW_PX, CARD_PX = 640, 330
+"""Width of the camera's image and of the images in the list."""
+FEW_FEATURES = 150
+"""Number of SIFT features in an image of NOW_PX below which registration is at risk."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImageCard:
-    """An image as the page lists it."""
+    """Image in the list of the page."""
 
     number: int
+    """Number in commands, from 1."""
     name: str
+    """File in the folder."""
     fault: str
-    """What is found against it; empty where nothing is."""
+    """Finding about it; empty where there is none."""
     state: str
-    """registered, not registered, new (no calibration with it yet)."""
+    """"registered", "not registered", or "new" before it is calibrated."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class PageState:
-    """All that changes on the page, but for the 3D view; the templates draw nothing else."""
+class PageContent:
+    """Everything that changes on the page except the 3D view; the templates draw nothing else."""
 
     kind: str
-    """good, fair, bad, or empty: the colour of the headline."""
+    """"good", "fair", "bad" or empty: colour of the headline."""
     headline: str
+    """State in a few words."""
     lines: Sequence[str]
-    """What is to be known of it, and what is wrong."""
+    """What to do, and further findings."""
     replaces: int | None
-    """The number of the image that the next one replaces."""
+    """Number of the image that the next one replaces."""
     is_over: bool
+    """Whether no more images are taken."""
+    has_report: bool
+    """Whether the report of the calibration at the end can be opened."""
     can_undo: bool
+    """Whether there is a change that can be taken back."""
     tiles: Sequence[Tile]
+    """Accuracies beside what is required."""
     next_pose: str
-    """Where it is and what is expected of it; empty where none is proposed."""
+    """Place of the next pose and expected accuracy; empty where none is proposed."""
     next_lines: Sequence[str]
-    """As the arm writes it."""
+    """Next pose in the notation of the arm."""
     courses: Sequence[Figure]
+    """Accuracy after each image."""
     images: Sequence[ImageCard]
-    """The newest first."""
+    """Images, the newest first."""
 
 
-def whole_page(capture: LiveCapture) -> str:
-    """The page as a browser loads it; it then asks for its parts."""
-    content = {"folder": str(capture.live.folder), "scene": _scene_section(capture)}
+def whole_page(session: LiveSession) -> str:
+    """Return the page as a browser loads it; its script requests the parts after that."""
+    checks = [
+        ("cameras", "cameras", True),
+        ("grippers", "grippers", True),
+        ("grid", "base and grid", True),
+        ("next", "next pose (green)", True),
+        ("tracks", "points seen (red)", True),
+    ]
+    view = {"layers": [], "checks": checks, "through": [], "labels": [], "data": _scene(session.state)}
+    content = {"folder": str(session.folder.folder), "scene": Section("view", view)}
     return render("live.html", content, PACKAGE)
 
 
-def page_parts(capture: LiveCapture) -> dict[str, Any]:
-    """What the page asks for when the capture has changed: the parts, as HTML, and what the 3D view draws."""
-    shown = capture.shown
-    state = page_state(shown, capture.live, capture.options.require or GRASPING, capture.words)
-    parts = {name: render(f"{name}.html", {"state": state}, PACKAGE) for name in PARTS}
+def page_parts(session: LiveSession, state: SessionState, has_report: bool) -> dict[str, Any]:
+    """Return the parts of the page as HTML and the data of the 3D view."""
+    required = session.options.require or GRASPING
+    content = page_content(state, required, session.notation, has_report)
     return {
-        "version": shown.version,
-        "is_over": shown.is_over,
-        "images": len(shown.images),
-        "parts": parts,
-        "scene": json.dumps(_scene(capture)),
+        "version": state.version,
+        "is_over": state.is_over,
+        "is_done": state.is_done,
+        "has_report": has_report,
+        "images": len(state.images),
+        "parts": {name: render(f"{name}.html", {"state": content}, PACKAGE) for name in PARTS},
+        "scene": json.dumps(_scene(state)),
     }
 
 
-def page_state(shown: Shown, live: LiveFolder, required: tuple[float, float], words: ArmWords) -> PageState:
-    """What the page shows at one moment; `required` are mm and degrees."""
-    progress, images = shown.progress, _cards(shown)
-    kind, headline, lines = _verdict(shown, required)
-    pose = progress.next_pose if not shown.is_over else None
-    return PageState(
+def page_content(
+    state: SessionState, required: tuple[float, float], notation: Notation, has_report: bool = False
+) -> PageContent:
+    """Return the content for a state; `required` are mm and degrees."""
+    progress, names = state.progress, state.names
+    kind, headline, lines = _verdict(state, required)
+    has_next = progress.next_pose is not None and not state.is_over and not progress.requirement_met
+    return PageContent(
         kind=kind,
-        headline=headline,
-        lines=lines,
-        replaces=None if shown.replaces is None else live.names.index(shown.replaces) + 1,
-        is_over=shown.is_over,
-        can_undo=live.can_undo or shown.replaces is not None,
-        tiles=_tiles(shown, required),
-        next_pose="" if pose is None else next_sentence(progress),
-        next_lines=[] if pose is None else next_lines(progress, words),
+        headline=_capitalised(headline),
+        lines=[_capitalised(line) for line in lines],
+        replaces=names.index(state.replaces) + 1 if state.replaces in names else None,
+        is_over=state.is_over,
+        has_report=has_report,
+        can_undo=state.can_undo,
+        tiles=_tiles(state, required),
+        next_pose=next_sentence(progress) if has_next else "",
+        next_lines=_next_lines(progress, notation) if has_next else [],
         courses=_courses(progress, required),
-        images=images[::-1],
+        images=_cards(state)[::-1],
     )
 
 
-def _cards(shown: Shown) -> list[ImageCard]:
-    progress = shown.progress
-    against = {name: sentence(one) for one in progress.findings[::-1] for name in _of_one(one)}
+def _next_lines(progress: Progress, notation: Notation) -> list[str]:
+    """Return the next pose as a person enters it; a line of a program would repeat the pose."""
+    return [line for line in next_lines(progress, notation) if not line.startswith("URScript")]
+
+
+def _cards(state: SessionState) -> list[ImageCard]:
+    """Return the images of the list."""
+    progress = state.progress
+    one_image = [one for one in progress.findings if len(one.images) == 1 and one.severity != "informs"]
+    against = {one.images[0]: sentence(one) for one in one_image[::-1]}
+    registered = dict.fromkeys(progress.images, "not registered") | dict.fromkeys(
+        progress.registered, "registered"
+    )
     return [
-        ImageCard(
-            number=number,
-            name=name,
-            fault=against.get(name, ""),
-            state="registered"
-            if name in progress.registered
-            else "not registered"
-            if name in progress.images
-            else "new",
-        )
-        for number, name in enumerate(shown.images, 1)
+        ImageCard(number=number, name=name, fault=against.get(name, ""), state=registered.get(name, "new"))
+        for number, name in enumerate(state.names, 1)
     ]
 
 
-def _of_one(finding: Finding) -> tuple[str, ...]:
-    return finding.images if len(finding.images) == 1 and finding.severity != "informs" else ()
-
-
-def _verdict(shown: Shown, required: tuple[float, float]) -> tuple[str, str, list[str]]:
-    """The kind, the headline and the lines below it."""
-    progress, wrong = shown.progress, faults(shown.progress)
-    lines = [_capitalised(sentence(one)) for one in wrong]
-    if shown.result is not None:
-        verdict = shown.result.verdict
-        kind = {"accepted": "good", "rejected": "bad"}.get(verdict, "fair")
-        found = shown.result.hand_eye.requirement
-        reached = [] if found is None else [_capitalised(reached_in_words(found))]
-        where = f"The calibration of all {len(shown.images)} images is in {shown.result.out}; its report.html shows it."
-        return kind, _capitalised(verdict), [*reached, where]
-    if shown.is_refusal:
-        return "bad", _capitalised(shown.event), lines
-    if shown.event:
-        return "", _capitalised(shown.event), lines
-    if not shown.images:
+def _verdict(state: SessionState, required: tuple[float, float]) -> tuple[str, str, list[str]]:
+    """Return the kind, the headline and the lines below it."""
+    progress, count = state.progress, len(state.images)
+    if state.result is not None:
+        return _final_verdict(state)
+    if state.event:
+        lines = [sentence(one) for one in faults(progress)] if state.is_refusal else []
+        return "bad" if state.is_refusal else "", state.event, lines
+    if not count:
         first = "Move the arm so that the camera sees textured things at different heights, and let it rest."
         return "", "No image yet", [first]
-    if wrong:
+    if not progress.images:
+        return "", f"{count} images", ["They are being calibrated."]
+    if wrong := faults(progress):
         is_bad = any(one.severity == "rejects" for one in wrong)
-        number = number_of(wrong[0], shown.images)
+        number = number_of(wrong[0], state.names)
         commands = [] if number is None else [f"Retake or remove image {number}."]
-        return "bad" if is_bad else "fair", lines[0], [*commands, *lines[1:]]
+        first, *more = (sentence(one) for one in wrong)
+        if progress.requirement_met and not is_bad:
+            return "good", "Requirement met, press Finish", [first, *commands, *more]
+        return "bad" if is_bad else "fair", first, [*commands, *more]
     if progress.now is None:
-        return (
-            "",
-            f"{len(shown.images)} images",
-            ["From the third image that registers on there is a calibration."],
-        )
-    return _accuracy(progress, required)
+        return "", f"{count} images", ["A calibration needs three images that register.", FIRST_ADVICE + "."]
+    return _accuracy_verdict(progress, required)
 
 
-def _accuracy(progress: Progress, required: tuple[float, float]) -> tuple[str, str, list[str]]:
-    """Of a calibration against which nothing is found."""
+def _final_verdict(state: SessionState) -> tuple[str, str, list[str]]:
+    """Return the verdict of the calibration at the end, with its reasons and warnings."""
+    assert state.result is not None
+    verdict, hand_eye = state.result.verdict, state.result.hand_eye
+    found = [] if hand_eye.requirement is None else [reached_in_words(hand_eye.requirement)]
+    warnings = [sentence(one) for one in hand_eye.findings if one.severity != "informs"]
+    where = f"The calibration of all {len(state.images)} images is in {state.result.out}."
+    return {"accepted": "good", "rejected": "bad"}.get(verdict, "fair"), verdict, [*found, *warnings, where]
+
+
+def _accuracy_verdict(progress: Progress, required: tuple[float, float]) -> tuple[str, str, list[str]]:
+    """Return the verdict of a calibration without findings."""
     assert progress.now is not None
     if progress.requirement_met:
-        return (
-            "good",
-            "Requirement met, press Finish",
-            ["The leave-one-out error confirms it. More images are possible."],
-        )
+        lines = ["The leave-one-out error confirms it. More images are possible."]
+        return "good", "Requirement met, press Finish", lines
     mm, deg = progress.now.translation_mm, progress.now.rotation_deg
     if mm > required[0] or deg > required[1]:
         return "", "Not accurate enough yet: go on to the next pose", []
@@ -177,38 +203,39 @@ def _accuracy(progress: Progress, required: tuple[float, float]) -> tuple[str, s
 
 
 def _capitalised(words: str) -> str:
+    """Return a sentence with a capital first letter."""
     return words[:1].upper() + words[1:]
 
 
-def _tiles(shown: Shown, required: tuple[float, float]) -> list[Tile]:
-    progress = shown.progress
-    if not shown.images:
+def _tiles(state: SessionState, required: tuple[float, float]) -> list[Tile]:
+    """Return the accuracies beside what is required, and the number of registered images."""
+    if not state.images:
         return []
     tiles: list[Tile] = [
         (name, f"± {significant(value)}{unit}", f"required {limit:g}{unit}", True)
         for name, value, limit, unit in zip(
-            ("Point seen, 95 %", "Direction, 95 %"), _reached(shown), required, (" mm", "°"), strict=False
+            ("Point seen, 95 %", "Direction, 95 %"), _reached(state), required, (" mm", "°"), strict=False
         )
     ]
-    count = f"{len(progress.registered)} of {len(shown.images)}"
+    count = f"{len(state.progress.registered)} of {len(state.images)}"
     tiles.append(("Images registered", count, "", False))
-    if (error := progress.leave_one_out) is not None:
+    if (error := state.progress.leave_one_out) is not None:
         off = f"{significant(error.translation_mm)} mm · {significant(error.rotation_deg)}°"
         tiles.append(("Leave-one-out error", off, "", False))
     return tiles
 
 
-def _reached(shown: Shown) -> tuple[float, ...]:
-    """How exact the calibration is (mm, degrees), at the end that of all images; empty where there is none."""
-    found = None if shown.result is None else shown.result.hand_eye.requirement
+def _reached(state: SessionState) -> tuple[float, ...]:
+    """Return the accuracy (mm, degrees), at the end that of all images; empty where there is none."""
+    found = None if state.result is None else state.result.hand_eye.requirement
     if found is not None:
         return found.reached_mm, found.reached_deg
-    now = shown.progress.now
+    now = state.progress.now
     return () if now is None else (now.translation_mm, now.rotation_deg)
 
 
 def _courses(progress: Progress, required: tuple[float, float]) -> list[Figure]:
-    """How exact the calibration was, image by image."""
+    """Return figures of the accuracy after each image."""
     if len(history := progress.history) < 2:
         return []
     count = [one.images for one in history]
@@ -219,40 +246,55 @@ def _courses(progress: Progress, required: tuple[float, float]) -> list[Figure]:
     return [course_figure(title, count, values, goal, unit) for title, values, goal, unit in curves]
 
 
-def _scene_section(capture: LiveCapture) -> Section:
-    checks = [
-        ("cameras", "cameras", True),
-        ("grippers", "grippers", True),
-        ("grid", "base and grid", True),
-        ("next", "next pose (green)", True),
-        ("tracks", "points seen (red)", True),
-    ]
-    return Section(
-        "view", {"layers": [], "checks": checks, "through": [], "labels": [], "data": _scene(capture)}
-    )
-
-
-def _scene(capture: LiveCapture) -> dict[str, Any]:
-    """Points seen, images and the next pose; cameras where a calibration places them."""
-    shown, live = capture.shown, capture.live
-    progress, found = shown.progress, shown.progress.hand_eye
+def _scene(state: SessionState) -> dict[str, Any]:
+    """Return the data of the 3D view: points, images, the next pose, and cameras where a calibration places them."""
+    progress, found = state.progress, state.progress.hand_eye
     x = np.eye(4) if found is None else found.gripper_from_camera
-    faults = {one.name: one.fault for one in _cards(shown)}
+    faults_of = {one.name: one.fault for one in _cards(state)}
     views = [
         scene_view(
             Path(one.name).name,
-            faults.get(one.name, "") or one.name,
-            not faults.get(one.name),
+            faults_of[one.name] or one.name,
+            not faults_of[one.name],
             one.base_from_gripper,
             one.base_from_gripper @ x if found is not None and one.name in progress.registered else None,
         )
-        for one in live.images
+        for one in state.images
     ]
     points = np.zeros((0, 3)) if progress.points_in_base is None else progress.points_in_base
-    layer = PointLayer(
-        "points seen", points, np.tile(np.array(TRACK_COLOR, np.uint8), (len(points), 1)), TRACK_SIZE
-    )
-    next_poses = [] if progress.next_pose is None or shown.is_over else [progress.next_pose.base_from_gripper]
+    colors = np.tile(np.array(TRACK_COLOR, np.uint8), (len(points), 1))
+    is_proposed = progress.next_pose is not None and not state.is_over and not progress.requirement_met
+    next_poses = [progress.next_pose.base_from_gripper] if is_proposed and progress.next_pose else []
     intrinsics = (found.intrinsics if found is not None else None) or ANY_CAMERA
-    shown_in_base = np.array([np.zeros(3), *(pose[:3, 3] for pose in (*live.poses, *next_poses))])
+    poses = [*(one.base_from_gripper for one in state.images), *next_poses]
+    shown_in_base = np.array([np.zeros(3), *(pose[:3, 3] for pose in poses)])
+    layer = PointLayer("points seen", points, colors, TRACK_SIZE)
     return scene_data([layer], views, next_poses, x, intrinsics, shown_in_base)
+
+
+@lru_cache(maxsize=128)
+def image_card(file: Path) -> bytes:
+    """Return a small copy of an image, JPEG."""
+    return _jpeg(_resized(read_image(file), CARD_PX))
+
+
+def camera_image(image: UInt8[ndarray, "h w 3"]) -> tuple[bytes, str]:
+    """Return the image NOW_PX wide with a ring at each SIFT feature, JPEG, and a sentence on their number."""
+    small = _resized(np.ascontiguousarray(image), NOW_PX)
+    found = cv2.SIFT.create(2000).detect(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), None)
+    for feature in found:
+        center = round(feature.pt[0]), round(feature.pt[1])
+        cv2.circle(small, center, 3, (60, 235, 120), 1, cv2.LINE_AA)
+    few = "" if len(found) >= FEW_FEATURES else " Few: put textured things into view."
+    return _jpeg(small), f"{len(found)} features.{few}"
+
+
+def _resized(image: UInt8[ndarray, "h w 3"], width: int) -> UInt8[ndarray, "h2 w2 3"]:
+    """Return an image of another width."""
+    height = max(1, round(width * image.shape[0] / image.shape[1]))
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _jpeg(image: UInt8[ndarray, "h w 3"]) -> bytes:
+    """Return an RGB image as JPEG."""
+    return cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]))[1].tobytes()

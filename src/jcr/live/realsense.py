@@ -1,4 +1,4 @@
-"""An Intel RealSense: images, depth aligned with them, and the intrinsics that its maker stored; with pyrealsense2."""
+"""Intel RealSense cameras with pyrealsense2: images, aligned depth, and the intrinsics stored by the maker."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -12,22 +12,22 @@ import numpy as np
 
 from jcr.errors import InputError
 from jcr.extras import extra
-from jcr.live.camera import TIMEOUT_S, Camera, CameraOptions, Frame, Newest, Recorded
+from jcr.live.cameras import TIMEOUT_S, Camera, CameraOptions, Frame, NewestFrame, RecordedFrames
 
 REALSENSE = "realsense"
-"""Its name for `--camera`, with `:SERIAL` or `:FILE` behind it."""
+"""Name for `--camera`, followed by `:SERIAL` or `:FILE` where needed."""
 SIZE = (1280, 720)
-"""A capture is better for more pixels; every D400 gives this."""
+"""Default resolution, px, which every D400 gives."""
 DEPTH_LIMIT_MM = 65_535
 FITTED_PX = 0.05
-"""Largest difference at which OpenCV's coefficients stand for the maker's distortion."""
+"""Largest difference (px) between OpenCV's coefficients and the maker's distortion."""
 
 
 @contextmanager
-def opened_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
-    """The camera with that serial number, the first one where it is empty, or a recording (.bag) of one.
+def open_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
+    """Open the camera with a serial number, the first one where it is empty, or a recording (.bag).
 
-    Raises InputError when the package or the camera is missing, or the camera does not keep to the options.
+    Raises InputError when the package or the camera is missing, or the camera does not follow the options.
     """
     name = REALSENSE + (f":{serial}" if serial else "")
     rs = extra("pyrealsense2", "realsense", f"--camera {name}")
@@ -43,14 +43,14 @@ def opened_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
         if is_file:
             profile.get_device().as_playback().set_real_time(False)
         else:
-            _keep_to(rs, profile, options)
+            _apply_options(rs, profile, options)
         read = _reader(rs, pipeline, profile, is_file)
         stored = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
-        source = Recorded(iter(read, None)) if is_file else Newest(read, name)
+        source = RecordedFrames(iter(read, None)) if is_file else NewestFrame(read, name)
         try:
             yield Camera(source, source.latest, intrinsics_of_realsense(rs, stored))
         finally:
-            if isinstance(source, Newest):
+            if isinstance(source, NewestFrame):
                 source.close()
     finally:
         with suppress(RuntimeError):
@@ -58,7 +58,7 @@ def opened_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
 
 
 def _config(rs: ModuleType, serial: str, is_file: bool, options: CameraOptions) -> Any:
-    """What to start: a recording, or colour and depth of the camera of a serial number, of any where it is empty."""
+    """Return the configuration of a recording, or of colour and depth of a camera (any for an empty serial number)."""
     config = rs.config()
     if is_file:
         if not Path(serial).is_file():
@@ -76,13 +76,14 @@ def _config(rs: ModuleType, serial: str, is_file: bool, options: CameraOptions) 
 
 
 def _reader(rs: ModuleType, pipeline: Any, profile: Any, is_file: bool) -> Callable[[], Frame | None]:
-    """Reads the next frame, with depth where the camera measures it; None when there is no more."""
+    """Return a function that reads the next frame, with depth where the camera measures it; None at the end."""
     aligned, has_depth = rs.align(rs.stream.color), False
     with suppress(RuntimeError):
         has_depth = bool(profile.get_stream(rs.stream.depth))
     unit_mm = 1e3 * profile.get_device().first_depth_sensor().get_depth_scale() if has_depth else 1.0
 
     def read() -> Frame | None:
+        """Return the next frame."""
         began = time.monotonic()
         try:
             frames = pipeline.wait_for_frames(int(1e3 * TIMEOUT_S if not is_file else 1e3))
@@ -103,7 +104,8 @@ def _reader(rs: ModuleType, pipeline: Any, profile: Any, is_file: bool) -> Calla
     return read
 
 
-def _keep_to(rs: ModuleType, profile: Any, options: CameraOptions) -> None:
+def _apply_options(rs: ModuleType, profile: Any, options: CameraOptions) -> None:
+    """Fix exposure and focus; raise InputError where the camera has no such setting or range."""
     sensor = profile.get_device().first_color_sensor()
     wanted = [
         (rs.option.exposure, options.exposure, "--exposure"),
@@ -123,7 +125,7 @@ def _keep_to(rs: ModuleType, profile: Any, options: CameraOptions) -> None:
 
 
 def intrinsics_of_realsense(rs: ModuleType, stored: Any) -> dict[str, Any] | None:
-    """Intrinsics for capture.json; None where OpenCV's coefficients do not reproduce the maker's to FITTED_PX.
+    """Return intrinsics for capture.json; None where OpenCV's coefficients differ from the maker's by FITTED_PX.
 
     librealsense has distortions of its own ("Projection in Intel RealSense SDK 2.0"), among them an inverse one. Its
     own deprojection gives the ray of each pixel, and the coefficients are linear in where rays go.

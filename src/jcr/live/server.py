@@ -8,48 +8,40 @@ read the capture, command it or add a pose.
 import hmac
 import ipaddress
 import json
-import queue
 import re
 import secrets
 import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, get_args
 
-import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture.images import read_image
 from jcr.errors import InputError
-from jcr.live.asks import Answer, Ask, pose_of_numbers
-from jcr.live.collect import LiveCapture
-from jcr.live.commands import Action, Command
-from jcr.live.page import page_parts, whole_page
+from jcr.live.page import camera_image, image_card, page_parts, whole_page
+from jcr.live.robot import RobotState, pose_of_numbers
+from jcr.live.session import LiveSession
+from jcr.live.terminal import Action
 
 LOOPBACK = "127.0.0.1"
 TIMEOUT_S = 10.0
 """Longest time in which a request must be complete."""
-ANSWER_S = 600.0
-"""Longest time that the answer to a sample may take."""
 MAX_COMMAND, MAX_SAMPLE = 1000, 65_536
 """Largest body in bytes."""
-LAST_S = 3.0
-"""Time at the end of a capture in which an open page can fetch the result."""
-NOW_PX, CARD_PX = 640, 330
-"""Width of the camera's image and of the images in the list."""
-FEW_FEATURES = 150
-"""Number of SIFT features in an image of NOW_PX below which registration is at risk."""
+OPEN_S, LAST_S = 4.0, 30.0
+"""Time since its last request in which a page counts as open, and longest time in which it can fetch the result."""
 POLICY = (
-    "default-src 'none'; img-src 'self' blob:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
+    "default-src 'none'; img-src 'self' blob: data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
+"""Content security policy of the page, and of the report that it opens."""
 
 
 @dataclass(frozen=True)
@@ -61,36 +53,46 @@ class Listen:
     port: int = 0
     """0: any free port."""
     token: str | None = None
-    """The key of the session; None: a random one."""
+    """Key of the session; None: a random one."""
     option: str = "--page-port"
     """Option that the user gave, for messages."""
 
+    def check(self) -> None:
+        """Raise InputError where the address would be open to others or cannot be named."""
+        if self.token is not None and not re.fullmatch(r"[\w.~-]+", self.token, re.ASCII):
+            raise InputError(
+                "--token: has characters that an address cannot have; use letters, digits, - and _"
+            )
+        if _is_any_address(self.host):
+            raise InputError(
+                f"{self.option} {self.host}:{self.port}: names no host; give the address of this machine that the "
+                "robot uses"
+            )
+        if self.option == "--listen" and self.token is None:
+            raise InputError(
+                f"{self.option} {self.host}:{self.port}: others can reach that address; set a token (JCR_TOKEN)"
+            )
 
-def checked_listen(listen: Listen) -> Listen:
-    """Return `listen`, or raise InputError where the address would be open to others or cannot be named."""
-    where = f"{listen.option} {listen.host}:{listen.port}"
-    if listen.token is not None and not re.fullmatch(r"[\w.~-]+", listen.token, re.ASCII):
-        raise InputError("--token: has characters that an address cannot have; use letters, digits, - and _")
-    if _is_any_address(listen.host):
-        raise InputError(f"{where}: names no host; give the address of this machine that the robot uses")
-    if listen.option == "--listen" and listen.token is None:
-        raise InputError(f"{where}: others can reach that address; set a token (JCR_TOKEN)")
-    return listen
 
+class LiveServer:
+    """HTTP server of a session while it is entered."""
 
-class Server:
-    """Serves the page of a capture and takes samples while it is entered."""
-
-    def __init__(self, capture: LiveCapture, listen: Listen | None = None) -> None:
-        """Bind the address; raise InputError where that fails."""
-        listen = checked_listen(listen or Listen())
-        self.capture, self.key, self.host = capture, listen.token or secrets.token_urlsafe(16), listen.host
-        self.seen_version, self.asked_s = -1, -np.inf
-        """Version of the state that a page has, and the time of its last request."""
-        self.samples: queue.SimpleQueue[Ask | None] = queue.SimpleQueue()
-        self.takes_samples = False
-        self.unanswered: set[int] = set()
-        """Requests for samples whose answers are not sent yet."""
+    def __init__(
+        self, session: LiveSession, listen: Listen | None = None, takes_samples: bool = False
+    ) -> None:
+        """Bind the address; raise InputError where that fails. `takes_samples`: programs post gripper poses."""
+        listen = listen or Listen()
+        listen.check()
+        self.session, self.key, self.host = session, listen.token or secrets.token_urlsafe(16), listen.host
+        self.takes_samples = takes_samples
+        self.sampled_s = time.monotonic()
+        """Time of the last sample."""
+        self._unanswered = 0
+        """Number of samples that are not answered yet."""
+        self._counting = threading.Lock()
+        """Held while `_unanswered` changes."""
+        self._page_version, self._page_s = -1, -np.inf
+        """Version of the state that the page has, and the time of its last request."""
         try:
             self._server = _HttpServer((self.host, listen.port), _Handler)
         except (OSError, OverflowError) as error:
@@ -113,42 +115,61 @@ class Server:
         names = (LOOPBACK, "localhost") if self.host == LOOPBACK else (self.host,)
         return tuple(f"{name}:{self.port}" for name in names)
 
-    def sampled_poses(self, timeout_s: float) -> Iterator[Ask]:
-        """Return a request per sample until a client is done; raise InputError after `timeout_s` without one."""
-        self.takes_samples = True
-        return self._sampled_poses(timeout_s)
+    @property
+    def report(self) -> Path | None:
+        """Report of the calibration at the end; None while there is none."""
+        result = self.session.state.result
+        file = None if result is None else result.out / "report.html"
+        return file if file is not None and file.is_file() else None
 
-    def _sampled_poses(self, timeout_s: float) -> Iterator[Ask]:
-        """Yield the samples of `sampled_poses`."""
+    def await_samples(self, timeout_s: float) -> None:
+        """Return when the session is over; raise InputError after `timeout_s` without a sample."""
+        while not self.session.state.is_over:
+            if not self._unanswered and time.monotonic() - self.sampled_s > timeout_s:
+                raise InputError(
+                    f"--poses http: no sample for {timeout_s:.0f} s; the images taken are kept and the same command "
+                    "resumes"
+                )
+            time.sleep(0.1)
+
+    @contextmanager
+    def answering(self) -> Iterator[None]:
+        """Keep the server from stopping while a sample is answered."""
+        with self._counting:
+            self._unanswered += 1
         try:
-            while (ask := self.samples.get(timeout=timeout_s)) is not None:
-                yield ask
-        except queue.Empty:
-            raise InputError(
-                f"--poses http: no sample for {timeout_s:.0f} s; the images taken are kept and the same command resumes"
-            ) from None
+            yield
+        finally:
+            with self._counting:
+                self._unanswered -= 1
 
-    def __enter__(self) -> "Server":
+    def page_has(self, version: int) -> None:
+        """Note the version of the state that the page has."""
+        self._page_version, self._page_s = max(self._page_version, version), time.monotonic()
+
+    def __enter__(self) -> "LiveServer":
+        """Serve in a thread."""
         self._thread.start()
         return self
 
     def __exit__(self, *error: object) -> None:
+        """Send the last answers and let an open page fetch the last state, then stop."""
         end = time.monotonic() + LAST_S
-        while time.monotonic() < end and (self.unanswered or self._page_is_behind()):
+        while time.monotonic() < end and (self._unanswered or self._page_is_behind()):
             time.sleep(0.05)
         self._server.shutdown()
         self._server.server_close()
 
     def _page_is_behind(self) -> bool:
-        """Test whether an open page has not fetched the newest state."""
-        is_open = time.monotonic() - self.asked_s < LAST_S
-        return is_open and self.seen_version < self.capture.shown.version
+        """Test whether an open page does not have the last state."""
+        is_open = time.monotonic() - self._page_s < OPEN_S
+        return is_open and self._page_version < self.session.state.version
 
 
 class _HttpServer(ThreadingHTTPServer):
-    """Socket server with a reference to the `Server` that owns it."""
+    """Socket server with a reference to the `LiveServer` that owns it."""
 
-    owner: Server
+    owner: LiveServer
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Ignore connections that the client closed; report anything else."""
@@ -163,7 +184,8 @@ class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "jcr", ""
 
     @property
-    def _owner(self) -> Server:
+    def _owner(self) -> LiveServer:
+        """Server that received the request."""
         assert isinstance(self.server, _HttpServer)
         return self.server.owner
 
@@ -173,94 +195,81 @@ class _Handler(BaseHTTPRequestHandler):
         if path is None:
             return
         path, _, query = path.partition("?")
+        session, name = self._owner.session, path.removeprefix("image/")
         if path == "":
-            self._send(whole_page(self._owner.capture).encode(), "text/html; charset=utf-8")
+            self._send(whole_page(session).encode(), "text/html; charset=utf-8")
         elif path == "state":
             self._send_state(query.removeprefix("version="))
         elif path == "now.jpg":
-            self._send_now()
-        elif path.removeprefix("image/") in self._owner.capture.live.names:
-            self._send(_card(self._owner.capture.live.folder / path.removeprefix("image/")), "image/jpeg")
+            self._send_camera_image()
+        elif path == "report.html" and (report := self._owner.report) is not None:
+            self._send(report.read_bytes(), "text/html; charset=utf-8")
+        elif name != path and name in session.state.names:
+            self._send(image_card(session.folder.folder / name), "image/jpeg")
         else:
-            self._refuse(404)
+            self._send(b"", "text/plain", 404)
 
     def do_POST(self) -> None:
         """Obey a command of the page, or take a sample."""
         if self.path == "/sample":
-            self._take_sample()
+            with self._owner.answering():
+                self._send_json(*self._sampled())
             return
         path = self._path()
         if path is None:
             return
         is_json = self.headers.get("Content-Type", "") == "application/json"
         if not self._is_own_origin(self.headers.get("Origin")) or not is_json:
-            self._refuse(403)
+            self._send(b"", "text/plain", 403)
         elif path != "press" or (command := self._command()) is None:
-            self._refuse(400)
+            self._send(b"", "text/plain", 400)
         else:
-            self._owner.capture.press(command)
+            self._owner.session.press(*command)
             self._send(b"", "text/plain", 204)
 
-    def _is_own_origin(self, origin: str | None) -> bool:
-        return origin in [f"http://{host}" for host in self._owner.hosts]
-
-    def _take_sample(self) -> None:
-        """Take an image at the pose in the body, and answer when it is calibrated or refused."""
-        origin, given = self.headers.get("Origin"), self.headers.get("Authorization", "")
-        key = given.removeprefix("Bearer ").strip()
-        if self.headers.get("Host") not in self._owner.hosts or not self._is_key(key):
-            self._send_json(_refusal("no or a wrong key; send the header Authorization: Bearer KEY"), 403)
-            return
+    def _sampled(self) -> tuple[dict[str, Any], int]:
+        """Take an image at the pose in the body; return answer and status when it is calibrated or refused."""
+        owner, origin = self._owner, self.headers.get("Origin")
+        key = self.headers.get("Authorization", "").removeprefix("Bearer ").strip()
+        if self.headers.get("Host") not in owner.hosts or not self._is_key(key):
+            return _refusal("no or a wrong key; send the header Authorization: Bearer KEY"), 403
         if origin is not None and not self._is_own_origin(origin):
-            self._send_json(_refusal("a sample from another web site"), 403)
-            return
-        if not self._owner.takes_samples:
-            self._send_json(_refusal("the poses of this capture come from elsewhere (--poses)"), 409)
-            return
+            return _refusal("a sample from another web site"), 403
+        if not owner.takes_samples:
+            return _refusal("the poses of this capture come from elsewhere (--poses)"), 409
         body = self._body(MAX_SAMPLE)
         if body is None:
-            self._send_json(_refusal(f"no Content-Length, or more than {MAX_SAMPLE} bytes"), 400)
-            return
+            return _refusal(f"no Content-Length, or more than {MAX_SAMPLE} bytes"), 400
         try:
             pose = sample_pose(body)
         except InputError as error:
-            self._send_json(_refusal(str(error)), 400)
-            return
-        self._answer_sample(pose)
-
-    def _answer_sample(self, pose: Float[ndarray, "4 4"] | None) -> None:
-        """Hand a pose to the capture, None where the client ends it, and send the answer.
-
-        The status tells whether the image is kept, for programs that read a line only.
-        """
-        owner = self._owner
+            return _refusal(str(error)), 400
         if pose is None:
-            owner.samples.put(None)
-            self._send_json({"accepted": True, "done": True})
-            return
-        answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
-        owner.unanswered.add(id(answers))
-        try:
-            owner.samples.put(Ask(pose, answer=answers.put, waits=True))
-            answer = answers.get(timeout=ANSWER_S)
-            self._send_json(answer, 200 if answer["accepted"] else 422)
-        except queue.Empty:
-            self._send_json(_refusal(f"no answer within {ANSWER_S:.0f} s"), 503)
-        finally:
-            owner.unanswered.discard(id(answers))
+            owner.session.end()
+            return {"accepted": True, "done": True}, 200
+        owner.sampled_s = time.monotonic()
+        answer = owner.session.take(RobotState(owner.sampled_s, pose), waits=True)
+        owner.sampled_s = time.monotonic()
+        # The status tells whether the image is kept, for programs that read a line only.
+        return answer, 200 if answer["accepted"] else 422
+
+    def _is_own_origin(self, origin: str | None) -> bool:
+        """Test whether a browser's request comes from the page."""
+        return origin in [f"http://{host}" for host in self._owner.hosts]
 
     def _path(self) -> str | None:
         """Return the path behind the key; None, after an answer, where host or key are wrong."""
         if self.headers.get("Host") not in self._owner.hosts:
-            self._refuse(403)
+            self._send(b"", "text/plain", 403)
             return None
         key, slash, path = self.path.removeprefix("/").partition("/")
         if not slash or not self._is_key(key):
-            self._refuse(404)
+            self._send(b"", "text/plain", 404)
             return None
         return path
 
     def _is_key(self, given: str) -> bool:
+        """Compare a key in constant time."""
         return hmac.compare_digest(given.encode(), self._owner.key.encode())
 
     def _body(self, most: int) -> bytes | None:
@@ -270,7 +279,7 @@ class _Handler(BaseHTTPRequestHandler):
             return None
         return self.rfile.read(int(length))
 
-    def _command(self) -> Command | None:
+    def _command(self) -> tuple[Action, int | None] | None:
         """Return the command in the body; None where there is no valid one."""
         try:
             found = json.loads(self._body(MAX_COMMAND) or b"")
@@ -280,30 +289,30 @@ class _Handler(BaseHTTPRequestHandler):
             return None
         number = found.get("number")
         is_number = number is None or (isinstance(number, int) and not isinstance(number, bool))
-        return Command(found["action"], number) if is_number else None
+        return (found["action"], number) if is_number else None
 
     def _send_state(self, version: str) -> None:
         """Send the state; only its version where the page has it."""
-        shown = self._owner.capture.shown
-        self._owner.asked_s = time.monotonic()
-        if version == str(shown.version):
-            self._owner.seen_version = shown.version
-            content = {"version": shown.version}
-        else:
-            content = page_parts(self._owner.capture)
-        self._send_json(content)
+        owner = self._owner
+        state = owner.session.state
+        if version == str(state.version):
+            owner.page_has(state.version)
+            self._send_json({"version": state.version})
+            return
+        owner.page_has(-1)
+        self._send_json(page_parts(owner.session, state, owner.report is not None))
 
-    def _send_now(self) -> None:
+    def _send_camera_image(self) -> None:
         """Send the newest image of the camera with its features."""
-        frame = self._owner.capture.camera.latest()
+        frame = self._owner.session.camera.latest()
         if frame is None:
             self._send(b"", "text/plain", 204)
-            return
-        image, count = with_features(frame.image)
-        few = "" if count >= FEW_FEATURES else " Few: put textured things into view."
-        self._send(_jpeg(image), "image/jpeg", features=f"{count} features.{few}")
+        else:
+            jpeg, features = camera_image(frame.image)
+            self._send(jpeg, "image/jpeg", features=features)
 
     def _send_json(self, content: dict[str, Any], status: int = 200) -> None:
+        """Send a response of JSON."""
         self._send(json.dumps(content).encode() + b"\n", "application/json", status)
 
     def _send(self, body: bytes, kind: str, status: int = 200, features: str | None = None) -> None:
@@ -324,9 +333,6 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header(name, value)
         self.end_headers()
         self.wfile.write(body)
-
-    def _refuse(self, status: int) -> None:
-        self._send(b"", "text/plain", status)
 
     def log_message(self, format: str, *arguments: object) -> None:
         """Log nothing: the terminal shows the capture."""
@@ -354,7 +360,8 @@ def sample_pose(body: bytes) -> Float[ndarray, "4 4"] | None:
     return pose_of_numbers(numbers, "base_from_gripper")
 
 
-def _refusal(reason: str) -> Answer:
+def _refusal(reason: str) -> dict[str, Any]:
+    """Return the answer to a sample that is not taken."""
     return {"accepted": False, "reason": reason}
 
 
@@ -364,26 +371,3 @@ def _is_any_address(host: str) -> bool:
         return ipaddress.ip_address(host).is_unspecified
     except ValueError:
         return host == ""
-
-
-@lru_cache(maxsize=128)
-def _card(file: Path) -> bytes:
-    """Return a small copy of an image, JPEG."""
-    image = read_image(file)
-    height = max(1, round(CARD_PX * image.shape[0] / image.shape[1]))
-    return _jpeg(cv2.resize(image, (CARD_PX, height), interpolation=cv2.INTER_AREA))
-
-
-def _jpeg(image: ndarray) -> bytes:
-    return cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]))[1].tobytes()
-
-
-def with_features(image: UInt8[ndarray, "h w 3"]) -> tuple[UInt8[ndarray, "h2 w2 3"], int]:
-    """Return the image NOW_PX wide with a ring at each SIFT feature, and the number of features."""
-    height = max(1, round(NOW_PX * image.shape[0] / image.shape[1]))
-    small = cv2.resize(np.ascontiguousarray(image), (NOW_PX, height), interpolation=cv2.INTER_AREA)
-    found = cv2.SIFT.create(2000).detect(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), None)
-    for feature in found:
-        center = round(feature.pt[0]), round(feature.pt[1])
-        cv2.circle(small, center, 3, (60, 235, 120), 1, cv2.LINE_AA)
-    return small, len(found)

@@ -1,21 +1,26 @@
 "use strict";
 (() => {
   const element = (id) => document.getElementById(id);
-  let version = -1;
+  let version = -1, isDone = false, report = null;
   // A part is replaced where it has changed, so that the reader's selection and the images stay.
   const parts = {};
   async function ask() {
     try {
       const found = await (await fetch(`state?version=${version}`)).json();
       element("away").hidden = true;
-      if (found.version === version) return;
+      // The answer to the last version tells the server that the page has it; the server then ends.
+      if (found.version === version) { isDone = isDone || document.body.dataset.done === "true"; return; }
+      // The report is kept in the page, so that its link works when the server has ended.
+      if (found.has_report && !report) report = URL.createObjectURL(await (await fetch("report.html")).blob());
       version = found.version;
       for (const [name, html] of Object.entries(found.parts)) {
         if (parts[name] !== html) element(name).innerHTML = parts[name] = html;
       }
+      if (report && element("report")) Object.assign(element("report"), { href: report, hidden: false });
       const main = document.querySelector("main");
       main.toggleAttribute("data-over", found.is_over);
       main.toggleAttribute("data-images", found.images > 0);
+      document.body.dataset.done = found.is_done;
       const holder = element("scene-data");
       if (holder.textContent !== found.scene) {
         holder.textContent = found.scene;
@@ -55,7 +60,7 @@
     }
   });
   async function repeat(action, every) {
-    for (;;) {
+    while (!isDone) {
       await action();
       await new Promise((resolve) => setTimeout(resolve, every));
     }

@@ -1,4 +1,4 @@
-"""The next pose in the words of the arm: what its pendant shows, a line for its program, its joint angles."""
+"""Gripper poses in the notation of an arm: pendant, program, joint angles."""
 
 from dataclasses import dataclass
 
@@ -14,30 +14,21 @@ from jcr.geometry import inverse, rotation_angle
 
 
 @dataclass(frozen=True)
-class ArmWords:
-    """How poses are written for one arm."""
+class Notation:
+    """Convention, units and arm with which poses are written."""
 
     convention: ConventionName = "auto"
-    """auto: quat-xyzw."""
+    """Pose convention; auto: quat-xyzw."""
     units: UnitsName = "auto"
     arm: Arm | None = None
-    """Known: joint angles are given too, and poses out of its reach are not proposed."""
-
-
-@dataclass(frozen=True)
-class Path:
-    """Where an arm has been."""
-
-    base_from_gripper: Float[ndarray, "n 4 4"]
-    joints: Float[ndarray, "n dof"] | None = None
-    """rad; None where they were not recorded."""
+    """Arm whose joint angles are written too; None where it is not known."""
 
 
 def pose_lines(
-    pose: Float[ndarray, "4 4"], words: ArmWords, joints: Float[ndarray, " dof"] | None = None
+    pose: Float[ndarray, "4 4"], notation: Notation, joints: Float[ndarray, " dof"] | None = None
 ) -> list[str]:
-    """The pose as the arm's pendant or program writes it, and its joint angles where they are known."""
-    convention = "quat-xyzw" if words.convention == "auto" else words.convention
+    """Return the pose as the arm's pendant or program writes it, and its joint angles (rad) where they are known."""
+    convention = "quat-xyzw" if notation.convention == "auto" else notation.convention
     if convention == "ur":
         row = numbers_from_poses(pose[None], "ur")[0]
         shown = ", ".join(f"{name} {1e3 * value:.1f}" for name, value in zip("xyz", row[:3], strict=True))
@@ -47,11 +38,11 @@ def pose_lines(
         numbers = ", ".join(f"{value:.5f}" for value in row)
         lines = [f"pendant: {shown} mm, {rotation} rad", f"URScript: movel(p[{numbers}], a=0.3, v=0.1)"]
     elif convention in ("franka", "matrix"):
-        row = numbers_from_poses(pose[None], convention, words.units)[0]
+        row = numbers_from_poses(pose[None], convention, notation.units)[0]
         order = "O_T_EE, by columns" if convention == "franka" else "base_from_gripper, by rows"
         lines = [f"{order}: [{', '.join(f'{value:.5f}' for value in row)}]"]
     else:
-        lines = [named_numbers(pose, convention, words.units)]
+        lines = [named_numbers(pose, convention, notation.units)]
     if joints is not None:
         degrees = ", ".join(f"{value:.2f}" for value in np.degrees(joints))
         lines.append(f"joints: {degrees} ° ({', '.join(f'{value:.4f}' for value in joints)} rad)")
@@ -59,7 +50,7 @@ def pose_lines(
 
 
 def named_numbers(pose: Float[ndarray, "4 4"], convention: ConventionName, units: UnitsName) -> str:
-    """The pose's numbers, each with its name, and the units."""
+    """Return the numbers of the pose, each with its name, and the units."""
     form = CONVENTIONS[convention]
     length, angle = form.units(units)
     row = numbers_from_poses(pose[None], convention, units)[0]
@@ -69,20 +60,26 @@ def named_numbers(pose: Float[ndarray, "4 4"], convention: ConventionName, units
     return f"{' '.join(text[:3])} {length}, {' '.join(text[3:])}{unit}"
 
 
-def joints_at(arm: Arm, path: Path, goal: Float[ndarray, "4 4"]) -> Float[ndarray, " dof"] | None:
-    """Joint angles (rad) within the limits that reach `goal` from where the arm is; None where none do.
+def joints_at(
+    arm: Arm,
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    joints: Float[ndarray, "n dof"] | None,
+    goal: Float[ndarray, "4 4"],
+) -> Float[ndarray, " dof"] | None:
+    """Return joint angles (rad) within the limits that reach `goal`; None where none do.
 
-    With recorded angles the tool follows from them and their pose, and the answer is of the branch that the arm is in.
+    `base_from_gripper` and `joints` (rad, None where not recorded) are those of the images. With recorded angles the
+    tool follows from them and their pose, and the answer is of the branch that the arm is in.
     """
-    if path.joints is not None:
-        now = path.joints[-1:]
-        flange_from_tool = (inverse(forward_kinematics(arm, now)) @ path.base_from_gripper[-1:])[0]
+    if joints is not None:
+        now = joints[-1:]
+        flange_from_tool = (inverse(forward_kinematics(arm, now)) @ base_from_gripper[-1:])[0]
         flange = (goal @ inverse(flange_from_tool))[None]
         found = reach_toward(arm, flange, now, steps=60)
         off = inverse(forward_kinematics(arm, found)) @ flange
         if np.linalg.norm(off[0, :3, 3]) < FITS[0] and float(rotation_angle(off[0, :3, :3])) < FITS[1]:
             return found[0]
         return None
-    posture = inverse_kinematics(arm, np.concatenate([path.base_from_gripper, goal[None]]))
+    posture = inverse_kinematics(arm, np.concatenate([base_from_gripper, goal[None]]))
     reached = posture.misfit_m[-1] < FITS[0] and posture.misfit_rad[-1] < FITS[1]
     return posture.joints[-1] if reached else None

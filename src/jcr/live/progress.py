@@ -1,0 +1,206 @@
+"""State of a calibration after each image of its capture, as a record, as text and as an answer for a program."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.live.notation import Notation, pose_lines
+from jcr.records import Finding, HandEye, Kind, LeaveOneOut, NextPose
+from jcr.records.findings import without_consequences
+from jcr.records.words import remedy, sentence, text
+from jcr.rounding import significant
+
+CONFIRMING_IMAGES = 8
+"""Least number of used images with which the leave-one-out error can confirm an accuracy."""
+EARLIER = 5
+"""Number of earlier accuracies that are printed."""
+FIRST_ADVICE = "rotate the wrist by 20° or more, and move, between images"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reached:
+    """Accuracy of the calibration with the first images."""
+
+    images: int
+    """Number of images."""
+    translation_mm: float
+    """95 % of the errors are smaller; `Requirement.at` names the point."""
+    rotation_deg: float
+    """95 % of the errors are smaller."""
+    accepted: bool
+    """Whether the calibration was accepted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """State of a calibration that grows by an image at a time."""
+
+    images: tuple[str, ...]
+    """Names of all images that are kept, in the order in which they were taken."""
+    added: str | None = None
+    """Image whose addition led to this state; None where none was added."""
+    refused: Finding | None = None
+    """Reason why the image that was given is not kept."""
+    registered: tuple[str, ...] = ()
+    """Images whose cameras are known."""
+    findings: tuple[Finding, ...] = ()
+    """Findings about single images and about the calibration, strongest first."""
+    hand_eye: HandEye | None = None
+    """Calibration; None while fewer than three images are registered."""
+    history: tuple[Reached, ...] = ()
+    """Accuracy after each image that gave a calibration."""
+    next_pose: NextPose | None = None
+    """Gripper pose that improves the calibration most; None below two images."""
+    next_joints: Float[ndarray, " dof"] | None = None
+    """Joint angles (rad) of `next_pose`; None where the arm is not known, or does not reach it."""
+    next_like: str | None = None
+    """Image whose gripper pose is nearest to `next_pose`."""
+    points_in_base: Float[ndarray, "p 3"] | None = None
+    """Reconstructed points of the scene (m); None without a calibration."""
+
+    @property
+    def now(self) -> Reached | None:
+        """Accuracy of the calibration; None where there is none with these images."""
+        return self.history[-1] if self.hand_eye is not None and self.history else None
+
+    @property
+    def leave_one_out(self) -> LeaveOneOut | None:
+        """Mean error of each image's gripper pose predicted by the others; None where too few images are used."""
+        found = self.hand_eye
+        if found is None or found.inliers.sum() < CONFIRMING_IMAGES:
+            return None
+        return found.leave_one_out
+
+    @property
+    def requirement_met(self) -> bool:
+        """Whether the calibration is accepted, estimated as exact as required, and its leave-one-out error agrees."""
+        found, error = self.hand_eye, self.leave_one_out
+        if found is None or not found.converged or found.requirement is None or error is None:
+            return False
+        required = found.requirement
+        is_within = (
+            error.translation_mm <= required.translation_mm and error.rotation_deg <= required.rotation_deg
+        )
+        return required.met and is_within
+
+    def __str__(self) -> str:
+        """Return two lines: the accuracy beside what is required, and what to do next."""
+        images = f"{len(self.registered)} of {len(self.images)} images registered"
+        return f"{images}: {_accuracy(self)}\n{_advice(self)}"
+
+
+def faults(state: Progress) -> list[Finding]:
+    """Return the findings that reject or warn, those of the last image first, but not that more images are needed."""
+    found = [
+        one
+        for one in without_consequences(state.findings)
+        if one.severity != "informs" and one.kind not in (Kind.NOT_EXACT_ENOUGH, Kind.FEW_IMAGES)
+    ]
+    return sorted(found, key=lambda one: one.images != (state.added,))
+
+
+def number_of(finding: Finding, images: Sequence[str]) -> int | None:
+    """Return the number by which commands name the one image of a finding; None of any other finding."""
+    if len(finding.images) != 1 or finding.images[0] not in images:
+        return None
+    return images.index(finding.images[0]) + 1
+
+
+def progress_lines(state: Progress, notation: Notation) -> list[str]:
+    """Return the state as lines of the terminal, the next pose in the notation of the arm."""
+    if state.hand_eye is None and len(state.images) <= 1:
+        return [FIRST_ADVICE]
+    lines = [str(state).split("\n")[0]]
+    if len(earlier := state.history[-EARLIER - 1 : -1]) and state.now is not None:
+        course = " → ".join(significant(one.translation_mm) for one in (*earlier, state.now))
+        angles = " → ".join(significant(one.rotation_deg) for one in (*earlier, state.now))
+        lines.append(f"  image by image: {course} mm, {angles}°")
+    if (error := state.leave_one_out) is not None:
+        lines.append(
+            f"  leave-one-out error {significant(error.translation_mm)} mm and {significant(error.rotation_deg)}°"
+        )
+    for one in faults(state):
+        number = number_of(one, state.images)
+        commands = "" if number is None else f" (retake {number}, or remove {number})"
+        lines.append(f"  {sentence(one)}{commands}")
+    if state.requirement_met:
+        return [*lines, "requirement met: finish, or go on"]
+    if state.next_pose is not None:
+        lines += [f"next: {next_sentence(state)}", *(f"  {line}" for line in next_lines(state, notation))]
+    return lines
+
+
+def next_sentence(state: Progress) -> str:
+    """Return the place of the next pose and the accuracy that is expected with it."""
+    pose = state.next_pose
+    assert pose is not None
+    moved, rotated = 1e3 * pose.moved_m, np.degrees(pose.rotation_rad)
+    then = f"expected then: {significant(pose.within_95_mm)} mm and {significant(pose.rotation_95_deg)}°"
+    return f"{moved:.0f} mm and {rotated:.0f}° from {state.next_like}; {then}"
+
+
+def next_lines(state: Progress, notation: Notation) -> list[str]:
+    """Return the next pose in the notation of the arm."""
+    assert state.next_pose is not None
+    lines = pose_lines(state.next_pose.base_from_gripper, notation, state.next_joints)
+    is_used = all(one.kind is not Kind.ROBOT_UNUSED for one in state.findings)
+    if notation.arm is not None and state.next_joints is None and is_used:
+        lines.append(f"a {notation.arm.name} cannot reach this pose within its joint limits: go near it")
+    return lines
+
+
+def _accuracy(state: Progress) -> str:
+    """Return the accuracy beside what is required."""
+    if state.now is None or state.hand_eye is None:
+        return "no calibration yet"
+    required = state.hand_eye.requirement
+    verdict = "" if state.hand_eye.is_sound else ", rejected"
+    limits = ""
+    if required is not None:
+        met = "met" if state.requirement_met else "not met"
+        limits = f"; required {required.translation_mm:g} mm and {required.rotation_deg:g}°: {met}"
+    mm, deg = significant(state.now.translation_mm), significant(state.now.rotation_deg)
+    return f"± {mm} mm and {deg}° (95 % of errors of a seen point){verdict}{limits}"
+
+
+def _advice(state: Progress) -> str:
+    """Return what to do next, in one line."""
+    if state.refused is not None:
+        return f"refused: {sentence(state.refused)}"
+    if found := faults(state):
+        return sentence(found[0])
+    if state.requirement_met:
+        return "requirement met: finish, or go on"
+    return FIRST_ADVICE if state.next_pose is None else f"next pose: {next_sentence(state)}"
+
+
+def progress_answer(state: Progress) -> dict[str, Any]:
+    """Return the state for a program, as values of JSON."""
+    pose, now, error = state.next_pose, state.now, state.leave_one_out
+    return {
+        "images": list(state.images),
+        "registered": list(state.registered),
+        "translation_95_mm": None if now is None else now.translation_mm,
+        "rotation_95_deg": None if now is None else now.rotation_deg,
+        "verdict": None if state.hand_eye is None else state.hand_eye.verdict,
+        "history": [vars(one) for one in state.history],
+        "findings": [
+            {
+                "kind": one.kind.value,
+                "severity": one.severity,
+                "images": list(one.images),
+                "text": text(one),
+                "remedy": remedy(one),
+            }
+            for one in state.findings
+        ],
+        "leave_one_out": None if error is None else [error.translation_mm, error.rotation_deg],
+        "requirement_met": state.requirement_met,
+        "next_base_from_gripper": None if pose is None else pose.base_from_gripper.tolist(),
+        "next_joints": None if state.next_joints is None else state.next_joints.tolist(),
+        "next_expected": None if pose is None else [pose.within_95_mm, pose.rotation_95_deg],
+    }

@@ -1,0 +1,410 @@
+"""Session of a capture: images on request, commands of a person, and the calibration in a thread of its own.
+
+Requests and commands may come from any thread (HTTP server, terminal, arm) and are served one after the other.
+"""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.errors import InputError, RejectedError
+from jcr.live.cameras import Camera, Frame
+from jcr.live.folder import TakenImage
+from jcr.live.notation import Notation
+from jcr.live.progress import Progress, progress_answer, progress_lines
+from jcr.live.robot import MOVED_ON, REST, TRY_AGAIN, RobotState, States, is_farther, next_rest
+from jcr.live.stillness import frame_at_rest
+from jcr.live.terminal import Action
+
+if TYPE_CHECKING:
+    from jcr.live.calibration import LiveCalibration
+    from jcr.results import RunResult
+
+SAME_PLACE = (0.005, np.radians(1.0))
+"""m, rad: a second image from within this adds nothing."""
+ENOUGH_IMAGES, MOST_IMAGES = 12, 40
+"""Default number of images of a capture, and of one that ends when it is accurate enough."""
+LEAST_IMAGES = 3
+"""Least number of images of a calibration."""
+LONGEST_S, INTERRUPTED_S = 60.0, 10.0
+"""Longest time that the end of a capture, or its interruption, waits for the calibration of the last images."""
+
+Answer = dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SessionOptions:
+    """Options of taking images."""
+
+    images: int | None = None
+    """Stop with this many images; unset: 12, and with --until-accurate 40."""
+    patience: float = 5.0
+    """Seconds to wait for an image at rest."""
+    reach: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        tyro.conf.arg(metavar="XMIN YMIN ZMIN XMAX YMAX ZMAX"),
+    ] = None
+    """Box that contains all proposed gripper positions (m, base frame)."""
+    require: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
+    """Required accuracy: 95 % of errors of a point seen at the distance of the scene. Unset: 5 mm and 1°."""
+    until_accurate: bool = False
+    """End, with exit status 0, as soon as the requirement is met and the leave-one-out error confirms it; with
+    status 3 where it is not met with the last image."""
+
+    @property
+    def most(self) -> int:
+        """Number of images with which the capture ends in any case."""
+        return self.images or (MOST_IMAGES if self.until_accurate else ENOUGH_IMAGES)
+
+    @property
+    def reach_m(self) -> Float[ndarray, "2 3"] | None:
+        """Lower and upper corner of `reach`."""
+        return None if self.reach is None else np.array(self.reach).reshape(2, 3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SessionState:
+    """Consistent state of a capture at one moment, for the live page."""
+
+    version: int = 0
+    """Number that grows with every change."""
+    event: str = ""
+    """Last event in words; empty where the rest of the state shows it."""
+    is_refusal: bool = False
+    """Whether the event is the reason why an image was not kept."""
+    images: tuple[TakenImage, ...] = ()
+    can_undo: bool = False
+    """Whether there is a change that can be taken back."""
+    replaces: str | None = None
+    """Image that the next one replaces."""
+    progress: Progress = Progress(images=())
+    """Last state of the calibration, which may have fewer images."""
+    is_over: bool = False
+    """Whether no more images are taken."""
+    is_done: bool = False
+    """Whether the session has its last state."""
+    result: "RunResult | None" = None
+    """Calibration of all images, at the end."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the images."""
+        return tuple(one.name for one in self.images)
+
+
+class LiveSession:
+    """Capture that is taken with a camera, image by image, and calibrated meanwhile.
+
+    `tell` receives each answer and each state of the calibration, with the lines that a person reads. `gripper` reads
+    the present state of the arm for an image on command; None where poses are typed or posted.
+    """
+
+    def __init__(
+        self,
+        calibration: "LiveCalibration",
+        camera: Camera,
+        options: SessionOptions | None = None,
+        tell: Callable[[Answer, list[str]], None] = lambda answer, lines: None,
+        notation: Notation | None = None,
+        gripper: Callable[[], RobotState] | None = None,
+    ) -> None:
+        """Prepare a session; `run` starts it."""
+        self.calibration, self.folder, self.camera = calibration, calibration.live, camera
+        self.options, self.notation = options or SessionOptions(), notation or Notation()
+        self._tell, self._gripper = tell, gripper
+        self._frames = iter(camera.frames)
+        self._lock = threading.RLock()
+        """Held while an image is taken or a command is obeyed."""
+        self._changed = threading.Condition()
+        """Notified when the state or the counters below change."""
+        self.state = SessionState(images=self.folder.images)
+        self._wanted = self._done = 0
+        """Number of changes that the calibration must follow, and of those that it has followed."""
+        self._refused: list[Float[ndarray, "4 4"]] = []
+        """Gripper poses at which no image was kept and for which no other pose is proposed yet."""
+        self._calibrated: tuple[str, ...] | None = None
+        self._is_abandoned = False
+        self._error: Exception | None = None
+        self._worker = threading.Thread(target=self._follow_changes, daemon=True)
+
+    def run(self, source: Callable[[], None] | None = None) -> None:
+        """Take images until there are enough, the source or the video ends, or the requirement ends the capture.
+
+        `source` calls `take` in a thread of its own; None where requests come from elsewhere. Raises the error of the
+        source or the camera.
+        """
+        self._want_calibration()
+        self._show(is_over=len(self.folder.names) >= self.options.most)
+        self._worker.start()
+        if source is not None:
+            threading.Thread(target=self._follow, args=(source,), daemon=True).start()
+        try:
+            with self._changed:
+                self._changed.wait_for(lambda: self.state.is_over)
+            self._stop_worker(LONGEST_S, abandon=self._error is not None)
+        except BaseException:
+            self._stop_worker(INTERRUPTED_S, abandon=True)
+            raise
+        if self._error is not None:
+            raise self._error
+
+    def end(self) -> None:
+        """Take no more images."""
+        self._show(self.state.event, is_over=True)
+
+    def watch(self, states: States) -> None:
+        """Take an image whenever the arm rests in a new place, until the session is over."""
+        last, limit = None, MOVED_ON
+        while not self.state.is_over:
+            state = next_rest(states, last, limit)
+            # The connection is closed meanwhile: states that wait would be old.
+            answer = self.take(state, current=lambda: next(states()))
+            last, limit = state.base_from_gripper, MOVED_ON if answer["accepted"] else TRY_AGAIN
+
+    def take(
+        self, state: RobotState, current: Callable[[], RobotState] | None = None, waits: bool = False
+    ) -> Answer:
+        """Take an image where the arm rests, and return whether it is kept.
+
+        `current` reads the arm once more after the image. With `waits` the answer has the calibration with that image
+        and the next pose, seconds later.
+        """
+        with self._lock:
+            if self.state.is_over:
+                return {"accepted": False, "reason": "the capture has ended", "done": True}
+            name, why = self._take(state, current)
+            is_over = self.state.is_over
+            if name is None:
+                answer: Answer = {"accepted": False, "reason": why, "done": is_over}
+                self._refuse(f"refused: {why}", answer)
+                self._want_calibration(state.base_from_gripper)
+            else:
+                answer = {"accepted": True, "image": name, "done": is_over}
+                self._tell(answer, [f"kept {name}"])
+            ticket = self._wanted
+        if not waits:
+            return answer
+        with self._changed:
+            self._changed.wait_for(lambda: self._done >= ticket)
+            return progress_answer(self.state.progress) | answer | {"done": self.state.is_over}
+
+    def press(self, action: Action, number: int | None = None) -> None:
+        """Obey a command; `number` counts images from 1, None: the last one."""
+        with self._lock:
+            if self.state.is_over:
+                return
+            names = self.folder.names
+            number = len(names) if number is None else number
+            if action == "finish":
+                self._show(is_over=True)
+            elif action == "take":
+                self._take_now()
+            elif action == "undo":
+                self._undo()
+            elif not 1 <= number <= len(names):
+                self._refuse(f"refused: there is no image {number}")
+            elif action == "retake":
+                self._retake(names[number - 1])
+            else:
+                self.folder.remove(names[number - 1])
+                self._follow_removal(f"removed {names[number - 1]}")
+
+    def finish(self) -> "RunResult | None":
+        """Return the calibration of all images; None, with a line that says why, where there is none."""
+        if self.state.result is None and len(self.folder.names) >= LEAST_IMAGES:
+            self._show(f"calibrating all {len(self.folder.names)} images", is_over=True)
+            try:
+                self._show(result=self.calibration.finish())
+            except RejectedError as error:
+                self._refuse(f"no calibration: {error}")
+        self._show(self.state.event, is_refusal=self.state.is_refusal, is_over=True, is_done=True)
+        return self.state.result
+
+    def _take(self, state: RobotState, current: Callable[[], RobotState] | None) -> tuple[str | None, str]:
+        """Return the name of a new image and "", or None and the reason why none is kept."""
+        try:
+            frame = self._frame(state, current)
+        except StopIteration:
+            self._show(is_over=True)
+            return None, "the video has ended"
+        except InputError as error:  # The camera is lost.
+            self._fail(error)
+            return None, str(error)
+        if isinstance(frame, str):
+            return None, frame
+        try:
+            name = self.folder.add(
+                frame.image,
+                state.base_from_gripper,
+                state.joints,
+                frame.depth_mm,
+                frame.time_s,
+                replaces=self.state.replaces,
+            )
+        except InputError as error:
+            return None, str(error)
+        except OSError as error:
+            return None, f"the image cannot be written ({error.strerror}); free the disk and take it again"
+        self._show(f"kept {name}", replaces=None, is_over=len(self.folder.names) >= self.options.most)
+        self._want_calibration()
+        return name, ""
+
+    def _frame(self, state: RobotState, current: Callable[[], RobotState] | None) -> Frame | str:
+        """Return a frame at rest, or the reason why none is kept."""
+        others = [one for one in self.folder.images if one.name != self.state.replaces]
+        pose = state.base_from_gripper
+        for one in others:
+            if not is_farther(one.base_from_gripper, pose, SAME_PLACE):
+                return f"the gripper is where {one.name} was taken; move to another pose"
+        kept = [self.folder.summary(one.name) for one in others]
+        found = frame_at_rest(self._frames, kept, self.options.patience)
+        if isinstance(found, Frame) and current is not None:
+            try:
+                if is_farther(pose, current().base_from_gripper, REST):
+                    return "the arm moved while the image was taken; let it rest"
+            except (InputError, StopIteration) as error:
+                return f"the pose cannot be read after the image: {error}"
+        return found
+
+    def _take_now(self) -> None:
+        """Take an image where the gripper is now."""
+        if self._gripper is None:
+            self._refuse("refused: give the pose at which the gripper rests; the image is taken then")
+            return
+        try:
+            state = self._gripper()
+        except InputError as error:
+            self._refuse(f"refused: {error}")
+            return
+        self.take(state, current=self._gripper)
+
+    def _retake(self, name: str) -> None:
+        """Let the next image replace one, and take it at once where the gripper is still there."""
+        event = f"the next image replaces {name}"
+        self._show(event, replaces=name)
+        self._tell({"retake": name}, [event])
+        if self._gripper is None:
+            return
+        there = next(one.base_from_gripper for one in self.folder.images if one.name == name)
+        try:
+            now = self._gripper().base_from_gripper
+        except InputError as error:
+            self._refuse(f"refused: {error}; {event}")
+            return
+        if not is_farther(there, now, SAME_PLACE):
+            self._take_now()
+
+    def _undo(self) -> None:
+        """Take back the last change."""
+        if self.state.replaces is not None:
+            self._show("no image is replaced", replaces=None)
+        elif self.folder.undo():
+            self._follow_removal(f"undone: {len(self.folder.names)} images")
+        else:
+            self._refuse("refused: nothing to undo")
+
+    def _follow_removal(self, event: str) -> None:
+        """Calibrate the images that are left."""
+        self._show(event, replaces=None)
+        self._want_calibration()
+        self._tell({"images": self.folder.names}, [event])
+
+    def _refuse(self, why: str, answer: Answer | None = None) -> None:
+        """Show and tell why something was not done."""
+        self._show(why, is_refusal=True)
+        self._tell(answer or {"accepted": False, "reason": why.removeprefix("refused: ")}, [why])
+
+    def _follow(self, source: Callable[[], None]) -> None:
+        """Run the source of requests; its end is the end of the capture."""
+        try:
+            source()
+        except Exception as error:
+            self._fail(error)
+        else:
+            self.end()
+
+    def _fail(self, error: Exception) -> None:
+        """End the session with an error."""
+        if not self.state.is_over:
+            self._error = error
+        self.end()
+
+    def _want_calibration(self, refused: Float[ndarray, "4 4"] | None = None) -> None:
+        """Let the worker calibrate the images, and propose a pose away from a refused one."""
+        with self._changed:
+            self._wanted += 1
+            if refused is not None:
+                self._refused.append(refused)
+            self._changed.notify_all()
+
+    def _stop_worker(self, longest_s: float, abandon: bool) -> None:
+        """Wait until the worker has calibrated all images, or with `abandon` the present ones."""
+        self._is_abandoned = abandon
+        self.end()
+        self._worker.join(longest_s)
+        with self._changed:
+            self._done = self._wanted
+            self._changed.notify_all()
+
+    def _follow_changes(self) -> None:
+        """Calibrate after each change of the capture, in the worker's thread."""
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._wanted > self._done or self.state.is_over)
+                if self._is_abandoned or self._wanted == self._done:
+                    return
+                ticket, refused, self._refused = self._wanted, self._refused, []
+            try:
+                self._calibrate(refused)
+            except (InputError, RejectedError) as error:
+                self._refuse(f"no calibration: {error}")
+            except OSError as error:
+                self._refuse(f"no calibration: {error.filename or self.folder.folder}: {error.strerror}")
+            except Exception as error:
+                self._fail(error)
+            with self._changed:
+                self._done = max(self._done, ticket)
+                self._changed.notify_all()
+
+    def _calibrate(self, refused: list[Float[ndarray, "4 4"]]) -> None:
+        """Calibrate the images where they changed, finish an accurate calibration, and propose other poses."""
+        if tuple(self.folder.names) != self._calibrated:
+            progress = self.calibration.update()
+            self._calibrated = progress.images
+            self._report(progress)
+            if self.options.until_accurate and progress.requirement_met:
+                result = self.calibration.finish()
+                required = result.hand_eye.requirement
+                if result.converged and required is not None and required.met:
+                    self._show(is_over=True, result=result)
+        for pose in refused:
+            self._report(self.calibration.propose_elsewhere(pose))
+
+    def _report(self, progress: Progress) -> None:
+        """Show and tell a state of the calibration."""
+        with self._changed:
+            state = self.state
+            is_done = not state.is_refusal and progress.images == state.names
+            self._show("" if is_done else state.event, is_refusal=state.is_refusal, progress=progress)
+        self._tell({"calibration": progress_answer(progress)}, progress_lines(progress, self.notation))
+
+    def _show(self, event: str = "", *, is_refusal: bool = False, **changes: Any) -> None:
+        """Replace the state by one with an event and other fields."""
+        with self._changed:
+            changes["is_over"] = self.state.is_over or changes.get("is_over", False)
+            self.state = replace(
+                self.state,
+                version=self.state.version + 1,
+                event=event,
+                is_refusal=is_refusal,
+                images=self.folder.images,
+                can_undo=self.folder.can_undo or changes.get("replaces", self.state.replaces) is not None,
+                **changes,
+            )
+            self._changed.notify_all()
