@@ -22,7 +22,7 @@ from jcr.estimation.inverse_kinematics import reach_toward
 from jcr.features.kept import FOLDER
 from jcr.geometry import apply, inverse, retract, rotation_angle, step_between
 from jcr.live.calibration import LiveCalibration
-from jcr.live.calibration_progress import Progress
+from jcr.live.progress import Progress
 from jcr.pipeline import calibrate
 from jcr.records import Intrinsics
 from jcr.results import RunResult

@@ -13,8 +13,6 @@ from pathlib import Path
 import numpy as np
 
 import jcr
-from jcr.capture.options import ReadOptions
-from jcr.check import check_capture
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))  # of the checkout, for what is simulated
 from simulation.ros_bag import write_bag
@@ -31,14 +29,14 @@ else:
     base, gripper = "base_link", "tool0"
 
 # Poses are interpolated at the images' stamps; frames are picked that are still, sharp and show most.
-options = ReadOptions(base_frame=base, gripper_frame=gripper, frames=12)
+options = jcr.ReadOptions(base_frame=base, gripper_frame=gripper, frames=12)
 capture = jcr.read_capture(bag, options, into=out / "capture")
 print(f"took {len(capture)} frames, intrinsics {'given' if capture.intrinsics else 'to be estimated'}")
 for name, pose in zip(capture.images, capture.base_from_gripper, strict=True):
     print(f"{name}: gripper at {np.array2string(pose[:3, 3], precision=3)} m")
 
 # Before the half minute of a calibration: do these motions show everything, and how exact will it be?
-found = check_capture(capture, look=False)
+found = jcr.check_capture(capture, look=False)
 print(f"motions show everything: {found.observability.observable}")
 if found.expected is not None:
     print(f"to be expected: a seen point within {found.expected.seen.within_95_mm:.1f} mm (95 % of errors)")

@@ -1,59 +1,68 @@
-"""Take a capture live from a Universal Robots arm: an image whenever it has come to rest in a new place.
+"""Take a capture from a program of your own with `jcr.LiveCalibration`: after each image, how exact it is.
 
     python examples/04_ur_robot.py [ROBOT_ADDRESS [CAMERA]]
 
-Drive the arm by its program or by hand; nothing is sent to it, its poses are read from port 30003. CAMERA is a
-V4L2 number or a stream (default 0). Without an address an arm and a camera over the bundled table are simulated.
-The command line does the same: `jcr capture captures/table --camera 0 --poses ur:ADDRESS`.
+Move a Universal Robots arm and press Enter at each pose; nothing is sent to it, its pose is read from port 30003. CAMERA
+is a number or a stream of OpenCV (default 0). Without an address the images and poses of the bundled table are used.
+`jcr capture captures/table --camera 0 --poses ur:ADDRESS` does the same with a live page.
 """
 
 import shutil
+import socket
+import struct
 import sys
-import time
-from contextlib import ExitStack, closing
 from pathlib import Path
 
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
 import jcr
-from jcr.capture.images import read_image
-from jcr.live.arm_words import ArmWords
-from jcr.live.camera import Camera, Frame, Recorded
-from jcr.live.collect import CollectOptions, LiveCapture
-from jcr.live.devices import opened
-from jcr.live.folder import LiveFolder
-from jcr.live.rest import asks_at_rest
-from jcr.live.ur import states
-
-sys.path.append(str(Path(__file__).resolve().parents[1]))  # of the checkout, for what is simulated
-from simulation.ur import SimulatedUr
 
 
-def simulated_camera(table, arm):
-    """What a camera on the simulated arm's wrist sees at 20 images a second."""
-    while True:
-        yield Frame(read_image(table.folder / table.images[arm.stop]), time.monotonic())
-        time.sleep(0.05)
+def ur_pose(host):
+    """Return base_from_gripper (4,4) from one packet of the real-time interface (software 3.0 and later)."""
+    with (
+        socket.create_connection((host, 30003), timeout=5) as connection,
+        connection.makefile("rb") as stream,
+    ):
+        (length,) = struct.unpack("!i", stream.read(4))
+        x, y, z, *rotation_vector = struct.unpack_from("!6d", stream.read(length - 4), 440)
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec(rotation_vector).as_matrix()
+    pose[:3, 3] = x, y, z
+    return pose
 
 
-with ExitStack() as until_done:
-    if len(sys.argv) > 1:
-        out, host, port, images = Path("captures/ur"), sys.argv[1], 30003, 12
-        camera = until_done.enter_context(opened(sys.argv[2] if len(sys.argv) > 2 else "0"))
-    else:
-        table = jcr.read_capture("examples/tabletop")
-        arm = until_done.enter_context(SimulatedUr(table.base_from_gripper))
-        out, host, port, images = Path("out/ur_robot"), "127.0.0.1", arm.port, 5
-        seen = Recorded(simulated_camera(table, arm))
-        camera = Camera(seen, seen.latest)
-        shutil.rmtree(out, ignore_errors=True)  # a real one is resumed
+def robot_samples(host, source):
+    """Yield an image (RGB) and the gripper pose whenever Enter is pressed."""
+    camera = cv2.VideoCapture(int(source) if source.isdigit() else source)
+    while input("let the arm rest and press Enter, or q and Enter to end: ") != "q":
+        for _ in range(5):  # older images wait in the driver's buffer
+            _, image = camera.read()
+        yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB), ur_pose(host)
 
-    def tell(answer, lines):
-        """Which image was kept or why not, how exact the calibration is now, and the pose to add next."""
-        print("\n".join(lines))
 
-    print("move the arm; an image is taken whenever it rests")
-    asks = asks_at_rest(lambda: states(host, port))
-    calibration = until_done.enter_context(closing(jcr.LiveCalibration(LiveFolder(out))))
-    LiveCapture(calibration, camera, CollectOptions(images=images), tell, ArmWords("ur")).run(asks)
+def bundled_samples(count):
+    """Yield the first images and poses of the bundled capture."""
+    table = jcr.read_capture("examples/tabletop")
+    for name, pose in list(zip(table.images, table.base_from_gripper, strict=True))[:count]:
+        yield cv2.cvtColor(cv2.imread(str(table.folder / name)), cv2.COLOR_BGR2RGB), pose
 
-capture = jcr.read_capture(out)
-print(f"{len(capture)} images in {out}; next: jcr run {out} out/ur_run")
+
+if len(sys.argv) > 1:
+    out = Path("captures/ur")  # a capture that was begun there is resumed
+    samples = robot_samples(sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else "0")
+else:
+    out = Path("out/ur_robot")
+    shutil.rmtree(out, ignore_errors=True)
+    samples = bundled_samples(5)
+
+live = jcr.LiveCalibration(out)
+for image, base_from_gripper in samples:
+    progress = live.add(image, base_from_gripper)
+    print(progress)
+    if progress.requirement_met:
+        break
+live.close()
+print(f"{len(progress.images)} images in {out}; next: jcr run {out} out/ur_run")

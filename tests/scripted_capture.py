@@ -1,4 +1,4 @@
-"""A capture whose calibration is scripted: what `LiveCapture` does with its states, without reconstructing anything."""
+"""A capture whose calibration is scripted: what `LiveSession` does with its states, without reconstructing anything."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -14,12 +14,11 @@ from numpy import ndarray
 import jcr
 from jcr.capture.images import read_image
 from jcr.geometry import rotation_exp, transform
-from jcr.live.asks import Answer, Ask
-from jcr.live.calibration_progress import Progress, Reached
-from jcr.live.camera import Camera, Frame
-from jcr.live.collect import CollectOptions, LiveCapture
+from jcr.live.cameras import Camera, Frame
 from jcr.live.folder import LiveFolder
-from jcr.live.rest import State
+from jcr.live.progress import Progress, Reached
+from jcr.live.robot import RobotState
+from jcr.live.session import Answer, LiveSession, SessionOptions
 from jcr.records import Finding, HandEye, Kind, Plan, Requirement
 
 REQUIRED = (2.0, 0.3)
@@ -48,6 +47,7 @@ class Scripted:
     """A calibration that is accurate from a number of images on; `contradicted` is an image with a wrong pose."""
 
     live: LiveFolder
+    arm: None = None
     accurate_from: int = 100
     contradicted: str | None = None
     fault: Exception | None = None
@@ -107,15 +107,15 @@ def a_capture(
     folder: Path,
     frames: Iterator[Frame],
     tell: Callable[[Answer, list[str]], None] = lambda answer, lines: None,
-    gripper: Callable[[], State] | None = None,
+    gripper: Callable[[], RobotState] | None = None,
     accurate_from: int = 100,
     **options: Any,
-) -> tuple[LiveCapture, Scripted]:
+) -> tuple[LiveSession, Scripted]:
     """A capture into a folder by these frames."""
-    scripted: Any = Scripted(LiveFolder(folder), accurate_from)
+    scripted: Any = Scripted(LiveFolder(folder), accurate_from=accurate_from)
     camera = Camera(frames, lambda: None)
     options = {"require": REQUIRED} | options
-    return LiveCapture(scripted, camera, CollectOptions(**options), tell, gripper=gripper), scripted
+    return LiveSession(scripted, camera, SessionOptions(**options), tell, gripper=gripper), scripted
 
 
 def still_frames(image: Callable[[], ndarray]) -> Iterator[Frame]:
@@ -126,10 +126,16 @@ def still_frames(image: Callable[[], ndarray]) -> Iterator[Frame]:
         step += 1
 
 
-def asked(poses: list[ndarray], answers: list[Answer], waits: bool = False) -> Iterator[Ask]:
-    """A request at each pose."""
-    for pose in poses:
-        yield Ask(pose, answer=answers.append, waits=waits)
+def take_all(session: LiveSession, poses: list[ndarray], waits: bool = False) -> list[Answer]:
+    """Run a session that is asked for an image at each pose, and return the answers."""
+    answers: list[Answer] = []
+
+    def source() -> None:
+        for pose in poses:
+            answers.append(session.take(RobotState(0.0, pose), waits=waits))
+
+    session.run(source)
+    return answers
 
 
 def still(tabletop: Path, k: int) -> ndarray:

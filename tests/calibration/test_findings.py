@@ -117,6 +117,8 @@ EXAMPLES: dict[Kind, dict] = {
     Kind.POSES_SWAPPED: {"images": ("a.png", "b.png")},
     Kind.POSE_CONTRADICTS_IMAGE: {"value": 0.1, "images": ("a.png",), "details": SIZE},
     Kind.NOT_REGISTERED: {"images": ("a.png",), "details": {"text": "matches no other image"}},
+    Kind.SAMPLE_REPEATED: {"images": ("a.png",)},
+    Kind.POSE_UNIT: {"value": 431.0, "details": {"unit": "millimetres", "a_metre": 1000.0}},
     Kind.FRAME_REPEATED: {"images": ("a.png",), "details": {"mm": 30.0, "deg": 5.0}},
     Kind.SIZE_DIFFERS: {"images": ("a.png",), "details": {"size": "640x480", "before": "320x240"}},
     Kind.CLOCK_JUMPS: {"value": 0.5, "images": ("a.png",)},

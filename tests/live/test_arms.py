@@ -20,8 +20,7 @@ from jcr.camera import project
 from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import forward_kinematics
 from jcr.geometry import inverse, rotation_exp, transform
-from jcr.live.camera import CameraOptions
-from jcr.live.devices import keep_to
+from jcr.live.cameras import CameraOptions, apply_options
 from jcr.records import Intrinsics
 from places import ROOT
 
@@ -45,13 +44,13 @@ def named_by(script: str, *words: object) -> Any:
 
 
 ASK = """
-    import json, sys, importlib
+    import json, sys
     from jcr.errors import InputError
-    from jcr.live.rest import asks_at_rest
-    source = importlib.import_module("jcr.live." + sys.argv[1])
-    ask = next(asks_at_rest(lambda: source.states(sys.argv[2])))
+    from jcr.live.arms import states_of
+    from jcr.live.robot import MOVED_ON, next_rest
+    ask = next_rest(states_of(f"{sys.argv[1]}:{sys.argv[2]}"), None, MOVED_ON)
     try:
-        next(source.states(sys.argv[3]))
+        next(states_of(f"{sys.argv[1]}:{sys.argv[3]}")())
     except InputError as error:
         refused = str(error)
     print(json.dumps([ask.base_from_gripper.tolist(), ask.joints.tolist(), refused]))
@@ -84,16 +83,16 @@ def simulated_franka(host: str) -> Iterator[None]:
 MOVED_FRANKA = """
     import json, sys, franky
     import numpy as np
-    from jcr.live import franka
-    from jcr.live.rest import asks_at_rest
-    asks = asks_at_rest(lambda: franka.states(sys.argv[1]))
-    first = next(asks)
+    from jcr.live.arms import states_of
+    from jcr.live.robot import MOVED_ON, next_rest
+    states = states_of("franka:" + sys.argv[1])
+    first = next_rest(states, None, MOVED_ON)
     robot = franky.Robot(sys.argv[1], realtime_config=franky.RealtimeConfig.Ignore)
     robot.relative_dynamics_factor = 0.3
     goal = np.array(robot.state.q) + np.array([0.3, 0, 0, 0, 0, 0.2, 0])
     robot.move(franky.JointMotion(goal))
     del robot
-    second = next(asks)
+    second = next_rest(states, first.base_from_gripper, MOVED_ON)
     print(json.dumps([[a.base_from_gripper.tolist() for a in (first, second)],
                       [a.joints.tolist() for a in (first, second)], goal.tolist()]))
 """
@@ -116,8 +115,8 @@ FILMED = """
     import numpy as np
     import pyrealsense2 as rs
     import record_realsense
-    from jcr.live.devices import opened
-    with opened("realsense:" + sys.argv[1]) as camera:
+    from jcr.live.cameras import open_camera
+    with open_camera("realsense:" + sys.argv[1]) as camera:
         frames = list(camera.frames)
     rays = [rs.rs2_deproject_pixel_to_point(record_realsense.intrinsics(rs), x, 1.0) for x in json.loads(sys.argv[2])]
     depth = np.unique(frames[0].depth_mm).tolist()
@@ -173,7 +172,7 @@ class Device:
 
 def test_a_device_keeps_to_size_exposure_and_focus_or_shows_what_it_does_instead():
     device = Device({})
-    keep_to(device, CameraOptions((1280, 720), 200.0, 30.0), "0")
+    apply_options(device, CameraOptions((1280, 720), 200.0, 30.0), "0")
     assert device.values == {
         cv2.CAP_PROP_FRAME_WIDTH: 1280,
         cv2.CAP_PROP_FRAME_HEIGHT: 720,
@@ -183,10 +182,10 @@ def test_a_device_keeps_to_size_exposure_and_focus_or_shows_what_it_does_instead
         cv2.CAP_PROP_FOCUS: 30.0,
     }
     with pytest.raises(jcr.InputError, match="--camera-size 1280 720: camera 0 gives 640x480"):
-        keep_to(
+        apply_options(
             Device({cv2.CAP_PROP_FRAME_WIDTH: 640, cv2.CAP_PROP_FRAME_HEIGHT: 480}),
             CameraOptions((1280, 720)),
             "0",
         )
     with pytest.raises(jcr.InputError, match="--focus 30: camera 0 stays at 7"):
-        keep_to(Device({cv2.CAP_PROP_FOCUS: 7.0}), CameraOptions(focus=30.0), "0")
+        apply_options(Device({cv2.CAP_PROP_FOCUS: 7.0}), CameraOptions(focus=30.0), "0")

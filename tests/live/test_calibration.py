@@ -16,8 +16,8 @@ from numpy import ndarray
 import jcr
 from jcr.capture.images import read_image
 from jcr.geometry import inverse, rotation_exp, step_between, transform
-from jcr.live.calibration import LiveCalibration
-from jcr.live.calibration_progress import Progress
+from jcr.live.calibration import LiveCalibration, checked_image
+from jcr.live.progress import Progress
 from jcr.reconstruct import ReconstructOptions, reconstruct
 from jcr.records import Kind
 
@@ -60,6 +60,7 @@ def test_every_image_from_the_fifth_on_gives_a_calibration_and_it_becomes_more_e
     reached = [one.translation_mm for one in states[-1].history]
     assert reached[-1] < 0.5 * reached[2]
     assert states[-1].registered == states[-1].images
+    assert len(str(states[-1]).splitlines()) == 2 and "requirement met" in str(states[-1])
     # The next pose is one to which a robot can be sent, and makes the calibration more exact.
     pose, now = states[-1].next_pose, states[-1].now
     assert pose is not None and now is not None and pose.within_95_mm < now.translation_mm
@@ -149,8 +150,8 @@ def test_a_capture_that_is_resumed_stands_where_it_stood_and_a_retake_replaces(
     std = np.sqrt(np.diag(before.hand_eye.covariance)[:6])
     away = step_between(now.hand_eye.gripper_from_camera, before.hand_eye.gripper_from_camera)
     assert np.abs(away / std).max() < 1
-    pose = resumed.live.poses[4]
-    after = resumed.replace(4, still(tabletop, 4), pose)
+    pose = resumed.live.images[4].base_from_gripper
+    after = resumed.add(still(tabletop, 4), pose, replaces=4)
     assert len(after.images) == 11 and states[4].added not in after.images
     assert after.images[-1] == after.added and after.registered == after.images
     assert after.hand_eye is not None
@@ -198,6 +199,55 @@ def test_each_fault_is_named_at_the_image_where_it_happens(resumed: LiveCalibrat
     assert Kind.BLURRED in against(blurred) and Kind.POSE_CONTRADICTS_IMAGE not in against(blurred)
     # What is wrong with single images has not harmed the others.
     assert blurred.hand_eye is not None and blurred.hand_eye.converged
+
+
+def test_what_is_no_image_or_no_pose_is_named_with_its_remedy(tmp_path: Path, tabletop: Path):
+    image, pose = still(tabletop, 0), jcr.read_capture(tabletop).base_from_gripper[0]
+    with closing(LiveCalibration(tmp_path / "capture")) as live:
+        for wrong, words in (
+            (str(tabletop / "images" / "00.jpg"), "is a path; give the pixels"),
+            (tabletop / "images" / "00.jpg", "is a path; give the pixels"),
+            (image / 255.0, "float64 values; give uint8"),
+            (np.dstack([image, image[..., :1]]), r"image\[..., :3\]"),
+        ):
+            with pytest.raises(jcr.InputError, match=words):
+                live.add(wrong, pose)
+        for wrong, words in (
+            (pose[:3, :3], "a rotation .3x3. has no translation"),
+            (pose[:3], "four rows"),
+            (2 * pose, "last row"),
+        ):
+            with pytest.raises(jcr.InputError, match=words):
+                live.add(image, wrong)
+        with pytest.raises(jcr.InputError, match="bgr"):
+            checked_image(image, "grb")
+        assert live.live.names == []
+
+
+def test_grey_and_bgr_images_are_converted_and_lists_are_poses(tmp_path: Path, tabletop: Path):
+    image, poses = still(tabletop, 0), jcr.read_capture(tabletop).base_from_gripper
+    grey = np.asarray(cv2.cvtColor(still(tabletop, 1), cv2.COLOR_RGB2GRAY), np.uint8)
+    with closing(LiveCalibration(tmp_path / "capture")) as live:
+        live.add(image[..., ::-1], poses[0].tolist(), color="bgr")
+        live.add(grey, poses[1].tolist())
+        kept = [read_image(live.live.folder / name) for name in live.live.names]
+    assert np.array_equal(kept[0], image) and np.array_equal(kept[1], np.dstack([grey] * 3))
+
+
+def test_a_pose_in_millimetres_and_a_sample_that_is_given_twice_are_not_kept(tmp_path: Path, tabletop: Path):
+    image, poses = still(tabletop, 0), jcr.read_capture(tabletop).base_from_gripper
+    with closing(LiveCalibration(tmp_path / "capture")) as live:
+        live.add(image, poses[0])
+        in_mm = poses[1].copy()
+        in_mm[:3, 3] *= 1e3
+        state = live.add(still(tabletop, 1), in_mm)
+        assert state.refused is not None and state.refused.kind is Kind.POSE_UNIT
+        assert "divide the translation by 1000" in str(state) and len(str(state).splitlines()) == 2
+        state = live.add(image, poses[0])
+        assert state.refused is not None and state.refused.kind is Kind.SAMPLE_REPEATED
+        assert state.refused.images == state.images == ("images/000.png",)
+        # In place of the first it is no second one.
+        assert live.add(image, poses[0], replaces=0).images == ("images/001.png",)
 
 
 @pytest.mark.slow

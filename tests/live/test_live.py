@@ -3,7 +3,6 @@
 import json
 import socket
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,29 +13,22 @@ from numpy import ndarray
 
 import jcr
 from jcr.capture.images import read_image
-from jcr.live import ur
-from jcr.live.asks import Ask, pose_of_numbers
-from jcr.live.camera import Frame
-from jcr.live.collect import CollectOptions, LiveCapture
-from jcr.live.devices import opened
+from jcr.live import arms
+from jcr.live.cameras import Frame, open_camera
 from jcr.live.folder import LiveFolder
-from jcr.live.look import Look, frame_at_rest
-from jcr.live.rest import asks_at_rest
-from jcr.live.typed import typed_poses
-from scripted_capture import RATE, Scripted, poses, still, video
+from jcr.live.robot import MOVED_ON, RobotState, next_rest, pose_of_numbers
+from jcr.live.session import LiveSession, SessionOptions
+from jcr.live.stillness import ImageSummary, frame_at_rest
+from jcr.live.terminal import typed_poses
+from scripted_capture import RATE, Scripted, poses, still, take_all, video
 from simulation.ur import SimulatedUr
 
 
-def taken(folder: Path, camera: Path, asks: Iterator[Ask], **options) -> list[dict]:
-    """The answers to requests."""
-    answers: list[dict] = []
+def taken(folder: Path, camera: Path, poses: list[ndarray], **options) -> list[dict]:
+    """The answers to requests at these poses."""
     scripted: Any = Scripted(LiveFolder(folder))
-    with opened(str(camera)) as opened_camera:
-        capture = LiveCapture(
-            scripted, opened_camera, CollectOptions(**options), lambda answer, lines: answers.append(answer)
-        )
-        capture.run(asks)
-    return [answer for answer in answers if "accepted" in answer]
+    with open_camera(str(camera)) as opened:
+        return take_all(LiveSession(scripted, opened, SessionOptions(**options)), poses)
 
 
 def close_to(image: ndarray, other: ndarray) -> bool:
@@ -47,7 +39,7 @@ def test_each_pose_gets_the_image_that_was_still_there_and_a_stopped_capture_is_
     tmp_path: Path, tabletop: Path
 ):
     pose = poses(tabletop)
-    first = taken(tmp_path / "c", video(tmp_path / "a.avi", tabletop, range(3)), map(Ask, pose[:3]))
+    first = taken(tmp_path / "c", video(tmp_path / "a.avi", tabletop, range(3)), pose[:3])
     assert [answer["image"] for answer in first] == [f"images/00{k}.png" for k in range(3)]
     file = tmp_path / "c" / "capture.json"
     content = json.loads(file.read_text()) | {
@@ -55,10 +47,8 @@ def test_each_pose_gets_the_image_that_was_still_there_and_a_stopped_capture_is_
         "intrinsics": {"fx": 600, "fy": 600, "cx": 320, "cy": 240},
     }
     file.write_text(json.dumps(content))
-    more = taken(
-        tmp_path / "c", video(tmp_path / "b.avi", tabletop, range(3, 6)), map(Ask, pose[3:6]), images=5
-    )
-    assert [answer["done"] for answer in more] == [False, True]
+    more = taken(tmp_path / "c", video(tmp_path / "b.avi", tabletop, range(3, 6)), pose[3:6], images=5)
+    assert [answer["done"] for answer in more[:2]] == [False, True]
     assert json.loads(file.read_text())["remark"] == "mine"
     capture = jcr.read_capture(tmp_path / "c")
     assert len(capture) == 5 and capture.intrinsics is not None
@@ -70,7 +60,7 @@ def test_each_pose_gets_the_image_that_was_still_there_and_a_stopped_capture_is_
 def test_a_frozen_stream_the_same_place_and_the_end_of_the_video_are_named(tmp_path: Path, tabletop: Path):
     pose = poses(tabletop)
     file = video(tmp_path / "a.avi", tabletop, range(1), rest_s=2)
-    answers = taken(tmp_path / "c", file, map(Ask, [pose[0], pose[0], pose[1], pose[2]]), patience=0.8)
+    answers = taken(tmp_path / "c", file, [pose[0], pose[0], pose[1], pose[2]], patience=0.8)
     assert [answer["accepted"] for answer in answers] == [True, False, False, False]
     assert "where images/000.png was taken" in answers[1]["reason"]
     assert "did not change" in answers[2]["reason"] and "ended" in answers[3]["reason"]
@@ -89,7 +79,7 @@ def test_an_image_that_moves_is_blurred_or_dark_is_refused(tabletop: Path, spoil
     sharp = frame_at_rest(iter(Frame(still(tabletop, 0), k / RATE) for k in range(10)), [], 5.0)
     assert not isinstance(sharp, str)
     spoiled = (Frame(spoil(still(tabletop, 1), k), k / RATE) for k in range(40))
-    assert words in str(frame_at_rest(spoiled, [Look.of(sharp.image)], 2.0))
+    assert words in str(frame_at_rest(spoiled, [ImageSummary.of(sharp.image)], 2.0))
 
 
 def test_noise_of_a_cheap_sensor_is_no_motion(tabletop: Path):
@@ -106,31 +96,32 @@ def test_noise_of_a_cheap_sensor_is_no_motion(tabletop: Path):
 def test_a_ur_arm_is_asked_for_wherever_it_rests(tabletop: Path, length: int):
     goals = np.array(poses(tabletop)[:3])
     angles = np.linspace(-1, 1, 18).reshape(3, 6)
+    last = None
     with SimulatedUr(goals, length, angles) as robot:
-        asks = asks_at_rest(lambda: ur.states("127.0.0.1", robot.port))
         for goal, joints in zip(goals, angles, strict=True):
-            ask = next(asks)
-            assert np.allclose(ask.base_from_gripper, goal, atol=1e-9)
-            assert ask.joints is not None and np.allclose(ask.joints, joints)
-            ask.answer({"accepted": True})
-        assert ask.current is not None and np.allclose(ask.current(), goals[2], atol=1e-9)
+            state = next_rest(lambda: arms.ur_states("127.0.0.1", robot.port), last, MOVED_ON)
+            last = state.base_from_gripper
+            assert np.allclose(last, goal, atol=1e-9)
+            assert state.joints is not None and np.allclose(state.joints, joints)
 
 
 def test_an_arm_that_moves_while_the_image_is_taken_is_named(tmp_path: Path, tabletop: Path):
     pose = poses(tabletop)
     moved = pose[0].copy()
     moved[0, 3] += 1e-3
-    ask = Ask(pose[0], current=lambda: moved)
-    (answer,) = taken(tmp_path / "c", video(tmp_path / "a.avi", tabletop, range(1)), iter([ask]))
+    scripted: Any = Scripted(LiveFolder(tmp_path / "c"))
+    with open_camera(str(video(tmp_path / "a.avi", tabletop, range(1)))) as opened:
+        session = LiveSession(scripted, opened)
+        answer = session.take(RobotState(0.0, pose[0]), current=lambda: RobotState(0.0, moved))
     assert "moved" in answer["reason"] and not (tmp_path / "c" / "capture.json").exists()
 
 
 def test_what_is_no_ur_robot_is_one_line(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(ur, "TIMEOUT_S", 0.2)
+    monkeypatch.setattr(arms, "UR_TIMEOUT_S", 0.2)
     server = socket.create_server(("127.0.0.1", 0))
     port = server.getsockname()[1]
     with pytest.raises(jcr.InputError, match="silent"):
-        next(ur.states("127.0.0.1", port))
+        next(arms.ur_states("127.0.0.1", port))
 
     def greet() -> None:
         for _ in range(2):  # the first connection is the one that gave up
@@ -141,17 +132,17 @@ def test_what_is_no_ur_robot_is_one_line(monkeypatch: pytest.MonkeyPatch):
     thread = threading.Thread(target=greet)
     thread.start()
     with pytest.raises(jcr.InputError, match="not come from a UR"):
-        next(ur.states("127.0.0.1", port))
+        next(arms.ur_states("127.0.0.1", port))
     thread.join(5)
     server.close()
     with pytest.raises(jcr.InputError, match="check the address"):
-        next(ur.states("127.0.0.1", port))
+        next(arms.ur_states("127.0.0.1", port))
 
 
 def test_poses_are_typed_in_three_ways_and_mistakes_asked_again():
     said: list[str] = []
     lines = ["0.4 0 0.5 0 3.14159265 0", "p[0.4, 0, 0.5, 0]", "abc", "0.4 0 0.5 0 1 0 0", "", "1 2 3"]
-    found = [ask.base_from_gripper for ask in typed_poses(iter(lines), said.append)]
+    found = list(typed_poses(iter(lines), said.append))
     assert len(found) == 2  # nothing after the empty line
     assert np.allclose(found[0], found[1], atol=1e-6)
     assert sum("refused" in text for text in said) == 2

@@ -9,7 +9,7 @@ from numpy import ndarray
 
 import jcr
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.live.next_pose import AIMED, ELSEWHERE_M, Reach, Tried, before_calibration
+from jcr.live.next_pose import AIMED, ELSEWHERE_M, Attempts, Reach, propose_before_calibration
 from jcr.records import Capture, HandEye
 from simulation.poses import looking_at
 
@@ -35,8 +35,8 @@ def seen() -> tuple[Capture, HandEye]:
     return capture, jcr.solve_hand_eye(poses, cameras)
 
 
-def next_pose(tried: Tried, hand_eye: HandEye | None) -> ndarray:
-    return before_calibration(tried, Reach(), hand_eye)["next_pose"].base_from_gripper
+def next_pose(attempts: Attempts, hand_eye: HandEye | None) -> ndarray:
+    return propose_before_calibration(attempts, Reach(), hand_eye)["next_pose"].base_from_gripper
 
 
 def past_scene(base_from_gripper: ndarray) -> float:
@@ -55,12 +55,12 @@ def test_a_rejected_calibration_that_knows_where_the_camera_looks_aims_the_next_
             hand_eye.estimate, gripper_from_camera=TILTED, covariance=np.diag([*6 * [1e-6], 1e-6])
         ),
     )
-    tried = Tried(capture, np.arange(4))
-    assert past_scene(next_pose(tried, aimed)) < np.radians(8)
+    attempts = Attempts(capture, np.arange(4))
+    assert past_scene(next_pose(attempts, aimed)) < np.radians(8)
     unknown = replace(
         aimed, estimate=replace(aimed.estimate, covariance=np.diag([*3 * [AIMED[0] ** 2], *3 * [0.1], 1e-6]))
     )
-    assert np.array_equal(next_pose(tried, unknown), next_pose(tried, None))
+    assert np.array_equal(next_pose(attempts, unknown), next_pose(attempts, None))
 
 
 @pytest.mark.parametrize("is_calibrated", [True, False])
@@ -70,26 +70,26 @@ def test_each_refused_pose_is_followed_by_one_elsewhere_that_is_rotated_little(i
         hand_eye,
         estimate=replace(hand_eye.estimate, gripper_from_camera=TILTED, covariance=np.diag(7 * [1e-6])),
     )
-    tried = Tried(capture, np.arange(4))
+    attempts = Attempts(capture, np.arange(4))
     for _ in range(5):
-        new = next_pose(tried, aimed if is_calibrated else None)
+        new = next_pose(attempts, aimed if is_calibrated else None)
         assert all(
             np.linalg.norm((new @ TILTED)[:3, 3] - (old @ TILTED)[:3, 3]) > 0.5 * ELSEWHERE_M
-            for old in tried.refused
+            for old in attempts.refused
         )
-        if tried.refused:
+        if attempts.refused:
             nearest = min(np.trace(old[:3, :3].T @ new[:3, :3]) for old in -capture.base_from_gripper)
             assert np.degrees(np.arccos((-nearest - 1) / 2)) < 25
-        tried = replace(tried, refused=(*tried.refused, new))
+        attempts = replace(attempts, refused=(*attempts.refused, new))
 
 
 def test_an_image_that_did_not_register_counts_as_a_place_without_images():
     capture, _ = seen()
-    first = next_pose(Tried(capture, np.arange(4)), None)
+    first = next_pose(Attempts(capture, np.arange(4)), None)
     more = replace(
         capture,
         images=(*capture.images, "4.png"),
         base_from_gripper=np.concatenate([capture.base_from_gripper, first[None]]),
     )
-    after = next_pose(Tried(more, np.arange(4)), None)
+    after = next_pose(Attempts(more, np.arange(4)), None)
     assert np.linalg.norm(after[:3, 3] - first[:3, 3]) > 0.99 * ELSEWHERE_M

@@ -2,7 +2,6 @@
 
 import http.client
 import json
-import queue
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,33 +14,31 @@ import pytest
 import jcr
 from chromium import Chromium
 from jcr.capture.images import read_image
-from jcr.live.arm_words import ArmWords
-from jcr.live.asks import Ask
-from jcr.live.calibration_words import progress_lines
-from jcr.live.collect import LiveCapture
-from jcr.live.commands import Command
-from jcr.live.rest import State
-from jcr.live.server import Listen, Server
+from jcr.live.notation import Notation
+from jcr.live.progress import progress_lines
+from jcr.live.robot import RobotState
+from jcr.live.server import Listen, LiveServer
+from jcr.live.session import LiveSession
 from scripted_capture import Scripted, a_capture, still_frames
 from waiting import until
 
 
 @pytest.fixture
-def capture(tmp_path: Path, tabletop: Path) -> tuple[LiveCapture, Scripted]:
+def capture(tmp_path: Path, tabletop: Path) -> tuple[LiveSession, Scripted]:
     image = read_image(tabletop / "images" / "00.jpg")
     return a_capture(tmp_path / "<c>", still_frames(lambda: image), accurate_from=5)
 
 
-def add(capture: LiveCapture, scripted: Scripted, tabletop: Path, count: int) -> None:
+def add(capture: LiveSession, scripted: Scripted, tabletop: Path, count: int) -> None:
     """Images, and the state of the calibration with them."""
     poses = jcr.read_capture(tabletop).base_from_gripper
-    for k in range(len(capture.live.names), count):
-        capture.live.add(read_image(tabletop / "images" / f"{k:02d}.jpg"), poses[k])
+    for k in range(len(capture.folder.names), count):
+        capture.folder.add(read_image(tabletop / "images" / f"{k:02d}.jpg"), poses[k])
     capture._report(scripted.update())
 
 
 @contextmanager
-def asked(page: Server, method: str, path: str, body: str = "", **headers: str) -> Iterator[Any]:
+def asked(page: LiveServer, method: str, path: str, body: str = "", **headers: str) -> Iterator[Any]:
     connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=10)
     names = {name.replace("_", "-"): value for name, value in headers.items()}
     connection.request(method, path, body or None, {"Host": f"127.0.0.1:{page.port}"} | names)
@@ -49,14 +46,14 @@ def asked(page: Server, method: str, path: str, body: str = "", **headers: str) 
     connection.close()
 
 
-def parts(page: Server, version: int = -1) -> dict[str, Any]:
+def parts(page: LiveServer, version: int = -1) -> dict[str, Any]:
     with asked(page, "GET", f"/{page.key}/state?version={version}") as answer:
         return json.loads(answer.read())
 
 
-def test_the_page_shows_each_state(capture: tuple[LiveCapture, Scripted], tabletop: Path):
+def test_the_page_shows_each_state(capture: tuple[LiveSession, Scripted], tabletop: Path):
     live, scripted = capture
-    with Server(live) as page:
+    with LiveServer(live) as page:
         with asked(page, "GET", f"/{page.key}/") as answer:
             whole = answer.read().decode()
         assert "&lt;c&gt;" in whole and "<c>" not in whole and "http" not in whole.replace("http-equiv", "")
@@ -83,8 +80,7 @@ def test_the_page_shows_each_state(capture: tuple[LiveCapture, Scripted], tablet
         assert wrong["images"].count('class="rejected"') == 1
         assert "Retake or remove image 4." in wrong["head"]
         assert any(
-            "(retake 4, or remove 4)" in line
-            for line in progress_lines(live.shown.progress, None, ArmWords())
+            "(retake 4, or remove 4)" in line for line in progress_lines(live.state.progress, Notation())
         )
 
         scripted.contradicted = None
@@ -95,16 +91,16 @@ def test_the_page_shows_each_state(capture: tuple[LiveCapture, Scripted], tablet
         assert "<h2>Accepted</h2>" in done["head"] and "data-press" not in done["head"] + done["images"]
         assert (
             "± 1.0 mm" in done["head"]
-            and str(live.live.folder / "result").replace("<c>", "&lt;c&gt;") in done["head"]
+            and str(live.folder.folder / "result").replace("<c>", "&lt;c&gt;") in done["head"]
         )
 
 
-def test_only_the_page_itself_commands(capture: tuple[LiveCapture, Scripted], tabletop: Path):
+def test_only_the_page_itself_commands(capture: tuple[LiveSession, Scripted], tabletop: Path):
     live, scripted = capture
     add(live, scripted, tabletop, 2)
-    pressed: list[Command] = []
-    live.press = pressed.append
-    with Server(live) as page:
+    pressed: list[tuple[str, int | None]] = []
+    live.press = lambda action, number=None: pressed.append((action, number))
+    with LiveServer(live) as page:
         press, body = f"/{page.key}/press", json.dumps({"action": "remove", "number": 1})
         own = {"Origin": f"http://127.0.0.1:{page.port}", "Content_Type": "application/json"}
 
@@ -122,19 +118,19 @@ def test_only_the_page_itself_commands(capture: tuple[LiveCapture, Scripted], ta
         with asked(page, "POST", press, body, Content_Type="application/json") as answer:
             assert answer.status == 403
         assert pressed == []
-        assert status() == 204 and pressed == [Command("remove", 1)]
+        assert status() == 204 and pressed == [("remove", 1)]
         with asked(page, "GET", f"/{page.key}/") as answer:
             assert "frame-ancestors 'none'" in answer.headers["Content-Security-Policy"]
-    other = Server(live)
+    other = LiveServer(live)
     assert other.key != page.key and len(other.key) >= 22
     with pytest.raises(jcr.InputError, match="--page-port"), other:
-        Server(live, Listen(port=other.port))
+        LiveServer(live, Listen(port=other.port))
 
 
-def test_the_camera_now_is_shown_with_its_features(capture: tuple[LiveCapture, Scripted], tabletop: Path):
+def test_the_camera_now_is_shown_with_its_features(capture: tuple[LiveSession, Scripted], tabletop: Path):
     live, _ = capture
     frame = next(iter(live.camera.frames))
-    with Server(live) as page:
+    with LiveServer(live) as page:
         with asked(page, "GET", f"/{page.key}/now.jpg") as answer:
             assert answer.status == 204
         object.__setattr__(live.camera, "latest", lambda: frame)
@@ -162,7 +158,7 @@ def test_the_buttons_take_retake_remove_undo_and_finish_on_a_phone(
     live, scripted = a_capture(
         tmp_path / ("a-long-name-of-a-folder-without-any-space" * 3),
         still_frames(lambda: read_image(tabletop / "images" / f"{at[0]:02d}.jpg")),
-        gripper=lambda: State(0.0, poses[at[0]]),
+        gripper=lambda: RobotState(0.0, poses[at[0]]),
         accurate_from=3,
     )
 
@@ -175,9 +171,8 @@ def test_the_buttons_take_retake_remove_undo_and_finish_on_a_phone(
         browser.js(f"document.querySelector('{selector}:not(:disabled)').click()")
         shows(f"document.querySelectorAll('#images figure').length === {images}")
 
-    asks: queue.SimpleQueue[Ask] = queue.SimpleQueue()
-    taking = threading.Thread(target=live.run, args=(iter(asks.get, None),), daemon=True)
-    with Server(live) as page:
+    taking = threading.Thread(target=live.run, daemon=True)
+    with LiveServer(live) as page:
         taking.start()
         browser.open(page.address, 390, 844, phone=True)
         browser.js("window.confirm = question => { window.asked = question; return true; }")
@@ -191,19 +186,19 @@ def test_the_buttons_take_retake_remove_undo_and_finish_on_a_phone(
         for at[0] in (1, 2):
             press("[data-press=take]", at[0] + 1)
         press(".commands [data-press=retake]", 3)
-        until(lambda: live.live.names == [f"images/00{k}.png" for k in (0, 1, 3)])
+        until(lambda: live.folder.names == [f"images/00{k}.png" for k in (0, 1, 3)])
         press('#images [data-press=remove][data-number="1"]', 2)
-        assert live.live.names == ["images/001.png", "images/003.png"]
+        assert live.folder.names == ["images/001.png", "images/003.png"]
         press("[data-press=undo]", 3)
         shows("document.querySelector('.verdict.good')")
         # Nothing is wider than the window.
         assert browser.js("document.documentElement.scrollWidth <= innerWidth")
         press(".commands [data-press=remove]", 2)
-        assert live.live.names == ["images/000.png", "images/001.png"]
+        assert live.folder.names == ["images/000.png", "images/001.png"]
         press("[data-press=finish]", 2)
         taking.join(60)
-        assert live.shown.is_over and browser.js("asked") == "End the capture with 2 images?"
-        live._show("", result=scripted.finish())
+        assert live.state.is_over and browser.js("asked") == "End the capture with 2 images?"
+        live._show(result=scripted.finish(), is_done=True)
         shows("document.querySelector('.verdict h2')?.innerText === 'Accepted'")
         assert browser.js("document.querySelector('[data-press]')") is None
         assert browser.js("document.documentElement.scrollWidth <= innerWidth")

@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,11 +18,10 @@ import pytest
 
 import jcr
 from jcr.capture.images import read_image
-from jcr.live.asks import Ask
-from jcr.live.server import MAX_SAMPLE, Listen, Server, checked_listen
+from jcr.live.robot import RobotState
+from jcr.live.server import MAX_SAMPLE, Listen, LiveServer
 from places import ROOT
 from scripted_capture import a_capture, poses, still_frames, video
-from waiting import until
 
 CLIENT = ROOT / "examples" / "pose_client.py"
 SCRIPT = ROOT / "examples" / "pose_client.script"
@@ -35,28 +33,24 @@ def serving(tmp_path: Path, tabletop: Path) -> Callable[..., Any]:
     """A server whose samples are all kept, and the samples that it took."""
 
     @contextmanager
-    def served(**listen: Any) -> Iterator[tuple[Server, list[Ask]]]:
+    def served(**listen: Any) -> Iterator[tuple[LiveServer, list[RobotState]]]:
         image, taken = read_image(tabletop / "images" / "00.jpg"), []
-        capture, _ = a_capture(tmp_path / "c", still_frames(lambda: image))
-        with Server(capture, Listen(**listen)) as server:
-            asks = server.sampled_poses(60.0)
+        session, _ = a_capture(tmp_path / "c", still_frames(lambda: image))
 
-            def grant() -> None:
-                for ask in asks:
-                    taken.append(ask)
-                    ask.answer({"accepted": True, "done": False})
+        def take(state: RobotState, waits: bool) -> dict[str, Any]:
+            taken.append(state)
+            return {"accepted": True, "done": False}
 
-            granting = threading.Thread(target=grant)
-            granting.start()
-            until(lambda: server.takes_samples)
+        session.take = take  # pyright: ignore[reportAttributeAccessIssue]
+        with LiveServer(session, Listen(**listen), takes_samples=True) as server:
             yield server, taken
-            server.samples.put(None)
-            granting.join()
 
     return served
 
 
-def posted(server: Server, content: Any, path: str = "/sample", **headers: str | None) -> tuple[int, dict]:
+def posted(
+    server: LiveServer, content: Any, path: str = "/sample", **headers: str | None
+) -> tuple[int, dict]:
     """Status and answer of a sample; a header that is None is not sent."""
     body = content if isinstance(content, str) else json.dumps(content)
     sent = {"Host": server.hosts[0], "Authorization": f"Bearer {server.key}"}
@@ -124,12 +118,12 @@ def test_bad_samples_are_answered_and_good_ones_taken(serving: Callable[..., Any
 
 def test_other_machines_need_a_token_and_the_name_of_the_host(serving: Callable[..., Any]):
     with pytest.raises(jcr.InputError, match="set a token"):
-        checked_listen(Listen("192.168.0.5", 7464, None, "--listen"))
+        Listen("192.168.0.5", 7464, None, "--listen").check()
     for host in ("0.0.0.0", "::", ""):
         with pytest.raises(jcr.InputError, match="names no host"):
-            checked_listen(Listen(host, 7464, "sesame", "--listen"))
+            Listen(host, 7464, "sesame", "--listen").check()
     with pytest.raises(jcr.InputError, match="letters, digits"):
-        checked_listen(Listen(token="a key"))
+        Listen(token="a key").check()
     with serving(host="127.0.0.2", token="sesame") as (server, taken):
 
         def status(host: str, key: str = "sesame") -> int:
@@ -147,10 +141,10 @@ def test_other_machines_need_a_token_and_the_name_of_the_host(serving: Callable[
 def test_silence_ends_the_wait_and_samples_of_a_watched_arm_are_refused(tmp_path: Path, tabletop: Path):
     image = read_image(tabletop / "images" / "00.jpg")
     capture, _ = a_capture(tmp_path / "c", still_frames(lambda: image))
-    with Server(capture) as server:
+    with LiveServer(capture) as server:
         assert posted(server, POSE)[0] == 409
         with pytest.raises(jcr.InputError, match="no sample for 0 s"):
-            next(server.sampled_poses(0.1))
+            server.await_samples(0.1)
 
 
 def played_script(address: str, port: int, token: str, pose: list[float]) -> list[str]:
@@ -193,7 +187,11 @@ def start(out: Path, camera: Path) -> tuple[subprocess.Popen[str], str]:
     command = [sys.executable, "-m", "jcr", "capture", out, "--camera", camera, "--poses", "http"]
     environment = os.environ | {"JCR_TOKEN": "sesame"}
     running = subprocess.Popen(
-        [str(word) for word in command], stderr=subprocess.PIPE, text=True, env=environment
+        [str(word) for word in command],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
     )
     assert running.stderr is not None
     line = next(line for line in running.stderr if "waiting for POST" in line)
@@ -221,8 +219,11 @@ def test_an_interrupted_command_goes_on_and_the_example_client_talks_to_it(tmp_p
     talked = subprocess.run(
         [sys.executable, CLIENT, address, "sesame"], capture_output=True, text=True, timeout=120
     )
-    printed = running.communicate(timeout=60)[1]
-    assert running.returncode == 0, printed
+    result, printed = running.communicate(timeout=60)
+    # The poses are not those of the images.
+    assert running.returncode == 3, printed
+    assert result.splitlines()[0].startswith(f"{out}/result: rejected; ")
+    assert result.splitlines()[-1] == f"next: jcr check {out}"
     assert talked.returncode == 0 and talked.stdout.count("images/00") == 3, talked.stdout + talked.stderr
     # From the second image on there is a pose to go to.
     assert "next: [[" in talked.stdout.splitlines()[-1]

@@ -4,6 +4,7 @@ import json
 import sys
 import threading
 import time
+from array import array
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
@@ -13,14 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from jcr_ros.core import Session, Settings
+from jcr_ros.core import Calibrator, FrameStream, Settings
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 import jcr
 from jcr.capture.images import read_image
-from jcr.live.collect import CollectOptions
-from jcr.live.rest import State
 from places import ROOT
 from waiting import until
 
@@ -41,8 +40,8 @@ class Played:
     def time_s(self) -> float:
         return 20 * (time.monotonic() - self.start)  # the arm lives twenty times as fast
 
-    def gripper(self) -> State:
-        return State(self.time_s, self.poses[self.at])
+    def gripper(self) -> jcr.RobotState:
+        return jcr.RobotState(self.time_s, self.poses[self.at])
 
     def message(self) -> SimpleNamespace:
         image = self.images[self.at]
@@ -50,7 +49,7 @@ class Played:
         stamp = SimpleNamespace(sec=int(self.time_s), nanosec=int(1e9 * (self.time_s % 1)))
         return SimpleNamespace(
             header=SimpleNamespace(stamp=stamp), height=height, width=width, encoding="rgb8", step=3 * width,
-            data=image.ravel(),
+            data=array("B", image.tobytes()),
         )  # fmt: skip
 
     def film(self, push: Callable[[Any, float], None], over: threading.Event) -> None:
@@ -64,11 +63,14 @@ def camera_info(**more: Any) -> SimpleNamespace:
 
 
 @pytest.fixture
-def filmed(tabletop: Path) -> Iterator[Callable[[Session, Played], None]]:
+def filmed(tabletop: Path) -> Iterator[Callable[[Calibrator, Played], None]]:
     over, threads = threading.Event(), []
 
-    def film(session: Session, played: Played) -> None:
-        threads.append(threading.Thread(target=played.film, args=(session.image, over)))
+    def film(calibrator: Calibrator, played: Played) -> None:
+        def push(message: Any, time_s: float) -> None:
+            calibrator.frames.push_image(jcr.read_ros_image(message), time_s)
+
+        threads.append(threading.Thread(target=played.film, args=(push, over)))
         threads[-1].start()
 
     yield film
@@ -79,17 +81,19 @@ def filmed(tabletop: Path) -> Iterator[Callable[[Session, Played], None]]:
 
 @pytest.mark.slow
 def test_images_are_taken_by_service_and_at_rest_each_with_its_state_and_a_change_is_undone(
-    tmp_path: Path, tabletop: Path, filmed: Callable[[Session, Played], None]
+    tmp_path: Path, tabletop: Path, filmed: Callable[[Calibrator, Played], None]
 ):
     played, events, states = Played(tabletop), [], []
 
-    def session(**settings: Any) -> Session:
-        collect = CollectOptions(images=6)
-        given = Settings(folder=tmp_path / "c", collect=collect, **settings)
-        return Session(given, played.gripper, events.append, states.append, lambda mount: None)
+    def session(**settings: Any) -> Calibrator:
+        options = jcr.SessionOptions(images=6)
+        given = Settings(folder=tmp_path / "c", options=options, **settings)
+        return Calibrator(
+            given, played.gripper, events.append, states.append, lambda gripper_from_camera: None
+        )
 
     at_rest = session()
-    at_rest.camera_info(camera_info())
+    at_rest.intrinsics = jcr.read_ros_camera_info(camera_info())
     filmed(at_rest, played)
     assert at_rest.start().startswith("http://127.0.0.1:")
     for k in range(5):  # The arm rests: no service is called.
@@ -120,12 +124,40 @@ def test_images_are_taken_by_service_and_at_rest_each_with_its_state_and_a_chang
 
 def test_intrinsics_that_are_not_known_and_a_gripper_that_is_not_in_tf_are_named(tmp_path: Path):
     nothing: Any = lambda *_: None  # noqa: E731
-    session = Session(Settings(folder=tmp_path / "c"), lambda: None, nothing, nothing, nothing)
+    calibrator = Calibrator(Settings(folder=tmp_path / "c"), lambda: None, nothing, nothing, nothing)
     with pytest.raises(jcr.InputError, match="camera_info"):
         info = camera_info()
         info.distortion_model, info.d = "thin_prism", [0.1] * 12
-        session.camera_info(info)
-    assert "gripper_frame" in session.take()[1]
+        jcr.read_ros_camera_info(info)
+    assert "gripper_frame" in calibrator.take()[1]
+
+
+def test_an_image_gets_the_depth_of_its_own_stamp():
+    """A depth camera's images come later or earlier than the colour images of the same moment."""
+    stream, image = FrameStream(has_depth=True), np.zeros((4, 6, 3), np.uint8)
+    for k in range(3):
+        stream.push_image(image, 0.1 * k)
+    assert stream.latest() is None
+    stream.push_depth(np.full((4, 6), 101, np.uint16), 0.105)
+    frame = stream.latest()
+    assert (
+        frame is not None
+        and frame.time_s == 0.1
+        and frame.depth_mm is not None
+        and frame.depth_mm[0, 0] == 101
+    )
+    # The depth of an image that was dropped is not used for another one.
+    stream.push_depth(np.full((4, 6), 100, np.uint16), 0.0)
+    assert stream.latest() is frame
+    stream.push_depth(np.full((4, 6), 103, np.uint16), 0.3)
+    stream.push_image(image, 0.31)
+    frame = stream.latest()
+    assert frame is not None and frame.depth_mm is not None and frame.depth_mm[0, 0] == 103
+    # A camera whose depth has ended does not end the images.
+    for k in range(20):
+        stream.push_image(image, 1.0 + 0.1 * k)
+    frame = stream.latest()
+    assert frame is not None and frame.time_s >= 1.0 and frame.depth_mm is None
 
 
 class Message(SimpleNamespace):
@@ -229,17 +261,22 @@ def test_the_node_broadcasts_the_transform_where_it_is_accepted_alone(
     parameters = {"folder": str(tmp_path / "c"), "images": 6, "depth_topic": "/depth"}
     parameters |= {"require_mm": require_mm, "require_deg": 1.0}
     monkeypatch.setattr(FakeNode, "parameters", parameters)
-    node = node_module.Calibrator()
+    node = node_module.CalibratorNode()
     node.buffer.lookup_transform = lambda base, gripper, at: stamped(played.poses[played.at], played.time_s)
     node.subscriptions_made["/camera/color/camera_info"](camera_info())
-    depth = np.full((480, 640), 0.5, np.float32)
-    node.subscriptions_made["/depth"](
-        SimpleNamespace(encoding="32FC1", height=480, width=640, data=depth.tobytes())
-    )
+    depth = array("B", np.full((480, 640), 0.5, np.float32).tobytes())
     over = threading.Event()
+
+    def push(message: Any, time_s: float) -> None:
+        """Publish an image, and its depth after it."""
+        node.subscriptions_made["/camera/color/image_raw"](message)
+        shape = {"height": 480, "width": 640, "step": 4 * 640, "is_bigendian": 0}
+        measured = SimpleNamespace(header=message.header, encoding="32FC1", data=depth, **shape)
+        node.subscriptions_made["/depth"](measured)
+
     film = threading.Thread(
         target=played.film,
-        args=(lambda message, at: node.subscriptions_made["/camera/color/image_raw"](message), over),
+        args=(push, over),
     )
     film.start()
     try:

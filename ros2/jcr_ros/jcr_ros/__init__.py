@@ -1,1 +1,1 @@
-"""Hand-eye calibration without a target, at the robot: the node and its core, which knows no ROS."""
+"""Hand-eye calibration without a target, at the robot: a node, and its core without ROS."""

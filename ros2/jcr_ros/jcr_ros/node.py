@@ -1,4 +1,4 @@
-"""The ROS 2 node: tf, images and camera_info in; the state of the calibration, next pose and static transform out."""
+"""ROS 2 node: tf, images and camera_info in; state of the calibration, next pose and static transform out."""
 
 import json
 from collections.abc import Callable
@@ -21,133 +21,142 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from tf2_ros import Buffer, StaticTransformBroadcaster, TransformException, TransformListener
 
-from jcr.errors import InputError
-from jcr.export.ros import CameraMount
-from jcr.geometry import transform
-from jcr.live.collect import CollectOptions
-from jcr.live.rest import State
-from jcr_ros.core import Session, Settings
+import jcr
+from jcr_ros.core import Calibrator, Settings
 
 
-class Calibrator(Node):
-    """Takes images and calibrates; see README.md for topics, services and parameters."""
+class CalibratorNode(Node):
+    """Node that takes images and calibrates; README.md has its topics, services and parameters."""
 
     def __init__(self) -> None:
+        """Read the parameters, subscribe to the topics, and offer the services."""
         super().__init__("jcr")
         self.base = self._parameter("base_frame", "base_link")
         self.gripper = self._parameter("gripper_frame", "tool0")
+        self.camera = self._parameter("camera_frame", "camera_color_optical_frame")
+        depth = self._parameter("depth_topic", "")
         settings = Settings(
             folder=Path(self._parameter("folder", "jcr_capture")).expanduser(),
-            collect=self._collect_options(),
+            options=self._options(),
             at_rest=self._parameter("at_rest", True),
             robot=self._parameter("robot", ""),
             parent=self.gripper,
-            child=self._parameter("camera_frame", "camera_color_optical_frame"),
-            base=self.base,
+            has_depth=bool(depth),
         )
         self.buffer = Buffer()
         self.listener = TransformListener(self.buffer, self)
         self.broadcaster = StaticTransformBroadcaster(self)
-        self.session = Session(settings, self._gripper_now, self._show, self._publish, self._broadcast)
+        self.calibrator = Calibrator(settings, self._gripper_now, self._show, self._publish, self._broadcast)
         group = ReentrantCallbackGroup()
         image = self._parameter("image_topic", "/camera/color/image_raw")
         kind = CompressedImage if image.endswith("compressed") else Image
         self.create_subscription(kind, image, self._image, qos_profile_sensor_data, callback_group=group)
         info = self._parameter("camera_info_topic", "/camera/color/camera_info")
         self.info = self.create_subscription(CameraInfo, info, self._camera_info, 10, callback_group=group)
-        depth = self._parameter("depth_topic", "")
         if depth:
             self.create_subscription(Image, depth, self._depth, qos_profile_sensor_data, callback_group=group)
-        self.depth_mm: ndarray | None = None
         self.status = self.create_publisher(String, "~/status", 10)
         self.next_pose = self.create_publisher(PoseStamped, "~/next_pose", 1)
         services = {
             "start": self._start,
-            "take": self.session.take,
-            "undo": self.session.undo,
-            "finish": self.session.finish,
+            "take": self.calibrator.take,
+            "undo": self.calibrator.undo,
+            "finish": self.calibrator.finish,
         }
         for name, action in services.items():
             self.create_service(Trigger, f"~/{name}", partial(_answered, action), callback_group=group)
         self._show("call ~/start when image and camera_info arrive")
 
     def _parameter(self, name: str, default: Any) -> Any:
+        """Declare a parameter and return its value."""
         return self.declare_parameter(name, default).value
 
-    def _collect_options(self) -> CollectOptions:
-        """Of numbers, 0 stands for the default."""
+    def _options(self) -> jcr.SessionOptions:
+        """Return the options of taking images; the number 0 stands for the default."""
         require = self._parameter("require_mm", 0.0), self._parameter("require_deg", 0.0)
-        return CollectOptions(
+        return jcr.SessionOptions(
             images=self._parameter("images", 0) or None,
             require=require if all(require) else None,
             until_accurate=self._parameter("until_accurate", False),
         )
 
     def _show(self, text: str) -> None:
+        """Log an event."""
         self.get_logger().info(text)
 
     def _publish(self, answer: dict[str, Any]) -> None:
-        """The state as JSON, and the next pose."""
+        """Publish the state as JSON, and the next pose."""
         self.status.publish(String(data=json.dumps(answer)))
         if answer.get("next_base_from_gripper") is not None:
             self._propose(np.array(answer["next_base_from_gripper"]))
 
     def _image(self, message: Any) -> None:
-        stamp = message.header.stamp
+        """Pass on an image."""
         try:
-            self.session.image(message, stamp.sec + 1e-9 * stamp.nanosec, self.depth_mm)
-        except InputError as error:
+            self.calibrator.frames.push_image(jcr.read_ros_image(message), _seconds(message.header.stamp))
+        except jcr.InputError as error:
             self.get_logger().error(str(error), throttle_duration_sec=5.0)
 
     def _depth(self, message: Any) -> None:
-        """16UC1 in mm or 32FC1 in m, aligned with the images (aligned_depth_to_color)."""
-        kind = {"16UC1": np.uint16, "32FC1": np.float32}[message.encoding]
-        values = np.frombuffer(bytes(message.data), kind).reshape(message.height, -1)[:, : message.width]
-        self.depth_mm = (
-            values if kind is np.uint16 else np.nan_to_num(1e3 * values).clip(0, 65535).astype(np.uint16)
-        )
+        """Pass on a depth image, which is aligned with the images (aligned_depth_to_color)."""
+        try:
+            self.calibrator.frames.push_depth(jcr.read_ros_depth(message), _seconds(message.header.stamp))
+        except jcr.InputError as error:
+            self.get_logger().error(str(error), throttle_duration_sec=5.0)
 
     def _camera_info(self, message: Any) -> None:
+        """Take the intrinsics of the first message."""
         try:
-            self.session.camera_info(message)
-        except InputError as error:
+            self.calibrator.intrinsics = jcr.read_ros_camera_info(message)
+        except jcr.InputError as error:
             self._show(f"error: {error}")
         self.destroy_subscription(self.info)
 
-    def _gripper_now(self) -> State | None:
+    def _gripper_now(self) -> jcr.RobotState | None:
+        """Return the newest pose of the gripper in tf; None while there is none."""
         try:
             found = self.buffer.lookup_transform(self.base, self.gripper, Time())
         except TransformException:
             return None
-        t, q, stamp = found.transform.translation, found.transform.rotation, found.header.stamp
-        rotation = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
-        return State(stamp.sec + 1e-9 * stamp.nanosec, transform(rotation, np.array([t.x, t.y, t.z])))
+        t, q = found.transform.translation, found.transform.rotation
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+        pose[:3, 3] = t.x, t.y, t.z
+        return jcr.RobotState(_seconds(found.header.stamp), pose)
 
     def _propose(self, base_from_gripper: ndarray) -> None:
+        """Publish the next gripper pose."""
         message = PoseStamped()
         message.header.frame_id = self.base
         message.header.stamp = self.get_clock().now().to_msg()
         _fill(message.pose.position, message.pose.orientation, base_from_gripper)
         self.next_pose.publish(message)
 
-    def _broadcast(self, mount: CameraMount) -> None:
-        """The accepted transform, on /tf_static."""
+    def _broadcast(self, gripper_from_camera: ndarray) -> None:
+        """Send the accepted transform on /tf_static."""
         message = TransformStamped()
-        message.header.frame_id, message.child_frame_id = mount.parent, mount.child
+        message.header.frame_id, message.child_frame_id = self.gripper, self.camera
         message.header.stamp = self.get_clock().now().to_msg()
-        _fill(message.transform.translation, message.transform.rotation, mount.parent_from_child)
+        _fill(message.transform.translation, message.transform.rotation, gripper_from_camera)
         self.broadcaster.sendTransform(message)
 
     def _start(self) -> tuple[bool, str]:
+        """Start the capture; return whether that worked, and the address of the page or the reason."""
         try:
-            return True, f"move the arm; {self.session.start()} shows the capture"
-        except InputError as error:
+            return True, f"move the arm; {self.calibrator.start()} shows the capture"
+        except jcr.InputError as error:
             return False, str(error)
 
 
 def _answered(action: Callable[[], tuple[bool, str]], request: Any, response: Any) -> Any:
+    """Answer a service with the outcome of an action."""
     response.success, response.message = action()
     return response
+
+
+def _seconds(stamp: Any) -> float:
+    """Return a stamp in seconds."""
+    return stamp.sec + 1e-9 * stamp.nanosec
 
 
 def _fill(translation: Any, rotation: Any, a_from_b: ndarray) -> None:
@@ -160,7 +169,7 @@ def _fill(translation: Any, rotation: Any, a_from_b: ndarray) -> None:
 def main() -> None:
     """Spin until Ctrl-C."""
     rclpy.init()
-    node = Calibrator()
+    node = CalibratorNode()
     executor = MultiThreadedExecutor()
     executor.add_node(node)
     try:
@@ -168,6 +177,6 @@ def main() -> None:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
-        node.session.stop()
+        node.calibrator.stop()
         node.destroy_node()
         rclpy.try_shutdown()

@@ -3,6 +3,7 @@
 import json
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -25,6 +26,7 @@ from jcr.capture.checks import MAX_REACH, likely_unit, read_rigid
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
+from jcr.estimation.kinematics import Arm
 from jcr.files import read_bytes, write_text
 from jcr.geometry import apply, largest_motion
 from jcr.least_squares import one_blas_thread
@@ -66,9 +68,18 @@ class LiveCalibration:
         robot: str | None = None,
         options: CalibrateOptions | Mapping[str, Any] | None = None,
         reach: Float[ndarray, "2 3"] | None = None,
+        exclusive: bool = False,
     ) -> None:
-        """Open or begin a capture; raise InputError where it cannot be continued, or an option is wrong."""
+        """Open or begin a capture; raise InputError where it cannot be continued, or an option is wrong.
+
+        `exclusive`: raise InputError where another process writes into the folder, and keep others out until `close`.
+        """
+        self._opened = ExitStack()
         if not isinstance(folder, LiveFolder):
+            if exclusive:
+                from jcr.run_folder import locked
+
+                self._opened.enter_context(locked(Path(folder)))
             given = None if intrinsics is None else intrinsics_as_json(intrinsics)
             folder = LiveFolder(Path(folder), given, robot)
         self.live = folder
@@ -87,9 +98,14 @@ class LiveCalibration:
         """Fields of Progress for the capture as it was calibrated last and the gripper poses refused since."""
         self.progress = Progress(images=tuple(folder.names), history=self._history)
 
+    @property
+    def arm(self) -> Arm | None:
+        """Arm that the user or the capture named."""
+        return self._reach.arm
+
     def add(
         self,
-        image: ArrayLike,
+        image: ArrayLike | Path,
         base_from_gripper: ArrayLike,
         joints: ArrayLike | None = None,
         time_s: float | None = None,
@@ -100,9 +116,9 @@ class LiveCalibration:
     ) -> Progress:
         """Keep an image (h,w,3) uint8 and the gripper pose (4,4) at it, and calibrate with it.
 
-        `joints` are the angles of the arm (rad), `time_s` is the time of the image, `depth_mm` (h,w) the image of a depth
-        camera, `color` the order of channels ("bgr" for OpenCV), `replaces` the index of an image that is removed for
-        this one. An image of another size, one that repeats an earlier one, or a pose in another unit is not kept:
+        `joints` are the angles of the arm (rad), `time_s` is the time of the image, `depth_mm` (h,w) the image of a
+        depth camera, `color` the order of channels ("bgr" for OpenCV), `replaces` the index of an image that is removed
+        for this one. An image of another size, one that repeats an earlier one, or a pose in another unit is not kept:
         `refused` says why, and the capture is unchanged. Raises InputError for arrays that are no image or no pose.
         """
         pixels, pose = checked_image(image, color), checked_pose(base_from_gripper)
@@ -175,6 +191,7 @@ class LiveCalibration:
             if self._map is not None:
                 self._map.close()
             self.live.close()
+            self._opened.close()
 
     def _refusal(
         self, image: UInt8[ndarray, "h w 3"], base_from_gripper: Float[ndarray, "4 4"], without: str | None
@@ -182,8 +199,8 @@ class LiveCalibration:
         """Return the reason why an image is not kept, or None; `without` names an image that does not count."""
         size = (image.shape[1], image.shape[0])
         if self.live.size not in (None, size):
-            sizes = {"size": "{}x{}".format(*size), "before": "{}x{}".format(*self.live.size)}
-            return Finding.of(Kind.SIZE_DIFFERS, "rejects", "images", **sizes)
+            now, before = ("{}x{}".format(*one) for one in (size, self.live.size))
+            return Finding.of(Kind.SIZE_DIFFERS, "rejects", "images", size=now, before=before)
         farthest = float(np.abs(base_from_gripper[:3, 3]).max())
         if farthest > MAX_REACH:
             unit, _, a_metre = likely_unit(farthest)
@@ -328,7 +345,7 @@ class LiveCalibration:
         write_text(self.live.folder / HISTORY, json.dumps([asdict(one) for one in self._history]) + "\n")
 
 
-def checked_image(image: ArrayLike, color: str = "rgb") -> UInt8[ndarray, "h w 3"]:
+def checked_image(image: ArrayLike | Path, color: str = "rgb") -> UInt8[ndarray, "h w 3"]:
     """Return an image as RGB (h,w,3) uint8, grey ones converted; raise InputError for anything else."""
     if isinstance(image, str | Path):
         raise InputError(
@@ -384,8 +401,8 @@ def _too_few(images: int) -> list[Finding]:
     """Return the reason why there is no calibration."""
     if images < FEW:
         return [Finding.of(Kind.FEW_IMAGES, "informs", "images", value=float(images))]
-    details = {"text": "fewer than three images are registered", "remedy": "let the views overlap more"}
-    return [Finding.of(Kind.NO_RECONSTRUCTION, "rejects", "reconstruction", **details)]
+    text, remedy = "fewer than three images are registered", "let the views overlap more"
+    return [Finding.of(Kind.NO_RECONSTRUCTION, "rejects", "reconstruction", text=text, remedy=remedy)]
 
 
 def _contradicting(case: Case, hand_eye: HandEye) -> list[Finding]:

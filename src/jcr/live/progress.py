@@ -92,6 +92,33 @@ class Progress:
         images = f"{len(self.registered)} of {len(self.images)} images registered"
         return f"{images}: {_accuracy(self)}\n{_advice(self)}"
 
+    def as_json(self) -> dict[str, Any]:
+        """Return the state for a program, as values of JSON."""
+        pose, now, error = self.next_pose, self.now, self.leave_one_out
+        return {
+            "images": list(self.images),
+            "registered": list(self.registered),
+            "translation_95_mm": None if now is None else now.translation_mm,
+            "rotation_95_deg": None if now is None else now.rotation_deg,
+            "verdict": None if self.hand_eye is None else self.hand_eye.verdict,
+            "history": [vars(one) for one in self.history],
+            "findings": [
+                {
+                    "kind": one.kind.value,
+                    "severity": one.severity,
+                    "images": list(one.images),
+                    "text": text(one),
+                    "remedy": remedy(one),
+                }
+                for one in self.findings
+            ],
+            "leave_one_out": None if error is None else [error.translation_mm, error.rotation_deg],
+            "requirement_met": self.requirement_met,
+            "next_base_from_gripper": None if pose is None else pose.base_from_gripper.tolist(),
+            "next_joints": None if self.next_joints is None else self.next_joints.tolist(),
+            "next_expected": None if pose is None else [pose.within_95_mm, pose.rotation_95_deg],
+        }
+
 
 def faults(state: Progress) -> list[Finding]:
     """Return the findings that reject or warn, those of the last image first, but not that more images are needed."""
@@ -176,31 +203,3 @@ def _advice(state: Progress) -> str:
     if state.requirement_met:
         return "requirement met: finish, or go on"
     return FIRST_ADVICE if state.next_pose is None else f"next pose: {next_sentence(state)}"
-
-
-def progress_answer(state: Progress) -> dict[str, Any]:
-    """Return the state for a program, as values of JSON."""
-    pose, now, error = state.next_pose, state.now, state.leave_one_out
-    return {
-        "images": list(state.images),
-        "registered": list(state.registered),
-        "translation_95_mm": None if now is None else now.translation_mm,
-        "rotation_95_deg": None if now is None else now.rotation_deg,
-        "verdict": None if state.hand_eye is None else state.hand_eye.verdict,
-        "history": [vars(one) for one in state.history],
-        "findings": [
-            {
-                "kind": one.kind.value,
-                "severity": one.severity,
-                "images": list(one.images),
-                "text": text(one),
-                "remedy": remedy(one),
-            }
-            for one in state.findings
-        ],
-        "leave_one_out": None if error is None else [error.translation_mm, error.rotation_deg],
-        "requirement_met": state.requirement_met,
-        "next_base_from_gripper": None if pose is None else pose.base_from_gripper.tolist(),
-        "next_joints": None if state.next_joints is None else state.next_joints.tolist(),
-        "next_expected": None if pose is None else [pose.within_95_mm, pose.rotation_95_deg],
-    }

@@ -17,7 +17,7 @@ from jcr.errors import InputError, RejectedError
 from jcr.live.cameras import Camera, Frame
 from jcr.live.folder import TakenImage
 from jcr.live.notation import Notation
-from jcr.live.progress import Progress, progress_answer, progress_lines
+from jcr.live.progress import Progress, progress_lines
 from jcr.live.robot import MOVED_ON, REST, TRY_AGAIN, RobotState, States, is_farther, next_rest
 from jcr.live.stillness import frame_at_rest
 from jcr.live.terminal import Action
@@ -116,7 +116,7 @@ class LiveSession:
     ) -> None:
         """Prepare a session; `run` starts it."""
         self.calibration, self.folder, self.camera = calibration, calibration.live, camera
-        self.options, self.notation = options or SessionOptions(), notation or Notation()
+        self.options, self.notation = options or SessionOptions(), notation or Notation(arm=calibration.arm)
         self._tell, self._gripper = tell, gripper
         self._frames = iter(camera.frames)
         self._lock = threading.RLock()
@@ -192,7 +192,7 @@ class LiveSession:
             return answer
         with self._changed:
             self._changed.wait_for(lambda: self._done >= ticket)
-            return progress_answer(self.state.progress) | answer | {"done": self.state.is_over}
+            return self.state.progress.as_json() | answer | {"done": self.state.is_over}
 
     def press(self, action: Action, number: int | None = None) -> None:
         """Obey a command; `number` counts images from 1, None: the last one."""
@@ -392,7 +392,7 @@ class LiveSession:
             state = self.state
             is_done = not state.is_refusal and progress.images == state.names
             self._show("" if is_done else state.event, is_refusal=state.is_refusal, progress=progress)
-        self._tell({"calibration": progress_answer(progress)}, progress_lines(progress, self.notation))
+        self._tell({"calibration": progress.as_json()}, progress_lines(progress, self.notation))
 
     def _show(self, event: str = "", *, is_refusal: bool = False, **changes: Any) -> None:
         """Replace the state by one with an event and other fields."""

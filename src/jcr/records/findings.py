@@ -82,6 +82,8 @@ class FindingKind(StrEnum):
     POSE_CONTRADICTS_IMAGE = "gripper pose contradicts its image"
     NOT_REGISTERED = "image not registered"
     FRAME_REPEATED = "image repeats another"
+    SAMPLE_REPEATED = "image and pose repeat others"
+    POSE_UNIT = "gripper pose in another unit"
     SIZE_DIFFERS = "image size differs"
     CLOCK_JUMPS = "clock jumps back"
 

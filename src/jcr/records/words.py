@@ -629,6 +629,8 @@ _TEXT: dict[Kind, Words] = {
         "the gripper pose of {images[0]} is {mm:.0f} mm and {deg:.1f}° from where its image shows the gripper"
     ),
     Kind.NOT_REGISTERED: _not_registered,
+    Kind.SAMPLE_REPEATED: "the image and the gripper pose are those of {images[0]}: not kept",
+    Kind.POSE_UNIT: "the gripper would be {value:.4g} m from the base, as of a pose in {unit}: not kept",
     Kind.FRAME_REPEATED: (
         "the image is the same as {images[0]}, though the gripper moved by {mm:.0f} mm and {deg:.0f}°: not kept"
     ),
@@ -689,6 +691,8 @@ _REMEDY: dict[Kind, Words] = {
     Kind.POSES_SWAPPED: "exchange the two poses",
     Kind.POSE_CONTRADICTS_IMAGE: "correct that pose, or drop the image",
     Kind.NOT_REGISTERED: "take such a view again, nearer to a pose that registered, with textured things in view",
+    Kind.SAMPLE_REPEATED: "move the gripper, or press retake",
+    Kind.POSE_UNIT: "divide the translation by {a_metre:.0f}",
     Kind.FRAME_REPEATED: "check that the camera's stream is live",
     Kind.SIZE_DIFFERS: "set the camera's old resolution, or name a new folder",
     Kind.CLOCK_JUMPS: "check that images and poses are stamped by one clock",

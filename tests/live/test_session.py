@@ -1,0 +1,271 @@
+"""A capture while it is taken: when it ends, what commands do to it, and what it does with faults of the world."""
+
+import errno
+import json
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy import ndarray
+
+import jcr
+from jcr.live.cameras import Frame
+from jcr.live.folder import LiveFolder
+from jcr.live.page import page_content
+from jcr.live.robot import MOVED_ON, RobotState, next_rest
+from jcr.live.session import Answer
+from jcr.live.terminal import command_of, without_commands
+from scripted_capture import a_capture, still, still_frames, take_all
+
+Step = int | tuple
+"""An image to take, or a command with its arguments."""
+
+
+class Stepped:
+    """A capture that is driven from a test, an image or a command at a time; each is calibrated before the next."""
+
+    def __init__(self, folder: Path, tabletop: Path, has_gripper: bool = True, **options) -> None:
+        self.poses = list(jcr.read_capture(tabletop).base_from_gripper)
+        self.at = 0
+        self.heard: list[tuple[Answer, list[str]]] = []
+        self.session, self.scripted = a_capture(
+            folder,
+            still_frames(lambda: still(tabletop, self.at)),
+            lambda answer, lines: self.heard.append((answer, lines)),
+            (lambda: RobotState(0.0, self.poses[self.at])) if has_gripper else None,
+            **options,
+        )
+        self.folder = self.session.folder
+
+    def run(self, steps: list[Step]) -> list[tuple[Answer, list[str]]]:
+        """Go to images and give commands, then end the session; return all that was told."""
+
+        def source() -> None:
+            for step in steps:
+                if isinstance(step, tuple):
+                    self.session.press(*step)
+                else:
+                    self.at = step
+                    self.session.take(RobotState(0.0, self.poses[step]), waits=True)
+
+        self.session.run(source)
+        return self.heard
+
+
+def frames_in(folder: Path) -> list[str]:
+    return [frame["image"] for frame in json.loads((folder / "capture.json").read_text())["frames"]]
+
+
+def test_a_capture_ends_by_itself_when_it_is_accurate(tmp_path: Path, tabletop: Path):
+    taken = Stepped(tmp_path / "c", tabletop, accurate_from=8, until_accurate=True)
+    heard = taken.run([*range(10)])
+    done = taken.session.state.result
+    assert done is not None and taken.session.finish() is done
+    assert len(taken.folder.names) == 8
+    met = [answer["calibration"]["requirement_met"] for answer, _ in heard if "calibration" in answer]
+    assert met[-8:] == 7 * [False] + [True]
+
+
+def test_commands_are_distinguished_from_poses():
+    assert command_of("retake") == ("retake", None) and command_of("rem 3") == ("remove", 3)
+    assert command_of("FINISH\n") == ("finish", None) and command_of("undo") == ("undo", None)
+    lines = ("", "0.4 0 0.5 0 0 0", "re", "remove it", "finish 1", "undo 2", "take 1", "retake ²")
+    assert all(command_of(line) is None for line in lines)
+    pressed: list[tuple[str, int | None]] = []
+    typed = without_commands(["1 2", "remove 2", "3 4"], lambda *command: pressed.append(command))
+    assert list(typed) == ["1 2", "3 4"] and pressed == [("remove", 2)]
+
+
+def test_commands_take_retake_remove_and_undo(tmp_path: Path, tabletop: Path):
+    taken = Stepped(tmp_path / "c", tabletop, has_gripper=False)
+    heard = taken.run(
+        [
+            0,
+            1,
+            2,
+            ("retake", 2),
+            3,
+            ("remove", 9),
+            ("remove", 1),
+            ("undo",),
+            ("undo",),
+            ("remove", 1),
+            ("undo",),
+        ]
+    )
+    assert ({"retake": "images/001.png"}, ["the next image replaces images/001.png"]) in heard
+    assert any(answer.get("reason") == "there is no image 9" for answer, _ in heard)
+    assert ({"images": ["images/002.png", "images/003.png"]}, ["removed images/000.png"]) in heard
+    assert frames_in(tmp_path / "c") == ["images/000.png", "images/001.png", "images/002.png"]
+    taken.scripted.close()
+    left = sorted(file.name for file in (tmp_path / "c" / "images").iterdir())
+    assert left == ["000.png", "001.png", "002.png"]
+
+
+def test_take_and_retake_read_where_the_gripper_is(tmp_path: Path, tabletop: Path):
+    taken = Stepped(tmp_path / "c", tabletop)
+    heard = taken.run([0, ("retake",)])
+    assert taken.session.state.names == ("images/001.png",) and taken.session.state.replaces is None
+    assert any(answer.get("retake") == "images/000.png" for answer, _ in heard)
+    assert np.allclose(taken.folder.images[0].base_from_gripper, taken.poses[0])
+    typed = Stepped(tmp_path / "d", tabletop, has_gripper=False)
+    assert "give the pose" in typed.run([("take",)])[-1][1][0]
+
+
+def test_a_connection_that_fails_during_retake_does_not_end_the_capture(tmp_path: Path, tabletop: Path):
+    taken = Stepped(tmp_path / "c", tabletop)
+
+    def lost() -> RobotState:
+        raise jcr.InputError("--poses ur:192.168.0.2:30003: silent for 5 s")
+
+    taken.session._gripper = lost
+    heard = taken.run([0, ("retake",), ("take",), 1])
+    reasons = [answer["reason"] for answer, _ in heard if "reason" in answer]
+    assert len(reasons) == 2 and all("silent for 5 s" in reason for reason in reasons)
+    # The next image replaced the first.
+    assert frames_in(tmp_path / "c") == ["images/001.png"]
+
+
+def test_the_page_is_drawn_while_the_image_that_it_replaces_goes(tmp_path: Path, tabletop: Path):
+    """A state is one moment: drawing it does not look at what the folder holds later."""
+    taken = Stepped(tmp_path / "c", tabletop, has_gripper=False)
+    taken.run([0, 1, ("retake", 1)])
+    before = taken.session.state
+    taken.folder.remove("images/000.png")
+    assert page_content(before, (2.0, 0.3), taken.session.notation).replaces == 1
+    (left,) = taken.folder.images
+    between = type(before)(images=(left,), replaces="images/000.png")
+    assert page_content(between, (2.0, 0.3), taken.session.notation).replaces is None
+
+
+def test_requests_and_commands_of_several_threads_come_one_after_the_other(tmp_path: Path, tabletop: Path):
+    taken = Stepped(tmp_path / "c", tabletop)
+    answers: list[Answer] = []
+
+    def source() -> None:
+        # All of them are at the same place: one image is kept, whoever comes first.
+        takers = [
+            threading.Thread(
+                target=lambda: answers.append(taken.session.take(RobotState(0.0, taken.poses[0])))
+            )
+            for _ in range(4)
+        ]
+        takers += [threading.Thread(target=taken.session.press, args=("take",)) for _ in range(4)]
+        for one in takers:
+            one.start()
+        for one in takers:
+            one.join()
+
+    taken.session.run(source)
+    assert frames_in(tmp_path / "c") == ["images/000.png"]
+    assert all("where images/000.png" in one["reason"] for one in answers if not one["accepted"])
+
+
+def test_a_program_whose_pose_is_refused_is_answered_with_another_next_pose(tmp_path: Path, tabletop: Path):
+    """Else it would be sent to the same place for ever."""
+    poses = list(jcr.read_capture(tabletop).base_from_gripper)
+    session, _ = a_capture(tmp_path / "c", still_frames(lambda: still(tabletop, 0)), patience=0.5)
+    kept, refused = take_all(session, poses[:2], waits=True)
+    assert kept["accepted"] and not refused["accepted"] and "did not change" in refused["reason"]
+    # The scripted calibration proposes joints by which the refused pose is known.
+    assert kept["next_joints"] is None and np.allclose(refused["next_joints"], poses[1][:3, 3])
+
+
+def test_a_program_that_sends_poses_is_answered_with_the_calibration(tmp_path: Path, tabletop: Path):
+    poses, at = list(jcr.read_capture(tabletop).base_from_gripper), [0]
+    session, _ = a_capture(tmp_path / "c", still_frames(lambda: still(tabletop, at[0])), images=4)
+    answers: list[Answer] = []
+
+    def source() -> None:
+        for at[0] in range(4):
+            answers.append(session.take(RobotState(0.0, poses[at[0]]), waits=True))
+
+    session.run(source)
+    assert [answer["done"] for answer in answers] == [False, False, False, True]
+    assert [answer["image"] for answer in answers] == [f"images/00{k}.png" for k in range(4)]
+    assert [len(answer["images"]) for answer in answers] == [1, 2, 3, 4]
+    assert answers[3]["translation_95_mm"] == 2.5 and answers[0]["translation_95_mm"] is None
+    assert session.take(RobotState(0.0, poses[5]))["reason"] == "the capture has ended"
+
+
+def test_a_full_disk_refuses_the_image_and_the_capture_goes_on(
+    tmp_path: Path, tabletop: Path, monkeypatch: pytest.MonkeyPatch
+):
+    taken = Stepped(tmp_path / "c", tabletop)
+    full = OSError(errno.ENOSPC, "No space left on device")
+    real, files = LiveFolder._write, []
+
+    def write(self: LiveFolder, images) -> None:
+        if len(images) == 2 and not files:
+            files.append(sorted(file.name for file in (self.folder / "images").iterdir()))
+            raise full
+        real(self, images)
+
+    monkeypatch.setattr(LiveFolder, "_write", write)
+    heard = taken.run([0, 1, 1, 2])
+    assert [answer["reason"] for answer, _ in heard if "reason" in answer] == [
+        "the image cannot be written (No space left on device); free the disk and take it again"
+    ]
+    assert files == [["000.png", "001.png"]] and len(frames_in(tmp_path / "c")) == 3
+    # Neither does a calibration that cannot write its files end the capture.
+    again = Stepped(tmp_path / "d", tabletop)
+    again.scripted.fault = full
+    heard = again.run([0, 1])
+    assert any("No space left" in lines[0] for answer, lines in heard) and len(again.folder.names) == 2
+
+
+@pytest.mark.parametrize(
+    ("camera", "why"),
+    [
+        (lambda first, k: first, "stream frozen"),
+        (lambda first, k: cv2.resize(np.roll(first, 9, 0), (320, 160)), "holds images of 640x480"),
+        (lambda first, k: np.roll(first, 9, 0)[: 480 - k % 2], "size of the camera's images changes"),
+    ],
+)
+def test_a_camera_that_repeats_or_changes_its_size_is_named_and_nothing_is_kept(
+    tmp_path: Path, tabletop: Path, camera: Callable[[ndarray, int], ndarray], why: str
+):
+    first, poses = still(tabletop, 0), list(jcr.read_capture(tabletop).base_from_gripper)
+
+    def frames() -> Iterator[Frame]:
+        for k in range(100):
+            image = camera(first, k) if (tmp_path / "c" / "capture.json").exists() else first
+            yield Frame(image, 0.25 * k)
+
+    session, _ = a_capture(tmp_path / "c", frames(), patience=1.0)
+    kept, refused = take_all(session, poses[:2])
+    assert kept["accepted"] and not refused["accepted"] and why in refused["reason"]
+    assert frames_in(tmp_path / "c") == ["images/000.png"]
+
+
+def test_a_clock_that_is_set_back_stops_neither_camera_nor_arm(tmp_path: Path, tabletop: Path):
+    image, poses = still(tabletop, 0), list(jcr.read_capture(tabletop).base_from_gripper)
+    times = [1e6, *(0.25 * k for k in range(20))]
+    session, _ = a_capture(tmp_path / "c", (Frame(image, time_s) for time_s in times))
+    assert take_all(session, poses[:1])[0]["accepted"]
+
+    def states() -> Iterator[RobotState]:
+        for k in range(200):
+            yield RobotState(1e6 + 0.1 * k if k < 3 else 0.1 * k, poses[0])
+
+    assert np.allclose(next_rest(states, None, MOVED_ON).base_from_gripper, poses[0])
+
+
+def test_poses_that_stop_end_the_capture_in_one_line_with_all_that_was_taken(tmp_path: Path, tabletop: Path):
+    poses = list(jcr.read_capture(tabletop).base_from_gripper)
+    session, scripted = a_capture(tmp_path / "c", still_frames(lambda: still(tabletop, 0)))
+
+    def source() -> None:
+        session.take(RobotState(0.0, poses[0]))
+        raise jcr.InputError("--poses ur:192.168.0.2:30003: silent for 5 s")
+
+    with pytest.raises(jcr.InputError, match="silent"):
+        session.run(source)
+    scripted.close()
+    assert frames_in(tmp_path / "c") == ["images/000.png"]
+    resumed, _ = a_capture(tmp_path / "c", still_frames(lambda: still(tabletop, 1)))
+    take_all(resumed, poses[1:2])
+    assert frames_in(tmp_path / "c") == ["images/000.png", "images/001.png"]
