@@ -22,8 +22,9 @@ from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import RobotErrors, robot_errors
 from jcr.calibration.stage import checked
 from jcr.capture.camera_json import intrinsics_as_json
-from jcr.capture.checks import MAX_REACH, likely_unit, read_rigid
+from jcr.capture.checks import read_rigid
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
+from jcr.capture.robot_poses import far_rows, likely_unit
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import Arm
@@ -201,8 +202,8 @@ class LiveCalibration:
         if self.live.size not in (None, size):
             now, before = ("{}x{}".format(*one) for one in (size, self.live.size))
             return Finding.of(Kind.SIZE_DIFFERS, "rejects", "images", size=now, before=before)
-        farthest = float(np.abs(base_from_gripper[:3, 3]).max())
-        if farthest > MAX_REACH:
+        far, farthest, _ = far_rows(base_from_gripper[None, :3, 3])
+        if far:
             unit, _, a_metre = likely_unit(farthest)
             return Finding.of(
                 Kind.POSE_UNIT, "rejects", "poses", value=farthest, unit=unit, a_metre=float(a_metre)

@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8, UInt16
 from numpy import ndarray
 
 from jcr.capture.camera_json import read_intrinsics, read_std
-from jcr.capture.checks import read_rigid
+from jcr.capture.checks import other_size, read_rigid
 from jcr.capture.formats.capture_json import FILE, read_joints
 from jcr.capture.images import encode_png, read_image
 from jcr.capture.plain_files import contained, read_json
@@ -120,11 +120,8 @@ class LiveFolder:
         capture is then unchanged.
         """
         size = (image.shape[1], image.shape[0])
-        if self.size not in (None, size):
-            raise InputError(
-                f"{self.folder}: holds images of {self.size[0]}x{self.size[1]} pixels, the camera gives "
-                f"{size[0]}x{size[1]}; set its old resolution or name a new folder"
-            )
+        if self.size is not None and self.size != size:
+            raise other_size("the camera's image", size, self.size, str(self.folder))
         if self.intrinsics is not None:
             read_intrinsics(self.intrinsics, size, self.folder / FILE)
         stem = f"{self._next_number:03d}"

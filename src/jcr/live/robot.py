@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.spatial.transform import Rotation
 
-from jcr.capture.checks import check_metres, read_rigid
+from jcr.capture.options import ConventionName, UnitsName
+from jcr.capture.robot_poses import CONVENTIONS, poses_from_numbers
 from jcr.errors import InputError
-from jcr.geometry import inverse, rotation_angle, rotation_exp, transform
+from jcr.geometry import inverse, rotation_angle
 
 REST_S = 0.5
 REST = (2e-4, np.radians(0.03))
@@ -20,6 +20,8 @@ MOVED_ON = (0.01, np.radians(3.0))
 """m, rad: least distance of a rest from the last image at which the next image is taken."""
 TRY_AGAIN = (1e-3, np.radians(0.2))
 """m, rad: the same distance after an image that was refused."""
+BY_COUNT: dict[int, ConventionName] = {6: "rotation-vector", 7: "quat-xyzw", 16: "matrix"}
+"""Convention of so many numbers, where none was given."""
 
 
 @dataclass(frozen=True)
@@ -60,28 +62,24 @@ def is_farther(a: Float[ndarray, "4 4"], b: Float[ndarray, "4 4"], limit: tuple[
     return bool(np.linalg.norm(motion[:3, 3]) > limit[0] or rotation_angle(motion[:3, :3]) > limit[1])
 
 
-def pose_of_numbers(numbers: list[float], where: str) -> Float[ndarray, "4 4"]:
-    """Return base_from_gripper from 6, 7 or 16 numbers in metres and radians; raise InputError for others.
+def pose_of_numbers(
+    numbers: list[float], where: str, convention: ConventionName = "auto", units: UnitsName = "auto"
+) -> Float[ndarray, "4 4"]:
+    """Return base_from_gripper of the numbers of one pose; raise InputError for others.
 
-    6: x y z and a rotation vector, as UR shows; 7: x y z qx qy qz qw; 16: a matrix, row by row.
+    `convention` auto: x y z and a rotation vector, as UR shows, x y z qx qy qz qw, or a matrix by rows.
     """
-    values = np.array(numbers, dtype=np.float64)
-    if not np.isfinite(values).all():
-        raise InputError(f"{where}: holds NaN or infinity; read the pose again")
-    if len(values) == 16:
-        pose = read_rigid(values.reshape(4, 4).tolist(), where)
-    elif len(values) == 7 and abs(np.linalg.norm(values[3:]) - 1) < 1e-2:
-        pose = transform(Rotation.from_quat(values[3:]).as_matrix(), values[:3])
-    elif len(values) == 7:
-        raise InputError(f"{where}: the last four of 7 numbers are no quaternion qx qy qz qw of length 1")
-    elif len(values) == 6 and np.linalg.norm(values[3:]) < 2 * np.pi + 0.01:
-        pose = transform(rotation_exp(values[3:]), values[:3])
-    elif len(values) == 6:
-        raise InputError(f"{where}: the last three of 6 numbers are no rotation vector in radians")
-    else:
-        raise InputError(
-            f"{where}: {len(values)} numbers; give x y z rx ry rz (rotation vector, radians), "
-            "x y z qx qy qz qw, or a matrix of 16, all in metres"
-        )
-    check_metres(pose[None], where)
-    return pose
+    named = BY_COUNT.get(len(numbers)) if convention == "auto" else convention
+    if named is None or len(numbers) != len(CONVENTIONS[named].columns):
+        raise InputError(f"{where}: {len(numbers)} numbers; give {pose_columns(convention, units)}")
+    return poses_from_numbers(np.array([numbers], np.float64), named, units, where)[0]
+
+
+def pose_columns(convention: ConventionName, units: UnitsName) -> str:
+    """Return names and units of the numbers of a pose."""
+    if convention == "auto":
+        unit = "m, rad" if units == "auto" else units.replace("-", ", ")
+        return f"x y z rx ry rz | x y z qx qy qz qw | 16 numbers by rows; {unit}"
+    form = CONVENTIONS[convention]
+    names = "16 numbers by columns" if convention == "franka" else " ".join(form.columns)
+    return f"{names}; {', '.join(form.units(units))}"

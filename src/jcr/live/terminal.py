@@ -3,19 +3,15 @@
 from collections.abc import Callable, Iterable, Iterator
 from typing import Literal, get_args
 
-import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.capture.options import ConventionName, UnitsName
-from jcr.capture.robot_poses import CONVENTIONS, poses_from_numbers
-from jcr.errors import InputError
+from jcr.live.robot import pose_columns, pose_of_numbers
 
 Action = Literal["take", "retake", "remove", "undo", "finish"]
 WITH_NUMBER: tuple[Action, ...] = ("retake", "remove")
 HELP = "type take, retake [NUMBER], remove [NUMBER], undo or finish, and Enter; NUMBER counts from 1, unset: the last"
-BY_COUNT: dict[int, ConventionName] = {6: "rotation-vector", 7: "quat-xyzw", 16: "matrix"}
-"""Convention of so many numbers, where none was given."""
 
 
 def command_of(line: str) -> tuple[Action, int | None] | None:
@@ -45,33 +41,12 @@ def typed_poses(
 ) -> Iterator[Float[ndarray, "4 4"]]:
     """Yield base_from_gripper of each typed line, until an empty one or the end of the input."""
     while True:
-        show(f"pose at rest ({_wanted(convention, units)}; empty line ends):")
+        show(f"pose at rest ({pose_columns(convention, units)}; empty line ends):")
         line = next(lines, "").strip().strip("[]p")
         if not line:
             return
         try:
-            yield _typed_pose(line, convention, units)
-        except InputError as error:
+            numbers = [float(word) for word in line.replace(",", " ").split()]
+            yield pose_of_numbers(numbers, "typed", convention, units)
+        except ValueError as error:  # InputError is one, too.
             show(f"refused: {error}")
-
-
-def _typed_pose(line: str, convention: ConventionName, units: UnitsName) -> Float[ndarray, "4 4"]:
-    """Return base_from_gripper of a line of numbers; raise InputError for any other."""
-    try:
-        numbers = [float(word) for word in line.replace(",", " ").split()]
-    except ValueError:
-        raise InputError("not numbers; type the pose again") from None
-    named = BY_COUNT.get(len(numbers)) if convention == "auto" else convention
-    if named is None or len(numbers) != len(CONVENTIONS[named].columns):
-        raise InputError(f"{len(numbers)} numbers; give {_wanted(convention, units)}")
-    return poses_from_numbers(np.array([numbers]), named, units, "typed")[0]
-
-
-def _wanted(convention: ConventionName, units: UnitsName) -> str:
-    """Return names and units of the numbers of a pose."""
-    if convention == "auto":
-        unit = "m, rad" if units == "auto" else units.replace("-", ", ")
-        return f"x y z rx ry rz | x y z qx qy qz qw | 16 numbers by rows; {unit}"
-    form = CONVENTIONS[convention]
-    names = "16 numbers by columns" if convention == "franka" else " ".join(form.columns)
-    return f"{names}; {', '.join(form.units(units))}"
