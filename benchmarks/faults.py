@@ -43,7 +43,7 @@ INTRINSICS = frozenset({Kind.INTRINSICS})
 MOVED = frozenset({Kind.SLIP, Kind.DRIFT})
 ORDER = frozenset({Kind.POSE_CONVENTION, Kind.DELAY, Kind.POSES_SWAPPED})
 ONE_POSE = frozenset({Kind.POSES_SWAPPED, Kind.POSE_CONTRADICTS_IMAGE})
-ROBOT = frozenset({Kind.SYSTEMATIC_ERRORS, Kind.JOINT_OFFSETS, Kind.LENGTHS, Kind.BASE_LEANS, Kind.TOOL_SAGS})
+ROBOT = frozenset({Kind.JOINT_OFFSETS, Kind.LENGTHS, Kind.BASE_LEANS, Kind.TOOL_SAGS})
 SCALE_ALONE = "positions 1 % too long"
 """Fault that no image shows: scale comes from the robot."""
 

@@ -12,7 +12,6 @@ from numpy import ndarray
 from jcr.boards.proposal import proposed
 from jcr.calibration.case import Case
 from jcr.calibration.checks.left_out import left_out_poses
-from jcr.calibration.checks.robot import angle_finding
 from jcr.calibration.checks.views import as_causes, view_findings
 from jcr.calibration.expected import (
     FEWEST,
@@ -31,13 +30,12 @@ from jcr.calibration.stage import checked
 from jcr.camera import fold_distance_px
 from jcr.capture.formats.table import OpenConventionError, possible_options
 from jcr.capture.images import brightness_and_sharpness, exposure_fault, read_image
-from jcr.capture.options import MIN_FRAMES, ReadOptions
+from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture, read_source
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.foreseen import ForeseenCamera
 from jcr.estimation.hand_eye import SCALE_STD, solve_hand_eye
 from jcr.estimation.observability import observability
-from jcr.estimation.residuals import angle_ratio
 from jcr.geometry import ARM, largest_motion
 from jcr.progress import Progress
 from jcr.records import (
@@ -50,7 +48,7 @@ from jcr.records import (
     PosePairs,
     Verdict,
 )
-from jcr.records.findings import CAMERA, without_consequences
+from jcr.records.findings import without_consequences
 from jcr.records.words import remedy, sentence, unobservable
 from jcr.sfm.colmap import reconstruct_colmap
 from jcr.sfm.options import ColmapOptions
@@ -78,9 +76,6 @@ class Examination:
     suggestions: tuple[NextPose, ...]
     hand_eye: HandEye | None
     """The calibration by sparse features; None where the images were not registered."""
-    angle_ratio: tuple[float, float] | None
-    """Rotation angles between cameras over those between grippers, and its standard deviation; 1 is right whatever
-    gripper_from_camera is. None without cameras to compare with."""
     faults: tuple[str, ...]
     """Why a calibration of this capture would be rejected."""
     remarks: tuple[str, ...]
@@ -124,7 +119,6 @@ def check_capture(
         shown = _compare_pairs(capture, robot_noise)
     elif look and not any(one.severity == "rejects" for one in alone.views):
         shown = _compare_with_images(capture, alone.robot, robot_noise, seed, progress, thorough)
-    angles = None if shown.ratio is None or shown.blames_camera else angle_finding(*shown.ratio)
     counted = alone.clear if shown.registered is None else shown.registered
     rows = counted if len(counted) >= FEWEST else np.arange(len(capture))
     gripper, assumptions = capture.base_from_gripper[rows], shown.assumptions
@@ -149,13 +143,11 @@ def check_capture(
         counted=counted,
         suggestions=tuple(replace(one, like=int(rows[one.like])) for one in suggestions),
         hand_eye=shown.hand_eye,
-        angle_ratio=shown.ratio,
         faults=tuple(dict.fromkeys((*causes, *faults))),
         remarks=(
             *alone.remarks,
             *weak,
             *shown.remarks,
-            *([] if angles is None else [sentence(angles)]),
             *(sentence(one) for one in views if one.severity == "warns"),
         ),
     )
@@ -230,18 +222,12 @@ class _Compared:
 
     hand_eye: HandEye | None = None
     """None where no cameras were found."""
-    ratio: tuple[float, float] | None = None
     faults: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     registered: Int[ndarray, " c"] | None = None
     """Rows of the images that a calibration would use; None where not all were looked at."""
     assumptions: Assumptions | None = None
     """What is found of camera and robot; None where nothing was, or it would be rejected."""
-
-    @property
-    def blames_camera(self) -> bool:
-        """Whether a fault of the camera was found: angles that differ follow from it."""
-        return self.hand_eye is not None and any(one.kind in CAMERA for one in self.hand_eye.findings)
 
     @property
     def observability(self) -> Observability | None:
@@ -264,9 +250,7 @@ def _compare_with_images(
         rows = spread_rows(len(capture))
         few = _of_rows(capture, rows)
         shown = _compare_registered(few, robot.of(rows), robot_noise, seed, progress, QUICK_SIZE_PX)
-        # Angles that differ have a cause, which all images at full size may show.
-        agree = shown.ratio is None or angle_finding(*shown.ratio) is None
-        if agree and not shown.faults and shown.registered is not None and len(shown.registered) == QUICK:
+        if not shown.faults and shown.registered is not None and len(shown.registered) == QUICK:
             return replace(shown, registered=None)
     return _compare_registered(capture, robot, robot_noise, seed, progress)
 
@@ -377,10 +361,9 @@ def _compare_by_calibration(capture: Capture, case: Case) -> _Compared:
     hand_eye = case.hand_eye
     if hand_eye.converged:
         hand_eye = hand_eye.with_findings(*left_out_poses(capture, case.reconstruction, hand_eye))
-    ratio, (faults, remarks) = hand_eye.robot.angle_ratio, _reasons(hand_eye)
+    faults, remarks = _reasons(hand_eye)
     return _Compared(
         hand_eye=hand_eye,
-        ratio=None if ratio is None or not hand_eye.converged else (ratio.ratio, ratio.std),
         faults=faults,
         remarks=remarks,
     )
@@ -389,16 +372,13 @@ def _compare_by_calibration(capture: Capture, case: Case) -> _Compared:
 def _compare_pairs(pairs: PosePairs, noise: tuple[float, float] | None) -> _Compared:
     """Compare gripper poses with camera poses that were given, by the calibration of both."""
     hand_eye = calibrate_poses(pairs, CalibrateOptions(robot_noise=_mm_deg(noise)))
-    used, ratio, assumptions = hand_eye.inliers, None, None
-    gripper, camera = pairs.base_from_gripper[used], pairs.recon_from_camera[used]
+    used, assumptions = hand_eye.inliers, None
     if hand_eye.converged:
         scale_std = SCALE_STD if pairs.is_metric and is_one(hand_eye) else None
-        assumptions = assumed_of_poses(hand_eye, gripper, scale_std)
-        ratio = angle_ratio(gripper, camera) if len(gripper) >= MIN_FRAMES else None
+        assumptions = assumed_of_poses(hand_eye, pairs.base_from_gripper[used], scale_std)
     faults, remarks = _reasons(hand_eye)
     return _Compared(
         hand_eye=hand_eye,
-        ratio=ratio,
         faults=faults,
         remarks=remarks,
         registered=np.flatnonzero(used),

@@ -45,17 +45,9 @@ MISTAKES = {
         lambda g: with_rotation(g, Rotation.from_euler("xyz", rotations(g).as_euler("ZYX"))),
         "Euler angles ZYX that were taken as xyz",
     ),
-    "vectors, degrees for radians": (
-        lambda g: with_rotation(g, Rotation.from_rotvec(np.degrees(rotations(g).as_rotvec()))),
-        "rotation vectors in degrees that were taken as radians",
-    ),
     "vectors, radians for degrees": (
         lambda g: with_rotation(g, Rotation.from_rotvec(np.radians(rotations(g).as_rotvec()))),
         "rotation vectors in radians that were taken as degrees",
-    ),
-    "angles, degrees for radians": (
-        lambda g: with_rotation(g, Rotation.from_euler("xyz", np.degrees(rotations(g).as_euler("xyz")))),
-        r"Euler angles \(xyz\) in degrees that were taken as radians",
     ),
     "angles, radians for degrees": (
         lambda g: with_rotation(g, Rotation.from_euler("xyz", np.radians(rotations(g).as_euler("xyz")))),

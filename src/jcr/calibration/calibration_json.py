@@ -3,10 +3,10 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import ValidationError, model_validator
 
 from jcr.arrays_json import Covariance7, Matrix, Numbers7, Part, Spread
 from jcr.calibration.findings_json import FindingJson, derived, require_one_verdict
@@ -16,7 +16,6 @@ from jcr.errors import InputError
 from jcr.files import write_text
 from jcr.intrinsics_json import IntrinsicsAndStd, IntrinsicsJson, Positive
 from jcr.records import (
-    AngleRatio,
     Attempt,
     BoardFound,
     Capture,
@@ -75,8 +74,6 @@ class RobotErrors(Part):
     translation_mm: Spread
     """What of them is left in the poses per axis, after the effective hand-eye transform took its part."""
     rotation_deg: Spread
-    p: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Chance of residuals like these where the robot's errors are random alone."""
     joints: list[JointOffset] | None = None
     """The joints from the base on; null where the arm is not known."""
 
@@ -90,7 +87,6 @@ class RobotErrors(Part):
         return cls(
             systematic_deg=float(np.degrees(robot.noise.systematic)),
             **mm_and_deg(*robot.noise.systematic_left),
-            p=robot.systematic_p,
             joints=joints,
         )
 
@@ -146,7 +142,6 @@ class CalibrationFile(Part):
     next_poses: list[Proposal] = []
     scale_check: ScaleCheck | None = None
     robot_errors: RobotErrors | None = None
-    angle_ratio: AngleRatio | None = None
     depth_check: DepthCheck | None = None
     lengths: list[LengthCheck] = []
     """Every length that was compared with the robot's positions."""
@@ -255,7 +250,6 @@ def calibration_file(
         "next_poses": [{name: pose[name] for name in Proposal.model_fields} for pose in proposals],
         "scale_check": measured.network,
         "robot_errors": RobotErrors.of(hand_eye.robot),
-        "angle_ratio": hand_eye.robot.angle_ratio,
         "depth_check": measured.depth,
         "lengths": list(measured.lengths),
         "board": measured.board,

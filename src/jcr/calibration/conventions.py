@@ -17,12 +17,10 @@ from scipy.spatial.transform import Rotation
 from jcr.estimation.closed_form import closed_form, initial_estimate
 from jcr.estimation.equation import Poses
 from jcr.estimation.hand_eye import solve_hand_eye
-from jcr.estimation.observability import observability
 from jcr.estimation.robust import least_trimmed
 from jcr.estimation.solve import solve
 from jcr.estimation.wrist import pose_problem
-from jcr.geometry import Transform, fit_similarity, inverse, retract, rotation_exp, skew, transform
-from jcr.least_squares import minimise
+from jcr.geometry import inverse, transform
 from jcr.records import Finding, HandEye, Kind, RobotNoise, Severity
 
 SOLVED = 24
@@ -129,14 +127,7 @@ def better_reading(
         return None
     others = candidates[1:]
     camera_angle = _angles(recon_from_camera)
-    gaps = [_incongruence(candidate, camera_angle) for candidate in others]
-    if min(gaps) > CONGRUENT and observability(base_from_gripper).observable:
-        # Lost rotations take a second to find again: only where no cheaper reading has the cameras' angles, and not of
-        # rotations about one axis, which read in degrees are as degenerate.
-        unwound = list(_degrees_taken_as_radians(base_from_gripper, recon_from_camera))
-        others += unwound
-        gaps += [_incongruence(candidate, camera_angle) for candidate in unwound]
-    gaps = np.array(gaps)
+    gaps = np.array([_incongruence(candidate, camera_angle) for candidate in others])
     order = np.argsort(np.round(gaps / SAME_ANGLE), kind="stable")[:SOLVED]
     worth = [others[k] for k in order if gaps[k] < 2 * gaps.min() + SAME_ANGLE]
     agree, errors = zip(*(_roughly(candidate, recon_from_camera) for candidate in worth), strict=True)
@@ -262,114 +253,8 @@ def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
         yield with_rotation(f"Euler angles {meant} that were taken as {taken}", read)
 
 
-def _degrees_taken_as_radians(base_from_gripper: Poses, recon_from_camera: Poses) -> Iterator[_Candidate]:
-    """Rotation vectors or Euler angles in degrees that were taken as radians: known up to multiples of 2π degrees.
-
-    The positions alone give the cameras' orientations in the base, hence all grippers' from any one of them.
-    Every possibility for the first image is tried, and must put the others on their multiples.
-    """
-    position = base_from_gripper[:, :3, 3]
-    base_rotation = _rotation_from_positions(position, recon_from_camera)
-    if base_rotation is None:
-        return
-    camera = base_rotation @ recon_from_camera[:, :3, :3]
-    read = Rotation.from_matrix(base_from_gripper[:, :3, :3])
-    for order in (None, *EULER_ORDERS[:4]):
-        numbers, along = _written(read, order)
-        multiples = np.meshgrid(*[np.arange(-29, 30)] * along.shape[1], indexing="ij")
-        first = ROTATION * np.stack(multiples, -1).reshape(-1, 1, along.shape[1]) @ along[0] + numbers[0]
-        first = first[(np.abs(first) <= [180, 90 if order else 180, 180]).all(2)]
-        gripper_from_camera = np.swapaxes(_rotations(first, order), 1, 2) @ camera[0]
-        for k in range(1, len(position)):
-            off = _nearest(camera[k] @ np.swapaxes(gripper_from_camera, 1, 2), order, numbers[k], along[k])[1]
-            gripper_from_camera = gripper_from_camera[off < ON_MULTIPLE]
-            if len(gripper_from_camera) == 0:  # an empty stack of rotations is no rotation for SciPy
-                break
-        else:
-            meant = [
-                _nearest((one @ gripper_from_camera[0].T)[None], order, numbers[k], along[k])[0]
-                for k, one in enumerate(camera)
-            ]
-            what = "rotation vectors" if order is None else f"Euler angles ({order})"
-            yield _Candidate(
-                f"{what} in degrees that were taken as radians",
-                transform(_rotations(np.concatenate(meant), order), position),
-                np.arange(len(position)),
-            )
-
-
-def _written(
-    rotation: Rotation, order: str | None
-) -> tuple[Float[ndarray, "n v 3"], Float[ndarray, "n d 3"]]:
-    """Numbers that write rotations as vectors (None) or Euler angles, in each of v ways, and along what they are known
-    up to multiples."""
-    if order is None:
-        vector = rotation.as_rotvec()
-        return vector[:, None], (vector / np.linalg.norm(vector, axis=1, keepdims=True).clip(1e-12))[:, None]
-    angles = _euler(rotation, order)
-    # The same rotation has two triples, and the one that was meant is not known.
-    both = np.stack([angles, angles * [1, -1, 1] + np.pi], axis=1)
-    return both, np.tile(np.eye(3), (len(angles), 1, 1))
-
-
-def _nearest(
-    expected: Float[ndarray, "m 3 3"],
-    order: str | None,
-    numbers: Float[ndarray, "v 3"],
-    along: Float[ndarray, "d 3"],
-) -> tuple[Float[ndarray, "m 3"], Float[ndarray, " m"]]:
-    """What an image's numbers may have been (degrees), nearest to those of expected rotations, and how far off."""
-    read = Rotation.from_matrix(expected)
-    degrees = np.degrees(read.as_rotvec() if order is None else _euler(read, order))[:, None]
-    possible = numbers + ROTATION * np.round((degrees - numbers) @ along.T / ROTATION) @ along
-    off = np.abs(possible - degrees).max(2)
-    return possible[np.arange(len(off)), off.argmin(1)], off.min(1)
-
-
-def _rotations(degrees: Float[ndarray, "m 3"], order: str | None) -> Float[ndarray, "m 3 3"]:
-    if order is None:
-        return rotation_exp(np.radians(degrees))
-    return Rotation.from_euler(order, degrees, degrees=True).as_matrix()
-
-
 def _euler(rotation: Rotation, order: str) -> Float[ndarray, "*batch 3"]:
     """Euler angles (rad), also at gimbal lock, where SciPy warns that any of the equal answers will do."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return rotation.as_euler(order)
-
-
-Unknowns = tuple[Transform, float, Float[ndarray, "3"]]
-"""base_from_recon, the scale, and the gripper's place in the camera in recon units times the scale."""
-
-
-def _rotation_from_positions(
-    position: Float[ndarray, "n 3"], recon_from_camera: Poses
-) -> Float[ndarray, "3 3"] | None:
-    """Rotation of base_from_recon from gripper positions alone; None when they do not fit the cameras.
-
-    A gripper is at position = R_Z (λ c − R_C w) + z with w the gripper's offset in the camera: no orientation
-    of the gripper enters.
-    """
-    camera, center = recon_from_camera[:, :3, :3], recon_from_camera[:, :3, 3]
-
-    def linearised(unknowns: Unknowns) -> tuple[Float[ndarray, "n 3"], Float[ndarray, "n 3 10"]]:
-        base_from_recon, scale, w = unknowns
-        rotation = base_from_recon[:3, :3]
-        arm = (scale * center - camera @ w) @ rotation.T
-        rows = np.zeros((len(position), 3, 10))
-        rows[:, :, :3] = np.eye(3)
-        rows[:, :, 3:6] = -skew(arm)
-        rows[:, :, 6] = center @ rotation.T * scale
-        rows[:, :, 7:] = -rotation @ camera
-        return arm + base_from_recon[:3, 3] - position, rows
-
-    def moved(unknowns: Unknowns, step: Float[ndarray, "10"]) -> Unknowns:
-        base_from_recon, scale, w = unknowns
-        return retract(base_from_recon, step[:6]), scale * float(np.exp(step[6])), w + step[7:]
-
-    found = minimise(linearised, (*fit_similarity(position, center), np.zeros(3)), moved)
-    spread = np.sqrt(((position - position.mean(0)) ** 2).sum(1).mean())
-    left = np.sqrt(2 * found.cost / len(position))
-    rotation = found.unknowns[0][:3, :3]
-    return rotation if left < 0.1 * spread and 3 * len(position) > 12 else None

@@ -168,9 +168,6 @@ def _as_json(capture: "Capture | PosePairs", found: "Examination") -> dict[str, 
             "translation_mm": 1e3 * noise.translation,
             "rotation_deg": float(np.degrees(noise.rotation)),
         },
-        "angle_ratio": None
-        if found.angle_ratio is None
-        else dict(zip(("ratio", "std"), found.angle_ratio, strict=True)),
         "suggestions": [
             {
                 "base_from_gripper": pose.base_from_gripper.tolist(),

@@ -1,12 +1,9 @@
 """Which joints of an arm seem off: the systematic part of the residuals, separated by the arm's own geometry."""
 
-from dataclasses import replace
-
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.distributions import chi2
 from jcr.estimation.components import most_likely
 from jcr.estimation.equation import Poses
 from jcr.estimation.kinematics import Arm, Joints, error_jacobian
@@ -17,20 +14,6 @@ from jcr.records import HandEye, JointOffsets
 
 Systematic = Float[ndarray, "s s"]
 """Covariance of the systematic errors of the used poses at 1 rad."""
-
-
-def systematic_p_value(
-    solved: HandEye, base_from_gripper: Poses, recon_from_camera: Poses, systematic: Systematic
-) -> float:
-    """Chance of residuals like these where errors are random alone, from the used poses of a fit to poses.
-
-    A likelihood ratio of the size of the systematic part, which is not negative: half the tail of χ²(1) (Self and Liang,
-    J. Am. Stat. Assoc. 82, 1987).
-    """
-    both = _linearised(solved, base_from_gripper, recon_from_camera, systematic).equations
-    tried = both, replace(both, systematic=None)
-    likely = [float(solve_equations(one, most_likely(one)[0]).log_likelihood) for one in tried]
-    return float(chi2.sf(max(2 * (likely[0] - likely[1]), 0.0), 1) / 2)
 
 
 def joint_offsets(

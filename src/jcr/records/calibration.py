@@ -342,24 +342,12 @@ class PaperResiduals:
 
 
 @dataclass(frozen=True)
-class AngleRatio:
-    """Rotation angles between cameras over those between grippers: 1 of a straight arm and the right intrinsics,
-    whatever gripper_from_camera is."""
-
-    ratio: float
-    std: float
-
-
-@dataclass(frozen=True)
 class RobotExamined:
     """What the residuals show of the robot itself."""
 
     noise: RobotNoise
-    systematic_p: float | None = None
-    """Chance of residuals like these where the robot's errors are random alone."""
     joint_offsets: JointOffsets | None = None
     """None where the arm is not known."""
-    angle_ratio: AngleRatio | None = None
 
 
 LengthName = Literal["board", "known length", "depth camera", "network"]

@@ -134,7 +134,6 @@ def _quantities(finding: Finding) -> dict[str, Any]:
             named |= {f"{name}_mm": 1e3 * number, f"{name}_deg": np.degrees(number)}
     if finding.p is not None:
         named["chance"] = f"p = {finding.p:.0e}"
-        named["rough_chance"] = f"p = {finding.p:.1g}" if finding.p > 1e-6 else "p < 1e-6"
     if (value := finding.value) is not None:
         named |= {"mm": 1e3 * value, "percent": 100 * value, "way": _Way(value), "size": abs(value)}
         named |= {"size_percent": 100 * abs(value), "size_deg": np.degrees(abs(value))}
@@ -378,16 +377,7 @@ def _joints_off(finding: Finding) -> str:
         for k in finding.joints
     )
     named = f"joint{'s' * (len(finding.joints) > 1)} {joined(str(k) for k in finding.joints)}"
-    return f"robot: {named} seem off by {sizes} ({_said('{rough_chance}', finding)})"
-
-
-def _angles_differ(finding: Finding) -> str:
-    ratio, std = _value_and_std(finding)
-    off, more = ratio - 1, "more" if ratio > 1 else "less"
-    return (
-        f"the camera rotates {100 * abs(off):.2f} ± {100 * std:.2f} % {more} than the gripper: the focal length or the "
-        "robot's joints are off"
-    )
+    return f"robot: {named} seem off by {sizes}"
 
 
 # Scale.
@@ -558,10 +548,6 @@ _TEXT: dict[Kind, Words] = {
     ),
     Kind.WRONG_MOUNT: "the images fit a camera that the gripper carries, not a fixed one",
     Kind.ROBOT_UNUSED: "the capture's robot is not used: {text}",
-    Kind.SYSTEMATIC_ERRORS: (
-        "robot: neighbouring poses have similar errors, {mm:.2g} mm and {deg:.2g}° per axis ({rough_chance}): joint "
-        "offsets or link errors"
-    ),
     Kind.JOINT_OFFSETS: _joints_off,
     Kind.LENGTHS: (
         "along {axis} the robot's positions are {size_percent:.1f} ± {std_percent} % too {way:long|short} beside those "
@@ -575,7 +561,6 @@ _TEXT: dict[Kind, Words] = {
         "the gripper rotates by {size_deg:.2f} ± {std_deg}° where it is level, as a tool does that sags under its "
         "weight ({chance})"
     ),
-    Kind.ANGLE_RATIO: _angles_differ,
     Kind.BOARD_SIZE: _board_size,
     Kind.SCALES: _scales,
     Kind.BOARD_SIDE: _board_side,

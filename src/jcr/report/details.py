@@ -100,14 +100,12 @@ def _lengths(calibration: CalibrationFile) -> dict[str, str]:
 def _robot(calibration: CalibrationFile) -> dict[str, str]:
     """What the poses show of the robot itself."""
     items = {}
-    if (errors := calibration.robot_errors) is not None and errors.p is not None:
+    if (errors := calibration.robot_errors) is not None:
         items["errors shared by neighbouring poses"] = (
-            f"{errors.translation_mm:.2g} mm {errors.rotation_deg:.2g}° per axis (p = {errors.p:.2g})"
+            f"{errors.translation_mm:.2g} mm {errors.rotation_deg:.2g}° per axis"
         )
         for k, joint in enumerate(errors.joints or [], start=1):
             items[f"joint {k} off by"] = f"{joint.offset_deg:+.3f} ± {joint.std_deg:.3f}°"
-    if (angles := calibration.angle_ratio) is not None:
-        items["camera angles over gripper angles"] = f"{angles.ratio:.4f} ± {angles.std:.4f} (1 is right)"
     return items
 
 
