@@ -1,0 +1,221 @@
+"""Plant one error in each stage of a copy of the source, and report whether the tests named for it fail.
+
+`python tests/planted_faults.py [NAME ...]` runs all rows or those that are named; exit status 1 if an error stays undetected.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[1]
+COPIED = (
+    "src",
+    "tests",
+    "simulation",
+    "benchmarks",
+    "examples",
+    "docs",
+    "ros2",
+    "pyproject.toml",
+    "README.md",
+)
+
+
+class PlantedFault(NamedTuple):
+    """An edit of the source, and the tests that must fail after it."""
+
+    stage: str
+    file: str
+    before: str
+    after: str
+    tests: tuple[str, ...]
+
+
+FAULTS = (
+    PlantedFault(
+        "geometry",
+        "src/jcr/geometry.py",
+        "rotation_exp(step[..., 3:]) @ a_from_b[..., :3, :3]",
+        "a_from_b[..., :3, :3] @ rotation_exp(step[..., 3:])",
+        ("tests/test_geometry.py",),
+    ),
+    PlantedFault(
+        "camera",
+        "src/jcr/camera.py",
+        "camera.fy * y / z + camera.cy",
+        "camera.fy * y / z + camera.cx",
+        ("tests/test_camera.py",),
+    ),
+    PlantedFault(
+        "capture",
+        "src/jcr/capture/robot_poses.py",
+        '"cm": 1e-2',
+        '"cm": 1e-3',
+        ("tests/capture/test_readers.py",),
+    ),
+    PlantedFault(
+        "features",
+        "src/jcr/features/gate.py",
+        "if gaps[best] < rotation_tolerance(",
+        "if gaps[best] > rotation_tolerance(",
+        ("tests/features/test_gate.py",),
+    ),
+    PlantedFault(
+        "structure from motion",
+        "src/jcr/sfm/track_refinement.py",
+        "return (x_px + 0.5) * factor - 0.5",
+        "return x_px * factor",
+        ("tests/sfm/test_track_refinement.py",),
+    ),
+    PlantedFault(
+        "photometric",
+        "src/jcr/photometric/residuals.py",
+        "misfit / (misfit + np.float32(sigma**2))",
+        "misfit / (misfit + np.float32(sigma))",
+        ("tests/photometric/test_direct.py",),
+    ),
+    PlantedFault(
+        "pointmaps",
+        "src/jcr/pointmaps/grid.py",
+        "return (x_px + 0.5) * self.scale - 0.5 - np.array(self.crop_corner)",
+        "return x_px * self.scale - np.array(self.crop_corner)",
+        ("tests/pointmaps/test_grid.py", "tests/pointmaps/test_adapters.py"),
+    ),
+    PlantedFault(
+        "estimation",
+        "src/jcr/estimation/closed_form.py",
+        "return transform(rotation, translation), scale, transform(base_rotation, base_translation)",
+        "return transform(rotation, translation), 1 / scale, transform(base_rotation, base_translation)",
+        ("tests/estimation/test_closed_form.py",),
+    ),
+    PlantedFault(
+        "calibration",
+        "src/jcr/calibration/verdict.py",
+        "if not accepted or not judged(hand_eye).converged:",
+        "if not accepted and not judged(hand_eye).converged:",
+        ("tests/calibration/test_findings.py", "tests/calibration/test_faults.py"),
+    ),
+    PlantedFault(
+        "depth",
+        "src/jcr/depth/consistency.py",
+        "(abs(there - here) < tolerance * here)",
+        "(abs(there - here) < tolerance)",
+        ("tests/depth/test_dense.py",),
+    ),
+    PlantedFault(
+        "map",
+        "src/jcr/scene/scene_map.py",
+        "return ((distance < radius) | (beyond > 0),)",
+        "return (distance < radius,)",
+        ("tests/scene/test_map.py",),
+    ),
+    PlantedFault(
+        "segments",
+        "src/jcr/segments/measure.py",
+        "middle = float(np.median(height[around]))",
+        "middle = float(height.max())",
+        ("tests/segments/test_segment.py",),
+    ),
+    PlantedFault(
+        "cell",
+        "src/jcr/cell/localise.py",
+        "recon_from_camera = inverse(transform(motion.rotation.matrix(), motion.translation))",
+        "recon_from_camera = transform(motion.rotation.matrix(), motion.translation)",
+        ("tests/cell/test_cell.py",),
+    ),
+    PlantedFault(
+        "export",
+        "src/jcr/export/ros.py",
+        "mount.parent_from_child @ inverse(root_from_optical)",
+        "mount.parent_from_child @ root_from_optical",
+        ("tests/export/test_export.py",),
+    ),
+    PlantedFault(
+        "report",
+        "src/jcr/report/render.py",
+        "autoescape=True",
+        "autoescape=False",
+        ("tests/report/test_report.py",),
+    ),
+    PlantedFault(
+        "live server",
+        "src/jcr/live/server.py",
+        "if origin is not None and not self._is_own_origin(origin):",
+        "if origin is None and not self._is_own_origin(origin):",
+        ("tests/live/test_server.py",),
+    ),
+    PlantedFault(
+        "run folder",
+        "src/jcr/run_folder.py",
+        "fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)",
+        "fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)",
+        ("tests/test_run_folder.py", "tests/faults/test_faults.py"),
+    ),
+    PlantedFault(
+        "files",
+        "src/jcr/files.py",
+        "        temporary.unlink(missing_ok=True)",
+        "        pass",
+        ("tests/faults/test_faults.py", "tests/test_run_folder.py"),
+    ),
+)
+
+
+def copy_source(into: Path) -> None:
+    """Copy what the tests need."""
+    for name in COPIED:
+        source = ROOT / name
+        if source.is_dir():
+            shutil.copytree(source, into / name, ignore=shutil.ignore_patterns("__pycache__", "_site"))
+        else:
+            shutil.copy(source, into / name)
+
+
+def is_caught(fault: PlantedFault, copy: Path) -> bool:
+    """Return whether a test fails while the error is in the copy; raise ValueError where the edit does not apply."""
+    file = copy / fault.file
+    text = file.read_text()
+    if text.count(fault.before) != 1:
+        raise ValueError(f"{fault.stage}: {fault.file} does not contain the line once: {fault.before}")
+    environment = os.environ | {
+        "PYTHONPATH": f"{copy / 'src'}{os.pathsep}{copy}",
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *fault.tests]
+    file.write_text(text.replace(fault.before, fault.after))
+    try:
+        done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True)
+    finally:
+        file.write_text(text)
+    # 1: tests failed. Others: nothing was collected, or pytest itself failed.
+    if done.returncode not in (0, 1):
+        raise ValueError(f"{fault.stage}: pytest ended with status {done.returncode}: {done.stdout[-500:]}")
+    return done.returncode == 1
+
+
+def main(names: list[str]) -> int:
+    """Plant the errors and print a row for each."""
+    missed = 0
+    with tempfile.TemporaryDirectory() as folder:
+        copy_source(Path(folder))
+        for fault in FAULTS:
+            if names and fault.stage not in names:
+                continue
+            try:
+                caught = is_caught(fault, Path(folder))
+            except ValueError as error:
+                sys.stdout.write(f"{error}\n")
+                missed += 1
+                continue
+            missed += not caught
+            sys.stdout.write(f"{fault.stage}: {'caught' if caught else 'NOT CAUGHT'}\n")
+            sys.stdout.flush()
+    return int(missed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
