@@ -63,7 +63,7 @@ def cli_page() -> str:
     parts = [
         "# Command line\n",
         "Written from the parser of each command. Exit status: 0 done, 2 the input is wrong, 3 done, but the result "
-        "is rejected, 1 a bug, 130 interrupted. [In the shell](../how-to/batch.md#in-the-shell) tells what goes to stdout.\n",
+        "is rejected, 1 a bug, 130 interrupted. [In the shell](../how-to/batch.md#in-the-shell).\n",
         "| command | |\n|---|---|",
         *(f"| [`jcr {name}`](#jcr-{name}) | {about} |" for name, about in COMMANDS.items()),
     ]

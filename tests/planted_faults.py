@@ -1,6 +1,7 @@
 """Plant one error in each stage of a copy of the source, and report whether the tests named for it fail.
 
-`python tests/planted_faults.py [NAME ...]` runs all rows or those that are named; exit status 1 if an error stays undetected.
+`python tests/planted_faults.py [STAGE ...]` runs all rows or those that are named; exit status 1 means an undetected
+error.
 """
 
 import os
