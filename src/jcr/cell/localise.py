@@ -9,23 +9,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import project, unproject
+from jcr.estimation.absolute_pose import absolute_pose
 from jcr.features.sift import matches
-from jcr.features.verify import HALF_PIXEL
-from jcr.geometry import apply, inverse, transform
+from jcr.geometry import apply, inverse
 from jcr.records import Intrinsics
-from jcr.sfm.mapping import camera_of
 from jcr.sfm.register import GATE_PX, MIN_POINTS, Features, features, triangulated
 
 FOCAL_OF_WIDTH = 0.9
 """Of a camera without known intrinsics: where the search for its focal length starts."""
 LEAST_SPREAD = 0.05
 """Of the image's area that the points must span; crowded ones determine the place badly."""
-TRIALS = 20_000
 CLEARLY_MORE = 1.1
 """Times the points that agree with given intrinsics: more are no chance of RANSAC."""
 
@@ -106,17 +103,18 @@ def _located(known: Known, seen: _Matched, intrinsics: Intrinsics, is_given: boo
         return int(good.sum())
     candidate = np.flatnonzero(good)
     x_px, points_seen = seen.x_px[candidate], points[candidate]
-    placed = _estimate_place(x_px, points_seen, intrinsics, is_given)
+    gate_px = 2 * GATE_PX * max(1.0, intrinsics.width / 1600)
+    placed = absolute_pose(
+        x_px, points_seen, intrinsics, gate_px=gate_px, focal="given" if is_given else "free"
+    )
     if is_given:
-        # Wrong intrinsics leave those points that agree with a wrong place: another focal length explains more.
-        free = _estimate_place(x_px, points_seen, intrinsics, False)
-        given, more = (0 if place is None else int(place[2].sum()) for place in (placed, free))
+        # Wrong intrinsics leave those points that agree with a wrong pose: another focal length explains more.
+        free = absolute_pose(x_px, points_seen, intrinsics, gate_px=gate_px, focal="free")
+        given, more = (0 if pose is None else int(pose.inlier.sum()) for pose in (placed, free))
         placed = free if more > CLEARLY_MORE * given else placed
-    if placed is None:
-        return 0
-    recon_from_camera, intrinsics, inlier = placed
-    if inlier.sum() < MIN_POINTS:
-        return int(inlier.sum())
+    if placed is None or placed.inlier.sum() < MIN_POINTS:
+        return 0 if placed is None else int(placed.inlier.sum())
+    recon_from_camera, intrinsics, inlier = placed.a_from_camera, placed.camera, placed.inlier
     agreed = candidate[inlier]
     # Of the known images' observations those that the point meets.
     rotation, centre = known.recon_from_camera[row, :3, :3], known.recon_from_camera[row, :3, 3]
@@ -136,39 +134,6 @@ def _located(known: Known, seen: _Matched, intrinsics: Intrinsics, is_given: boo
         row_x_px=seen.row_x_px[kept],
         row_point=number[feature[kept]],
     )
-
-
-_Place = tuple[Float[ndarray, "4 4"], Intrinsics, ndarray]
-"""Pose, intrinsics and inliers."""
-
-
-def _estimate_place(
-    x_px: Float[ndarray, "p 2"],
-    points: Float[ndarray, "p 3"],
-    intrinsics: Intrinsics,
-    is_given: bool,
-) -> _Place | None:
-    """None where no pose has enough of these."""
-    estimation = pycolmap.AbsolutePoseEstimationOptions()
-    refinement = pycolmap.AbsolutePoseRefinementOptions()
-    estimation.estimate_focal_length = not is_given
-    estimation.ransac.max_error = 2 * GATE_PX * max(1.0, intrinsics.width / 1600)
-    estimation.ransac.max_num_trials, estimation.ransac.random_seed = TRIALS, 0
-    refinement.refine_focal_length = not is_given
-    refinement.print_summary = False
-    camera = camera_of(intrinsics, is_given)
-    found = pycolmap.estimate_and_refine_absolute_pose(
-        x_px + HALF_PIXEL, points, camera, estimation, refinement
-    )
-    if found is None:
-        return None
-    motion = found["cam_from_world"]
-    recon_from_camera = inverse(transform(motion.rotation.matrix(), motion.translation))
-    if not is_given:
-        focal, cx, cy, k1, k2 = (float(value) for value in camera.params)
-        size, distortion = (intrinsics.width, intrinsics.height), (k1, k2, 0.0, 0.0, 0.0)
-        intrinsics = Intrinsics(focal, focal, cx - HALF_PIXEL, cy - HALF_PIXEL, *size, distortion)
-    return recon_from_camera, intrinsics, np.asarray(found["inlier_mask"], bool)
 
 
 def spread(shared: Shared) -> float:

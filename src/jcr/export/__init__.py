@@ -1,0 +1,1 @@
+"""Export of a run in the formats of other tools."""

@@ -32,14 +32,14 @@ class Sheet:
     px_per_mm: float
 
     def as_pdf(self) -> bytes:
-        """The page at its true size, without loss."""
+        """Return the page at its true size as PDF, without loss."""
         file = io.BytesIO()
         self.pixels.save(file, "PDF", resolution=MM_PER_INCH * self.px_per_mm)
         return file.getvalue()
 
 
 def board_sheet(spec: str, paper: str = "a4") -> Sheet:
-    """The sheet of a ChArUco board or chessboard as `--board` names it, a square a whole number of pixels wide.
+    """Return the sheet of a ChArUco board or chessboard as `--board` names it, a square a whole number of pixels wide.
 
     Raises InputError on a name that means none, and on a board that the paper has no room for.
     """

@@ -1,4 +1,4 @@
-"""The table of formats: a run's calibration and map as other tools read them."""
+"""Table of export formats for calibration and map of a run."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Format:
-    """One row of the table."""
+    """Row of the table."""
 
     name: FormatName
     file: str
-    """Its name in OUT/export, where the user gives no path; ends with / for a folder."""
+    """Default name in OUT/export; ends with / for a folder."""
     about: str
     write: Callable[["Run", Path], None]
 
@@ -84,7 +84,7 @@ def write_run(
 
 
 class Run:
-    """A run folder and how to export it; what a format does not need is not read."""
+    """Run folder with export options; only the data that a format needs are read."""
 
     def __init__(self, out: Path, options: ExportOptions) -> None:
         self.options, self.folder = options, RunFolder(out)
@@ -100,14 +100,14 @@ class Run:
 
     @property
     def doubt(self) -> str | None:
-        """Why the calibration is rejected, or that of the camera asked for; None where it is accepted."""
+        """Reason for the rejection of the calibration, or of the chosen camera; None where it is accepted."""
         if self.calibration.doubt is not None or self.options.camera is None:
             return self.calibration.doubt
         return self._camera(self.options.camera).doubt
 
     @property
     def provenance(self) -> Provenance:
-        """Of what is in the base frame."""
+        """Provenance of data in the base frame."""
         ros.require_frame_name(self.options.base_frame)
         return Provenance(self.options.base_frame, self.doubt)
 
@@ -207,7 +207,7 @@ class Run:
 
     @cached_property
     def capture(self) -> "Capture":
-        """The images and poses the run was made from."""
+        """Images and poses of the run."""
         return self.folder.capture()
 
     @cached_property
@@ -217,7 +217,7 @@ class Run:
 
     @property
     def views(self) -> "PosedImages":
-        """The registered images in the base frame."""
+        """Registered images in the base frame."""
         from jcr.export.views import posed_images
 
         scale = self.calibration.scale
@@ -231,36 +231,34 @@ class Run:
 
 
 def _of_mount(text: Callable[[ros.CameraMount], str]) -> Callable[[Run, Path], None]:
-    """The format whose file is that text about the camera on the gripper."""
+    """Return the writer of a text about the exported camera."""
     return lambda run, path: write_text(path, text(run.mount))
 
 
 def _ros2(run: Run, path: Path) -> None:
+    """Write a launch file of all cameras and arms."""
     write_text(path, ros.ros2_launch(run.mount, *run.others))
 
 
 def _urdf(run: Run, path: Path) -> None:
+    """Write a URDF of all cameras and arms."""
     write_text(path, ros.urdf(run.mount, *run.others))
 
 
 def _easy_handeye2(run: Run, path: Path) -> None:
+    """Write a .calib file that has the name of its calibration."""
     write_text(path, ros.easy_handeye2(run.mount, path.stem))
 
 
-def _camera_info(run: Run, path: Path) -> None:
-    write_text(path, ros.camera_info(run.mount))
-
-
 def _ply(run: Run, path: Path) -> None:
+    """Write the cloud."""
     from jcr.scene.cloud_ply import write_cloud
 
     write_cloud(path, run.folder.cloud(), run.provenance.notes)
 
 
-# A map that is missing is named before what writes it is imported, which needs torch as well.
-
-
 def _glb(run: Run, path: Path) -> None:
+    """Write the mesh of the surface."""
     scene = run.folder.scene()
     from jcr.export.volume import write_glb
 
@@ -268,6 +266,7 @@ def _glb(run: Run, path: Path) -> None:
 
 
 def _octomap(run: Run, path: Path) -> None:
+    """Write an OctoMap."""
     scene = run.folder.scene()
     from jcr.export.volume import write_octomap
 
@@ -275,6 +274,7 @@ def _octomap(run: Run, path: Path) -> None:
 
 
 def _esdf(run: Run, path: Path) -> None:
+    """Write voxels of signed distance."""
     scene = run.folder.scene()
     from jcr.export.volume import write_esdf
 
@@ -282,6 +282,7 @@ def _esdf(run: Run, path: Path) -> None:
 
 
 def _spheres(run: Run, path: Path) -> None:
+    """Write spheres that cover solid space."""
     scene = run.folder.scene()
     from jcr.export.volume import write_spheres
 
@@ -289,6 +290,7 @@ def _spheres(run: Run, path: Path) -> None:
 
 
 def _nerfstudio(run: Run, path: Path) -> None:
+    """Write transforms.json with images and initial points."""
     from jcr.export.views import write_nerfstudio
 
     images = run.options.undistort, run.options.link_images
@@ -296,6 +298,7 @@ def _nerfstudio(run: Run, path: Path) -> None:
 
 
 def _colmap(run: Run, path: Path) -> None:
+    """Write a COLMAP model with images."""
     from jcr.export.views import write_colmap
 
     images = run.options.undistort, run.options.link_images
@@ -303,6 +306,7 @@ def _colmap(run: Run, path: Path) -> None:
 
 
 def _rerun(run: Run, path: Path) -> None:
+    """Write a Rerun recording."""
     scene = run.folder.scene()
     from jcr.export.rrd import write_rrd
 
@@ -320,7 +324,9 @@ FORMATS = (
     ),
     Format("urdf", "hand_eye.urdf", "camera link and fixed joint", _urdf),
     Format("easy_handeye2", "hand_eye.calib", ".calib for its publisher", _easy_handeye2),
-    Format("camera_info", "camera_info.yaml", "intrinsics for camera_info_manager", _camera_info),
+    Format(
+        "camera_info", "camera_info.yaml", "intrinsics for camera_info_manager", _of_mount(ros.camera_info)
+    ),
     Format("ply", "cloud.ply", "points, colours, labels", _ply),
     Format("glb", "map.glb", "mesh of the seen surface with colours", _glb),
     Format("octomap", "map.bt", "occupied, free and unknown voxels", _octomap),

@@ -1,4 +1,4 @@
-"""The formats and how they are written, apart from the writers so that the command line stays quick."""
+"""Export formats and options, in a module of their own so that the command line's help imports no writer."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal

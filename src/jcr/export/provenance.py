@@ -1,4 +1,4 @@
-"""What every exported file states: its frame, its units, and why a calibration is rejected."""
+"""Provenance that every exported file states: frame, units, and the reason of a rejection."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from jcr import __version__
 
 @dataclass(frozen=True)
 class Provenance:
-    """Whose frame a file's numbers are in, and why they are rejected, where they are not."""
+    """Frame of a file's numbers, and the reason of a rejection."""
 
     frame: str
     doubt: str | None = None

@@ -1,4 +1,4 @@
-"""The map as planners load it: OctoMap, a voxel grid of distances, spheres, the mesh of its surface.
+"""Map in the formats of planners: OctoMap, voxel grid of distances, spheres, mesh of the surface.
 
 The first three query the map itself, so that they answer as `SceneMap.check_spheres` and `SceneMap.query` do.
 """
@@ -77,6 +77,7 @@ def write_esdf(
 
 
 def _write_npz(path: Path, provenance: Provenance, **arrays: object) -> None:
+    """Write arrays and provenance as .npz, whole or not at all."""
     with written_whole(path) as temporary, open(temporary, "wb") as stream:
         np.savez_compressed(
             stream, allow_pickle=False, **{k: np.array(v) for k, v in (arrays | provenance.notes).items()}
@@ -126,13 +127,13 @@ def write_glb(path: Path, scene: SceneMap, provenance: Provenance) -> None:
 
 
 def _centers(lower: ndarray, count: ndarray, voxel: float) -> Float[ndarray, "x y z 3"]:
-    """Centres of a grid of voxels."""
+    """Return the centres of a grid of voxels."""
     axes = [corner + voxel * (np.arange(n) + 0.5) for corner, n in zip(lower, count, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1)
 
 
 def _voxel(scene: SceneMap, side: float | None) -> float:
-    """The voxels' side, by default the map's cell; InputError where it is no length or makes too many voxels."""
+    """Return the voxels' side, by default the map's cell; raise InputError for no length or too many voxels."""
     side = scene.cell if side is None else side
     extent = scene.box[1] - scene.box[0]
     if not 0 < side <= extent.min():

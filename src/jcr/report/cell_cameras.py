@@ -1,4 +1,4 @@
-"""The section of the cell's other cameras and arms: where each is, how surely, and by which images."""
+"""Section of the cell's other cameras and arms: transform, uncertainty and images of each."""
 
 from typing import Any
 
@@ -10,12 +10,13 @@ from jcr.rounding import significant
 
 
 def cameras_section(cameras: CamerasFile) -> Section:
-    """A card for each."""
+    """Return a card for each camera and arm."""
     cards = [_camera(camera) for camera in cameras.cameras] + [_arm(arm) for arm in cameras.arms]
     return Section("cameras", {"cards": cards})
 
 
 def _camera(camera: CameraPlaced) -> dict[str, Any]:
+    """Return the card of a camera with its images."""
     arm = "" if camera.arm is None else f" of arm {camera.arm}"
     name = "base_from_camera" if camera.mount == "base" else f"gripper_from_camera{arm}"
     images = [
@@ -37,6 +38,7 @@ def _camera(camera: CameraPlaced) -> dict[str, Any]:
 
 
 def _arm(arm: ArmPlaced) -> dict[str, Any]:
+    """Return the card of an arm."""
     name = "base_from_other_base"
     placed = _transform(name, arm.base_from_other_base, arm.uncertainty)
     return placed | {"title": f"arm {arm.name}: {name}", "rejected": False, "remarks": (), "images": ()}
@@ -45,7 +47,7 @@ def _arm(arm: ArmPlaced) -> dict[str, Any]:
 def _transform(
     name: str, matrix: list[list[float]] | None, uncertainty: TransformUncertainty | None
 ) -> dict[str, Any]:
-    """The matrix as text, for people and to copy, and its standard deviations; None where there is none."""
+    """Return the matrix as text, to read and to copy, and its standard deviations; None without a transform."""
     if matrix is None or uncertainty is None:
         return {"name": name, "matrix": None}
     scene = ""

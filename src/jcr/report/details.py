@@ -1,4 +1,4 @@
-"""The last section: times, intrinsics, options and versions, for who looks for a number."""
+"""Section of details: times, intrinsics, uncertainty budget, options and versions."""
 
 import platform
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ from jcr.report.render import Section
 from jcr.rounding import significant, with_std
 
 Options = Mapping[str, Mapping[str, Any]]
-"""A stage's name, and its options by name."""
+"""Options by name, by the name of their stage."""
 CELLS = 16
 """Cells across the image in which coverage is counted."""
 PACKAGES = ("numpy", "scipy", "torch", "pycolmap")
@@ -51,6 +51,7 @@ def details_section(
 
 
 def _times(calibration: CalibrationFile) -> dict[str, str]:
+    """Return the seconds of the stages and the attempts."""
     timings = calibration.timings_s
     rows = {stage: f"{seconds:.1f} s" for stage, seconds in timings.items()}
     rows["together"] = f"{sum(timings.values()):.1f} s"
@@ -61,6 +62,7 @@ def _times(calibration: CalibrationFile) -> dict[str, str]:
 
 
 def _intrinsics(calibration: CalibrationFile) -> dict[str, str]:
+    """Return the intrinsics with standard deviations; none where they are unknown."""
     if (found := calibration.intrinsics) is None:
         return {}
     return {
@@ -72,10 +74,12 @@ def _intrinsics(calibration: CalibrationFile) -> dict[str, str]:
 
 
 def _plus_minus(std: list[float] | None, first: int) -> str:
+    """Return the larger of two standard deviations as text."""
     return "" if std is None else f" ± {significant(max(std[first : first + 2]))}"
 
 
 def _depth_camera(calibration: CalibrationFile) -> dict[str, str]:
+    """Return scale error and noise of the depth camera."""
     if (check := calibration.depth_check) is None:
         return {}
     noise_mm = {z: significant(1e3 * float(check.std_m(np.array(z)))) for z in check.distances_m}
@@ -87,7 +91,7 @@ def _depth_camera(calibration: CalibrationFile) -> dict[str, str]:
 
 
 def _lengths(calibration: CalibrationFile) -> dict[str, str]:
-    """By how much each length that is known beside the robot's positions differs from these."""
+    """Return the difference between each known length and the robot's positions."""
     return {
         LENGTHS[one.name]: (
             f"{one.robot_longer_percent:+.2f} ± {significant(one.std_percent)} % longer by the robot's positions, "
@@ -98,7 +102,7 @@ def _lengths(calibration: CalibrationFile) -> dict[str, str]:
 
 
 def _robot(calibration: CalibrationFile) -> dict[str, str]:
-    """What the poses show of the robot itself."""
+    """Return systematic robot errors, joint offsets and the ratio of angles."""
     items = {}
     if (errors := calibration.robot_errors) is not None:
         items["errors shared by neighbouring poses"] = (
@@ -144,6 +148,7 @@ def _board(calibration: CalibrationFile) -> dict[str, str]:
 
 
 def _value(value: Any) -> str:
+    """Return the value of an option as text."""
     if value is None:
         return "unset"
     return str(list(value) if isinstance(value, tuple) else value)

@@ -48,7 +48,7 @@ OPEN = {"verdict", "failure", "tiles", "warnings", "transform", "view", "images"
 
 
 def report_html(result: RunResult, options: Options | None = None) -> str:
-    """The report of a run, made with these options, as one HTML page that loads nothing else.
+    """Return the report of a run, made with these options, as one HTML page that loads nothing else.
 
     Sections whose record a run does not have are left out. Raises InputError when an image of the capture has
     become unreadable.
@@ -89,7 +89,7 @@ def report_html(result: RunResult, options: Options | None = None) -> str:
 
 
 def poses_report_html(result: PosesResult, options: Options | None = None) -> str:
-    """The report of camera poses that were given: as that of a run, without images."""
+    """Return the report of a calibration from given camera poses, without images."""
     calibration = result.calibration
     sections = [
         *head(calibration),
@@ -103,7 +103,7 @@ def poses_report_html(result: PosesResult, options: Options | None = None) -> st
 
 
 def failed_report_html(capture: Capture, calibration: CalibrationFile, options: Options | None = None) -> str:
-    """The report of a run that found no camera poses: why, with the remedy, and the images."""
+    """Return the report of a run that found no camera poses: reason, remedy and images."""
     sections = [
         failure_section(calibration),
         images_alone_section(capture),
@@ -113,7 +113,7 @@ def failed_report_html(capture: Capture, calibration: CalibrationFile, options: 
 
 
 def _about_capture(capture: Capture, options: Options) -> str:
-    """The arm and the camera of a capture, as far as it names them."""
+    """Return arm and camera of a capture as text."""
     width, height = capture.image_size
     given = "given" if capture.intrinsics is not None else "estimated"
     robot = options.get("calibrate", {}).get("robot") or capture.robot
@@ -133,7 +133,7 @@ def _about_intrinsics(calibration: CalibrationFile) -> list[str]:
 
 
 def _page(about: str, source: Path, calibration: CalibrationFile, sections: Iterable[Section | None]) -> str:
-    """The whole page; `source` is the capture as the user named it."""
+    """Return the whole page; `source` is the capture as the user named it."""
     # The table or the bag's metadata are called alike in every capture: their folder has the name.
     named = source.parent if source.stem in UNNAMED else source
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")

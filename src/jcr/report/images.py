@@ -1,4 +1,4 @@
-"""The section that goes through the images: what each shows, and how well its features fit."""
+"""Section of the images: each with its residuals and the reprojection errors of its features."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -30,13 +30,13 @@ GRID = 17
 
 
 def shown_names(images: Sequence[ImageVerdict]) -> list[str]:
-    """File names without their folders, unless two of them would then be the same."""
+    """Return file names without their folders, unless two of them would then be the same."""
     short = [Path(image.image).name for image in images]
     return short if len(set(short)) == len(short) else [image.image for image in images]
 
 
 def image_numbers(image: ImageVerdict) -> str:
-    """Residuals and median reprojection error of one image, as far as there are any."""
+    """Return residuals and median reprojection error of one image as text, as far as there are any."""
     parts = [
         (image.translation_residual_mm, " mm"),
         (image.rotation_residual_deg, "°"),
@@ -46,7 +46,7 @@ def image_numbers(image: ImageVerdict) -> str:
 
 
 def images_section(result: RunResult) -> Section:
-    """Every image with its numbers, and why it was rejected if it was."""
+    """Return every image with its numbers, and the reason where it was rejected."""
     images, marks = result.calibration.images, _reprojections(result)
     urls = thumbnails(result.capture, result.intrinsics)
     cards = [
@@ -64,7 +64,7 @@ def images_section(result: RunResult) -> Section:
 
 
 def images_alone_section(capture: Capture) -> Section:
-    """The images of a run that found nothing in them."""
+    """Return the images of a run without a calibration."""
     cards = [
         {"path": name, "name": name, "url": url, "numbers": "", "rejected": None, "marks": None}
         for name, url in zip(capture.images, thumbnails(capture, capture.intrinsics), strict=True)
@@ -73,7 +73,7 @@ def images_alone_section(capture: Capture) -> Section:
 
 
 def _section(cards: Sequence[dict[str, Any]], capture: Capture, intrinsics: Intrinsics | None) -> Section:
-    """`intrinsics` are those of a calibration; None where there is none."""
+    """Return the section of cards; `intrinsics` are those of a calibration, None without one."""
     width, height = capture.image_size
     content = {
         "cards": cards,
@@ -88,7 +88,7 @@ def _section(cards: Sequence[dict[str, Any]], capture: Capture, intrinsics: Intr
 
 
 def pixels_of_file(intrinsics: Intrinsics | None, size: tuple[int, int]) -> dict[str, list[list[float]]]:
-    """x and y, in the image file, of a grid of points over an image as it is shown, which is undistorted."""
+    """Return x and y, in the image file, of a grid of points over the displayed image, which is undistorted."""
     u, v = (np.linspace(-0.5, side - 0.5, GRID) for side in size)
     shown = np.stack(np.meshgrid(u, v), axis=-1)
     if intrinsics is not None and is_distorted(intrinsics):
@@ -98,7 +98,7 @@ def pixels_of_file(intrinsics: Intrinsics | None, size: tuple[int, int]) -> dict
 
 
 def _reprojections(result: RunResult) -> dict[int, str]:
-    """Per image of the capture a drawing over it, as an SVG path: some features, and where their 3D points fall."""
+    """Return an SVG path per image of the capture: reprojection errors of some features."""
     tracks, intrinsics = result.reconstruction.tracks, result.intrinsics
     if len(tracks.image) == 0:
         return {}
@@ -129,7 +129,7 @@ def reprojections_px(reconstruction: Reconstruction) -> Float[ndarray, "k 2"]:
 
 
 def thumbnails(capture: Capture, intrinsics: Intrinsics | None) -> list[str]:
-    """Every image as a JPEG of the size that its number allows; undistorted, as the 3D view shows it."""
+    """Return every image as a small JPEG, undistorted as in the 3D view; more images are smaller."""
     shape = capture.image_size[1] / capture.image_size[0]
     width = min(LARGEST, capture.image_size[0], int(np.sqrt(PIXELS / len(capture) / shape)))
     width = max(width, SMALLEST)

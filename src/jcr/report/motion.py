@@ -1,4 +1,4 @@
-"""The section on what the motions show of the calibration, and which gripper poses would show more."""
+"""Section of observability, uncertainty and the gripper poses to add."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -24,11 +24,11 @@ GENERAL = 0.4
 """Excitation that general motions reach: the full length of a bar."""
 
 Bar = tuple[str, float, float, str]
-"""Its name, where it begins and how wide it is (percent), and its number."""
+"""Name, begin and width (percent), and number."""
 
 
 def motion_section(result: RunResult | PosesResult) -> Section:
-    """Excitation of the seven directions, standard deviations of their parts, and the poses to add."""
+    """Return excitation of the seven directions, standard deviations of their parts, and the poses to add."""
     observed, uncertainty = result.calibration.observability, result.calibration.uncertainty
     found = result.hand_eye.plan.excitation
     content = {
@@ -49,7 +49,7 @@ def motion_section(result: RunResult | PosesResult) -> Section:
 
 
 def excitation_bars(found: Excitation) -> Iterator[tuple[str, str, float, str]]:
-    """Of each principal direction, least seen first: used or rejected, its name, the percent of a bar, its number."""
+    """Yield state, name, percent of a bar and number of each principal direction, least excited first."""
     for value, direction in zip(found.value, np.abs(found.direction), strict=True):
         parts = [PARTS[k] for k in np.argsort(-direction) if direction[k] > NAMED]
         name = ", ".join(parts) or PARTS[int(direction.argmax())]
@@ -58,14 +58,14 @@ def excitation_bars(found: Excitation) -> Iterator[tuple[str, str, float, str]]:
 
 
 def _spreads(name: str, std: Sequence[float], unit: str) -> Iterator[Bar]:
-    """A bar each axis, as wide as ± one standard deviation against the largest of them."""
+    """Yield a bar for each axis, as wide as ± one standard deviation relative to the largest."""
     for axis, value in zip("xyz", std, strict=True):
         half = 50 * value / (max(std) or 1.0)
         yield f"{name} {axis}", 50 - half, 2 * half, f"±{significant(value)}{unit}"
 
 
 def _next_poses(result: RunResult | PosesResult) -> dict[str, Any] | None:
-    """The proposed gripper poses, what each would leave uncertain, ready to copy; None where there is none."""
+    """Return the proposed gripper poses with their expected uncertainty, ready to copy; None without any."""
     if not (poses := result.hand_eye.next_poses):
         return None
     convention = _convention(result)
@@ -79,7 +79,7 @@ def _next_poses(result: RunResult | PosesResult) -> dict[str, Any] | None:
 
 
 def _convention(result: RunResult | PosesResult) -> str:
-    """How the capture's robot writes poses; a quaternion where neither its file nor its arm shows it."""
+    """Return the pose convention of the capture's robot; a quaternion where it is unknown."""
     if not isinstance(result, RunResult):
         return ANY_CONVENTION
     capture = result.capture
@@ -87,6 +87,7 @@ def _convention(result: RunResult | PosesResult) -> str:
 
 
 def _next_pose(pose: NextPose, near: str, convention: str) -> dict[str, Any]:
+    """Return a proposed pose in the convention of the robot, with its expected uncertainty."""
     numbers = numbers_from_poses(pose.base_from_gripper[None], convention)[0]
     mm, deg = significant(1e3 * float(pose.expected_std[:3].max())), np.degrees(pose.expected_std[3:6].max())
     percent = significant(100 * float(pose.expected_std[6]))

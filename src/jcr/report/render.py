@@ -13,29 +13,29 @@ REPORT = "jcr.report"
 
 @dataclass(frozen=True)
 class Section:
-    """A section of the report."""
+    """Section of the report."""
 
     name: str
-    """Its id in the page, and its template in templates/."""
+    """Id in the page, and name of the template in templates/."""
     content: Mapping[str, Any]
-    """What the template calls `it`."""
+    """Content, the variable `it` of the template."""
 
 
 def render(template: str, content: Mapping[str, Any], package: str = REPORT) -> str:
-    """The page or part of one that a template in `templates/` of a package makes of its content."""
+    """Return the page, or part of one, that a template in `templates/` of a package makes of its content."""
     return _environment(package).get_template(template).render(content)
 
 
 @cache
 def _environment(package: str) -> Environment:
-    """Templates of the package, then those of the report, whose layout, style and macros all pages share."""
+    """Return the templates of a package and of the report, whose layout, style and macros all pages share."""
     loader = ChoiceLoader([PackageLoader(name, "templates") for name in dict.fromkeys((package, REPORT))])
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
 
     def source(name: str) -> Markup:
-        """A style sheet or script of ours as it is."""
+        """Return a style sheet or script of a package unescaped."""
         return Markup(loader.get_source(environment, name)[0])  # nosec B704: a file of this package, no text from outside
 
     environment.globals["source"] = source

@@ -1,4 +1,4 @@
-"""The section of residuals: a bar each image, and the fit as a whole, before and after features refined it."""
+"""Section of residuals: a bar for each image, and the whole fit before and after bundle adjustment."""
 
 from collections.abc import Sequence
 
@@ -17,7 +17,7 @@ NOTICEABLE = 1.05
 
 
 def residuals_section(result: RunResult | PosesResult) -> Section:
-    """Residuals image by image and of the whole, before and after the images' features refined the fit."""
+    """Return residuals by image and of the whole fit, before and after bundle adjustment."""
     now, before = result.hand_eye, result.hand_eye.before
     fits = [now] if before is None else [now, before]
     names, used = shown_names(result.calibration.images), now.inliers
@@ -40,14 +40,14 @@ def residuals_section(result: RunResult | PosesResult) -> Section:
 
 
 def _refinement(before: HandEye, now: HandEye) -> tuple[str, str]:
-    """Millimetres and degrees by which the images' features moved the camera on the gripper."""
+    """Return the step (mm, degrees) of the camera on the gripper by bundle adjustment."""
     step = step_between(before.gripper_from_camera, now.gripper_from_camera)
     degrees = float(np.degrees(np.linalg.norm(step[3:])))
     return significant(1e3 * float(np.linalg.norm(step[:3]))), significant(degrees)
 
 
 def _noise(fit: HandEye) -> dict[str, str | int | None]:
-    """Why the robot pose noise per axis is not the size of the residuals."""
+    """Return the robot pose noise and the factor by which the fit reduces residuals."""
     count = 6 * int(fit.inliers.sum())
     noise, together = fit.robot_noise.translation, fit.robot_noise.together[0]
     return {
@@ -59,12 +59,13 @@ def _noise(fit: HandEye) -> dict[str, str | int | None]:
 
 
 def _bar(values: Sequence[float], longest: float, unit: str) -> tuple[float, float | None, str]:
-    """Percent of the bar for the first value, of a tick for the second if there is one, and the number."""
+    """Return the bar's percent for the first value, the tick's for the second if any, and the number."""
     shares = [min(100 * float(value) / longest, 100.0) for value in values]
     return shares[0], shares[1] if len(shares) > 1 else None, f"{significant(values[0])}{unit}"
 
 
 def _whole(fits: Sequence[HandEye]) -> dict[str, list[str]]:
+    """Return leave-one-out error and mean residuals of each fit."""
     return {
         "error": [leave_one_out_text(fit.leave_one_out) if fit.leave_one_out else "–" for fit in fits],
         "translation": [f"{significant(1e3 * fit.residuals.translation)} mm" for fit in fits],

@@ -1,4 +1,4 @@
-"""The 3D view: what templates/scene3d.js draws, packed small enough to live in the page."""
+"""Data of the 3D view that templates/scene3d.js draws."""
 
 import base64
 from collections.abc import Mapping, Sequence
@@ -27,7 +27,7 @@ TRACK_SIZE = 0.006
 
 @dataclass(frozen=True)
 class PointLayer:
-    """Points of one kind, which the reader shows or hides."""
+    """Points of one kind, which can be shown or hidden."""
 
     name: str
     points_in_base: Float[ndarray, "n 3"]
@@ -39,7 +39,7 @@ class PointLayer:
 def scene_section(
     result: RunResult, base_from_camera: Float[ndarray, "m 4 4"], surface: SurfacePoints | None
 ) -> Section:
-    """Cameras, grippers and points in the base frame, to be rotated by hand."""
+    """Return the section of the 3D view: cameras, grippers and points in the base frame."""
     layers = [*_map_layers(result, surface), *_measured_layer(result)]
     views = _views(result, base_from_camera)
     next_poses = [np.array(pose.base_from_gripper) for pose in result.calibration.next_poses]
@@ -70,8 +70,10 @@ def scene_data(
     intrinsics: Intrinsics,
     shown_in_base: Float[ndarray, "m 3"],
 ) -> dict[str, Any]:
-    """What scene3d.js draws: points, the images (`scene_view`), and gripper poses to add; `shown_in_base` are further
-    points that the box of coordinates holds."""
+    """Return the data of scene3d.js: points, images (`scene_view`), and gripper poses to add.
+
+    `shown_in_base` are further points (m) that the box of coordinates contains.
+    """
     return {
         **_packed_layers(layers, shown_in_base),
         "views": views,
@@ -91,7 +93,7 @@ def scene_view(
     base_from_gripper: Float[ndarray, "4 4"],
     base_from_camera: Float[ndarray, "4 4"] | None,
 ) -> dict[str, Any]:
-    """An image: its name and numbers, and where its gripper and its camera (None: not known) were."""
+    """Return an image with its name, numbers, gripper pose and camera pose (None: unknown)."""
     camera = None if base_from_camera is None else _rows(base_from_camera)
     return {
         "name": name,
@@ -103,18 +105,18 @@ def scene_view(
 
 
 def _rows(a_from_b: Float[ndarray, "4 4"]) -> list[list[float]]:
-    """The upper three rows, to a micrometre."""
+    """Return the upper three rows, to a micrometre."""
     return a_from_b[:3].round(6).tolist()
 
 
 def _labels(result: RunResult) -> list[tuple[str, list[int]]]:
-    """Names and colours of the map's labels; none where it has one alone."""
+    """Return names and colours of the map's labels; none for a single label."""
     names = () if result.scene is None else result.scene.label_names
     return list(zip(names, label_colors(len(names)).tolist(), strict=True)) if len(names) > 1 else []
 
 
 def _map_layers(result: RunResult, surface: SurfacePoints | None) -> list[PointLayer]:
-    """The surface of the map by colour, and by label where it has some."""
+    """Return the surface of the map by colour, and by label where it has several."""
     if surface is None:
         return []
     x, size = surface.points_in_base[:POINTS], surface.point_size
@@ -126,6 +128,7 @@ def _map_layers(result: RunResult, surface: SurfacePoints | None) -> list[PointL
 
 
 def _measured_layer(result: RunResult) -> list[PointLayer]:
+    """Return the measured points; none without a cloud."""
     if (cloud := result.cloud) is None:
         return []
     some = np.random.default_rng(0).permutation(len(cloud.points_in_base))[:POINTS]
@@ -134,6 +137,7 @@ def _measured_layer(result: RunResult) -> list[PointLayer]:
 
 
 def _tracks(result: RunResult) -> PointLayer:
+    """Return the tracked features in red."""
     hand_eye, tracked = result.hand_eye, result.reconstruction.tracks.points_in_recon
     tracked = apply_similarity(hand_eye.base_from_recon, hand_eye.scale, tracked)
     red = np.tile(np.array(TRACK_COLOR, np.uint8), (len(tracked), 1))
@@ -143,7 +147,7 @@ def _tracks(result: RunResult) -> PointLayer:
 def _packed_layers(
     layers: Sequence[PointLayer], centers_in_base: Float[ndarray, "m 3"]
 ) -> dict[str, list[Any]]:
-    """The points in their common box, as 16-bit steps through it."""
+    """Return the points in their common box, as 16-bit steps through it."""
     everything = np.vstack([layer.points_in_base for layer in layers] + [centers_in_base])
     # A few stray points far away must not take the resolution, and the view, from all others.
     low, high = np.percentile(everything, [1, 99], axis=0)
@@ -153,6 +157,7 @@ def _packed_layers(
 
 
 def _packed(layer: PointLayer, box: Float[ndarray, "2 3"]) -> dict[str, Any]:
+    """Return a layer as base64 text."""
     low, high = box
     inside = ((layer.points_in_base >= low) & (layer.points_in_base <= high)).all(1)
     steps = (layer.points_in_base[inside] - low) / (high - low) * 65535
@@ -165,7 +170,7 @@ def _packed(layer: PointLayer, box: Float[ndarray, "2 3"]) -> dict[str, Any]:
 
 
 def _views(result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]) -> list[dict[str, Any]]:
-    """Per image its name, its numbers, and three rows of where its gripper and its camera (or null) were."""
+    """Return every image with its numbers, gripper pose and camera pose."""
     row_of = {int(row): k for k, row in enumerate(result.image_index)}
     images = result.calibration.images
     return [
@@ -181,7 +186,7 @@ def _views(result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]) -> list
 
 
 def _others(result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]) -> list[dict[str, Any]]:
-    """The cell's further cameras, each with where it was and what it is."""
+    """Return the cell's further cameras with their poses and intrinsics."""
     if result.cameras is None:
         return []
     grippers = base_from_camera @ inverse(result.hand_eye.gripper_from_camera)
@@ -215,7 +220,7 @@ def _places(
     known: dict[str, CellCamera],
     by_row: dict[int, Float[ndarray, "4 4"]],
 ) -> list[Float[ndarray, "4 4"]]:
-    """base_from_camera of each image of a further camera; one where it is fixed."""
+    """Return base_from_camera of each image of a further camera; one pose of a fixed camera."""
     if found.parent_from_camera is None or result.cameras is None:
         return []
     if found.mount == "base":
@@ -226,7 +231,7 @@ def _places(
 
 
 def _bases(result: RunResult) -> list[dict[str, Any]]:
-    """The bases of other arms."""
+    """Return the bases of other arms."""
     arms = () if result.cameras is None else result.cameras.arms
     return [
         {"name": f"base of {arm.name}", "base": _rows(np.array(arm.base_from_other_base))} for arm in arms

@@ -1,4 +1,4 @@
-"""The section that draws over an image how exactly a point seen there is placed."""
+"""Section of the point uncertainty: contours over an image."""
 
 from collections.abc import Iterator
 
@@ -27,8 +27,7 @@ SHORTEST = 8
 
 
 def seen_section(result: RunResult) -> Section | None:
-    """Contours of what 95 % of the errors of a point are below, over the image in the middle; None without
-    intrinsics."""
+    """Return contours of the 95 % bound of a point's error over an image; None without intrinsics."""
     uncertainty, hand_eye = result.calibration.uncertainty, result.hand_eye
     if uncertainty is None or uncertainty.seen is None or hand_eye.estimate.intrinsics_cross is None:
         return None
@@ -45,7 +44,7 @@ def seen_section(result: RunResult) -> Section | None:
 
 
 def _figure(result: RunResult, distance_m: float) -> Figure:
-    """The image with contours in millimetres, each with its number."""
+    """Return the image with contours in millimetres, each with its number."""
     used = result.image_index[result.hand_eye.inliers]
     pixels = read_image(result.capture.folder / result.capture.images[used[len(used) // 2]])
     width, height = ACROSS, round(ACROSS * pixels.shape[0] / pixels.shape[1])
@@ -63,6 +62,7 @@ def _figure(result: RunResult, distance_m: float) -> Figure:
 
 
 def _field_mm(result: RunResult, distance_m: float) -> Float[ndarray, "h w"]:
+    """Return the 95 % bound (mm) of the error of points on a grid over the image."""
     intrinsics = result.intrinsics
     rows = max(round(GRID * intrinsics.height / intrinsics.width), 2)
     u, v = np.meshgrid(
@@ -73,7 +73,7 @@ def _field_mm(result: RunResult, distance_m: float) -> Float[ndarray, "h w"]:
 
 
 def _contour(field: Float[ndarray, "h w"], level: float) -> Iterator[Shape]:
-    """Lines along which the field has one value, and the value in the middle of each line."""
+    """Yield lines along which the field has one value, and the value in the middle of each line."""
     height, width = field.shape
     found, _ = cv2.findContours((field < level).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     for outline in found:

@@ -1,4 +1,4 @@
-"""The stage: from a cloud to the map of it."""
+"""Training of a map from a point cloud."""
 
 import math
 import time
@@ -30,7 +30,7 @@ def build_scene(
     values: dict[str, Float[ndarray, "n d"]] | None = None,
     device: str = "cpu",
 ) -> SceneMap:
-    """The map of a cloud: what was seen, and fields of occupancy, colour, label and any further `values` (n,d).
+    """Return the map of a cloud: seen space, and fields of occupancy, colour, label and any further `values` (n,d).
 
     Raises InputError when hardly any point lies in the workspace, or a number is not finite.
     """
@@ -46,6 +46,7 @@ def build_scene(
     report = progress or silent
 
     def fit(field: Field) -> int:
+        """Train a field and return the number of steps."""
         stage = f"map: {', '.join(field.heads)}"
         return train(field, rays, seen, recipe, options.map_seed, options.max_seconds, partial(report, stage))
 
@@ -71,7 +72,7 @@ def build_scene(
 
 
 def _workspace(cloud: PointCloud, options: MapOptions) -> tuple[Float[ndarray, "2 3"], float]:
-    """The box of the map, whole cells along every axis, and the side of a cell (m)."""
+    """Return the box of the map, whole cells along every axis, and the side of a cell (m)."""
     box = workspace_box(cloud, options.workspace)
     cell = max(options.cell, float(np.prod(box[1] - box[0]) / options.max_cells) ** (1 / 3))
     box[1] = box[0] + np.ceil((box[1] - box[0]) / cell - 1e-6) * cell
@@ -90,7 +91,7 @@ def _field_shapes(rays: Rays, labels: int, recipe: Recipe) -> list[FieldShape]:
 
 
 def feature_lattices(seen: SeenGrid) -> list[Lattice]:
-    """Three lattices: four cells a step everywhere, one cell near surfaces, half a cell on them."""
+    """Return three lattices: four cells a step everywhere, one cell near surfaces, half a cell on them."""
     hit = (seen.state & HIT) != 0
     nz, ny, nx = ((n // 2 + 3) // 4 for n in hit.shape)
     everywhere = torch.ones(nz, ny, nx, dtype=torch.bool, device=hit.device)
@@ -110,6 +111,7 @@ def threads_of_one_core(device: torch.device) -> Executor:
     """
 
     def limit() -> None:
+        """Limit the calling thread."""
         torch.zeros(1)  # torch sets its number of threads at a thread's first operation
         threadpool_limits(1, user_api="openmp")
 

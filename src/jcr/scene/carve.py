@@ -28,7 +28,7 @@ def carve(
     measured: Bool[ndarray, " n"],
     device: str = "cpu",
 ) -> SeenGrid:
-    """The seen grid of the rays from each point's camera to the point; the box is whole pairs of cells.
+    """Return the seen grid of the rays from each point's camera to the point; the box is whole pairs of cells.
 
     Rays of points that are not `measured` cross nothing, and end the crossing of those beside them.
 
@@ -58,7 +58,7 @@ def carve(
 def _depth_image(
     points: Float[ndarray, "n 3"], measured: Bool[ndarray, " n"]
 ) -> tuple[Float[ndarray, "r c"], Float[ndarray, "3 3"], tuple[float, float], float]:
-    """The nearest depth in each bin of a pinhole image about the mean direction of a camera's measured points.
+    """Return the nearest depth in each bin of a pinhole image about the mean direction of a camera's measured points.
 
     `points` are relative to the camera; with it the rotation to the image's frame, the image's corner and the bins'
     side, both as tangents. An empty bin has depth 0 and frees nothing; points that are not measured only end what

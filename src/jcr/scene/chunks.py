@@ -1,4 +1,4 @@
-"""Many points in pieces that fit a processor's cache, on all its cores."""
+"""Evaluation of many points in pieces that fit a processor's cache, on all cores."""
 
 import itertools
 from collections.abc import Callable
@@ -11,7 +11,7 @@ CHUNK = {"cpu": 1 << 15, "cuda": 1 << 22}
 
 
 def in_chunks(ask: Callable[..., tuple[Tensor, ...]], *columns: Tensor) -> tuple[Tensor, ...]:
-    """What `ask` answers to the rows of `columns`, asked piece by piece and joined again.
+    """Return what `ask` returns for the rows of `columns`, called piece by piece and joined.
 
     Gradients are kept where a column wants them. Without them, each core takes pieces of its own.
     """

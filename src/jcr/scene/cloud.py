@@ -1,4 +1,4 @@
-"""From pointmaps and a calibration to one metric point cloud in the base frame (paper, section IV-C)."""
+"""Metric point cloud in the base frame from pointmaps and a calibration (JCR, section IV-C)."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer, UInt8
@@ -22,7 +22,7 @@ def point_cloud(
     options: CloudOptions | None = None,
     label_names: tuple[str, ...] = ("none",),
 ) -> PointCloud:
-    """The confident points in the base frame, each with colour, label, margin and the camera that saw it.
+    """Return the confident points in the base frame, with colour, label, margin and the image of each.
 
     `labels` (m,h,w) are segments at the pointmaps' pixels, 0 = none; `label_names` names them.
     Raises InputError when no point passes the threshold.
@@ -75,7 +75,7 @@ def point_cloud(
 def _clears(
     reason: UInt8[ndarray, " n"], confidence: Float[ndarray, " n"], added: Bool[ndarray, " n"]
 ) -> Bool[ndarray, " n"]:
-    """The points to which the way is free: no priors, no doubtful matches.
+    """Test which points show that the space before them is free: no priors, no doubtful matches.
 
     Images that were `added` to a run show what has changed, where the others contradict them: there no match is too
     doubtful to say that a thing was taken away.
@@ -91,7 +91,7 @@ def position_std(
     image: Integer[ndarray, " n"],
     x_in_recon: Float[ndarray, "n 3"],
 ) -> Float[ndarray, " n"]:
-    """One-sigma uncertainty (m), in the worst direction, that the calibration leaves at each point.
+    """Return the standard deviation (m) of each point in the worst direction, as far as the calibration causes it.
 
     `recon_from_camera` and `x_in_recon` are metric. Where images were adjusted it is that of the scene in the base
     frame. Of camera poses alone, a point that image i sees at x in its camera lies in the base frame at

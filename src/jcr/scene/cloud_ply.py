@@ -15,7 +15,7 @@ _VERTEX = np.dtype(
     + [("label", "<i4"), ("confidence", "<f4"), ("margin", "<f4"), ("image", "<i4")]
 )
 _DENSE = [("reason", "|u1"), ("depth_std", "<f4")]
-"""Of clouds whose depths say what they rest on; m."""
+"""Further properties of clouds with a reason and a standard deviation (m) for each depth."""
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 
 
@@ -52,7 +52,7 @@ def write_cloud(path: Path, cloud: PointCloud, notes: Mapping[str, str] | None =
 
 
 def read_cloud(path: Path) -> PointCloud:
-    """The cloud that `write_cloud` wrote; raises InputError for any other file."""
+    """Read a cloud that `write_cloud` wrote; raise InputError for any other file."""
     try:
         header, separator, body = read_bytes(path).partition(b"end_header\n")
         lines = header.decode().splitlines()

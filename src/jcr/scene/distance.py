@@ -29,11 +29,11 @@ class DistanceGrid:
     """The distance again, then its derivatives along x, y and z; in memory node after node, as queries read it."""
 
     def at(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-        """Distance and gradient, interpolated trilinearly at points (n,3) of the box."""
+        """Return distance and gradient (n,4), interpolated trilinearly at points (n,3) of the box."""
         return self._interpolate(self.gradients, x_in_base).T
 
     def distance(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """The distance alone, at points (n,3) of the box."""
+        """Return the distance (n,) alone, at points (n,3) of the box."""
         return self._interpolate(self.nodes[None], x_in_base)[0]
 
     def _interpolate(
@@ -47,7 +47,7 @@ class DistanceGrid:
 def distance_grid(
     lower: Float[Tensor, "3"], cell: float, shape: tuple[int, int, int], is_solid: IsSolid, closed: bool
 ) -> DistanceGrid:
-    """Distance of the nodes (nz,ny,nx) of a grid from the boundary of what `is_solid`; if `closed`, so is all outside.
+    """Return the distances of grid nodes (nz,ny,nx) from the boundary of solid space; `closed`: so is all outside.
 
     Nodes beside the boundary carry the point of it that is nearest to them; every other node takes the distance
     to the point of its nearest such node. Where there is no boundary at all, the distance is the box's diagonal.
@@ -81,7 +81,7 @@ def distance_grid(
 def _boundary(
     lower: Float[Tensor, "3"], cell: float, solid: Bool[Tensor, "nz ny nx"], is_solid: IsSolid
 ) -> tuple[Float[ndarray, "3 nz ny nx"], Bool[ndarray, "nz ny nx"]]:
-    """Offsets (in cells, z y x) from nodes to the boundary nearest them, and which nodes are beside it.
+    """Return offsets (cells; z, y, x) from nodes to their nearest boundary, and a mask of the nodes beside it.
 
     Where the boundary cuts a node's edges at t_x, t_y and t_z, the plane through the cuts is nearest at n·d with
     n_a = d / t_a and 1/d² = Σ 1/t_a², as fast marching starts (Adalsteinsson and Sethian 1999).

@@ -17,13 +17,13 @@ from torch.nn import functional as F
 
 @dataclass(frozen=True)
 class FieldShape:
-    """What must be known to build a field before its weights are loaded."""
+    """Architecture of a field, from which it is built before its weights are loaded."""
 
     heads: dict[str, int]
     """Property and its number of outputs."""
     hidden: int
     frequencies: int = 0
-    """Of the sinusoidal encoding; 0 = feature grids."""
+    """Frequencies of the sinusoidal encoding; 0 for feature grids."""
     grids: tuple[tuple[int, int], ...] = ()
     """(lattice, features) of each feature grid."""
 
@@ -51,7 +51,7 @@ class Lattice(nn.Module):
 
     @classmethod
     def around(cls, near: Bool[Tensor, "z y x"], lower: Float[Tensor, "3"], cell: float) -> "Lattice":
-        """The lattice whose nodes with features are the corners of the cells that are `near`."""
+        """Return the lattice whose nodes with features are the corners of the cells `near`."""
         corner = F.pad(near, (1, 1, 1, 1, 1, 1))
         for axis, n in enumerate(corner.shape):
             corner = corner.narrow(axis, 0, n - 1) | corner.narrow(axis, 1, n - 1)
@@ -59,7 +59,7 @@ class Lattice(nn.Module):
         return cls(lower, cell, (nz, ny, nx), corner.view(-1).nonzero()[:, 0].int())
 
     def corners(self, x_in_base: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, "n 8"], Float[Tensor, "n 8"]]:
-        """The rows of the eight nodes around each point, and their trilinear weights."""
+        """Return the rows (n,8) of the eight nodes around each point, and their trilinear weights (n,8)."""
         nz, ny, nx = self.shape
         at = (x_in_base - self.lower) * (1.0 / self.cell)
         last = torch.tensor([nx - 2, ny - 2, nz - 2], dtype=torch.int32, device=at.device)
@@ -80,7 +80,7 @@ class Interpolate(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
-        """(features, n) from a table (k, features), rows (n,8) and weights (n,8)."""
+        """Return (features, n) from a table (k, features), rows (n,8) and weights (n,8)."""
         ctx.save_for_backward(table, rows, weight)
         return F.embedding_bag(rows, table, per_sample_weights=weight, mode="sum").T
 
@@ -117,7 +117,7 @@ class SinusoidalEncoding(nn.Module):
         self.features = 6 * frequencies
 
     def forward(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "f n"]:
-        """Features of points (n,3)."""
+        """Return the features (f,n) of points (n,3)."""
         angle = (self.frequency[:, None, None] * (x_in_base - self.center).T).flatten(0, 1)
         return torch.cat([angle.sin(), angle.cos()])
 
@@ -135,7 +135,7 @@ class GridEncoding(nn.Module):
         self.features = sum(features)
 
     def forward(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "f n"]:
-        """Features of points (n,3)."""
+        """Return the features (f,n) of points (n,3)."""
         parts = zip(self.tables, self.lattices, strict=True)
         return torch.cat([Interpolate.apply(t, *lattice.corners(x_in_base)) for t, lattice in parts])
 
@@ -155,7 +155,7 @@ class SpreadEncoding:
         ]
 
     def __call__(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "f n"]:
-        """Features of points (n,3)."""
+        """Return the features (f,n) of points (n,3)."""
         parts = []
         for table, lower, scale in zip(self.tables, self.lower, self.scale, strict=True):
             at = ((x_in_base - lower) * scale - 1.0).view(1, 1, 1, -1, 3)
@@ -211,13 +211,13 @@ class Field(nn.Module):
             standard.copy_(torch.stack([target.mean(0), target.std(0).clamp(min=1e-6)]))
 
     def before_relu(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "hidden n"]:
-        """Inputs of the hidden units at points (n,3)."""
+        """Return the inputs of the hidden units at points (n,3)."""
         # Features first: with so few of them, this product and its gradients take half the time.
         features = (self.spread or self.encoding)(x_in_base)
         return torch.addmm(self.hidden.bias[:, None], self.hidden.weight, features)
 
     def forward(self, x_in_base: Float[Tensor, "n 3"]) -> dict[str, Tensor]:
-        """Outputs (n, outputs) of every head at points (n,3)."""
+        """Return the outputs (n, outputs) of every head at points (n,3)."""
         hidden = F.relu(self.before_relu(x_in_base))
         outputs = {}
         for name, head in self.heads.items():
@@ -245,7 +245,7 @@ class Fields(nn.Module):
         self.of = nn.ModuleList(Field(shape, box, lattices, generator) for shape in shapes)
 
     def forward(self, x_in_base: Float[Tensor, "n 3"], names: Collection[str]) -> dict[str, Tensor]:
-        """Outputs (n, outputs) of the named heads at points (n,3)."""
+        """Return the outputs (n, outputs) of the named heads at points (n,3)."""
         out: dict[str, Tensor] = {}
         for shape, field in zip(self.shapes, self.of, strict=True):
             if not shape.heads.keys().isdisjoint(names):
@@ -253,7 +253,7 @@ class Fields(nn.Module):
         return {name: out[name] for name in names}
 
     def field_of(self, name: str) -> Field:
-        """The field that has the head."""
+        """Return the field that has the head."""
         return next(f for shape, f in zip(self.shapes, self.of, strict=True) if name in shape.heads)  # pyright: ignore[reportReturnType]
 
     def spread(self, name: str) -> None:

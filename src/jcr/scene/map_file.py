@@ -1,4 +1,4 @@
-"""The file of a map; without torch, which its fields need, reading one says what to install."""
+"""File of a map; without torch, reading one raises InputError with the package to install."""
 
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 FILE = "map.safetensors"
 PACKAGES = "torch", "safetensors", "skimage"
-"""That training, reading and meshing a map need."""
+"""Packages that training, reading and meshing a map need."""
 
 
 def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
@@ -51,6 +51,6 @@ def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
 
 
 def require_packages(what: str, otherwise: str = "") -> None:
-    """InputError where one of `PACKAGES` is not installed."""
+    """Raise InputError where one of `PACKAGES` is not installed."""
     for package in PACKAGES:
         extra(package, "map", what, otherwise)

@@ -1,4 +1,4 @@
-"""How a map is built; apart from the building, so that the command line's help need not import SciPy and torch."""
+"""Options of cloud and map, in a module of their own so that the command line's help imports no torch."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal

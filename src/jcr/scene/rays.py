@@ -1,4 +1,4 @@
-"""The cloud as rays, and the samples of space that the fields are trained on."""
+"""Rays of a cloud, and the samples of space on which the fields are trained."""
 
 from dataclasses import dataclass
 
@@ -35,7 +35,7 @@ class Rays:
     measured: Float[Tensor, " n"]
     """1; 0 for a prior, whose ray shows no free space."""
     targets: dict[str, Tensor]
-    """What each point says of itself: color (n,3), label (n,), further values (n,d)."""
+    """Properties of each point: color (n,3), label (n,), further values (n,d)."""
 
     def __getitem__(self, rows: Tensor | slice) -> "Rays":
         targets = {name: target[rows] for name, target in self.targets.items()}
@@ -60,12 +60,12 @@ class Samples:
 
 
 def on_surface(rays: Rays) -> Samples:
-    """The points alone."""
+    """Return the surface points alone as samples."""
     return Samples(rays.x, torch.ones_like(rays.weight), rays.weight, rays)
 
 
 def draw_samples(rays: Rays, seen: SeenGrid, along_rays: bool, generator: torch.Generator) -> Samples:
-    """Positives and negatives of occupancy for a batch of rays.
+    """Return positives and negatives of occupancy for a batch of rays.
 
     The paper's: the points, and as many places drawn uniformly in the box (noise-contrastive estimation). Along
     the rays: all from the camera to shortly before the point is free, half of it drawn close to the surface; and
@@ -111,7 +111,7 @@ def draw_samples(rays: Rays, seen: SeenGrid, along_rays: bool, generator: torch.
 def workspace_box(
     cloud: PointCloud, workspace: tuple[float, float, float, float, float, float] | None
 ) -> Float[ndarray, "2 3"]:
-    """Lower and upper corner of the map: as asked, or around the scene and the cameras with 5 cm to spare.
+    """Return lower and upper corner of the map: as given, or around scene and cameras with a margin of 5 cm.
 
     The scene is what lies within one and a half times the median distance from the cameras.
     """
@@ -139,7 +139,7 @@ def workspace_rays(
     cell: float,
     device: str,
 ) -> Rays:
-    """The rays of the points that lie in the box; reliable points weigh more.
+    """Return the rays of the points that lie in the box; reliable points weigh more.
 
     A point counts by its confidence (relative to the median, within a factor of four) and by how small its
     `margin` and the depth's sigma are against a cell: there is no use in sharpness that the measurement does not have.

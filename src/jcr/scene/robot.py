@@ -1,4 +1,4 @@
-"""A robot as spheres: its URDF's collision shapes covered by spheres, and where joint values put them."""
+"""Spheres that cover the collision shapes of a robot's URDF, and their positions for joint values."""
 
 import re
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ JointValues = Float[ndarray, "*batch dof"] | Mapping[str, Float[ndarray, "*batch
 
 @dataclass(frozen=True, kw_only=True)
 class RobotJoint:
-    """How a link hangs on another."""
+    """Joint between two links."""
 
     parent: int
     child: int
@@ -37,10 +37,10 @@ class RobotJoint:
     kind: str
     """revolute, continuous, prismatic or fixed."""
     column: int | None
-    """Of the joint values; None when fixed."""
+    """Column of the joint values; None for a fixed joint."""
     multiplier: float = 1.0
     offset: float = 0.0
-    """Of a joint that mimics another: value = multiplier · other + offset."""
+    """Offset of a joint that mimics another: value = multiplier · other + offset."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +57,7 @@ class RobotSpheres:
     radii: Float[ndarray, " s"]
 
     def without(self, names: tuple[str, ...]) -> "RobotSpheres":
-        """The robot without the spheres of some links; InputError for a link that it does not have."""
+        """Return the robot without the spheres of some links; raise InputError for a link that it does not have."""
         unknown = set(names) - set(self.links)
         if unknown:
             raise InputError(f"links {sorted(unknown)}: the robot has only {', '.join(self.links)}")
@@ -67,7 +67,7 @@ class RobotSpheres:
         )
 
     def centers(self, joint_values: JointValues) -> Float[ndarray, "*batch s 3"]:
-        """Sphere centres (…,s,3) in the frame of the robot's root link, for joint values (…,dof) rad or m.
+        """Return sphere centres (…,s,3) in the frame of the robot's root link, for joint values (…,dof) rad or m.
 
         Values are in the order of `joint_names`, or a mapping from these names to values (…). Raises
         InputError for other names, another number of values, or one that is not finite.
@@ -88,6 +88,7 @@ class RobotSpheres:
         return (pose[..., :3, :3] @ self.centers_in_link[:, :, None])[..., 0] + pose[..., :3, 3]
 
     def _in_order(self, joint_values: JointValues) -> Float[ndarray, "*batch dof"]:
+        """Return joint values in the order of `joint_names`; raise InputError for unusable ones."""
         names = ", ".join(self.joint_names)
         if isinstance(joint_values, Mapping):
             wrong = set(joint_values) ^ set(self.joint_names)
@@ -106,7 +107,7 @@ class RobotSpheres:
 
 
 def load_robot(urdf: str | Path, excess: float = 0.01) -> RobotSpheres:
-    """The robot of a URDF file, its collision shapes covered by spheres that stick out by about `excess` (m).
+    """Load the robot of a URDF file, its collision shapes covered by spheres that stick out by about `excess` (m).
 
     Boxes, cylinders, spheres and meshes; a link without collision shape has no spheres. The result is kept, so
     that the robot of unchanged files is quick to load again. Raises InputError where the file or a mesh of it cannot be
@@ -176,7 +177,7 @@ def _load(path: Path, times_ns: tuple[int, ...], excess: float) -> RobotSpheres:
 
 
 def _joints(robot: Any, links: tuple[str, ...], path: Path) -> tuple[RobotJoint, ...]:
-    """The joints of a yourdfpy.URDF, parents before children."""
+    """Return the joints of a yourdfpy.URDF, parents before children."""
     columns = {name: k for k, name in enumerate(robot.actuated_joint_names)}
     waiting, reached, joints = list(robot.robot.joints), {robot.base_link}, []
     while waiting:

@@ -1,4 +1,4 @@
-"""Answers of a map at points."""
+"""Answers of a map at points, computed when first used."""
 
 from collections.abc import Callable
 from functools import cached_property
@@ -28,7 +28,7 @@ class Sample:
         unknown: str,
         tensors: bool,
     ) -> None:
-        """`distance_grid` gives the signed distance with the unknown as "occupied" or as "free"."""
+        """Prepare the answers; `distance_grid` returns the signed distance with the unknown "occupied" or "free"."""
         self._fields, self._seen, self._distance_grid = fields, seen, distance_grid
         self._properties = [name for shape in fields.shapes for name in shape.heads]
         self._x, self._unknown_as, self._tensors = x_in_base, unknown, tensors
@@ -77,6 +77,7 @@ class Sample:
 
     @cached_property
     def _occupancy_unknown(self) -> tuple[Any, ...]:
+        """Occupancy and unknown (n,)."""
         unseen = {"occupied": 1.0, "free": 0.0, "report": 0.5}[self._unknown_as]
 
         def occupancy_unknown(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -98,6 +99,7 @@ class Sample:
 
     @cached_property
     def _distance_gradient(self) -> tuple[Any, ...]:
+        """Distance (n,) and gradient (n,3)."""
         grid = self._distance_grid("occupied" if self._unknown_as == "occupied" else "free")
 
         def distance_gradient(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -107,6 +109,8 @@ class Sample:
         return self._given(in_chunks(distance_gradient, self._x))
 
     def _continuous(self, name: str, low: float, high: float) -> Any:
+        """Return a property between two bounds; NaN outside of the workspace."""
+
         def continuous(x: Tensor) -> tuple[Tensor]:
             value = self._fields(x, (name,))[name].clamp(low, high)
             return (torch.where(self._seen.index(x)[1][:, None], value, torch.nan),)
@@ -114,5 +118,5 @@ class Sample:
         return self._given(in_chunks(continuous, self._x))[0]
 
     def _given(self, answers: tuple[Tensor, ...]) -> tuple[Any, ...]:
-        """The answers in the kind of array that the points came in."""
+        """Return the answers as tensors or arrays, as the points were."""
         return answers if self._tensors else tuple(answer.cpu().numpy() for answer in answers)

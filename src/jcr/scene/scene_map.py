@@ -1,4 +1,4 @@
-"""The map a planner asks: is this free, how far is the nearest surface, what is there, has anyone looked."""
+"""Query interface of the map: occupancy, signed distance, colour, label and visibility at points in the base frame."""
 
 import copy
 import json
@@ -27,11 +27,11 @@ from jcr.scene.sample import Sample
 from jcr.scene.seen import CROSSED, HIT, SeenGrid, dilate, halve
 
 FREE, OCCUPIED, UNKNOWN = 0, 1, 2
-"""What is answered to `unknown="report"`."""
+"""Answers to `unknown="report"`."""
 
 Unknown = Literal["occupied", "free", "report"]
 FORMAT = "jcr.map/1"
-"""Of the file that `SceneMap.save` writes and map_file.py reads."""
+"""Format of the file that `SceneMap.save` writes and map_file.py reads."""
 
 
 class SceneMap:
@@ -49,15 +49,15 @@ class SceneMap:
     ) -> None:
         self.fields, self.seen, self.label_names = fields.requires_grad_(False).eval(), seen, label_names
         self.history = history or {}
-        """How the map was trained: preset, steps, seconds."""
+        """Preset, steps and seconds of the training."""
         self.properties = tuple(name for shape in fields.shapes for name in shape.heads)
-        """What the fields know: occupancy, color, and label or further values where they were given."""
+        """Properties of the fields: occupancy, color, and label or further values where they were given."""
         self.fields.spread("occupancy")
         self._distance: dict[str, DistanceGrid] = {}
         self._lock = threading.Lock()
 
     def _repr_html_(self) -> str:
-        """A table, for notebooks."""
+        """Return a table for notebooks."""
         lower, upper = self.box.round(3).tolist()
         rows = [
             ("workspace", f"{lower} to {upper} m, base frame"),
@@ -97,9 +97,9 @@ class SceneMap:
     def query(
         self, x_in_base: Float[ndarray, "n 3"] | Float[Tensor, "n 3"], unknown: Unknown = "report"
     ) -> Sample:
-        """Everything the map knows at points (n,3) m; tensors are answered with (differentiable) tensors.
+        """Query the map at points (n,3) m; tensors are answered with (differentiable) tensors.
 
-        `unknown` says how places that nobody has seen count in `occupancy` and `distance`: as solid, as empty,
+        `unknown` is how unseen places count in `occupancy` and `distance`: as solid, as empty,
         or (report) as one half and as no surface. Raises InputError on a wrong shape or a value that is not
         finite.
         """
@@ -113,9 +113,9 @@ class SceneMap:
         radii: Float[ndarray, "..."] | float,
         unknown: Unknown = "occupied",
     ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
-        """Whether spheres at (…,3) with radii (broadcast to …) in metres touch something.
+        """Test whether spheres at (…,3) with radii (broadcast to …) in metres touch something.
 
-        With `unknown` "occupied" a sphere that reaches where nobody has looked, or out of the workspace,
+        With `unknown` "occupied" a sphere that reaches unseen space, or out of the workspace,
         touches; with "free" only seen surfaces count; "report" answers FREE, OCCUPIED or UNKNOWN (0, 1, 2).
         Raises InputError on a wrong shape, a value that is not finite or a negative radius.
         """
@@ -145,7 +145,7 @@ class SceneMap:
         radii: Float[ndarray, "..."] | float,
         unknown: Unknown = "occupied",
     ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
-        """Whether spheres swept from starts to ends (…,3) touch something; answers and raises as `check_spheres`.
+        """Test whether spheres swept from starts to ends (…,3) touch something; answers and raises as `check_spheres`.
 
         The sweep is checked at steps of half a cell, so an obstacle's corner may be overlooked by
         r - sqrt(r² - (cell/4)²): 0.2 mm for a radius of 2 cm at the default cell.
@@ -172,7 +172,7 @@ class SceneMap:
         base_from_robot: Float[ndarray, "4 4"] | None = None,
         ignore_links: tuple[str, ...] = (),
     ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
-        """Whether a robot touches something at joint values (…,dof); answers as `check_spheres`.
+        """Test whether a robot touches something at joint values (…,dof); answers as `check_spheres`.
 
         `robot` is a URDF file, or what `jcr.scene.robot.load_robot` made of it: spheres that cover the
         collision shapes. Joint values (rad, m) are in the order of `RobotSpheres.joint_names` (as in the URDF),
@@ -191,6 +191,7 @@ class SceneMap:
     def _touches(
         self, x: Float[Tensor, "n 3"], radius: Float[Tensor, " n"], unknown: str
     ) -> Bool[Tensor, " n"]:
+        """Test spheres with unknown space "occupied" or "free"."""
         grid, (lower, upper) = self.distance_grid(unknown), self.seen.box
 
         def touches(x: Tensor, radius: Tensor) -> tuple[Tensor]:
@@ -205,16 +206,16 @@ class SceneMap:
         return in_chunks(touches, x, radius)[0]
 
     def distance_grid(self, unknown: str) -> DistanceGrid:
-        """Signed distance on the nodes of the workspace, worked out once for each way to count the unknown."""
+        """Return the signed distance on the nodes of the workspace, computed once for each way to count the unknown."""
         with self._lock:
             if unknown not in self._distance:
                 self._distance[unknown] = self._transform(unknown)
             return self._distance[unknown]
 
     def _transform(self, unknown: str) -> DistanceGrid:
-        """The distance transform of the field, with the unknown as solid or as empty.
+        """Return the distance transform of the field, with the unknown as solid or as empty.
 
-        Up to two cells behind a seen surface the field's word is taken in either case, though no ray passed
+        Up to two cells behind a seen surface the field decides in either case, though no ray passed
         there: a surface without thickness would slip through the grid.
         """
         skin = dilate(halve((self.seen.state & HIT) != 0), 2)
@@ -236,6 +237,7 @@ class SceneMap:
         )
 
     def _points(self, x: ndarray | Tensor, what: str) -> Float[Tensor, "n 3"]:
+        """Return points on the map's device; raise InputError for a wrong shape or numbers that are not finite."""
         if np.ndim(x) != 2 or x.shape[1] != 3:
             raise InputError(f"{what}: expected an array of shape (n, 3) in metres, got {tuple(np.shape(x))}")
         tensor = torch.as_tensor(x, dtype=torch.float32, device=self.seen.lower.device)
@@ -261,7 +263,7 @@ class SceneMap:
 
 
 def digest(tensors: dict[str, Tensor]) -> str:
-    """Of all numbers of a map: a bit that flipped in its weights would else answer a planner wrongly."""
+    """Return a digest of all numbers of a map, which detects a changed bit in its weights."""
     total = blake2b(digest_size=16)
     for name in sorted(tensors):
         total.update(name.encode() + tensors[name].numpy().tobytes())
@@ -269,7 +271,7 @@ def digest(tensors: dict[str, Tensor]) -> str:
 
 
 def scene_of(tensors: dict[str, Tensor], about: dict[str, Any]) -> SceneMap:
-    """The map of what `save` put in a file; raises KeyError, ValueError and their like for anything else."""
+    """Return the map that `save` wrote; raise KeyError, ValueError or similar for other content."""
     seen = SeenGrid(tensors.pop("lower"), about["cell"], tensors.pop("seen"))
     lattices = [
         Lattice(seen.lower, cell, tuple(shape), tensors[f"fields.lattices.{k}.nodes"])
@@ -285,7 +287,7 @@ def scene_of(tensors: dict[str, Tensor], about: dict[str, Any]) -> SceneMap:
 
 
 def _worst(states: Bool[ndarray, "*batch k"] | UInt8[ndarray, "*batch k"], unknown: str) -> ndarray:
-    """Of the k answers for one thing, the answer for all of it."""
+    """Return the answer for each body from the k answers of its spheres."""
     if unknown == "report":
         surface, unseen = (states == OCCUPIED).any(-1), (states == UNKNOWN).any(-1)
         return np.where(surface, OCCUPIED, np.where(unseen, UNKNOWN, FREE)).astype(np.uint8)
@@ -293,5 +295,6 @@ def _worst(states: Bool[ndarray, "*batch k"] | UInt8[ndarray, "*batch k"], unkno
 
 
 def _check_choice(unknown: str) -> None:
+    """Raise InputError for an unknown way to count unseen space."""
     if unknown not in ("occupied", "free", "report"):
         raise InputError(f"unknown={unknown!r}: choose occupied, free or report")

@@ -1,8 +1,8 @@
-"""What the rays saw: every cell of the workspace is crossed by a ray, hit by one, both, or unseen.
+"""Grid of seen space: every cell of the workspace is crossed by a ray, hit by one, both, or unseen.
 
 Each point is a ray from its camera: all before it is free, the point is surface, all behind it is unseen. Of a point
-that rests on a prior only the surface counts: nobody has seen that the way to it is free. A field
-alone cannot know this: trained on surfaces, it calls the inside of every object free.
+that rests on a prior only the surface counts, because no ray showed free space before it. A field
+alone cannot represent this: trained on surfaces, it calls the inside of every object free.
 """
 
 from dataclasses import dataclass
@@ -36,12 +36,12 @@ class SeenGrid:
         return torch.stack([self.lower, self.lower + self.size])
 
     def at(self, x_in_base: Float[Tensor, "n 3"]) -> UInt8[Tensor, " n"]:
-        """The states at points (n,3); outside of the box everything is unseen."""
+        """Return the states at points (n,3); outside of the box everything is unseen."""
         index, inside = self.index(x_in_base)
         return torch.where(inside, self.state.view(-1)[index], 0)
 
     def index(self, x_in_base: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, " n"], Bool[Tensor, " n"]]:
-        """Flat indices of the cells that hold the points, and whether they lie in the box (else the index is 0)."""
+        """Return flat indices of the cells that hold the points, and whether they lie in the box (else index 0)."""
         nz, ny, nx = self.state.shape
         # A point beyond int32, or NaN, must not wrap into the box.
         at = ((x_in_base - self.lower) * (1.0 / self.cell)).nan_to_num(-1.0).clamp(-1.0, 1e6).floor().int()
@@ -51,7 +51,7 @@ class SeenGrid:
 
 
 def without_doubts(seen: SeenGrid) -> SeenGrid:
-    """The seen grid without what its rays leave open: a ray shows its line, not the whole of a cell.
+    """Return the seen grid without cells that its rays leave open: a ray shows its line, not the whole cell.
 
     Next to the unseen, the rest of a crossed cell may belong to a thing that gave no points there, unless a surface
     was found in this very cell. And where a surface ends beside such a cell, the thing that it belongs to goes on:
@@ -66,7 +66,7 @@ def without_doubts(seen: SeenGrid) -> SeenGrid:
 
 
 def dilate(mask: Bool[Tensor, "nz ny nx"], cells: int) -> Bool[Tensor, "nz ny nx"]:
-    """The mask grown by this many cells along every axis."""
+    """Return the mask grown by this many cells along every axis."""
     for axis in range(3):
         grown, n = mask.clone(), mask.shape[axis]
         for step in range(1, min(cells, n - 1) + 1):
@@ -77,7 +77,7 @@ def dilate(mask: Bool[Tensor, "nz ny nx"], cells: int) -> Bool[Tensor, "nz ny nx
 
 
 def halve(mask: Bool[Tensor, "nz ny nx"]) -> Bool[Tensor, "z y x"]:
-    """The mask at half the resolution: set where any of eight cells is."""
+    """Return the mask at half the resolution: set where any of eight cells is."""
     z, y, x = (n // 2 * 2 for n in mask.shape)
     for axis, n in enumerate((z, y, x)):
         mask = mask.narrow(axis, 0, n).unflatten(axis, (n // 2, 2))

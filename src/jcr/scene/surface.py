@@ -16,10 +16,10 @@ from jcr.scene.seen import HIT, SeenGrid, dilate
 def surface_mesh(
     scene: SceneMap,
 ) -> tuple[Float[ndarray, "v 3"], Integer[ndarray, "f 3"], UInt8[ndarray, "v 3"]]:
-    """Vertices (v,3) m in the base frame, triangles (f,3) facing free space, and RGB of the vertices (v,3).
+    """Return vertices (v,3) m in the base frame, triangles (f,3) facing free space, and RGB of the vertices (v,3).
 
     Marching cubes (scikit-image) on the logit of occupancy at steps of half a cell. Behind each surface, where
-    nobody has looked, the field crosses one half again: only triangles where rays ended are kept.
+    no ray passed, the field crosses one half again: only triangles where rays ended are kept.
     Raises InputError where there are none.
     """
     seen = scene.seen

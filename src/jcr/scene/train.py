@@ -1,4 +1,4 @@
-"""Training: one loop fits a field of either preset to the rays, until validation rays are explained no better."""
+"""Training of a field on rays, until the loss on validation rays stops falling."""
 
 import time
 from collections.abc import Callable
@@ -28,7 +28,7 @@ class Recipe:
     grids: tuple[tuple[int, int], ...]
     """(lattice of `feature_lattices`, features) that occupancy interpolates in."""
     surface_grids: tuple[tuple[int, int], ...]
-    """The same for what is known on surfaces only."""
+    """(lattice, features) of the properties of surfaces."""
     rays: bool
     """Samples along the rays, instead of uniform negatives alone."""
     layer_rate: float
@@ -79,7 +79,7 @@ def train(
     max_seconds: float,
     report: Callable[[float], None],
 ) -> int:
-    """Fit a field to the rays until the loss on validation rays stops falling; gives the number of steps."""
+    """Fit a field to the rays until the loss on validation rays stops falling; return the number of steps."""
     device, start = rays.x.device, time.perf_counter()
     generator = torch.Generator(device).manual_seed(seed)
     field.standardise(rays.targets)
@@ -121,7 +121,7 @@ def train(
 
 
 def total_loss(field: Field, samples: Samples) -> Tensor:
-    """Binary cross-entropy of occupancy, cross-entropy of labels, squared error of all else, weighted by point.
+    """Return the weighted loss: binary cross-entropy of occupancy, cross-entropy of labels, squared error of others.
 
     Squared errors are in units of the value's variance, so that neither metres nor kelvins drown the rest.
     """
@@ -152,7 +152,7 @@ class Adam:
 
     @torch.no_grad()
     def step(self) -> None:
-        """One step down the gradients, which it clears."""
+        """Make one step down the gradients, and clear them."""
         gradients = [p.grad for p in self.parameters if p.grad is not None]
         adam(
             list[Tensor](self.parameters),
@@ -175,6 +175,7 @@ class Adam:
 
 
 def _has_bfloat16(device: torch.device) -> bool:
+    """Test whether the device multiplies matrices in bfloat16."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported()
     return bool(torch.cpu.get_capabilities().get("avx512_bf16", False))

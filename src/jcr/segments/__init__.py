@@ -1,0 +1,1 @@
+"""Segmentation of a scene and measurement of its objects."""

@@ -28,7 +28,7 @@ class LabelImages:
 
 
 def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages | None:
-    """The capture's `labels/NAME.png` (8 or 16 bit, the image's size, 0 = none); None where there are none.
+    """Read the capture's `labels/NAME.png` (8 or 16 bit, the image's size, 0 = none); None where there are none.
 
     `labels/names.json` may name them: {"1": "mug", …}. Raises InputError when the labels of a registered image
     are missing or unreadable, have another size than the image, or go beyond 1023.
@@ -53,6 +53,7 @@ def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages
 
 
 def _read(path: Path, capture: Capture, image: str) -> Int[ndarray, "h w"]:
+    """Read the labels of an image; raise InputError where they are missing or do not fit it."""
     if not path.is_file():
         raise InputError(
             f"{path}: not found; give labels for every image of the capture, or for none ({image})"
@@ -70,7 +71,7 @@ def _read(path: Path, capture: Capture, image: str) -> Int[ndarray, "h w"]:
 
 
 def _on_pointmap(label: Int[ndarray, "h w"], reconstruction: Reconstruction) -> Int[ndarray, "r c"]:
-    """The label nearest to where each pixel of the pointmap lies in the capture's image."""
+    """Return the nearest label of the capture's image at each pixel of the pointmap."""
     camera, grid = reconstruction.intrinsics, reconstruction.dense.intrinsics
     x_px, y_px = np.moveaxis(project(camera, rays(grid)).astype(np.float32), -1, 0)
     nearest = cv2.remap(label.astype(np.uint16), x_px, y_px, cv2.INTER_NEAREST, borderValue=0)
@@ -78,6 +79,7 @@ def _on_pointmap(label: Int[ndarray, "h w"], reconstruction: Reconstruction) -> 
 
 
 def _read_names(path: Path) -> dict[int, str]:
+    """Read the names of labels; none without a file."""
     if not path.is_file():
         return {}
     try:

@@ -1,4 +1,4 @@
-"""What stands on the table, in metres: the paper's heights, and footprint, box and how sure they are."""
+"""Measurement of objects on the support plane: height, footprint and box with standard deviations."""
 
 from dataclasses import dataclass
 
@@ -15,15 +15,15 @@ from jcr.segments.tabletop import FEWEST, Support, support_plane
 SHARPEST = 0.0005
 """Metres; heights are separated no finer than this, nor than twice the roughness of the plane."""
 TOP_SHARE = 0.25
-"""Of an object's mean density along its height that its top has at least: stray points above it have less."""
+"""Least density of a top as a share of the object's mean density along its height; stray points have less."""
 CELL = 0.003
 """Side (m) of the cells in which the density of an object seen from above is counted."""
 EDGE_SHARE = 0.4
-"""Of the median density seen from above below which a cell holds the fringe of wrong depths beside an outline."""
+"""Share of the median density seen from above, below which a cell holds wrong depths beside an outline."""
 SIDE_SHARE = 0.005
-"""Of the area seen from above that lies beyond each side, where noise has put it."""
+"""Share of the area seen from above that noise has put beyond each side."""
 SAME_TOP = 0.05
-"""Of the height by which images left out may move the top (jackknife) when it is the same top they show."""
+"""Largest jackknife deviation, as a share of the height, of a top that several images show."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +71,7 @@ class _Shape:
 
 
 def measure(cloud: PointCloud, scale_std: float = 0.0, support: Support | None = None) -> Measured:
-    """Sizes of all labelled objects above the support plane.
+    """Measure all labelled objects above the support plane.
 
     The support plane's own label, and label 0, are no objects. `scale_std` is the relative uncertainty (one
     sigma) of the calibration's scale. Standard deviations are the jackknife's over images (Efron and Stein
@@ -113,6 +113,7 @@ def _size(
     support: Support,
     scale_std: float,
 ) -> ObjectSize:
+    """Return the size of an object with its jackknife over images; `parts` have top and sides without each image."""
     size = np.array([*shape.sides, shape.top])
     bent = np.sqrt(max(support.noise**2 - support.roughness**2, 0.0))
     own = np.array([CELL / 2, CELL / 2, np.hypot(bent, shape.spread / np.sqrt(max(len(parts), 1)))])
@@ -139,7 +140,7 @@ def _size(
 
 
 def _without_each(values: Float[ndarray, " n"], image: Int[ndarray, " n"]) -> dict[int, float]:
-    """Mean of the values of all images but one, for each image left out."""
+    """Return the mean of the values of all images but one, for each image left out."""
     total, count = np.bincount(image, values), np.bincount(image)
     left = len(values) - count
     return {int(k): float((values.sum() - total[k]) / left[k]) for k in np.flatnonzero(count) if left[k] > 0}
@@ -148,6 +149,7 @@ def _without_each(values: Float[ndarray, " n"], image: Int[ndarray, " n"]) -> di
 def _shape(
     x_in_support: Float[ndarray, "n 3"], roughness: float, rotation_rad: float | None = None
 ) -> _Shape:
+    """Return top, box and outline of an object; its rotation is estimated where it is not given."""
     top, spread = _top(x_in_support[:, 2], roughness)
     xy, area = _dense(x_in_support[:, :2])
     middle = xy.mean(0)
@@ -168,12 +170,12 @@ def _shape(
 
 
 def _outline(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "k 2"]:
-    """Convex hull in single precision, which near the origin is exact enough."""
+    """Return the convex hull in single precision, which is exact enough near the origin."""
     return cv2.convexHull(xy.astype(np.float32))[:, 0].astype(np.float64)
 
 
 def _rotation_to_longer_side(hull: Float[ndarray, "k 2"]) -> float:
-    """Radians to the longer side of the smallest rectangle around a convex outline."""
+    """Return the angle (rad) to the longer side of the smallest rectangle around a convex outline."""
     rotation_rad = float(np.radians(cv2.minAreaRect(hull.astype(np.float32))[2]))
     length, width = np.ptp(hull @ _axes(rotation_rad).T, axis=0)
     return rotation_rad + np.pi / 2 * (length < width)
@@ -202,7 +204,7 @@ def _top(height: Float[ndarray, " n"], roughness: float) -> tuple[float, float]:
 
 
 def _counted(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "c r"]:
-    """Points in each cell of the map from above, with an empty cell all around."""
+    """Return the number of points in each cell seen from above, with an empty cell all around."""
     cell = np.floor((xy - xy.min(0)) / CELL).astype(int) + 1
     shape = cell.max(0) + 2
     flat = np.ravel_multi_index(tuple(cell.T), shape)
@@ -210,7 +212,7 @@ def _counted(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "c r"]:
 
 
 def _dense(xy: Float[ndarray, "n 2"]) -> tuple[Float[ndarray, "k 2"], Float[ndarray, " k"]]:
-    """The points without the thin fringe around them, and the share of a cell that each stands for."""
+    """Return the points without the thin fringe around them, and the share of a cell that each represents."""
     count = _counted(xy)
     cell = tuple((np.floor((xy - xy.min(0)) / CELL).astype(int) + 1).T)
     smooth = gaussian_filter(count, 0.5, mode="constant")
@@ -221,6 +223,7 @@ def _dense(xy: Float[ndarray, "n 2"]) -> tuple[Float[ndarray, "k 2"], Float[ndar
 
 
 def _axes(rotation_rad: float) -> Float[ndarray, "2 2"]:
+    """Return the rows of axes rotated from x and y."""
     return np.array(
         [[np.cos(rotation_rad), np.sin(rotation_rad)], [-np.sin(rotation_rad), np.cos(rotation_rad)]]
     )

@@ -1,4 +1,4 @@
-"""What divides a scene into objects, apart from the code that does it so that the command line stays quick."""
+"""Options of segmentation, in a module of their own so that the command line's help imports no SciPy."""
 
 from dataclasses import dataclass, field
 from typing import Annotated, Literal

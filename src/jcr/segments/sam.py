@@ -43,7 +43,7 @@ OVERLAP = 0.5
 
 
 def load_sam(weights: str) -> "Sam2Model":
-    """Segment Anything 2 by hub id or path; InputError, with the remedy, where it is not on this machine or damaged."""
+    """Load Segment Anything 2 by hub id or path; raise InputError where it is missing or damaged."""
     extra("transformers", "sam", "--segments sam")
     from transformers import Sam2Model, logging
 
@@ -75,7 +75,7 @@ def load_sam(weights: str) -> "Sam2Model":
 def sam_labels(
     model: "Sam2Model", reconstruction: Reconstruction, hand_eye: HandEye, progress: Progress | None = None
 ) -> LabelImages:
-    """Labels at the pointmaps' pixels: masks of all images, merged into objects by their overlap in space."""
+    """Return labels at the pointmaps' pixels: masks of all images, merged into objects by their overlap in space."""
     masks, dense = [], reconstruction.dense
     for k, image in enumerate(dense.colors):
         if progress:
@@ -89,7 +89,7 @@ def sam_labels(
 
 @torch.no_grad()
 def image_masks(model: "Sam2Model", image: UInt8[ndarray, "h w 3"]) -> Bool[ndarray, "k h w"]:
-    """Masks of everything that the network finds in one image, best first.
+    """Return masks of everything that the network finds in one image, best first.
 
     Prompts are points on a regular grid; of the three masks for each, the one of highest quality is taken.
     """
@@ -121,7 +121,7 @@ def image_masks(model: "Sam2Model", image: UInt8[ndarray, "h w 3"]) -> Bool[ndar
 
 
 def _distinct(masks: Bool[Tensor, "k h w"]) -> Bool[Tensor, "j h w"]:
-    """The masks without those that repeat an earlier one."""
+    """Return the masks without those that repeat an earlier one."""
     flat = masks.flatten(1).float()
     area = flat.sum(1)
     shared = flat @ flat.T
@@ -136,7 +136,7 @@ def _distinct(masks: Bool[Tensor, "k h w"]) -> Bool[Tensor, "j h w"]:
 def merged(
     masks: list[Bool[ndarray, "_ h w"]], x_in_base: Float[ndarray, "m h w 3"], known: Bool[ndarray, "m h w"]
 ) -> LabelImages:
-    """Labels (m,h,w) of the objects that the masks of m images show, 1 for the largest; 0 = none.
+    """Return labels (m,h,w) of the objects that the masks of m images show, 1 for the largest; 0 = none.
 
     Two masks of different images are one object when they fill the same cells of space, of those that both
     images see. What one image alone shows is no object, where there are several images.

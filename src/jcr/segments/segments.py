@@ -1,4 +1,4 @@
-"""Where the segments come from: the user's label images, the geometry, or Segment Anything."""
+"""Selection of the segments: label images of the user, geometry, or Segment Anything."""
 
 from jcr.errors import InputError
 from jcr.progress import Progress
@@ -15,7 +15,7 @@ def image_labels(
     options: SegmentOptions,
     progress: Progress | None = None,
 ) -> LabelImages | None:
-    """Labels at the pointmaps' pixels; None where the geometry is to tell, or nothing.
+    """Return labels at the pointmaps' pixels; None where geometry or nothing labels the cloud.
 
     Raises InputError when label images are asked for and missing, or Segment Anything cannot be loaded.
     """
@@ -37,7 +37,7 @@ def image_labels(
 def label_cloud(
     cloud: PointCloud, options: SegmentOptions, support: Support | None = None
 ) -> tuple[PointCloud, tuple[str, ...]]:
-    """The cloud with labels from its geometry, where nothing else gave any, and what the user should know of it.
+    """Return the cloud with labels from its geometry, where nothing else gave any, and notes for the user.
 
     `support` is found here where it is not given. Raises InputError when the tabletop was asked for and no plane
     carries the scene.

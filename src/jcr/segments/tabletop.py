@@ -1,4 +1,4 @@
-"""Segments from geometry alone: the plane that carries the scene, and what stands on it."""
+"""Segmentation by geometry: the support plane, and the objects on it."""
 
 from dataclasses import dataclass, replace
 
@@ -24,12 +24,12 @@ class Support:
     noise: float
     """Robust one-sigma distance (m) of the plane's points from it."""
     roughness: float
-    """The same about the surface that neighbouring points form, which leaves the plane where the table is bent."""
+    """Robust distance (m) from the surface of neighbouring points, which leaves the plane where the table is bent."""
     on_plane: Bool[ndarray, " n"]
     """Points of the cloud that lie on it."""
 
     def height(self, x_in_base: Float[ndarray, "n 3"]) -> Float[ndarray, " n"]:
-        """Metres above the plane."""
+        """Return the height (m) of points (n,3) above the plane."""
         return apply(inverse(self.base_from_support), x_in_base)[:, 2]
 
 
@@ -52,7 +52,7 @@ PLANES, SAMPLE = 400, 20_000
 
 
 def support_plane(cloud: PointCloud) -> Support:
-    """The plane with most points on it that has the cameras on one side (RANSAC, then robust least squares).
+    """Fit the plane with most points on it that has the cameras on one side (RANSAC, then robust least squares).
 
     What was filled in by planes is left out of the fit and its noise: it lies on planes by construction.
     Raises InputError when no plane holds a tenth of the points.
@@ -113,14 +113,14 @@ def support_plane(cloud: PointCloud) -> Support:
 
 
 def _noise(distance: Float[ndarray, " n"]) -> float:
-    """Robust sigma: 1.4826 times the median absolute deviation."""
+    """Return a robust standard deviation: 1.4826 times the median absolute deviation."""
     return float(1.4826 * np.median(np.abs(distance - np.median(distance))))
 
 
 def label_tabletop(
     cloud: PointCloud, options: TabletopOptions | None = None, support: Support | None = None
 ) -> PointCloud:
-    """The cloud with label 1 on the support plane and 2, 3, … on the objects that stand on it, largest first.
+    """Return the cloud with label 1 on the support plane and 2, 3, … on the objects that stand on it, largest first.
 
     Objects are separated seen from straight above: what lies over one another is one object, and so are objects
     that touch. Raises InputError when no plane carries the scene.
@@ -153,7 +153,7 @@ def label_tabletop(
 
 
 def _parts(cell: Int[ndarray, "k 2"], shape: tuple[int, ...]) -> Int[ndarray, "c r"]:
-    """Connected cells (from 1) of the map from above that hold more than a few stray points."""
+    """Return connected cells (from 1) seen from above that hold more than a few stray points."""
     count = np.zeros(shape)
     np.add.at(count, tuple(cell.T), 1)
     enough = max(FEWEST_IN_CELL, STRAY_SHARE * float(np.median(count[count > 0])))
@@ -167,7 +167,7 @@ def _objects(
     bare: Bool[ndarray, " n"],
     options: TabletopOptions,
 ) -> Int[ndarray, " n"]:
-    """Number of the object of each point, from 1 for the one with most points; 0 = none.
+    """Return the object of each point, from 1 for the one with most points; 0 = none.
 
     `bare` are the points of the plane that lie beneath nothing.
     """
@@ -197,7 +197,7 @@ def _objects(
 def _joined(
     part: Int[ndarray, " n"], x_in_support: Float[ndarray, "n 3"], options: TabletopOptions
 ) -> Int[ndarray, " n"]:
-    """Parts of one object made one: outlines that overlap, and small parts in the air close to a larger one.
+    """Join parts of one object: outlines that overlap, and small parts in the air close to a larger one.
 
     The two sides of a ring seen from either side, the far rim of a cup, its handle.
     """

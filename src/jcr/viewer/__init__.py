@@ -1,0 +1,1 @@
+"""3D view of a run in the browser."""
