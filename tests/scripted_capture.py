@@ -50,6 +50,8 @@ class Scripted:
     arm: None = None
     accurate_from: int = 100
     contradicted: str | None = None
+    warns: bool = False
+    """Whether the calibration at the end has a warning."""
     fault: Exception | None = None
     """Raised by the next update."""
     finished: int = 0
@@ -94,7 +96,8 @@ class Scripted:
     def finish(self) -> Any:
         self.finished += 1
         requirement = a_hand_eye(True).requirement
-        hand_eye = SimpleNamespace(requirement=requirement, findings=())
+        blurred = Finding.of(Kind.BLURRED, "warns", "images", "images/000.png", value=5.0)
+        hand_eye = SimpleNamespace(requirement=requirement, findings=(blurred,) if self.warns else ())
         return SimpleNamespace(
             converged=True, hand_eye=hand_eye, verdict="accepted", out=self.live.folder / "result"
         )

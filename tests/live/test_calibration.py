@@ -17,9 +17,13 @@ import jcr
 from jcr.capture.images import read_image
 from jcr.geometry import inverse, rotation_exp, step_between, transform
 from jcr.live.calibration import LiveCalibration, checked_image
-from jcr.live.progress import Progress
+from jcr.live.notation import Notation
+from jcr.live.page import page_content
+from jcr.live.progress import Progress, next_lines
+from jcr.live.session import SessionState
 from jcr.reconstruct import ReconstructOptions, reconstruct
 from jcr.records import Kind
+from jcr.records.words import sentence
 
 REQUIRED = (2.0, 0.3)
 
@@ -199,6 +203,26 @@ def test_each_fault_is_named_at_the_image_where_it_happens(resumed: LiveCalibrat
     assert Kind.BLURRED in against(blurred) and Kind.POSE_CONTRADICTS_IMAGE not in against(blurred)
     # What is wrong with single images has not harmed the others.
     assert blurred.hand_eye is not None and blurred.hand_eye.converged
+
+
+@pytest.mark.slow
+def test_a_robot_whose_model_is_refused_gives_no_joint_targets_and_is_named_once(grown, tmp_path: Path):
+    folder = shutil.copytree(grown[0], tmp_path / "capture")
+    content, rng = json.loads((folder / "capture.json").read_text()), np.random.default_rng(0)
+    content["robot"] = "ur5e"
+    for frame in content["frames"]:
+        frame["joints"] = rng.uniform(-1, 1, 6).tolist()
+    (folder / "capture.json").write_text(json.dumps(content))
+    with closing(LiveCalibration(folder)) as live:
+        state = live.update()
+        notation = Notation("ur", arm=live.arm)
+    assert [one.kind for one in state.findings].count(Kind.ROBOT_UNUSED) == 1
+    assert state.next_pose is not None and state.next_joints is None
+    shown = "\n".join(next_lines(state, notation))
+    assert "joints" not in shown and "cannot reach" not in shown
+    page = page_content(SessionState(images=live.live.images, progress=state), REQUIRED, notation)
+    (warning,) = [sentence(one) for one in state.findings if one.kind is Kind.ROBOT_UNUSED]
+    assert [page.headline, *page.lines].count(warning[:1].upper() + warning[1:]) == 1
 
 
 def test_what_is_no_image_or_no_pose_is_named_with_its_remedy(tmp_path: Path, tabletop: Path):

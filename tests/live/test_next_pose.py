@@ -83,6 +83,25 @@ def test_each_refused_pose_is_followed_by_one_elsewhere_that_is_rotated_little(i
         attempts = replace(attempts, refused=(*attempts.refused, new))
 
 
+def test_a_proposed_pose_is_rotated_by_fifteen_degrees_or_more_from_every_image():
+    capture, _ = seen()
+    new = next_pose(Attempts(capture, np.arange(4)), None)
+    assert _rotations_deg(new, capture.base_from_gripper).min() > 15
+    # Two images more at such poses do not use up what is advised.
+    more = replace(
+        capture,
+        images=(*capture.images, "4.png"),
+        base_from_gripper=np.concatenate([capture.base_from_gripper, new[None]]),
+    )
+    again = next_pose(Attempts(more, np.arange(5)), None)
+    assert _rotations_deg(again, more.base_from_gripper).min() > 15
+
+
+def _rotations_deg(pose: ndarray, others: ndarray) -> ndarray:
+    trace = np.einsum("nij,ij->n", others[:, :3, :3], pose[:3, :3])
+    return np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+
+
 def test_an_image_that_did_not_register_counts_as_a_place_without_images():
     capture, _ = seen()
     first = next_pose(Attempts(capture, np.arange(4)), None)

@@ -3,8 +3,10 @@
 import http.client
 import json
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from jcr.live.progress import progress_lines
 from jcr.live.robot import RobotState
 from jcr.live.server import Listen, LiveServer
 from jcr.live.session import LiveSession
+from jcr.records import NextPose
 from scripted_capture import Scripted, a_capture, still_frames
 from waiting import until
 
@@ -93,6 +96,74 @@ def test_the_page_shows_each_state(capture: tuple[LiveSession, Scripted], tablet
             "± 1.0 mm" in done["head"]
             and str(live.folder.folder / "result").replace("<c>", "&lt;c&gt;") in done["head"]
         )
+
+
+def test_the_page_says_when_the_requirement_is_met_and_stops_proposing(
+    capture: tuple[LiveSession, Scripted], tabletop: Path
+):
+    live, scripted = capture
+    poses = jcr.read_capture(tabletop).base_from_gripper
+    proposed = NextPose(
+        base_from_gripper=poses[11], expected_std=np.ones(7), within_95_mm=1.0, rotation_95_deg=0.1, like=0,
+        moved_m=0.1, rotation_rad=0.5,
+    )  # fmt: skip
+    with LiveServer(live) as page:
+        for count, is_met in ((4, False), (5, True)):
+            add(live, scripted, tabletop, count)
+            live._report(replace(scripted.progress, next_pose=proposed, next_like="images/000.png"))
+            shown = parts(page)
+            assert ("verdict good" in shown["parts"]["head"]) is is_met
+            assert ("Requirement met, press Finish" in shown["parts"]["head"]) is is_met
+            assert ("100 mm and 29° from images/000.png" in shown["parts"]["next"]) is not is_met
+            assert bool(json.loads(shown["scene"])["next"]) is not is_met
+
+
+def test_a_capture_that_is_resumed_opens_without_a_red_message(
+    capture: tuple[LiveSession, Scripted], tmp_path: Path, tabletop: Path
+):
+    live, scripted = capture
+    add(live, scripted, tabletop, 5)
+    resumed, again = a_capture(live.folder.folder, live.camera.frames)
+    with LiveServer(resumed) as page:
+        head = parts(page)["parts"]["head"]
+        assert "5 images" in head and "being calibrated" in head and "verdict bad" not in head
+        resumed._report(again.update())
+        assert "verdict bad" not in parts(page)["parts"]["head"]
+
+
+def test_the_server_answers_until_the_page_has_the_result_and_its_report(
+    capture: tuple[LiveSession, Scripted], tabletop: Path
+):
+    live, scripted = capture
+    add(live, scripted, tabletop, 5)
+    scripted.warns = True
+    got: dict[str, Any] = {}
+
+    def read() -> None:
+        """Poll as the page does, slower than the end comes."""
+        version = -1
+        while "report" not in got:
+            state = parts(page, version)
+            if state["version"] == version:
+                continue
+            if state["has_report"]:
+                with asked(page, "GET", f"/{page.key}/report.html") as answer:
+                    got["report"] = answer.read().decode()
+                got["head"] = state["parts"]["head"]
+            version = state["version"]
+            time.sleep(0.5)
+        got["last"] = parts(page, version)["version"] == version
+
+    (live.folder.folder / "result").mkdir()
+    (live.folder.folder / "result" / "report.html").write_text("<p>the report</p>")
+    with LiveServer(live) as page:
+        reading = threading.Thread(target=read)
+        reading.start()
+        until(lambda: page._page_version >= 0 or page._page_s > 0)
+        live.finish()
+    reading.join()
+    assert got["report"] == "<p>the report</p>" and got["last"]
+    assert 'id="report"' in got["head"] and "images/000.png is blurred" in got["head"].lower()
 
 
 def test_only_the_page_itself_commands(capture: tuple[LiveSession, Scripted], tabletop: Path):

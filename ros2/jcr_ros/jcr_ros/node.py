@@ -49,12 +49,15 @@ class CalibratorNode(Node):
         self.calibrator = Calibrator(settings, self._gripper_now, self._show, self._publish, self._broadcast)
         group = ReentrantCallbackGroup()
         image = self._parameter("image_topic", "/camera/color/image_raw")
-        kind = CompressedImage if image.endswith("compressed") else Image
-        self.create_subscription(kind, image, self._image, qos_profile_sensor_data, callback_group=group)
+        self.create_subscription(
+            _kind(image), image, self._image, qos_profile_sensor_data, callback_group=group
+        )
         info = self._parameter("camera_info_topic", "/camera/color/camera_info")
         self.info = self.create_subscription(CameraInfo, info, self._camera_info, 10, callback_group=group)
         if depth:
-            self.create_subscription(Image, depth, self._depth, qos_profile_sensor_data, callback_group=group)
+            self.create_subscription(
+                _kind(depth), depth, self._depth, qos_profile_sensor_data, callback_group=group
+            )
         self.status = self.create_publisher(String, "~/status", 10)
         self.next_pose = self.create_publisher(PoseStamped, "~/next_pose", 1)
         services = {
@@ -152,6 +155,11 @@ def _answered(action: Callable[[], tuple[bool, str]], request: Any, response: An
     """Answer a service with the outcome of an action."""
     response.success, response.message = action()
     return response
+
+
+def _kind(topic: str) -> type:
+    """Return the type of messages of a topic."""
+    return CompressedImage if "compressed" in topic else Image
 
 
 def _seconds(stamp: Any) -> float:

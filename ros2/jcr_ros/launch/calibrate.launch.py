@@ -1,4 +1,4 @@
-"""The node, and RViz with the next pose: ros2 launch jcr_ros calibrate.launch.py image_topic:=… gripper_frame:=…"""
+"""Launch the node, and RViz with the next pose."""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
@@ -21,6 +21,7 @@ TEXT = {
 
 
 def generate_launch_description() -> LaunchDescription:
+    """Return the node with its parameters as launch arguments, and RViz."""
     arguments = [DeclareLaunchArgument(name, default_value=value) for name, value in TEXT.items()]
     arguments += [
         DeclareLaunchArgument("images", default_value="0"),

@@ -53,7 +53,7 @@ class Arguments:
     """V4L2 device number, realsense[:SERIAL], URL of a stream (rtsp://…), or a recording (video file, .bag)."""
     optics: CameraOptions = field(default_factory=CameraOptions)
     poses: Annotated[str, tyro.conf.arg(metavar="SOURCE")] = "http"
-    """Where gripper poses come from: ur:HOST[:PORT] (Universal Robots), franka:HOST, xarm:HOST, typed (by hand),
+    """Source of gripper poses: ur:HOST[:PORT] (Universal Robots), franka:HOST, xarm:HOST, typed (by hand),
     or http (a program sends them, jcr docs capture)."""
     pose_convention: ConventionName = "auto"
     """Notation of typed poses and of the printed next pose; auto: the arm's own."""
@@ -68,7 +68,7 @@ class Arguments:
     token: str | None = None
     """Key of the session instead of a random one; better set as JCR_TOKEN, which other users cannot see."""
     timeout: Annotated[float, tyro.conf.arg(metavar="S")] = 600.0
-    """With --poses http: stop after this many seconds without a pose."""
+    """Time limit for --poses http: stop after this many seconds without a pose."""
     intrinsics_from: Path | None = None
     """JSON file with the camera's "intrinsics" (a capture.json or calibration.json); unset: those stored in the camera
     (RealSense), otherwise estimated."""

@@ -1,0 +1,1 @@
+"""Captures taken at the robot and calibrated image by image."""

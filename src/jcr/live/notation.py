@@ -45,7 +45,8 @@ def pose_lines(
         lines = [named_numbers(pose, convention, notation.units)]
     if joints is not None:
         degrees = ", ".join(f"{value:.2f}" for value in np.degrees(joints))
-        lines.append(f"joints: {degrees} ° ({', '.join(f'{value:.4f}' for value in joints)} rad)")
+        lines.append(f"joints, °: {degrees}")
+        lines.append(f"joints, rad: {', '.join(f'{value:.4f}' for value in joints)}")
     return lines
 
 

@@ -60,7 +60,7 @@ class PageContent:
     headline: str
     """State in a few words."""
     lines: Sequence[str]
-    """What to do, and further findings."""
+    """Actions to take, and further findings."""
     replaces: int | None
     """Number of the image that the next one replaces."""
     is_over: bool
@@ -134,8 +134,10 @@ def page_content(
 
 
 def _next_lines(progress: Progress, notation: Notation) -> list[str]:
-    """Return the next pose as a person enters it; a line of a program would repeat the pose."""
-    return [line for line in next_lines(progress, notation) if not line.startswith("URScript")]
+    """Return the next pose as a person enters it; the lines of a program would repeat the pose."""
+    return [
+        line for line in next_lines(progress, notation) if not line.startswith(("URScript", "joints, rad"))
+    ]
 
 
 def _cards(state: SessionState) -> list[ImageCard]:

@@ -184,11 +184,13 @@ def _accuracy(state: Progress) -> str:
     """Return the accuracy beside what is required."""
     if state.now is None or state.hand_eye is None:
         return "no calibration yet"
-    required = state.hand_eye.requirement
     verdict = "" if state.hand_eye.is_sound else ", rejected"
-    limits = ""
+    required, limits = state.hand_eye.requirement, ""
     if required is not None:
-        met = "met" if state.requirement_met else "not met"
+        reached = "reached, but exceeded by the leave-one-out error"
+        if state.leave_one_out is None:
+            reached = f"reached, to be confirmed with {CONFIRMING_IMAGES} images"
+        met = "met" if state.requirement_met else reached if required.met else "not met"
         limits = f"; required {required.translation_mm:g} mm and {required.rotation_deg:g}°: {met}"
     mm, deg = significant(state.now.translation_mm), significant(state.now.rotation_deg)
     return f"± {mm} mm and {deg}° (95 % of errors of a seen point){verdict}{limits}"
