@@ -144,10 +144,11 @@ def test_a_scale_that_was_known_is_not_promised_again():
         recon_from_camera=cameras,
         is_metric=True,
     )
-    known = calibrate_poses(given)
+    asked = CalibrateOptions(next_poses=2)
+    known = calibrate_poses(given, asked)
     gripper = given.base_from_gripper
     assumptions = assumed_of_poses(known, gripper)
-    free = advised(known, gripper, CalibrateOptions(), errors_of(gripper), assumptions)
+    free = advised(known, gripper, asked, errors_of(gripper), assumptions)
     first, other = (found.next_poses[0].expected_std for found in (known, free))
     assert 1.02 * other[6] < first[6] and first[6] > 0.95 * np.sqrt(known.covariance[6, 6])
 

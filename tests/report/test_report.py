@@ -19,6 +19,7 @@ import jcr
 from chromium import Chromium
 from conftest import shrunk_capture
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file, failed_file
+from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.calibration.words import log
 from jcr.capture.formats.capture_json import kept
@@ -87,7 +88,7 @@ def run(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
         intrinsics=intrinsics,
     )
     reconstruction, label = _cast(truth, tabletop)
-    hand_eye = calibrate(capture, reconstruction)
+    hand_eye = calibrate(capture, reconstruction, CalibrateOptions(next_poses=2))
     content = calibration_file(capture, reconstruction, hand_eye, {"reconstruct": 1.0}, "0.0")
     names = ("none", *(f"<i>{thing.name}" for thing in truth.objects))
     cloud = point_cloud(capture, reconstruction, hand_eye, label, label_names=names)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.expected import Ahead, Assumptions, typical_noise, worse_of
-from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.options import MOST_POSES, CalibrateOptions
 from jcr.calibration.robot_errors import RobotErrors
 from jcr.calibration.seen import Scene, in_use, within_95
 from jcr.estimation.next_poses import assumed_camera
@@ -20,8 +20,6 @@ GRASPING = (5.0, 1.0)
 tip of a finger of 100 mm by 2 mm."""
 PROPOSED = 2
 """Gripper poses proposed after a calibration, if that is enough."""
-MOST = 12
-"""Poses that are proposed to reach what is required; of more, no number is given."""
 
 
 def advised(
@@ -32,8 +30,9 @@ def advised(
     assumptions: Assumptions,
     scene: Scene | None = None,
 ) -> HandEye:
-    """With what the motions show of each direction, how exact it is in use, the requirement, and the poses to add.
+    """Return the calibration with its excitation, its accuracy in use, the requirement, and the poses to add.
 
+    Poses are proposed where the requirement is not met or the user asks: the prediction takes a third of a calibration.
     `gripper` are the poses that the solver was given, in its order, `robot` is of these; `assumptions` are those of the
     calibration, `scene` is what the camera sees, where images were adjusted.
     """
@@ -43,8 +42,12 @@ def advised(
     # Wrong intrinsics and a bent robot stay what they are with further images.
     lasting = [one.covariance for one in hand_eye.findings if one.mend == "intrinsics" or one.kind in BENT]
     assumptions = replace(assumptions, faults=sum(lasting, start=np.zeros((7, 7))))
-    if hand_eye.converged:
-        reach, proposed = _worthwhile(hand_eye, used, required, assumptions, robot)
+    proposed = list[NextPose]()
+    if hand_eye.converged and required.met and not options.next_poses:
+        required = replace(required, more_images=0)
+    elif hand_eye.converged:
+        count = options.next_poses if required.met else max(PROPOSED, options.next_poses)
+        reach, proposed = _worthwhile(hand_eye, used, required, assumptions, robot, count)
         required = replace(required, more_images=reach)
     else:
         # A rejected X is not used, and a robot that is worse than usual is not expected to improve.
@@ -108,13 +111,14 @@ def _worthwhile(
     required: Requirement,
     assumptions: Assumptions,
     robot: RobotErrors,
+    least: int,
 ) -> tuple[int | None, list[NextPose]]:
-    """How many poses would reach what is required, and those poses, which shrink the reported uncertainty most.
+    """Return how many poses would reach the requirement, and those poses or `least`, the best first.
 
-    What is reported shrinks by the share by which what is expected does, for the very images and robot may do better or
-    worse than expected.
+    The reported uncertainty shrinks by the ratio by which the predicted one does: images and robot may be better or
+    worse than predicted.
     """
-    ahead = Ahead.of(assumptions, used, robot, PROPOSED if required.met else MOST)
+    ahead = Ahead.of(assumptions, used, robot, least if required.met else MOST_POSES)
     now, expected = ahead.expected(0), cache(ahead.expected)
 
     def shrunk(count: int, at: Where, mm: float, deg: float) -> tuple[float, float]:
@@ -126,12 +130,12 @@ def _worthwhile(
         return replace(required, reached_mm=mm, reached_deg=deg).met
 
     reach = 0 if required.met else None
-    if not required.met and is_met(MOST):
-        reach = next(count for count in range(1, MOST + 1) if is_met(count))
+    if not required.met and is_met(MOST_POSES):
+        reach = next(count for count in range(1, MOST_POSES + 1) if is_met(count))
     found, std = hand_eye.in_use, np.sqrt(np.diag(hand_eye.covariance))
     assert found is not None
     proposed = []
-    for count in range(1, max(PROPOSED, reach or 0) + 1):
+    for count in range(1, max(least, reach or 0) + 1):
         then = expected(count)
         mm, deg = shrunk(count, "seen", found.seen.within_95_mm, found.seen.rotation_95_deg)
         proposed.append(

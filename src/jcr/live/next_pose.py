@@ -104,9 +104,11 @@ def propose(
     """Return the next pose as fields of Progress, with the errors that the calibration found."""
     if not hand_eye.is_sound:
         return propose_before_calibration(attempts, reach, hand_eye)
-    used, pose = case.used, hand_eye.next_poses[0]
+    used, required = case.used, hand_eye.requirement
     rows = case.reconstruction.image_index[used]
-    required = hand_eye.requirement
+    if not hand_eye.next_poses:
+        return _best(assumptions, case.base_from_gripper[used], robot.of(used), attempts, rows, reach, False)
+    pose = hand_eye.next_poses[0]
     limited = required is not None and required.reached_deg > required.rotation_deg
     first = pose.base_from_gripper[None]
     is_free = reach.arm is None and reach.box is None and (not limited or attempts.is_apart(first)[0])
