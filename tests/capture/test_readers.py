@@ -464,7 +464,7 @@ def test_faults_of_samples_are_named(tmp_path: Path, problem: HandEyeProblem):
 def test_faults_of_given_cameras_are_named(tmp_path: Path, capture: Capture, problem: HandEyeProblem):
     folder = writers.write_colmap(tmp_path / "capture", capture, problem.recon_from_camera)
     (folder / "poses.csv").unlink()
-    with pytest.raises(jcr.InputError, match="no gripper poses; give --poses TABLE"):
+    with pytest.raises(jcr.InputError, match="holds no table of poses .*; name it with --poses"):
         jcr.read_capture(folder)
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "cameras.bin").write_bytes(b"nonsense")

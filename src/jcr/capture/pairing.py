@@ -44,35 +44,6 @@ def pair_with_images(folder: Path, file: Path, table: "PoseTable", options: Read
     return taken, table.base_from_gripper, (how,)
 
 
-def rows_of_images(
-    table: "PoseTable", file: Path, images: Sequence[str]
-) -> tuple[list[int], list[int], tuple[str, ...]]:
-    """Return which of the `images` a file of poses knows, by their names without folder and ending, and their rows.
-
-    Without names the rows are those of the images. Raises InputError where the file does not belong to the images.
-    """
-    every = list(range(len(images)))
-    if table.images is None:
-        if len(table.base_from_gripper) != len(images):
-            raise InputError(
-                f"{file}: {len(table.base_from_gripper)} poses for {len(images)} images; add a column with the "
-                "images' names"
-            )
-        return every, every, ()
-    row_of = {Path(name).stem: row for row, name in enumerate(table.images)}
-    if len(row_of) < len(table.images):
-        raise InputError(f"{file}: names an image more than once; keep one row per image")
-    known = [k for k in every if Path(images[k]).stem in row_of]
-    if not known:
-        raise InputError(
-            f"{file}: lists none of the images; it lists {table.images[0]}, the images are called {images[0]}"
-        )
-    notes = ()
-    if unknown := len(images) - len(known):
-        notes = (f"{unknown} of {len(images)} images have no gripper pose in {file.name}: left out",)
-    return known, [row_of[Path(images[k]).stem] for k in known], notes
-
-
 def paired_by_name(
     names: Sequence[str], poses: Float[ndarray, "n 4 4"]
 ) -> dict[bool, Float[ndarray, "n 4 4"]]:

@@ -13,11 +13,9 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.camera import HALF_PIXEL
-from jcr.capture.checks import checked_capture, checked_intrinsics
-from jcr.capture.formats import Format
-from jcr.capture.formats.table import find_table, read_pose_table
+from jcr.capture.checks import checked_intrinsics
+from jcr.capture.formats import Format, table
 from jcr.capture.options import ReadOptions
-from jcr.capture.pairing import rows_of_images
 from jcr.capture.plain_files import contained
 from jcr.errors import InputError
 from jcr.geometry import inverse, transform
@@ -60,18 +58,28 @@ def read(path: Path, options: ReadOptions) -> Capture:
     for name in names:
         beside = f"images/{name}"
         located.append(beside if contained(root, beside, str(folder)).is_file() else name)
-    file = options.poses or find_table(root)
-    if file is None:
-        raise InputError(f"{root}: the cameras' poses are here, but no gripper poses; give --poses TABLE")
-    table = read_pose_table(file, options)
-    known, rows, notes = rows_of_images(table, file, located)
-    faults = {k: table.faults[row] for k, row in enumerate(rows) if row in table.faults}
-    poses = table.base_from_gripper[rows]
-    capture, kept = checked_capture(root, [located[k] for k in known], poses, str(folder), faults)
-    of_capture = {names[known[k]] for k in kept}
-    intrinsics = _common_intrinsics(model, of_capture, folder, capture.image_size)
-    notes = (*notes, *capture.notes)
-    return replace(capture, intrinsics=intrinsics, source=folder, cameras=folder, notes=notes)
+    whole = table.read(root, options)
+    rows = [k for k, name in enumerate(whole.images) if name in located]
+    if not rows:
+        raise InputError(
+            f"{whole.source}: lists none of the model's images; it lists {whole.images[0]}, the model {located[0]}"
+        )
+    images = tuple(whole.images[k] for k in rows)
+    notes = whole.notes
+    if unknown := len(located) - len(rows):
+        notes = (f"{unknown} of {len(located)} images of the model have no gripper pose: left out", *notes)
+    return replace(
+        whole,
+        images=images,
+        base_from_gripper=whole.base_from_gripper[rows],
+        depths=None if whole.depths is None else tuple(whole.depths[k] for k in rows),
+        intrinsics=_common_intrinsics(
+            model, {names[located.index(name)] for name in images}, folder, whole.image_size
+        ),
+        source=folder,
+        cameras=folder,
+        notes=notes,
+    )
 
 
 def read_model(folder: Path) -> "pycolmap.Reconstruction":
