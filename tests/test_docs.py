@@ -168,7 +168,7 @@ def test_the_schema_of_captures_takes_ours_and_knows_every_key_that_is_read():
     assert not valid.is_valid({"frames": [{"image": "a.png"}]})
     source = "\n".join(
         (SOURCE / "capture" / file).read_text()
-        for file in ("formats/capture_json.py", "cell_cameras.py", "camera_json.py")
+        for file in ("formats/capture_json.py", "cell_cameras.py", "camera_info.py")
     )
     read = set(re.findall(r"\b(?:content|frame|camera|intrinsics|given)\.get\(\"(\w+)\"", source))
     known = set(schema["properties"]).union(

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 import jcr
-from jcr.capture import camera_info, camera_json
+from jcr.capture import camera_info
 from jcr.capture.formats import capture_json, colmap
 from jcr.export import ros
 from jcr.intrinsics_json import IntrinsicsAndStd
@@ -28,8 +28,8 @@ CAMERAS = [RATIONAL, FISHEYE, Intrinsics(500.0, 500.0, 320.0, 240.0, *SIZE, (0.1
 def test_a_intrinsics_survives_capture_json_camera_info_and_calibration_json(
     intrinsics: Intrinsics, tmp_path: Path
 ):
-    read = camera_json.read_intrinsics(
-        json.loads(json.dumps(camera_json.intrinsics_as_json(intrinsics))), SIZE, tmp_path
+    read = camera_info.read_intrinsics(
+        json.loads(json.dumps(camera_info.intrinsics_as_json(intrinsics))), SIZE, tmp_path
     )
     assert read == intrinsics
     mount = ros.CameraMount(
@@ -82,9 +82,9 @@ def test_a_capture_names_the_models_that_there_are():
         jcr.InputError,
         match="distortion model 'omni' is not known; give one of pinhole, rational, thin_prism, fisheye",
     ):
-        camera_json.read_intrinsics(intrinsics | {"model": "omni"}, SIZE, Path("capture.json"))
+        camera_info.read_intrinsics(intrinsics | {"model": "omni"}, SIZE, Path("capture.json"))
     with pytest.raises(jcr.InputError, match="5 numbers, not the 4 of a fisheye intrinsics, k1,k2,k3,k4"):
-        camera_json.read_intrinsics(
+        camera_info.read_intrinsics(
             intrinsics | {"model": "fisheye", "distortion": [0] * 5}, SIZE, Path("capture.json")
         )
 

@@ -219,7 +219,7 @@ FRAME_FAULTS = {
     "image truncated": (truncate, r"01\.jpg: not a readable image"),
     "image empty": (lambda c: (c / "images/01.jpg").write_bytes(b""), r"01\.jpg: not a readable image"),
     "text as image": (lambda c: (c / "images/01.jpg").write_text("hello"), r"01\.jpg: not a readable image"),
-    "wrong size": (shrink, r"01\.jpg: 320x240 pixels, but images/00\.jpg has 640x480"),
+    "wrong size": (shrink, r"01\.jpg: image of 320x240 pixels, images/00\.jpg of 640x480"),
     "same image": (
         lambda c: shutil.copy(c / "images/00.jpg", c / "images/01.jpg"),
         r"01\.jpg: the same image as images/00\.jpg",

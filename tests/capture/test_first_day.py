@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import jcr
+from jcr.capture.conventions import numbers_from_poses
 from jcr.capture.options import ReadOptions
-from jcr.capture.robot_poses import numbers_from_poses
 from jcr.geometry import inverse, rotation_exp, transform
 
 RNG = np.random.default_rng(3)

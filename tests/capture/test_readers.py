@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 import capture_writers as writers
 import jcr
 from in_process import run_jcr
+from jcr.capture.conventions import CONVENTIONS, poses_from_numbers
 from jcr.capture.formats import capture_json, colmap
 from jcr.capture.options import ReadOptions
 from jcr.capture.pairing import stamp_ns
 from jcr.capture.plain_files import read_npy, read_yaml
 from jcr.capture.read import FORMATS, format_of, read_source
-from jcr.capture.robot_poses import CONVENTIONS, poses_from_numbers
 from jcr.cli.query import read_points
 from jcr.geometry import scale_translation
 from jcr.records import Capture, PosePairs
@@ -363,7 +363,7 @@ FAULTS = {
             (f.parent / "camera_info.yaml").read_text().replace("image_width: 640", "image_width: 1280")
         ),
         {},
-        "calibrated at 1280x480, the images are 640x480",
+        "intrinsics of 1280x480 pixels, images of 640x480",
     ),
     "fisheye intrinsics": (
         lambda f: (f.parent / "camera_info.yaml").write_text(

@@ -399,7 +399,7 @@ def test_cameras_of_a_capture_are_read_and_written_alike(folder: Path):
     [
         ({"mount": "table", "images": ["3.png"]}, "write gripper or base"),
         ({"mount": "base", "images": []}, "no images"),
-        ({"mount": "base", "images": ["3.png", "7.png"]}, "all images of a camera must have one size"),
+        ({"mount": "base", "images": ["3.png", "7.png"]}, "take all with one camera"),
         ({"mount": "base", "images": ["0.png"]}, "is one of the frames' own"),
         ({"mount": "gripper", "images": ["3.png"]}, "1 images for 3 frames"),
         ({"mount": "base", "images": ["7.png"], "intrinsics": INTRINSICS}, "another resolution"),

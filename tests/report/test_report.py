@@ -22,10 +22,10 @@ from jcr.calibration.calibration_json import CalibrationFile, calibration_file, 
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.calibration.words import log
+from jcr.capture.conventions import numbers_from_poses, poses_from_numbers
 from jcr.capture.formats.capture_json import kept
 from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
-from jcr.capture.robot_poses import numbers_from_poses, poses_from_numbers
 from jcr.cell.cameras_json import cameras_file
 from jcr.cell.found import ArmFound, CameraFound, CellFound, ImageFound
 from jcr.cli.output import Output

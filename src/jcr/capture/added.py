@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from jcr.capture.formats import capture_json
+from jcr.capture.images import other_size
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import is_written, read_json, shown
 from jcr.capture.read import read_source
@@ -51,10 +52,7 @@ def with_images(added: Capture, path: Path, options: ReadOptions | None = None) 
         if not isinstance(new, Capture):
             raise InputError(f"{path}: has poses without images; give images with their gripper poses")
         if new.image_size != added.image_size:
-            raise InputError(
-                f"{path}: images of {new.image_size[0]}x{new.image_size[1]} pixels, but the run has "
-                f"{added.image_size[0]}x{added.image_size[1]}; take them with the same camera and resolution"
-            )
+            raise other_size(f"{path}: images", new.image_size, added.image_size, "the run has images")
         names = list(added.images)
         known = {(added.folder / name).read_bytes() for name in names}
         for image in new.images:

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture.camera_json import intrinsics_as_json, read_intrinsics_of_size, read_std, std_as_json
-from jcr.capture.checks import image_sizes, other_size, read_rigid, require_frames
+from jcr.capture.camera_info import intrinsics_as_json, read_intrinsics_of_size, read_std, std_as_json
+from jcr.capture.checks import image_sizes, read_rigid, require_frames
+from jcr.capture.images import other_size
 from jcr.capture.plain_files import contained, first_few, shown
 from jcr.errors import InputError
 from jcr.records import Capture, CellCamera, Mount

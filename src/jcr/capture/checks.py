@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture.images import ROTATED, HowStored, read_image, read_stored
+from jcr.capture.conventions import METRES_LIMIT, far_rows, likely_unit, tolerated
+from jcr.capture.images import ROTATED, HowStored, other_size, read_image, read_stored
 from jcr.capture.options import MAX_FRAMES, MIN_FRAMES
 from jcr.capture.plain_files import contained, first_few
-from jcr.capture.robot_poses import METRES_LIMIT, far_rows, likely_unit, tolerated
 from jcr.errors import InputError
 from jcr.geometry import require_rigid, step_between
-from jcr.records import COEFFICIENTS, Capture, DistortionModel, Finding, Intrinsics, Kind, coefficients_of
+from jcr.records import Capture, Finding, Kind
 
 MIRRORED = (2, 4, 5, 7)
 SAME_POSE = (0.5e-3, np.radians(0.05))
@@ -91,7 +91,7 @@ def _decoded(
         (usual, _), *_ = Counter(sizes.values()).most_common(1)
         if size != usual:
             like = images[next(j for j in sizes if sizes[j] == usual)]
-            found[k] = str(other_size(f"{folder / images[k]}", size, usual, like))
+            found[k] = str(other_size(f"{folder / images[k]}: image", size, usual, like))
     return stored
 
 
@@ -115,40 +115,6 @@ def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> No
         )
 
 
-def checked_intrinsics(
-    focal_and_centre: Sequence[Any],
-    distortion: Sequence[Any],
-    size: tuple[int, int],
-    where: str,
-    model: DistortionModel = "pinhole",
-) -> Intrinsics:
-    """Intrinsics of images of `size` from fx, fy, cx, cy and the model's coefficients; InputError if they cannot be."""
-    names = COEFFICIENTS[model]
-    try:
-        fx, fy, cx, cy = (float(value) for value in focal_and_centre)
-        coefficients = [float(k) for k in distortion]
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(
-            f"{where}: need numbers fx, fy, cx, cy and distortion [{','.join(names)}], or null"
-        ) from None
-    if len(coefficients) != len(names):
-        raise InputError(
-            f"{where}: distortion has {len(coefficients)} numbers, not the {len(names)} of a {model} intrinsics, "
-            f'{",".join(names)}; "model" may be {", ".join(COEFFICIENTS)}'
-        )
-    if not np.isfinite([fx, fy, cx, cy, *coefficients]).all() or fx <= 0 or fy <= 0:
-        raise InputError(
-            f"{where}: fx and fy must be positive and all numbers finite; or give null to estimate them"
-        )
-    width, height = size
-    if not (0 < cx < width and 0 < cy < height):
-        raise InputError(
-            f"{where}: the principal point ({cx:.4g}, {cy:.4g}) lies outside the {width}x{height} images; "
-            "scale the intrinsics to this resolution"
-        )
-    return Intrinsics(fx, fy, cx, cy, width, height, coefficients_of(coefficients), model)
-
-
 def read_rigid(value: Any, where: str) -> Float[ndarray, "4 4"]:
     """A rigid 4x4 from nested lists; InputError saying how far from rigid it is and what it looks like."""
     try:
@@ -169,14 +135,6 @@ def check_metres(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None
             f"{where}: the gripper is up to {farthest:.4g} from the base; these look like {name}: "
             f"divide the translations by {a_metre} (a pose table: --pose-units {short}-rad or {short}-deg)"
         )
-
-
-def other_size(what: str, size: tuple[int, int], expected: tuple[int, int], whose: str) -> InputError:
-    """Return the error of an image, depth image or intrinsics of another resolution than the images'."""
-    return InputError(
-        f"{what}: {size[0]}x{size[1]} pixels, but {whose} has {expected[0]}x{expected[1]}; take all with one camera at "
-        "one resolution"
-    )
 
 
 def image_sizes(folder: Path, images: Sequence[str]) -> list[tuple[int, int]]:

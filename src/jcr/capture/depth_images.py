@@ -9,6 +9,7 @@ from jaxtyping import Float32
 from numpy import ndarray
 from PIL import Image
 
+from jcr.capture.images import other_size
 from jcr.capture.plain_files import contained, shown
 from jcr.errors import InputError
 
@@ -32,10 +33,8 @@ def read_depth(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h w"]:
     if not mode.startswith("I"):
         raise InputError(f"{path}: a depth image has 16 bits and one channel (mm), this is {mode}")
     if found != size:
-        raise InputError(
-            f"{path}: {found[0]}x{found[1]} beside images of {size[0]}x{size[1]}; align depth with colour (ROS: "
-            "align_depth.enable, librealsense: rs.align)"
-        )
+        remedy = "align depth with colour (ROS: align_depth.enable, librealsense: rs.align)"
+        raise other_size(f"{path}: depth", found, size, remedy=remedy)
     depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if depth is None or depth.dtype != np.uint16 or depth.ndim != 2:
         raise InputError(f"{path}: not a readable 16-bit image; save it again as 16-bit PNG")

@@ -1,6 +1,7 @@
 """One image: read from whatever a camera or a phone wrote, written without loss, judged for sharpness."""
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -141,6 +142,19 @@ def _refuse_size(path: Path, size: tuple[int, int]) -> None:
         raise InputError(
             f"{path}: {size[0]}x{size[1]} is over {MAX_PIXELS // 1_000_000} million pixels; shrink the image"
         )
+
+
+def other_size(
+    what: str,
+    size: Sequence[object],
+    expected: tuple[int, int],
+    whose: str = "images",
+    remedy: str = "take all with one camera at one resolution",
+) -> InputError:
+    """Return the error of an image, depth image or intrinsics of another resolution than the images'."""
+    return InputError(
+        f"{what} of {size[0]}x{size[1]} pixels, {whose} of {expected[0]}x{expected[1]}; {remedy}"
+    )
 
 
 def brightness_and_sharpness(image: UInt8[ndarray, "h w 3"]) -> tuple[float, float]:

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from jcr.capture.conventions import RADIANS_LIMIT
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import Stamps, bracket
-from jcr.capture.robot_poses import RADIANS_LIMIT
 from jcr.capture.urdf_chain import chain_of, joints_to, load_urdf, source_of
 from jcr.errors import InputError
 from jcr.geometry import rotation_exp, transform

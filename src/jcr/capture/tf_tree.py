@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from jcr.capture.conventions import poses_from_numbers
 from jcr.capture.pose_track import PosesAt, PoseTrack, Stamps, pose_track
-from jcr.capture.robot_poses import poses_from_numbers
 from jcr.errors import InputError
 from jcr.geometry import inverse
 

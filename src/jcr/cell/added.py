@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from jcr.capture.camera_json import read_intrinsics_of_size
+from jcr.capture.camera_info import read_intrinsics_of_size
 from jcr.capture.cell_cameras import NAME, cameras_as_json, with_cameras
 from jcr.capture.images import read_image
 from jcr.capture.plain_files import is_written, read_json

@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from jcr.capture.checks import read_rigid
+from jcr.capture.conventions import poses_from_numbers
 from jcr.capture.formats.capture_json import MOST_ROTATION
 from jcr.capture.options import ConventionName
-from jcr.capture.robot_poses import poses_from_numbers
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.live.robot import RobotState, States, pose_of_numbers

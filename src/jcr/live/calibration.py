@@ -21,10 +21,10 @@ from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import RobotErrors, robot_errors
 from jcr.calibration.stage import checked
-from jcr.capture.camera_json import intrinsics_as_json
+from jcr.capture.camera_info import intrinsics_as_json
 from jcr.capture.checks import read_rigid
+from jcr.capture.conventions import far_rows, likely_unit
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
-from jcr.capture.robot_poses import far_rows, likely_unit
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import Arm

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 from numpy import ndarray
 
-from jcr.capture.camera_json import read_intrinsics, read_std
-from jcr.capture.checks import other_size, read_rigid
+from jcr.capture.camera_info import read_intrinsics, read_std
+from jcr.capture.checks import read_rigid
 from jcr.capture.formats.capture_json import FILE, read_joints
-from jcr.capture.images import encode_png, read_image
+from jcr.capture.images import encode_png, other_size, read_image
 from jcr.capture.plain_files import contained, read_json
 from jcr.errors import InputError
 from jcr.estimation.arms import ROBOT_NAMES

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.capture.conventions import CONVENTIONS, numbers_from_poses
 from jcr.capture.options import ConventionName, UnitsName
-from jcr.capture.robot_poses import CONVENTIONS, numbers_from_poses
 from jcr.estimation.inverse_kinematics import FITS, inverse_kinematics, reach_toward
 from jcr.estimation.kinematics import Arm, forward_kinematics
 from jcr.geometry import inverse, rotation_angle

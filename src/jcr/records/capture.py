@@ -109,7 +109,7 @@ class Capture:
     bits: tuple[int, ...] = (8,)
     """Of each colour that the images' files use; of more than 8 the upper eight are read."""
     pose_convention: str | None = None
-    """How its robot writes poses, a name of capture.robot_poses.CONVENTIONS; None where its file does not tell."""
+    """How its robot writes poses, a name of capture.conventions.CONVENTIONS; None where its file does not tell."""
     depths: tuple[str | None, ...] | None = None
     """Of a depth camera, an image each or None: 16-bit PNG in mm, aligned with the images, relative to `folder`."""
     camera_name: str = "wrist"

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jcr.capture.robot_poses import CONVENTIONS, OF_ARM, numbers_from_poses, units_of
+from jcr.capture.conventions import CONVENTIONS, OF_ARM, numbers_from_poses, units_of
 from jcr.estimation.observability import WEAK
 from jcr.records import Excitation, NextPose
 from jcr.report.render import Section

@@ -9,14 +9,14 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture.camera_json import intrinsics_as_json, read_intrinsics, read_std, std_as_json
+from jcr.capture.camera_info import intrinsics_as_json, read_intrinsics, read_std, std_as_json
 from jcr.capture.cell_cameras import cameras_as_json, with_cameras
 from jcr.capture.checks import checked_capture, read_rigid, require_frames
+from jcr.capture.conventions import CONVENTIONS
 from jcr.capture.depth_images import depth_of_frames
 from jcr.capture.formats import Format
 from jcr.capture.options import MAX_FRAMES, ReadOptions
 from jcr.capture.plain_files import contained, read_json, shown
-from jcr.capture.robot_poses import CONVENTIONS
 from jcr.errors import InputError
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.files import write_bytes, write_text

@@ -13,8 +13,9 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.camera import HALF_PIXEL
-from jcr.capture.checks import checked_intrinsics
+from jcr.capture.camera_info import checked_intrinsics
 from jcr.capture.formats import Format, table
+from jcr.capture.images import other_size
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained
 from jcr.errors import InputError
@@ -171,9 +172,7 @@ def _intrinsics(camera: "pycolmap.Camera", folder: Path, size: tuple[int, int]) 
             f"{folder}: camera model {name}, which jcr does not know; run colmap image_undistorter"
         )
     if (width, height) != size:
-        raise InputError(
-            f"{folder}: cameras of {width}x{height}, images of {size[0]}x{size[1]}; use the same images"
-        )
+        raise other_size(f"{folder}: cameras", (width, height), size, remedy="use the same images")
     two_focals = name in ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
     focals, rest = (params[:2], params[2:]) if two_focals else (params[:1] * 2, params[1:])
     centre, rest = [value - HALF_PIXEL for value in rest[:2]], rest[2:]

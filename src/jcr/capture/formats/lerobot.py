@@ -13,6 +13,7 @@ from numpy import ndarray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from jcr.capture.camera_info import read_camera_info
+from jcr.capture.conventions import CONVENTIONS
 from jcr.capture.formats import Format
 from jcr.capture.formats.table import PoseColumns, poses_of_columns
 from jcr.capture.joints import read_arm
@@ -20,7 +21,6 @@ from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, first_fault, read_json
 from jcr.capture.pose_track import pose_track, speed
 from jcr.capture.recording import Recording, capture_of_recording
-from jcr.capture.robot_poses import CONVENTIONS
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.progress import Progress

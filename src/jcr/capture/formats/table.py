@@ -14,12 +14,12 @@ from numpy import ndarray
 
 from jcr.capture.camera_info import FILE, read_camera_info
 from jcr.capture.checks import checked_capture, require_frames
+from jcr.capture.conventions import CONVENTIONS, poses_from_numbers
 from jcr.capture.depth_images import depth_beside
 from jcr.capture.formats import Format, pose_lists
 from jcr.capture.options import ConventionName, ReadOptions, UnitsName
 from jcr.capture.pairing import pair_with_images, stamp_ns
 from jcr.capture.plain_files import read_npy, read_text, shown
-from jcr.capture.robot_poses import CONVENTIONS, poses_from_numbers
 from jcr.errors import InputError
 from jcr.records import Capture
 
