@@ -22,8 +22,9 @@ from benchmarks.page import mm_deg, table
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.errors import InputError, RejectedError
+from jcr.findings import Finding, FindingKind, kinds_of
 from jcr.geometry import step_between
-from jcr.records import CAMERA, Finding, HandEye, Kind
+from jcr.records import HandEye
 from simulation import image_faults as make
 from simulation.faults import Faults, FaultyCapture, faulty_capture, reconstructed
 from simulation.image_faults import IMAGES as FEW_IMAGES
@@ -36,14 +37,14 @@ DRAWS, CLEAN, CLEAN_IMAGES = 2, 70, 5
 """Captures per fault (observations), and captures without a fault of each kind."""
 SIGMAS, JOINT_P = 3.0, 0.0027
 """Largest error on an axis in stated standard deviations, and least joint chance, of an error that is stated rightly."""
-FOCUS = frozenset({Kind.FOCUS_BY_DISTANCE, Kind.FOCUS_BY_IMAGE})
-ZOOM = frozenset({Kind.ZOOM, Kind.FOCUS_BY_IMAGE})
-SHUTTER = frozenset({Kind.ROLLING_SHUTTER, Kind.ROLLING_SHUTTER_BY_IMAGE})
-INTRINSICS = frozenset({Kind.INTRINSICS})
-MOVED = frozenset({Kind.SLIP, Kind.DRIFT})
-ORDER = frozenset({Kind.POSE_CONVENTION, Kind.DELAY, Kind.POSES_SWAPPED})
-ONE_POSE = frozenset({Kind.POSES_SWAPPED, Kind.POSE_CONTRADICTS_IMAGE})
-ROBOT = frozenset({Kind.JOINT_OFFSETS, Kind.LENGTHS, Kind.BASE_LEANS, Kind.TOOL_SAGS})
+FOCUS = frozenset({FindingKind.FOCUS_BY_DISTANCE, FindingKind.FOCUS_BY_IMAGE})
+ZOOM = frozenset({FindingKind.ZOOM, FindingKind.FOCUS_BY_IMAGE})
+SHUTTER = frozenset({FindingKind.ROLLING_SHUTTER, FindingKind.ROLLING_SHUTTER_BY_IMAGE})
+INTRINSICS = frozenset({FindingKind.INTRINSICS})
+MOVED = frozenset({FindingKind.SLIP, FindingKind.DRIFT})
+ORDER = frozenset({FindingKind.POSE_CONVENTION, FindingKind.DELAY, FindingKind.POSES_SWAPPED})
+ONE_POSE = frozenset({FindingKind.POSES_SWAPPED, FindingKind.POSE_CONTRADICTS_IMAGE})
+ROBOT = kinds_of("strain") | {FindingKind.JOINT_OFFSETS}
 SCALE_ALONE = "positions 1 % too long"
 """Fault that no image shows: scale comes from the robot."""
 
@@ -54,7 +55,7 @@ class Case:
 
     what: str
     fault: Faults | Fault
-    named_by: frozenset[Kind] = frozenset()
+    named_by: frozenset[FindingKind] = frozenset()
     """Any of these; images left out name their own fault, too."""
     given: bool = True
     """Whether intrinsics are given."""
@@ -95,8 +96,8 @@ RENDERED = (
     Case("k1 of -0.1 missing", Fault(make.distorted(-0.1)), INTRINSICS),
     Case("principal point 40 px off", Fault(make.off_centre(32.0, -24.0)), INTRINSICS),
     Case("rolling shutter, 24 px", Fault(make.rolling(24.0)), SHUTTER),
-    Case("stabiliser moves the image by 3 px", Fault(make.stabilised(3.0)), CAMERA),
-    Case("thin prism, 0.04", Fault(make.thin_prism(0.04)), CAMERA),
+    Case("stabiliser moves the image by 3 px", Fault(make.stabilised(3.0)), kinds_of("camera")),
+    Case("thin prism, 0.04", Fault(make.thin_prism(0.04)), kinds_of("camera")),
     Case("focal length given 3 % too long", Fault(change=make.given(fx=1.03, fy=1.03)), INTRINSICS),
     Case("images of half the resolution", Fault(change=make.halved), INTRINSICS),
     Case("mirrored images", Fault(make.mirrored), ORDER),
@@ -120,7 +121,7 @@ class Outcome:
     """Result of one capture against the truth."""
 
     accepted: bool
-    kinds: frozenset[Kind] = frozenset()
+    kinds: frozenset[FindingKind] = frozenset()
     """Kinds of the findings that warn or reject."""
     left_out: frozenset[int] = frozenset()
     """Rows of images that the result does not use."""
@@ -209,7 +210,7 @@ def through_images(seed: int, fault: Fault, given: bool) -> Outcome:
         except InputError:
             return Outcome(False, refused=True)
         except RejectedError:
-            return Outcome(False, frozenset({Kind.NO_RECONSTRUCTION}))
+            return Outcome(False, frozenset({FindingKind.NO_RECONSTRUCTION}))
     used = result.reconstruction.image_index[result.hand_eye.inliers].tolist()
     return _judged(
         result.hand_eye, capture.gripper_from_camera, frozenset(range(len(capture.images))) - set(used)
@@ -231,7 +232,9 @@ def _judged(hand_eye: HandEye, truths: Iterable[Float[ndarray, "4 4"]], left_out
 
 def _warnings(findings: Iterable[Finding]) -> list[Finding]:
     """Return the findings that a user reads as a warning; insufficient accuracy is no fault."""
-    return [one for one in findings if one.severity != "informs" and one.kind is not Kind.NOT_EXACT_ENOUGH]
+    return [
+        one for one in findings if one.severity != "informs" and one.kind is not FindingKind.NOT_EXACT_ENOUGH
+    ]
 
 
 Rows = dict[Case, list[Outcome]]

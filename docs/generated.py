@@ -23,6 +23,8 @@ from jcr.cell.cameras_json import CamerasFile
 from jcr.cli import COMMANDS, dispatch
 from jcr.cli.models import SCALES
 from jcr.depth.depth_npz import About as DepthAbout
+from jcr.findings import FindingKind
+from jcr.findings.table import GROUPS, Row
 from jcr.pages import pages
 from jcr.reconstruct import BACKENDS
 from jcr.reconstruction_npz import About
@@ -333,10 +335,35 @@ def _link(named: re.Match[str]) -> str:
     return f"([{named[1]}](../{file.parent.name}/{file.name}))"
 
 
+def findings_page() -> str:
+    """Return the page of the findings: the introduction by hand, then each kind from its row of the table."""
+    parts = [(REFERENCE / "findings.md").read_text("utf-8").partition("\n## ")[0].rstrip()]
+    for group, title in GROUPS.items():
+        parts += ["", f"## {title}"]
+        for kind in FindingKind:
+            if kind.row.group == group:
+                parts += ["", f"### `{kind}`", "", *_about_kind(kind.row)]
+    return "\n".join(parts) + "\n"
+
+
+def _about_kind(row: Row) -> Iterator[str]:
+    if isinstance(row.message, str) and row.message != "{text}":
+        yield f"> {re.sub(r'{[^}]*}', '…', row.message)}\n"
+    yield from (
+        f"- **{name}**: {text}." for name, text in (("Means", row.means), ("`value`", row.evidence)) if text
+    )
+    advice = row.help or (row.remedy if isinstance(row.remedy, str) else "")
+    if advice:
+        yield f"- **Remedy**: {re.sub(r'{[^}]*}', '…', advice)}."
+    if row.explains:
+        yield f"- **Explains**: {', '.join(f'`{name}`' for name in row.explains)}."
+
+
 PAGES = {
     "api.md": api_page,
     "backends.md": backends_page,
     "cli.md": cli_page,
+    "findings.md": findings_page,
     "formats.md": formats_page,
 }
 """What writes each page."""

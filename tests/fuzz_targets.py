@@ -30,7 +30,16 @@ from jcr.geometry import inverse
 from jcr.pointmaps.pairs import pairs_from_arrays, read_arrays
 from jcr.reconstruct import ReconstructOptions
 from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
-from jcr.records import Attempt, Capture, Intrinsics, PointCloud, Pointmaps, PosePairs, Reconstruction, Tracks
+from jcr.records import (
+    Attempt,
+    Capture,
+    Intrinsics,
+    PointCloud,
+    Pointmaps,
+    PosePairs,
+    Reconstruction,
+    Tracks,
+)
 from jcr.scene.cloud_ply import read_cloud, write_cloud
 from jcr.scene.map_file import load_map
 from jcr.scene.options import MapOptions

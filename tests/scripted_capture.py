@@ -13,13 +13,14 @@ from numpy import ndarray
 
 import jcr
 from jcr.capture.images import read_image
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import rotation_exp, transform
 from jcr.live.cameras import Camera, Frame
 from jcr.live.folder import LiveFolder
 from jcr.live.progress import Progress, Reached
 from jcr.live.robot import RobotState
 from jcr.live.session import Answer, LiveSession, SessionOptions
-from jcr.records import Finding, HandEye, Kind, Plan, Requirement
+from jcr.records import HandEye, Plan, Requirement
 
 REQUIRED = (2.0, 0.3)
 RATE = 10
@@ -70,9 +71,9 @@ class Scripted:
         if self.contradicted in images:
             findings = (
                 Finding(
-                    kind=Kind.POSE_CONTRADICTS_IMAGE,
+                    kind=FindingKind.POSE_CONTRADICTS_IMAGE,
                     severity="warns",
-                    mend="poses",
+                    concerns="poses",
                     images=(str(self.contradicted),),
                     value=0.03,
                     details={"rotation": 0.1},
@@ -96,7 +97,7 @@ class Scripted:
     def finish(self) -> Any:
         self.finished += 1
         requirement = a_hand_eye(True).requirement
-        blurred = Finding.of(Kind.BLURRED, "warns", "images", "images/000.png", value=5.0)
+        blurred = Finding.of(FindingKind.BLURRED, "warns", "images", "images/000.png", value=5.0)
         hand_eye = SimpleNamespace(requirement=requirement, findings=(blurred,) if self.warns else ())
         return SimpleNamespace(
             converged=True, hand_eye=hand_eye, verdict="accepted", out=self.live.folder / "result"

@@ -18,9 +18,10 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.cli import dispatch
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.hand_eye import solve_hand_eye
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import rotation_exp, transform
 from jcr.reconstruct import Backend, ReconstructOptions
-from jcr.records import Capture, Finding, HandEye, Intrinsics, Kind, Pointmaps, Reconstruction, Tracks
+from jcr.records import Capture, HandEye, Intrinsics, Pointmaps, Reconstruction, Tracks
 from simulation.problems import HandEyeProblem, hand_eye_problem
 
 GARBAGE = {
@@ -148,9 +149,9 @@ def test_a_second_one_runs_only_when_the_first_is_rejected(
 
 
 BLUR = Finding(
-    kind=Kind.BLURRED,
+    kind=FindingKind.BLURRED,
     severity="warns",
-    mend="images",
+    concerns="images",
     images=tuple(f"{k:02d}.png" for k in range(6)),
     value=14.0,
     details={"of": 8.0},
@@ -166,7 +167,10 @@ def test_blurred_images_are_the_reason_and_not_what_follows(
     with pytest.raises(attempts.NothingFoundError) as caught:
         auto_result(problem, {"colmap": nothing, "direct": nothing}, monkeypatch)
     assert str(caught.value).startswith("6 of 8 images are blurred") and "texture" not in str(caught.value)
-    assert [one.kind for one in caught.value.findings[:2]] == [Kind.BLURRED, Kind.NO_RECONSTRUCTION]
+    assert [one.kind for one in caught.value.findings[:2]] == [
+        FindingKind.BLURRED,
+        FindingKind.NO_RECONSTRUCTION,
+    ]
     # Of a calibration that is accepted it is a warning, and of one that uses all images without any, no word.
     kept = chosen(problem, problem.recon_from_camera[:7], monkeypatch)
     assert kept.verdict == "accepted with warnings" and kept.findings[0] == BLUR
@@ -177,7 +181,7 @@ def test_blurred_images_are_the_reason_and_not_what_follows(
 def test_a_camera_at_rest_is_reconstructed_once(present: set[str], monkeypatch: pytest.MonkeyPatch):
     present.add("xfeat")
     problem = hand_eye_problem(np.random.default_rng(0), 8, robot_noise=(2e-4, 5e-4))
-    still = Finding(kind=Kind.STATIC_IMAGES, severity="rejects", value=0.5, details={"rotation": 1.0})
+    still = Finding(kind=FindingKind.STATIC_IMAGES, severity="rejects", value=0.5, details={"rotation": 1.0})
     monkeypatch.setattr(attempts, "view_findings", lambda _: (still,))
     tried = []
 
@@ -199,12 +203,16 @@ def test_of_two_that_are_rejected_the_one_that_shows_the_cause_is_kept(
     problem = hand_eye_problem(np.random.default_rng(0), 8, robot_noise=(2e-4, 5e-4))
     sound = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     uncertain = Finding(
-        kind=Kind.UNCERTAIN, severity="rejects", mend="images", value=0.03, details={"part": "translation"}
+        kind=FindingKind.UNCERTAIN,
+        severity="rejects",
+        concerns="images",
+        value=0.03,
+        details={"part": "translation"},
     )
     intrinsics = Finding(
-        kind=Kind.INTRINSICS,
+        kind=FindingKind.INTRINSICS,
         severity="rejects",
-        mend="intrinsics",
+        concerns="intrinsics",
         details={"focal": 310.0, "focal_std": 2.0, "focal_given": 465.0},
     )
     leave_one_out = sound.leave_one_out

@@ -17,7 +17,8 @@ from jcr.calibration.checks.left_out import left_out_poses
 from jcr.capture.images import BLURRED_EDGE, edge_width, read_image, show_one_view
 from jcr.cli import dispatch
 from jcr.estimation.hand_eye import solve_hand_eye
-from jcr.records import Capture, Intrinsics, Kind, Reconstruction, Tracks
+from jcr.findings import FindingKind
+from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 from simulation.problems import hand_eye_problem
 
 RNG = np.random.default_rng(0)
@@ -99,8 +100,8 @@ def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():
         Capture(folder=Path(), images=names, base_from_gripper=gripper, image_size=(640, 480)), made, hand_eye
     )
     assert [(one.kind, one.severity, one.images) for one in found] == [
-        (Kind.POSES_SWAPPED, "rejects", ("3.png", "8.png")),
-        (Kind.POSE_CONTRADICTS_IMAGE, "warns", ("5.png",)),
+        (FindingKind.POSES_SWAPPED, "rejects", ("3.png", "8.png")),
+        (FindingKind.POSE_CONTRADICTS_IMAGE, "warns", ("5.png",)),
     ]
     assert found[1].value == pytest.approx(0.08 * np.sqrt(3), rel=0.05)
     right = problem.base_from_gripper

@@ -118,7 +118,8 @@ def test_pages_of_the_reference_are_made_from_the_source():
     assert all(f"## jcr {name}" in made["cli.md"] for name in COMMANDS)
     assert all(f"## jcr.{name}" in made["api.md"] for name in jcr.__all__)
     assert "| `gripper_from_camera`" in made["formats.md"]
-    assert made["backends.md"] == (ROOT / "docs" / "reference" / "backends.md").read_text()
+    for name in ("backends.md", "findings.md"):
+        assert made[name] == (ROOT / "docs" / "reference" / name).read_text()
 
 
 def test_pages_are_printed_and_listed(capsys: pytest.CaptureFixture[str]):

@@ -11,7 +11,7 @@ SOURCES = [*(ROOT / "src" / "jcr").rglob("*.py"), *(ROOT / "ros2" / "jcr_ros" / 
 FIELDS = {"warnings", "doubt", "remarks", "advice", "why_not", "unobservable", "remedies"}
 """Attributes that hold messages."""
 WORDS = {"text", "remedy", "sentence", "doubt_of", "warnings_of"}
-"""Functions of records/words.py."""
+"""Functions of jcr.findings."""
 ERRORS = {"error", "failure", "nothing", "refusal"}
 """As exceptions are named."""
 READS = {"split", "rsplit", "partition", "startswith", "endswith", "find", "index", "count", "removesuffix"}

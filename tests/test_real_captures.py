@@ -8,8 +8,8 @@ import pytest
 
 import jcr
 from jcr.calibration.stage import calibrate
+from jcr.findings import FindingKind
 from jcr.geometry import apply_similarity, fit_similarity, rotation_between_deg
-from jcr.records import Kind
 from jcr.sfm.colmap import reconstruct_colmap
 
 
@@ -47,7 +47,7 @@ def test_nominal_intrinsics_are_contradicted_by_their_images(real_captures: Path
     """The reference of this capture was made with them, and belongs to them."""
     capture = jcr.read_capture(real_captures / "franka_tabletop")
     solved = calibrate(capture, reconstruct_colmap(capture))
-    assert solved.converged and any(one.kind is Kind.INTRINSICS for one in solved.findings)
+    assert solved.converged and any(one.kind is FindingKind.INTRINSICS for one in solved.findings)
     found, given = solved.intrinsics, solved.with_given_intrinsics
     assert found is not None and found.fx == pytest.approx(found.fy, rel=2e-3)
     assert capture.intrinsics is not None and capture.intrinsics.fx > 1.005 * capture.intrinsics.fy

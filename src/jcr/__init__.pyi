@@ -17,6 +17,8 @@ from .estimation.hand_eye import solve_hand_eye as solve_hand_eye
 from .estimation.kinematics import Arm as Arm
 from .export.formats import export_run as export_run
 from .export.options import ExportOptions as ExportOptions
+from .findings import Finding as Finding
+from .findings import FindingKind as FindingKind
 from .live.calibration import LiveCalibration as LiveCalibration
 from .live.cameras import Camera as Camera
 from .live.cameras import Frame as Frame
@@ -43,8 +45,6 @@ from .reconstruct import ReconstructOptions as ReconstructOptions
 from .records import Budget as Budget
 from .records import Capture as Capture
 from .records import CellCamera as CellCamera
-from .records import Finding as Finding
-from .records import FindingKind as FindingKind
 from .records import HandEye as HandEye
 from .records import Intrinsics as Intrinsics
 from .records import LeaveOneOut as LeaveOneOut

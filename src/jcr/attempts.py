@@ -13,22 +13,19 @@ from jcr.calibration.words import leave_one_out_text
 from jcr.depth.densify import densify
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError, RejectedError
+from jcr.findings import (
+    Concerns,
+    Finding,
+    FindingKind,
+    is_lasting,
+    no_reconstruction,
+    remedy,
+    strongest_first,
+    text,
+)
 from jcr.progress import Progress, silent
 from jcr.reconstruct import BACKENDS, ReconstructOptions, reconstruct, tries
-from jcr.records import (
-    LASTING,
-    Attempt,
-    Capture,
-    Finding,
-    HandEye,
-    Kind,
-    LeaveOneOut,
-    Mend,
-    Reconstruction,
-    no_reconstruction,
-    strongest_first,
-)
-from jcr.records.words import remedy, text
+from jcr.records import Attempt, Capture, HandEye, LeaveOneOut, Reconstruction
 
 
 class NothingFoundError(RejectedError):
@@ -40,7 +37,7 @@ class NothingFoundError(RejectedError):
         self.attempts = attempts
         self.findings = strongest_first((*causes, *no_reconstruction(failure)))
         first = self.findings[0]
-        if first.kind is Kind.NO_RECONSTRUCTION:
+        if first.kind is FindingKind.NO_RECONSTRUCTION:
             super().__init__(failure.what, *failure.remedies, also=failure.also)
         else:  # too few features, and what would give more, are its consequences
             super().__init__(text(first), *filter(None, [remedy(first)]))
@@ -139,7 +136,7 @@ class Tried:
         return replace(self, calibrated=self.hand_eye.with_findings(*found)) if found else self
 
 
-HELPS: tuple[Mend, ...] = ("reconstruction", "images")
+HELPS: tuple[Concerns, ...] = ("reconstruction", "images")
 """What another reconstruction of the same images may help against: one that is wrong, or of too few of them."""
 
 
@@ -158,7 +155,7 @@ def needs_another(tried: Tried) -> bool:
     if tried.calibrated is None:
         return True
     rejected = rejection(tried)
-    return rejected is not None and rejected.kind not in LASTING and rejected.mend in HELPS
+    return rejected is not None and not is_lasting(rejected) and rejected.concerns in HELPS
 
 
 TEXTURED = 50
@@ -391,7 +388,7 @@ def _calibrated(
 def _is_explained(tried: Tried) -> bool:
     """Whether what rejects it is a cause, which holds for every reconstruction of the same images."""
     rejected = rejection(tried)
-    return rejected is not None and rejected.kind in LASTING
+    return rejected is not None and is_lasting(rejected)
 
 
 def _better(one: Tried, other: Tried) -> Tried:

@@ -23,10 +23,9 @@ from jcr.capture.read import read_capture
 from jcr.errors import InputError, RejectedError
 from jcr.extras import extra
 from jcr.files import write_text
+from jcr.findings import Verdict, sentence, verdict_of
 from jcr.pipeline import RunOptions, calibrate, run
 from jcr.progress import Progress, silent
-from jcr.records import Verdict, verdict_of
-from jcr.records.words import sentence
 from jcr.report.render import render
 from jcr.run_folder import CAPTURE, RunFolder, fingerprint
 

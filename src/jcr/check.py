@@ -36,20 +36,11 @@ from jcr.errors import InputError, RejectedError
 from jcr.estimation.foreseen import ForeseenCamera
 from jcr.estimation.hand_eye import SCALE_STD, solve_hand_eye
 from jcr.estimation.observability import observability
+from jcr.findings import Finding, FindingKind, Verdict, remedy, sentence, without_consequences
+from jcr.findings.sentences import unobservable
 from jcr.geometry import ARM, largest_motion
 from jcr.progress import Progress
-from jcr.records import (
-    Capture,
-    Finding,
-    HandEye,
-    Kind,
-    NextPose,
-    Observability,
-    PosePairs,
-    Verdict,
-)
-from jcr.records.findings import without_consequences
-from jcr.records.words import remedy, sentence, unobservable
+from jcr.records import Capture, HandEye, NextPose, Observability, PosePairs
 from jcr.sfm.colmap import reconstruct_colmap
 from jcr.sfm.options import ColmapOptions
 
@@ -193,7 +184,7 @@ def _examine_alone(capture: Capture | PosePairs) -> _Alone:
 def _with_images(alone: _Alone, capture: Capture) -> _Alone:
     robot, views = robot_errors(capture, CalibrateOptions()), view_findings(capture)
     brightness, sharpness = _brightness_and_sharpness_of_each(capture)
-    blurred = {name for one in views if one.kind is Kind.BLURRED for name in one.images}
+    blurred = {name for one in views if one.kind is FindingKind.BLURRED for name in one.images}
     clear = [
         exposure_fault(grey) is None and name not in blurred
         for name, grey in zip(capture.images, brightness, strict=True)

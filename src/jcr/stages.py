@@ -14,9 +14,9 @@ from jcr.cell.added import read_added_cameras
 from jcr.cell.cameras_json import CamerasFile, cameras_file
 from jcr.cell.carried import carried_scene, refined
 from jcr.depth.densify import densify
+from jcr.findings import sentence
 from jcr.progress import Progress
 from jcr.records import Attempt, Capture, CellCamera
-from jcr.records.words import sentence
 from jcr.results import RunOptions, RunResult
 from jcr.run_folder import MOVING, RunFolder, State, state_of
 

@@ -22,12 +22,12 @@ from jcr.errors import InputError, RejectedError
 from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.solve import Solution, solve
 from jcr.estimation.wrist import pose_problem
+from jcr.findings import Verdict, sentence
 from jcr.geometry import Poses, step_between
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.reconstruct import reconstruct
-from jcr.records import Capture, CellCamera, HandEye, PosePairs, Reconstruction, Verdict
-from jcr.records.words import sentence
+from jcr.records import Capture, CellCamera, HandEye, PosePairs, Reconstruction
 from jcr.run_folder import MadeWith, RunFolder
 from jcr.sfm.register import register
 

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.faults import Case, Outcome, page
+from jcr.findings import FindingKind
 from jcr.geometry import inverse, step_between
-from jcr.records import Intrinsics, Kind
+from jcr.records import Intrinsics
 from simulation import image_faults as make
 from simulation.image_faults import IMAGES, Fault, draw
 from simulation.poses import gripper_poses, random_hand_eye
@@ -88,9 +89,9 @@ def test_a_row_counts_silent_errors_apart_from_warned_and_stated_ones():
     within = Outcome(True, mm=1.0, deg=0.1, sigmas=2.0, joint_p=0.5)
     silent = replace(within, sigmas=8.0, joint_p=1e-9)
     jointly = replace(within, joint_p=1e-4)
-    warned = replace(silent, kinds=frozenset({Kind.ZOOM}))
+    warned = replace(silent, kinds=frozenset({FindingKind.ZOOM}))
     rejected = replace(warned, accepted=False)
-    case = Case("a zoom", Fault(make.zoomed(1.1)), frozenset({Kind.ZOOM}))
+    case = Case("a zoom", Fault(make.zoomed(1.1)), frozenset({FindingKind.ZOOM}))
     text = page({}, {case: [within, silent, jointly, warned, rejected]}, [], [within, warned])
     assert "| a zoom | 5 | 2 | focal length changed once 2 | 1 | 1 | 1 | **2** |" in text
     assert (

@@ -9,9 +9,8 @@ import pytest
 import jcr
 from jcr.capture.images import encode_png, read_image
 from jcr.files import write_bytes
+from jcr.findings import FindingKind, sentence
 from jcr.geometry import inverse, rotation_exp, transform
-from jcr.records import Kind
-from jcr.records.words import sentence
 from jcr.results import RunResult
 from simulation.boards import with_chessboard
 from simulation.truth import read_truth
@@ -66,7 +65,7 @@ def test_another_kind_is_not_found_and_what_the_images_show_is_proposed(
 ):
     result = calibrated(captures["still"], tmp_path, "chessboard:8x5:0.025")
     assert result.verdict == "accepted with warnings" and result.calibration.board is None
-    (named,) = (one for one in result.hand_eye.findings if one.kind is Kind.BOARD_NOT_FOUND)
+    (named,) = (one for one in result.hand_eye.findings if one.kind is FindingKind.BOARD_NOT_FOUND)
     assert "no two images show chessboard:8x5:0.025" in sentence(named)
     assert "seem to show chessboard:6x5:SIDE" in sentence(named)
 
@@ -78,5 +77,5 @@ def test_a_board_that_was_moved_between_images_is_used_where_it_lay_longer(
     board = result.calibration.board
     assert board is not None and board.images == 5 and board.side_mm == pytest.approx(25.0, abs=0.05)
     assert np.allclose(board.centres_in_base[0][2], 0.16, atol=5e-4)
-    (named,) = (one for one in result.hand_eye.findings if one.kind is Kind.BOARD_MOVED)
+    (named,) = (one for one in result.hand_eye.findings if one.kind is FindingKind.BOARD_MOVED)
     assert named.images == ("08.png", "10.png", "11.png")

@@ -10,10 +10,10 @@ from jcr.boards import corners
 from jcr.boards.detection import Board, Sighting, boards, is_of_unknown_size, side_of
 from jcr.calibration.stage import calibrate
 from jcr.camera import project
+from jcr.findings import FindingKind, sentence
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
-from jcr.records import Capture, Kind, Reconstruction
-from jcr.records.words import sentence
+from jcr.records import Capture, Reconstruction
 from simulation.faults import Faults, FaultyCapture, faulty_capture, reconstructed
 
 pytestmark = pytest.mark.slow
@@ -71,7 +71,7 @@ def test_a_board_that_was_moved_is_used_where_most_images_show_it_and_the_others
     boards = made.tracks.boards
     assert boards is not None and boards.elsewhere == (6, 7, 8)
     hand_eye = calibrate(capture, made)
-    (named,) = (one for one in hand_eye.findings if one.kind is Kind.BOARD_MOVED)
+    (named,) = (one for one in hand_eye.findings if one.kind is FindingKind.BOARD_MOVED)
     assert named.images == ("06.png", "07.png", "08.png") and "it was moved, or there are two" in sentence(
         named
     )
@@ -84,7 +84,7 @@ def test_a_board_that_no_image_shows_is_named_and_features_alone_are_used(monkey
     hand_eye = calibrate(capture, made)
     alone = calibrate(*reconstructed(found, estimated=False))
     assert np.array_equal(hand_eye.gripper_from_camera, alone.gripper_from_camera)
-    (named,) = (one for one in hand_eye.findings if one.kind is Kind.BOARD_NOT_FOUND)
+    (named,) = (one for one in hand_eye.findings if one.kind is FindingKind.BOARD_NOT_FOUND)
     assert named.severity == "warns" and SPEC in sentence(named)
     boards = made.tracks.boards
     assert boards is not None

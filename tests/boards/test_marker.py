@@ -18,9 +18,10 @@ from jcr.capture.read import read_capture
 from jcr.cli import dispatch
 from jcr.depth.densify import densify
 from jcr.errors import InputError, RejectedError
+from jcr.findings import FindingKind
 from jcr.geometry import rotation_between_deg
 from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
-from jcr.records import Intrinsics, Kind
+from jcr.records import Intrinsics
 from places import SHARED
 from simulation.problems import TARGET_IN_BASE, HandEyeProblem, hand_eye_problem
 
@@ -273,7 +274,7 @@ def test_a_sheet_of_paper_tells_the_size_that_the_robot_asks_for():
     hand_eye = calibrate(capture, reconstruct_marker(capture, "chessboard:9x6:0.02607"))
     # Nothing is found against it; 95 % of errors stay below 5.05 mm, where 5 mm are needed to grasp.
     kinds = {found.kind for found in hand_eye.findings if found.severity != "informs"}
-    assert hand_eye.converged and kinds <= {Kind.NOT_EXACT_ENOUGH}
+    assert hand_eye.converged and kinds <= {FindingKind.NOT_EXACT_ENOUGH}
 
 
 def test_the_table_of_real_captures_holds_each_against_its_reference(tmp_path):

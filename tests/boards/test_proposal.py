@@ -7,7 +7,7 @@ from numpy import ndarray
 
 from jcr.boards.proposal import board_in_view, proposed
 from jcr.export.board_sheet import PAPERS_MM, board_sheet
-from jcr.records.words import sentence
+from jcr.findings import sentence
 
 PX_PER_MM = 5
 

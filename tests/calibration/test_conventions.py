@@ -16,8 +16,8 @@ from jcr.calibration.conventions import (
     convention_finding,
 )
 from jcr.capture.pairing import paired_by_name
+from jcr.findings import sentence
 from jcr.geometry import inverse, transform
-from jcr.records.words import sentence
 from simulation.problems import hand_eye_problem
 
 

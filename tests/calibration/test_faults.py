@@ -16,9 +16,9 @@ from jcr.calibration.stage import calibrate
 from jcr.camera import project, unproject
 from jcr.cell.carried import exchanged, refined
 from jcr.estimation.arms import RobotName, arm_named
+from jcr.findings import Finding, FindingKind, kinds_of, sentence
 from jcr.geometry import apply, inverse, retract, step_between
-from jcr.records import BENT, Capture, Finding, Kind, PosePairs, Reconstruction
-from jcr.records.words import sentence
+from jcr.records import Capture, PosePairs, Reconstruction
 from simulation.arms import PresetName
 from simulation.faults import INTRINSICS, Faults, faulty_capture, reconstructed
 from simulation.problems import INTRINSICS as OBSERVED_BY
@@ -169,7 +169,7 @@ def test_joint_offsets_and_link_errors_are_not_named_as_a_bent_robot(arm: RobotN
         tracks=observed(problem, np.random.default_rng(2), 300, 0.4),
         backend="simulated",
     )
-    assert not BENT & {one.kind for one in calibrate(capture, reconstruction).findings}
+    assert not kinds_of("strain") & {one.kind for one in calibrate(capture, reconstruction).findings}
 
 
 def test_a_thin_prism_becomes_part_of_the_intrinsics():
@@ -218,7 +218,7 @@ def test_the_parts_of_the_uncertainty_of_a_fixed_camera_are_the_whole_with_its_f
     parts = np.sum(list(vars(hand_eye.budget).values()), axis=0)
     assert np.allclose(parts, hand_eye.covariance, rtol=0, atol=1e-9)
     # The zoom is part of the calibration, and adds no uncertainty of a fault.
-    assert hand_eye.findings[0].kind is Kind.ZOOM and np.trace(hand_eye.budget.faults) == 0
+    assert hand_eye.findings[0].kind is FindingKind.ZOOM and np.trace(hand_eye.budget.faults) == 0
     error = step_between(hand_eye.gripper_from_camera, found.gripper_from_camera)
     assert error @ np.linalg.solve(hand_eye.covariance[:6, :6], error) < 16.8  # 99 % of chi2 of 6
 
@@ -236,7 +236,7 @@ def test_a_change_of_the_tool_in_translation_alone_is_named_in_few_images_howeve
         recon_from_camera=problem.recon_from_camera,
         is_metric=False,
     )
-    found = next(one for one in calibrate_poses(pairs).findings if one.kind is Kind.SLIP)
+    found = next(one for one in calibrate_poses(pairs).findings if one.kind is FindingKind.SLIP)
     assert found.images == ("d", "e")
     assert found.value == pytest.approx(1e-3 * mm, abs=1e-3)
 
@@ -258,7 +258,7 @@ def test_positions_that_are_all_too_long_are_said_to_be_beyond_what_images_show_
     unknown = calibrate(capture, reconstruction)
     assert unknown.converged and not unknown.warnings
     file = calibration_file(capture, reconstruction, unknown, {}, "")
-    (alone,) = (sentence(one) for one in file.findings if one.kind is Kind.SCALE_FROM_ROBOT)
+    (alone,) = (sentence(one) for one in file.findings if one.kind is FindingKind.SCALE_FROM_ROBOT)
     assert alone in file.notes
     # Simulated observations are metric as the scene is; the robot's positions are not.
     metric = calibrate(capture, replace(reconstruction, is_metric=True, metric_std=0.002))
@@ -279,8 +279,13 @@ def test_what_differs_from_image_to_image_is_a_fault_where_it_is_surely_larger_t
     """Of 200 images a scatter of 1.4 standard deviations has a chance of 1e-7 if the noise is exactly as estimated."""
     std = np.full(6, 1e-5)
     found = Finding(
-        kind=Kind.FOCUS_BY_IMAGE, severity="warns", mend="images", value=4.8e-4, std=3.4e-4, shift=(1e-4,) * 7
+        kind=FindingKind.FOCUS_BY_IMAGE,
+        severity="warns",
+        concerns="images",
+        value=4.8e-4,
+        std=3.4e-4,
+        shift=(1e-4,) * 7,
     )
     assert not is_material(found, std)
     assert is_material(replace(found, value=1e-2), std)
-    assert is_material(replace(found, kind=Kind.FOCUS_BY_DISTANCE), std)
+    assert is_material(replace(found, kind=FindingKind.FOCUS_BY_DISTANCE), std)

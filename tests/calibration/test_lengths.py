@@ -10,9 +10,9 @@ from jcr.calibration.checks import lengths
 from jcr.calibration.checks.lengths import Length, contradiction, finding_of
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
+from jcr.findings import Finding, FindingKind, sentence
 from jcr.geometry import step_between
-from jcr.records import DepthCheck, Finding, HandEye, Kind
-from jcr.records.words import sentence
+from jcr.records import DepthCheck, HandEye
 from simulation.boards import Sheet, with_sheet
 from simulation.faults import Faults, faulty_capture, reconstructed
 
@@ -40,7 +40,7 @@ def of_pixels(monkeypatch: pytest.MonkeyPatch, metres_per_unit: float) -> None:
         monkeypatch.setattr(module, "length_cue", lambda *_: (metres_per_unit, 0.01))
 
 
-def of_kind(hand_eye: HandEye, kind: Kind) -> Finding:
+def of_kind(hand_eye: HandEye, kind: FindingKind) -> Finding:
     (found,) = (one for one in hand_eye.findings if one.kind is kind)
     return found
 
@@ -51,7 +51,7 @@ def test_a_board_that_agrees_with_the_robot_makes_the_scale_more_certain():
     assert both.covariance[6, 6] < 0.9 * alone.covariance[6, 6]
     (board,) = both.scale_evidence.lengths
     assert board.name == "board" and board.used and abs(board.robot_longer_percent) < 1
-    assert not any(one.kind is Kind.SCALE_FROM_ROBOT for one in both.findings)
+    assert not any(one.kind is FindingKind.SCALE_FROM_ROBOT for one in both.findings)
     assert both.converged and not both.warnings
     step = step_between(both.gripper_from_camera, x)
     assert (np.abs(step) < 3 * np.sqrt(np.diag(both.covariance)[:6])).all()
@@ -64,7 +64,7 @@ def test_positions_too_long_are_named_with_the_board_and_the_truth_is_within_wha
     pose_scale: float,
 ):
     hand_eye, x = calibrated(Sheet(bend_m=2e-3), pose_scale)
-    named = of_kind(hand_eye, Kind.BOARD_SIZE)
+    named = of_kind(hand_eye, FindingKind.BOARD_SIZE)
     assert named.std is not None and named.value == pytest.approx(pose_scale - 1, abs=3 * named.std)
     assert not hand_eye.scale_evidence.lengths[0].used
     assert hand_eye.converged == (abs(pose_scale - 1) < 0.03)
@@ -81,7 +81,7 @@ def test_a_board_of_30_mm_given_for_one_of_25_rejects_the_calibration_in_one_lin
 
 def test_the_side_of_a_board_of_unknown_size_is_stated_by_the_robot():
     hand_eye, _ = calibrated(Sheet(stated_m=None), pose_scale=1.016)
-    side = of_kind(hand_eye, Kind.BOARD_SIDE)
+    side = of_kind(hand_eye, FindingKind.BOARD_SIDE)
     assert side.value is not None and side.std is not None
     assert side.value == pytest.approx(1.016 * 0.025, abs=3 * side.std) and side.std < 1e-4
     assert "if they measure 25.5 mm" in sentence(side) or "if they measure 25 mm, give 0.025" in sentence(
@@ -96,7 +96,7 @@ def test_a_board_that_neither_agrees_with_the_robot_nor_surely_contradicts_it_is
     alone, _ = calibrated(Sheet(stated_m=None), pose_scale=1.006)
     (board,) = hand_eye.scale_evidence.lengths
     assert not board.used and 0.4 < board.robot_longer_percent < 1.0
-    assert not any(one.kind is Kind.BOARD_SIZE for one in hand_eye.findings)
+    assert not any(one.kind is FindingKind.BOARD_SIZE for one in hand_eye.findings)
     assert np.allclose(hand_eye.gripper_from_camera, alone.gripper_from_camera, rtol=0, atol=1e-9)
     assert hand_eye.covariance[6, 6] > 2 * alone.covariance[6, 6]
     error = np.r_[step_between(hand_eye.gripper_from_camera, x), -np.log(hand_eye.scale)]
@@ -109,13 +109,13 @@ def test_a_known_length_that_contradicts_the_robot_rejects_unless_a_board_agrees
     options = CalibrateOptions(known_length=("00.png", 1.0, 2.0, 300.0, 200.0, 100.0))
     of_pixels(monkeypatch, 1.05)
     alone, _ = calibrated(None, options=options)
-    named = of_kind(alone, Kind.SCALES)
+    named = of_kind(alone, FindingKind.SCALES)
     assert (named.severity, named.details) == ("rejects", {"one": "robot", "other": "known length"})
     (line,) = alone.warnings
     assert "the robot's positions and the known length contradict each other by 4." in line
     assert line.endswith(" ± 1.0 %; measure both again")
     both, _ = calibrated(Sheet(), options=options)
-    named = of_kind(both, Kind.SCALES)
+    named = of_kind(both, FindingKind.SCALES)
     assert both.converged and named.severity == "warns" and named.shift is None
     assert sentence(named) == (
         "the size of the board and the known length contradict each other by 4.8 ± 1.0 %; check the known length: the "
@@ -131,7 +131,7 @@ def test_a_known_length_that_agrees_is_compared_beside_features(monkeypatch: pyt
     (known,) = hand_eye.scale_evidence.lengths
     assert known.name == "known length" and known.robot_longer_percent == pytest.approx(-0.5, abs=0.5)
     assert hand_eye.converged and not hand_eye.warnings
-    assert not any(one.kind is Kind.SCALE_FROM_ROBOT for one in hand_eye.findings)
+    assert not any(one.kind is FindingKind.SCALE_FROM_ROBOT for one in hand_eye.findings)
 
 
 def test_a_depth_camera_that_contradicts_robot_and_board_is_named_with_the_percent(
@@ -148,7 +148,7 @@ def test_a_depth_camera_that_contradicts_robot_and_board_is_named_with_the_perce
     )
     monkeypatch.setattr(lengths, "depth_check", lambda *_: measured)
     hand_eye, _ = calibrated(Sheet())
-    named = of_kind(hand_eye, Kind.SCALES)
+    named = of_kind(hand_eye, FindingKind.SCALES)
     assert named.details["other"] == "depth camera" and named.severity == "warns" and hand_eye.converged
     assert "the depth camera contradict each other by 8.3 ± 2.0 %" in sentence(named)
 
@@ -166,7 +166,11 @@ def test_the_one_of_three_lengths_that_is_wrong_is_named_and_a_robot_that_is_rig
     robot, known = Length("robot", 0.0, 0.002), Length("known length", 0.003, 0.01)
     board = Length("board", -0.167, 0.002)
     wrong_board = finding_of(robot, board, [known], hand_eye)
-    assert (wrong_board.kind, wrong_board.severity, wrong_board.shift) == (Kind.BOARD_SIZE, "warns", None)
+    assert (wrong_board.kind, wrong_board.severity, wrong_board.shift) == (
+        FindingKind.BOARD_SIZE,
+        "warns",
+        None,
+    )
     assert "check the size of the board: the robot's positions and the known length agree" in sentence(
         wrong_board
     )

@@ -20,15 +20,15 @@ from jcr.cli import dispatch
 from jcr.cli.output import Output
 from jcr.cli.result import show, show_calibration
 from jcr.errors import InputError, RejectedError
+from jcr.findings import Finding, FindingKind, sentence
 from jcr.geometry import inverse, scale_translation, step_between
-from jcr.records import Finding, HandEye, Kind, PosePairs
-from jcr.records.words import sentence
+from jcr.records import HandEye, PosePairs
 from jcr.report.html import poses_report_html
 from jcr.results import PosesResult, RunOptions
 from simulation.problems import HandEyeProblem, disturbed, hand_eye_problem
 
 DISAGREE = Finding(
-    kind=Kind.RECONSTRUCTION, severity="rejects", details={"text": "the images disagree", "remedy": ""}
+    kind=FindingKind.RECONSTRUCTION, severity="rejects", details={"text": "the images disagree", "remedy": ""}
 )
 NOISE = (5e-4, np.radians(0.1))
 
@@ -158,7 +158,7 @@ def test_what_no_number_of_images_reaches_is_not_promised():
     given, _ = pairs(12, 12)
     content, html = page(given, calibrate_poses(given, CalibrateOptions(require=(0.01, 0.001))))
     assert content.requirement is not None and content.requirement.more_images is None
-    assert content.short is not None and content.short.mend == "none"
+    assert content.short is not None and content.short.concerns == "none"
     assert "a dozen more images would not be enough" in sentence(content.short)
     assert "would not be enough" in html
     met = page(given, calibrate_poses(given))

@@ -11,8 +11,9 @@ from jcr.calibration.stage import calibrate
 from jcr.estimation import image_equations
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.estimation.wrist import adjust_wrist
+from jcr.findings import FindingKind
 from jcr.geometry import retract, step_between
-from jcr.records import Kind, Tracks
+from jcr.records import Tracks
 from simulation.faults import faulty_capture, reconstructed
 
 
@@ -68,5 +69,5 @@ def test_images_of_contradictory_poses_take_few_steps(monkeypatch):
         image_equations, "_normal_equations", lambda *given: solved.append(1) or equations(*given)
     )
     hand_eye = calibrate(replace(capture, base_from_gripper=shuffled), reconstruction)
-    assert Kind.POSES_CONTRADICT_IMAGES in {one.kind for one in hand_eye.findings}
+    assert FindingKind.POSES_CONTRADICT_IMAGES in {one.kind for one in hand_eye.findings}
     assert len(solved) <= 40

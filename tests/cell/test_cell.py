@@ -28,9 +28,9 @@ from jcr.estimation.intrinsics_prior import FIXED, Camera, camera_with_prior
 from jcr.estimation.problem import Problem, State, similarities, with_observations
 from jcr.estimation.projection import view_of
 from jcr.estimation.solve import Solution, solve
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
-from jcr.records import Capture, CellCamera, Finding, HandEye, Reconstruction, Tracks
-from jcr.records import Kind as FindingKind
+from jcr.records import Capture, CellCamera, HandEye, Reconstruction, Tracks
 from simulation.cells import CellProblem, Kind, cell_problem
 
 COUNT = 8

@@ -19,7 +19,17 @@ from jcr.depth.densify import densify
 from jcr.depth.options import DepthOptions
 from jcr.depth.views import choose_neighbours, sweep_planes
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.records import BOTH, MATCHED, NO_DEPTH, PRIOR, Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
+from jcr.records import (
+    BOTH,
+    MATCHED,
+    NO_DEPTH,
+    PRIOR,
+    Capture,
+    Intrinsics,
+    Pointmaps,
+    Reconstruction,
+    Tracks,
+)
 
 pytestmark = pytest.mark.slow
 

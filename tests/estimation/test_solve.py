@@ -14,8 +14,8 @@ from jcr.estimation.mixed_model import Equations, left_out, solve_equations
 from jcr.estimation.solve import solve
 from jcr.estimation.systematic import smooth_errors
 from jcr.estimation.wrist import pose_problem
+from jcr.findings import FindingKind
 from jcr.geometry import inverse, retract, rotation_between_deg, rotation_exp, scale_translation, transform
-from jcr.records import Kind
 from simulation.problems import error, hand_eye_problem
 
 NOISE = (5e-4, np.radians(0.1))
@@ -305,7 +305,7 @@ def test_motions_that_show_too_little_are_named(pattern, deviation_deg, noise):
         if nearly:
             std = np.sqrt(np.diag(solved.covariance))
             too_uncertain = bool((std > [0.02] * 3 + [np.radians(3)] * 3 + [0.05]).any())
-            assert too_uncertain == any(finding.kind is Kind.UNCERTAIN for finding in solved.findings)
+            assert too_uncertain == any(finding.kind is FindingKind.UNCERTAIN for finding in solved.findings)
 
 
 def test_a_weakly_observed_direction_warns_and_its_uncertainty_rejects():
@@ -315,7 +315,7 @@ def test_a_weakly_observed_direction_warns_and_its_uncertainty_rejects():
     for noise in ((1e-5, 1e-5), (5e-3, np.radians(1.0))):
         problem = hand_eye_problem(np.random.default_rng(3), 10, "planar", noise, deviation=np.radians(3.0))
         solved = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
-        assert solved.findings[0].kind is Kind.UNOBSERVABLE
+        assert solved.findings[0].kind is FindingKind.UNOBSERVABLE
         assert solved.findings[0].severity == ("warns" if solved.converged else "rejects")
         verdicts[noise] = solved.verdict
     assert list(verdicts.values()) == ["accepted with warnings", "rejected"]

@@ -15,6 +15,7 @@ from numpy import ndarray
 
 import jcr
 from jcr.capture.images import read_image
+from jcr.findings import FindingKind, sentence
 from jcr.geometry import inverse, rotation_exp, step_between, transform
 from jcr.live.calibration import LiveCalibration, checked_image
 from jcr.live.notation import Notation
@@ -22,8 +23,6 @@ from jcr.live.page import page_content
 from jcr.live.progress import Progress, next_lines
 from jcr.live.session import SessionState
 from jcr.reconstruct import ReconstructOptions, reconstruct
-from jcr.records import Kind
-from jcr.records.words import sentence
 
 REQUIRED = (2.0, 0.3)
 
@@ -139,7 +138,7 @@ def test_a_place_that_shows_what_another_does_is_not_proposed_again(resumed: Liv
         x = resumed.progress.hand_eye.gripper_from_camera  # pyright: ignore[reportOptionalMemberAccess]
         places.append((pose.base_from_gripper @ x)[:3, 3])
         state = resumed.add(still(tabletop, 0), pose.base_from_gripper)
-        assert state.refused is not None and state.refused.kind is Kind.FRAME_REPEATED
+        assert state.refused is not None and state.refused.kind is FindingKind.FRAME_REPEATED
     assert all(np.linalg.norm(places[k] - places[j]) > 0.05 for k in range(3) for j in range(k))
 
 
@@ -177,18 +176,18 @@ def test_each_fault_is_named_at_the_image_where_it_happens(resumed: LiveCalibrat
     count = len(resumed.live.names)
 
     repeated = resumed.add(still(tabletop, 3), pose)
-    assert repeated.refused is not None and repeated.refused.kind is Kind.FRAME_REPEATED
+    assert repeated.refused is not None and repeated.refused.kind is FindingKind.FRAME_REPEATED
     assert repeated.refused.images == ("images/003.png",)
     small = resumed.add(image[::2, ::2], pose)
-    assert small.refused is not None and small.refused.kind is Kind.SIZE_DIFFERS
+    assert small.refused is not None and small.refused.kind is FindingKind.SIZE_DIFFERS
     assert len(resumed.live.names) == count and repeated.registered == resumed.progress.registered
 
-    def against(state: Progress) -> dict[Kind, Any]:
+    def against(state: Progress) -> dict[FindingKind, Any]:
         return {one.kind: one for one in state.findings if one.images == (state.added,)}
 
     noise = np.random.default_rng(0).integers(0, 255, image.shape, dtype=np.uint8)
     strange = resumed.add(noise, pose, time_s=10.0)
-    assert against(strange)[Kind.NOT_REGISTERED].value == 0
+    assert against(strange)[FindingKind.NOT_REGISTERED].value == 0
     wrong = pose @ transform(rotation_exp(np.radians([3.0, 8.0, 0.0])), np.array([0.03, 0.0, 0.02]))
     begun = time.process_time()
     contradicted = resumed.add(image, wrong, time_s=9.0)
@@ -196,11 +195,15 @@ def test_each_fault_is_named_at_the_image_where_it_happens(resumed: LiveCalibrat
     assert len(contradicted.images) == 13 and time.process_time() - begun < 6
     assert contradicted.added in contradicted.registered
     found = against(contradicted)
-    assert found[Kind.POSE_CONTRADICTS_IMAGE].details["rotation"] == pytest.approx(np.radians(8.5), rel=0.1)
-    assert found[Kind.CLOCK_JUMPS].value == pytest.approx(1.0)
+    assert found[FindingKind.POSE_CONTRADICTS_IMAGE].details["rotation"] == pytest.approx(
+        np.radians(8.5), rel=0.1
+    )
+    assert found[FindingKind.CLOCK_JUMPS].value == pytest.approx(1.0)
     resumed.remove(len(resumed.live.names) - 1)
     blurred = resumed.add(np.asarray(cv2.GaussianBlur(image, (0, 0), 9), np.uint8), pose)
-    assert Kind.BLURRED in against(blurred) and Kind.POSE_CONTRADICTS_IMAGE not in against(blurred)
+    assert FindingKind.BLURRED in against(blurred) and FindingKind.POSE_CONTRADICTS_IMAGE not in against(
+        blurred
+    )
     # What is wrong with single images has not harmed the others.
     assert blurred.hand_eye is not None and blurred.hand_eye.converged
 
@@ -216,12 +219,12 @@ def test_a_robot_whose_model_is_refused_gives_no_joint_targets_and_is_named_once
     with closing(LiveCalibration(folder)) as live:
         state = live.update()
         notation = Notation("ur", arm=live.arm)
-    assert [one.kind for one in state.findings].count(Kind.ROBOT_UNUSED) == 1
+    assert [one.kind for one in state.findings].count(FindingKind.ROBOT_UNUSED) == 1
     assert state.next_pose is not None and state.next_joints is None
     shown = "\n".join(next_lines(state, notation))
     assert "joints" not in shown and "cannot reach" not in shown
     page = page_content(SessionState(images=live.live.images, progress=state), REQUIRED, notation)
-    (warning,) = [sentence(one) for one in state.findings if one.kind is Kind.ROBOT_UNUSED]
+    (warning,) = [sentence(one) for one in state.findings if one.kind is FindingKind.ROBOT_UNUSED]
     assert [page.headline, *page.lines].count(warning[:1].upper() + warning[1:]) == 1
 
 
@@ -265,10 +268,10 @@ def test_a_pose_in_millimetres_and_a_sample_that_is_given_twice_are_not_kept(tmp
         in_mm = poses[1].copy()
         in_mm[:3, 3] *= 1e3
         state = live.add(still(tabletop, 1), in_mm)
-        assert state.refused is not None and state.refused.kind is Kind.POSE_UNIT
+        assert state.refused is not None and state.refused.kind is FindingKind.POSE_UNIT
         assert "divide the translation by 1000" in str(state) and len(str(state).splitlines()) == 2
         state = live.add(image, poses[0])
-        assert state.refused is not None and state.refused.kind is Kind.SAMPLE_REPEATED
+        assert state.refused is not None and state.refused.kind is FindingKind.SAMPLE_REPEATED
         assert state.refused.images == state.images == ("images/000.png",)
         # In place of the first it is no second one.
         assert live.add(image, poses[0], replaces=0).images == ("images/001.png",)
@@ -283,5 +286,5 @@ def test_poses_of_another_convention_are_named(grown, tmp_path: Path):
     (folder / "capture.json").write_text(json.dumps(content))
     with closing(LiveCalibration(folder)) as live:
         state = live.update()
-    assert Kind.POSE_CONVENTION in {one.kind for one in state.findings}
+    assert FindingKind.POSE_CONVENTION in {one.kind for one in state.findings}
     assert state.hand_eye is not None and not state.hand_eye.converged and not state.requirement_met

@@ -32,6 +32,8 @@ from jcr.cli.output import Output
 from jcr.cli.result import show
 from jcr.errors import RejectedError
 from jcr.estimation.observability import excitation
+from jcr.findings import no_reconstruction
+from jcr.findings.sentences import worst_direction
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import (
     COVARIANCE_ORDER,
@@ -42,9 +44,7 @@ from jcr.records import (
     Pointmaps,
     Reconstruction,
     Tracks,
-    no_reconstruction,
 )
-from jcr.records.words import worst_direction
 from jcr.report.details import details_section
 from jcr.report.html import failed_report_html, report_html
 from jcr.report.images import MAGNIFIED, reprojections_px

@@ -8,7 +8,8 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from jcr.capture.images import read_image
-from jcr.records import Capture, Finding, Kind
+from jcr.findings import Finding, FindingKind
+from jcr.records import Capture
 
 LOOKED_AT = 3
 """Number of images that are searched; a board that helps is in most of them."""
@@ -82,4 +83,6 @@ def proposed(images: Sequence[UInt8[ndarray, "h w 3"]]) -> Finding | None:
     """Return the finding of a board in view with the --board that would use it; None where there is none."""
     if (board := board_in_view(images)) is None:
         return None
-    return Finding(kind=Kind.BOARD_IN_VIEW, severity="warns", mend="reconstruction", details={"board": board})
+    return Finding(
+        kind=FindingKind.BOARD_IN_VIEW, severity="warns", concerns="reconstruction", details={"board": board}
+    )

@@ -14,16 +14,25 @@ from jcr.calibration.uncertainty_json import SeenJson, Uncertainty, mm_and_deg
 from jcr.capture.plain_files import first_fault, read_json, shown
 from jcr.errors import InputError
 from jcr.files import write_text
+from jcr.findings import (
+    Finding,
+    FindingKind,
+    Verdict,
+    doubt_of,
+    remedy,
+    sentence,
+    strongest_first,
+    text,
+    without_consequences,
+)
 from jcr.intrinsics_json import IntrinsicsAndStd, IntrinsicsJson, Positive
 from jcr.records import (
     Attempt,
     BoardFound,
     Capture,
     DepthCheck,
-    Finding,
     HandEye,
     ImageVerdict,
-    Kind,
     LeaveOneOut,
     LengthCheck,
     Mount,
@@ -33,11 +42,7 @@ from jcr.records import (
     Requirement,
     RobotExamined,
     ScaleCheck,
-    Verdict,
-    strongest_first,
-    without_consequences,
 )
-from jcr.records.words import doubt_of, remedy, sentence, text
 
 FORMAT = "jcr.calibration/1"
 OF_HAND_EYE = (
@@ -192,7 +197,7 @@ class CalibrationFile(Part):
     @property
     def short(self) -> Finding | None:
         """That it is not as exact as is required; None where it is."""
-        return next((one for one in self.findings if one.kind is Kind.NOT_EXACT_ENOUGH), None)
+        return next((one for one in self.findings if one.kind is FindingKind.NOT_EXACT_ENOUGH), None)
 
     @property
     def remarks(self) -> list[str]:

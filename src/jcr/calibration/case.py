@@ -22,7 +22,8 @@ from jcr.estimation.intrinsics_prior import (
 from jcr.estimation.points import points_in_base
 from jcr.estimation.problem import LinearPrior
 from jcr.estimation.solve import Solution
-from jcr.records import Capture, Finding, HandEye, Reconstruction, Tracks
+from jcr.findings import Finding
+from jcr.records import Capture, HandEye, Reconstruction, Tracks
 
 MIN_OBSERVATIONS = 200
 """Fewer correspondences than this do not refine what the poses show."""

@@ -20,8 +20,9 @@ from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.estimation.robust import least_trimmed
 from jcr.estimation.solve import solve
 from jcr.estimation.wrist import pose_problem
+from jcr.findings import Finding, FindingKind, Severity
 from jcr.geometry import inverse, transform
-from jcr.records import Finding, HandEye, Kind, RobotNoise, Severity
+from jcr.records import HandEye, RobotNoise
 
 SOLVED = 24
 """At most this many readings are solved in full, the most congruent ones."""
@@ -160,7 +161,7 @@ def convention_finding(found: tuple[Reading, Reading], severity: Severity = "rej
     )
     remedy = OPTIONS.get(found[0].name, "correct them at their source")
     details = {"reading": found[0].name, "fits": best, "given": given, "remedy": remedy}
-    finding = Finding.of(Kind.POSE_CONVENTION, severity, "poses", value=1e-3 * found[0].translation_mm)
+    finding = Finding.of(FindingKind.POSE_CONVENTION, severity, "poses", value=1e-3 * found[0].translation_mm)
     return replace(finding, details=details)
 
 

@@ -7,8 +7,9 @@ from numpy import ndarray
 from jcr.calibration.options import LengthInImage
 from jcr.camera import project, unproject
 from jcr.errors import InputError
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import Poses, rotation_angle
-from jcr.records import Capture, Finding, HandEye, Kind, Reconstruction
+from jcr.records import Capture, HandEye, Reconstruction
 
 LENGTH_STD = 0.01
 """Relative: a pixel's breadth at either end of a length of a hundred pixels."""
@@ -105,4 +106,4 @@ def scale_contradiction(free: HandEye, metric_std: float) -> Finding | None:
     sigmas, share = CONTRADICTED
     if abs(off) < max(share, sigmas * float(np.hypot(std, metric_std))):
         return None
-    return Finding.of(Kind.BOARD_SIZE, "rejects", "poses", value=float(np.expm1(off)), std=std)
+    return Finding.of(FindingKind.BOARD_SIZE, "rejects", "poses", value=float(np.expm1(off)), std=std)

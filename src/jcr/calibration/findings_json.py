@@ -7,8 +7,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, PlainSerializer, TypeAdapter, ValidationError
 
 from jcr.capture.plain_files import first_fault
-from jcr.records import Finding, Verdict, verdict_of
-from jcr.records.words import remedy, text, warnings_of
+from jcr.findings import Finding, Verdict, remedy, text, verdict_of, warnings_of
 
 
 def _with_words(finding: Finding) -> dict[str, Any]:

@@ -16,7 +16,8 @@ from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.hand_eye import SCALE_STD, solve_hand_eye
 from jcr.estimation.wrist import pose_problem
-from jcr.records import Finding, HandEye, Kind, PosePairs
+from jcr.findings import Finding, FindingKind
+from jcr.records import HandEye, PosePairs
 
 METRIC_STD = 0.005
 """Relative; a printed marker has its stated size to half a percent."""
@@ -64,7 +65,7 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotE
             gripper, camera, robot_noise=noise, offset=offset, systematic=systematic, scale=scale
         )
         if not free.observability.observable and scale == 1.0:
-            return hand_eye.with_findings(Finding.of(Kind.SCALE_ASSUMED, "warns", "motion"))
+            return hand_eye.with_findings(Finding.of(FindingKind.SCALE_ASSUMED, "warns", "motion"))
     if not hand_eye.converged:
         found = better_reading(gripper, camera)
         if found is None:
@@ -75,7 +76,7 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotE
     if pairs.is_metric and not is_one(hand_eye):
         return hand_eye.with_findings(
             Finding.of(
-                Kind.BOARD_SIZE,
+                FindingKind.BOARD_SIZE,
                 "warns",
                 "intrinsics",
                 value=hand_eye.scale - 1,

@@ -13,7 +13,8 @@ from jcr.calibration.robot_errors import RobotErrors
 from jcr.calibration.seen import Scene, in_use, within_95
 from jcr.estimation.next_poses import assumed_camera
 from jcr.estimation.observability import excitation
-from jcr.records import BENT, Finding, HandEye, Kind, Mend, NextPose, Plan, Requirement, Where
+from jcr.findings import Concerns, Finding, FindingKind
+from jcr.records import HandEye, NextPose, Plan, Requirement, Where
 
 GRASPING = (5.0, 1.0)
 """mm, degrees: a parallel gripper that opens 10 mm wider than its object has 5 mm to either side, and a degree moves the
@@ -40,7 +41,11 @@ def advised(
     hand_eye = replace(hand_eye, in_use=in_use(hand_eye.estimate, scene or Scene(assumptions.distance_m)))
     required = _required(hand_eye, options)
     # Wrong intrinsics and a bent robot stay what they are with further images.
-    lasting = [one.covariance for one in hand_eye.findings if one.mend == "intrinsics" or one.kind in BENT]
+    lasting = [
+        one.covariance
+        for one in hand_eye.findings
+        if one.concerns == "intrinsics" or one.kind.row.group == "strain"
+    ]
     assumptions = replace(assumptions, faults=sum(lasting, start=np.zeros((7, 7))))
     proposed = list[NextPose]()
     if hand_eye.converged and required.met and not options.next_poses:
@@ -56,7 +61,7 @@ def advised(
         ahead = Ahead.of(assumptions, used, robot, PROPOSED)
         proposed = [ahead.next_pose(count, ahead.expected(count)) for count in range(1, PROPOSED + 1)]
     seen = excitation(used, hand_eye.gripper_from_camera) if len(used) > 1 else None
-    earlier = tuple(one for one in hand_eye.findings if one.kind is not Kind.NOT_EXACT_ENOUGH)
+    earlier = tuple(one for one in hand_eye.findings if one.kind is not FindingKind.NOT_EXACT_ENOUGH)
     hand_eye = replace(hand_eye, plan=Plan(seen, tuple(proposed), required), findings=earlier)
     short = not_exact_enough(required, hand_eye.budget is not None and hand_eye.budget.mostly_systematic)
     return hand_eye if short is None or not hand_eye.converged else hand_eye.with_findings(short)
@@ -69,13 +74,13 @@ def not_exact_enough(required: Requirement, systematic: bool) -> Finding | None:
     """
     if required.met:
         return None
-    mend: Mend = "images" if required.more_images is not None else "robot" if systematic else "none"
+    concerns: Concerns = "images" if required.more_images is not None else "robot" if systematic else "none"
     numbers = {
         name: value if isinstance(value, str) else float(value)
         for name, value in vars(required).items()
         if value is not None
     }
-    finding = Finding.of(Kind.NOT_EXACT_ENOUGH, "rejects" if required.asked else "warns", mend)
+    finding = Finding.of(FindingKind.NOT_EXACT_ENOUGH, "rejects" if required.asked else "warns", concerns)
     return replace(finding, value=1e-3 * required.reached_mm, details=numbers)
 
 

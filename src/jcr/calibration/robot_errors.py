@@ -16,7 +16,8 @@ from jcr.estimation.kinematics import Arm, Joints
 from jcr.estimation.mounting import LengthError
 from jcr.estimation.next_poses import nearest
 from jcr.estimation.systematic import arm_errors, posed, smooth_errors
-from jcr.records import Capture, Finding, Kind
+from jcr.findings import Finding, FindingKind
+from jcr.records import Capture
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ def robot_errors(capture: Capture, options: CalibrateOptions, later: Capture | N
     except InputError as error:
         if options.robot is not None:
             raise InputError(f"--robot {options.robot}: {error}") from None
-        unused = Finding.of(Kind.ROBOT_UNUSED, "warns", "robot", text=str(error))
+        unused = Finding.of(FindingKind.ROBOT_UNUSED, "warns", "robot", text=str(error))
         return replace(errors_of(gripper), unused=unused)
 
 

@@ -11,8 +11,8 @@ from pydantic import AfterValidator, model_validator
 from jcr.arrays_json import Covariance7, Part, PartCovariance7, Spread, Spread3, Square
 from jcr.calibration.seen import joint_covariance
 from jcr.camera import parameter_names
+from jcr.findings.sentences import worst_direction
 from jcr.records import COVARIANCE_ORDER, Budget, Estimate, InUse, Seen
-from jcr.records.words import worst_direction
 
 
 def mm_and_deg(metres: float, radians: float) -> dict[str, float]:

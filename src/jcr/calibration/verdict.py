@@ -6,7 +6,8 @@ import numpy as np
 
 from jcr.calibration.case import Case, Checked
 from jcr.estimation.hand_eye import judged
-from jcr.records import Finding, HandEye, verdict_of
+from jcr.findings import Finding, verdict_of
+from jcr.records import HandEye
 
 
 def with_checked(case: Case, checked: Checked) -> Case:

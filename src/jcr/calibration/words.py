@@ -7,8 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from jcr.calibration.calibration_json import CalibrationFile, GivenIntrinsicsKept
 from jcr.calibration.uncertainty_json import SeenAndCorners, UncertaintyBudget
-from jcr.records import Attempt, BoardFound, DepthCheck, LeaveOneOut, is_explained, verdict_of
-from jcr.records.words import network_scale, reached_in_words, sentence
+from jcr.findings import is_explained, sentence, verdict_of
+from jcr.findings.sentences import network_scale, reached_in_words
+from jcr.records import Attempt, BoardFound, DepthCheck, LeaveOneOut
 from jcr.rounding import significant, with_std
 
 NOTHING = 0.02

@@ -15,8 +15,9 @@ from jcr.capture.images import ROTATED, HowStored, other_size, read_image, read_
 from jcr.capture.options import MAX_FRAMES, MIN_FRAMES
 from jcr.capture.plain_files import contained, first_few
 from jcr.errors import InputError
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import require_rigid, step_between
-from jcr.records import Capture, Finding, Kind
+from jcr.records import Capture
 
 MIRRORED = (2, 4, 5, 7)
 SAME_POSE = (0.5e-3, np.radians(0.05))
@@ -164,7 +165,7 @@ def how_rotated(capture: Capture) -> Finding | None:
     if capture.orientation == 1:
         return None
     return Finding(
-        kind=Kind.IMAGES_ROTATED,
+        kind=FindingKind.IMAGES_ROTATED,
         severity="warns",
         value=float(capture.orientation),
         details={"rotated": ROTATED[capture.orientation]},

@@ -16,11 +16,11 @@ from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.capture.pairing import image_names
 from jcr.capture.plain_files import read_json
 from jcr.errors import InputError
+from jcr.findings import sentence
 from jcr.geometry import inverse
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.records import Capture, PosePairs
-from jcr.records.words import sentence
 
 FORMATS = {
     module.FORMAT.name: module.FORMAT for module in (capture_json, bag, lerobot, samples, colmap, table)

@@ -11,7 +11,8 @@ from numpy import ndarray
 from jcr.camera import usable_intrinsics
 from jcr.cell.found import CameraFound
 from jcr.cell.localise import Shared, distance
-from jcr.records import CellCamera, Finding, Intrinsics, Kind, Mend
+from jcr.findings import Concerns, Finding, FindingKind
+from jcr.records import CellCamera, Intrinsics
 
 
 @dataclass(frozen=True)
@@ -70,9 +71,11 @@ class CameraViews:
         """With why some images are not used."""
         return replace(self, reasons=tuple(reasons.get(k, before) for k, before in enumerate(self.reasons)))
 
-    def refused(self, kind: Kind, mend: Mend = "none", *images: str, **numbers: Any) -> CameraFound:
+    def refused(
+        self, kind: FindingKind, concerns: Concerns = "none", *images: str, **numbers: Any
+    ) -> CameraFound:
         """The camera is not placed, for this finding, as Finding.of makes it."""
-        return self.not_placed(Finding.of(kind, "rejects", mend, *images, **numbers))
+        return self.not_placed(Finding.of(kind, "rejects", concerns, *images, **numbers))
 
     def not_placed(self, *why: Finding) -> CameraFound:
         """The camera with why it is not placed."""

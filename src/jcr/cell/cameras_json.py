@@ -15,9 +15,9 @@ from jcr.capture.plain_files import first_fault, is_written, read_json
 from jcr.cell.found import CameraFound, CellFound, ImageFound
 from jcr.errors import InputError
 from jcr.files import write_text
+from jcr.findings import Verdict, doubt_of
 from jcr.intrinsics_json import IntrinsicsAndStd
-from jcr.records import Mount, Verdict
-from jcr.records.words import doubt_of
+from jcr.records import Mount
 from jcr.rounding import significant
 
 FILE, FORMAT = "cameras.json", "jcr.cameras/1"

@@ -19,8 +19,9 @@ from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.verdict import with_findings
 from jcr.cell.background import write_moving_parts
 from jcr.estimation.hand_eye import judged, solve_hand_eye
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import inverse
-from jcr.records import Capture, Finding, HandEye, Kind, Reconstruction
+from jcr.records import Capture, HandEye, Reconstruction
 
 
 def exchanged(capture: Capture) -> Capture:
@@ -92,5 +93,5 @@ def _explained(capture: Capture, reconstruction: Reconstruction, found: HandEye)
     on_gripper = solve_hand_eye(capture.base_from_gripper[rows], reconstruction.recon_from_camera)
     if not on_gripper.converged:
         return found
-    why = Finding.of(Kind.WRONG_MOUNT, "rejects", "mount", camera=capture.camera_name)
+    why = Finding.of(FindingKind.WRONG_MOUNT, "rejects", "mount", camera=capture.camera_name)
     return found.with_findings(why)

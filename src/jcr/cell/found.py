@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.findings import Finding
 from jcr.geometry import skew
-from jcr.records import Assessed, CellCamera, Finding, Intrinsics, Mount
+from jcr.records import Assessed, CellCamera, Intrinsics, Mount
 
 if TYPE_CHECKING:
     from jcr.estimation.problem import State

@@ -16,7 +16,8 @@ from jcr.estimation.observations import Observations
 from jcr.estimation.problem import Problem, RigGaussian, State, with_observations
 from jcr.estimation.score_test import freed, with_camera
 from jcr.estimation.solve import Solution, solve
-from jcr.records import Capture, HandEye, Intrinsics, Kind, Reconstruction
+from jcr.findings import FindingKind
+from jcr.records import Capture, HandEye, Intrinsics, Reconstruction
 from jcr.sfm.track_refinement import KEYPOINT_STD_PX
 
 EXACT = 1e-6
@@ -132,7 +133,7 @@ def _cameras(
 
     Given intrinsics that the own camera's images contradict count as estimated.
     """
-    contradicted = any(one.kind is Kind.INTRINSICS and one.shift is None for one in hand_eye.findings)
+    contradicted = any(one.kind is FindingKind.INTRINSICS and one.shift is None for one in hand_eye.findings)
     given = capture.intrinsics is not None and not contradicted
     cameras = [camera_about(own, given, capture.intrinsics_std)]
     for member in members:

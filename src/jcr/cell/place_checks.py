@@ -8,7 +8,7 @@ from jcr.cell.found import CameraFound
 from jcr.cell.localise import LEAST_SPREAD, spread
 from jcr.cell.rigs import Member
 from jcr.estimation.hand_eye import MAX_STD
-from jcr.records import Finding, Kind
+from jcr.findings import Finding, FindingKind
 
 MEDIAN_PX = 3.0
 """Images of a camera that miss by more, of one 1600 px wide, do not fit one place."""
@@ -36,7 +36,7 @@ def contradicting_image(found: CameraFound, member: Member) -> Finding | None:
     px = worst.reprojection_px or 0.0
     if px <= MEDIAN_PX * max(1.0, member.camera.image_size[0] / 1600):
         return None
-    return Finding.of(Kind.IMAGE_MISSES, "rejects", "mount", worst.image, value=px, mount=found.mount)
+    return Finding.of(FindingKind.IMAGE_MISSES, "rejects", "mount", worst.image, value=px, mount=found.mount)
 
 
 def place_uncertain(found: CameraFound, member: Member) -> Finding | None:
@@ -49,7 +49,7 @@ def place_uncertain(found: CameraFound, member: Member) -> Finding | None:
     if unknown:
         details["focal_std"] = float(found.intrinsics_std[0] / found.intrinsics.fx)
     return Finding.of(
-        Kind.PLACE_UNCERTAIN, "rejects", "intrinsics" if unknown else "images", value=metres, **details
+        FindingKind.PLACE_UNCERTAIN, "rejects", "intrinsics" if unknown else "images", value=metres, **details
     )
 
 
@@ -58,7 +58,7 @@ def crowded_points(member: Member) -> Finding | None:
     widest = max(spread(one) for one in member.seen.shared if one is not None)
     if widest >= LEAST_SPREAD:
         return None
-    return Finding.of(Kind.POINTS_CROWDED, "warns", "images", value=widest)
+    return Finding.of(FindingKind.POINTS_CROWDED, "warns", "images", value=widest)
 
 
 def far_from_gripper(found: CameraFound) -> Finding | None:
@@ -67,4 +67,4 @@ def far_from_gripper(found: CameraFound) -> Finding | None:
     away = float(np.linalg.norm(found.parent_from_camera[:3, 3]))
     if found.mount == "base" or away <= FAR_FROM_GRIPPER:
         return None
-    return Finding.of(Kind.FAR_FROM_GRIPPER, "warns", "mount", value=away)
+    return Finding.of(FindingKind.FAR_FROM_GRIPPER, "warns", "mount", value=away)

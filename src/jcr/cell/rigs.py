@@ -18,8 +18,9 @@ from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.estimation.pose_effects import arm_rows
 from jcr.estimation.problem import Arm
 from jcr.estimation.systematic import smooth_errors
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import Transform, inverse, motion_length, step_between
-from jcr.records import BENT, Capture, CellCamera, Finding, HandEye, Kind
+from jcr.records import Capture, CellCamera, HandEye
 
 SAME_PLACE = (0.02, np.radians(2.0))
 """m, rad: images of one fixed camera, or places of a camera on its gripper, differ by no more."""
@@ -70,7 +71,7 @@ class Rigs:
         if not len(seen.rows):
             most = int(np.argmax(seen.counts))
             best, count = seen.camera.images[most], float(seen.counts[most])
-            return seen.refused(Kind.FEW_POINTS_SHARED, "images", best, value=count)
+            return seen.refused(FindingKind.FEW_POINTS_SHARED, "images", best, value=count)
         if seen.camera.arm is not None:
             return self._on_other_arm(seen, seen.camera.arm)
         return self._on_same_gripper(seen) if seen.camera.mount == "gripper" else self._fixed(seen)
@@ -85,7 +86,7 @@ class Rigs:
         if metres.max() > most_m or radians.max() > most_rad:
             a, b = np.unravel_index((metres / most_m + radians / most_rad).argmax(), metres.shape)
             apart = {"value": float(metres[a, b]), "rotation": float(radians[a, b])}
-            return seen.refused(Kind.NOT_FIXED, "mount", names[a], names[b], **apart)
+            return seen.refused(FindingKind.NOT_FIXED, "mount", names[a], names[b], **apart)
         middle = int(metres.sum(1).argmin())
         rig = np.full(len(seen.shared), -1)
         rig[seen.rows] = len(self.poses)
@@ -100,7 +101,9 @@ class Rigs:
         near = np.flatnonzero((metres < AT_A_FRAME[0]) & (radians < AT_A_FRAME[1]))
         images = [self._capture.images[self._rows[row]] for row in near[:1]]
         own = self._capture.camera_name
-        return tuple(Finding.of(Kind.AT_ANOTHER_CAMERA, "warns", "mount", one, camera=own) for one in images)
+        return tuple(
+            Finding.of(FindingKind.AT_ANOTHER_CAMERA, "warns", "mount", one, camera=own) for one in images
+        )
 
     def _on_same_gripper(self, seen: CameraViews) -> Member | CameraFound:
         assert seen.camera.frame is not None
@@ -115,11 +118,13 @@ class Rigs:
         seen = seen.without(unused)
         taken = np.flatnonzero(rig >= 0)
         if not len(taken):
-            return seen.refused(Kind.NO_COMMON_POSE, "images")
+            return seen.refused(FindingKind.NO_COMMON_POSE, "images")
         wrist = np.stack(self.poses)[rig[taken]]
         metres, radians = _apart(wrist[:, None], wrist)
         if not ((metres > SAME_PLACE[0]) | (radians > SAME_PLACE[1])).any():
-            return seen.refused(Kind.ONE_GRIPPER_POSE, "images", *(seen.camera.images[k] for k in taken))
+            return seen.refused(
+                FindingKind.ONE_GRIPPER_POSE, "images", *(seen.camera.images[k] for k in taken)
+            )
         on_rig = inverse(wrist) @ seen.places[np.isin(seen.rows, taken)]
         between = np.asarray(motion_length(inverse(on_rig)[:, None] @ on_rig[None]))
         middle = int(np.median(between, axis=1).argmin())
@@ -127,7 +132,7 @@ class Rigs:
         astray = (metres > SAME_PLACE[0]) | (radians > SAME_PLACE[1])
         if astray.mean() > 0.4:
             most_m, own = float(metres.max()), self._capture.camera_name
-            return seen.refused(Kind.NOT_RIGID, "mount", value=most_m, camera=own)
+            return seen.refused(FindingKind.NOT_RIGID, "mount", value=most_m, camera=own)
         rig[taken[astray]] = -1
         why = "its place on the gripper is not that of its other images"
         seen = seen.without(dict.fromkeys(taken[astray].tolist(), why))
@@ -136,10 +141,10 @@ class Rigs:
     def _on_other_arm(self, seen: CameraViews, arm: str) -> Member | CameraFound:
         assert seen.camera.base_from_gripper is not None
         if arm in self.arms:
-            return seen.refused(Kind.SECOND_ON_ARM, arm=arm)
+            return seen.refused(FindingKind.SECOND_ON_ARM, arm=arm)
         if len(seen.rows) < LEAST_POSES:
             counts = {"value": float(len(seen.rows)), "needed": float(LEAST_POSES)}
-            return seen.refused(Kind.FEW_LOCALISED, "images", **counts)
+            return seen.refused(FindingKind.FEW_LOCALISED, "images", **counts)
         places, gripper = seen.places, seen.camera.base_from_gripper[seen.rows]
         std = max(float(np.sqrt(self._hand_eye.covariance[6, 6])), 1e-4)
         found = solve_hand_eye(gripper, places, scale=1.0, scale_std=std)
@@ -159,7 +164,7 @@ class Rigs:
         robot = robot_errors(self._capture, options).of(self._rows)
         hand_eye = self._hand_eye
         poses = self._capture.base_from_gripper[self._rows]
-        kinds = {one.kind for one in hand_eye.findings if one.kind in BENT}
+        kinds = {one.kind for one in hand_eye.findings if one.kind.row.group == "strain"}
         bent = [row.prior_std * row.columns for row in arm_rows(poses) if row.kind in kinds]
         arms = [
             Arm(

@@ -34,10 +34,11 @@ from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.intrinsics_prior import ESTIMATED, camera_with_prior
 from jcr.estimation.problem import State
 from jcr.estimation.solve import Solution
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import inverse, scale_translation
 from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress, silent, steps
-from jcr.records import Capture, CellCamera, Finding, HandEye, Kind, Reconstruction
+from jcr.records import Capture, CellCamera, HandEye, Reconstruction
 
 SURE_OF_INTRINSICS = 3.5
 """Standard deviations from which a further camera's images are said to contradict its intrinsics: one image of 127
@@ -61,7 +62,7 @@ def place_cameras(
     if not others:
         return CellFound((), (), None)
     if not hand_eye.is_sound:
-        why = (Finding.of(Kind.OWN_REJECTED, "rejects", camera=capture.camera_name),)
+        why = (Finding.of(FindingKind.OWN_REJECTED, "rejects", camera=capture.camera_name),)
         refused = [
             CameraFound.not_placed(
                 one, why, [0] * len(one.images), ["the camera was not placed"] * len(one.images)
@@ -145,7 +146,7 @@ def _examined(
         )
         _, faults = effects(imaged)
         contradiction = None
-        if is_given and all(one.kind is Kind.INTRINSICS for one in faults):
+        if is_given and all(one.kind is FindingKind.INTRINSICS for one in faults):
             contradiction = contradicted_by(imaged, SURE_OF_INTRINSICS)
         if contradiction is not None:
             answer, contradicted = contradiction

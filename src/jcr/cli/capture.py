@@ -126,7 +126,8 @@ def _conclude(
     requirement_met: bool,
 ) -> int:
     """Print the result and the next command; return 3 where it is rejected or not what `--until-accurate` requires."""
-    from jcr.records.words import reached_in_words, sentence
+    from jcr.findings import sentence
+    from jcr.findings.sentences import reached_in_words
 
     out, images = arguments.out, len(folder.names)
     required = None if result is None else result.hand_eye.requirement

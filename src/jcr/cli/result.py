@@ -27,7 +27,7 @@ def show(result: "RunResult | SavedRun | PosesResult", output: Output, after: st
     """
     from jcr.calibration.words import verdict_in_words
     from jcr.cell.cameras_json import in_words
-    from jcr.records.words import sentence
+    from jcr.findings import sentence
     from jcr.results import PosesResult
 
     content, cameras = result.calibration, getattr(result, "cameras", None)

@@ -18,19 +18,17 @@ from jcr.estimation.residuals import paper_residuals
 from jcr.estimation.robust import robust_fit
 from jcr.estimation.solve import Solution
 from jcr.estimation.systematic import arm_errors, posed, smooth_errors
+from jcr.findings import Finding, FindingKind, strongest_first
 from jcr.geometry import Poses, require_rigid
 from jcr.least_squares import one_blas_thread
 from jcr.records import (
     Estimate,
-    Finding,
     HandEye,
     ImageResiduals,
-    Kind,
     LeaveOneOut,
     PaperResiduals,
     RobotExamined,
     RobotNoise,
-    strongest_first,
 )
 
 MAX_NOISE = (0.02, np.radians(3.0))
@@ -161,12 +159,12 @@ def _with_residuals(gripper: Poses, camera: Poses, fit: Solution, distinct: Int[
 
 JUDGED = frozenset(
     {
-        Kind.FEW_AGREE,
-        Kind.POSES_CONTRADICT_IMAGES,
-        Kind.UNCERTAIN,
-        Kind.NOISE_ABOVE_GIVEN,
-        Kind.LEAVE_ONE_OUT,
-        Kind.FEW_IMAGES,
+        FindingKind.FEW_AGREE,
+        FindingKind.POSES_CONTRADICT_IMAGES,
+        FindingKind.UNCERTAIN,
+        FindingKind.NOISE_ABOVE_GIVEN,
+        FindingKind.LEAVE_ONE_OUT,
+        FindingKind.FEW_IMAGES,
     }
 )
 """Kinds of findings that the numbers of a calibration decide by themselves."""
@@ -190,10 +188,10 @@ def _of_agreement(hand_eye: HandEye) -> Iterator[Finding]:
     """Too few images, or none, that fit their gripper poses."""
     used, n = float(hand_eye.inliers.sum()), len(hand_eye.inliers)
     if used < max(3, MIN_SHARE_USED * n) and n > 2:
-        yield Finding.of(Kind.FEW_AGREE, "rejects", "reconstruction", value=used, images=float(n))
+        yield Finding.of(FindingKind.FEW_AGREE, "rejects", "reconstruction", value=used, images=float(n))
     metres, radians = hand_eye.robot_noise.together
     if metres > MAX_NOISE[0] or radians > MAX_NOISE[1]:
-        kind = Kind.POSES_CONTRADICT_IMAGES
+        kind = FindingKind.POSES_CONTRADICT_IMAGES
         yield Finding.of(kind, "rejects", "reconstruction", value=metres, rotation=radians)
 
 
@@ -208,7 +206,9 @@ def _of_uncertainty(hand_eye: HandEye) -> Iterator[Finding]:
     for (part, value), limit in zip(parts.items(), MAX_STD, strict=True):
         if value > limit:
             of_noise = {"noise_unknown": 1.0} if unknown else {}
-            yield Finding.of(Kind.UNCERTAIN, "rejects", "images", value=float(value), part=part, **of_noise)
+            yield Finding.of(
+                FindingKind.UNCERTAIN, "rejects", "images", value=float(value), part=part, **of_noise
+            )
 
 
 def _of_residuals(hand_eye: HandEye) -> Iterator[Finding]:
@@ -219,13 +219,15 @@ def _of_residuals(hand_eye: HandEye) -> Iterator[Finding]:
         metres > SURPRISE * noise.given[0] or radians > SURPRISE * noise.given[1]
     ):
         details = {"rotation": radians, "given": noise.given[0], "given_rotation": noise.given[1]}
-        yield Finding.of(Kind.NOISE_ABOVE_GIVEN, "warns", "none", value=metres, **details)
+        yield Finding.of(FindingKind.NOISE_ABOVE_GIVEN, "warns", "none", value=metres, **details)
     if (leave_one_out := hand_eye.leave_one_out) is not None:
         leave_one_out_m, typical = 1e-3 * leave_one_out.translation_mm, float(np.sqrt(3)) * noise.together[0]
         if leave_one_out_m > max(3 * typical, WELL_ABOVE):
-            yield Finding.of(Kind.LEAVE_ONE_OUT, "warns", "images", value=leave_one_out_m, residual=typical)
+            yield Finding.of(
+                FindingKind.LEAVE_ONE_OUT, "warns", "images", value=leave_one_out_m, residual=typical
+            )
     if len(hand_eye.inliers) < FEW:
-        yield Finding.of(Kind.FEW_IMAGES, "warns", "images", value=float(len(hand_eye.inliers)))
+        yield Finding.of(FindingKind.FEW_IMAGES, "warns", "images", value=float(len(hand_eye.inliers)))
 
 
 def _disagreement(hand_eye: HandEye) -> tuple[float, float]:

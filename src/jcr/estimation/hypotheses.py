@@ -16,7 +16,8 @@ from jcr.distributions import f as f_distribution
 from jcr.estimation.components import most_likely, over_sizes
 from jcr.estimation.equation import UNKNOWNS
 from jcr.estimation.mixed_model import Equations, LogSizes, solve_equations
-from jcr.records import Kind, RobotNoise
+from jcr.findings import FindingKind
+from jcr.records import RobotNoise
 
 CONFIRMED_AT_MOST = 3
 """Kinds of effects that are confirmed: those with the largest gains of the score test."""
@@ -30,7 +31,7 @@ BY_CHANCE = 0.02
 class Row:
     """Columns that one effect adds to the equations of the gripper poses."""
 
-    kind: Kind
+    kind: FindingKind
     columns: Float[ndarray, "s d"]
     """Derivative of the residuals (m, rad, base axes) by the d parameters of the effect."""
     place: int = 0
@@ -84,7 +85,7 @@ def best_tests(equations: Equations, log_sizes: LogSizes, rows: Sequence[Row]) -
     if not rows:
         return []
     gain = gains(equations, log_sizes, rows)
-    best: dict[Kind, int] = {}
+    best: dict[FindingKind, int] = {}
     for k in np.argsort(-gain).tolist():
         best.setdefault(rows[k].kind, k)
     chosen = list(best.values())[:CONFIRMED_AT_MOST]

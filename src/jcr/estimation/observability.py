@@ -16,8 +16,9 @@ from numpy import ndarray
 
 from jcr.estimation.equation import BASE_ROTATION, ROTATION, SCALE, Poses, residuals
 from jcr.estimation.problem import LinearPrior
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import ARM, Transform, transform
-from jcr.records import Excitation, Finding, Kind, Observability
+from jcr.records import Excitation, Observability
 
 MIN_SPREAD = 0.1
 """Metres; camera centres closer together than this show little of scale."""
@@ -82,7 +83,7 @@ def _unseen(motion: str, at: Float[ndarray, "3"] | None = None, frame: str = "")
     where: dict[str, Any] = (
         {} if at is None else dict(zip("xyz", at.tolist(), strict=True)) | {"frame": frame}
     )
-    return Finding.of(Kind.UNOBSERVABLE, "rejects", "motion", motion=motion, **where)
+    return Finding.of(FindingKind.UNOBSERVABLE, "rejects", "motion", motion=motion, **where)
 
 
 def _explained(

@@ -7,22 +7,22 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.estimation.hypotheses import Row
+from jcr.findings import FindingKind
 from jcr.geometry import Poses, skew
-from jcr.records import Kind
 
 LEAST_PART = 3
 """Images on either side of a change: fewer are single wrong poses."""
 MANY_PLACES = 60
 """Largest number of places of a change that are tested; longer captures are sampled evenly."""
 UP = np.array([0.0, 0.0, 1.0])
-PLAUSIBLE: dict[Kind, tuple[float, float]] = {
-    Kind.SLIP: (0.12, np.radians(45.0)),
-    Kind.BASE_MOVED: (0.2, np.radians(20.0)),
-    Kind.DRIFT: (0.03, np.radians(10.0)),
-    Kind.DELAY: (1.0, 0.0),
-    Kind.LENGTHS: (0.1, 0.0),
-    Kind.BASE_LEANS: (0.3, 0.0),
-    Kind.TOOL_SAGS: (0.3, 0.0),
+PLAUSIBLE: dict[FindingKind, tuple[float, float]] = {
+    FindingKind.SLIP: (0.12, np.radians(45.0)),
+    FindingKind.BASE_MOVED: (0.2, np.radians(20.0)),
+    FindingKind.DRIFT: (0.03, np.radians(10.0)),
+    FindingKind.DELAY: (1.0, 0.0),
+    FindingKind.LENGTHS: (0.1, 0.0),
+    FindingKind.BASE_LEANS: (0.3, 0.0),
+    FindingKind.TOOL_SAGS: (0.3, 0.0),
 }
 """Largest estimate that the cause can produce: m and rad of a motion, else the norm of the parameters. A clamped camera
 slips by centimetres, and another tool frame is rarely farther away; a delay of a whole interval is a wrong pairing. An
@@ -61,11 +61,11 @@ def order_rows(
         return
     for k in np.unique(np.linspace(LEAST_PART, n - LEAST_PART, count).astype(int)).tolist():
         after = (np.arange(n) >= k).astype(float)[:, None, None]
-        yield Row(kind=Kind.SLIP, columns=_flat(by_x * after), place=k)
-        yield Row(kind=Kind.BASE_MOVED, columns=_flat(by_z * after), place=k)
+        yield Row(kind=FindingKind.SLIP, columns=_flat(by_x * after), place=k)
+        yield Row(kind=FindingKind.BASE_MOVED, columns=_flat(by_z * after), place=k)
     share = np.linspace(-0.5, 0.5, n)[:, None, None]
-    yield Row(kind=Kind.DRIFT, columns=_flat(by_x * share))
-    yield Row(kind=Kind.DELAY, columns=_flat(velocity(base_from_gripper)[..., None]))
+    yield Row(kind=FindingKind.DRIFT, columns=_flat(by_x * share))
+    yield Row(kind=FindingKind.DELAY, columns=_flat(velocity(base_from_gripper)[..., None]))
 
 
 def arm_rows(base_from_gripper: Poses) -> Iterator[Row]:
@@ -74,18 +74,18 @@ def arm_rows(base_from_gripper: Poses) -> Iterator[Row]:
     n = len(position)
     strain = np.zeros((n, 6, len(STRAINS)))
     strain[:, :3] = np.einsum("kab,nb->nak", STRAINS, position)
-    yield Row(kind=Kind.LENGTHS, columns=_flat(strain), prior_std=0.1)
+    yield Row(kind=FindingKind.LENGTHS, columns=_flat(strain), prior_std=0.1)
     # The base rotates towards the gripper by 1 rad per metre of horizontal reach.
     lean = np.cross(position, UP)
     yield Row(
-        kind=Kind.BASE_LEANS,
+        kind=FindingKind.BASE_LEANS,
         columns=_flat(np.concatenate([np.cross(lean, position), lean], axis=1)[..., None]),
         prior_std=0.2,
     )
     # The gripper rotates by its weight at a lever along each of its axes, 1 rad where that lever is level.
     sag = np.zeros((n, 6, 3))
     sag[:, 3:] = -rotation @ skew(rotation[:, 2])
-    yield Row(kind=Kind.TOOL_SAGS, columns=_flat(sag), prior_std=0.1)
+    yield Row(kind=FindingKind.TOOL_SAGS, columns=_flat(sag), prior_std=0.1)
 
 
 def velocity(base_from_gripper: Poses) -> Float[ndarray, "n 6"]:

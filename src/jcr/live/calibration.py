@@ -29,6 +29,7 @@ from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import Arm
 from jcr.files import read_bytes, write_text
+from jcr.findings import Finding, FindingKind, strongest_first
 from jcr.geometry import apply, largest_motion
 from jcr.least_squares import one_blas_thread
 from jcr.live.folder import LiveFolder
@@ -36,7 +37,7 @@ from jcr.live.next_pose import Attempts, Reach, propose, propose_before_calibrat
 from jcr.live.progress import Progress, Reached
 from jcr.live.stillness import ImageSummary
 from jcr.options import checked_options
-from jcr.records import Capture, Finding, HandEye, Intrinsics, Kind, Reconstruction, Tracks, strongest_first
+from jcr.records import Capture, HandEye, Intrinsics, Reconstruction, Tracks
 from jcr.sfm.growing import Growing
 
 if TYPE_CHECKING:
@@ -201,12 +202,12 @@ class LiveCalibration:
         size = (image.shape[1], image.shape[0])
         if self.live.size not in (None, size):
             now, before = ("{}x{}".format(*one) for one in (size, self.live.size))
-            return Finding.of(Kind.SIZE_DIFFERS, "rejects", "images", size=now, before=before)
+            return Finding.of(FindingKind.SIZE_DIFFERS, "rejects", "images", size=now, before=before)
         far, farthest, _ = far_rows(base_from_gripper[None, :3, 3])
         if far:
             unit, _, a_metre = likely_unit(farthest)
             return Finding.of(
-                Kind.POSE_UNIT, "rejects", "poses", value=farthest, unit=unit, a_metre=float(a_metre)
+                FindingKind.POSE_UNIT, "rejects", "poses", value=farthest, unit=unit, a_metre=float(a_metre)
             )
         new = ImageSummary.of(image)
         for one in self.live.images:
@@ -214,13 +215,13 @@ class LiveCalibration:
                 continue
             metres, radians = largest_motion(np.stack([one.base_from_gripper, base_from_gripper]))
             moved = metres >= MOVED[0] or radians >= MOVED[1]
-            kind = Kind.FRAME_REPEATED if moved else Kind.SAMPLE_REPEATED
+            kind = FindingKind.FRAME_REPEATED if moved else FindingKind.SAMPLE_REPEATED
             return Finding.of(kind, "rejects", "images", one.name, value=metres, rotation=radians)
         return None
 
     def _refuse(self, refused: Finding, base_from_gripper: Float[ndarray, "4 4"]) -> Progress:
         """Return the state after an image that is not kept."""
-        if refused.kind is Kind.FRAME_REPEATED:
+        if refused.kind is FindingKind.FRAME_REPEATED:
             self.propose_elsewhere(base_from_gripper)
         self.progress = replace(self.progress, added=None, refused=refused)
         return self.progress
@@ -255,9 +256,9 @@ class LiveCalibration:
         found = []
         if (width := edge_width(image)) > BLURRED_EDGE:
             edge_px = max(*image.shape[:2], EDGES_AT) * width
-            found.append(Finding.of(Kind.BLURRED, "warns", "images", name, value=edge_px))
+            found.append(Finding.of(FindingKind.BLURRED, "warns", "images", name, value=edge_px))
         if (back := self.live.seconds_back(name)) is not None:
-            found.append(Finding.of(Kind.CLOCK_JUMPS, "warns", "poses", name, value=back))
+            found.append(Finding.of(FindingKind.CLOCK_JUMPS, "warns", "poses", name, value=back))
         return tuple(found)
 
     def _calibrated(self, capture: Capture | None, added: str | None) -> Progress:
@@ -327,7 +328,9 @@ class LiveCalibration:
             return []
         inside = set(self._map.registered)
         return [
-            Finding.of(Kind.NOT_REGISTERED, "warns", "images", name, value=float(self._map.matched_with(row)))
+            Finding.of(
+                FindingKind.NOT_REGISTERED, "warns", "images", name, value=float(self._map.matched_with(row))
+            )
             for row, name in enumerate(names)
             if row not in inside
         ]
@@ -401,9 +404,9 @@ def _longest(tracks: Tracks, most: int) -> Tracks:
 def _too_few(images: int) -> list[Finding]:
     """Return the reason why there is no calibration."""
     if images < FEW:
-        return [Finding.of(Kind.FEW_IMAGES, "informs", "images", value=float(images))]
+        return [Finding.of(FindingKind.FEW_IMAGES, "informs", "images", value=float(images))]
     text, remedy = "fewer than three images are registered", "let the views overlap more"
-    return [Finding.of(Kind.NO_RECONSTRUCTION, "rejects", "reconstruction", text=text, remedy=remedy)]
+    return [Finding.of(FindingKind.NO_RECONSTRUCTION, "rejects", "reconstruction", text=text, remedy=remedy)]
 
 
 def _contradicting(case: Case, hand_eye: HandEye) -> list[Finding]:
@@ -413,7 +416,7 @@ def _contradicting(case: Case, hand_eye: HandEye) -> list[Finding]:
     images = hand_eye.images
     return [
         Finding.of(
-            Kind.POSE_CONTRADICTS_IMAGE,
+            FindingKind.POSE_CONTRADICTS_IMAGE,
             "warns",
             "poses",
             case.names[row],

@@ -14,11 +14,12 @@ from numpy import ndarray
 
 from jcr.calibration.requirement import GRASPING
 from jcr.capture.images import read_image
+from jcr.findings import sentence
+from jcr.findings.sentences import reached_in_words
 from jcr.live.notation import Notation
 from jcr.live.progress import FIRST_ADVICE, Progress, faults, next_lines, next_sentence, number_of
 from jcr.live.session import LiveSession, SessionState
 from jcr.records import Intrinsics
-from jcr.records.words import reached_in_words, sentence
 from jcr.report.figures import Figure, course_figure
 from jcr.report.raster import TRACK_COLOR
 from jcr.report.render import Section, render

@@ -8,10 +8,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.findings import Finding, FindingKind, remedy, sentence, text, without_consequences
 from jcr.live.notation import Notation, pose_lines
-from jcr.records import Finding, HandEye, Kind, LeaveOneOut, NextPose
-from jcr.records.findings import without_consequences
-from jcr.records.words import remedy, sentence, text
+from jcr.records import HandEye, LeaveOneOut, NextPose
 from jcr.rounding import significant
 
 CONFIRMING_IMAGES = 8
@@ -125,7 +124,8 @@ def faults(state: Progress) -> list[Finding]:
     found = [
         one
         for one in without_consequences(state.findings)
-        if one.severity != "informs" and one.kind not in (Kind.NOT_EXACT_ENOUGH, Kind.FEW_IMAGES)
+        if one.severity != "informs"
+        and one.kind not in (FindingKind.NOT_EXACT_ENOUGH, FindingKind.FEW_IMAGES)
     ]
     return sorted(found, key=lambda one: one.images != (state.added,))
 
@@ -174,7 +174,7 @@ def next_lines(state: Progress, notation: Notation) -> list[str]:
     """Return the next pose in the notation of the arm."""
     assert state.next_pose is not None
     lines = pose_lines(state.next_pose.base_from_gripper, notation, state.next_joints)
-    is_used = all(one.kind is not Kind.ROBOT_UNUSED for one in state.findings)
+    is_used = all(one.kind is not FindingKind.ROBOT_UNUSED for one in state.findings)
     if notation.arm is not None and state.next_joints is None and is_used:
         lines.append(f"a {notation.arm.name} cannot reach this pose within its joint limits: go near it")
     return lines

@@ -8,6 +8,5 @@ from jcr.records.assessed import *
 from jcr.records.calibration import *
 from jcr.records.capture import *
 from jcr.records.cloud import *
-from jcr.records.findings import *
 from jcr.records.reconstruction import *
 from jcr.records.requirement import *

@@ -3,8 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-from jcr.records.findings import Finding, Verdict, strongest_first, verdict_of
-from jcr.records.words import doubt_of, warnings_of
+from jcr.findings import Finding, Verdict, doubt_of, strongest_first, verdict_of, warnings_of
 
 Same = TypeVar("Same", bound="Assessed")
 

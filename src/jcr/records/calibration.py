@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
+from jcr.findings import Finding, FindingKind, remedy, verdict_of
+from jcr.findings.sentences import unobservable
 from jcr.records.assessed import Assessed
 from jcr.records.capture import Intrinsics
-from jcr.records.findings import Finding, Kind, verdict_of
 from jcr.records.notebook import table
 from jcr.records.requirement import Requirement
-from jcr.records.words import remedy, unobservable
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -489,12 +489,15 @@ class HandEye(Assessed):
     @property
     def observability(self) -> Observability:
         """Which directions the motions can see."""
-        return Observability(tuple(one for one in self.findings if one.kind is Kind.UNOBSERVABLE))
+        return Observability(tuple(one for one in self.findings if one.kind is FindingKind.UNOBSERVABLE))
 
     @property
     def is_sound(self) -> bool:
         """Whether nothing but an unmet requirement rejects it: other stages can build on it."""
-        return verdict_of(one for one in self.findings if one.kind is not Kind.NOT_EXACT_ENOUGH) != "rejected"
+        return (
+            verdict_of(one for one in self.findings if one.kind is not FindingKind.NOT_EXACT_ENOUGH)
+            != "rejected"
+        )
 
     def _repr_html_(self) -> str:
         """A table, for notebooks."""

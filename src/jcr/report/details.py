@@ -10,8 +10,8 @@ import numpy as np
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.calibration.words import attempt_in_words, budget_in_words
 from jcr.extras import is_installed
+from jcr.findings.sentences import LENGTHS
 from jcr.records import COEFFICIENTS, Reconstruction
-from jcr.records.words import LENGTHS
 from jcr.report.images import reprojections_px
 from jcr.report.render import Section
 from jcr.rounding import significant, with_std

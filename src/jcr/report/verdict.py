@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.calibration.words import leave_one_out_text
-from jcr.records import Kind, verdict_of
-from jcr.records.words import SHORT, reached_in_words, remedy, sentence, text
+from jcr.findings import FindingKind, remedy, sentence, text, verdict_of
+from jcr.findings.sentences import SHORT, reached_in_words
 from jcr.report.render import Section
 from jcr.rounding import significant
 
@@ -30,7 +30,7 @@ def notes_section(calibration: CalibrationFile) -> list[Section]:
 def failure_section(calibration: CalibrationFile) -> Section:
     """Return the fault, its remedies, and the reason why each back end failed."""
     failed, *others = calibration.findings
-    remedies = [sentence(one) for one in others if one.kind is Kind.BOARD_IN_VIEW]
+    remedies = [sentence(one) for one in others if one.kind is FindingKind.BOARD_IN_VIEW]
     remedies += filter(None, [remedy(failed)])
     content = {
         "fault": text(failed),

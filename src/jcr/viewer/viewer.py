@@ -16,10 +16,10 @@ from viser.extras import ViserUrdf
 
 from jcr.camera import pinhole_inside, undistortion
 from jcr.capture.images import read_image
+from jcr.findings import sentence, verdict_of
+from jcr.findings.sentences import reached_in_words
 from jcr.geometry import apply, apply_similarity, scale_translation
 from jcr.progress import Progress, silent
-from jcr.records import verdict_of
-from jcr.records.words import reached_in_words, sentence
 from jcr.report.raster import TRACK_COLOR, label_colors
 from jcr.report.render import render
 from jcr.run_folder import RunFolder

@@ -8,6 +8,7 @@ import pytest
 
 from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.stage import calibrate
+from jcr.findings.sentences import network_scale
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
 from jcr.pointmaps.dust3r.pair_graph import complete_pairs
 from jcr.pointmaps.from_pairs import reconstruction_from_pairs
@@ -16,7 +17,6 @@ from jcr.pointmaps.grid import ImageGrid, PreparedImages
 from jcr.pointmaps.pairs import PairPredictions
 from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Capture, HandEye, Reconstruction
-from jcr.records.words import network_scale
 from simulation.pairs import PairErrors, synthetic_pairs
 
 SIZE = (48, 36)

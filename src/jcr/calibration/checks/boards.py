@@ -8,8 +8,9 @@ from numpy import ndarray
 
 from jcr.calibration.case import Case, Checked
 from jcr.estimation.solve import Solution, size_of_boards
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import apply
-from jcr.records import BoardFound, Boards, Finding, Kind
+from jcr.records import BoardFound, Boards
 
 
 def check_boards(case: Case) -> Checked:
@@ -20,18 +21,22 @@ def check_boards(case: Case) -> Checked:
     if not boards.bodies:
         details = {"board": boards.spec} | ({"proposed": boards.proposed} if boards.proposed else {})
         findings.append(
-            Finding(kind=Kind.BOARD_NOT_FOUND, severity="warns", mend="reconstruction", details=details)
+            Finding(
+                kind=FindingKind.BOARD_NOT_FOUND, severity="warns", concerns="reconstruction", details=details
+            )
         )
     if boards.elsewhere:
         elsewhere = [case.names[row] for row in boards.elsewhere]
-        findings.append(Finding.of(Kind.BOARD_MOVED, "warns", "images", *elsewhere, board=boards.spec))
+        findings.append(Finding.of(FindingKind.BOARD_MOVED, "warns", "images", *elsewhere, board=boards.spec))
     hand_eye = case.hand_eye
     if case.adjusted is None or case.adjusted.problem.boards is None:
         return Checked(tuple(findings))
     found = board_found(case.adjusted, boards)
     if boards.size_std is None and hand_eye.before is not None:
         side = 1e-3 * found.side_mm, 1e-3 * found.side_std_mm
-        findings.append(Finding.of(Kind.BOARD_SIDE, "informs", value=side[0], std=side[1], board=boards.spec))
+        findings.append(
+            Finding.of(FindingKind.BOARD_SIDE, "informs", value=side[0], std=side[1], board=boards.spec)
+        )
     evidence = replace(hand_eye.scale_evidence, board=found)
     return Checked(tuple(findings), replace(hand_eye, scale_evidence=evidence))
 

@@ -31,8 +31,9 @@ from jcr.estimation.score_test import (
     tested,
 )
 from jcr.estimation.solve import Solution
+from jcr.findings import Concerns, Finding, FindingKind
 from jcr.geometry import step_between
-from jcr.records import Finding, Intrinsics, Kind, Mend, Tracks
+from jcr.records import Intrinsics, Tracks
 
 LOG_P = float(np.log(1e-6))
 """Chance of any one alarm where there is nothing, before it is divided by the number of places of a change."""
@@ -46,13 +47,13 @@ MOST_BYTES, BYTES_PER_IMAGE = 100_000_000, 16 * OF_IMAGE
 """Of the derivatives of all observations by the nuisances of each image: of 58 000 observations by 200 images they were
 740 MB, and the equations several times that."""
 LEAST_PX = {
-    Kind.ROLLING_SHUTTER: 3.0,
-    Kind.ROLLING_SHUTTER_BY_IMAGE: 3.0,
-    Kind.CENTRE_SAGS: 3.0,
-    Kind.THIN_PRISM: 1.0,
+    FindingKind.ROLLING_SHUTTER: 3.0,
+    FindingKind.ROLLING_SHUTTER_BY_IMAGE: 3.0,
+    FindingKind.CENTRE_SAGS: 3.0,
+    FindingKind.THIN_PRISM: 1.0,
 }
 """What is measured in pixels and smaller is what a distortion model leaves over."""
-OF_EACH = {Kind.FOCUS_BY_IMAGE, Kind.ROLLING_SHUTTER_BY_IMAGE}
+OF_EACH = {FindingKind.FOCUS_BY_IMAGE, FindingKind.ROLLING_SHUTTER_BY_IMAGE}
 SURE = 2.0
 """Standard deviations of what differs from image to image: of hundreds of images the chance of less is small for any
 noise that is estimated a little too small. Of a dozen images what is that improbable is larger."""
@@ -61,9 +62,12 @@ LEAST_PART = 2
 """Images before and after a change."""
 ASPECT = ("fx", "p1", "p2")
 """Of estimated intrinsics, whose focal length is one and whose tangential distortion is none: what is tested."""
-MENDS: dict[Kind, Mend] = {Kind.THIN_PRISM: "intrinsics", Kind.CENTRE_SAGS: "mount"}
+CONCERNS: dict[FindingKind, Concerns] = {
+    FindingKind.THIN_PRISM: "intrinsics",
+    FindingKind.CENTRE_SAGS: "mount",
+}
 """What would help where other images would not."""
-FOCUS = {Kind.FOCUS_BY_DISTANCE, Kind.FOCUS_BY_IMAGE, Kind.ZOOM}
+FOCUS = {FindingKind.FOCUS_BY_DISTANCE, FindingKind.FOCUS_BY_IMAGE, FindingKind.ZOOM}
 """Of a focal length that differs between images, one is named."""
 NEARLY_ALL = 0.9
 """Of the squares of what the focal length differs by."""
@@ -75,7 +79,7 @@ def with_contradiction(
 ) -> tuple[Finding, ...]:
     """What was found of one camera, where its given intrinsics are contradicted as a whole: with the parameters that a
     test of these named, if it did."""
-    named = [one for one in faults if contradiction and one.kind is Kind.INTRINSICS]
+    named = [one for one in faults if contradiction and one.kind is FindingKind.INTRINSICS]
     whole = [replace(one, shift=contradiction[0].shift, intrinsics_shift=None) for one in named]
     return (*(one for one in faults if one not in named), *(whole or contradiction))
 
@@ -84,7 +88,7 @@ def with_contradiction(
 class CameraEffect:
     """Combinations of the columns of score_test.Alternatives that one effect frees."""
 
-    kind: Kind
+    kind: FindingKind
     free: Float[ndarray, "e p"]
     """The combinations that it is about."""
     beside: Float[ndarray, "e q"]
@@ -125,7 +129,7 @@ class State:
         """Return the adjustment as it is; a focal length of each image is free where the user asked for that."""
         if (free := imaged.free) is None:
             return State(imaged, (), imaged.adjusted)
-        varies = CameraEffect(Kind.FOCUS_BY_IMAGE, free, np.zeros((len(free), 0)))
+        varies = CameraEffect(FindingKind.FOCUS_BY_IMAGE, free, np.zeros((len(free), 0)))
         return State(imaged, (varies,), imaged.adjusted)
 
     def with_free(self, found: Sequence[CameraEffect], poses: Sequence[Row]) -> "State":
@@ -185,7 +189,7 @@ def freed(state: State, best: CameraEffect) -> State | None:
         return None
     try:
         after = state.with_free((*state.found, best), state.poses)
-        simple = _simpler(after) if best.kind is Kind.FOCUS_BY_IMAGE else None
+        simple = _simpler(after) if best.kind is FindingKind.FOCUS_BY_IMAGE else None
         return after if simple is None else state.with_free((*state.found, simple), state.poses)
     except np.linalg.LinAlgError:
         return None
@@ -207,7 +211,7 @@ def camera_finding(after: State, before: State) -> Finding:
     alone = tested(before.equations, best.both, _all(before))
     last = tested(after.equations, best.free, np.concatenate([_all(before), best.beside], axis=1))
     p = float(np.exp(max(alone.log_p + np.log(best.places), -700)))
-    size = _of_intrinsics(after, last) if best.kind is Kind.INTRINSICS else _size(after, last)
+    size = _of_intrinsics(after, last) if best.kind is FindingKind.INTRINSICS else _size(after, last)
     (then, scale), (now, new_scale) = (after.imaged.answer(one.adjusted) for one in (before, after))
     moved = parameters(after.camera) - parameters(before.camera)
     return Finding(
@@ -298,21 +302,21 @@ def _hypotheses(state: State) -> list[CameraEffect]:
     x, y = equations.down_in_camera[:, :2].T
     sag = [equations.of_images("x", x[:, None]), equations.of_images("y", y[:, None])]
     found = [
-        CameraEffect(Kind.FOCUS_BY_DISTANCE, equations.of_images("focal", far[:, None]), common),
-        CameraEffect(Kind.FOCUS_BY_IMAGE, equations.of_images("focal", differences(m)), common),
-        CameraEffect(Kind.ROLLING_SHUTTER, equations.of_images("shear", np.ones((m, 1))), common),
-        CameraEffect(Kind.ROLLING_SHUTTER_BY_IMAGE, equations.of_images("shear", np.eye(m)), common),
+        CameraEffect(FindingKind.FOCUS_BY_DISTANCE, equations.of_images("focal", far[:, None]), common),
+        CameraEffect(FindingKind.FOCUS_BY_IMAGE, equations.of_images("focal", differences(m)), common),
+        CameraEffect(FindingKind.ROLLING_SHUTTER, equations.of_images("shear", np.ones((m, 1))), common),
+        CameraEffect(FindingKind.ROLLING_SHUTTER_BY_IMAGE, equations.of_images("shear", np.eye(m)), common),
     ]
     for k in steps:
         after = (np.arange(m) >= k) - (m - k) / m
         free = equations.of_images("focal", after[:, None])
-        found.append(CameraEffect(Kind.ZOOM, free, common, places=len(steps), after=int(k) - 1))
+        found.append(CameraEffect(FindingKind.ZOOM, free, common, places=len(steps), after=int(k) - 1))
     of_centre = np.concatenate([common, equations.of_camera(("cx", "cy"))], axis=1)
-    found.append(CameraEffect(Kind.CENTRE_SAGS, np.concatenate(sag, axis=1), of_centre))
+    found.append(CameraEffect(FindingKind.CENTRE_SAGS, np.concatenate(sag, axis=1), of_centre))
     if len(state.adjusted.problem.cameras) == 1:  # all images share the glass
-        found.append(CameraEffect(Kind.THIN_PRISM, np.eye(equations.columns)[:, -PRISM:], of_centre))
+        found.append(CameraEffect(FindingKind.THIN_PRISM, np.eye(equations.columns)[:, -PRISM:], of_centre))
     # Intrinsics that are wrong in all images include the focal length that shows nothing in the others.
-    found.append(CameraEffect(Kind.INTRINSICS, equations.of_camera(_freed(state)), nothing))
+    found.append(CameraEffect(FindingKind.INTRINSICS, equations.of_camera(_freed(state)), nothing))
     return found
 
 
@@ -326,7 +330,7 @@ def _of_intrinsics(after: State, last: Tested) -> dict[str, Any]:
         if name in INTRINSICS:
             found |= {name: float(new), f"{name}_given": float(old)}
     found |= {f"{name}_std": float(std[k] * units[name]) for k, name in enumerate(_freed(after))}
-    return {"mend": "intrinsics", "details": found}
+    return {"concerns": "intrinsics", "details": found}
 
 
 def _size(after: State, last: Tested) -> dict[str, Any]:
@@ -338,21 +342,21 @@ def _size(after: State, last: Tested) -> dict[str, Any]:
     spread = float(np.ptp(np.log(equations.distance)))
     focal_px, width = after.imaged.start.fx, after.camera.width
     match fault.kind:
-        case Kind.FOCUS_BY_DISTANCE:
+        case FindingKind.FOCUS_BY_DISTANCE:
             size, error = spread * value[0], spread * std[0]
-        case Kind.FOCUS_BY_IMAGE:
+        case FindingKind.FOCUS_BY_IMAGE:
             size, error = np.sqrt(value @ value / equations.images), each
-        case Kind.ZOOM:
+        case FindingKind.ZOOM:
             size, error = value[0], std[0]
-        case Kind.THIN_PRISM:
+        case FindingKind.THIN_PRISM:
             size, error = _largest_px(after, value, last.covariance)
-        case Kind.CENTRE_SAGS:
+        case FindingKind.CENTRE_SAGS:
             size, error = width * typical, width * each / np.sqrt(2)
         case _:
             size, error = focal_px * typical, focal_px * each
-    changed = after.imaged.names[fault.after : fault.after + 2] if fault.kind is Kind.ZOOM else ()
-    mend = MENDS.get(fault.kind, "images")
-    return {"mend": mend, "value": float(size), "std": float(error), "images": tuple(changed)}
+    changed = after.imaged.names[fault.after : fault.after + 2] if fault.kind is FindingKind.ZOOM else ()
+    concerns = CONCERNS.get(fault.kind, "images")
+    return {"concerns": concerns, "value": float(size), "std": float(error), "images": tuple(changed)}
 
 
 def _largest_px(

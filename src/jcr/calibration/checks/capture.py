@@ -7,7 +7,7 @@ from jcr.calibration.conventions import better_reading, convention_finding
 from jcr.capture.checks import how_rotated
 from jcr.capture.pairing import paired_by_name
 from jcr.estimation.observability import observability
-from jcr.records import Finding, Kind
+from jcr.findings import Finding, FindingKind
 
 
 def check_registered(case: Case) -> Checked:
@@ -20,9 +20,9 @@ def check_registered(case: Case) -> Checked:
     if every or hand_eye.observability.observable or not observability(capture.base_from_gripper).observable:
         return Checked()
     counts = {"value": float(len(case.used)), "of": float(len(capture))}
-    few = Finding.of(Kind.FEW_USED, "rejects", "reconstruction", **counts)
+    few = Finding.of(FindingKind.FEW_USED, "rejects", "reconstruction", **counts)
     findings = tuple(
-        replace(one, mend="reconstruction") if one.kind is Kind.UNOBSERVABLE else one
+        replace(one, concerns="reconstruction") if one.kind is FindingKind.UNOBSERVABLE else one
         for one in hand_eye.findings
     )
     return Checked((few,), replace(hand_eye, findings=findings))
@@ -61,5 +61,8 @@ def check_images(case: Case) -> Checked:
 def check_reconstruction(case: Case) -> Checked:
     """What the back end warned of."""
     return Checked(
-        tuple(Finding.of(Kind.RECONSTRUCTION, "warns", text=text) for text in case.reconstruction.warnings)
+        tuple(
+            Finding.of(FindingKind.RECONSTRUCTION, "warns", text=text)
+            for text in case.reconstruction.warnings
+        )
     )

@@ -42,19 +42,20 @@ from jcr.estimation.problem import State as ProblemState
 from jcr.estimation.solve import Solution
 from jcr.estimation.systematic import Region
 from jcr.estimation.wrist import pose_problem
+from jcr.findings import Finding, FindingKind, kinds_of
 from jcr.geometry import Poses
-from jcr.records import BENT, CAMERA, Finding, HandEye, Kind
+from jcr.records import HandEye
 
 AT_ONCE = 3
 """Largest number of effects that are named of one capture."""
-LOG_ALPHA = {kind: np.log(1e-6) for kind in BENT}
+LOG_ALPHA = {kind: np.log(1e-6) for kind in kinds_of("strain")}
 """Logarithm of the probability of a false alarm of the effects of the arm. Of 132 simulated captures of 8 to 20 images,
 72 of them by arms with joint offsets of up to 1° and links 1 mm off, none comes below 1e-5."""
 LOG_ALPHA_OF_ORDER = np.log(1e-4)
 """Logarithm of the probability of a false alarm of the effects that depend on the order of the images."""
-SHARES = frozenset({Kind.SLIP, Kind.BASE_MOVED, Kind.DRIFT})
+SHARES = frozenset({FindingKind.SLIP, FindingKind.BASE_MOVED, FindingKind.DRIFT})
 """Effects of a motion that has a share in each image, tested against other orders of the images."""
-EFFECTS = CAMERA | BENT | SHARES | {Kind.DELAY}
+EFFECTS = kinds_of("camera", "strain") | SHARES | {FindingKind.DELAY}
 """Kinds of findings that these tests make."""
 MATERIAL = 0.5
 """Standard deviations by which an effect must move the camera on some axis to be reported."""
@@ -74,7 +75,7 @@ def check_effects(case: Case) -> Checked:
         return Checked(_effects_of_poses(longer))
     imaged = of_case(of_fewer_points(longer))
     state, findings = effects(imaged)
-    if imaged.is_given and all(one.kind is Kind.INTRINSICS for one in findings):
+    if imaged.is_given and all(one.kind is FindingKind.INTRINSICS for one in findings):
         checked = intrinsics_contradiction(case)
         return replace(checked, findings=with_contradiction(findings, checked.findings))
     return Checked(findings) if longer is not case else _adopted(case, state, findings)
@@ -83,7 +84,7 @@ def check_effects(case: Case) -> Checked:
 def effects(imaged: Imaged) -> tuple[State, tuple[Finding, ...]]:
     """Return the adjustment with all effects free that one camera's images show, and a finding of each."""
     state, findings = State.start(imaged), list[Finding]()
-    dismissed, passed = list[CameraEffect](), set[Kind]()
+    dismissed, passed = list[CameraEffect](), set[FindingKind]()
     while len(findings) < AT_ONCE and len(imaged.names) >= MIN_IMAGES:
         of_camera, log_chance = best_camera_effect(state, dismissed)
         test = _best_pose_effect(state, passed)
@@ -163,13 +164,13 @@ def _poses_of(state: State) -> ArmEquations | None:
     )
 
 
-def _best_pose_effect(state: State, passed: Collection[Kind]) -> Test | None:
+def _best_pose_effect(state: State, passed: Collection[FindingKind]) -> Test | None:
     """Return the most significant effect on the gripper poses that its cause can produce."""
     poses = _poses_of(state)
     return None if poses is None else best_pose_effect(poses, {*passed, *(row.kind for row in state.poses)})
 
 
-def best_pose_effect(poses: ArmEquations, passed: Collection[Kind]) -> Test | None:
+def best_pose_effect(poses: ArmEquations, passed: Collection[FindingKind]) -> Test | None:
     """Return the most significant effect on the poses of an arm, none of the kinds `passed`.
 
     Return None where the most significant one is larger than its cause can produce, or leaves poses that contradict the
@@ -196,7 +197,7 @@ def _is_of_the_order(poses: ArmEquations, test: Test) -> bool:
     blocks = np.zeros((len(poses.equations.residual) // 6, 6, 6))
     of_images = np.zeros(len(blocks))
     own = slice(poses.rows.start // 6, poses.rows.stop // 6)
-    blocks[own], of_images[own] = poses.by_motion()[test.row.kind is Kind.BASE_MOVED], share
+    blocks[own], of_images[own] = poses.by_motion()[test.row.kind is FindingKind.BASE_MOVED], share
     return explains_by_order(poses.equations, poses.log_sizes, blocks, of_images, own)
 
 
@@ -210,13 +211,13 @@ def pose_finding(
     assert poses is not None
     own = test.shift[poses.columns[:6]]
     kind, p = test.row.kind, float(np.exp(max(test.log_p, -700)))
-    if kind in BENT:
+    if kind.row.group == "strain":
         columns = test.row.prior_std * test.row.columns
         straight = straight_shift(poses.equations, poses.log_sizes, columns)[poses.columns[:6]]
         if not (np.abs([own, straight]) > MATERIAL * std).any():
             return None
         return replace(Finding.of(kind, "warns", "robot", p=p), **_size_of_strain(test))
-    moved = own if kind is Kind.DELAY else test.estimate
+    moved = own if kind is FindingKind.DELAY else test.estimate
     if not (np.abs(moved) > MATERIAL * std).any():
         return None
     return replace(Finding.of(kind, "warns", "mount", p=p), **_size_in_order(test, own, names))
@@ -225,20 +226,20 @@ def pose_finding(
 def _size_in_order(test: Test, shift: Float[ndarray, "6"], names: Sequence[str]) -> dict[str, Any]:
     """Return the fields of a finding that state how large an effect of the order is."""
     kind, place = test.row.kind, test.row.place
-    if kind is Kind.DELAY:
+    if kind is FindingKind.DELAY:
         std = float(np.sqrt(test.covariance[0, 0]))
         fields = {"value": float(test.estimate[0]), "std": std, "shift": (*shift.tolist(), 0.0)}
-        return {"mend": "poses", "details": {"unit": "interval"}, **fields}
+        return {"concerns": "poses", "details": {"unit": "interval"}, **fields}
     metres, radians = np.linalg.norm(test.estimate.reshape(2, 3), axis=1).tolist()
-    if kind is Kind.DRIFT:
+    if kind is FindingKind.DRIFT:
         shift = test.estimate / 2
         return {"value": metres, "shift": (*shift.tolist(), 0.0), "details": {"rotation": radians}}
     count, longer = max((place, "before"), (len(names) - place, "after"))
     # A base that moves takes no part in the hand-eye transform: its shift is what it does to the fit.
-    moved = test.estimate if kind is Kind.SLIP else shift
+    moved = test.estimate if kind is FindingKind.SLIP else shift
     return {
         "severity": "rejects" if metres > LARGE_MOTION[0] or radians > LARGE_MOTION[1] else "warns",
-        "mend": "mount" if kind is Kind.SLIP else "poses",
+        "concerns": "mount" if kind is FindingKind.SLIP else "poses",
         "images": (names[place - 1], names[place]),
         "value": metres,
         "shift": (*moved.tolist(), 0.0),
@@ -249,9 +250,9 @@ def _size_in_order(test: Test, shift: Float[ndarray, "6"], names: Sequence[str])
 def _size_of_strain(test: Test) -> dict[str, Any]:
     """Return the fields of a finding that state how large an effect of the arm is, without its shift."""
     estimate, covariance = test.estimate, test.covariance
-    if test.row.kind is Kind.BASE_LEANS:
+    if test.row.kind is FindingKind.BASE_LEANS:
         return {"value": float(estimate[0]), "std": float(np.sqrt(covariance[0, 0]))}
-    if test.row.kind is Kind.TOOL_SAGS:
+    if test.row.kind is FindingKind.TOOL_SAGS:
         value = float(np.linalg.norm(estimate))
         axis, frame = estimate / value, "gripper"
         std = float(np.sqrt(axis @ covariance @ axis))
@@ -287,16 +288,16 @@ def with_effects(
     far it is from that of the true poses, and what the scale may be off by, counts as uncertainty. A thin prism becomes
     part of the intrinsics. Return None where there is no effect that the model can carry.
     """
-    strains = [row for row in state.poses if row.kind in BENT]
-    if not strains and not any(one.kind in CAMERA for one in findings):
+    strains = [row for row in state.poses if row.kind.row.group == "strain"]
+    if not strains and not any(one.kind.row.group == "camera" for one in findings):
         return None, findings
     found = list(state.found)
-    if any(one.kind is Kind.THIN_PRISM for one in found) and state.camera.model != "fisheye":
+    if any(one.kind is FindingKind.THIN_PRISM for one in found) and state.camera.model != "fisheye":
         camera = with_thin_prism(case.reconstruction.intrinsics)
         reconstruction = replace(case.reconstruction, intrinsics=camera)
         case = replace(case, reconstruction=reconstruction, adjusted=None)
         own, own_now = len(parameters(state.camera)), len(parameters(camera))
-        found = [one.with_parameters(own, own_now) for one in found if one.kind is not Kind.THIN_PRISM]
+        found = [one.with_parameters(own, own_now) for one in found if one.kind is not FindingKind.THIN_PRISM]
     combinations = np.concatenate([one.both for one in found], axis=1) if found else None
     bent = np.concatenate([row.prior_std * row.columns for row in strains], axis=1) if strains else None
     adjusted = adjust_case(case, combinations=combinations, confirmed_errors=bent)
@@ -309,7 +310,7 @@ def with_effects(
 
 def _as_adopted(found: Finding, straight: Float[ndarray, "7"] | None, adjusted: Solution) -> Finding:
     """Return a finding with the uncertainty that remains after the calibration adopted the effect."""
-    if found.kind in CAMERA:
+    if found.kind.row.group == "camera":
         return replace(found, shift=None, intrinsics_shift=None)
     if straight is None:
         return found
@@ -318,7 +319,7 @@ def _as_adopted(found: Finding, straight: Float[ndarray, "7"] | None, adjusted: 
 
 def _with_metre(found: Finding, shift: Float[ndarray, "7"], adjusted: Solution) -> Float[ndarray, "7"]:
     """Add to a shift what the scale may be off by: of three lengths one differs, and no image shows which is a metre."""
-    if found.kind is not Kind.LENGTHS or found.value is None:
+    if found.kind is not FindingKind.LENGTHS or found.value is None:
         return shift
     equations = adjusted.equations
     region = Region.of_unknowns(np.delete(equations.jacobian[:, :UNKNOWNS], SCALE, axis=1), UNKNOWNS)
@@ -386,7 +387,7 @@ def effects_of_fit(
         columns=columns_of_arm(0),
     )
     # Errors of camera poses that come from features look like a strained arm; only the adjustment separates them.
-    test = best_pose_effect(poses, BENT)
+    test = best_pose_effect(poses, kinds_of("strain"))
     std = np.sqrt(np.diag(hand_eye.covariance)[:6]) * hand_eye.converged
     found = None if test is None else pose_finding(test, poses, [names[row] for row in used.tolist()], std)
     return () if found is None else (found,)

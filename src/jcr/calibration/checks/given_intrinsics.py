@@ -17,8 +17,8 @@ from jcr.estimation.hand_eye import judged
 from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, camera_with_prior
 from jcr.estimation.score_test import freed_intrinsics
 from jcr.estimation.solve import Solution
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import ARM, step_between
-from jcr.records import Finding, Kind
 
 SURE = 5.0
 """Standard deviations, widened for an estimated robot noise. Of 48 simulated webcam captures of 5 to 15 images with the
@@ -79,7 +79,7 @@ def contradicted_by(imaged: Imaged, sure: float = SURE) -> tuple[Solution, Findi
     if not found:
         return None
     severity = "warns" if surely else "informs"
-    return freed, Finding.of(Kind.INTRINSICS, severity, "intrinsics", **found)
+    return freed, Finding.of(FindingKind.INTRINSICS, severity, "intrinsics", **found)
 
 
 def _found_off(imaged: Imaged, adjusted: Solution, sure: float, share: float) -> dict[str, float]:

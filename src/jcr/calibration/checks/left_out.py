@@ -7,8 +7,9 @@ from numpy import ndarray
 from jcr.capture.images import read_image
 from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.equation import predict
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import step_between
-from jcr.records import Capture, Finding, HandEye, Kind, Reconstruction
+from jcr.records import Capture, HandEye, Reconstruction
 from jcr.sfm.register import register
 
 SAME = (10e-3, np.radians(1.0))
@@ -35,10 +36,10 @@ def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: HandEye) ->
             is_pose_of[row] = int(np.where(fits, metres, np.inf).argmin())
         off = {"value": float(metres[row]), "rotation": float(radians[row])}
         image = capture.images[row]
-        findings.append(Finding.of(Kind.POSE_CONTRADICTS_IMAGE, "warns", "poses", image, **off))
+        findings.append(Finding.of(FindingKind.POSE_CONTRADICTS_IMAGE, "warns", "poses", image, **off))
     pairs = [(i, j) for i, j in is_pose_of.items() if i < j and is_pose_of.get(j) == i]
     swapped = [
-        Finding.of(Kind.POSES_SWAPPED, "rejects", "poses", capture.images[i], capture.images[j])
+        Finding.of(FindingKind.POSES_SWAPPED, "rejects", "poses", capture.images[i], capture.images[j])
         for i, j in pairs
     ]
     named = {image for one in swapped for image in one.images}

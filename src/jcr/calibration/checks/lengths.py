@@ -23,7 +23,8 @@ from jcr.estimation.equation import SCALE
 from jcr.estimation.hand_eye import judged
 from jcr.estimation.problem import LinearPrior
 from jcr.estimation.solve import Solution, size_of_boards, with_priors
-from jcr.records import Finding, HandEye, Kind, LengthCheck, LengthName, ScaleCheck, ScaleEvidence
+from jcr.findings import Finding, FindingKind
+from jcr.records import HandEye, LengthCheck, LengthName, ScaleCheck, ScaleEvidence
 
 DEPTH_STD, NETWORK_STD = 0.02, 0.05
 """Relative, of the metre of depth cameras, which are off by a few percent, and of networks, at times by ten."""
@@ -158,7 +159,7 @@ def finding_of(one: Length, other: Length, others: list[Length], hand_eye: HandE
     if one.name == "robot" and other.name == "network":
         check = _network_check(hand_eye)
         value, of_robot = check.off_percent / 100, check.std_percent / 100
-        return Finding.of(Kind.NETWORK_SCALE, "warns", "poses", value=value, std=of_robot)
+        return Finding.of(FindingKind.NETWORK_SCALE, "warns", "poses", value=value, std=of_robot)
     agreeing = [
         (third.name, right.name)
         for third in others
@@ -168,7 +169,7 @@ def finding_of(one: Length, other: Length, others: list[Length], hand_eye: HandE
     is_robot_doubted = one.name == "robot" and not any(right == "robot" for _, right in agreeing)
     exact = max(one.std, other.std) < EXACT and abs(off) >= CONTRADICTED[1]
     found = Finding.of(
-        Kind.BOARD_SIZE if (one.name, other.name) == ("robot", "board") else Kind.SCALES,
+        FindingKind.BOARD_SIZE if (one.name, other.name) == ("robot", "board") else FindingKind.SCALES,
         "rejects" if exact and is_robot_doubted else "warns",
         "poses",
         value=float(np.expm1(off)),
@@ -192,7 +193,7 @@ def _from_robot_alone(case: Case, hand_eye: HandEye) -> tuple[Finding, ...]:
     compared = any(one.name != "network" for one in hand_eye.scale_evidence.lengths)
     if compared or case.priors or case.reconstruction.metric_std is not None:
         return ()
-    return (Finding.of(Kind.SCALE_FROM_ROBOT, "informs"),)
+    return (Finding.of(FindingKind.SCALE_FROM_ROBOT, "informs"),)
 
 
 def _fault(hand_eye: HandEye, lengths: list[Length]) -> Float[ndarray, "7 7"]:

@@ -7,7 +7,8 @@ import numpy as np
 from jcr.calibration.case import Case, Checked
 from jcr.calibration.robot_errors import of_poses
 from jcr.estimation.joint_offsets import joint_offsets
-from jcr.records import CAMERA, Finding, JointOffsets, Kind, RobotExamined
+from jcr.findings import Finding, FindingKind
+from jcr.records import JointOffsets, RobotExamined
 
 MIN_EXAMINED = 4
 """Fewest images from which joint offsets are estimated."""
@@ -28,7 +29,7 @@ def check_robot(case: Case) -> Checked:
     systematic = of_poses(case.robot.systematic, used)
     offsets = joint_offsets(hand_eye.before or hand_eye, gripper, camera, systematic, arm, joints[used])
     examined = RobotExamined(hand_eye.robot_noise, offsets)
-    of_camera = any(finding.kind in CAMERA for finding in hand_eye.findings)
+    of_camera = any(finding.kind.row.group == "camera" for finding in hand_eye.findings)
     found = None if of_camera else _joint_finding(offsets)
     return Checked(() if found is None else (found,), replace(hand_eye, robot=examined))
 
@@ -41,5 +42,5 @@ def _joint_finding(offsets: JointOffsets) -> Finding | None:
     sizes = {f"joint_{k + 1}": float(offsets.offset[k]) for k in off}
     stds = {f"joint_{k + 1}_std": float(offsets.std[k]) for k in off}
     value = float(np.abs(offsets.offset[off]).max())
-    finding = Finding.of(Kind.JOINT_OFFSETS, "informs", "robot", value=value, **sizes, **stds)
+    finding = Finding.of(FindingKind.JOINT_OFFSETS, "informs", "robot", value=value, **sizes, **stds)
     return replace(finding, joints=tuple(k + 1 for k in off))

@@ -20,7 +20,7 @@ from jcr.calibration.checks.capture import (
 from jcr.calibration.checks.effects import check_effects
 from jcr.calibration.checks.lengths import check_lengths
 from jcr.calibration.checks.robot import check_robot
-from jcr.records import Kind
+from jcr.findings import FindingKind
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,10 @@ def _is_observable(case: Case) -> bool:
 def _fit_was_rejected(case: Case) -> bool:
     """Return whether the poses themselves are rejected, with and without the images, and not because of a board."""
     fit = case.hand_eye.before or case.hand_eye
-    return not case.hand_eye.converged and not fit.converged and not _has(case, {Kind.BOARD_SIZE})
+    return not case.hand_eye.converged and not fit.converged and not _has(case, {FindingKind.BOARD_SIZE})
 
 
-def _has(case: Case, kinds: Collection[Kind]) -> bool:
+def _has(case: Case, kinds: Collection[FindingKind]) -> bool:
     return any(finding.kind in kinds for finding in case.hand_eye.findings)
 
 

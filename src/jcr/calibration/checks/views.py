@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image, show_one_view
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import largest_motion
-from jcr.records import Capture, Finding, Kind
+from jcr.records import Capture
 
 STILL = (20e-3, np.radians(5.0))
 """m, rad: a gripper that moves farther is seen to, in images of a camera that it carries."""
@@ -32,12 +33,14 @@ def view_findings(capture: Capture) -> tuple[Finding, ...]:
     findings = []
     if is_still:
         details = {"rotation": radians}
-        findings.append(Finding.of(Kind.STATIC_IMAGES, "rejects", "images", value=metres, **details))
+        findings.append(Finding.of(FindingKind.STATIC_IMAGES, "rejects", "images", value=metres, **details))
     blurred = tuple(name for name, share in width.items() if share > BLURRED_EDGE)
     if blurred:
         edge_px = max(*capture.image_size, EDGES_AT) * float(np.median([width[name] for name in blurred]))
         findings.append(
-            Finding.of(Kind.BLURRED, "warns", "images", *blurred, value=edge_px, of=float(len(capture)))
+            Finding.of(
+                FindingKind.BLURRED, "warns", "images", *blurred, value=edge_px, of=float(len(capture))
+            )
         )
     return tuple(findings)
 
@@ -46,7 +49,7 @@ def as_causes(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """The findings of the images alone on a capture that is rejected; those that concern many images reject it."""
     return tuple(
         replace(one, severity="rejects")
-        if one.kind is Kind.BLURRED and len(one.images) > MANY * float(one.details["of"])
+        if one.kind is FindingKind.BLURRED and len(one.images) > MANY * float(one.details["of"])
         else one
         for one in findings
     )

@@ -1,0 +1,306 @@
+"""Table of the findings: a row for each kind, with message, remedy, consequences and documentation."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+from jcr.findings import sentences
+
+if TYPE_CHECKING:
+    from jcr.findings.finding import Finding
+
+MISFIT = (
+    "few images agree",
+    "gripper poses contradict the images",
+    "noise above the given one",
+    "too uncertain",
+    "leave-one-out error",
+)
+"""Kinds that follow from a fault of camera, robot, mount or order where that fault rejects a calibration."""
+TOO_FEW = (
+    "unobservable motion",
+    "camera moved on the gripper",
+    "camera drifts on the gripper",
+    "robot base moved against the scene",
+    "gripper poses early or late",
+)
+"""Kinds that follow, too, where too few of the images can be used."""
+GROUPS = {
+    "motion": "Motions, poses and accuracy",
+    "camera": "The camera",
+    "order": "Order of the images",
+    "robot": "The robot",
+    "strain": "Gripper poses that depend on the reach",
+    "lengths": "Lengths and boards",
+    "images": "Images by themselves",
+    "reconstruction": "Images and reconstruction",
+    "cell": "Further cameras",
+    "single": "Single images",
+}
+"""Title of each group of kinds in the documentation."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Properties of a kind of finding."""
+
+    group: str
+    """Key of GROUPS."""
+    message: "str | Callable[[Finding], str]"
+    """Template of the numbers and names of a finding (`sentences.filled`), or the function that makes the sentence."""
+    remedy: "str | Callable[[Finding], str]" = ""
+    """Remedy in one sentence, a template or a function; empty where nothing helps or nothing need be done."""
+    explains: tuple[str, ...] = ()
+    """Kinds that follow from this one where it rejects a calibration; empty for a kind that is no cause."""
+    means: str = ""
+    """Meaning, for the documentation, where the message does not state it."""
+    evidence: str = ""
+    """Meaning and unit of `value`, for the documentation."""
+    help: str = ""
+    """Remedy for the documentation, where `remedy` is a function or empty."""
+
+
+class FindingKind(StrEnum):
+    """Kinds of findings."""
+
+    row: Row
+
+    def __new__(cls, name: str, row: Row) -> "FindingKind":
+        """Make a member whose value is its name and which carries its row."""
+        member = str.__new__(cls, name)
+        member._value_ = name
+        member.row = row
+        return member
+
+    # fmt: off
+    UNOBSERVABLE = "unobservable motion", Row("motion", sentences.unobservable_text, sentences.to_observe,
+        means="the motions do not determine a direction of translation, rotation or scale",
+        evidence="excitation of that direction, 0 to 0.06",
+        help="other motions; `details.motion` says what these are like")
+    FEW_IMAGES = "few images", Row("motion", "with {value:.0f} images a wrong one cannot be identified",
+        "take 8 or more", evidence="images")
+    FEW_AGREE = "few images agree", Row("motion",
+        "only {value:.0f} of {images:.0f} images agree on one calibration",
+        "check that images and poses are paired, and how the poses are written (jcr docs captures)",
+        evidence="images that agree")
+    POSES_CONTRADICT_IMAGES = "gripper poses contradict the images", Row("motion",
+        "gripper poses and images disagree by {mm:.0f} mm and {deg:.1f}° per axis",
+        "check the pairing, and how the poses are written (jcr docs captures)", evidence="m per axis")
+    POSE_CONVENTION = "pose convention", Row("motion",
+        "the poses fit when read as {reading}: {fits}, instead of {given}", sentences.given_remedy,
+        explains=MISFIT, evidence="m per axis, when read so",
+        help="the option in `remedy`, or correct them at their source")
+    NOISE_ABOVE_GIVEN = "noise above the given one", Row("motion",
+        "gripper poses and images disagree by {mm:.2g} mm and {deg:.2g}° per axis, more than the given "
+        "robot noise ({given_mm:.2g} mm, {given_rotation_deg:.2g}°): the larger is used",
+        evidence="m per axis", help="none needed: the larger is used")
+    UNCERTAIN = "too uncertain", Row("motion", sentences.uncertain, sentences.to_be_sure,
+        means="translation, rotation or scale (`details.part`) is less certain than 20 mm, 3° or 5 %",
+        evidence="1σ: m, rad, share", help="more images, rotated about different axes")
+    LEAVE_ONE_OUT = "leave-one-out error", Row("motion",
+        "the leave-one-out error ({mm:.1f} mm) is well above the fit's residual ({residual_mm:.1f} mm): "
+        "too few images for this motion", "add some", evidence="m")
+    NOT_EXACT_ENOUGH = "requirement not met", Row("motion", sentences.not_exact_enough, sentences.to_be_exact,
+        means="not as exact as `--require` asks, which rejects, or as grasping needs, which warns",
+        evidence="m, 95 % of errors are smaller", help="the images in `next_poses`; or the arm's name")
+    FOCUS_BY_DISTANCE = "focal length changes with distance", Row("camera",
+        "the focal length {way:grows|shrinks} by {size_percent:.1f} ± {std_percent} % from the nearest "
+        "view to the farthest ({chance})", "lock the focus, or --focus varies", explains=MISFIT,
+        means="autofocus", evidence="share, from the nearest view to the farthest; the chance `p`")
+    FOCUS_BY_IMAGE = "focal length differs between images", Row("camera",
+        "the focal length differs between images by {percent:.1f} % (rms, each ± {std_percent} %; {chance})",
+        "lock the focus and take the images again, or --focus varies", explains=MISFIT,
+        means="autofocus or zoom", evidence="share, rms")
+    ZOOM = "focal length changed once", Row("camera",
+        "the focal length changes by {percent:+.1f} ± {std_percent} % after {images[0]} ({chance}): the "
+        "zoom or focus was moved", "calibrate the images before or after it, or --focus varies",
+        explains=MISFIT, means="between two `images`", evidence="share; the chance `p`")
+    ROLLING_SHUTTER = "images sheared alike", Row("camera",
+        "the images are sheared by {value:.1f} ± {std} px from top to bottom ({chance}), as by the rolling "
+        "shutter of a moving camera", "take the images at rest", explains=MISFIT, means="a rolling shutter",
+        evidence="px from top to bottom; the chance `p`")
+    ROLLING_SHUTTER_BY_IMAGE = "images sheared each by itself", Row("camera",
+        "each image is sheared by itself, {value:.1f} px from top to bottom (rms, {chance}), as by the "
+        "rolling shutter of a moving camera", "take the images at rest", explains=MISFIT,
+        means="a rolling shutter", evidence="px from top to bottom, rms")
+    THIN_PRISM = "thin prism", Row("camera",
+        "the images show a thin-prism distortion of up to {value:.1f} ± {std} px ({chance}): the sensor is "
+        "tilted, or the optics are decentred",
+        "use the transform with the estimated intrinsics, which have the thin prism coefficients s1 to s4",
+        explains=MISFIT, means="a tilted sensor, or decentred optics",
+        evidence="px, where it is largest; the chance `p`")
+    CENTRE_SAGS = "principal point moves with gravity", Row("camera",
+        "the principal point moves with gravity, by {value:.1f} ± {std} px when it lies in the image "
+        "({chance}): the optics are image-stabilised or loose",
+        "switch image stabilisation off, or fix the optics", explains=MISFIT,
+        means="image-stabilised or loose optics",
+        evidence="px, when gravity lies in the image; the chance `p`")
+    INTRINSICS = "intrinsics contradict the images", Row("camera", sentences.intrinsics,
+        "calibrate the intrinsics again at this resolution, or give no intrinsics (null) to have them "
+        "estimated", explains=MISFIT,
+        means="the given intrinsics are not those of the images; parameters in `details`",
+        evidence="the chance `p`")
+    SLIP = "camera moved on the gripper", Row("order",
+        "the camera seems to have moved on the gripper by {mm:.1f} mm and {deg:.2f}° after {images[0]} "
+        "({chance})", sentences.one_part, explains=MISFIT, evidence="m; the chance `p`",
+        help="calibrate the longer part alone")
+    DRIFT = "camera drifts on the gripper", Row("order",
+        "the camera seems to drift on the gripper by {mm:.1f} mm and {deg:.2f}° from the first image to "
+        "the last ({chance})", "tighten its mount, let it warm up, and take the images again",
+        explains=MISFIT, evidence="m; the chance `p`")
+    BASE_MOVED = "robot base moved against the scene", Row("order",
+        "the robot's base and the scene moved against each other by {mm:.1f} mm and {deg:.2f}° after "
+        "{images[0]} ({chance})", sentences.one_part, explains=MISFIT, evidence="m; the chance `p`",
+        help="calibrate the longer part alone; bolt the base")
+    DELAY = "gripper poses early or late", Row("order",
+        "the gripper poses look as if read {size:.3f} ± {std} of the time from one image to the next too "
+        "{way:late|early} ({chance})", "stop the arm at each image, or read pose and image by the same clock",
+        explains=MISFIT, evidence="intervals between images; the chance `p`")
+    WRONG_MOUNT = "wrong mount", Row("robot",
+        "the images fit a camera that the gripper carries, not a fixed one",
+        "write mount gripper for {camera}", explains=MISFIT)
+    ROBOT_UNUSED = "robot not used", Row("robot", "the capture's robot is not used: {text}",
+        means="the poses are not those of the capture's arm", help="correct its name, URDF or joint angles")
+    JOINT_OFFSETS = "joint offsets", Row("robot", sentences.joints_off,
+        means="`joints` are off; each in `details`", evidence="rad, the largest",
+        help="master the joints")
+    LENGTHS = "robot lengths differ by direction", Row("strain",
+        "along {axis} the robot's positions are {size_percent:.1f} ± {std_percent} % too {way:long|short} "
+        "beside those across it ({chance})",
+        "check that axis (a lift, a rail, a gantry): its gear ratio, its unit", explains=MISFIT,
+        means="positions along one axis of the base (`details`) are too long beside those across it",
+        evidence="share, positive: too long; the chance `p`")
+    BASE_LEANS = "robot base leans with reach", Row("strain",
+        "the robot's base leans {way:towards|away from} the gripper by {size_deg:.1f} ± {std_deg}° per "
+        "metre of reach, which its poses do not say ({chance})", "bolt the stand to the floor, or brace it",
+        explains=MISFIT, means="a stand that bends as the arm reaches out",
+        evidence="rad per m, positive: towards the gripper; the chance `p`")
+    TOOL_SAGS = "tool sags", Row("strain",
+        "the gripper rotates by {size_deg:.2f} ± {std_deg}° where it is level, as a tool does that sags "
+        "under its weight ({chance})",
+        "stiffen its mount, and check the zero of the wrist's joints, which looks like it", explains=MISFIT,
+        means="the gripper rotates with its tilt, as under its weight; the zero of a wrist joint that is "
+        "off looks alike", evidence="rad, where it is level; the chance `p`")
+    BOARD_SIZE = "board size contradicts the robot", Row("lengths", sentences.board_size, sentences.to_size,
+        explains=MISFIT, means="the board is larger or smaller than given",
+        evidence="share, positive: larger", help="measure its squares; poses in metres")
+    SCALES = "lengths contradict each other", Row("lengths", sentences.scales, sentences.to_lengths, explains=MISFIT,
+        means="two of what the scale is known from (`details.one`, `details.other`: robot, board, known "
+        "length, depth camera, network) differ by more than they may",
+        evidence="share, positive: the second is longer",
+        help="measure both again; where a third length (`details.third`) agrees with one of the two, check "
+        "the other")
+    BOARD_SIDE = "side of a board", Row("lengths", sentences.board_side, sentences.to_board_side,
+        means="what the robot's positions make of a board of unknown side", evidence="m",
+        help="measure it, and give it")
+    BOARD_MOVED = "board at several places", Row("lengths", sentences.board_moved,
+        "its corners there are left out; keep one board of a kind, and keep it still",
+        means="in `images` it is elsewhere: it was moved, or there are two of a kind")
+    BOARD_NOT_FOUND = "board not found", Row("lengths", sentences.board_not_found,
+        "check its kind and its numbers of squares or corners (jcr docs markers)",
+        means="no two images show what `--board` names; `details.proposed` is what they seem to show")
+    NETWORK_SCALE = "a network's metre contradicts the robot", Row("lengths", sentences.network_scale_of,
+        "check the unit of the gripper poses", means="by far more than networks err",
+        evidence="share, positive: too long")
+    SCALE_ASSUMED = "scale assumed", Row("lengths",
+        "the scale is unobservable from these motions: it is taken as 1, from the marker's size",
+        help="other motions")
+    SCALE_FROM_ROBOT = "scale from the robot alone", Row("lengths",
+        "the scale comes from the robot's positions alone: if all of them are wrong by one factor, no "
+        "image shows it, and ± does not include it", "the size of a board or --known-length would show it")
+    IMAGES_ROTATED = "images rotated", Row("reconstruction",
+        "EXIF orientation {value:.0f}: the images are {rotated}, as viewers show them, and "
+        "gripper_from_camera and the intrinsics are of the camera that would see them so",
+        "for a driver that gives the sensor's own images remove the tag (exiftool -Orientation= FILES) and "
+        "calibrate again", evidence="the orientation, 2 to 8")
+    BOARD_IN_VIEW = "board in view", Row("reconstruction", "a calibration board is in view",
+        sentences.board_lengths, help="`--board`, see [markers](../how-to/markers.md)")
+    RECONSTRUCTION = "reconstruction", Row("reconstruction", "{text}", sentences.given_remedy,
+        means="what a back end says to act on, in words", help="in its words")
+    NO_RECONSTRUCTION = "no reconstruction", Row("reconstruction", "{text}", sentences.given_remedy,
+        means="no back end found camera poses", help="in its words")
+    OWN_REJECTED = "the capture's own camera is rejected", Row("cell",
+        "the {camera} camera's own calibration is rejected", help="correct that first")
+    FEW_POINTS_SHARED = "few points shared with the scene", Row("cell",
+        "{images[0]} shares {value:.0f} points with the mapped scene, too few",
+        "it must see the same scene, unchanged, from a direction not too different",
+        evidence="points, of the best image")
+    FEW_LOCALISED = "few images localised", Row("cell",
+        "{value:.0f} of its images share enough of the mapped scene; {needed:.0f} are needed",
+        "add images of the mapped scene", evidence="images")
+    NO_COMMON_POSE = "no image taken with one that is used", Row("cell",
+        "none of its images was taken with an image that is used", help="more images")
+    ONE_GRIPPER_POSE = "camera seen at one gripper pose", Row("cell",
+        "its images show one gripper pose only: whether it is on the gripper, and at which frame each "
+        "image was taken, cannot be tested",
+        "add an image at another gripper pose, or write mount base for a fixed camera")
+    SECOND_ON_ARM = "second camera on another arm", Row("cell",
+        "a second camera on arm {arm}: one each is supported")
+    NOT_FIXED = "camera not fixed", Row("cell",
+        "{images[0]} and {images[1]} were taken from places {mm:.0f} mm and {deg:.1f}° apart: it is not "
+        "fixed", "of a camera on the gripper write mount gripper, of several cameras give each its own name",
+        evidence="m")
+    NOT_RIGID = "camera not rigid on the gripper", Row("cell",
+        "its place beside the {camera} camera differs by up to {mm:.0f} mm between images: the two are not "
+        "rigid, or the images are not of the frames that they stand for", evidence="m",
+        help="tighten the mounts; check the frames")
+    FAR_FROM_GRIPPER = "camera far from the gripper", Row("cell",
+        "it is {value:.2f} m from the gripper's frame",
+        "check that it is on the gripper, and that the images are of the frames that they stand for",
+        evidence="m")
+    IMAGE_MISSES = "image contradicts the camera's place", Row("cell", sentences.misses,
+        means="that image does not fit the place of the camera's others", evidence="px, median",
+        help="tighten the mount, or leave the image out")
+    PLACE_UNCERTAIN = "camera's place too uncertain", Row("cell", sentences.place_uncertain, sentences.to_place,
+        means="a further camera is known worse than to 20 mm and 3°", evidence="m, 1σ of the worst axis",
+        help="intrinsics, or more images")
+    AT_ANOTHER_CAMERA = "camera stands where another was", Row("cell",
+        "it stands where the {camera} camera was at {images[0]}: if its image is one of that camera, it is "
+        "not fixed", help="check that the image is its own")
+    POINTS_CROWDED = "points crowded", Row("cell", "its points lie in {percent:.0f} % of the image",
+        "more of the scene in view would help", evidence="share of the image")
+    STATIC_IMAGES = "images show no motion", Row("images",
+        "all images show the same view but for noise, while the gripper moves by {mm:.0f} mm and rotates "
+        "by {deg:.0f}°",
+        "check that the camera is on the gripper and its stream is live, and take each image at its own pose",
+        explains=(*MISFIT, *TOO_FEW), evidence="m, the gripper's motion")
+    BLURRED = "images blurred", Row("images", sentences.blurred,
+        "take them again at rest, in focus and with more light", explains=(*MISFIT, *TOO_FEW),
+        means="the strongest edges of these `images` climb over more than 1/80 of the long side; rejects "
+        "where a quarter of all are and the calibration is rejected", evidence="px, how wide the edges are")
+    FEW_USED = "few images used", Row("reconstruction",
+        "only {value:.0f} of {of:.0f} images are used, and their motions alone are degenerate, those of "
+        "all are not", "let the views overlap more and show more texture, or use a board (jcr docs markers)",
+        explains=(*MISFIT, *TOO_FEW), evidence="images")
+    POSES_SWAPPED = "gripper poses exchanged", Row("single",
+        "{images[0]} and {images[1]} have each other's gripper pose", "exchange the two poses",
+        explains=MISFIT)
+    POSE_CONTRADICTS_IMAGE = "gripper pose contradicts its image", Row("single",
+        "the gripper pose of {images[0]} is {mm:.0f} mm and {deg:.1f}° from where its image shows the "
+        "gripper", "correct that pose, or drop the image", evidence="m")
+    NOT_REGISTERED = "image not registered", Row("single", sentences.not_registered,
+        "take such a view again, nearer to a pose that registered, with textured things in view",
+        means="while a capture is taken (`jcr capture`): its camera is not in the reconstruction",
+        evidence="other images that match it")
+    SAMPLE_REPEATED = "image and pose repeat others", Row("single",
+        "the image and the gripper pose are those of {images[0]}: not kept",
+        "move the gripper, or press retake", evidence="m, the motion between both")
+    POSE_UNIT = "gripper pose in another unit", Row("single",
+        "the gripper would be {value:.4g} m from the base, as of a pose in {unit}: not kept",
+        "divide the translation by {a_metre:.0f}", evidence="largest coordinate of the position, as given")
+    FRAME_REPEATED = "image repeats another", Row("single",
+        "the image is the same as {images[0]}, though the gripper moved by {mm:.0f} mm and {deg:.0f}°: not "
+        "kept", "check that the camera's stream is live", evidence="m between the gripper poses")
+    SIZE_DIFFERS = "image size differs", Row("single",
+        "the image has {size} pixels, the others {before}: not kept",
+        "set the camera's old resolution, or name a new folder")
+    CLOCK_JUMPS = "clock jumps back", Row("single",
+        "the time of {images[0]} is {value:.3g} s before that of the image before it",
+        "check that images and poses are stamped by one clock", evidence="s")
+    # fmt: on
+
+
+def kinds_of(*groups: str) -> frozenset[FindingKind]:
+    """Return the kinds of these groups."""
+    return frozenset(kind for kind in FindingKind if kind.row.group in groups)
