@@ -8,6 +8,7 @@ import numpy as np
 
 from benchmarks.page import mm_deg, table
 from jcr.capture.read import read_capture
+from jcr.geometry import fit_similarity
 from jcr.pipeline import RunOptions
 from jcr.pipeline import run as run_all
 from jcr.reconstruct import ReconstructOptions
@@ -68,24 +69,25 @@ def end_to_end(images: int, seed: int, noise: tuple[float, float]) -> EndToEnd:
         made = simulate(
             Path(folder) / "capture", SimulateOptions(images=images, seed=seed, robot_noise=noise)
         )
-        predictions, truth = pairs_of_capture(made, seed=seed)
+        predictions, _ = pairs_of_capture(made, seed=seed)
         pairs = Path(folder) / "pairs.npz"
         write_pairs(pairs, predictions)
         options = RunOptions(reconstruct=ReconstructOptions(predictions=pairs))
         result = run_all(read_capture(made), Path(folder) / "out", options)
-        # Metres per geometric mean of the pairs' units.
-        return _scored(result, made, float(np.exp(-np.log(truth.pair_unit).mean())))
+        return _scored(result, made)
 
 
-def _scored(result: RunResult, capture: Path, true_scale: float) -> EndToEnd:
+def _scored(result: RunResult, capture: Path) -> EndToEnd:
     """Compare a run with the truth of its simulated capture."""
     truth, found = read_truth(capture), result.hand_eye
     surface, _ = truth_points(capture)
     assert result.scene is not None
     distance = np.abs(np.asarray(result.scene.query(surface[:: max(1, len(surface) // 20_000)]).distance))
+    cameras = result.reconstruction.recon_from_camera
+    true_scale = fit_similarity(truth.base_from_camera[:, :3, 3], cameras[:, :3, 3])[1]
     problem = HandEyeProblem(
         truth.base_from_gripper,
-        result.reconstruction.recon_from_camera,
+        cameras,
         truth.gripper_from_camera,
         true_scale,
         truth.base_from_gripper,

@@ -72,13 +72,13 @@ def synthetic_pairs(
 ) -> tuple[PairPredictions, PairTruth]:
     """Predictions for `edges` at `size` (width, height), each pair in a unit between half and twice a metre.
 
-    Without `intrinsics` the focal length is 0.95 widths and the principal point (W/2, H/2), and the
+    Without `intrinsics` the focal length is 0.95 widths and the principal point the middle, and the
     predictions carry none.
     """
     errors = errors or PairErrors()
     rng = np.random.default_rng(seed)
     width, height = size
-    k = intrinsics or Intrinsics(0.95 * width, 0.95 * width, width / 2, height / 2, width, height)
+    k = intrinsics or Intrinsics(0.95 * width, 0.95 * width, (width - 1) / 2, (height - 1) / 2, width, height)
     images = int(edges.max()) + 1
     base_from_camera = _cameras(images, rng)
     depth = np.stack([_depth(pose, rays(k)) for pose in base_from_camera])

@@ -532,7 +532,7 @@ def test_a_network_that_gives_garbage_is_left_for_colmap_and_the_run_folder_repo
 def test_one_network_that_sees_all_views_is_asked_between_colmap_and_direct_alignment(
     present: set[str], monkeypatch: pytest.MonkeyPatch
 ):
-    present |= {"da3", "mapanything"}
+    present |= {"da3", "da3-small"}
     problem = hand_eye_problem(np.random.default_rng(3), 8)
     good, nothing = problem.recon_from_camera, RejectedError("0 of 8 images registered")
     answers = {"colmap": nothing, "da3": nothing, "direct": good}

@@ -1,12 +1,12 @@
 """The table of back ends: a row is all that a new one takes, and no option that it does not use passes silently."""
 
-import importlib.util
 import json
+import os
 import re
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ import pytest
 from jcr import reconstruct as backends
 from jcr import run_folder
 from jcr.calibration.options import CalibrateOptions
-from jcr.cli import call, dispatch, models, run
+from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.pages import page
 from jcr.reconstruct import (
@@ -27,18 +27,6 @@ from jcr.reconstruct import (
 )
 from jcr.records import Capture
 
-MINE = """
-        Backend(
-            name="mine",
-            reconstruct=lambda capture, options, progress: (options.backend, len(capture)),
-            licence="MIT",
-            metric=True,
-            auto=True,
-            options=("weights",),
-            accuracy="9 mm",
-        ),
-"""
-
 
 @pytest.fixture
 def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
@@ -49,72 +37,66 @@ def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     return names
 
 
-@pytest.fixture
-def with_mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The module as it would be with one more row in its table, before the others, and nothing else changed."""
-    source = Path(backends.__file__).read_text()
-    begin = "    for row in (\n"
-    assert source.count(begin) == 1
-    path = tmp_path / "backends_with_mine.py"
-    path.write_text(source.replace(begin, begin + MINE.removeprefix("\n")))
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, path.stem, module)
-    spec.loader.exec_module(module)
-    return module
+MINE = """
+from jcr.reconstruct import Backend
+
+ROW = Backend(
+    name="mine",
+    reconstruct=lambda capture, options, progress: (options.backend, capture.images),
+    licence="MIT",
+    metric=True,
+    auto=True,
+    options=("weights",),
+    accuracy="9 mm",
+)
+"""
+USES = """
+import json, sys
+import numpy as np
+from pathlib import Path
+import jcr.reconstruct as table
+from jcr.cli import dispatch
+from jcr.records import Capture
+
+table._of_capture = lambda found, order: (found, order.tolist())
+poses = np.stack([np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0])])
+capture = Capture(folder=Path(), images=("a", "b"), base_from_gripper=poses, image_size=(64, 48))
+options = table.ReconstructOptions(backend="mine")
+print(json.dumps([list(table.BACKENDS), table.reconstruct(capture, options)]))
+dispatch(["models", "--json"])
+"""
 
 
-def test_a_new_back_end_is_one_row(
-    with_mine: ModuleType,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert with_mine.candidates(with_mine.ReconstructOptions())[0] == "mine"
-    named = with_mine.ReconstructOptions(backend="mine", weights=str(tmp_path))
-    assert with_mine.candidates(named) == ("mine",) and with_mine.weights_of(named).path == tmp_path
-    assert "mine" in str(with_mine.BackendName)
-    with pytest.raises(InputError, match="give --backend mine or mast3r or"):
-        with_mine.candidates(replace(named, backend="colmap"))
-
-    row = Backend(**vars(with_mine.BACKENDS["mine"]))
-    monkeypatch.setattr(models, "BACKENDS", {"mine": row} | BACKENDS)
-    assert dispatch(["models", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["models"][0] == {
-        "backend": "mine", "weights": "", "licence": "MIT", "commercial": True, "scale": "metres",
-        "parameters_m": 0, "download_gb": 0.0, "present": "yes", "accuracy": "9 mm",
-    }  # fmt: skip
-
-    # The help of `jcr run`, were its options these.
-    command = ModuleType("command")
-    vars(command).update(Arguments=with_mine.ReconstructOptions, main=run.main)
-    assert call(lambda: command, "jcr run", ["--help"]) == 0
-    assert "{auto,mine,mast3r," in re.sub(r"[\s│]", "", capsys.readouterr().out)
-
-
-def test_a_row_is_called_with_the_options_as_it_takes_them(with_mine: ModuleType) -> None:
-    capture = Capture(
-        folder=Path(),
-        images=("a.png", "b.png"),
-        base_from_gripper=np.stack([np.diag([1.0, 1.0, 1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0])]),
-        image_size=(64, 48),
+@pytest.mark.slow
+def test_another_package_adds_a_row_by_an_entry_point(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(MINE)
+    folder = tmp_path / "mine-0.1.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 0.1\n")
+    (folder / "entry_points.txt").write_text("[jcr.backends]\nmine = mine:ROW\nbroken = mine:NO_ROW\n")
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    done = subprocess.run(
+        [sys.executable, "-c", USES], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}
     )
-    seen = []
-    with_mine._of_capture = lambda found, order: seen.append((found, order.tolist()))
-    with_mine.reconstruct(capture, with_mine.ReconstructOptions())
-    assert seen == [(("mine", 2), [1, 0])]
+    assert done.returncode == 0, done.stderr
+    first, rest = done.stdout.split("\n", 1)
+    names, found = json.loads(first)
+    assert names.index("da3-small") < names.index("mine") < names.index("direct") and "broken" not in names
+    assert found == [["mine", ["b", "a"]], [1, 0]], "images come in the order of their poses"
+    row = next(row for row in json.loads(rest)["models"] if row["backend"] == "mine")
+    assert (row["accuracy"], row["licence"], row["present"]) == ("9 mm", "MIT", "yes")
+    assert "back end broken (mine:NO_ROW) cannot be loaded" in done.stderr
 
 
 def test_the_best_whose_weights_are_here_comes_first(
     present: set[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert candidates(ReconstructOptions()) == ("colmap", "direct")
-    present |= {"dust3r", "mapanything"}
-    assert candidates(ReconstructOptions()) == ("dust3r", "colmap", "mapanything", "direct")
+    present |= {"dust3r", "da3"}
+    assert candidates(ReconstructOptions()) == ("dust3r", "colmap", "da3", "direct")
     present.add("mast3r")
     assert candidates(ReconstructOptions())[0] == "mast3r"
-    monkeypatch.setattr(Backend, "is_installed", lambda self: self.name != "mapanything")
+    monkeypatch.setattr(Backend, "is_installed", lambda self: self.name != "da3")
     assert candidates(ReconstructOptions()) == ("mast3r", "dust3r", "colmap", "direct")
     assert candidates(ReconstructOptions(backend="colmap")) == ("colmap",)
 
@@ -158,9 +140,9 @@ def test_an_option_of_one_back_end_selects_it(present: set[str]) -> None:
     ("options", "words"),
     [
         (ReconstructOptions(backend="colmap", predictions=Path("p.npz")), "--predictions p.npz: .*predictions"),
-        (ReconstructOptions(backend="predictions", weights="p.npz"), "--weights p.npz: .*mast3r or dust3r or .*mapany"),
+        (ReconstructOptions(backend="predictions", weights="p.npz"), "--weights p.npz: .*mast3r or dust3r or da3"),
         (ReconstructOptions(backend="direct", board="b"), "--board b: .*colmap or marker or given"),
-        (ReconstructOptions(backend="mapanything", pair_graph="window"), "--pair-graph window: .*mast3r or dust3r"),
+        (ReconstructOptions(backend="da3", pair_graph="window"), "--pair-graph window: .*mast3r or dust3r"),
         (ReconstructOptions(pair_graph="robot"), r"--pair-graph robot: .*\(colmap, direct\) does not use it"),
         (ReconstructOptions(board="b", predictions=Path("c")), r"--board b: .*\(predictions\) does not use it"),
         (ReconstructOptions(weights="w", predictions=Path("p")), "--weights and --predictions select"),
@@ -246,7 +228,7 @@ def test_models_are_listed_with_licence_scale_and_what_is_present(capsys: pytest
     rows = {(row["backend"], row["weights"]): row for row in json.loads(capsys.readouterr().out)["models"]}
     assert rows["colmap", ""]["present"] == "yes"
     assert "non-commercial" in rows["mast3r", BACKENDS["mast3r"].hub_id]["licence"]
-    assert rows["mapanything", BACKENDS["mapanything"].hub_id]["licence"] == "Apache-2.0"
+    assert rows["da3", BACKENDS["da3"].hub_id]["licence"] == "Apache-2.0"
     assert {row.name for row in BACKENDS.values()} == {name for name, _ in rows}
 
 

@@ -1,4 +1,4 @@
-"""Weights on the Hugging Face hub: whether they are on this machine, and the one place that downloads them.
+"""Weights of networks in the local cache of the Hugging Face hub, and their download.
 
 Cache, mirror, proxy, token and offline mode are those of huggingface_hub (HF_HOME, HF_ENDPOINT, HTTPS_PROXY, HF_TOKEN,
 HF_HUB_OFFLINE). Only `jcr models get` calls `download`; a run looks into the cache.
@@ -6,7 +6,6 @@ HF_HUB_OFFLINE). Only `jcr models get` calls `download`; a run looks into the ca
 
 import hashlib
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from jcr.errors import InputError
 from jcr.extras import extra, is_installed
 
 HUB_FILES = ("config.json", "model.safetensors")
+"""Files of the weights of every network."""
 HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 
 
@@ -22,21 +22,21 @@ class Weights:
     """Weights of a network on this machine."""
 
     path: Path
-    """Their file, or the folder of their files."""
+    """File of the weights, or folder of their files."""
     name: str
-    """The path or hub id that was asked for."""
+    """Path or hub id that the user named."""
     licence: str
 
     @property
     def note(self) -> str:
-        """For the notes of what they were used for."""
+        """Note on the weights and their licence for the result."""
         return f"weights {self.name}: licence {self.licence}"
 
 
-def cached_files(hub_id: str, names: Sequence[str] = HUB_FILES, revision: str | None = None) -> list[Path]:
-    """Files of a hub id in the cache of this machine: of `revision`, else of the newest one that was downloaded.
+def cached_files(hub_id: str, revision: str | None = None) -> list[Path]:
+    """Return the HUB_FILES of a hub id from the cache of this machine: of one commit, or of the newest downloaded one.
 
-    The network is not asked. Empty unless all are there.
+    The network is not asked. The list is empty unless all files are there.
     """
     if not is_installed("huggingface_hub"):
         return []
@@ -47,20 +47,18 @@ def cached_files(hub_id: str, names: Sequence[str] = HUB_FILES, revision: str | 
         return []
     from huggingface_hub import try_to_load_from_cache
 
-    for commit in {revision: None, None: None}:
-        # Not a path where a file is missing, or known to be missing on the hub.
-        found = [
-            try_to_load_from_cache(hub_id, name, constants.HF_HUB_CACHE, revision=commit) for name in names
-        ]
-        if all(isinstance(path, str) for path in found):
-            return [Path(str(path)) for path in found]
-    return []
+    found = [
+        try_to_load_from_cache(hub_id, name, constants.HF_HUB_CACHE, revision=revision) for name in HUB_FILES
+    ]
+    # The result is no path where a file is missing here, or known to be missing on the hub.
+    paths = [Path(path) for path in found if isinstance(path, str)]
+    return paths if len(paths) == len(HUB_FILES) else []
 
 
-def download(hub_id: str, names: Sequence[str], revision: str | None = None, quiet: bool = False) -> Path:
-    """The folder in the cache that holds the files of a hub id, of a commit or of the newest one.
+def download(hub_id: str, revision: str | None = None, quiet: bool = False) -> Path:
+    """Download the HUB_FILES of a hub id, of a commit or of the newest one, and return their folder in the cache.
 
-    What is in the cache is not downloaded again; every file is compared with its published checksum. Raises InputError
+    Files in the cache are not downloaded again; every file is compared with its published checksum. Raises InputError
     where the hub cannot be reached, has no such files, or sent other bytes than it publishes; these are deleted.
     """
     extra("huggingface_hub", "networks", "jcr models get")
@@ -72,14 +70,14 @@ def download(hub_id: str, names: Sequence[str], revision: str | None = None, qui
     if quiet:
         disable_progress_bars()
     try:
-        folder = Path(snapshot_download(hub_id, revision=revision, allow_patterns=list(names)))
+        folder = Path(snapshot_download(hub_id, revision=revision, allow_patterns=list(HUB_FILES)))
     except Exception as error:  # those of its transport (requests, httpx) differ by its version
         reason = " ".join(str(error).split())[:160] or type(error).__name__
         raise InputError(
             f"{hub_id}: not downloaded ({reason}); try again, check the network, HTTPS_PROXY, or set HF_ENDPOINT to a "
             "mirror"
         ) from None
-    for name in names:
+    for name in HUB_FILES:
         path = folder / name
         if not path.is_file():
             raise InputError(f"{hub_id}: the hub has no {name} of it; ask for another --revision")
@@ -94,9 +92,9 @@ def download(hub_id: str, names: Sequence[str], revision: str | None = None, qui
 
 
 def _is_as_published(path: Path) -> bool:
-    """Whether a file has the checksum by which the hub's cache names it: SHA-256, or git's SHA-1 of a small file.
+    """Test whether a file has the checksum by which the hub's cache names it: SHA-256, or git's SHA-1 of a small file.
 
-    True where a system without symbolic links keeps no such name.
+    The result is true where a system without symbolic links keeps no such name.
     """
     published = path.resolve().name
     if re.fullmatch("[0-9a-f]{64}", published):

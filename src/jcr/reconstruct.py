@@ -1,7 +1,13 @@
-"""The back ends: each makes the same Reconstruction of a capture. A new one is a file and a row of this table."""
+"""Table of back ends: each makes a Reconstruction of a capture.
 
+A back end of this package is a file and a row here. Another package adds rows by entry points of the group
+`jcr.backends`, each the name and a `Backend` (examples/backend_mapanything).
+"""
+
+import logging
 from collections.abc import Callable
-from dataclasses import KW_ONLY, asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,34 +19,43 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.extras import extra, install, is_installed, xfeat_is_installed
 from jcr.features.order import order_by_pose
-from jcr.hub import HUB_FILES, HUB_ID, Weights, cached_files
+from jcr.hub import HUB_ID, Weights, cached_files
 from jcr.progress import Progress
 from jcr.records import Boards, CameraEvidence, Capture, Reconstruction
 
 CC_BY_NC_SA = "CC BY-NC-SA 4.0, non-commercial use only (https://creativecommons.org/licenses/by-nc-sa/4.0/)"
 INSTALL_DA3 = "pip install omegaconf addict einops && pip install --no-deps depth-anything-3"
-"""Without what the package asks for beside these, numpy below 2 among it; its network uses none of it."""
+"""The package's other requirements, numpy below 2 among them, are not used by its network."""
+GROUP = "jcr.backends"
+"""Group of the entry points of back ends from other packages."""
+MARKER = "marker"
+"""Name of the back end that uses the board and nothing else."""
+PATHS = ("predictions", "cameras")
+"""Options that name files."""
+
+logger = logging.getLogger(__name__)
 
 
 def _colmap(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
+    """Reconstruct by structure from motion."""
     from jcr.sfm.colmap import reconstruct_colmap
     from jcr.sfm.options import ColmapOptions
 
     features = "sift" if options.features == "auto" else options.features
     if features != "sift":
         extra("torch", "match", f"--features {features}")
-    made = ColmapOptions(seed=options.seed, features=features)
-    return reconstruct_colmap(capture, made, progress)
+    return reconstruct_colmap(capture, ColmapOptions(seed=options.seed, features=features), progress)
 
 
 def _direct(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
+    """Reconstruct by photometric alignment."""
     from jcr.photometric.direct import reconstruct_direct
 
     return reconstruct_direct(capture, progress)
 
 
 def _dust3r(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    """MASt3R, too: its files bring one more head, which is left out, and points in metres."""
+    """Reconstruct by DUSt3R or MASt3R, whose files have one more head, which is left out, and points in metres."""
     extra("torch", "networks", f"--backend {options.backend}")
     from jcr.pointmaps.dust3r.dust3r import Dust3rOptions, reconstruct_dust3r
 
@@ -53,25 +68,18 @@ def _dust3r(capture: Capture, options: "ReconstructOptions", progress: Progress 
     return reconstruct_dust3r(capture, made, progress)
 
 
-def _views_at_once(
-    capture: Capture, options: "ReconstructOptions", progress: Progress | None
-) -> Reconstruction:
-    """All models that see every view at once: their rows name the adapter."""
+def _da3(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
+    """Reconstruct by Depth Anything 3."""
     extra("torch", "networks", f"--backend {options.backend}")
-    from jcr.pointmaps import da3, mapanything
-    from jcr.pointmaps.any_view import ViewsOptions, reconstruct_views_at_once
+    from jcr.pointmaps import da3
+    from jcr.pointmaps.any_view import reconstruct_any_view
 
-    row = BACKENDS[options.backend]
-    made = ViewsOptions(
-        backend=row.name,
-        load=mapanything.load if row.name == "mapanything" else da3.load,
-        weights=weights_of(options),
-        device=device_of(options),
-    )
-    return reconstruct_views_at_once(capture, made, progress)
+    weights, device = weights_of(options), device_of(options)
+    return reconstruct_any_view(capture, da3.load, weights, device, options.backend, progress)
 
 
 def _marker(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
+    """Reconstruct by the corners of a board alone."""
     from jcr.boards.marker import reconstruct_marker
 
     if options.board is None:
@@ -82,6 +90,7 @@ def _marker(capture: Capture, options: "ReconstructOptions", progress: Progress 
 def _predictions(
     capture: Capture, options: "ReconstructOptions", progress: Progress | None
 ) -> Reconstruction:
+    """Reconstruct from a file of predictions."""
     from jcr.pointmaps.predictions import reconstruct_predictions
 
     if options.predictions is None:
@@ -92,6 +101,7 @@ def _predictions(
 
 
 def _given(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
+    """Reconstruct with the camera poses of a COLMAP model."""
     from jcr.sfm.given import reconstruct_given
     from jcr.sfm.options import ColmapOptions
 
@@ -103,39 +113,40 @@ def _given(capture: Capture, options: "ReconstructOptions", progress: Progress |
 
 @dataclass(frozen=True, kw_only=True)
 class Backend:
-    """A row of the table."""
+    """Row of the table of back ends."""
 
     name: str
-    """For --backend."""
+    """Name for --backend."""
     reconstruct: Callable[..., Reconstruction]
-    """A function of capture, ReconstructOptions and progress; its heavy imports happen inside."""
+    """Function of capture, ReconstructOptions and progress; its heavy imports happen inside."""
     licence: str
-    _: KW_ONLY
+    """Licence of the code, or of the weights where there are some."""
     metric: bool | None = False
-    """Whether its scale is metres already; None: its input has a flag for it."""
+    """Whether the scale is in metres already; None: its input states it."""
     auto: bool = False
-    """Whether `auto` may take it, where its package and its weights are on this machine."""
+    """Whether `auto` may take it where its package and its weights are on this machine."""
     tests_camera: bool = True
-    """Whether its calibrations are tested for a camera that is not as given: by points found in the images alone."""
+    """Whether its calibrations are tested for wrong intrinsics, by points that are found in the images alone."""
     options: tuple[str, ...] = ()
     """Fields of ReconstructOptions that it uses and not every back end does."""
     selected_by: str = ""
     """The one of these by which `auto` takes it."""
     hub_id: str = ""
-    """Of its published weights; empty: it needs none."""
+    """Hub id of its published weights; empty: it needs none."""
     package: str = ""
-    """That must be installed beside this one's core."""
+    """Package that must be installed beside the core."""
     install: str = ""
-    """The command that does so."""
+    """Command that installs the package."""
     keeps_order: bool = False
     """Whether its input or its options count images in the capture's own order."""
     accuracy: str = ""
-    """As measured, and where that stands; empty: not measured here."""
+    """Measured accuracy and the page with the measurement; empty: not measured here."""
     revision: str = ""
-    """The commit of its weights that `jcr models get` downloads."""
+    """Commit of its weights that `jcr models get` downloads."""
     parameters: int = 0
-    """Of the network, in millions."""
+    """Parameters of the network in millions."""
     download_gb: float = 0.0
+    """Size of the weights."""
     commercial: bool = True
     """Whether the licence of its weights allows commercial use."""
     sees_all_views: bool = False
@@ -143,173 +154,152 @@ class Backend:
 
     @property
     def predicts_depth(self) -> bool:
-        """Whether its reconstructions come with pointmaps, a network's."""
+        """Whether its reconstructions have the pointmaps of a network."""
         return bool(self.hub_id) or "predictions" in self.options
 
     def is_installed(self) -> bool:
-        """Whether the package it needs is there, without importing it."""
+        """Test whether the package it needs is there, without importing it."""
         return not self.package or is_installed(self.package)
 
     def has_weights(self) -> bool:
-        """Whether its published weights are on this machine, or none are needed; nothing is downloaded."""
-        return not self.hub_id or bool(cached_files(self.hub_id, HUB_FILES, self.revision))
+        """Test whether its published weights are on this machine, or none are needed; nothing is downloaded."""
+        return not self.hub_id or bool(cached_files(self.hub_id, self.revision or None))
 
 
-BACKENDS: dict[str, Backend] = {
-    row.name: row
-    for row in (
-        Backend(
-            name="mast3r",
-            reconstruct=_dust3r,
-            licence=f"{CC_BY_NC_SA}, and the licences of its training data (its CHECKPOINTS_NOTICE)",
-            metric=True,
-            auto=True,
-            tests_camera=False,
-            options=("weights", "pair_graph"),
-            hub_id="naver/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric",
-            revision="06e7259f34c3060f322df5cb0c7b9094f57e41fc",
-            keeps_order=True,
-            package="torch",
-            install=install("networks"),
-            parameters=689,
-            download_gb=2.8,
-            commercial=False,
-        ),
-        Backend(
-            name="dust3r",
-            reconstruct=_dust3r,
-            licence=CC_BY_NC_SA,
-            auto=True,
-            tests_camera=False,
-            options=("weights", "pair_graph"),
-            selected_by="weights",
-            hub_id="naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt",
-            revision="61c57447d7b0adc8a1a30b2b0adec7a8935aa2a3",
-            keeps_order=True,
-            package="torch",
-            install=install("networks"),
-            parameters=571,
-            download_gb=2.3,
-            commercial=False,
-        ),
-        Backend(
-            name="colmap",
-            reconstruct=_colmap,
-            licence="BSD-3-Clause; XFeat and LightGlue Apache-2.0",
-            auto=True,
-            options=("features", "board"),
-            selected_by="features",
-            accuracy="0.02 mm and 0.002° on the bundled capture (jcr docs results/speed)",
-        ),
-        Backend(
-            name="da3",
-            reconstruct=_views_at_once,
-            licence="Apache-2.0",
-            auto=True,
-            tests_camera=False,
-            options=("weights",),
-            hub_id="depth-anything/DA3-BASE",
-            revision="f4a6c9b3c95e41c82048423d3493a81ec3fa810e",
-            package="depth_anything_3",
-            install=INSTALL_DA3,
-            parameters=135,
-            download_gb=0.5,
-            sees_all_views=True,
-        ),
-        Backend(
-            name="da3-small",
-            reconstruct=_views_at_once,
-            licence="Apache-2.0",
-            auto=True,
-            tests_camera=False,
-            options=("weights",),
-            hub_id="depth-anything/DA3-SMALL",
-            revision="e08cab65ca0ec38e7826075418411ab90cab4da3",
-            package="depth_anything_3",
-            install=INSTALL_DA3,
-            parameters=34,
-            download_gb=0.14,
-            sees_all_views=True,
-        ),
-        Backend(
-            name="mapanything",
-            reconstruct=_views_at_once,
-            licence="Apache-2.0",
-            metric=True,
-            auto=True,
-            tests_camera=False,
-            options=("weights",),
-            hub_id="facebook/map-anything-apache",
-            revision="00f9c245bbcb60522d1ed7f9e9d88462c6e3f38a",
-            package="mapanything",
-            install="pip install git+https://github.com/facebookresearch/map-anything",
-            sees_all_views=True,
-        ),
-        Backend(
-            name="direct",
-            reconstruct=_direct,
-            licence="Apache-2.0",
-            auto=True,
-            tests_camera=False,
-            accuracy="0.10 mm and 0.012° on printed, 0.29 mm and 0.023° on plain simulated tables "
-            "(jcr docs plain-tables)",
-        ),
-        Backend(
-            name="marker",
-            reconstruct=_marker,
-            licence="Apache-2.0",
-            metric=True,
-            options=("board",),
-            accuracy="0.7 mm and 0.20° from the reference of a real capture (jcr docs results/real)",
-        ),
-        Backend(
-            name="predictions",
-            reconstruct=_predictions,
-            licence="your network's",
-            metric=None,
-            tests_camera=False,
-            options=("predictions",),
-            selected_by="predictions",
-            keeps_order=True,
-            accuracy="0.74 mm and 0.047° from simulated predictions (jcr docs results/pointmaps)",
-        ),
-        Backend(
-            name="given",
-            reconstruct=_given,
-            licence="your reconstruction's",
-            options=("cameras", "board"),
-            selected_by="cameras",
-        ),
-    )
-}
-"""By name; `auto` takes the first that it may.
+_FIRST = (
+    Backend(
+        name="mast3r",
+        reconstruct=_dust3r,
+        licence=f"{CC_BY_NC_SA}, and the licences of its training data (its CHECKPOINTS_NOTICE)",
+        metric=True,
+        auto=True,
+        tests_camera=False,
+        options=("weights", "pair_graph"),
+        hub_id="naver/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric",
+        revision="06e7259f34c3060f322df5cb0c7b9094f57e41fc",
+        keeps_order=True,
+        package="torch",
+        install=install("networks"),
+        parameters=689,
+        download_gb=2.8,
+        commercial=False,
+    ),
+    Backend(
+        name="dust3r",
+        reconstruct=_dust3r,
+        licence=CC_BY_NC_SA,
+        auto=True,
+        tests_camera=False,
+        options=("weights", "pair_graph"),
+        selected_by="weights",
+        hub_id="naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt",
+        revision="61c57447d7b0adc8a1a30b2b0adec7a8935aa2a3",
+        keeps_order=True,
+        package="torch",
+        install=install("networks"),
+        parameters=571,
+        download_gb=2.3,
+        commercial=False,
+    ),
+    Backend(
+        name="colmap",
+        reconstruct=_colmap,
+        licence="BSD-3-Clause; XFeat and LightGlue Apache-2.0",
+        auto=True,
+        options=("features", "board"),
+        selected_by="features",
+        accuracy="0.02 mm and 0.002° on the bundled capture (jcr docs results/speed)",
+    ),
+    Backend(
+        name="da3",
+        reconstruct=_da3,
+        licence="Apache-2.0",
+        auto=True,
+        tests_camera=False,
+        options=("weights",),
+        hub_id="depth-anything/DA3-BASE",
+        revision="f4a6c9b3c95e41c82048423d3493a81ec3fa810e",
+        package="depth_anything_3",
+        install=INSTALL_DA3,
+        parameters=135,
+        download_gb=0.5,
+        sees_all_views=True,
+    ),
+    Backend(
+        name="da3-small",
+        reconstruct=_da3,
+        licence="Apache-2.0",
+        auto=True,
+        tests_camera=False,
+        options=("weights",),
+        hub_id="depth-anything/DA3-SMALL",
+        revision="e08cab65ca0ec38e7826075418411ab90cab4da3",
+        package="depth_anything_3",
+        install=INSTALL_DA3,
+        parameters=34,
+        download_gb=0.14,
+        sees_all_views=True,
+    ),
+)
+_LAST = (
+    Backend(
+        name="direct",
+        reconstruct=_direct,
+        licence="Apache-2.0",
+        auto=True,
+        tests_camera=False,
+        accuracy="0.10 mm and 0.012° on printed, 0.29 mm and 0.023° on plain simulated tables "
+        "(jcr docs plain-tables)",
+    ),
+    Backend(
+        name="marker",
+        reconstruct=_marker,
+        licence="Apache-2.0",
+        metric=True,
+        options=("board",),
+        accuracy="0.7 mm and 0.20° from the reference of a real capture (jcr docs results/real)",
+    ),
+    Backend(
+        name="predictions",
+        reconstruct=_predictions,
+        licence="your network's",
+        metric=None,
+        tests_camera=False,
+        options=("predictions",),
+        selected_by="predictions",
+        keeps_order=True,
+        accuracy="0.74 mm and 0.047° from simulated predictions (jcr docs results/pointmaps)",
+    ),
+    Backend(
+        name="given",
+        reconstruct=_given,
+        licence="your reconstruction's",
+        options=("cameras", "board"),
+        selected_by="cameras",
+    ),
+)
 
-Networks that see pairs, whose uncertainty is known, come first, metric ones before others. COLMAP needs no weights, and
-sees what networks do not. Networks that see all views come after it and before direct alignment: with simulated
-predictions, refined by colours, they are more accurate on plain tables, for more time.
-Direct alignment needs no weights: COLMAP matches what is printed on things, it the colours of plain ones.
-"""
-
-MARKER = "marker"
-"""The back end that uses the board and nothing else."""
-PATHS = ("predictions", "cameras")
-"""Options that name files."""
-
-# The choices of --backend.
+# Names of entry points are known without importing their packages.
 if TYPE_CHECKING:
     BackendName = str
 else:
-    BackendName = Literal[("auto", *BACKENDS)]
+    BackendName = Literal[
+        (
+            "auto",
+            *(row.name for row in _FIRST),
+            *(point.name for point in entry_points(group=GROUP)),
+            *(row.name for row in _LAST),
+        )
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructOptions:
-    """What turns images into camera poses."""
+    """Options of the reconstruction."""
 
     backend: BackendName = "auto"
     """auto tries the back ends of this list that need no extra input and whose package and weights are on this machine
     (jcr models), in this order, and the next only if the result is rejected."""
-    _: KW_ONLY
     board: Annotated[str | None, tyro.conf.arg(metavar="KIND:SIZE")] = None
     """The board or tags in view, in metres (SIDE where the side is unknown), used beside the features, or alone where
     these fail (--backend marker: only alone): charuco:7x5:0.030:0.022:DICT_4X4_50, chessboard:9x6:0.025 (inner corners),
@@ -329,15 +319,16 @@ class ReconstructOptions:
     cameras: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
     """Camera poses from another tool, a COLMAP model; selects the back end given."""
     pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
-    """Pairs of images that dust3r and mast3r process; robot leaves out pairs without a common view."""
+    """Pairs of images that dust3r and mast3r process: all, near in order, or near by the gripper poses; auto: all of
+    up to 12 images, else robot."""
 
     def with_absolute_paths(self) -> "ReconstructOptions":
-        """The same with paths that hold in every working folder."""
+        """Return the options with absolute paths."""
         paths = {name: path.resolve() for name in PATHS if isinstance(path := getattr(self, name), Path)}
         return replace(self, **paths)
 
     def as_json(self) -> dict[str, Any]:
-        """The fields as JSON knows them; paths as text that holds in every working folder."""
+        """Return the fields as JSON values, paths as absolute text."""
         values = asdict(self.with_absolute_paths())
         return {name: str(x) if isinstance(x, Path) else x for name, x in values.items()}
 
@@ -353,7 +344,7 @@ def check_board(options: ReconstructOptions) -> None:
 def reconstruct(
     capture: Capture, options: ReconstructOptions | None = None, progress: Progress | None = None
 ) -> Reconstruction:
-    """The capture reconstructed by the back end that `options` names.
+    """Reconstruct a capture by the back end that `options` names.
 
     Raises InputError for a back end that is not there, RejectedError when it finds too little.
     """
@@ -383,7 +374,7 @@ def reconstruct(
 
 
 def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Reconstruction:
-    """The reconstruction with its images in the capture's own order; row k was taken as order[k]."""
+    """Return the reconstruction with its images in the capture's own order; row k was given as order[k]."""
     image_index = order[reconstruction.image_index]
     rows = np.argsort(image_index)
     row_of = np.argsort(rows)
@@ -404,13 +395,14 @@ def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Re
 
 
 def _in_order(boards: Boards | None, row_of: Int[ndarray, " m"]) -> Boards | None:
+    """Return the boards with rows renumbered by `row_of`."""
     if boards is None:
         return None
     return replace(boards, elsewhere=tuple(sorted(row_of[list(boards.elsewhere)].tolist())))
 
 
 def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
-    """What `auto` stands for here, the best first, or the one back end that was asked for.
+    """Return the back ends that `auto` may take here, the best first, or the one that was named.
 
     An option that only one back end uses selects that one. A network whose weights were named is followed by the best
     back end that needs none, and one that uses a board beside its features by the board alone. Raises InputError for
@@ -453,7 +445,7 @@ def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
 
 
 def tries(options: ReconstructOptions) -> list[ReconstructOptions]:
-    """The options of every attempt that `auto` may make, the best first.
+    """Return the options of every attempt that `auto` may make, the best first.
 
     Of the candidates the two best, where one network that sees all views does not count, and no second such one; COLMAP
     with SIFT, then with learned features where their weights are installed. Raises as `candidates` does.
@@ -475,14 +467,14 @@ def tries(options: ReconstructOptions) -> list[ReconstructOptions]:
 
 
 def for_backend(options: ReconstructOptions, name: BackendName) -> ReconstructOptions:
-    """The options as one of `candidates` takes them: without what is meant for another."""
+    """Return the options for one of `candidates`, without those of other back ends."""
     unused = _given_options(options).keys() - set(BACKENDS[name].options)
     defaults = {field.name: field.default for field in fields(options) if field.name in unused}
     return replace(options, backend=name, **defaults)
 
 
 def with_cameras_of(capture: Capture, options: ReconstructOptions) -> ReconstructOptions:
-    """The options with the capture's own camera poses, where it has some and nothing else was asked for."""
+    """Return the options with the capture's own camera poses, where it has some and the options select no other."""
     if capture.cameras is None or options.cameras is not None:
         return options
     selecting = {row.selected_by for row in BACKENDS.values()} & _given_options(options).keys()
@@ -491,7 +483,7 @@ def with_cameras_of(capture: Capture, options: ReconstructOptions) -> Reconstruc
 
 
 def weights_of(options: ReconstructOptions) -> Weights:
-    """The weights of the network that `options` names: a path that was given, or what `jcr models get` downloaded.
+    """Return the weights of the network that `options` names: a path, or the pinned commit in the cache.
 
     Nothing is downloaded. Raises InputError, with the command that gets them, where they are not on this machine.
     """
@@ -505,10 +497,13 @@ def weights_of(options: ReconstructOptions) -> Weights:
     )
     if options.weights is not None and Path(name).exists():
         return Weights(Path(name), name, licence)
-    if cached := cached_files(name, HUB_FILES, published and published.revision):
+    revision = (published and published.revision) or None
+    if cached := cached_files(name, revision):
         return Weights(cached[0].parent, name, licence)
     if published:
-        raise InputError(f"{name}: not on this machine; {weights_command(published)}")
+        other = cached_files(name)
+        found = f"only revision {other[0].parent.name[:12]} is" if other else "not"
+        raise InputError(f"{name}: {found} on this machine; {weights_command(published)}")
     remedy = "give a file, a folder or a hub id (jcr models)"
     if HUB_ID.fullmatch(name) and Path(name).suffix not in (".pth", ".pt", ".safetensors"):
         remedy = f"jcr models get {name} downloads them"
@@ -516,14 +511,14 @@ def weights_of(options: ReconstructOptions) -> Weights:
 
 
 def weights_command(row: Backend) -> str:
-    """How to get the published weights of a network."""
+    """Return the command that downloads the published weights of a network, with size and licence."""
     size = f" ({row.download_gb:g} GB)" if row.download_gb else ""
     licence = "" if row.commercial else ", non-commercial"
     return f"jcr models get {row.name} downloads {row.hub_id}{size}{licence}"
 
 
 def _given_options(options: ReconstructOptions) -> dict[str, Any]:
-    """Those that some back ends do not use, where they are not what they are unset."""
+    """Return the options that not every back end uses and that differ from their defaults."""
     own = {name for row in BACKENDS.values() for name in row.options}
     values = {field.name: getattr(options, field.name) for field in fields(options) if field.name in own}
     unset = {field.name: field.default for field in fields(options)}
@@ -531,11 +526,12 @@ def _given_options(options: ReconstructOptions) -> dict[str, Any]:
 
 
 def _flag(name: str) -> str:
+    """Return the flag of an option on the command line."""
     return f"--{name.replace('_', '-')}"
 
 
 def device_of(options: ReconstructOptions) -> str:
-    """cuda or cpu; `auto` is cuda where there is one. InputError when cuda is asked for and absent."""
+    """Return cuda or cpu; `auto` is cuda where there is one. Raise InputError where cuda is named and absent."""
     if options.device == "cpu" or (options.device == "auto" and not is_installed("torch")):
         return "cpu"
     torch = extra("torch", "networks", "--device cuda")
@@ -544,3 +540,26 @@ def device_of(options: ReconstructOptions) -> str:
     if options.device == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     return options.device
+
+
+def _third_party() -> list[Backend]:
+    """Return the rows of other packages; a package that cannot be loaded is logged and left out."""
+    rows = []
+    for point in entry_points(group=GROUP):
+        try:
+            row = point.load()
+            if not isinstance(row, Backend) or row.name != point.name:
+                raise TypeError(f"{point.value} is no Backend of the name {point.name}")
+            rows.append(row)
+        except Exception as error:
+            logger.warning("back end %s (%s) cannot be loaded: %s", point.name, point.value, error)
+    return rows
+
+
+BACKENDS: dict[str, Backend] = {row.name: row for row in (*_FIRST, *_third_party(), *_LAST)}
+"""Rows by name; `auto` takes the first that it may.
+
+Networks that see pairs, whose uncertainty is known, come first, metric ones before others. COLMAP needs no weights and
+sees what networks do not. Networks that see all views come after it and before direct alignment: with simulated
+predictions, refined by matches, they are more accurate on plain tables, for more time.
+"""

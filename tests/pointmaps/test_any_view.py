@@ -91,7 +91,7 @@ class Fake:
 
     def __call__(self, views):
         from jcr.pointmaps.da3 import grid_of
-        from jcr.pointmaps.interface import Predicted
+        from jcr.pointmaps.posed import PosedPointmaps
 
         rotation_deg, bend = self.errors
         rng = np.random.default_rng(1)
@@ -104,35 +104,27 @@ class Fake:
         step = rng.normal(size=(COUNT, 6)) * ([0.01] * 3 + [np.radians(rotation_deg)] * 3)
         recon = inverse(poses[0]) @ retract(poses, step)
         recon[:, :3, 3] *= 2
-        pinholes = np.tile([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy], (COUNT, 1))
         points = (2 * depth[..., None] * ray).astype(np.float32)
-        return Predicted(
+        return PosedPointmaps(
             grid=grid,
             x_in_camera=points,
             confidence=np.ones(depth.shape, np.float32),
-            pinholes=pinholes,
             recon_from_camera=recon,
             is_metric=False,
         )
 
 
-def options(predict, **changes):
-    from jcr.pointmaps.any_view import ViewsOptions
+def reconstructed(capture: Capture, predict) -> Reconstruction:
+    from jcr.pointmaps.any_view import reconstruct_any_view
 
-    made = ViewsOptions(
-        backend="da3",
-        load=lambda weights, device: predict,
-        weights=Weights(Path("weights"), "weights", "Apache-2.0"),
-    )
-    return replace(made, **changes)
+    weights = Weights(Path("weights"), "weights", "Apache-2.0")
+    return reconstruct_any_view(capture, lambda weights, device: predict, weights, "cpu", "da3")
 
 
 @pytest.fixture(scope="module")
 def found(capture: Capture) -> Reconstruction:
     """By one pass of the model."""
-    from jcr.pointmaps.any_view import reconstruct_views_at_once
-
-    return reconstruct_views_at_once(capture, options(Fake()))
+    return reconstructed(capture, Fake())
 
 
 def test_matches_by_colour_put_predicted_cameras_right_and_show_how_surely(
@@ -169,17 +161,14 @@ def test_matches_by_colour_put_predicted_cameras_right_and_show_how_surely(
 
 
 def test_an_unknown_focal_length_is_adjusted(capture: Capture) -> None:
+    from jcr.pointmaps.any_view import Views
     from jcr.pointmaps.grid import ImageGrid, prepare_images
     from jcr.pointmaps.refine import refine
 
-    def whole(size):
-        return ImageGrid(size, size, (0, 0), size)
-
-    images = prepare_images(replace(capture, intrinsics=None), whole)
-    from jcr.pointmaps.interface import Views
-
+    unknown = replace(capture, intrinsics=None)
+    images = prepare_images(unknown, lambda size: ImageGrid.uncropped(size, size))
     predicted = Fake(rotation_deg=0.3, bend=0.0)(Views(images.colors, None))
     guess = replace(INTRINSICS, fx=INTRINSICS.fx * 1.03, fy=INTRINSICS.fy * 1.03)
-    refined = refine(predicted, images, guess)
+    refined = refine(unknown, images, predicted.on_rays(predicted.grid.grid_intrinsics(guess)), guess)
     assert refined is not None
     assert refined.pinhole.fx == pytest.approx(INTRINSICS.fx, rel=0.01)

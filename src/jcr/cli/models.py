@@ -8,7 +8,7 @@ import tyro
 
 from jcr.cli.output import Output
 from jcr.errors import InputError
-from jcr.hub import HUB_FILES, HUB_ID, download
+from jcr.hub import HUB_ID, download
 from jcr.reconstruct import BACKENDS, Backend, weights_command
 
 
@@ -107,7 +107,7 @@ def _get(arguments: Arguments) -> int:
         raise InputError(
             f"jcr models get {name}: its licence is {row.licence}; accept it with --accept-licence, or take da3"
         )
-    folder = download(hub_id, HUB_FILES, arguments.revision or revision, arguments.output.quiet)
+    folder = download(hub_id, arguments.revision or revision, arguments.output.quiet)
     text = f"{hub_id}: revision {folder.name[:12]}, checked, in {folder}\n"
     if row and not row.is_installed():
         text += f"its package is missing: {row.install}\n"

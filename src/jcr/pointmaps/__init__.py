@@ -1,4 +1,1 @@
-"""Networks that see all views at once: images in, depth, confidence and cameras of every view out.
-
-An adapter each (da3, mapanything, moge) converts its package's conventions to ours; all else is shared.
-"""
+"""Pointmaps of networks: pairwise or in one frame, predicted here or read from a file, refined by matches."""

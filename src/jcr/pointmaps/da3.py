@@ -1,9 +1,8 @@
 """Depth Anything 3 (Lin et al. 2025, arXiv 2511.10647): depth, confidence and cameras of any number of views.
 
-Its package builds the network of a configuration (`create_object(load_config(...))`, its README), which is all that is
-taken of it: reading images, exporting and the web page are left alone, and so need not be installed. Its conventions:
-cameras are camera_from_recon, x right, y down, z forward; depth is along z, not along the ray; intrinsics count from the
-image's corner; the unit is arbitrary.
+Only the network of its package is used (`create_object(load_config(...))`), so that the package's other requirements
+need not be installed. Its conventions: cameras are camera_from_recon, x right, y down, z forward; depth is along z,
+not along the ray; intrinsics count from the image's corner; the unit is arbitrary.
 """
 
 import json
@@ -22,24 +21,15 @@ from torch import nn
 
 from jcr.errors import InputError
 from jcr.geometry import inverse
+from jcr.pointmaps.any_view import Predict, Views, normalised, output, pinhole_of_edges, rays_of, rigid
 from jcr.pointmaps.grid import ImageGrid
-from jcr.pointmaps.interface import (
-    Predict,
-    Predicted,
-    Views,
-    checked,
-    normalised,
-    output,
-    pinhole_of_edges,
-    rays_of,
-    rigid,
-)
+from jcr.pointmaps.posed import PosedPointmaps
 
 LONG_EDGE, PATCH = 504, 14
 
 
 def load(weights: Path, device: str) -> Predict:
-    """The network in a folder of config.json and model.safetensors.
+    """Load the network from a folder of config.json and model.safetensors.
 
     Raises InputError for files that are missing, damaged or of another network.
     """
@@ -58,8 +48,8 @@ def load(weights: Path, device: str) -> Predict:
 
 
 def build(name: str) -> nn.Module:
-    """The network of a configuration of the package, with random weights; KeyError for a name it does not know."""
-    os.environ.setdefault("DA3_LOG_LEVEL", "ERROR")  # it tells stdout which layers it builds
+    """Build the network of a configuration of the package with random weights; raise KeyError for an unknown name."""
+    os.environ.setdefault("DA3_LOG_LEVEL", "ERROR")  # else the package prints its layers
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of its configuration's library
         from depth_anything_3.cfg import create_object, load_config  # type: ignore[import-not-found]
@@ -68,7 +58,7 @@ def build(name: str) -> nn.Module:
         return create_object(load_config(MODEL_REGISTRY[name])).eval()
 
 
-def predict(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) -> Predicted:
+def predict(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) -> PosedPointmaps:
     """Predict all views in one pass."""
     grid = grid_of(views.size, long_edge)
     colors = np.stack([resized(image, grid, long_edge) for image in views.colors])
@@ -81,28 +71,25 @@ def predict(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) -> Pre
     depth = output(answer, "depth", (count, height, width), "Depth Anything 3")
     pinholes = pinhole_of_edges(output(answer, "intrinsics", (count, 3, 3), "Depth Anything 3"))
     camera_from_recon = rigid(output(answer, "extrinsics", (count, 3, 4), "Depth Anything 3"))
-    return checked(
-        Predicted(
-            grid=grid,
-            x_in_camera=depth[..., None] * rays_of(pinholes, height, width),
-            confidence=output(answer, "depth_conf", (count, height, width), "Depth Anything 3"),
-            pinholes=pinholes,
-            recon_from_camera=inverse(camera_from_recon),
-            is_metric=False,
-        ),
-        "Depth Anything 3",
+    return PosedPointmaps(
+        grid=grid,
+        x_in_camera=depth[..., None] * rays_of(pinholes, height, width),
+        confidence=output(answer, "depth_conf", (count, height, width), "Depth Anything 3"),
+        recon_from_camera=inverse(camera_from_recon),
+        is_metric=False,
     )
 
 
 def grid_of(size: tuple[int, int], long_edge: int = LONG_EDGE) -> ImageGrid:
-    """Nothing is cropped: the long edge becomes `long_edge`, then each edge the nearest multiple of the patch."""
+    """Return the grid of an image: the long edge becomes `long_edge`, then each edge the nearest multiple of the
+    patch."""
     edges = (round(edge * long_edge / max(size)) for edge in size)
     width, height = (max(1, (edge + PATCH // 2) // PATCH) * PATCH for edge in edges)
     return ImageGrid.uncropped(size, (width, height))
 
 
 def resized(image: UInt8[ndarray, "h w 3"], grid: ImageGrid, long_edge: int) -> UInt8[ndarray, "h2 w2 3"]:
-    """An image on the grid, in the two steps and with the filters of the package."""
+    """Resize an image to the grid in the two steps and with the filters of the package."""
     height, width = image.shape[:2]
     scale = long_edge / max(width, height)
     for size in ((max(1, round(width * scale)), max(1, round(height * scale))), grid.size):

@@ -58,7 +58,7 @@ class Matches:
     x_px: Float[ndarray, "k 2"]
 
 
-def colour_matches(gray: UInt8[ndarray, "n h w"], geometry: Geometry, keypoints: int) -> Matches:
+def photometric_matches(gray: UInt8[ndarray, "n h w"], geometry: Geometry, keypoints: int) -> Matches:
     """Where other views show up to `keypoints` corners of each view."""
     count, height, width = gray.shape
     directions = rays(geometry.pinhole)

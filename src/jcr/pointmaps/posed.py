@@ -1,104 +1,68 @@
-"""Pointmaps that share one frame, with a camera pose each, made into a Reconstruction."""
+"""Pointmaps with a camera pose each, in one frame: the common form of every prediction."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.errors import InputError
-from jcr.geometry import apply, inverse
-from jcr.pointmaps.grid import PreparedImages
-from jcr.pointmaps.pointmap_matches import tracks_from_pointmaps
-from jcr.records import Intrinsics, Pointmaps, Reconstruction
-
-LARGEST_MISFIT = 0.02
-"""Median distance of points' projections from their own pixels, over the width, at which poses are wrong."""
+from jcr.camera import rays
+from jcr.pointmaps.grid import ImageGrid
+from jcr.records import CameraEvidence, Intrinsics
 
 SAMPLES = 20_000
-"""Pixels of all images that the pinhole is fitted to, about."""
+"""Approximate number of pixels of all images that the pinhole is fitted to."""
+PREDICTED_STD = (0.02, np.radians(1.5))
+"""Standard deviations of a predicted camera that no match confirms: of its distance from the scene (relative), and of
+its rotation per axis (rad). Depth Anything 3's largest model has these on 7-Scenes (27 % of pairs within an average
+threshold of 3°, its benchmark page)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PosedPointmaps:
-    """A camera and a pointmap of each image, in one frame."""
+    """A camera pose and a pointmap of each image, in one frame."""
 
-    image_index: Int[ndarray, " m"]
-    """Rows of the capture, ascending."""
-    recon_from_camera: Float[ndarray, "m 4 4"]
-    points_in_recon: Float[ndarray, "m h w 3"]
-    confidence: Float[ndarray, "m h w"]
+    grid: ImageGrid
+    """Position of the pointmaps' pixels in the undistorted images."""
+    recon_from_camera: Float[ndarray, "n 4 4"]
+    """Rigid camera poses."""
+    x_in_camera: Float[ndarray, "n h w 3"]
+    """A point per pixel of the grid in its own camera's frame; finite where the confidence is above 0."""
+    confidence: Float[ndarray, "n h w"]
+    """Confidence, at least 0; 0 means no estimate. Comparable within an image only, and no probability."""
+    is_metric: bool
+    """Whether the unit is meant to be the metre."""
+    covariance: Float[ndarray, "r r"] | None = None
+    """Covariance of the steps of all cameras (translation, rotation), r = 6n; None: unknown."""
 
+    def on_rays(self, pinhole: Intrinsics) -> "PosedPointmaps":
+        """Return the pointmaps with each point moved along z onto the ray of its pixel in a pinhole of the grid."""
+        points = self.x_in_camera[..., 2:] * rays(pinhole).astype(np.float32)
+        return replace(self, x_in_camera=np.where((self.confidence > 0)[..., None], points, 0))
 
-def reconstruction_from_pointmaps(
-    images: PreparedImages,
-    maps: PosedPointmaps,
-    *,
-    source: str,
-    backend: str,
-    is_metric: bool,
-    notes: tuple[str, ...] = (),
-    warnings: tuple[str, ...] = (),
-) -> Reconstruction:
-    """The record, with tracks from the pointmaps and, where they are not known, intrinsics from them too.
-
-    Raises InputError, naming `source`, when the points do not project onto their own pixels.
-    """
-    recon_from_camera, points_in_recon, confidence = (
-        maps.recon_from_camera,
-        maps.points_in_recon,
-        maps.confidence,
-    )
-    pinhole, misfit_px = fit_pinhole(recon_from_camera, points_in_recon, confidence)
-    width = points_in_recon.shape[2]
-    if misfit_px > LARGEST_MISFIT * width:
-        _, inverted_px = fit_pinhole(inverse(recon_from_camera), points_in_recon, confidence)
-        remedy = "give poses and points of one frame"
-        if inverted_px <= LARGEST_MISFIT * width:
-            remedy = "they are camera_from_recon (world to camera); invert them"
-        raise InputError(
-            f"{source}: by recon_from_camera the points lie {misfit_px:.0f} px from their pixels; {remedy}"
-        )
-    pinhole = images.intrinsics or pinhole
-    return Reconstruction(
-        image_index=maps.image_index,
-        recon_from_camera=recon_from_camera,
-        intrinsics=images.intrinsics_of_capture or images.grid.original_intrinsics(pinhole),
-        pointmaps=Pointmaps(
-            intrinsics=pinhole, points_in_recon=points_in_recon, confidence=confidence, colors=images.colors
-        ),
-        tracks=tracks_from_pointmaps(recon_from_camera, points_in_recon, confidence, images.original_px),
-        backend=backend,
-        is_metric=is_metric,
-        notes=notes,
-        warnings=(*images.warnings, *warnings),
-    )
+    def evidence(self) -> CameraEvidence | None:
+        """Return the cameras with their covariance, None where that is unknown."""
+        return None if self.covariance is None else CameraEvidence(self.recon_from_camera, self.covariance)
 
 
-def fit_pinhole(
-    recon_from_camera: Float[ndarray, "m 4 4"],
-    points_in_recon: Float[ndarray, "m h w 3"],
-    confidence: Float[ndarray, "m h w"],
-) -> tuple[Intrinsics, float]:
-    """The pinhole that best projects points onto their pixels, and the median misfit in pixels.
+def fit_pinhole(maps: PosedPointmaps) -> tuple[Intrinsics, float]:
+    """Fit the pinhole of the grid that projects all points onto their pixels; return it with the median misfit in
+    pixels.
 
     u = fx · x/z + cx is linear in the unknowns; residuals beyond the common spread lose their weight (Geman
     and McClure). The misfit is infinite where half the points lie behind their camera.
     """
-    count, height, width = confidence.shape
+    confidence = maps.confidence
+    height, width = confidence.shape[1:]
     stride = max(1, int(np.sqrt(confidence.size / SAMPLES)))
-    v, u = np.mgrid[:height:stride, :width:stride].reshape(2, -1)
-    rays, pixels, weights = [], [], []
-    for k in range(count):
-        x_in_camera = apply(inverse(recon_from_camera[k]), points_in_recon[k, v, u])
-        known = (confidence[k, v, u] > 0) & (x_in_camera[:, 2] > 0)
-        rays.append(x_in_camera[known, :2] / x_in_camera[known, 2:])
-        pixels.append(np.stack([u, v], -1)[known])
-        weights.append(confidence[k, v, u][known])
-    ray, pixel, prior = (np.concatenate(parts) for parts in (rays, pixels, weights))
-    if len(ray) < max(100, 0.5 * (confidence[:, v, u] > 0).sum()):
+    points, prior = maps.x_in_camera[:, ::stride, ::stride], confidence[:, ::stride, ::stride]
+    v, u = np.mgrid[:height:stride, :width:stride]
+    pixel = np.broadcast_to(np.stack([u, v], -1), (*prior.shape, 2))
+    ahead = (prior > 0) & (points[..., 2] > 0)
+    if ahead.sum() < max(100, 0.5 * (prior > 0).sum()):
         guess = Intrinsics(float(width), float(width), (width - 1) / 2, (height - 1) / 2, width, height)
         return guess, float("inf")
+    ray, pixel, prior = points[ahead, :2] / points[ahead, 2:], pixel[ahead], prior[ahead]
     focal, center = np.empty(2), np.empty(2)
     misfit = np.zeros_like(ray)
     for _ in range(5):
@@ -113,3 +77,21 @@ def fit_pinhole(
     (fx, fy), (cx, cy) = focal.tolist(), center.tolist()
     error = float("inf") if min(fx, fy) <= 0 else float(np.median(np.linalg.norm(misfit, axis=1)))
     return Intrinsics(fx, fy, cx, cy, width, height), error
+
+
+def published_covariance(maps: PosedPointmaps) -> Float[ndarray, "r r"]:
+    """Return the covariance (6n,6n) of cameras with the published errors of a network, relative to the first camera.
+
+    Every camera has an error of its own; the first camera's error rotates all others about it.
+    """
+    poses = maps.recon_from_camera
+    count = len(poses)
+    distance = float(np.median(maps.x_in_camera[..., 2][maps.confidence > 0]))
+    single = np.diag(np.repeat([(PREDICTED_STD[0] * distance) ** 2, PREDICTED_STD[1] ** 2], 3))
+    by_first = np.tile(np.eye(6), (count, 1, 1))
+    for axis in range(3):
+        by_first[:, :3, 3 + axis] = np.cross(np.eye(3)[axis], poses[:, :3, 3] - poses[0, :3, 3])
+    covariance = np.einsum("nij,jk,mlk->niml", by_first, single, by_first)
+    covariance[np.arange(count), :, np.arange(count), :] += single
+    covariance[0], covariance[:, :, 0] = 0, 0
+    return covariance.reshape(6 * count, 6 * count)

@@ -1,4 +1,4 @@
-"""The `predictions` back end: bring the output of any network as one npz file (jcr docs predictions).
+"""The `predictions` back end: the output of any network from one npz file (jcr docs predictions).
 
 Either pairwise pointmaps, which are aligned here, or pointmaps that share one frame, with camera poses.
 """
@@ -12,13 +12,16 @@ from numpy import ndarray
 
 from jcr.camera import is_distorted, usable_intrinsics
 from jcr.errors import InputError
-from jcr.geometry import require_rigid
-from jcr.pointmaps.from_pairs import reconstruction_from_pairs
+from jcr.geometry import apply, inverse, require_rigid
 from jcr.pointmaps.grid import ImageGrid, PreparedImages, image_grid, read_colors
 from jcr.pointmaps.pairs import camera_of_arrays, pairs_from_arrays, read_arrays
-from jcr.pointmaps.posed import PosedPointmaps, reconstruction_from_pointmaps
+from jcr.pointmaps.posed import PosedPointmaps, fit_pinhole
+from jcr.pointmaps.reconstruction import PredictionSource, align_pairs, reconstruct_pointmaps
 from jcr.progress import Progress
 from jcr.records import Capture, Reconstruction
+
+LARGEST_MISFIT = 0.02
+"""Median distance of the points' projections from their pixels, over the width, beyond which poses are wrong."""
 
 
 def reconstruct_predictions(capture: Capture, path: Path, progress: Progress | None = None) -> Reconstruction:
@@ -35,18 +38,23 @@ def reconstruct_predictions(capture: Capture, path: Path, progress: Progress | N
         predictions = replace(predictions, edges=rank[predictions.edges], images=())
         height, width = predictions.conf.shape[1:]
         images = _images(capture, rows, arrays, (width, height), source)
-        return reconstruction_from_pairs(
-            images, np.sort(rows), predictions, backend="predictions", progress=progress
+        maps, origin = align_pairs(predictions, images, PredictionSource(backend="predictions"), progress)
+    elif "recon_from_camera" in arrays:
+        rows = _check_pointmaps(capture, arrays, source)
+        height, width = arrays["confidence"].shape[1:]
+        images = _images(capture, rows, arrays, (width, height), source)
+        maps = _posed_pointmaps(arrays, np.argsort(rows), images.grid, source)
+        origin = PredictionSource(backend="predictions")
+    else:
+        raise InputError(
+            f"{source}: holds neither 'edges' with pairwise pointmaps nor 'recon_from_camera' with pointmaps; "
+            "see jcr docs predictions"
         )
-    if "recon_from_camera" in arrays:
-        return _from_pointmaps(capture, arrays, source)
-    raise InputError(
-        f"{source}: holds neither 'edges' with pairwise pointmaps nor 'recon_from_camera' with pointmaps; "
-        "see jcr docs predictions"
-    )
+    return reconstruct_pointmaps(capture, images, maps, origin, progress, np.sort(rows))
 
 
-def _from_pointmaps(capture: Capture, arrays: dict[str, ndarray], source: str) -> Reconstruction:
+def _check_pointmaps(capture: Capture, arrays: dict[str, ndarray], source: str) -> Int[ndarray, " m"]:
+    """Return the rows of the capture; raise InputError for pointmaps that are missing or do not agree."""
     dimensions = {"recon_from_camera": 3, "points_in_recon": 4, "confidence": 3}
     for name, number in dimensions.items():
         if name not in arrays:
@@ -63,24 +71,43 @@ def _from_pointmaps(capture: Capture, arrays: dict[str, ndarray], source: str) -
             raise InputError(f"{source}: {name} has shape {arrays[name].shape}, confidence asks for {shape}")
     if arrays["confidence"].min() < 0:
         raise InputError(f"{source}: confidence is negative somewhere; 0 is for no estimate")
-    rows = _rows(tuple(str(name) for name in arrays.get("images", ())), count, capture, source)
-    order, poses = np.argsort(rows), arrays["recon_from_camera"].astype(np.float64)
-    return reconstruction_from_pointmaps(
-        _images(capture, rows, arrays, (width, height), source),
-        PosedPointmaps(
-            rows[order],
-            np.stack([require_rigid(poses[k], f"{source}: recon_from_camera[{k}]") for k in order]),
-            arrays["points_in_recon"][order].astype(np.float32, copy=False),
-            arrays["confidence"][order].astype(np.float32, copy=False),
-        ),
-        source=source,
-        backend="predictions",
-        is_metric=bool(arrays.get("is_metric", False)),
-    )
+    return _rows(tuple(str(name) for name in arrays.get("images", ())), count, capture, source)
+
+
+def _posed_pointmaps(
+    arrays: dict[str, ndarray], order: Int[ndarray, " m"], grid: ImageGrid, source: str
+) -> PosedPointmaps:
+    """Return the pointmaps of a file in an order; raise InputError where the points miss their pixels."""
+    poses = arrays["recon_from_camera"].astype(np.float64)
+    poses = np.stack([require_rigid(poses[k], f"{source}: recon_from_camera[{k}]") for k in order])
+    points, confidence = arrays["points_in_recon"][order], arrays["confidence"][order].astype(np.float32)
+
+    def posed(recon_from_camera: ndarray) -> tuple[PosedPointmaps, float]:
+        maps = PosedPointmaps(
+            grid=grid,
+            recon_from_camera=recon_from_camera,
+            x_in_camera=np.stack(
+                [apply(*each) for each in zip(inverse(recon_from_camera), points, strict=True)]
+            ),
+            confidence=confidence,
+            is_metric=bool(arrays.get("is_metric", False)),
+        )
+        return maps, fit_pinhole(maps)[1]
+
+    maps, misfit_px = posed(poses)
+    largest_px = LARGEST_MISFIT * grid.size[0]
+    if misfit_px > largest_px:
+        remedy = "give poses and points of one frame"
+        if posed(inverse(poses))[1] <= largest_px:
+            remedy = "they are camera_from_recon (world to camera); invert them"
+        raise InputError(
+            f"{source}: by recon_from_camera the points lie {misfit_px:.0f} px from their pixels; {remedy}"
+        )
+    return maps
 
 
 def _rows(names: tuple[str, ...], count: int, capture: Capture, source: str) -> Int[ndarray, " m"]:
-    """Rows of the capture that the file's images are."""
+    """Return the rows of the capture of the file's images; raise InputError for names that do not fit."""
     if not names:
         if count != len(capture):
             raise InputError(
@@ -100,7 +127,7 @@ def _rows(names: tuple[str, ...], count: int, capture: Capture, source: str) -> 
 def _images(
     capture: Capture, rows: Int[ndarray, " m"], arrays: dict[str, ndarray], size: tuple[int, int], source: str
 ) -> PreparedImages:
-    """How the file's pixels lie in the capture's images, in ascending order of `rows`.
+    """Return the images on the file's grid, in ascending order of `rows`.
 
     Intrinsics in the file are those of an undistorted image, as our own predictions are made from. Without
     them the pixels are taken to be the capture's own, and a known distortion cannot be accounted for.
@@ -143,7 +170,7 @@ def _images(
 
 
 def _plain_grid(original: tuple[int, int], size: tuple[int, int], source: str) -> ImageGrid:
-    """The published resize and crop where it gives `size`, else a resize alone where the aspect allows it."""
+    """Return the published resize and crop where it gives `size`, else a resize alone where the aspect allows it."""
     for published in (image_grid(original), image_grid(original, 224)):
         if published.size == size:
             return published

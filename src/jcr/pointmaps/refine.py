@@ -1,8 +1,7 @@
-"""Predicted cameras and depth refined by what the images show: colour matches, then bundle adjustment without the robot.
+"""Refinement of predicted cameras and depth: photometric matches between the images, then bundle adjustment.
 
-Predictions are rough at the pixel. Matches by colour (colour_matches.py) are not, and go where COLMAP's go: first into
-an adjustment of cameras and points alone, here, which also corrects each view's depth by a smooth factor; then as tracks
-into the calibration's. Matching and adjusting are repeated, for better cameras predict better where to look.
+The robot's poses are not used. Each view's depth is multiplied by a smooth factor that fits the adjusted points.
+Matching and adjustment are repeated, for better cameras predict better where to match.
 """
 
 from collections.abc import Sequence
@@ -19,58 +18,60 @@ from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, camera_with_prior
 from jcr.estimation.observations import Observations
 from jcr.estimation.wrist import image_problem
 from jcr.geometry import inverse
-from jcr.pointmaps.grid import ImageGrid, PreparedImages
-from jcr.pointmaps.interface import Predicted
-from jcr.pointmaps.photometric_matches import Geometry, Matches, colour_matches
-from jcr.records import CameraEvidence, Intrinsics, Tracks
+from jcr.pointmaps.grid import ImageGrid, PreparedImages, read_colors
+from jcr.pointmaps.photometric_matches import Geometry, Matches, photometric_matches
+from jcr.pointmaps.posed import PosedPointmaps
+from jcr.records import Capture, Intrinsics, Tracks
 
 LONG_EDGE = 960
-"""Longest side of the images that are compared; larger ones are made smaller."""
+"""Long edge of the images that are matched, in pixels; larger images are reduced."""
 ROUNDS = 3
 KEYPOINTS = 4000
 """Keypoints of all images together."""
 LEAST_MATCHES = 25
-"""Of an image, in bundle adjustment: with fewer it is left where it was predicted, and nothing is refined."""
+"""Matches of an image in bundle adjustment; with fewer in any image nothing is refined."""
 LARGEST_PX = 4.0
-"""Reprojection error beyond which a match is none, in units of the median."""
+"""Reprojection error beyond which a match is left out, in units of the median."""
 BEND_STD = 0.03
-"""Prior of the logarithm of a depth correction's uneven part, which is zero where no match is near."""
+"""Prior standard deviation of the logarithm of a depth correction's uneven part."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Refined:
-    """A prediction after adjustment to the images' matches."""
+class Refinement:
+    """Cameras, depth and tracks after adjustment to the matches."""
 
     recon_from_camera: Float[ndarray, "n 4 4"]
-    """The first camera is where it was."""
+    """Adjusted camera poses; the first camera keeps its predicted pose."""
+    covariance: Float[ndarray, "r r"]
+    """Covariance of the steps of all cameras, r = 6n; zero for the first camera."""
     depth_factor: Float[ndarray, "n h w"]
-    """Factor of the predicted points, on the model's grid."""
+    """Factor of the predicted points on the network's grid."""
     tracks: Tracks
-    """Tracks in the capture's own images."""
+    """Tracks in the pixels of the capture's own images."""
     pinhole: Intrinsics
-    """Of the undistorted images, as given, or with the focal length that the images show."""
-    evidence: CameraEvidence
+    """Pinhole of the undistorted images: given, or with the adjusted focal length."""
     error_px: float
-    """Median reprojection error, in pixels of the camera's images."""
+    """Median reprojection error in pixels of the capture's images."""
 
 
-def refine(predicted: Predicted, images: PreparedImages, pinhole: Intrinsics) -> Refined | None:
-    """Cameras, depth and tracks; None where too few matches are found.
+def refine(
+    capture: Capture, images: PreparedImages, maps: PosedPointmaps, pinhole: Intrinsics
+) -> Refinement | None:
+    """Match the images of a capture and adjust cameras, depth and points; return None where too few matches are found.
 
-    `images` are those of the capture without distortion, in full size; `pinhole` is theirs, fixed where `images` has
-    it, else a first value of the focal length.
+    `pinhole` belongs to the undistorted images; it is fixed where `images` has it, else its focal length is adjusted.
     """
-    poses = predicted.recon_from_camera
-    work = ImageGrid.shrunk(images.grid.size, LONG_EDGE)
-    smaller = [cv2.resize(image, work.size, interpolation=cv2.INTER_AREA) for image in images.colors]
-    gray = np.stack([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in smaller])
-    camera = work.grid_intrinsics(pinhole)
-    depth = _depth_on(work, predicted)
-    factor = np.ones(predicted.confidence.shape, np.float32)
+    work = ImageGrid.shrunk(maps.grid.original_size, LONG_EDGE)
+    colors = read_colors(capture, work, images.intrinsics_of_capture, images.pinhole)
+    gray = np.stack([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in colors])
+    camera, poses = work.grid_intrinsics(pinhole), maps.recon_from_camera
+    depth = _depth_on(work, maps)
+    factor = np.ones(maps.confidence.shape, np.float32)
+    at_depth, at_map = _coordinates(work, work), _coordinates(maps.grid, work)
     adjusted = None
     for _ in range(ROUNDS):
         geometry = Geometry(camera, poses, depth)
-        tracks = _tracks(colour_matches(gray, geometry, KEYPOINTS // len(gray)), geometry)
+        tracks = _tracks(photometric_matches(gray, geometry, KEYPOINTS // len(gray)), geometry)
         if np.bincount(tracks.image, minlength=len(gray)).min() < LEAST_MATCHES:
             return None
         adjusted = adjust_matches(tracks, geometry, fixed=images.pinhole is not None)
@@ -78,51 +79,55 @@ def refine(predicted: Predicted, images: PreparedImages, pinhole: Intrinsics) ->
             return None
         poses, camera = adjusted.shown.state.world_from_rig, adjusted.shown.view.cameras[0]
         change = depth_changes(adjusted.tracks, poses, depth)
-        depth = depth * np.stack([smooth_factor(c, work.size[1], work.size[0]) for c in change])
-        factor = factor * np.stack([smooth_factor(c, *predicted.grid.size[::-1]) for c in change])
+        depth = depth * np.stack([np.exp(at_depth @ c) for c in change]).astype(np.float32)
+        factor = factor * np.stack([np.exp(at_map @ c) for c in change]).astype(np.float32)
     assert adjusted is not None
-    tracks = adjusted.tracks
-    seen_px = images.grid.grid_from_original(work.original_from_grid(tracks.x_px))
-    return Refined(
+    original_px = replace(images, grid=work).original_px(adjusted.tracks.x_px)
+    return Refinement(
         recon_from_camera=poses,
+        covariance=adjusted.shown.rig_covariance(),
         depth_factor=factor,
-        tracks=replace(tracks, x_px=images.original_px(seen_px)),
+        tracks=replace(adjusted.tracks, x_px=original_px),
         pinhole=pinhole if images.pinhole is not None else work.original_intrinsics(camera),
-        evidence=CameraEvidence(poses, adjusted.shown.rig_covariance()),
         error_px=adjusted.error_px / float(work.scale.mean()),
     )
 
 
 @dataclass(frozen=True)
-class _Adjusted:
-    """On the working grid."""
+class _Adjustment:
+    """Bundle adjustment of the matches, in pixels of the working grid."""
 
     shown: ImageEvidence
     tracks: Tracks
-    """Without outliers; none where most points came to lie behind their cameras."""
+    """Tracks without outliers; empty where most points lie behind their cameras."""
     error_px: float
-    """Median, of these."""
+    """Median reprojection error of the tracks."""
 
 
-def _depth_on(grid: ImageGrid, predicted: Predicted) -> Float[ndarray, "n h w"]:
-    """Predicted depth at the pixels of another grid of the same images; 0 outside, and beside what is unknown."""
+def _depth_on(grid: ImageGrid, maps: PosedPointmaps) -> Float[ndarray, "n h w"]:
+    """Return the predicted depth at the pixels of another grid of the same images; 0 where no depth is known."""
     v, u = np.mgrid[: grid.size[1], : grid.size[0]]
-    there = predicted.grid.grid_from_original(
-        grid.original_from_grid(np.stack([u, v], -1).astype(np.float64))
-    )
+    there = maps.grid.grid_from_original(grid.original_from_grid(np.stack([u, v], -1).astype(np.float64)))
     x, y = (there[..., axis].astype(np.float32) for axis in range(2))
     # The grid's outermost half pixels are still inside the image.
-    x, y = np.clip(x, 0, predicted.grid.size[0] - 1), np.clip(y, 0, predicted.grid.size[1] - 1)
+    x, y = np.clip(x, 0, maps.grid.size[0] - 1), np.clip(y, 0, maps.grid.size[1] - 1)
     inside = (np.abs(x - there[..., 0]) <= 0.5) & (np.abs(y - there[..., 1]) <= 0.5)
     depths = []
-    for points, confidence in zip(predicted.x_in_camera, predicted.confidence, strict=True):
+    for points, confidence in zip(maps.x_in_camera, maps.confidence, strict=True):
         known = cv2.remap((confidence > 0).astype(np.float32), x, y, cv2.INTER_LINEAR) > 0.99
         depths.append(np.where(known & inside, cv2.remap(points[..., 2], x, y, cv2.INTER_LINEAR), 0))
     return np.stack(depths).astype(np.float32)
 
 
+def _coordinates(grid: ImageGrid, work: ImageGrid) -> Float[ndarray, "h w 6"]:
+    """Return the quadratic basis of the working grid's coordinates at the pixels of a grid."""
+    v, u = np.mgrid[: grid.size[1], : grid.size[0]]
+    on_work = work.grid_from_original(grid.original_from_grid(np.stack([u, v], -1).astype(np.float64)))
+    return _basis(on_work[..., 0] / (work.size[0] - 1), on_work[..., 1] / (work.size[1] - 1))
+
+
 def _tracks(matches: Matches, geometry: Geometry) -> Tracks:
-    """Keypoints and where others show them; the points are where the depth of their first view puts them."""
+    """Return tracks of keypoints and their matches, the points at the depth of their first view."""
     used, row = np.unique(matches.point, return_inverse=True)
     first, x_px = matches.start[used, 0].astype(int), matches.start[used, 1:].astype(np.float64)
     column, line = np.rint(x_px).astype(int).T
@@ -136,9 +141,11 @@ def _tracks(matches: Matches, geometry: Geometry) -> Tracks:
     )
 
 
-def adjust_matches(tracks: Tracks, geometry: Geometry, fixed: bool) -> _Adjusted:
-    """Cameras and points adjusted, and the focal length unless it is fixed; matches far from their points left out, and
-    points that fewer than two views are left to see."""
+def adjust_matches(tracks: Tracks, geometry: Geometry, fixed: bool) -> _Adjustment:
+    """Adjust cameras and points, and the focal length unless it is fixed.
+
+    Matches far from their points are left out of the tracks, and points that then have fewer than two views.
+    """
     images, camera = len(geometry.recon_from_camera), geometry.pinhole
     prior = camera_with_prior(camera, FIXED if fixed else {"f": ESTIMATED["f"]})
     observations = Observations.of_one_camera(tracks, images)
@@ -153,16 +160,16 @@ def adjust_matches(tracks: Tracks, geometry: Geometry, fixed: bool) -> _Adjusted
     good &= (np.bincount(seen.point[good], minlength=len(points)) >= 2)[seen.point]
     kept, point = np.unique(seen.point[good], return_inverse=True)
     inliers = Tracks(image=seen.image[good], x_px=seen.x_px[good], point=point, points_in_recon=points[kept])
-    return _Adjusted(shown, inliers, float(np.median(error[good])) if good.any() else np.inf)
+    return _Adjustment(shown, inliers, float(np.median(error[good])) if good.any() else np.inf)
 
 
 def depth_changes(
     tracks: Tracks, recon_from_camera: Float[ndarray, "n 4 4"], depth: Float[ndarray, "n h w"]
 ) -> Sequence[Float[ndarray, "6"]]:
-    """Per view a quadratic in the image's coordinates, for the logarithm by which its depth is too small.
+    """Fit per view a quadratic in the image's coordinates to the logarithm of the factor that corrects its depth.
 
-    `depth` is on the grid in whose pixels `tracks` counts, 0 where nothing is known. Robust least squares on the tracks'
-    points, with a prior on all but its constant: five points in a corner do not bend the rest.
+    `depth` is on the grid of the pixels of `tracks`, 0 where no depth is known. The fit is robust, with a prior on all
+    coefficients but the constant: five points in a corner do not bend the rest.
     """
     camera_from_recon = inverse(recon_from_camera)[tracks.image]
     z = np.einsum("kj,kj->k", camera_from_recon[:, 2, :3], tracks.points_in_recon[tracks.point])
@@ -187,12 +194,6 @@ def depth_changes(
 
 
 def _basis(x: ndarray, y: ndarray) -> ndarray:
-    """1, x, y, x², xy, y² of coordinates 0 … 1, centred."""
+    """Return 1, x, y, x², xy, y² of coordinates 0 … 1, centred."""
     x, y = 2 * x - 1, 2 * y - 1
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
-
-
-def smooth_factor(coefficients: Float[ndarray, "6"], height: int, width: int) -> Float[ndarray, "h w"]:
-    """The factor at every pixel of an image of that size."""
-    y, x = np.meshgrid(np.linspace(0, 1, height), np.linspace(0, 1, width), indexing="ij")
-    return np.exp(_basis(x, y) @ coefficients).astype(np.float32)

@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from jcr.errors import InputError
-from jcr.geometry import inverse, transform
-from jcr.pointmaps.dust3r.pair_graph import complete_pairs, overlapping_pairs, window_pairs
+from jcr.pointmaps.dust3r.pair_graph import complete_pairs, pairs_of_graph, window_pairs
 from jcr.pointmaps.grid import PreparedImages, image_grid
 from jcr.pointmaps.pairs import PairPredictions, read_pairs
 from jcr.records import Intrinsics
@@ -210,68 +208,15 @@ def test_file_round_trip_and_faults(tmp_path: Path) -> None:
         read_pairs(tmp_path / "absent.npz")
 
 
-def chain_over_a_table(base_from_camera: np.ndarray, noise: float) -> PairPredictions:
-    """Pairs of neighbours that look at the plane z = 0, each at a scale of its own."""
-    rng = np.random.default_rng(1)
-    height, width, focal = 24, 32, 32.0
-    v, u = np.mgrid[:height, :width]
-    rays = np.stack([(u - 15.5) / focal, (v - 11.5) / focal, np.ones((height, width))], -1)
-    edges = window_pairs(len(base_from_camera), 1)
-    own, other = [], []
-    for first, second in edges:
-        scale = rng.uniform(0.5, 2)
-        for image, out in ((first, own), (second, other)):
-            to_base = base_from_camera[image]
-            depth = -to_base[2, 3] / (rays @ to_base[2, :3])
-            relative = inverse(base_from_camera[first]) @ to_base
-            points = (rays * depth[..., None]) @ relative[:3, :3].T + relative[:3, 3]
-            out.append(scale * (points + noise * rng.normal(size=points.shape)))
-    one = np.ones((len(edges), height, width), np.float32)
-    return PairPredictions(
-        edges=edges,
-        pts3d=np.array(own, np.float32),
-        conf=one,
-        pts3d_in_other_view=np.array(other, np.float32),
-        conf2=one,
-    )
-
-
-def test_robot_poses_leave_out_exactly_the_pairs_without_a_common_view() -> None:
-    rng = np.random.default_rng(0)
-    count = 14
-    gripper_from_camera = transform(
-        Rotation.from_rotvec([0.3, -0.2, 1.2]).as_matrix(), np.array([0.05, 0.02, 0.1])
-    )
-    down = Rotation.from_euler("x", 180, degrees=True)
-    tilt = Rotation.from_rotvec(rng.normal(scale=0.2, size=(count, 3)))
-    x = np.linspace(0, 2.2, count)
-    centers = np.stack([x, 0.05 * rng.normal(size=count), 0.4 + 0.03 * rng.normal(size=count)], -1)
-    base_from_camera = transform((tilt * down).as_matrix(), centers)
-    base_from_gripper = base_from_camera @ inverse(gripper_from_camera)
-    edges, note = overlapping_pairs(chain_over_a_table(base_from_camera, noise=0.002), base_from_gripper)
-
-    kept = {tuple(edge) for edge in edges.tolist()}
-    assert len(kept) < 0.6 * count * (count - 1) and "share no view" in note
-    distance = np.abs(np.subtract.outer(x, x))
-    # At 0.4 m a view is 0.4 m wide; views no farther apart than that overlap, however they are tilted.
-    assert kept >= {tuple(edge) for edge in np.argwhere((distance > 0) & (distance < 0.3)).tolist()}
-    assert kept == {(second, first) for first, second in kept}
-    assert all(distance[edge] < 1.4 for edge in kept)
-
-
-def test_all_pairs_are_kept_when_the_motions_do_not_tell_where_the_camera_looks() -> None:
-    count = 6
-    rotation = Rotation.from_euler("z", np.linspace(0, 60, count)[:, None], degrees=True)
-    down = Rotation.from_euler("x", 180, degrees=True)
-    base_from_camera = transform(
-        (rotation * down).as_matrix(), np.array([[0.3 * k, 0, 0.4] for k in range(count)])
-    )
-    edges, note = overlapping_pairs(chain_over_a_table(base_from_camera, noise=0.0), base_from_camera)
-    assert len(edges) == count * (count - 1) and "less than two axes" in note
-    rng = np.random.default_rng(3)
-    shuffled = transform(Rotation.random(count, rng=rng).as_matrix(), rng.normal(size=(count, 3)))
-    base_from_camera[:, :3, :3] = (
-        Rotation.from_rotvec(rng.normal(scale=0.2, size=(count, 3))) * rotation * down
-    ).as_matrix()
-    edges, note = overlapping_pairs(chain_over_a_table(base_from_camera, noise=0.0), shuffled)
-    assert len(edges) == count * (count - 1) and "do not agree with the robot" in note
+def test_the_robot_graph_has_near_pairs_and_joins_far_groups() -> None:
+    # Two groups of images, 2 m apart, that share no view.
+    base_from_gripper = np.tile(np.eye(4), (24, 1, 1))
+    base_from_gripper[:, 0, 3] = 0.05 * np.arange(24) + 2.0 * (np.arange(24) >= 12)
+    edges = pairs_of_graph("auto", base_from_gripper)
+    pairs = {tuple(edge) for edge in edges.tolist()}
+    assert pairs == {(second, first) for first, second in pairs}
+    across = {(first, second) for first, second in pairs if (first < 12) != (second < 12)}
+    assert across == {(11, 12), (12, 11)}
+    assert all((first, first + 1) in pairs for first in range(23)) and len(pairs) < 24 * 23 / 2
+    assert len(pairs_of_graph("auto", base_from_gripper[:12])) == 12 * 11
+    assert len(pairs_of_graph("window", base_from_gripper)) == len(window_pairs(24, 3))

@@ -259,18 +259,22 @@ def test_a_hub_id_comes_from_the_cache(
     row = BACKENDS["dust3r"]
     assert not row.has_weights()
     repository = tmp_path / f"models--{row.hub_id.replace('/', '--')}"
-    # Of another commit than the pinned one: whatever was downloaded last, by this program or another.
+    # Another commit than the pinned one is not used silently.
     (repository / "refs").mkdir(parents=True)
     (repository / "refs" / "main").write_text("0" * 40)
     (repository / "snapshots").mkdir()
     write_folder(repository / "snapshots" / ("0" * 40), linear, LINEAR_CONFIG)
+    assert not row.has_weights()
+    with pytest.raises(
+        InputError, match="only revision 000000000000 is on this machine; jcr models get dust3r"
+    ):
+        weights_of(ReconstructOptions(backend="dust3r"))
+    write_folder(repository / "snapshots" / row.revision, linear, LINEAR_CONFIG)
     assert row.has_weights()
     weights = weights_of(ReconstructOptions(backend="dust3r"))
     assert weights.name == row.hub_id and weights.licence.startswith("CC BY-NC-SA 4.0")
+    assert weights.path.name == row.revision
     assert_same_output(linear, load_weights(weights).network)
-    # The pinned one is preferred.
-    write_folder(repository / "snapshots" / row.revision, linear, LINEAR_CONFIG)
-    assert weights_of(ReconstructOptions(backend="dust3r")).path.name == row.revision
 
 
 def test_pairs_are_predicted_from_a_checkpoint_and_a_damaged_one_is_named(

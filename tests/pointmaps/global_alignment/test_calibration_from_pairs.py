@@ -2,19 +2,21 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.stage import calibrate
 from jcr.findings.sentences import network_scale
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
 from jcr.pointmaps.dust3r.pair_graph import complete_pairs
-from jcr.pointmaps.from_pairs import reconstruction_from_pairs
 from jcr.pointmaps.global_alignment.alignment import AlignOptions
 from jcr.pointmaps.grid import ImageGrid, PreparedImages
 from jcr.pointmaps.pairs import PairPredictions
+from jcr.pointmaps.reconstruction import PredictionSource, align_pairs, reconstruct_pointmaps
 from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Capture, HandEye, Reconstruction
 from simulation.pairs import PairErrors, synthetic_pairs
@@ -24,10 +26,22 @@ FEW_PIXELS = AlignOptions(pixels=432)
 NOISE = (5e-4, float(np.radians(0.1)))
 
 
+@pytest.fixture(autouse=True, scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of black images, in which nothing matches."""
+    made = tmp_path_factory.getbasetemp() / "black"
+    made.mkdir(exist_ok=True)
+    for k in range(7):
+        Image.new("RGB", SIZE).save(made / f"{k:02d}.png")
+    Case.folder = made
+    return made
+
+
 @dataclass(frozen=True)
 class Case:
     """Predictions of what a camera on a gripper sees, and the truth."""
 
+    folder: ClassVar[Path]
     capture: Capture
     images: PreparedImages
     predictions: PairPredictions
@@ -37,11 +51,10 @@ class Case:
     """Metres per geometric mean of the pairs' units."""
 
     def reconstruction(self) -> Reconstruction:
-        """Aligned and matched."""
-        rows = np.arange(len(self.capture))
-        return reconstruction_from_pairs(
-            self.images, rows, self.predictions, FEW_PIXELS, backend="predictions"
-        )
+        """Return the alignment as a reconstruction; the black images have no matches."""
+        source = PredictionSource(backend="predictions")
+        maps, source = align_pairs(self.predictions, self.images, source, options=FEW_PIXELS)
+        return reconstruct_pointmaps(self.capture, self.images, maps, source)
 
     def error(self, found: HandEye) -> np.ndarray:
         """True less found, in the order of the covariance."""
@@ -64,7 +77,11 @@ def case(
     colors = np.zeros((count, SIZE[1], SIZE[0], 3), np.uint8)
     return Case(
         Capture(
-            folder=Path(), images=names, base_from_gripper=poses, image_size=SIZE, intrinsics=truth.intrinsics
+            folder=Case.folder,
+            images=names,
+            base_from_gripper=poses,
+            image_size=SIZE,
+            intrinsics=truth.intrinsics,
         ),
         PreparedImages(
             colors=colors,
@@ -142,4 +159,3 @@ def test_evidence_survives_the_file(tmp_path: Path):
     back = read_reconstruction(tmp_path / "reconstruction.npz")
     np.testing.assert_array_equal(back.evidence.recon_from_camera, made.evidence.recon_from_camera)
     np.testing.assert_array_equal(back.evidence.covariance, made.evidence.covariance)
-    assert back.tracks.from_pointmaps

@@ -2,17 +2,15 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from jcr.allocator import give_back
 from jcr.errors import RejectedError
 from jcr.hub import Weights
 from jcr.pointmaps.dust3r.pair_graph import PairGraph
 from jcr.pointmaps.dust3r.predictor import predict_pairs
 from jcr.pointmaps.dust3r.weights import load_weights
-from jcr.pointmaps.from_pairs import reconstruction_from_pairs
 from jcr.pointmaps.grid import PreparedImages, prepare_images
 from jcr.pointmaps.pairs import PairPredictions
+from jcr.pointmaps.reconstruction import PredictionSource, align_pairs, reconstruct_pointmaps
 from jcr.progress import Progress
 from jcr.records import Capture, Reconstruction
 
@@ -53,10 +51,10 @@ def reconstruct_dust3r(
     """
     images, predictions, notes = predict(capture, options, progress)
     give_back()  # the network's memory
-    rows = np.arange(len(capture))
     try:
-        return reconstruction_from_pairs(
-            images, rows, predictions, backend=options.backend, notes=notes, progress=progress
+        maps, source = align_pairs(
+            predictions, images, PredictionSource(backend=options.backend, notes=notes), progress
         )
+        return reconstruct_pointmaps(capture, images, maps, source, progress)
     except RejectedError as error:  # the weights and their licence belong to a rejection, too
         raise error.with_more(*notes) from None

@@ -11,14 +11,7 @@ from torch import Tensor
 
 from jcr.errors import InputError
 from jcr.pointmaps.dust3r.network import Features
-from jcr.pointmaps.dust3r.pair_graph import (
-    FEW_IMAGES,
-    WINDOW,
-    PairGraph,
-    complete_pairs,
-    overlapping_pairs,
-    window_pairs,
-)
+from jcr.pointmaps.dust3r.pair_graph import PairGraph, pairs_of_graph
 from jcr.pointmaps.dust3r.weights import LoadedNetwork
 from jcr.pointmaps.grid import PreparedImages
 from jcr.pointmaps.pairs import PairPredictions
@@ -38,22 +31,13 @@ def predict_pairs(
     pair_graph: PairGraph = "auto",
     progress: Progress | None = None,
 ) -> tuple[PairPredictions, tuple[str, ...]]:
-    """Predict the pointmaps of the pairs of a capture's images, and return them with notes on what was left out.
+    """Predict the pointmaps of the pairs of a capture's images, and return them with notes for the user.
 
     Where CUDA runs out of memory the batch is halved, then the CPU takes over. Raises InputError where the memory does
     not suffice for one pair.
     """
-    count = len(images.colors)
     predictor = _Predictor(loaded, images, names, progress or silent)
-    if pair_graph == "auto":
-        pair_graph = "complete" if count <= FEW_IMAGES else "robot"
-    if pair_graph == "complete":
-        return predictor.predict(complete_pairs(count)), predictor.notes
-    if pair_graph == "window":
-        return predictor.predict(window_pairs(count, WINDOW)), predictor.notes
-    neighbours = predictor.predict(window_pairs(count, 1))
-    edges, note = overlapping_pairs(neighbours, base_from_gripper)
-    return predictor.predict(edges, neighbours), (note, *predictor.notes)
+    return predictor.predict(pairs_of_graph(pair_graph, base_from_gripper)), predictor.notes
 
 
 class _Predictor:
@@ -69,26 +53,14 @@ class _Predictor:
         self.features: dict[int, Features] = {}
         self.notes: tuple[str, ...] = ()
 
-    def predict(self, edges: Int[ndarray, "e 2"], known: PairPredictions | None = None) -> PairPredictions:
-        """Return the pointmaps of `edges`, copied from `known` where it has them."""
+    def predict(self, edges: Int[ndarray, "e 2"]) -> PairPredictions:
+        """Return the pointmaps of some pairs."""
         height, width = self.images.colors.shape[1:3]
         shapes = ((height, width, 3), (height, width)) * 2
         arrays = [np.empty((len(edges), *shape), np.float32) for shape in shapes]
-        rows = {} if known is None else {tuple(edge): row for row, edge in enumerate(known.edges.tolist())}
-        missing = []
-        for e, edge in enumerate(edges.tolist()):
-            row = rows.get(tuple(edge))
-            if known is None or row is None:
-                missing.append(e)
-                continue
-            for array, values in zip(arrays, known.pointmaps, strict=True):
-                array[e] = values[row]
-        unseen = np.setdiff1d(edges[missing], list(self.features))
-        self._in_batches("encode images", unseen, self._encode)
+        self._in_batches("encode images", np.arange(len(self.images.colors)), self._encode)
         self._in_batches(
-            "predict pairs",
-            np.array(missing, dtype=np.int64),
-            lambda rows: self._decode(rows, edges, arrays),
+            "predict pairs", np.arange(len(edges)), lambda rows: self._decode(rows, edges, arrays)
         )
         pts3d, conf, pts3d_in_other_view, conf2 = arrays
         return PairPredictions(

@@ -25,7 +25,7 @@ class AlignOptions:
     where the predictions carry intrinsics, else shared."""
     principal_point_px: tuple[float, float] | None = None
     """x, y on the pointmaps' grid, pixel (0, 0) being a centre; unset: the predictions' intrinsics where they
-    carry them, else (W/2, H/2), where DUSt3R puts it (half a pixel right and down of the image's middle)."""
+    carry them, else the image's middle, ((W - 1)/2, (H - 1)/2)."""
     pixels: int = 2048
     """Pixels per image, the most confident of as many equal cells."""
 
@@ -70,18 +70,12 @@ class Alignment:
     warnings: tuple[str, ...] = ()
     """Faults of the alignment that the user must act on, such as pairs that agree on nothing."""
 
-    def points_in_recon(self) -> Float[ndarray, "n h w 3"]:
-        """The pointmaps, float32."""
-        count, height, width = self.depth.shape
+    def x_in_camera(self) -> Float[ndarray, "n h w 3"]:
+        """Return the points of all pixels in their cameras' frames, float32."""
+        _, height, width = self.depth.shape
         cx, cy = self.principal_point_px
-        points = np.empty((count, height, width, 3), np.float32)
-        for k, (recon_from_camera, (fx, fy)) in enumerate(
-            zip(self.recon_from_camera, self.focal_px, strict=True)
-        ):
-            ray = rays(Intrinsics(fx, fy, cx, cy, width, height)).astype(np.float32)
-            points[k] = (ray * self.depth[k, ..., None]) @ recon_from_camera[:3, :3].T.astype(np.float32)
-            points[k] += recon_from_camera[:3, 3].astype(np.float32)
-        return points
+        ray = [rays(Intrinsics(fx, fy, cx, cy, width, height)) for fx, fy in self.focal_px]
+        return np.stack(ray).astype(np.float32) * self.depth[..., None]
 
 
 def pinhole_of(predictions: PairPredictions, options: AlignOptions) -> Pinhole:
@@ -95,7 +89,7 @@ def pinhole_of(predictions: PairPredictions, options: AlignOptions) -> Pinhole:
             "focal 'given', but the predictions carry no intrinsics; add them or ask for 'shared'"
         )
     height, width = predictions.conf.shape[1:]
-    middle = (width / 2, height / 2) if given is None else (given.cx, given.cy)
+    middle = ((width - 1) / 2, (height - 1) / 2) if given is None else (given.cx, given.cy)
     return Pinhole(
         principal_point_px=options.principal_point_px or middle,
         aspect=given.fy / given.fx if given else 1.0,
