@@ -1,0 +1,1 @@
+"""Reading of captures: images and gripper poses in every format, checked."""

@@ -1,4 +1,4 @@
-"""Which frames of a recording to keep: taken while the arm stands still, sharp, and spread to show most."""
+"""Selection of the frames of a recording: the arm at rest, sharp images, the least uncertain calibration."""
 
 from collections.abc import Callable
 
@@ -13,11 +13,11 @@ from jcr.estimation.equation import ASSUMED_NOISE, most_informative, pose_inform
 from jcr.geometry import inverse, motion_length
 
 STILL = 0.005
-"""m/s, rotation counted at ARM: a tenth of a pixel in an exposure of 20 ms, half a metre away."""
+"""Speed of an arm at rest, m/s, rotation counted at ARM: a tenth of a pixel in 20 ms, half a metre away."""
 LOOKS = 5
-"""Frames of one moment that are compared for sharpness."""
+"""Number of frames of one stop that are compared for sharpness."""
 SAME_VIEW = 0.005
-"""m, rotation counted at ARM: of frames nearer to each other the sharpest is kept."""
+"""Smallest distance between two views, m, rotation counted at ARM; the sharpest of nearer frames is kept."""
 
 Rows = Int[ndarray, " _"]
 Poses = Float[ndarray, "n 4 4"]
@@ -30,11 +30,11 @@ def best_frames(
     sharpness_of: Callable[[Rows], Float[ndarray, " k"]],
     count: int,
 ) -> tuple[Rows, tuple[str, ...]]:
-    """Rows of the best `count` frames in order of time, and remarks on the choice.
+    """Return the rows of the best `count` frames in order of time, and remarks on the choice.
 
-    `speed` is m/s with rotation counted at ARM. `sharpness_of` is asked once, about ascending rows. A moment of
-    standing still gives one frame at most; where there are too few, the slowest frames in between fill up. Raises
-    InputError when fewer than three frames are left.
+    `speed` is in m/s with rotation counted at ARM; `sharpness_of` is called once, with ascending rows. A stop gives one
+    frame at most; where there are too few stops, the slowest frames between them are added. Raises InputError when
+    fewer than three frames are left.
     """
     still = _runs(usable & (speed < STILL))
     moving = _slowest(_runs(usable & (speed >= STILL)), speed, count) if len(still) < count else []
@@ -64,6 +64,7 @@ def best_frames(
 
 
 def _remarks(frames: Rows, speed: Float[ndarray, " n"], blurred: int, at_rest: int, count: int):
+    """Yield remarks on blurred stops and on frames that were taken in motion."""
     if blurred:
         yield f"{blurred} moments of the recording are blurred and were left out"
     if at_rest < count and (fastest := float(speed[frames].max())) >= STILL:
@@ -74,20 +75,20 @@ def _remarks(frames: Rows, speed: Float[ndarray, " n"], blurred: int, at_rest: i
 
 
 def _runs(mask: Bool[ndarray, " n"]) -> list[Rows]:
-    """The unbroken runs of rows where `mask` holds."""
+    """Return the unbroken runs of rows where `mask` holds."""
     rows = np.flatnonzero(mask)
     return [run for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(run)]
 
 
 def _slowest(runs: list[Rows], speed: Float[ndarray, " n"], count: int) -> list[Rows]:
-    """The slowest frame of each of some `4 · count` equal pieces of the rows, as moments of one frame."""
+    """Return the slowest frame of each of about `4 · count` equal pieces of the rows, as runs of one frame."""
     piece = max(sum(map(len, runs)) // (4 * count), 1)
     pieces = [part for run in runs for part in np.array_split(run, max(len(run) // piece, 1))]
     return [part[[speed[part].argmin()]] for part in pieces]
 
 
 def _different(base_from_gripper: Poses, rows: Int[ndarray, " r"]) -> Rows:
-    """Of `rows`, best first, those that no better one shows the same view as."""
+    """Return the `rows`, best first, without those near a better one."""
     kept = rows[:0]
     for row in rows:
         motion = inverse(base_from_gripper[kept]) @ base_from_gripper[row]

@@ -66,6 +66,7 @@ def with_cameras(capture: Capture, cameras: Any, file: Path, used: Sequence[bool
 
 
 def _check(name: str, camera: dict[str, Any], where: str) -> None:
+    """Raise InputError where the keys of a camera cannot be."""
     if not NAME.fullmatch(name):
         raise InputError(f"{where}: a name has letters, digits and _, and begins with a letter")
     if unknown := sorted(camera.keys() - KEYS):
@@ -89,6 +90,7 @@ def _check(name: str, camera: dict[str, Any], where: str) -> None:
 def _camera(
     name: str, camera: dict[str, Any], capture: Capture, where: str, used: Sequence[bool] | None
 ) -> CellCamera:
+    """Return a further camera with its images, all of one size."""
     arm, poses, frame = camera.get("arm"), None, None
     if arm is not None:
         images, poses = _frames(camera["frames"], str(arm), where)
@@ -134,6 +136,7 @@ def _camera(
 
 
 def _frames(frames: Any, arm: str, where: str) -> tuple[list[str], Float[ndarray, "k 4 4"]]:
+    """Return the images of a camera on another arm, and the gripper poses of that arm."""
     if not NAME.fullmatch(arm):
         raise InputError(
             f"{where}: arm {shown(arm)}: a name has letters, digits and _, and begins with a letter"
@@ -153,7 +156,7 @@ def _frames(frames: Any, arm: str, where: str) -> tuple[list[str], Float[ndarray
 
 
 def cameras_as_json(capture: Capture) -> dict[str, Any]:
-    """The "cameras" of a capture.json; nothing where there is one wrist camera and no more."""
+    """Return the "cameras" of a capture.json; nothing where there is only the wrist camera."""
     if not capture.others and capture.mount == "gripper":
         return {}
     out: dict[str, Any] = {capture.camera_name: {"mount": capture.mount}}
@@ -175,6 +178,7 @@ def cameras_as_json(capture: Capture) -> dict[str, Any]:
 
 
 def _listed(camera: CellCamera, count: int) -> Sequence[str | None]:
+    """Return the images of a camera, with None at the frames of the capture that have none."""
     if camera.frame is None:
         return camera.images
     listed: list[str | None] = [None] * count

@@ -1,4 +1,4 @@
-"""What every reader of captures demands, whatever the format: sound files, rigid metres, one camera."""
+"""Checks of all formats: frames that can be used, rigid poses in metres, one camera at one resolution."""
 
 import hashlib
 from collections import Counter
@@ -21,7 +21,7 @@ from jcr.records import Capture
 
 MIRRORED = (2, 4, 5, 7)
 SAME_POSE = (0.5e-3, np.radians(0.05))
-"""m, rad: within this, poses are one at which the arm rests."""
+"""Position (m) and rotation (rad) within which gripper poses count as the same."""
 
 
 def checked_capture(
@@ -97,7 +97,7 @@ def _decoded(
 
 
 def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
-    """Raises InputError where there are fewer frames than a calibration, or whatever else, needs, or too many."""
+    """Raise InputError for fewer than `at_least` frames, or too many."""
     if count > MAX_FRAMES:
         raise InputError(f"{where}: {count} frames; choose {MAX_FRAMES} at most, 8 to 15 are good")
     if count < at_least:
@@ -105,7 +105,7 @@ def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
 
 
 def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None:
-    """Raises InputError where three gripper poses or more are one and the same."""
+    """Raise InputError where three gripper poses or more are all the same."""
     metres, radians = np.abs(step_between(base_from_gripper[:1], base_from_gripper).reshape(-1, 2, 3)).max(
         axis=(0, 2), initial=0.0
     )
@@ -117,7 +117,7 @@ def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> No
 
 
 def read_rigid(value: Any, where: str) -> Float[ndarray, "4 4"]:
-    """A rigid 4x4 from nested lists; InputError saying how far from rigid it is and what it looks like."""
+    """Return a rigid 4x4 from nested lists; InputError with the distance from rigid and a guess of the cause."""
     try:
         matrix = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -139,12 +139,12 @@ def check_metres(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None
 
 
 def image_sizes(folder: Path, images: Sequence[str]) -> list[tuple[int, int]]:
-    """Width and height of every image, each decoded once; InputError where one is no image."""
+    """Return width and height (px) of every image, each decoded once; InputError where one is no image."""
     return [read_image(folder / name).shape[1::-1] for name in images]
 
 
 def _common_orientation(folder: Path, images: Sequence[str], stored: Sequence[HowStored]) -> int:
-    """The EXIF orientation of all images; InputError where they differ, as a camera's axes cannot."""
+    """Return the EXIF orientation of all images; InputError where they differ, as the axes of a camera cannot."""
     first = stored[0].orientation
     for name, how in zip(images, stored, strict=True):
         if (other := how.orientation) != first:
@@ -161,7 +161,7 @@ def _common_orientation(folder: Path, images: Sequence[str], stored: Sequence[Ho
 
 
 def how_rotated(capture: Capture) -> Finding | None:
-    """What a user must know of a capture whose images are rotated to be shown."""
+    """Return the finding on images that their EXIF tag rotates; None without such a tag."""
     if capture.orientation == 1:
         return None
     return Finding(
@@ -173,7 +173,7 @@ def how_rotated(capture: Capture) -> Finding | None:
 
 
 def how_scaled(capture: Capture) -> str | None:
-    """What was done to images of 16 bits that use fewer."""
+    """Return a note on the bits that are read of 16-bit images; None of 8-bit images."""
     if max(capture.bits) == 8:
         return None
     return f"images of 16 bits, {' or '.join(map(str, capture.bits))} of them used: read by the upper eight of those"

@@ -1,4 +1,4 @@
-"""Poses as robots and their controllers write them: rows of numbers to transforms, and nothing of files."""
+"""Conventions in which robots and their controllers write poses: rows of numbers to transforms and back."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,15 +13,15 @@ from jcr.errors import InputError
 from jcr.geometry import HUGE, require_rigid, transform
 
 QUATERNION_TOLERANCE = 1e-2
-"""Largest distance of a quaternion's length from 1; three printed digits pass."""
+"""Largest difference of a quaternion's length from 1: three printed digits are within it."""
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 """Metres in each unit of length."""
 RADIANS_LIMIT = 2 * np.pi + 0.01
-"""No angle in radians is larger, and no wrist worth calibrating keeps all of its angles smaller in degrees."""
+"""Largest angle in radians; the angles of a wrist in degrees are larger."""
 LEAST_REACH = 0.25
-"""m: no arm with a camera stays nearer to its base."""
+"""Smallest reach of an arm with a camera, m."""
 METRES_LIMIT = 10.0
-"""No position in metres is larger, and no gripper is always within 1 cm of its base in millimetres."""
+"""Largest distance of a gripper from its base in metres; in millimetres no gripper stays that near."""
 
 
 QUATERNIONS = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}
@@ -30,7 +30,7 @@ QUATERNIONS = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}
 
 @dataclass(frozen=True)
 class Convention:
-    """How one kind of controller writes a pose."""
+    """Notation and units of the poses of one kind of controller."""
 
     columns: tuple[str, ...]
     """Names of its numbers, in order: position first, unless it is a whole matrix."""
@@ -42,11 +42,11 @@ class Convention:
 
     @property
     def has_angles(self) -> bool:
-        """Whether it has angles, which have a unit."""
+        """Presence of angles, which have a unit."""
         return self.rotation not in (*QUATERNIONS, "rows", "columns")
 
     def units(self, asked: UnitsName = "auto") -> tuple[str, str]:
-        """Names of the units of positions and angles, its own or those that are asked for: ("mm", "deg")."""
+        """Return the names of the units of positions and angles, the convention's own or the given: ("mm", "deg")."""
         length, _, angle = (f"{self.length}-{self.angle}" if asked == "auto" else asked).partition("-")
         return length, angle
 
@@ -89,11 +89,11 @@ OF_ARM = {
     "xarm7": "xarm",
     "z1": "unitree",
 }
-"""What the controller of an arm (handeye.arms.ROBOT_NAMES) writes."""
+"""Convention of the controller of each arm of estimation.arms.ROBOT_NAMES."""
 
 
 def units_of(convention: str) -> str:
-    """The units of a convention's numbers, for people: "m, rad", "mm, °", or "m" where no angle is among them."""
+    """Return the units of a convention's numbers as text: "m, rad", "mm, °", or "m" without angles."""
     form = CONVENTIONS[convention]
     return f"{form.length}, {form.angle.replace('deg', '°')}" if form.has_angles else form.length
 
@@ -101,7 +101,7 @@ def units_of(convention: str) -> str:
 def numbers_from_poses(
     base_from_gripper: Float[ndarray, "n 4 4"], convention: str, units: UnitsName = "auto"
 ) -> Float[ndarray, "n k"]:
-    """Rows in a convention's columns, the inverse of `poses_from_numbers`; `units` likewise."""
+    """Return rows in a convention's columns, the inverse of `poses_from_numbers`."""
     form = CONVENTIONS[convention]
     position_unit, angle_unit = _in_metres_and_radians(form, units)
     position = base_from_gripper[:, :3, 3] / position_unit
@@ -243,6 +243,7 @@ def _check_position(
 
 
 def _check_angles(angles: Float[ndarray, "n 3"], unit: float, units: UnitsName, where: str) -> None:
+    """Raise InputError where angles cannot be in the unit."""
     largest = float(np.abs(angles).max(initial=0.0))
     if unit == 1.0 and largest > RADIANS_LIMIT:
         raise InputError(

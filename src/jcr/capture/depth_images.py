@@ -14,12 +14,12 @@ from jcr.capture.plain_files import contained, shown
 from jcr.errors import InputError
 
 FOLDER = "depth"
-"""Beside the images of a table."""
+"""Folder of the depth images beside the images of a table."""
 Names = tuple[str | None, ...]
 
 
 def read_depth(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h w"]:
-    """Depth along the optical axis (m) at the pixels of images of `size`; 0 where the camera measured none.
+    """Read the depth along the optical axis (m) at the pixels of images of `size`; 0 where none was measured.
 
     Raises InputError where the file is no 16-bit grey image of that size.
     """
@@ -42,7 +42,7 @@ def read_depth(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h w"]:
 
 
 def depth_of_frames(frames: Sequence[dict[str, object]], folder: Path, where: str) -> Names | None:
-    """Paths of depth images from the frames of a capture.json; None where no frame names one."""
+    """Return the depth images of the frames of a capture.json; None where no frame names one."""
     names = [frame.get("depth") for frame in frames]
     if all(name is None for name in names):
         return None
@@ -57,7 +57,7 @@ def depth_of_frames(frames: Sequence[dict[str, object]], folder: Path, where: st
 
 
 def depth_beside(folder: Path, images: Sequence[str]) -> Names | None:
-    """Depth images in depth/, named as the images; None where there are none."""
+    """Return the depth images in depth/ that are named as the images; None where there are none."""
     names = [f"{FOLDER}/{Path(name).stem}.png" for name in images]
     there = [(folder / name).is_file() for name in names]
     if not any(there):

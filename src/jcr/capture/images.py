@@ -1,4 +1,4 @@
-"""One image: read from whatever a camera or a phone wrote, written without loss, judged for sharpness."""
+"""Reading and writing of images, and measures of their exposure and sharpness."""
 
 import warnings
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ MAX_PIXELS = 64_000_000
 BLURRED = 0.25
 """Share of the usual sharpness below which an image is called blurred."""
 ORIENTATION = 0x0112
-"""The EXIF tag."""
+"""EXIF tag of the orientation."""
 ROTATED = {
     2: "mirrored",
     3: "rotated by 180°",
@@ -29,43 +29,43 @@ ROTATED = {
     7: "mirrored and rotated by 90°",
     8: "rotated by 90° counter-clockwise",
 }
-"""What is done to show an image of that orientation (EXIF 2.32, tag 274)."""
+"""Transformation that shows an image of each orientation (EXIF 2.32, tag 274)."""
 PNG_DEPTH = 24
 """Byte of a PNG's header with the bits of a sample."""
 BITS_PER_SAMPLE = 258
-"""The TIFF tag."""
+"""TIFF tag of the bits of a sample."""
 DEFECTIVE = 10_000
-"""One pixel in this many may be one that the sensor does not read."""
+"""Number of pixels of which one may be defective."""
 BLURRED_EDGE = 1 / 80
-"""Of the long side, or of EDGES_AT: the strongest edges of a sharp image climb within it. Those of images of eleven real
-arms took 1/300 to 1/98."""
+"""Width of the strongest edges of a sharp image, as a share of the long side or of EDGES_AT: those of images of eleven
+real arms took 1/300 to 1/98."""
 EDGES_AT = 640
 """Pixels of the long side at which edges are measured; a smaller image is measured as it is."""
 LEAST_CONTRAST = 20
 """Grey levels that the strongest edges climb, or there is none to judge by."""
 ONE_VIEW = 0.5
-"""Of the sum of the squared details of two images, which unrelated images differ by."""
+"""Share of the sum of the squared details of two images; unrelated images differ by the whole sum."""
 DARK, BRIGHT = 12, 243
 """Mean grey levels of 255 beyond which an image shows nothing."""
 
 
 @dataclass(frozen=True)
 class HowStored:
-    """How a file stores its pixels."""
+    """Storage of the pixels in a file."""
 
     orientation: int
-    """EXIF: 1 as the sensor has it; others are rotated, or mirrored, to be shown."""
+    """EXIF orientation: 1 as the sensor has it; others are rotated, or mirrored, to be shown."""
     bits: int
-    """Used of each colour."""
+    """Bits in use of each colour."""
 
 
 def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
-    """RGB (h,w,3) uint8, rotated upright by its EXIF tag; InputError when the file is no readable image."""
+    """Read RGB (h,w,3) uint8, rotated upright by its EXIF tag; InputError when the file is no readable image."""
     return read_stored(path)[0]
 
 
 def read_stored(path: Path) -> tuple[UInt8[ndarray, "h w 3"], HowStored]:
-    """An image as `read_image` has it, and how its file stores it, decoded once."""
+    """Read an image as `read_image`, and how its file stores it."""
     require_file(path)
     try:
         with warnings.catch_warnings():
@@ -99,7 +99,7 @@ def read_stored(path: Path) -> tuple[UInt8[ndarray, "h w 3"], HowStored]:
 
 
 def _sixteen_bit(path: Path, opened: Image.Image) -> UInt16[ndarray, "h w *rgb"] | None:
-    """Pixels of an image of 16 bits, grey or RGB; None of any other. Pillow keeps the upper eight of coloured ones.
+    """Return the pixels of a 16-bit image, grey or RGB; None of any other. Pillow keeps 8 bits of coloured ones.
 
     Raises InputError for fractions and for more than 16 bits: which values are black and white is not in the file.
     """
@@ -118,7 +118,7 @@ def _sixteen_bit(path: Path, opened: Image.Image) -> UInt16[ndarray, "h w *rgb"]
 
 
 def _depth(path: Path, opened: Image.Image) -> int:
-    """Bits of a sample of a PNG or a TIFF, which Pillow's mode does not tell; 8 of any other."""
+    """Return the bits of a sample of a PNG or a TIFF, which Pillow's mode does not tell; 8 of any other."""
     if opened.format == "TIFF":
         return max(opened.tag_v2.get(BITS_PER_SAMPLE, (8,)))  # type: ignore[attr-defined]
     if opened.format != "PNG":
@@ -128,7 +128,7 @@ def _depth(path: Path, opened: Image.Image) -> int:
 
 
 def _bits(deep: UInt16[ndarray, "h w *rgb"]) -> int:
-    """Bits that an image of 16 uses: sensors of 8, 10, 12 or 14 fill the lower ones, and black is what they show.
+    """Return the bits that a 16-bit image uses: sensors of 8, 10, 12 or 14 bits fill the lower ones.
 
     Single defective pixels, which may have any value, do not count.
     """
@@ -138,6 +138,7 @@ def _bits(deep: UInt16[ndarray, "h w *rgb"]) -> int:
 
 
 def _refuse_size(path: Path, size: tuple[int, int]) -> None:
+    """Raise InputError for an image of too many pixels."""
     if size[0] * size[1] > MAX_PIXELS:
         raise InputError(
             f"{path}: {size[0]}x{size[1]} is over {MAX_PIXELS // 1_000_000} million pixels; shrink the image"
@@ -158,16 +159,16 @@ def other_size(
 
 
 def brightness_and_sharpness(image: UInt8[ndarray, "h w 3"]) -> tuple[float, float]:
-    """Mean grey level, and variance of the Laplacian, which falls when an image is blurred."""
+    """Return the mean grey level, and the variance of the Laplacian, which falls when an image is blurred."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     return float(grey.mean()), float(cv2.Laplacian(grey, cv2.CV_64F).var())
 
 
 def edge_width(image: UInt8[ndarray, "h w 3"]) -> float:
-    """Over which share of the long side, or of EDGES_AT, the strongest edges climb along the axis that is blurred most.
+    """Return the width of the strongest edges along the axis that is blurred most, as a share of the long side.
 
-    By how much they climb within 2 pixels, over what they climb within 16: from 1/320, of sharp edges, to 1/40. 0 of an
-    image without edges.
+    The width follows from their rise within 2 pixels and within 16: from 1/320 of sharp edges to 1/40; 0 without edges.
+    An image smaller than EDGES_AT counts as of that size.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     scale = min(EDGES_AT / max(grey.shape), 1.0)
@@ -181,16 +182,16 @@ def edge_width(image: UInt8[ndarray, "h w 3"]) -> float:
 
 
 def show_one_view(first: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "h w 3"]) -> bool:
-    """Whether two images differ by less than their detail, as two of a camera at rest do but for noise and exposure.
+    """Return whether two images differ by less than their detail, as those of a camera at rest do.
 
-    Of a camera that moved by a few pixels the details of some pixels' size have nothing in common.
+    After a motion by a few pixels the details of some pixels' size have nothing in common.
     """
     one, two = (_detail(image) for image in (first, other))
     return float(((one - two) ** 2).mean()) < ONE_VIEW * float((one**2).mean() + (two**2).mean())
 
 
 def _detail(image: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "rows columns"]:
-    """Details of some pixels' size, of unit contrast: noise is smaller, shading larger."""
+    """Return the details of some pixels' size, with unit contrast: noise is smaller, shading larger."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     grey = cv2.resize(grey, None, fx=(scale := 640 / max(grey.shape)), fy=scale).astype(np.float32)
     band = cv2.GaussianBlur(grey, (0, 0), 2.0) - cv2.GaussianBlur(grey, (0, 0), 8.0)
@@ -198,7 +199,7 @@ def _detail(image: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "rows columns"]:
 
 
 def exposure_fault(brightness: float) -> str | None:
-    """What an image of that mean grey level is, if it shows nothing."""
+    """Return what is wrong with an image of that mean grey level; None where it shows something."""
     if DARK < brightness < BRIGHT:
         return None
     return "nearly black" if brightness <= DARK else "nearly white"
@@ -211,7 +212,7 @@ def encode_png(pixels: UInt8[ndarray, "h w *rgb"] | UInt16[ndarray, "h w"]) -> b
 
 
 def sharpness(image: bytes | UInt8[ndarray, "h w 3"]) -> float:
-    """The same variance of RGB pixels or of an encoded file; none of a file that cannot be decoded."""
+    """Return the variance of the Laplacian of RGB pixels or of an encoded file; 0 where it cannot be decoded."""
     if not isinstance(image, bytes):
         return brightness_and_sharpness(image)[1]
     bgr = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)

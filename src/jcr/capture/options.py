@@ -1,4 +1,4 @@
-"""How a capture is read, whatever its format: the options of the command line."""
+"""Options of reading a capture, on the command line and in Python."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 import tyro
 
 MIN_FRAMES = 3
-"""Fewer do not calibrate."""
+"""Smallest number of frames that can be calibrated."""
 MAX_FRAMES = 1000
-"""More is a video: every image is compared with others, and every pose's errors with all the others'."""
+"""Largest number of frames: every image is compared with others, and every pose's errors with all others."""
 
 FormatName = Literal[
     "auto", "capture", "table", "samples", "colmap", "bag", "lerobot",
@@ -23,7 +23,7 @@ UnitsName = Literal["auto", "m-rad", "m-deg", "mm-rad", "mm-deg", "cm-rad", "cm-
 
 @dataclass(frozen=True, kw_only=True)
 class ReadOptions:
-    """How the capture is read; a capture.json needs none of these."""
+    """Options of reading a capture; a capture.json needs none of these."""
 
     pose_convention: ConventionName = "auto"
     """Notation of the gripper poses (base_from_gripper) in a table; auto: from the names of its columns."""
@@ -38,7 +38,7 @@ class ReadOptions:
     format: FormatName = "auto"
     """Format of the capture, if its files do not show it (jcr docs captures)."""
     frames: Annotated[int, tyro.conf.arg(metavar="COUNT")] = 15
-    """How many frames to take from a recording: still, sharp, and chosen to determine the calibration best."""
+    """Number of frames to take from a recording: still, sharp, and chosen to determine the calibration best."""
     base_frame: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
     """Recordings: tf frame or URDF link of the robot's base."""
     gripper_frame: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None

@@ -91,6 +91,7 @@ def stamp_ns(text: str, where: str) -> int:
 
 
 def _paired_by_name(folder: Path, file: Path, table: "PoseTable") -> Paired:
+    """Pair rows with the images that they name."""
     assert table.images is not None
     located = _located(folder, table.images, file)
     named = set(located)

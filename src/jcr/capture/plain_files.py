@@ -1,4 +1,4 @@
-"""Text, YAML, JSON and arrays that others wrote: plain data from inside of the folder, or one line of what is wrong."""
+"""Reading of text, YAML, JSON and arrays from untrusted files: plain data inside the folder, or an InputError."""
 
 import json
 import os
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
     from pydantic import ValidationError
 
 LONGEST = 255
-"""Bytes of a file's name that file systems take."""
+"""Bytes of the longest file name that file systems take."""
 MAX_YAML = 4_000_000
-"""Characters: more takes long to read, and is no capture."""
+"""Characters of the longest YAML file: a longer one takes long to read, and is no capture."""
 NAMED = 10
 """Names that a message lists; of more it gives the number."""
 LONGEST_SHOWN = 80
-"""Characters of a value that a message quotes."""
+"""Characters of the longest value that a message quotes."""
 
 
 def is_written(file: Path) -> bool:
-    """Whether a file that jcr may have written is there; InputError where something else has its name."""
+    """Return whether a file that jcr may have written is there; InputError where something else has its name."""
     if not os.path.lexists(file) and (not os.path.lexists(file.parent) or file.parent.is_dir()):
         return False
     if not os.path.lexists(file):
@@ -41,7 +41,7 @@ def is_written(file: Path) -> bool:
 
 
 def read_text(file: Path) -> str:
-    """The text of a file; InputError when it is missing, binary, compressed or not UTF-8."""
+    """Read the text of a file; InputError when it is missing, binary, compressed or not UTF-8."""
     try:
         data = read_bytes(file)
     except OSError as error:
@@ -58,7 +58,7 @@ def read_text(file: Path) -> str:
 
 
 def read_yaml(file: Path) -> Any:
-    """Return the plain data of a YAML file, a list of several documents; InputError when it is none."""
+    """Read the plain data of a YAML file, a list of several documents; InputError when it is none."""
     import yaml
 
     try:
@@ -86,7 +86,7 @@ def read_yaml(file: Path) -> Any:
 
 
 def read_json(file: Path) -> Any:
-    """The content of a JSON file; InputError on bytes that are not UTF-8 JSON or keys that appear twice."""
+    """Read the content of a JSON file; InputError on bytes that are not UTF-8 JSON or keys that appear twice."""
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         content = dict(pairs)
@@ -110,7 +110,7 @@ def read_json(file: Path) -> Any:
 
 
 def shown(value: object) -> str:
-    """A value of a file as a message may quote it: one that is long is cut."""
+    """Return a value of a file as a message quotes it: a long one is cut."""
     text = repr(value)
     return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}… ({len(text)} characters)"
 
@@ -122,7 +122,7 @@ def first_few(names: Sequence[str]) -> str:
 
 
 def first_fault(error: "ValidationError") -> str:
-    """Where the first thing wrong is that a schema finds, and what."""
+    """Return the first fault that a schema finds, with its place."""
     first = error.errors()[0]
     place = ".".join(str(part)[:LONGEST_SHOWN] for part in first["loc"])
     what = first["msg"].removeprefix("Value error, ")
@@ -130,7 +130,7 @@ def first_fault(error: "ValidationError") -> str:
 
 
 def read_npy(file: Path) -> ndarray:
-    """The array that numpy.save wrote, never objects; InputError for any other file."""
+    """Read the array that numpy.save wrote, never objects; InputError for any other file."""
     try:
         require_file(file)
         with file.open("rb") as stream:
@@ -142,7 +142,7 @@ def read_npy(file: Path) -> ndarray:
 
 
 def contained(folder: Path, name: str, where: str) -> Path:
-    """`folder/name`, or InputError when the name is absolute, no file's name, or leads out of the folder."""
+    """Return `folder/name`; InputError when the name is absolute, no file's name, or leads out of the folder."""
     try:
         longest = max(len(part.encode()) for part in Path(name).parts)
     except ValueError:  # an empty name, or half of a surrogate pair

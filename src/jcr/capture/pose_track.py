@@ -1,4 +1,4 @@
-"""A moving frame sampled in time, asked at the stamps of images: interpolated, and never stale."""
+"""Interpolation of a moving frame at the stamps of images."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,11 +12,11 @@ from jcr.geometry import inverse, motion_length, transform
 
 Stamps = Int[ndarray, " n"]
 PosesAt = Callable[[Stamps], tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]]
-"""Poses at stamps (ns), and between how distant samples (ns) each lies; NEVER outside of the recording."""
+"""Poses at stamps (ns), and the distance (ns) of the samples around each; NEVER outside of the recording."""
 
 NEVER = np.iinfo(np.int64).max
 SPEED_OVER_NS = 50_000_000
-"""To either side: long enough that an encoder's last digit is no speed, short beside a stop of the arm."""
+"""Time to either side over which speed is measured, ns: long for an encoder's last digit, short for a stop."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class PoseTrack:
     a_from_b: Float[ndarray, "n 4 4"]
 
     def at(self, stamp_ns: Stamps) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
-        """Position linear and orientation by slerp between the samples around each stamp."""
+        """Return poses at stamps (ns), linear in position and by slerp in rotation, and the gaps (ns) around each."""
         before, share, gap = bracket(self.stamp_ns, stamp_ns)
         if len(self.stamp_ns) == 1:
             return np.repeat(self.a_from_b, len(stamp_ns), axis=0), gap
@@ -39,7 +39,7 @@ class PoseTrack:
 
 
 def pose_track(stamp_ns: Stamps, a_from_b: Float[ndarray, "n 4 4"]) -> PoseTrack:
-    """Samples put in order of time; of those with the same stamp the first stays."""
+    """Return samples in order of time; the first of those with the same stamp stays."""
     stamps, rows = np.unique(stamp_ns, return_index=True)
     return PoseTrack(stamps, a_from_b[rows])
 
@@ -47,7 +47,7 @@ def pose_track(stamp_ns: Stamps, a_from_b: Float[ndarray, "n 4 4"]) -> PoseTrack
 def bracket(
     sample_ns: Int[ndarray, " k"], stamp_ns: Stamps
 ) -> tuple[Int[ndarray, " n"], Float[ndarray, " n"], Int[ndarray, " n"]]:
-    """Row of the sample before each stamp, the share of the way to the next, and their distance in ns."""
+    """Return the row of the sample before each stamp, the share of the way to the next, and their distance in ns."""
     last = len(sample_ns) - 1
     before = np.clip(np.searchsorted(sample_ns, stamp_ns, side="right") - 1, 0, max(last - 1, 0))
     width = sample_ns[np.minimum(before + 1, last)] - sample_ns[before]
@@ -59,7 +59,7 @@ def bracket(
 
 
 def speed(poses_at: PosesAt, stamp_ns: Stamps) -> Float[ndarray, " n"]:
-    """How fast the frame moves (m/s), rotation counted at ARM; ends of the recording count one side."""
+    """Return the speed (m/s) of the frame, rotation counted at ARM; at the ends of the recording from one side."""
     start, end = poses_at(stamp_ns - SPEED_OVER_NS), poses_at(stamp_ns + SPEED_OVER_NS)
     motion = inverse(start[0]) @ end[0]
     return np.asarray(motion_length(motion)) / (2e-9 * SPEED_OVER_NS)

@@ -114,6 +114,7 @@ def format_of(path: Path, options: ReadOptions | None = None) -> str:
 
 
 def _inverted(found: Any, options: ReadOptions) -> Any:
+    """Return the capture with its poses inverted, where the options say so."""
     if not options.pose_inverted:
         return found
     return replace(found, base_from_gripper=inverse(found.base_from_gripper))
@@ -141,6 +142,7 @@ def _made_from(path: Path, options: ReadOptions) -> list[Any]:
 
 
 def _content(folder: Path) -> dict[str, Any]:
+    """Return the content of the capture.json of a folder, empty where there is none."""
     file = folder / capture_json.FILE
     content = read_json(file) if file.is_file() else None
     return content if isinstance(content, dict) else {}

@@ -1,4 +1,4 @@
-"""From a recording to a capture: the best frames are chosen, and put in a folder with a capture.json."""
+"""Extraction of the best frames of a recording into a capture folder."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -23,12 +23,12 @@ ImagesOfRows = Callable[[Int[ndarray, " k"]], Iterator[tuple[int, bytes | UInt8[
 IntrinsicsOfSize = Callable[[tuple[int, int]], Intrinsics | None]
 """Intrinsics of images of a size (width, height)."""
 BESIDE_ALL_POSES_NS = 1e15
-"""A gap that is none: the frame is before the first pose or after the last."""
+"""Gap (ns) beyond which the frame is before the first pose or after the last."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """What a reader found in a recording: a frame a row, images only when asked for."""
+    """Frames of a recording, a row each, whose images are read on demand."""
 
     source: Path
     options: ReadOptions
@@ -36,13 +36,13 @@ class Recording:
     """Names of the frames' files, without their endings."""
     base_from_gripper: Float[ndarray, "n 4 4"]
     speed: Float[ndarray, " n"]
-    """m/s, rotation counted as jcr.geometry.motion_length does."""
+    """Speed of the gripper, m/s, rotation counted as in jcr.geometry.motion_length."""
     gap_ns: Int[ndarray, " n"]
     """Time between the two poses around each frame; 0 where none is interpolated."""
     images_of_rows: ImagesOfRows
     intrinsics_of_size: IntrinsicsOfSize
     joints: Float[ndarray, "n j"] | None = None
-    """rad, of the arm in `options.urdf`, where they are known."""
+    """Joint angles (rad) of the arm in `options.urdf`, where they are known."""
     depth_at: Callable[[int], UInt16[ndarray, "h w"] | None] | None = None
     """Depth (mm) aligned with the frame of a row."""
 
@@ -53,7 +53,7 @@ class Recording:
 
 
 def capture_of_recording(recording: Recording, into: Path, report: Progress) -> Capture:
-    """The best frames of a recording in the folder `into`.
+    """Extract the best frames of a recording into the folder `into`.
 
     Raises InputError when the poses of all frames are stale, or when too few frames are still and sharp.
     """
@@ -81,7 +81,7 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
 
 
 def _stale(recording: Recording) -> list[str]:
-    """A note on the frames whose pose is; InputError where all are."""
+    """Return a note on the frames whose pose is stale; InputError where all are."""
     fresh, gap_ns, limit_ms = recording.fresh, recording.gap_ns, recording.options.max_gap_ms
     if fresh.all():
         return []
@@ -104,6 +104,7 @@ def _stale(recording: Recording) -> list[str]:
 
 
 def _sharpness(recording: Recording, rows: Int[ndarray, " k"], report: Progress) -> Float[ndarray, " k"]:
+    """Return the sharpness of the images of these rows."""
     values = []
     for k, (_, image, _) in enumerate(recording.images_of_rows(rows)):
         values.append(sharpness(image))
@@ -119,7 +120,7 @@ def _sharpness(recording: Recording, rows: Int[ndarray, " k"], report: Progress)
 def _written(
     recording: Recording, rows: Int[ndarray, " k"], into: Path, report: Progress
 ) -> tuple[list[str], list[str | None]]:
-    """Files of the images of these rows and of their depth, None where there is none."""
+    """Write the images of these rows and their depth; return the files, None for a missing depth."""
     images, depths = list[str](), list[str | None]()
     for k, (row, image, ending) in enumerate(recording.images_of_rows(rows)):
         name = recording.names[row]

@@ -1,4 +1,4 @@
-"""sensor_msgs/Image and CompressedImage to images, and to depth."""
+"""Conversion of sensor_msgs/Image and CompressedImage to images and depth."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ _TO_RGB = {
 
 
 def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"], str]:
-    """An encoded file's bytes as they are, or RGB pixels; and the file's ending.
+    """Return the bytes of an encoded file, or RGB pixels, and the ending of the file.
 
     Raises InputError for encodings that are no image (depth) or that jcr does not know.
     """
@@ -56,7 +56,7 @@ def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"],
 
 
 def depth_of(message: Any, where: str) -> UInt16[ndarray, "h w"]:
-    """Depth in mm, 0 where there is none; InputError for what is no depth image."""
+    """Return depth in mm, 0 where there is none; InputError for a message that is no depth image."""
     if hasattr(message, "format"):
         # compressed_depth_image_transport writes its quantisation before the PNG.
         data = message.data.tobytes()
@@ -80,7 +80,7 @@ def depth_of(message: Any, where: str) -> UInt16[ndarray, "h w"]:
 
 
 def _rows(message: Any, used: int, what: str, where: str) -> UInt8[ndarray, "h used"]:
-    """The `used` bytes of each row, which may be padded to `step`; InputError where some are missing."""
+    """Return the `used` bytes of each row, which may be padded to `step`; InputError where some are missing."""
     if message.step < used or message.data.size < message.height * message.step:
         raise InputError(f"{where}: {what} is cut short; record again")
     rows = message.data[: message.height * message.step].reshape(message.height, message.step)

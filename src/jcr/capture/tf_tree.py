@@ -1,4 +1,4 @@
-"""ROS's tf: a tree of frames whose edges move, and the pose of one frame in another at any stamp."""
+"""Tree of the frames of ROS's tf: the pose of one frame in another at any stamp."""
 
 from array import array
 from pathlib import Path
@@ -15,16 +15,17 @@ from jcr.geometry import inverse
 
 
 class TfTree:
-    """What /tf and /tf_static given, in plain arrays: an hour of a robot is a few million transforms."""
+    """Transforms of /tf and /tf_static in plain arrays: an hour of a robot has a few million."""
 
     def __init__(self) -> None:
+        """Start without frames."""
         self.parent: dict[str, str] = {}
         self.static: set[str] = set()
         self._stamps: dict[str, array[int]] = {}
         self._numbers: dict[str, array[float]] = {}
 
     def add(self, transforms: list[Any], static: bool) -> None:
-        """The transforms of one message; a frame has one parent, the last that was given."""
+        """Add the transforms of one message; a frame has one parent, the last that was given."""
         for stamped in transforms:
             child, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")
             if self.parent.get(child, parent) != parent:
@@ -37,11 +38,11 @@ class TfTree:
                 self.static.add(child)
 
     def frames(self) -> list[str]:
-        """All frames by name."""
+        """Return the names of all frames, sorted."""
         return sorted(self.parent.keys() | set(self.parent.values()))
 
     def poses_at(self, base: str | None, gripper: str | None, source: Path) -> PosesAt:
-        """Where the gripper is in the base at stamps; InputError listing the frames, or that none joins them."""
+        """Return a function from stamps to gripper poses in the base; InputError where no transforms join the two."""
         frames = self.frames()
         for option, frame in (("--base-frame", base), ("--gripper-frame", gripper)):
             if frame not in frames:
@@ -67,13 +68,14 @@ class TfTree:
         return poses_at
 
     def _to_root(self, frame: str) -> list[str]:
-        """The frame and all above it."""
+        """Return the frame and all above it."""
         chain = [frame]
         while chain[-1] in self.parent and len(chain) <= len(self.parent):
             chain.append(self.parent[chain[-1]])
         return chain
 
     def _edge(self, child: str, source: Path) -> tuple[PoseTrack, bool]:
+        """Return the samples of parent_from_child of a frame, and whether it is static."""
         numbers = np.frombuffer(self._numbers[child]).reshape(-1, 7)
         where = f"{source}: tf from {self.parent[child]} to {child}"
         poses = poses_from_numbers(numbers, "quat-xyzw", "m-rad", where)
@@ -83,7 +85,7 @@ class TfTree:
 def _chain(
     edges: list[tuple[PoseTrack, bool]], stamp_ns: Stamps
 ) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
-    """Product of edges that lead upward from a frame, and the widest gap among the moving ones."""
+    """Return the product of edges that lead upward from a frame, and the widest gap among the moving ones."""
     poses, gap = np.tile(np.eye(4), (len(stamp_ns), 1, 1)), np.zeros(len(stamp_ns), np.int64)
     for track, static in edges:
         if static:

@@ -17,4 +17,4 @@ class Format:
     read: Callable[..., Any]
     """Reader of (path, options), returning a Capture or PosePairs."""
     recording: bool = False
-    """Whether the images are inside a file: the reader then takes (path, options, folder to extract to, progress)."""
+    """True where the images are inside a file: the reader then takes (path, options, folder, progress)."""

@@ -165,6 +165,7 @@ def _intrinsics(bag: _Bag, options: ReadOptions, size: tuple[int, int]) -> Intri
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
+    """Open a bag; InputError where it is none, or damaged."""
     highlevel = extra("rosbags.highlevel", "ros", "a bag")
     typesys = extra("rosbags.typesys", "ros", "a bag")
     try:

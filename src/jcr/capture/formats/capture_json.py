@@ -24,15 +24,15 @@ from jcr.records import Capture
 
 FILE, URDF = "capture.json", "robot.urdf"
 MAX_BYTES = 32_000_000
-"""More takes long to read, and is no capture."""
+"""Size of the largest capture.json: a larger one takes long to read, and is no capture."""
 MOST_ROTATION = 6 * np.pi + 0.01
-"""rad: no joint rotates farther to either side."""
+"""Largest joint angle, rad: no joint rotates farther to either side."""
 OF_EVERY_FORMAT = ("format", "pose_inverted")
-"""Options of reading that a capture.json obeys too."""
+"""Options that a capture.json is read by, too."""
 
 
 def read(path: Path, options: ReadOptions | None = None) -> Capture:
-    """The capture in a folder, or named by its capture.json; no option changes how (`unused_options`)."""
+    """Read the capture in a folder, or named by its capture.json; no option changes how (`unused_options`)."""
     folder, file = (path, path / FILE) if path.is_dir() else (path.parent, path)
     if not file.is_file():
         raise InputError(f"{folder}: holds no capture.json; name a capture folder")
@@ -77,7 +77,7 @@ def read(path: Path, options: ReadOptions | None = None) -> Capture:
 
 
 def unused_options(options: ReadOptions) -> str | None:
-    """A note that names the options which were given and a capture.json is not read by; None where there are none."""
+    """Return a note on given options that a capture.json does not need; None where there are none."""
     usual = asdict(ReadOptions())
     given = [
         f"--{name.replace('_', '-')}"
@@ -119,7 +119,7 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
 
 
 def origin(folder: Path) -> Path:
-    """What a capture folder was read from: the table or recording whose frames were copied into it, or itself."""
+    """Return the table or recording whose frames were copied into a capture folder, or the folder itself."""
     content = read_json(folder / FILE) if (folder / FILE).is_file() else {}
     content = content if isinstance(content, dict) else {}
     made_from = content.get("made_from")
@@ -128,7 +128,7 @@ def origin(folder: Path) -> Path:
 
 
 def kept(capture: Capture, folder: Path) -> Capture:
-    """The capture copied into a folder of its own with a capture.json, unless it has one where it lies.
+    """Copy the capture into a folder of its own with a capture.json, unless it has one where it lies.
 
     A run whose capture was read from another format can then go on without that format's options.
     """
@@ -169,7 +169,7 @@ def _joints(
 
 
 def read_joints(value: Any, where: str) -> Float[ndarray, " dof"]:
-    """Joint angles (rad) of one frame from a list; InputError where it holds anything else."""
+    """Return joint angles (rad) of one frame from a list; InputError where it holds anything else."""
     try:
         row = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -184,7 +184,7 @@ def read_joints(value: Any, where: str) -> Float[ndarray, " dof"]:
 def _robot(
     name: Any, joints: Float[ndarray, "n dof"] | None, file: Path
 ) -> tuple[str | None, tuple[str, ...]]:
-    """The name of an arm that is known, and a note where it is not."""
+    """Return the name of a known arm, and a note where it is not known."""
     if name is None:
         return None, ()
     if name not in ROBOT_NAMES:
@@ -200,6 +200,7 @@ def _robot(
 
 
 def _urdf(name: Any, file: Path) -> Path | None:
+    """Return the path of the URDF inside the capture; InputError where it is not there."""
     if name is None:
         return None
     if not isinstance(name, str):
@@ -211,6 +212,7 @@ def _urdf(name: Any, file: Path) -> Path | None:
 
 
 def _image_name(frame: Any, index: int, file: Path) -> str:
+    """Return the image of a frame; InputError where it names none."""
     if not isinstance(frame, dict) or not isinstance(frame.get("image"), str):
         raise InputError(f'{file}: frame {index} has no "image"; give the image\'s path as text')
     return frame["image"]

@@ -1,4 +1,4 @@
-"""A COLMAP model with its images, beside a table of gripper poses.
+"""COLMAP models with their images, beside a table of gripper poses.
 
 COLMAP has the centre of the top-left pixel at (0.5, 0.5) and stores camera from world.
 """
@@ -35,11 +35,11 @@ _COEFFICIENTS = {
     "FULL_OPENCV": COEFFICIENTS["rational"],
     "OPENCV_FISHEYE": COEFFICIENTS["fisheye"],
 }
-"""COLMAP's camera models that jcr knows, and which coefficients follow in their parameters."""
+"""Coefficients in the parameters of the known camera models of COLMAP."""
 
 
 def find_model(path: Path) -> Path | None:
-    """The folder of a COLMAP model in or at a folder."""
+    """Return the folder of a COLMAP model in or at a folder; None where there is none."""
     places = [path / place for place in _PLACES]
     return next(
         (place for place in places if any((place / f"cameras.{end}").is_file() for end in ("bin", "txt"))),
@@ -84,7 +84,7 @@ def read(path: Path, options: ReadOptions) -> Capture:
 
 
 def read_model(folder: Path) -> "pycolmap.Reconstruction":
-    """The model; InputError when it cannot be read."""
+    """Read a model; InputError when it cannot be read."""
     import pycolmap
 
     for name, check in (("images.bin", _check_images), ("points3D.bin", _check_points)):
@@ -118,7 +118,7 @@ def _check_images(data: bytes) -> None:
 
 
 def _check_points(data: bytes) -> None:
-    """The same of the points with their tracks."""
+    """Raise where the counts of points and their tracks lead past the end."""
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(count):
         at += 51 + 8 * struct.unpack_from("<Q", data, at + 43)[0]
@@ -126,16 +126,18 @@ def _check_points(data: bytes) -> None:
 
 
 def _check_end(data: bytes, at: int) -> None:
+    """Raise where the counts of a file do not lead to its end."""
     if at != len(data):
         raise ValueError("counts do not lead to the end")
 
 
 def read_cameras(folder: Path) -> tuple[list[str], Float[ndarray, "n 4 4"]]:
-    """Names of the registered images, in order, and their recon_from_camera (n,4,4)."""
+    """Read the names of the registered images, in order, and their recon_from_camera (n,4,4)."""
     return _posed(read_model(folder), folder)
 
 
 def _posed(model: "pycolmap.Reconstruction", folder: Path) -> tuple[list[str], Float[ndarray, "n 4 4"]]:
+    """Return the names of the registered images, in order, and their recon_from_camera (n,4,4)."""
     images = sorted((model.image(k) for k in model.reg_image_ids()), key=lambda image: image.name)
     if not images:
         raise InputError(f"{folder}: the COLMAP model has no registered image")
@@ -153,6 +155,7 @@ def read_intrinsics(folder: Path, size: tuple[int, int]) -> Intrinsics:
 def _common_intrinsics(
     model: "pycolmap.Reconstruction", names: set[str], folder: Path, size: tuple[int, int]
 ) -> Intrinsics:
+    """Return the intrinsics that the images of the names share; InputError where they differ."""
     images = [image for k in model.reg_image_ids() if (image := model.image(k)).name in names]
     cameras = [model.camera(image.camera_id) for image in images]
     kinds = {
@@ -166,6 +169,7 @@ def _common_intrinsics(
 
 
 def _intrinsics(camera: "pycolmap.Camera", folder: Path, size: tuple[int, int]) -> Intrinsics:
+    """Return the intrinsics of a camera of a model; InputError for another size or an unknown model."""
     name, width, height, params = camera.model.name, camera.width, camera.height, [*map(float, camera.params)]
     if name not in _COEFFICIENTS:
         raise InputError(

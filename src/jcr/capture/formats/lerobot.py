@@ -201,6 +201,7 @@ def _read_table(
 
 
 def _file(path: Path, template: str | None, fields: dict[str, Any]) -> Path:
+    """Return the file of a path template; InputError where the fields do not fit."""
     if template is None:
         raise InputError(f"{path / INFO}: has videos and no video_path; download it again")
     try:
@@ -289,6 +290,7 @@ def _camera(features: dict[str, Feature], options: ReadOptions, path: Path) -> s
 
 
 def _state_key(features: dict[str, Feature], options: ReadOptions, path: Path) -> str:
+    """Return the key of the robot's state; InputError with the keys that there are."""
     key = options.joint_topic or (CARTESIAN if CARTESIAN in features and options.urdf is None else STATE)
     if key not in features:
         states = [name for name, feature in features.items() if feature.dtype.startswith("float")]
@@ -326,6 +328,7 @@ def _poses(
 
 
 def _speed(episode: Episode, poses: Float[ndarray, "n 4 4"]) -> Float[ndarray, " n"]:
+    """Return the speed (m/s) of the gripper at each row of an episode."""
     stamps = np.round(1e9 * episode.time_s).astype(np.int64)
     return speed(pose_track(stamps, poses).at, stamps)
 

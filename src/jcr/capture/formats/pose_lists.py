@@ -66,6 +66,7 @@ def _entries(content: Any) -> list[Any]:
 
 
 def _cells(entry: Any, where: str) -> Entry:
+    """Return the cells of one entry; InputError where it holds no pose."""
     if isinstance(entry, list) and len(entry) not in (3, 4, 12, 16) and all(map(_is_plain, entry)):
         return [_text(value) for value in entry]
     cells = dict[str, str]()
@@ -127,8 +128,10 @@ def _of_list(value: list[Any], rotation: str | None) -> Iterator[tuple[str, str]
 
 
 def _is_plain(value: Any) -> bool:
+    """Return whether a value is text or a number."""
     return isinstance(value, str | int | float) and not isinstance(value, bool)
 
 
 def _text(value: Any) -> str:
+    """Return the text of a cell."""
     return value if isinstance(value, str) else repr(value)

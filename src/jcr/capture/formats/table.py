@@ -58,7 +58,7 @@ class PoseColumns:
     """Columns of a file of poses as text."""
 
     cells: dict[str, tuple[str, ...]]
-    """By the columns' names: lower case, without units; tx, pos_x, q_x … as x and qx."""
+    """Cells by the columns' names: lower case, without units; tx, pos_x, q_x … as x and qx."""
     units: frozenset[str] = frozenset()
     """Units that the names give: of mm, cm, m, deg, rad."""
     convention: ConventionName = "auto"
@@ -342,6 +342,7 @@ def _rows_of_array(file: Path) -> tuple[Sequence[str] | None, list[list[str]]]:
 
 
 def _name_and_unit(cell: str) -> tuple[str, str]:
+    """Return the name of a column in its usual form, and the unit that follows it."""
     plain = re.sub(r"[\s.]+", "_", cell.strip().strip('"').lower()).strip("_")
     match = _UNIT.match(plain)
     name, unit = match.groups() if match else (plain, "")
