@@ -56,7 +56,5 @@ BENCHES = {
         "Peers", OTHERS, "Hand-eye solvers, few images and global alignment beside other methods.", True
     ),
     "pointmaps": Bench("Pointmaps", OTHERS, "The whole job from pairwise pointmaps with a network's errors."),
-    "table2": Bench("Heights of objects", MAPPED, "Heights of objects from few images."),
-    "depth": Bench("Dense depth", MAPPED, "Dense depth on simulated scenes.", True),
 }
 """Benches in the order of the index."""
