@@ -73,13 +73,7 @@ def run() -> str:
         *table(
             "job | processor, s | times COLMAP | wall, s | peak, GiB",
             (
-                [
-                    name,
-                    *(
-                        f"{x:.2f}"
-                        for x in (one.processor_s, one.processor_s / alone, one.wall_s, one.peak_mib / 1024)
-                    ),
-                ]
+                [name, f"{one.processor_s:.1f}", f"{one.processor_s / alone:.2f}", *_wall_and_peak(one)]
                 for name, one in of.items()
             ),
         ),

@@ -151,11 +151,6 @@ def breathing(share: float) -> Optics:
     return lambda view, px: _magnified(view, px, 1 + share * view.far)
 
 
-def scattering(share: float) -> Optics:
-    """A focal length that differs by a share, one sigma, between images."""
-    return lambda view, px: _magnified(view, px, 1 + share * float(view.random[0]))
-
-
 def zoomed_midway(share: float) -> Optics:
     """A focal length that is longer by a share from midway on."""
     return lambda view, px: _magnified(view, px, 1 + share * (view.number >= view.count // 2))
@@ -286,13 +281,6 @@ def given(**changes: float) -> Change:
         )
 
     return change
-
-
-def of_another_camera(drawn: Drawn, rng: np.random.Generator) -> Drawn:
-    """The intrinsics of a camera of the same resolution and a wider view."""
-    return replace(
-        drawn, camera=Intrinsics(462.0, 461.5, 326.1, 243.7, 640, 480, (0.09, -0.19, 1e-3, 0.0, 0.0))
-    )
 
 
 # Of the gripper poses.

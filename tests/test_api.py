@@ -4,7 +4,6 @@ import inspect
 import re
 import subprocess
 import sys
-from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -19,7 +18,6 @@ from fuzz_targets import sound_run
 from jcr.capture.images import encode_png
 from jcr.capture.options import ReadOptions
 from jcr.options import checked_options
-from jcr.reconstruct import BACKENDS
 from jcr.results import RunOptions
 
 
@@ -69,30 +67,6 @@ def test_every_type_of_a_public_function_has_a_public_name():
     assert len(functions) > 80, "the annotations are read"
     for value in (*functions, jcr.RunOptions, jcr.RunResult, jcr.SegmentOptions):
         assert {one for one in _own_types(value) - public if one.__name__ not in INTERNAL} == set(), value
-
-
-def test_help_of_run_names_the_back_ends():
-    assert all(repr(name) in str(inspect.signature(jcr.run)) for name in ("auto", *BACKENDS))
-
-
-def test_a_camera_without_images_is_refused(tmp_path: Path):
-    with pytest.raises(jcr.InputError, match="overhead: no images"):
-        jcr.add_camera(tmp_path, "overhead")
-
-
-def test_notebooks_show_records_as_tables(tabletop: Path):
-    capture = jcr.read_capture(tabletop)
-    shown = replace(capture, robot="<ur5>")._repr_html_()
-    assert f"{len(capture)} of 640 x 480 px" in shown and "&lt;ur5&gt;" in shown and "<ur5>" not in shown
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("first", ["import jcr.pipeline, jcr.check, jcr.verify", "import jcr; jcr.calibrate"])
-def test_packages_and_functions_have_names_of_their_own(first: str):
-    done = python(
-        f"{first}\nimport jcr\nassert jcr.calibrate is jcr.pipeline.calibrate and jcr.run is jcr.pipeline.run"
-    )
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.slow

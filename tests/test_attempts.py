@@ -158,43 +158,6 @@ BLUR = Finding(
 )
 
 
-def test_blurred_images_are_the_reason_and_not_what_follows(
-    present: set[str], monkeypatch: pytest.MonkeyPatch
-):
-    problem = hand_eye_problem(np.random.default_rng(0), 8, robot_noise=(2e-4, 5e-4))
-    monkeypatch.setattr(attempts, "view_findings", lambda _: (BLUR,))
-    nothing = RejectedError("0 of 8 images registered (too little texture)", "put a newspaper on the table")
-    with pytest.raises(attempts.NothingFoundError) as caught:
-        auto_result(problem, {"colmap": nothing, "direct": nothing}, monkeypatch)
-    assert str(caught.value).startswith("6 of 8 images are blurred") and "texture" not in str(caught.value)
-    assert [one.kind for one in caught.value.findings[:2]] == [
-        FindingKind.BLURRED,
-        FindingKind.NO_RECONSTRUCTION,
-    ]
-    # Of a calibration that is accepted it is a warning, and of one that uses all images without any, no word.
-    kept = chosen(problem, problem.recon_from_camera[:7], monkeypatch)
-    assert kept.verdict == "accepted with warnings" and kept.findings[0] == BLUR
-    kept = chosen(problem, problem.recon_from_camera, monkeypatch)
-    assert kept.verdict == "accepted" and BLUR not in kept.findings
-
-
-def test_a_camera_at_rest_is_reconstructed_once(present: set[str], monkeypatch: pytest.MonkeyPatch):
-    present.add("xfeat")
-    problem = hand_eye_problem(np.random.default_rng(0), 8, robot_noise=(2e-4, 5e-4))
-    still = Finding(kind=FindingKind.STATIC_IMAGES, severity="rejects", value=0.5, details={"rotation": 1.0})
-    monkeypatch.setattr(attempts, "view_findings", lambda _: (still,))
-    tried = []
-
-    def nothing(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
-        tried.append(options.features)
-        raise RejectedError("0 of 8 images registered")
-
-    monkeypatch.setattr(attempts, "reconstruct", nothing)
-    with pytest.raises(attempts.NothingFoundError, match="all images show the same view"):
-        attempts.choose(capture_of(problem), ReconstructOptions(), CalibrateOptions())
-    assert len(tried) == 1
-
-
 def test_of_two_that_are_rejected_the_one_that_shows_the_cause_is_kept(
     present: set[str], monkeypatch: pytest.MonkeyPatch
 ):
@@ -248,41 +211,6 @@ def test_of_two_that_are_rejected_the_smaller_leave_one_out_error_is_kept(
         kept, tried = auto_result(problem, answers, monkeypatch)
         assert tried == ["dust3r", "colmap"] and kept.backend == name
         assert f"and so is colmap; {name} (leave-one-out error" in kept.notes[0]
-
-
-@pytest.mark.slow
-def test_where_colmap_is_rejected_colours_are_asked(present: set[str], monkeypatch: pytest.MonkeyPatch):
-    problem = hand_eye_problem(np.random.default_rng(3), 8)
-    good = problem.recon_from_camera
-    shuffled = good[np.random.default_rng(4).permutation(8)]
-    nothing = RejectedError("0 of 8 images registered")
-    kept, tried = auto_result(problem, {"colmap": good}, monkeypatch)
-    assert tried == ["colmap"] and kept.backend == "colmap" and not kept.notes
-    kept, tried = auto_result(problem, {"colmap": shuffled, "direct": good}, monkeypatch)
-    assert tried == ["colmap", "direct"] and kept.backend == "direct"
-    kept, tried = auto_result(problem, {"colmap": nothing, "direct": good}, monkeypatch)
-    assert tried == ["colmap", "direct"] and kept.backend == "direct"
-    assert "colmap failed (0 of 8 images registered)" in kept.notes[0]
-
-
-@pytest.mark.slow
-def test_learned_features_are_asked_where_those_of_sift_fail(
-    present: set[str], monkeypatch: pytest.MonkeyPatch
-):
-    present.add("xfeat")
-    rng = np.random.default_rng(0)
-    problem = hand_eye_problem(rng, 8, robot_noise=(2e-4, 5e-4))
-    good = problem.recon_from_camera
-    shuffled = good[rng.permutation(8)]
-    kept, tried = auto_result(problem, {"sift": good}, monkeypatch)
-    assert tried == ["colmap"] and not kept.notes
-    kept, tried = auto_result(problem, {"sift": RejectedError("0 of 8"), "xfeat": good}, monkeypatch)
-    assert tried == ["colmap", "colmap"]
-    assert "colmap with sift failed (0 of 8); colmap with xfeat (leave-one-out" in kept.notes[0]
-    # Two that fail, and a third that does not: all three are named.
-    refused = RejectedError("1 of 8")
-    kept, tried = auto_result(problem, {"sift": refused, "xfeat": shuffled, "direct": good}, monkeypatch)
-    assert tried == ["colmap", "colmap", "direct"] and kept.backend == "direct"
 
 
 @pytest.mark.slow
@@ -450,15 +378,6 @@ def test_a_known_length_ends_on_surfaces_and_nothing_else_needs_depth_before_the
     assert densified == ["colmap", "colmap"]
 
 
-def test_no_other_back_end_cures_a_motion_that_shows_too_little(
-    present: set[str], monkeypatch: pytest.MonkeyPatch
-):
-    present.add("dust3r")
-    problem = hand_eye_problem(np.random.default_rng(2), 8, pattern="translation")
-    kept, tried = auto_result(problem, {"dust3r": problem.recon_from_camera}, monkeypatch)
-    assert tried == ["dust3r"] and kept.backend == "dust3r"
-
-
 @pytest.fixture
 def garbage_weights(tmp_path: Path) -> Path:
     """A folder of weights that no training touched."""
@@ -526,22 +445,3 @@ def test_a_network_that_gives_garbage_is_left_for_colmap_and_the_run_folder_repo
     assert found["backend"] == "dust3r" and not found["converged"]
     licence = next(text for text in found["notes"] if "licence" in text)
     assert str(garbage_weights) in licence and licence in (out / "log.txt").read_text()
-
-
-@pytest.mark.slow
-def test_one_network_that_sees_all_views_is_asked_between_colmap_and_direct_alignment(
-    present: set[str], monkeypatch: pytest.MonkeyPatch
-):
-    present |= {"da3", "da3-small"}
-    problem = hand_eye_problem(np.random.default_rng(3), 8)
-    good, nothing = problem.recon_from_camera, RejectedError("0 of 8 images registered")
-    answers = {"colmap": nothing, "da3": nothing, "direct": good}
-    kept, tried = auto_result(problem, answers, monkeypatch)
-    assert tried == ["colmap", "da3", "direct"] and kept.backend == "direct"
-    kept, tried = auto_result(problem, answers | {"da3": good}, monkeypatch)
-    assert tried == ["colmap", "da3"] and kept.backend == "da3"
-    # A network that cannot run here takes nothing from what the others found.
-    shuffled = good[np.random.default_rng(4).permutation(8)]
-    answers = {"colmap": shuffled, "da3": InputError("no weights"), "direct": nothing}
-    kept, tried = auto_result(problem, answers, monkeypatch)
-    assert tried == ["colmap", "da3", "direct"] and kept.backend == "colmap"

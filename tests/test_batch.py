@@ -2,7 +2,6 @@
 
 import csv
 import json
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,7 @@ import pytest
 
 from dying_process import dies_on_bad
 from jcr import batch as module
-from jcr.batch import STATE, BatchOptions, Row, Task, batch, run_one
+from jcr.batch import BatchOptions, Row, Task, batch, run_one
 from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
 from jcr.cli import dispatch
@@ -97,32 +96,6 @@ def test_folders_of_one_name_are_kept_apart(tmp_path: Path):
         "x-2-2",
         "x-3",
     ]
-
-
-def test_a_bug_is_a_row_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, captures: list[Path]):
-    def broken(*arguments: object) -> None:
-        raise ZeroDivisionError("oops")
-
-    monkeypatch.setattr(module, "calibrate", broken)
-    row = run_one(
-        Task(
-            capture=captures[1],
-            out=tmp_path / "out",
-            run=RunOptions(),
-            calibrate_only=True,
-            read=ReadOptions(),
-        )
-    )
-    assert row.status == "failed" and "ZeroDivisionError: oops" in row.reason
-    assert not (tmp_path / "out" / STATE).exists()
-
-
-def test_without_ray_the_remedy_is_named(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, captures: list[Path]
-):
-    monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(module.InputError, match=r"jcr-handeye\[cluster\]"):
-        batch(captures[:1], tmp_path / "out", RunOptions(), replace(COMPLETE, ray="auto"))
 
 
 @pytest.mark.slow

@@ -138,31 +138,6 @@ def test_similarity_is_recovered_exactly_and_ignores_zero_weights():
     assert np.allclose(apply(found, found_scale * x_in_b[1:]), x_in_a[1:], atol=1e-9)
 
 
-@repeatable
-@given(st.data(), batch)
-def test_similarities_of_a_batch_are_those_one_by_one(data, shape):
-    rng = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
-    x_in_a, x_in_b = rng.normal(size=(2, *shape, 7, 3))
-    weights = rng.uniform(size=(*shape, 7))
-    a_from_b, scale = fit_similarity(x_in_a, x_in_b, weights)
-    assert a_from_b.shape == (*shape, 4, 4) and np.shape(scale) == shape
-    for at in np.ndindex(shape):
-        one, own_scale = fit_similarity(x_in_a[at], x_in_b[at], weights[at])
-        assert np.allclose(a_from_b[at], one, atol=1e-12)
-        assert np.asarray(scale)[at] == pytest.approx(own_scale, rel=1e-12)
-
-
-@repeatable
-@given(rigid, rigid, st.floats(0.01, 100))
-def test_a_similarity_of_either_side_is_found_again(a_from_b, moved, factor):
-    x_in_b = np.random.default_rng(2).normal(size=(9, 3))
-    x_in_a = apply_similarity(a_from_b, factor, x_in_b)
-    found, scale = fit_similarity(x_in_a, x_in_b)
-    assert np.allclose(found, a_from_b, atol=1e-9) and scale == pytest.approx(factor, rel=1e-9)
-    there, same = fit_similarity(apply(moved, x_in_a), x_in_b)
-    assert np.allclose(there, moved @ a_from_b, atol=1e-9) and same == pytest.approx(factor, rel=1e-9)
-
-
 def test_points_without_weight_have_no_extent_and_no_infinity():
     found, scale = fit_similarity(np.ones((4, 3)), np.ones((4, 3)), np.zeros(4))
     assert scale == 1.0 and np.isfinite(found).all()

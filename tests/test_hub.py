@@ -183,15 +183,6 @@ def test_a_non_commercial_licence_is_accepted_first_and_once(hub: Hub, tmp_path:
     assert get(hub, tmp_path, "mast3r").returncode == 0
 
 
-def test_no_hub_and_no_such_model_are_a_line(hub: Hub, tmp_path: Path) -> None:
-    hub.url = "http://127.0.0.1:9"
-    done = get(hub, tmp_path, "da3-small")
-    assert done.returncode == 2 and "not downloaded (" in done.stderr and "HF_ENDPOINT" in done.stderr
-    unknown = get(hub, tmp_path, "colmap")
-    assert unknown.returncode == 2 and "colmap has none to get" in unknown.stderr
-    assert all(row.commercial or "non-commercial" in row.licence for row in BACKENDS.values())
-
-
 def test_a_run_without_weights_names_the_command_and_asks_no_network(monkeypatch: pytest.MonkeyPatch) -> None:
     import huggingface_hub
 

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -16,13 +15,11 @@ from jcr import run_folder
 from jcr.calibration.options import CalibrateOptions
 from jcr.cli import dispatch
 from jcr.errors import InputError
-from jcr.pages import page
 from jcr.reconstruct import (
     BACKENDS,
     Backend,
     ReconstructOptions,
     candidates,
-    for_backend,
     with_cameras_of,
 )
 from jcr.records import Capture
@@ -168,12 +165,6 @@ def test_a_back_end_without_its_input_shows_which_option_names_it(name: str, fla
         backends.reconstruct(capture, ReconstructOptions(backend=name))
 
 
-def test_a_second_back_end_is_spared_what_was_meant_for_the_first() -> None:
-    options = ReconstructOptions(weights="folder", pair_graph="window", seed=3)
-    assert for_backend(options, "dust3r") == replace(options, backend="dust3r")
-    assert for_backend(options, "colmap") == ReconstructOptions(backend="colmap", seed=3)
-
-
 def test_the_captures_own_cameras_are_taken_where_nothing_else_is_asked_for(tmp_path: Path) -> None:
     capture = Capture(
         folder=tmp_path,
@@ -215,14 +206,6 @@ def test_a_changed_file_of_predictions_is_another_input(tmp_path: Path) -> None:
         assert run_folder.fingerprint(capture, options) != before
 
 
-def test_the_help_names_what_each_option_selects() -> None:
-    helped = Path(backends.__file__).read_text().split("class ReconstructOptions")[1].split("def as_json")[0]
-    for row in BACKENDS.values():
-        if row.selected_by and not row.hub_id:
-            said = helped.split(f"    {row.selected_by}: ")[1].split('"""')[1]
-            assert f"selects the back end {row.name}" in said
-
-
 def test_models_are_listed_with_licence_scale_and_what_is_present(capsys: pytest.CaptureFixture[str]) -> None:
     assert dispatch(["models", "--json"]) == 0
     rows = {(row["backend"], row["weights"]): row for row in json.loads(capsys.readouterr().out)["models"]}
@@ -230,12 +213,3 @@ def test_models_are_listed_with_licence_scale_and_what_is_present(capsys: pytest
     assert "non-commercial" in rows["mast3r", BACKENDS["mast3r"].hub_id]["licence"]
     assert rows["da3", BACKENDS["da3"].hub_id]["licence"] == "Apache-2.0"
     assert {row.name for row in BACKENDS.values()} == {name for name, _ in rows}
-
-
-def test_the_numbers_of_the_table_are_measured() -> None:
-    for row in BACKENDS.values():
-        if row.accuracy:
-            numbers, where = re.fullmatch(r"(.*) \(jcr docs (.*)\)", row.accuracy).groups()
-            text = page(where)
-            for number in re.findall(r"\d+\.\d+(?= mm|°)", numbers):
-                assert number in text, (row.name, number)

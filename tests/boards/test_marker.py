@@ -17,7 +17,7 @@ from jcr.camera import unproject
 from jcr.capture.read import read_capture
 from jcr.cli import dispatch
 from jcr.depth.densify import densify
-from jcr.errors import InputError, RejectedError
+from jcr.errors import InputError
 from jcr.findings import FindingKind
 from jcr.geometry import rotation_between_deg
 from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
@@ -234,12 +234,6 @@ def test_the_metre_of_a_board_is_kept_on_disk_and_its_pointmaps_are_in_metres(tm
 def test_a_board_that_is_none_is_refused_with_the_remedy(spec, message):
     with pytest.raises(InputError, match=message):
         boards(spec)
-
-
-def test_images_without_the_board_are_reported(tmp_path):
-    capture, _ = capture_of(tmp_path / "capture", charuco, count=3)
-    with pytest.raises(RejectedError, match="0 of 3 images show chessboard:8x5:0.025"):
-        reconstruct_marker(capture, "chessboard:8x5:0.025")
 
 
 DATA = SHARED / "data"

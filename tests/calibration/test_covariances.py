@@ -56,10 +56,3 @@ def test_parts_that_are_not_the_whole_decide_nothing(tmp_path: Path, capsys: pyt
     found = json.loads(capsys.readouterr().out)
     assert found["chi2"] > 0 and found["explained_by"]["reference"] == pytest.approx(0.5, abs=0.01)
     assert sum(found["explained_by"].values()) == pytest.approx(1.0)
-
-
-def test_references_that_are_both_exact_have_a_difference_and_no_verdict(tmp_path: Path, capsys):
-    exact = {"gripper_from_camera": np.eye(4).tolist(), "std_mm": [0, 0, 0], "std_deg": [0, 0, 0]}
-    (tmp_path / "reference.json").write_text(json.dumps(exact))
-    assert dispatch(["compare", str(tmp_path), str(tmp_path)]) == 0
-    assert capsys.readouterr().out == "0.000 mm, 0.0000°\n"

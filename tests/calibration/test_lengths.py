@@ -7,7 +7,7 @@ import pytest
 
 from jcr.calibration import fit
 from jcr.calibration.checks import lengths
-from jcr.calibration.checks.lengths import Length, contradiction, finding_of
+from jcr.calibration.checks.lengths import Length, finding_of
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.findings import Finding, FindingKind, sentence
@@ -90,19 +90,6 @@ def test_the_side_of_a_board_of_unknown_size_is_stated_by_the_robot():
     assert hand_eye.converged and hand_eye.scale_evidence.lengths == ()
 
 
-def test_a_board_that_neither_agrees_with_the_robot_nor_surely_contradicts_it_is_not_weighed():
-    """Weighed, it bends the transform; what it differs by may be the robot's and is counted."""
-    hand_eye, x = calibrated(Sheet(), pose_scale=1.006)
-    alone, _ = calibrated(Sheet(stated_m=None), pose_scale=1.006)
-    (board,) = hand_eye.scale_evidence.lengths
-    assert not board.used and 0.4 < board.robot_longer_percent < 1.0
-    assert not any(one.kind is FindingKind.BOARD_SIZE for one in hand_eye.findings)
-    assert np.allclose(hand_eye.gripper_from_camera, alone.gripper_from_camera, rtol=0, atol=1e-9)
-    assert hand_eye.covariance[6, 6] > 2 * alone.covariance[6, 6]
-    error = np.r_[step_between(hand_eye.gripper_from_camera, x), -np.log(hand_eye.scale)]
-    assert (np.abs(error) < 3 * np.sqrt(np.diag(hand_eye.covariance))).all()
-
-
 def test_a_known_length_that_contradicts_the_robot_rejects_unless_a_board_agrees_with_the_robot(
     monkeypatch: pytest.MonkeyPatch,
 ):
@@ -124,16 +111,6 @@ def test_a_known_length_that_contradicts_the_robot_rejects_unless_a_board_agrees
     assert [one.name for one in both.scale_evidence.lengths] == ["board", "known length"]
 
 
-def test_a_known_length_that_agrees_is_compared_beside_features(monkeypatch: pytest.MonkeyPatch):
-    options = CalibrateOptions(known_length=("00.png", 1.0, 2.0, 300.0, 200.0, 100.0))
-    of_pixels(monkeypatch, 1.005)
-    hand_eye, _ = calibrated(None, options=options)
-    (known,) = hand_eye.scale_evidence.lengths
-    assert known.name == "known length" and known.robot_longer_percent == pytest.approx(-0.5, abs=0.5)
-    assert hand_eye.converged and not hand_eye.warnings
-    assert not any(one.kind is FindingKind.SCALE_FROM_ROBOT for one in hand_eye.findings)
-
-
 def test_a_depth_camera_that_contradicts_robot_and_board_is_named_with_the_percent(
     monkeypatch: pytest.MonkeyPatch,
 ):
@@ -151,14 +128,6 @@ def test_a_depth_camera_that_contradicts_robot_and_board_is_named_with_the_perce
     named = of_kind(hand_eye, FindingKind.SCALES)
     assert named.details["other"] == "depth camera" and named.severity == "warns" and hand_eye.converged
     assert "the depth camera contradict each other by 8.3 ± 2.0 %" in sentence(named)
-
-
-def test_of_several_lengths_the_two_that_contradict_each_other_most_surely_are_named():
-    robot, board = Length("robot", 0.0, 0.001), Length("board", 0.001, 0.002)
-    depth, network = Length("depth camera", -0.15, 0.02), Length("network", 0.1, 0.05)
-    assert contradiction([robot, board]) is None
-    assert contradiction([robot, board, network]) is None
-    assert contradiction([robot, board, depth, network]) == (board, depth)
 
 
 def test_the_one_of_three_lengths_that_is_wrong_is_named_and_a_robot_that_is_right_is_not_rejected():

@@ -5,19 +5,13 @@ import re
 import shutil
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
 
 from capture_writers import write_easy_handeye2
-from jcr.cli import COMMANDS, dispatch
-from jcr.cli.output import Output
-from jcr.cli.query import labelled
-from jcr.export.formats import FORMATS
-from jcr.export.options import FormatName
+from jcr.cli import dispatch
 from jcr.geometry import scale_translation
 from places import ROOT
 from simulation.problems import hand_eye_problem
@@ -40,15 +34,6 @@ def commands(done: Path, tabletop: Path, tmp_path_factory: pytest.TempPathFactor
         "models": ["models"],
     }
     return {name: list(map(str, line)) for name, line in lines.items()}
-
-
-def _arguments(name: str) -> type:
-    return import_module(f"jcr.cli.{name.replace('-', '_')}").Arguments
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_takes_json_and_quiet(name: str):
-    assert isinstance(_arguments(name).__dataclass_fields__["output"].default_factory(), Output)
 
 
 def test_json_is_one_object_and_quiet_is_silence(
@@ -80,20 +65,10 @@ def test_what_decides_is_named_quiet_or_not(tmp_path: Path, capsys: pytest.Captu
     assert printed.err.startswith("warning: the calibration is rejected") and printed.err.count("\n") == 1
 
 
-def test_a_query_shows_on_what_its_points_lie():
-    said = labelled(np.array([0, 2, 2, 1, 2, 0]), ("none", "table", "object 1", "object 2"))
-    assert said == "; by label: table 1, object 1 3"
-    assert labelled(np.zeros(3, int), ("none",)) == ""
-
-
 def test_errors_are_named_quiet_or_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert dispatch(["measure", str(tmp_path), "--quiet", "--json"]) == 2
     printed = capsys.readouterr()
     assert printed.out == "" and printed.err.startswith("error: ") and printed.err.count("\n") == 1
-
-
-def test_every_export_format_is_in_the_table():
-    assert tuple(row.name for row in FORMATS) == get_args(FormatName)
 
 
 TYPED = {
@@ -120,10 +95,6 @@ def test_bash_completes(tmp_path: Path):
         )
         printed = subprocess.run(["bash", "-c", asked], capture_output=True, text=True, timeout=30)
         assert set(printed.stdout.split()) == offered, (line, printed.stderr)
-
-
-def test_there_is_no_script_for_other_shells(capsys: pytest.CaptureFixture[str]):
-    assert dispatch(["--tyro-write-completion", "powershell", "FILE"]) == 2
 
 
 @pytest.mark.slow

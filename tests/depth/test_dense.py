@@ -1,8 +1,5 @@
 """Dense depth on a scene whose depth is known: a box on a table, drawn by casting rays."""
 
-import os
-import subprocess
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -209,33 +206,6 @@ def test_windows_lie_on_slopes() -> None:
     assert (np.abs(inverse_depth * np.stack(depths) - 1)[middle] < 0.005).mean() > 0.95
 
 
-MATCH_NOISE = """
-import hashlib
-import numpy as np
-from scipy.ndimage import gaussian_filter
-from jcr.depth.matched import match_depth
-from jcr.records import Intrinsics
-texture = gaussian_filter(np.random.default_rng(0).uniform(0, 255, (60, 120, 3)), (1.5, 1.5, 0))
-images = np.stack([texture[:, 10 * k : 10 * k + 80] for k in range(3)]).astype(np.uint8)
-poses = np.tile(np.eye(4), (3, 1, 1))
-poses[:, 0, 3] = 0.1 * np.arange(3)
-planes = np.tile([[[0, 0, 0.3], [0, 0, 1.2]]], (3, 1, 1))
-neighbours = [np.array([1, 2]), np.array([0, 2]), np.array([1, 0])]
-depth = match_depth(images, poses, Intrinsics(75.0, 75.0, 39.5, 29.5, 80, 60), neighbours, planes, 1, lambda _: None)
-print(hashlib.sha256(np.stack(depth).tobytes()).hexdigest())
-"""
-
-
-def test_loops_give_the_same_bits_freshly_compiled_and_from_the_cache(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", MATCH_NOISE]
-    at = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    compiled, cached = (
-        subprocess.run(command, env=at, capture_output=True, text=True, check=True) for _ in "12"
-    )
-    assert any(tmp_path.rglob("*.nbc"))
-    assert compiled.stdout == cached.stdout
-
-
 def test_only_a_confirmed_depth_sees_through_a_point() -> None:
     """A wall at 1 m before four cameras side by side; the last one found 2 m, by chance or because it is so."""
     from jcr.depth.consistency import agreement, evidence
@@ -348,17 +318,6 @@ def test_the_stage_estimates_depth_whatever_the_order_of_the_frames(
     for name in ("points_in_recon", "confidence", "reason", "depth_std"):
         np.testing.assert_array_equal(getattr(made.dense, name)[by_name], getattr(dense, name))
     assert densify(capture, made) is made
-
-
-def test_planes_take_the_slope_of_the_table(scene: Scene) -> None:
-    planes = sweep_planes(scene.tracks, scene.recon_from_camera)
-    camera_from_recon = inverse(scene.recon_from_camera)
-    normal = camera_from_recon[:, :3, 2]  # the table's, in the camera
-    table = normal / (normal * camera_from_recon[:, :3, 3]).sum(-1, keepdims=True)
-    # A sixth of the points lie on the box and must not tilt the planes.
-    np.testing.assert_allclose(planes[:, 0, :2], table[:, :2], atol=0.02)
-    assert (planes[:, 0, 2] < table[:, 2]).all() and (table[:, 2] < planes[:, -1, 2]).all()
-    np.testing.assert_allclose(np.diff(planes, 2, axis=1), 0, atol=1e-12)
 
 
 def test_neighbours_share_points_under_a_useful_angle() -> None:

@@ -6,7 +6,6 @@ from scipy.stats import chi2
 
 import jcr
 from jcr.camera import parameters, with_parameters
-from jcr.estimation import solve
 from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.intrinsics_prior import ESTIMATED, MEASURED, camera_with_prior
 from jcr.estimation.solve import Solution
@@ -118,28 +117,6 @@ def test_intrinsics_go_as_far_from_what_was_given_as_their_standard_deviation_le
     ]
     assert sigmas[1] < 3 < sigmas[0]
     assert usual.budget.intrinsics[2, 2] > 0 and not exact.budget.intrinsics.any()
-
-
-def counted(monkeypatch) -> list[int]:
-    """One more entry for each time that images are linearised."""
-    calls, linearised = [], solve.linearised
-    monkeypatch.setattr(solve, "linearised", lambda *given: (calls.append(1), linearised(*given))[1])
-    return calls
-
-
-def test_an_adjustment_goes_on_until_it_stays(monkeypatch):
-    rng = np.random.default_rng(6)
-    problem = hand_eye_problem(rng, 10, robot_noise=(3e-4, np.radians(0.05)))
-    tracks = observed(problem, rng, 300, 0.4)
-    # Errors of matches have long tails, and their size and the weights then depend on each other for long.
-    tracks.x_px[:] += rng.standard_t(2, size=tracks.x_px.shape)
-    found = solved(problem, tracks, camera_with_prior(INTRINSICS, MEASURED))
-    monkeypatch.setattr(solve, "STEP_SETTLED", 1e-5)
-    monkeypatch.setattr(solve, "SIZES_SETTLED", 1e-5)
-    monkeypatch.setattr(solve, "ROUNDS", 200)
-    settled = solved(problem, tracks, camera_with_prior(INTRINSICS, MEASURED))
-    off = step_between(found.state.x[0], settled.state.x[0])
-    assert (np.abs(off) < 0.05 * np.sqrt(np.diag(settled.covariance)[:6])).all()
 
 
 def test_an_adjustment_that_begins_near_ends_where_one_from_poses_does(monkeypatch):

@@ -505,13 +505,6 @@ def test_a_folder_where_a_result_belongs_is_named(tmp_path: Path, sound: Path, c
     assert not list((tmp_path / "out").rglob("*.part*"))
 
 
-def test_the_evil_file_would_be_written_where_it_is_looked_for(tmp_path: Path):
-    pickled_weights(tmp_path / "weights.pth")
-    with (tmp_path / "weights.pth").open("rb") as stream:
-        pickle.load(stream)
-    assert executed(tmp_path / "capture").exists()
-
-
 def test_a_failed_run_leaves_no_map_of_an_earlier_one(tmp_path: Path, sound: Path, done: Path, capsys):
     out = tmp_path / "out"
     shutil.copytree(done, out)
@@ -521,17 +514,6 @@ def test_a_failed_run_leaves_no_map_of_an_earlier_one(tmp_path: Path, sound: Pat
     capsys.readouterr()
     assert dispatch(["map", str(out), "--quiet"]) == 2
     assert "holds no run" in capsys.readouterr().err
-
-
-def test_another_calibration_takes_the_map_of_the_earlier_one_along(
-    tmp_path: Path, done: Path, tabletop: Path
-):
-    out = tmp_path / "out"
-    shutil.copytree(done, out)
-    files = {path.name for path in out.iterdir()}
-    assert dispatch(["calibrate", str(tabletop), str(out), "--quiet", "--robot-noise", "3", "0.5"]) in (0, 3)
-    assert files - {path.name for path in out.iterdir()} == {"cloud.ply", "map.safetensors"}
-    assert "map.safetensors" not in (out / "report.html").read_text()
 
 
 def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(

@@ -58,8 +58,3 @@ def test_a_keypoint_found_twice_is_no_rival_of_itself(away_px: float, is_rival: 
     descriptors[0][3] = _unit(one + 0.1 * other)
     descriptors[1] = np.vstack([descriptors[1], _unit(one - 0.01 * other)])
     assert ((3, 3) in _found(x_px, descriptors)) is not is_rival
-
-
-def test_an_image_without_keypoints_matches_nothing() -> None:
-    x_px, descriptors = _two_images(np.random.default_rng(2))
-    assert _found([x_px[0], x_px[1][:0]], [descriptors[0], descriptors[1][:0]]) == set()

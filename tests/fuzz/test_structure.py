@@ -30,13 +30,6 @@ def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Document]:
     return documents(tmp_path_factory.mktemp("structure"))
 
 
-def test_every_document_is_read_as_it_is(readers: dict[str, Document]):
-    for document in readers.values():
-        document.write(document.content)
-        document.read()
-        document.write(document.content)
-
-
 def test_no_value_of_another_kind_makes_a_traceback_or_takes_long(readers: dict[str, Document]):
     cases = [
         (name, place, value)

@@ -16,8 +16,6 @@ from jcr.cli.measure import table as sizes_table
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import (
-    MATCHED,
-    PRIOR,
     Capture,
     Estimate,
     HandEye,
@@ -33,7 +31,7 @@ from jcr.records import (
 )
 from jcr.segments.labels import read_labels
 from jcr.segments.measure import measure
-from jcr.segments.options import SegmentOptions, TabletopOptions
+from jcr.segments.options import SegmentOptions
 from jcr.segments.segments import image_labels, label_cloud
 from jcr.segments.tabletop import label_tabletop, support_plane
 
@@ -157,24 +155,11 @@ def test_objects_that_touch_are_one_and_those_with_space_between_are_two(rng: np
     assert sorted(round(size[2], 2) for size in apart) == [0.05, 0.08]
 
 
-def test_a_lid_in_the_air_above_a_cup_belongs_to_it(rng: np.random.Generator):
-    lid = ring(rng, 0.0, 0.035, 0.13, foot=0.13)
-    (size,) = sizes_of(cloud_of(rng, table(rng), ring(rng, 0.03, 0.04, 0.09), lid))
-    assert size[2] == pytest.approx(0.13, abs=5e-4)
-
-
 def test_points_that_stray_above_a_narrow_top_do_not_lift_it(rng: np.random.Generator):
     tape = ring(rng, 0.038, 0.05, 0.048)
     stray = tape[tape[:, 2] > 0.0479][:200] + rng.uniform(0, [[0, 0, 0.01]], (200, 3))
     (size,) = sizes_of(cloud_of(rng, table(rng), tape, stray))
     assert size[2] == pytest.approx(0.048, abs=3e-4)
-
-
-def test_a_fringe_beside_the_outline_hardly_widens_the_box(rng: np.random.Generator):
-    thing = box(rng, (0.1, 0.08, 0.06))
-    fringe = rng.uniform((0.05, -0.04, 0.055), (0.06, 0.04, 0.06), (60, 3))
-    (size,) = sizes_of(cloud_of(rng, table(rng), thing, fringe))
-    np.testing.assert_allclose(size, [0.1, 0.08, 0.06], atol=0.006)
 
 
 def test_a_board_on_the_table_does_not_lift_the_plane(rng: np.random.Generator):
@@ -229,17 +214,6 @@ def test_labels_that_came_with_the_images_are_kept_and_measured(rng: np.random.G
     ]
 
 
-def test_what_planes_filled_shows_nothing_of_the_supports_noise(rng: np.random.Generator):
-    cloud = cloud_of(rng, table(rng), noise=3e-4)
-    filled = rng.uniform(size=len(cloud.image)) < 0.6
-    x = cloud.points_in_base.copy()
-    x[filled, 2] = 0.0
-    reason = np.where(filled, PRIOR, MATCHED).astype(np.uint8)
-    found = support_plane(replace(cloud, points_in_base=x, reason=reason))
-    assert 2.5e-4 < found.noise < 3.5e-4
-    assert found.on_plane[filled].all() and found.on_plane[~filled].mean() > 0.98
-
-
 @pytest.mark.slow
 def test_the_stated_sigma_of_a_height_covers_its_error(rng: np.random.Generator):
     """Depth errs together within an image: plane and top are off by 2 mm each, again in every image."""
@@ -274,18 +248,6 @@ def test_a_top_that_one_image_alone_shows_is_no_more_than_a_lower_bound(rng: np.
     assert not hidden[True].top_seen and hidden[False].top_seen
     measured = measure(label_tabletop(replace(cloud, image=np.where(top, 0, np.maximum(cloud.image, 1)))))
     assert sizes_table(measured).count("≥") == 1
-
-
-def test_options_show_what_counts_as_an_object(rng: np.random.Generator):
-    things = table(rng), box(rng, (0.05, 0.05, 0.03), (-0.1, 0)), box(rng, (0.05, 0.05, 0.2), (0.1, 0))
-    cloud = cloud_of(rng, *things)
-
-    def found(options: TabletopOptions) -> int:
-        return len(label_tabletop(cloud, options).label_names) - 2
-
-    assert found(TabletopOptions()) == 2
-    assert found(TabletopOptions(object_lowest=0.04)) == 1
-    assert found(TabletopOptions(object_smallest=0.1)) == 1
 
 
 INTRINSICS = Intrinsics(90.0, 90.0, 39.5, 29.5, 80, 60, (-0.1, 0.0, 0.0, 0.0, 0.0))

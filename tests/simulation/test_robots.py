@@ -7,29 +7,20 @@ import numpy as np
 import pytest
 
 import jcr
-from jcr.errors import InputError
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
-from jcr.estimation.kinematics import error_std, forward_kinematics
+from jcr.estimation.kinematics import forward_kinematics
 from jcr.estimation.known_scale import fit_known_scale
-from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, rotation_log, transform
-from jcr.records import Intrinsics
+from jcr.geometry import apply, inverse, rotation_angle, rotation_log
 from simulation.arms import (
     PRESETS,
-    ArmErrors,
     BentArm,
-    ErrorSizes,
-    about_posture,
-    bend,
-    effective_about,
     error_names,
     hand_eye_on,
-    patterned,
     table_center,
     views,
 )
 from simulation.capture import SimulateOptions, simulate
 from simulation.problems import bent_problem
-from simulation.taken import with_intrinsics_error
 from simulation.truth import read_truth, true_depth, true_labels
 
 
@@ -57,26 +48,6 @@ def test_every_arm_sees_its_table_from_varied_sides(name):
     # Relative rotations about all axes: what a hand-eye calibration lives on.
     rotations = rotation_log(cameras[:1, :3, :3].swapaxes(1, 2) @ cameras[1:, :3, :3])
     assert np.linalg.svd(rotations, compute_uv=False)[2] / np.sqrt(len(rotations)) > np.radians(5)
-
-
-@pytest.mark.parametrize("name", ROBOT_NAMES)
-def test_every_arm_moves_about_a_posture(name):
-    arm = arm_named(name)
-    joints = about_posture(arm, arm.rest, 5, np.random.default_rng(0))
-    assert joints.shape == (5, arm.dof) and 0.0 < np.abs(joints - arm.rest).max() < 0.85
-
-
-def test_effective_hand_eye_of_errors_that_only_move_gripper_or_base():
-    arm, rng = arm_named("ur5e"), np.random.default_rng(0)
-    physical = hand_eye_on(arm, rng)
-    about_z = transform(rotation_exp(np.array([0.0, 0.0, 0.01])), np.zeros(3))
-    # The last joint rotates the flange about its z: to the user the camera sits rotated. The first rotates the base.
-    last = effective_about(only(arm, "joint 6", 0.01), physical, 12, rng).gripper_from_camera
-    np.testing.assert_allclose(last, about_z @ physical, atol=1e-9)
-    first = effective_about(only(arm, "joint 1", 0.01), physical, 12, rng).gripper_from_camera
-    np.testing.assert_allclose(first, physical, atol=1e-9)
-    elbow = effective_about(only(arm, "joint 3", 0.01), physical, 12, rng).gripper_from_camera
-    assert rotation_angle(elbow[:3, :3] @ physical[:3, :3].T) > 1e-3
 
 
 @pytest.mark.slow
@@ -119,47 +90,6 @@ def test_a_problem_reports_nominal_poses_of_a_bent_arm():
     np.testing.assert_allclose(seen[:, :3, :3], motion[:, :3, :3], atol=1e-12)
 
 
-def test_without_systematic_errors_the_effective_transform_is_the_physical_one():
-    problem = bent_problem(arm_named("xarm7"), "white", 30, 0)
-    assert not problem.bent.errors.any()
-    np.testing.assert_allclose(problem.gripper_from_camera, problem.physical_gripper_from_camera, atol=1e-9)
-    off = inverse(problem.true_base_from_gripper) @ problem.base_from_gripper
-    std = np.sqrt((off[:, :3, 3] ** 2).mean()), np.sqrt((rotation_log(off[:, :3, :3]) ** 2).mean())
-    # The sigma of 90 numbers is known to 8 %.
-    np.testing.assert_allclose(std, PRESETS["white"].white, rtol=0.3)
-
-
-def test_errors_have_the_sizes_asked_for():
-    arm, rng = arm_named("ur5e"), np.random.default_rng(0)
-    sizes = ErrorSizes(joint_offset=1e-3, link=3e-4, sag=2e-3, gear=5e-4)
-    draws = np.stack([bend(arm, sizes, rng).errors for _ in range(1000)])
-    std = np.r_[error_std(arm, 1e-3, 3e-4), np.repeat([2e-3, 5e-4], [6, 12])]
-    np.testing.assert_allclose(draws.std(0), std, rtol=0.12)
-    named = bend(arm, ErrorSizes(joint_offset=1e-3), rng).named_errors()
-    assert list(named) == [f"joint {k}" for k in range(1, 7)]
-    assert bent_problem(arm, ArmErrors(), 3, 0, (0.0, 0.0)).bent.named_errors() == {}
-
-
-def test_a_pattern_out_of_reach_is_refused():
-    arm, rng = arm_named("so101"), np.random.default_rng(0)
-    with pytest.raises(InputError, match="--pattern orbit: a so101 does not reach all of its views"):
-        patterned(arm, "orbit", 6, table_center(arm), hand_eye_on(arm, rng), rng)
-    large = arm_named("ur10e")
-    physical = hand_eye_on(large, rng)
-    joints = patterned(large, "orbit", 6, np.array([0.6, 0.0, 0.0]), physical, rng)
-    centres = (forward_kinematics(large, joints) @ physical)[:, :3, 3]
-    np.testing.assert_allclose(np.linalg.norm(centres - [0.6, 0, 0], axis=1), 0.5, atol=1e-5)
-
-
-def test_given_intrinsics_are_drawn_around_the_true_ones():
-    camera, rng = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480), np.random.default_rng(0)
-    drawn = [with_intrinsics_error(camera, 0.5, rng) for _ in range(2000)]
-    numbers = np.array([[one.fx, one.fy, one.cx, one.cy] for one in drawn])
-    np.testing.assert_array_equal(numbers[:, 0], numbers[:, 1])
-    np.testing.assert_allclose(numbers[:, [0, 2, 3]].std(0), [3.0, 3.2, 3.2], rtol=0.07)
-    assert with_intrinsics_error(camera, 0.0, rng) == camera
-
-
 @pytest.mark.gl
 @pytest.mark.usefixtures("opengl")
 def test_a_capture_of_a_bent_arm(tmp_path):
@@ -198,15 +128,3 @@ def test_a_capture_of_a_bent_arm(tmp_path):
     assert 1e-5 < np.abs(effective - physical).max() < 0.05
     assert capture.intrinsics is not None and capture.intrinsics.fx != camera.fx
     assert abs(capture.intrinsics.fx / camera.fx - 1) < 0.02 and capture.intrinsics.cx != camera.cx
-
-
-def test_options_of_a_robot_that_mean_nothing_are_refused(tmp_path):
-    for options, message in (
-        (SimulateOptions(joint_offsets=0.1), "--joint-offsets 0.1: errors of an arm; name it with --robot"),
-        (SimulateOptions(robot="ur5e", link_errors=-1.0), "give 0 or more"),
-        (SimulateOptions(intrinsics_error=-1.0), "give 0 or more"),
-        (SimulateOptions(intrinsics_error=0.5, unknown_intrinsics=True), "exclude each other"),
-    ):
-        with pytest.raises(InputError, match=message):
-            simulate(tmp_path / "out", options)
-    assert not (tmp_path / "out").exists()

@@ -11,16 +11,14 @@ import numpy as np
 import pytest
 
 from jcr.errors import InputError
-from jcr.geometry import apply, inverse, rotation_exp, rotation_log, skew, transform
+from jcr.geometry import apply, inverse
 from jcr.records import Intrinsics
 from places import ROOT
 from simulation.capture import SimulateOptions, simulate
-from simulation.objects import CATALOGUE
 from simulation.poses import gripper_poses, random_hand_eye
 from simulation.render import render
 from simulation.scenes import RECIPES, make_scene
-from simulation.surface import solid_labels, truth_points, winding_number
-from simulation.taken import with_robot_noise
+from simulation.surface import truth_points
 from simulation.truth import read_truth, true_depth, true_labels
 
 CAMERA = Intrinsics(610.0, 610.0, 319.5, 239.5, 640, 480)
@@ -52,62 +50,7 @@ def test_objects_stand_on_the_table_and_apart(name):
             assert all(cv2.intersectConvexConvex(first, second)[0] == 0 for second in boxes[:k])
 
 
-@pytest.mark.parametrize("make", CATALOGUE.values(), ids=CATALOGUE)
-def test_surfaces_close_and_face_outwards(make):
-    parts = make(np.random.default_rng(0))
-    corners = np.concatenate([part.mesh.vertices for part in parts])
-    x = np.random.default_rng(1).uniform(corners.min(0) - 0.01, corners.max(0) + 0.01, (1000, 3))
-    rotations = sum(winding_number(part.mesh, x) for part in parts)
-    # The open ends of a mug's handle and an apple's stalk leak a little, and little else than beside them.
-    assert (np.abs(rotations - rotations.round()) > 0.05).mean() < 0.02
-    assert rotations.round().min() == 0 and rotations.round().max() >= 1
-
-
-def test_solids_are_where_the_boxes_are():
-    scene = make_scene("tabletop", 0)
-    x_in_box = np.random.default_rng(0).uniform(-0.6, 0.6, (2000, 3))
-    carton = scene.true_objects[scene.labels.index("carton") - 2]
-    within = (np.abs(x_in_box) < 0.5).all(1)
-    found = solid_labels(scene, apply(carton.base_from_box, x_in_box * carton.box_size))
-    np.testing.assert_array_equal(found == carton.label, within)
-    below = x_in_box * [0.5, 0.5, 0.02] + scene.table_center_in_base - [0, 0, 0.02]
-    np.testing.assert_array_equal(solid_labels(scene, below), 1)
-
-
 # Dimension of what (translation, rotation, log scale) the poses leave free, scale unknown.
-@pytest.mark.parametrize(
-    ("pattern", "free"),
-    [
-        ("varied", 0),
-        ("orbit", 1),
-        ("translation", 3),
-        ("one-axis", 3),
-        ("planar", 1),
-        ("pivot", 1),
-        ("camera-centre", 1),
-        ("two", 2),
-    ],
-)
-def test_each_pattern_hides_what_it_is_named_for(pattern, free):
-    for seed in range(3):
-        rng = np.random.default_rng(seed)
-        gripper_from_camera = random_hand_eye(rng)
-        table_in_base = np.array([0.5, 0.0, 0.02])
-        base_from_gripper = gripper_poses(pattern, 12, table_in_base, gripper_from_camera, rng)
-        rotation, offset = gripper_from_camera[:3, :3], gripper_from_camera[:3, 3]
-        rows = []
-        # A X = X B: the derivatives of log R_A - R log R_B and of (I - R_A) t - t_A + λ R t_B.
-        for i, j in zip(*np.triu_indices(len(base_from_gripper), 1), strict=True):
-            a = inverse(base_from_gripper[i]) @ base_from_gripper[j]
-            b = inverse(gripper_from_camera) @ a @ gripper_from_camera
-            moved = rotation @ b[:3, 3]
-            rows.append(np.c_[np.zeros((3, 3)), skew(rotation @ rotation_log(b[:3, :3])), np.zeros(3)])
-            rows.append(np.c_[np.eye(3) - a[:3, :3], -skew(moved), moved])
-        values = np.linalg.svd(np.concatenate(rows), compute_uv=False)
-        assert 7 - (values > 1e-9 * values[0]).sum() == free
-        assert 0.03 <= np.linalg.norm(offset) <= 0.12
-
-
 @pytest.mark.gl
 @pytest.mark.usefixtures("opengl")
 def test_depth_and_labels_are_those_of_the_pixel_centers():
@@ -205,74 +148,6 @@ def test_the_bundled_example_is_what_its_command_makes(simulated, tabletop):
         bundled, made = (cv2.imread(str(folder / image)).astype(int) for folder in (tabletop, simulated))
         # Another OpenGL may round and filter a little differently.
         assert np.abs(bundled - made).mean() < 2
-
-
-@pytest.mark.gl
-def test_same_seed_same_bytes_and_fewer_images_are_the_first_ones(simulated, tmp_path):
-    fewer = simulate(tmp_path / "fewer", SimulateOptions(seed=1, images=4))
-    files = [path.relative_to(fewer) for path in fewer.rglob("*.*g")]
-    assert len(files) == 3 * 4
-    for name in files:
-        assert (fewer / name).read_bytes() == (simulated / name).read_bytes(), name
-    frames, first = (
-        json.loads((folder / "capture.json").read_text())["frames"] for folder in (simulated, fewer)
-    )
-    assert frames[:4] == first
-    assert make_scene("tabletop", 2).true_objects[0].height != read_truth(fewer).objects[0].height
-
-
-@pytest.mark.gl
-def test_robot_noise_is_in_the_report_and_not_in_the_images(simulated, tmp_path):
-    options = SimulateOptions(
-        seed=1, images=2, robot_noise=(2.0, 0.5), unknown_intrinsics=True, truth="scene"
-    )
-    noisy = simulate(tmp_path / "noisy", options)
-    truth, capture = read_truth(noisy), json.loads((noisy / "capture.json").read_text())
-    for image in truth.images:
-        assert (noisy / image).read_bytes() == (simulated / image).read_bytes()
-    np.testing.assert_array_equal(truth.base_from_gripper, read_truth(simulated).base_from_gripper[:2])
-    assert capture["intrinsics"] is None
-    reported = np.array([frame["base_from_gripper"] for frame in capture["frames"]])
-    assert (np.abs(reported[:, :3, 3] - truth.base_from_gripper[:, :3, 3]).max(1) > 1e-4).all()
-
-
-def test_robot_noise_has_the_sigma_asked_for_in_every_axis():
-    true = transform(rotation_exp(np.random.default_rng(0).normal(size=(4000, 3))), np.array([0.4, 0.1, 0.3]))
-    reported = with_robot_noise(true, 2.0, 0.5, np.random.default_rng(1))
-    shift = reported[:, :3, 3] - true[:, :3, 3]
-    rotation = rotation_log(reported[:, :3, :3] @ true[:, :3, :3].transpose(0, 2, 1))
-    # The sigma of 4000 draws is known to 1.1 %; their mean to 1.6 % of it.
-    np.testing.assert_allclose(shift.std(0), 2e-3, rtol=0.05)
-    np.testing.assert_allclose(np.degrees(rotation).std(0), 0.5, rtol=0.05)
-    assert np.abs(shift.mean(0)).max() < 1.5e-4
-
-
-@pytest.mark.gl
-def test_texture_is_what_features_hold_to(simulated, tmp_path):
-    right = {}
-    plain = simulate(tmp_path / "plain", SimulateOptions(images=2, texture=False, seed=1))
-    for folder in (simulated, plain):
-        truth = read_truth(folder)
-        first, second = (cv2.imread(str(folder / image), cv2.IMREAD_GRAYSCALE) for image in truth.images[:2])
-        sift = cv2.SIFT.create()
-        (at, described), (at_other, other) = (
-            sift.detectAndCompute(first, None),
-            sift.detectAndCompute(second, None),
-        )
-        pairs = [
-            m for m, n in cv2.BFMatcher().knnMatch(described, other, k=2) if m.distance < 0.75 * n.distance
-        ]
-        x = np.array([at[m.queryIdx].pt for m in pairs]).reshape(-1, 2)
-        y = np.array([at_other[m.trainIdx].pt for m in pairs]).reshape(-1, 2)
-        camera = truth.intrinsics
-        column, row = x.round().astype(int).T
-        rays = np.c_[(x - [camera.cx, camera.cy]) / camera.fx, np.ones(len(x))]
-        second_from_first = inverse(truth.base_from_camera[1]) @ truth.base_from_camera[0]
-        in_second = apply(second_from_first, true_depth(truth, 0)[row, column][:, None] * rays)
-        projected = in_second[:, :2] / in_second[:, 2:] * camera.fx + [camera.cx, camera.cy]
-        right[folder] = int((np.linalg.norm(projected - y, axis=1) < 2).sum())
-    assert right[simulated] > 100
-    assert right[plain] < 10
 
 
 def test_options_that_mean_nothing_are_refused_in_one_line(tmp_path):

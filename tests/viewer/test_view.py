@@ -1,6 +1,5 @@
 """The viewer: what its controls answer on the bundled capture, and that a browser shows it."""
 
-import shutil
 import signal
 import socket
 import subprocess
@@ -154,41 +153,6 @@ def test_the_photograph_lies_where_its_camera_sees_it(viewer: "Viewer"):
     assert not photo.visible and all(frustum.visible for frustum in viewer.frusta)
 
 
-def test_colours_have_their_legend(viewer: "Viewer"):
-    viewer.by_label.value = True
-    viewer.show_points()
-    assert "table" in viewer._legend.content and "rgb(" in viewer._legend.content
-    viewer.by_label.value = False
-    viewer.show_points()
-    assert not viewer._legend.content
-    for of, words in (
-        ("distance", "20 cm and more"),
-        ("occupancy", "rgb(37, 99, 235)"),
-        ("unknown", "unseen"),
-    ):
-        viewer.slice_of.value = of
-        viewer.show_slice()
-        assert words in viewer._slice_legend.content and viewer._slice.visible
-    viewer.slice_of.value = "none"
-    viewer.show_slice()
-    assert not viewer._slice_legend.content and not viewer._slice.visible
-
-
-def test_slice_has_the_base_frames_y_upwards(viewer: "Viewer", truth: Truth):
-    from jcr.scene.samples import level_slice
-    from jcr.viewer.viewer import slice_colors
-
-    can = next(thing for thing in truth.objects if thing.name == "can")
-    scene, (x, y, z) = viewer.scene, can.base_from_box[:3, 3]
-    pixels = slice_colors(level_slice(scene, z, "occupied"), "distance")
-    low, high = scene.box[:, :2]
-    column, row = ([x, high[1]] - np.array([low[0], y])) / (high - low) * pixels.shape[1::-1]
-    assert pixels[int(row), int(column)].tolist() == [200, 30, 30, 230]
-    mirrored = pixels[::-1][int(row), int(column)]
-    assert scene.query(np.array([[x, low[1] + high[1] - y, z]]), "occupied").distance[0] > 0
-    assert mirrored.tolist() != [200, 30, 30, 230]
-
-
 def test_robot_and_chosen_camera_follow_the_image(viewer: "Viewer"):
     from jcr.viewer.viewer import CHOSEN
 
@@ -212,34 +176,6 @@ def test_a_robot_without_joint_values_or_with_too_few_joints_is_refused(
         read_robot(gantry, replace(capture, joints=np.zeros((12, 7))))
     with pytest.raises(InputError, match="no such URDF"):
         read_robot(tmp_path / "none.urdf", capture)
-
-
-def test_without_a_map_cameras_and_features_remain(done: Path, tmp_path: Path):
-    from jcr.viewer.server import open_server
-    from jcr.viewer.viewer import REJECTED, Viewer
-
-    for name in ("calibration.json", "reconstruction.npz", "run.json"):
-        shutil.copy(done / name, tmp_path / name)
-    server = open_server(0, "bare")
-    try:
-        bare = Viewer(server, RunFolder(tmp_path))
-        assert bare.scene is None and "jcr map" in bare._verdict(RunFolder(tmp_path))
-        assert bare.show_tracks.value and len(bare.tracks_in_base) > 100 and len(bare.frusta) == 12
-        assert bare.robot is None and not bare.show_robot.visible
-        assert tuple(bare.frusta[3].color) != REJECTED
-    finally:
-        server.stop()
-
-
-def test_a_port_is_taken_or_refused():
-    from jcr.viewer.server import open_server
-
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        with pytest.raises(InputError, match=f"port {port} of 127.0.0.1; .*--port"):
-            open_server(port, "")
-    with pytest.raises(InputError, match="70000"):
-        open_server(70000, "")
 
 
 def test_command_serves_this_machine_alone_until_it_is_interrupted(done: Path):

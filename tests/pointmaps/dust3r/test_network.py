@@ -163,51 +163,6 @@ def test_state_dict_has_the_published_keys_and_shapes(keys: Path) -> None:
     assert {key: str(list(tensor.shape)) for key, tensor in state.items()} == published
 
 
-def test_rotary_positions_and_activations_equal_the_published_ones() -> None:
-    import torch
-
-    from jcr.pointmaps.dust3r.network import pointmap, rotary_embedding, rotate
-
-    units = {key: torch.from_numpy(value) for key, value in np.load(FIXTURES / "units.npz").items()}
-    for x, position, out in zip(units["rope_in"], units["rope_pos"], units["rope_out"], strict=True):
-        rotated = rotate(x[None], rotary_embedding(position, x.shape[-1], 100.0))
-        torch.testing.assert_close(rotated[0], out, rtol=1e-5, atol=1e-6)
-    raw = torch.cat([units["depth_in"], units["conf_in"][..., None]], -1).permute(0, 3, 1, 2)
-    view = pointmap(raw)
-    torch.testing.assert_close(view.points, units["depth_out"], rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(view.confidence, units["conf_out"], rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.usefixtures("inference_mode")
-def test_a_batch_of_pairs_equals_its_pairs_one_by_one() -> None:
-    import torch
-
-    from jcr.pointmaps.dust3r.network import Features
-
-    truth, network = fixture("tiny_dpt_portrait_64x48_b2")
-    whole = network.encode(truth["img1"])
-    for row in range(2):
-        alone = Features(whole.tokens[row : row + 1], whole.grid)
-        swapped = Features(whole.tokens[1 - row : 2 - row], whole.grid)
-        views = network.decode(alone, swapped)
-        together = network.decode(whole, Features(whole.tokens.flip(0), whole.grid))
-        for view, batched in zip(views, together, strict=True):
-            torch.testing.assert_close(view.points[0], batched.points[row], **TOLERANCE)
-
-
-@pytest.mark.parametrize("name", ["tiny_dpt12_mixed_48x64_64x48", "tiny_linear_48x64_b1"])
-@pytest.mark.usefixtures("inference_mode")
-def test_features_made_for_many_pairs_give_the_same_pointmaps(name: str) -> None:
-    import torch
-
-    truth, network = fixture(name)
-    kept1, kept2 = (network.encode(truth[image], many_pairs=True) for image in ("img1", "img2"))
-    assert (kept1.finest[0] is None) == ("linear" in name)
-    view1, view2 = network.decode(kept1, kept2)
-    torch.testing.assert_close(view1.points, truth["pts3d"], **TOLERANCE)
-    torch.testing.assert_close(view2.points, truth["pts3d_in_other_view"], **TOLERANCE)
-
-
 @pytest.mark.usefixtures("inference_mode")
 def test_bfloat16_stays_near_float32_and_returns_float32() -> None:
     import torch

@@ -73,17 +73,6 @@ def test_each_pair_is_what_the_network_shows_of_its_two_images(
         np.testing.assert_allclose(pairs.conf2[e], view2.confidence[0], rtol=1e-4, atol=1e-5)
 
 
-def test_every_image_is_encoded_once(
-    loaded: "LoadedNetwork", images: PreparedImages, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    encoded, decoded = [], []
-    encode, decode = loaded.network.encode, loaded.network.decode
-    monkeypatch.setattr(loaded.network, "encode", lambda x, **how: encoded.append(len(x)) or encode(x, **how))
-    monkeypatch.setattr(loaded.network, "decode", lambda a, b: decoded.append(len(a.tokens)) or decode(a, b))
-    predicted(loaded, images)
-    assert (sum(encoded), sum(decoded)) == (4, 12)
-
-
 def test_out_of_memory_halves_the_batch_and_reports_it(
     loaded: "LoadedNetwork",
     images: PreparedImages,

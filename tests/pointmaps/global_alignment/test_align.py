@@ -1,6 +1,5 @@
 """Global alignment against the truth of synthetic pairs: accuracy, gauge, wrong pairs, graphs, bad input."""
 
-import importlib.util
 import json
 from dataclasses import replace
 
@@ -22,7 +21,6 @@ from jcr.pointmaps.global_alignment.normal_equations import (
 )
 from jcr.pointmaps.global_alignment.pointmap_residuals import State
 from jcr.records import Intrinsics
-from places import SHARED
 from simulation.pairs import PairErrors, PairTruth, synthetic_pairs, write_pairs
 
 SMALL = (48, 36)
@@ -188,17 +186,6 @@ def test_non_square_pixels_and_a_principal_point_off_the_middle_are_fixed():
     np.testing.assert_allclose(free.focal_px[:, 1] / free.focal_px[:, 0], 41 / 46)
 
 
-def test_principal_point_comes_from_the_option_then_the_file_then_the_middle():
-    predictions, _ = synthetic_pairs(complete_pairs(2), SMALL)
-    assert pinhole_of(predictions, AlignOptions()).principal_point_px == (23.5, 17.5)
-    known = replace(predictions, intrinsics=Intrinsics(40.0, 40.0, 22.0, 17.0, *SMALL))
-    assert pinhole_of(known, AlignOptions()).principal_point_px == (22, 17)
-    asked = AlignOptions(principal_point_px=(24.0, 18.0))
-    assert pinhole_of(known, asked).principal_point_px == (24.0, 18.0)
-    with pytest.raises(InputError, match="carry no intrinsics"):
-        global_align(predictions, AlignOptions(focal="given"))
-
-
 @pytest.mark.parametrize("network", ["from 1 up", "from 0 to 1"])
 def test_pixels_without_confidence_do_not_count(network):
     # More than half of each image is rubbish, as sky is.
@@ -302,31 +289,6 @@ def test_command_refuses_a_truncated_file(tmp_path):
     whole.write_bytes(whole.read_bytes()[:-2000])
     with pytest.raises(InputError, match=f"^{whole}"):
         command(str(whole), str(tmp_path / "out.npz"))
-
-
-def test_yardstick(tmp_path):
-    script = SHARED / "align" / "make_synthetic.py"
-    if not script.is_file():
-        pytest.skip("the alignment yardstick is not on this machine")
-    spec = importlib.util.spec_from_file_location("make_synthetic", script)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    made = module.make(128, 96, 6, seed=0)
-    np.savez(tmp_path / "pairs.npz", **made)
-    # The generator's principal point is half a pixel right and below the middle.
-    middle = ["--options.principal-point-px", "64", "48"]
-    assert command(str(tmp_path / "pairs.npz"), str(tmp_path / "out.npz"), *middle) == 0
-    with np.load(tmp_path / "out.npz") as file:
-        true, found = made["gt_poses"], file["poses"]
-        world_from_recon, scale = fit_similarity(true[:, :3, 3], found[:, :3, 3])
-        centers = apply_similarity(world_from_recon, scale, found[:, :3, 3])
-        rotation = rotation_between_deg(world_from_recon[:3, :3] @ found[:, :3, :3], true[:, :3, :3])
-        # What the published aligner reaches with 10 images.
-        assert 1e3 * np.linalg.norm(centers - true[:, :3, 3], axis=1).mean() < 0.84
-        assert rotation.mean() < 0.091
-        np.testing.assert_allclose(file["focals"], made["gt_focal"], rtol=9e-4)
-        assert np.median(np.abs(file["depth"] * scale / made["gt_depth"] - 1)) < 3e-3
 
 
 def test_pairs_whose_errors_cannot_be_solved_for_are_rejected(monkeypatch: pytest.MonkeyPatch):
