@@ -34,20 +34,24 @@ Weighed = list[tuple[Float[ndarray, " g"], Float[ndarray, "g c"], LinearSolution
 
 
 def most_likely(
-    equations: Equations, start: LogSizes | None = None, settled: float = SETTLED
+    equations: Equations,
+    start: LogSizes | None = None,
+    settled: float = SETTLED,
+    score: Callable[[LogSizes], tuple[float, LogSizes, Information]] | None = None,
 ) -> tuple[LogSizes, Information]:
     """Log sizes at the mode of their posterior, and the expected information there, to a last step `settled`.
 
     By Fisher scoring, with the curvature that the last step showed (BFGS, Nocedal and Wright, "Numerical optimization",
     2006, eq. 6.19): where the expected information is half of it, steps swing about the mode.
     """
+    score = score or (lambda at: _score(equations, at))
     at = np.log(equations.typical) if start is None else start
-    value, gradient, information = _score(equations, at)
+    value, gradient, information = score(at)
     curvature = information
     for _ in range(40):
         step = np.linalg.solve(curvature, gradient)
         step /= max(1.0, float(np.abs(step).max()))
-        while (scored := _score(equations, at + step))[0] < value and np.abs(step).max() > settled:
+        while (scored := score(at + step))[0] < value and np.abs(step).max() > settled:
             step = step / 2
         if scored[0] < value:
             break
@@ -64,15 +68,15 @@ def most_likely(
     return at, information
 
 
-def log_evidence(equations: Equations, solution: LinearSolution, information: Information) -> float:
+def log_evidence(equations: Equations, log_posterior: float, information: Information) -> float:
     """Log density of the residuals, averaged over unknowns and sizes: of s residuals but for (2π)^(−s/2), and up to a
     constant that all sets of residuals share.
 
-    By Laplace's method about the mode of the sizes, at which `solution` and `information` are.
+    By Laplace's method about the mode of the sizes, at which `log_posterior` and `information` are.
     """
     gradient = equations.prior_gradient
     against_prior = gradient @ np.linalg.lstsq(equations.prior_information, gradient, rcond=None)[0]
-    return float(solution.log_posterior - against_prior / 2 - np.linalg.slogdet(information)[1] / 2)
+    return log_posterior - float(against_prior) / 2 - float(np.linalg.slogdet(information)[1]) / 2
 
 
 def over_sizes(

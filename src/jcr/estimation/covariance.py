@@ -5,7 +5,7 @@ covariance: the covariance is scaled until its 99 % ellipsoid holds 99 %, for an
 deviations off is the worst fault.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -185,14 +185,22 @@ def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covari
     if exact.known is not None:
         images = images + gain @ exact.known @ gain.T
     intrinsics = solve_equations(equations, log_sizes).covariance[:UNKNOWNS, :UNKNOWNS] - solution.covariance
-    parts = [part[:7, :7] for part in (random, systematic, intrinsics, images)]
+    return budget_of((random, systematic, intrinsics, images), covariance)
+
+
+def budget_of(parts: Sequence[Square], covariance: Square) -> Budget:
+    """Return the covariance of X and scale by its causes: random and systematic robot errors, intrinsics, images.
+
+    The parts share the excess of the covariance over their sum.
+    """
+    parts = [part[:7, :7] for part in parts]
     to_whole = _between(sum(parts[1:], parts[0]), covariance[:7, :7])
     random, systematic, intrinsics, _ = (to_whole @ part @ to_whole.T for part in parts)
     return Budget(
         robot_random=random,
         robot_systematic=systematic,
         intrinsics=intrinsics,
-        # What is unobservable is among it, and the rounding of its large numbers.
+        # Unobservable directions are in it, and the rounding of their large numbers.
         images=covariance[:7, :7] - random - systematic - intrinsics,
         faults=np.zeros((7, 7)),
     )

@@ -60,7 +60,7 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
     used = np.ones(n, bool) if problem.used is None else problem.used
     rows = np.flatnonzero(np.repeat(used, 6))
     jacobian = by_arms.reshape(6 * n, arms)
-    information, gradient = _prior(problem, state)
+    information, gradient = prior_of_unknowns(problem, state)
     if images is None:
         assert problem.known_rigs is not None
         covariance = problem.known_rigs.covariance
@@ -103,7 +103,7 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
     )
 
 
-def _prior(problem: Problem, state: State) -> tuple[Float[ndarray, "p p"], Float[ndarray, " p"]]:
+def prior_of_unknowns(problem: Problem, state: State) -> tuple[Float[ndarray, "p p"], Float[ndarray, " p"]]:
     """Return the information of the weak prior and the linear priors, and their gradient."""
     arms = problem.arm_unknowns
     information, gradient = np.zeros((problem.unknowns, problem.unknowns)), np.zeros(problem.unknowns)

@@ -12,12 +12,13 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.estimation import smooth
 from jcr.estimation.acceleration import Acceleration
 from jcr.estimation.cholesky import cholesky, inverse_of, lower, over
 from jcr.estimation.components import SETTLED, Information, log_evidence, most_likely
 from jcr.estimation.covariance import expected_posterior, posterior
 from jcr.estimation.elimination import Normal
-from jcr.estimation.equation import SCALE, pose_by_pose, share_within_limits, weak_prior
+from jcr.estimation.equation import SCALE, UNKNOWNS, pose_by_pose, share_within_limits, weak_prior
 from jcr.estimation.image_equations import (
     SIZES_SETTLED,
     ImageEvidence,
@@ -44,6 +45,8 @@ from jcr.estimation.problem import (
     with_free,
 )
 from jcr.estimation.projection import view_of
+from jcr.estimation.smooth import SmoothSolution
+from jcr.estimation.systematic import Region
 from jcr.geometry import Transform, step_between
 from jcr.least_squares import one_blas_thread
 from jcr.records import Budget, ModelError, RobotNoise
@@ -80,6 +83,8 @@ class Solution:
     evidence: ImageEvidence | None
     settled: bool
     iterations: int
+    smooth: SmoothSolution | None = None
+    """Solution of many poses in the eigenvectors of their systematic errors; None: of the equations themselves."""
 
     @property
     def equations(self) -> Equations:
@@ -106,12 +111,14 @@ class Solution:
     @property
     def log_evidence(self) -> float:
         """Log density of the used residuals, averaged over unknowns and sizes, times (2π)^(3m)."""
-        found = solve_equations(self.equations, self.log_sizes)
-        return log_evidence(self.equations, found, self.size_information)
+        found = self.smooth or solve_equations(self.equations, self.log_sizes)
+        return log_evidence(self.equations, float(found.log_posterior), self.size_information)
 
     def leave_one_out(self) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 6"]]:
         """Return the residual of each reported pose from a solution without it (m, rad; base axes), and its covariance,
         the pose's own errors included."""
+        if self.smooth is not None:
+            return smooth.left_out(self.smooth, self.problem, self.most_likely)
         poses, noise = self.poses, self.noise
         solution, random = (
             solve_equations(self.equations, self.log_sizes),
@@ -195,7 +202,9 @@ def solve(
     uncertainty. `start_noise` is the initial size of the random errors of the poses (m, rad).
     """
     if problem.observations is None:
-        return _with_covariance(problem, start, None, averaged)
+        return (_solve_smooth if smooth.is_smooth(problem, averaged) else _solve_poses)(
+            problem, start, averaged
+        )
     if start.pixel_noise is None:
         start = _adjusted_to_poses(problem, start, problem.robot_noise_floor or start_noise)
     state, images, settled, rounds = _rounds(problem, start)
@@ -335,6 +344,44 @@ class _JointStep:
         problem = self.images.problem
         state, _, _ = adjusted_images(problem, state, [_rig_information(problem, state, self.root)])
         return _most_likely_arms(problem, state, evidence(problem, state), STEP_SETTLED**2)
+
+
+def _solve_poses(problem: Problem, start: State, averaged: bool) -> Solution:
+    """Solve a problem without observations."""
+    return _with_covariance(problem, start, None, averaged)
+
+
+def _solve_smooth(problem: Problem, state: State, averaged: bool) -> Solution:
+    """Solve a problem of many exact camera poses whose systematic errors are smooth."""
+    basis, settled = smooth.decomposed(problem), ARMS_SETTLED if averaged else NEARLY_SETTLED
+    for _ in range(STEPS):
+        model = smooth.smooth_model(problem, state, basis)
+        found, information = smooth.likeliest(model, state.robot_log_sizes, SETTLED)
+        region = Region.of_unknowns(np.delete(model.equations.jacobian, SCALE, axis=1), UNKNOWNS)
+        step = smooth.effective_step(found, region)
+        step *= share_within_limits(step)
+        state = replace(full_step(problem, state, step), robot_log_sizes=found.log_sizes)
+        if float(step @ np.linalg.solve(found.covariance, step)) < settled:
+            break
+    model = smooth.smooth_model(problem, state, basis)
+    found, information = smooth.likeliest(model, state.robot_log_sizes, SETTLED)
+    likely = replace(state, robot_log_sizes=found.log_sizes)
+    step, covariance, budget = (
+        smooth.effective(found, region) if averaged else (np.zeros(UNKNOWNS), found.covariance, None)
+    )
+    return Solution(
+        problem=problem,
+        state=full_step(problem, likely, step),
+        covariance=covariance,
+        budget=budget,
+        most_likely=likely,
+        poses=pose_equations(problem, likely, None),
+        size_information=information,
+        evidence=None,
+        settled=True,
+        iterations=0,
+        smooth=found,
+    )
 
 
 def _with_covariance(
