@@ -1,7 +1,8 @@
 """`python -m benchmarks.unchanged`: estimates of stored and simulated captures before and after a change of the code.
 
-`measure RUNS OUT.json` calibrates the reconstructions of the run folders below RUNS again, and forty simulated problems.
-`compare BEFORE.json AFTER.json` lists differences of verdicts, findings and results in standard deviations.
+`measure CAPTURES RUNS OUT.json` calibrates the captures below CAPTURES from the reconstructions in the run folders of
+the same names below RUNS, and forty simulated problems. `compare BEFORE.json AFTER.json` lists differences of
+verdicts, findings and results in standard deviations.
 """
 
 import json
@@ -14,15 +15,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jcr.reconstruct.reconstruction_npz import read_reconstruction
 
 from benchmarks.cameras import COUNT, answered, wanted
 from benchmarks.faults import IMAGES, OBSERVED, calibrated
 from jcr.calibration.stage import calibrate
+from jcr.capture.read import read_capture
 from jcr.estimation.arms import arm_named
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.geometry import step_between
 from jcr.records import HandEye
-from jcr.run_folder import RunFolder
 from simulation.boards import Sheet, with_sheet
 from simulation.cells import Kind, cell_problem
 from simulation.faults import Faults, faulty_capture, reconstructed
@@ -37,10 +39,10 @@ TOLERANCE = 0.05
 """Largest accepted change of a result, in standard deviations of the state before."""
 
 
-def cases(runs: Path) -> Iterator[tuple[str, Callable[[], Record]]]:
+def cases(captures: Path, runs: Path) -> Iterator[tuple[str, Callable[[], Record]]]:
     """Yield the name of each problem and a function that solves it."""
     for folder in sorted(path.parent for path in runs.glob("*/reconstruction.npz")):
-        yield f"capture {folder.name}", lambda folder=folder: _record_run(folder)
+        yield f"capture {folder.name}", lambda folder=folder: _record_run(captures, folder)
     for k, case in enumerate(OBSERVED):
         name = f"fault {k} {case.what}"
         assert isinstance(case.fault, Faults)
@@ -62,13 +64,13 @@ def cases(runs: Path) -> Iterator[tuple[str, Callable[[], Record]]]:
         yield f"cell {kind}", lambda kind=kind: _record_cell(kind)
 
 
-def measure(runs: Path, out: Path) -> None:
+def measure(captures: Path, runs: Path, out: Path) -> None:
     """Solve all problems and write their records as JSON."""
     calls = [0]
     for module, name in COUNTED:
         _count_calls(import_module(module), name, calls)
     records: dict[str, Record] = {}
-    for name, solve in cases(runs):
+    for name, solve in cases(captures, runs):
         calls[0], start = 0, time.process_time()
         try:
             record = solve()
@@ -130,10 +132,10 @@ def _count_calls(module: Any, name: str, calls: list[int]) -> None:
     setattr(module, name, counted)
 
 
-def _record_run(folder: Path) -> Record:
-    """Return the record of a stored reconstruction that is calibrated again."""
-    run = RunFolder(folder)
-    return _record(calibrate(run.capture(), run.reconstruction(), run.options().calibrate))
+def _record_run(captures: Path, run: Path) -> Record:
+    """Return the record of a capture that is calibrated from a stored reconstruction."""
+    capture = read_capture(captures / run.name)
+    return _record(calibrate(capture, read_reconstruction(run / "reconstruction.npz")))
 
 
 def _record(hand_eye: HandEye) -> Record:
@@ -187,8 +189,8 @@ def _weighed_poses() -> HandEye:
 
 
 if __name__ == "__main__":
-    command, first, second = sys.argv[1:]
+    command, *paths = sys.argv[1], *map(Path, sys.argv[2:])
     if command == "measure":
-        measure(Path(first), Path(second))
+        measure(*paths)
     else:
-        sys.exit(bool(compare(Path(first), Path(second))))
+        sys.exit(bool(compare(*paths)))

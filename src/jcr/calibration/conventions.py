@@ -167,7 +167,8 @@ def convention_finding(found: tuple[Reading, Reading], severity: Severity = "rej
 
 def _solved(candidate: _Candidate, recon_from_camera: Poses) -> Reading:
     return _reading(
-        candidate, solve_hand_eye(candidate.base_from_gripper, recon_from_camera[candidate.image])
+        candidate,
+        solve_hand_eye(candidate.base_from_gripper, recon_from_camera[candidate.image], in_sequence=False),
     )
 
 

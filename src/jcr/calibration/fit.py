@@ -71,6 +71,7 @@ def _solved(
         offset=offset,
         camera_covariance=None if evidence is None else evidence.covariance,
         systematic=robot.systematic,
+        in_sequence=False,
     )
 
 

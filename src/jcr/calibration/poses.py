@@ -56,13 +56,23 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotE
     height = options.known_height
     offset = None if height is None else height_cue(gripper, height / 1e3)
     systematic = robot.systematic
-    free = solve_hand_eye(gripper, camera, robot_noise=noise, offset=offset, systematic=systematic)
+    # Poses of a marker of known size are found each by itself.
+    in_sequence = not pairs.is_metric
+    free = solve_hand_eye(
+        gripper, camera, robot_noise=noise, offset=offset, systematic=systematic, in_sequence=in_sequence
+    )
     scale = 1.0 if options.scale is None and pairs.is_metric else options.scale
     hand_eye = free
     # A known size makes few samples worth more; where the robot's motion excludes it, the motion decides.
     if scale is not None and (options.scale is not None or not free.converged or is_one(free)):
         hand_eye = solve_hand_eye(
-            gripper, camera, robot_noise=noise, offset=offset, systematic=systematic, scale=scale
+            gripper,
+            camera,
+            robot_noise=noise,
+            offset=offset,
+            systematic=systematic,
+            scale=scale,
+            in_sequence=in_sequence,
         )
         if not free.observability.observable and scale == 1.0:
             return hand_eye.with_findings(Finding.of(FindingKind.SCALE_ASSUMED, "warns", "motion"))

@@ -90,7 +90,9 @@ def refined(
 def _explained(capture: Capture, reconstruction: Reconstruction, found: HandEye) -> HandEye:
     """A failure, with the reason where the images are those of a camera on the gripper."""
     rows = reconstruction.image_index
-    on_gripper = solve_hand_eye(capture.base_from_gripper[rows], reconstruction.recon_from_camera)
+    on_gripper = solve_hand_eye(
+        capture.base_from_gripper[rows], reconstruction.recon_from_camera, in_sequence=False
+    )
     if not on_gripper.converged:
         return found
     why = Finding.of(FindingKind.WRONG_MOUNT, "rejects", "mount", camera=capture.camera_name)

@@ -147,7 +147,7 @@ class Rigs:
             return seen.refused(FindingKind.FEW_LOCALISED, "images", **counts)
         places, gripper = seen.places, seen.camera.base_from_gripper[seen.rows]
         std = max(float(np.sqrt(self._hand_eye.covariance[6, 6])), 1e-4)
-        found = solve_hand_eye(gripper, places, scale=1.0, scale_std=std)
+        found = solve_hand_eye(gripper, places, scale=1.0, scale_std=std, in_sequence=False)
         if not found.converged:
             return seen.not_placed(*found.findings)
         rig = np.full(len(seen.shared), -1)

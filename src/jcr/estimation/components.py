@@ -5,7 +5,7 @@ Restricted maximum likelihood shows the three sizes (Searle, Casella and McCullo
 their posterior weights, on a grid about the mode (Rue, Martino and Chopin, J. R. Statist. Soc. B 71, 2009, section 3).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import product
 
 import numpy as np
@@ -79,6 +79,17 @@ def log_evidence(equations: Equations, log_posterior: float, information: Inform
     return log_posterior - float(against_prior) / 2 - float(np.linalg.slogdet(information)[1]) / 2
 
 
+def growth_scores(
+    equations: Equations, log_sizes: LogSizes, parts: Sequence[Float[ndarray, "s s"]]
+) -> Float[ndarray, " k"]:
+    """Return the score test of further components at size 0, in standard deviations (Rao 1948)."""
+    solution = solve_equations(equations, log_sizes)
+    projection, left = solution.projection, solution.weighed_left
+    by = [projection @ part for part in parts]
+    pull = np.array([left @ part @ left - np.trace(one) for part, one in zip(parts, by, strict=True)])
+    return pull / np.sqrt([2 * (one * one.T).sum() for one in by])
+
+
 def over_sizes(
     equations: Equations,
     log_sizes: LogSizes,
@@ -113,13 +124,13 @@ def _score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, 
     masks = np.stack([equations.of_position, 1 - equations.of_position])
     squares, traces = masks @ left**2, masks @ np.diagonal(projection)
     pairs = masks @ projection**2 @ masks.T
-    if equations.systematic is not None:
-        by_systematic = projection @ equations.systematic
-        beside = masks @ (by_systematic * projection).sum(1)
-        own = (by_systematic * by_systematic.T).sum()
-        pairs = np.block([[pairs, beside[:, None]], [beside[None], own]])
-        squares = np.append(squares, left @ equations.systematic @ left)
-        traces = np.append(traces, np.trace(by_systematic))
+    if parts := equations.components:
+        by = [projection @ part for part in parts]
+        beside = np.stack([masks @ (one * projection).sum(1) for one in by], axis=1)
+        own = np.array([[(one * other.T).sum() for other in by] for one in by])
+        pairs = np.block([[pairs, beside], [beside.T, own]])
+        squares = np.r_[squares, [left @ part @ left for part in parts]]
+        traces = np.r_[traces, [np.trace(one) for one in by]]
     growth = np.exp(2 * log_sizes)
     gradient, information = equations.log_prior_slope(log_sizes)
     return (

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
+from jcr.estimation.camera_drift import drift_covariance
 from jcr.estimation.equation import residuals
 from jcr.estimation.kinematics import Arm, Joints
 from jcr.estimation.observability import observability
@@ -63,6 +64,7 @@ def solve_hand_eye(  # noqa: PLR0913 (published; each is a fact about the captur
     joints: ArrayLike | None = None,
     robot: str | Arm | None = None,
     systematic: Float[ndarray, "r r"] | None = None,
+    in_sequence: bool = True,
 ) -> HandEye:
     """Hand-eye calibration with unknown scale from camera poses of your own.
 
@@ -79,6 +81,9 @@ def solve_hand_eye(  # noqa: PLR0913 (published; each is a fact about the captur
     `scale` (metres per unit of the camera poses, 1 if these are metric) is known to `scale_std` (relative); without it
     the scale is estimated. `offset` is an axis of the gripper frame, the position of the camera along it (m), and its
     standard deviation (m), for motions that do not determine it.
+
+    `in_sequence`: the camera poses may have been found one after the other, as by visual odometry or SLAM; errors that
+    add up along their order are then looked for, and weighed where the poses show them.
 
     Raises InputError for shapes, values or counts that cannot be poses, and for poses or angles that do not fit the
     robot. Degenerate motion raises nothing; it is in the result (`observability`, `converged`).
@@ -101,6 +106,12 @@ def solve_hand_eye(  # noqa: PLR0913 (published; each is a fact about the captur
         arm, angles = _checked_arm(robot, joints, n)
         systematic = smooth_errors(gripper) if arm is None else arm_errors(*posed(arm, angles, gripper))
     fit, distinct = _fit_distinct(gripper, camera, robot_noise, priors, camera_covariance, systematic)
+    if in_sequence and camera_covariance is None:
+        assert fit.problem.used is not None
+        start, used = (fit.state.x[0], fit.state.scale, fit.state.z[0]), fit.problem.used[distinct]
+        drift = drift_covariance(gripper, camera, start, used, systematic, robot_noise)
+        if drift is not None:
+            fit, distinct = _fit_distinct(gripper, camera, robot_noise, priors, drift, systematic)
     return judged(_with_residuals(gripper, camera, fit, distinct))
 
 

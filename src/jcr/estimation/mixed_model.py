@@ -22,6 +22,10 @@ TYPICAL = np.array([3e-4, np.radians(0.04), np.radians(0.1)])
 FACTOR_STD = np.log([10.0, 10.0, 3.0])
 """By what factor arms differ in these. Data sheets of industrial arms leave 0.03 to 0.1° of systematic error, those of
 servo arms 1 to 2°."""
+TYPICAL_WALKS, WALK_FACTOR_STD = np.array([3e-4, 1e-3, 1e-3]), np.log(30.0)
+"""Growth of the errors of camera poses from one image to the next (m, rad, relative scale), and the factor by which it
+differs between sequences."""
+_FACTORS = np.r_[FACTOR_STD, np.full(3, WALK_FACTOR_STD)]
 GIVEN_SHARE = 0.3
 """Of a given noise, that a robot has beside it: the middle of the prior."""
 SHOWN = 1.1
@@ -54,6 +58,8 @@ class Equations:
     """Of the systematic part where σ_s is 1 rad; None: there is none."""
     given: tuple[float, float] | None = None
     """σ_t and σ_r as the user gave them (m, rad): no less is counted."""
+    walks: tuple[Covariance, ...] = ()
+    """Covariances of errors of the camera poses that add up along the sequence, where their sizes are 1."""
     confirmed: Covariance | None = None
     """Covariance of errors that were confirmed, whatever the sizes of the others are."""
 
@@ -65,7 +71,7 @@ class Equations:
     @property
     def typical(self) -> Float[ndarray, " c"]:
         """Middle of the priors of what is estimated."""
-        typical = TYPICAL[: self.count].copy()
+        typical = np.r_[TYPICAL, TYPICAL_WALKS][: self.count]
         if self.given is not None:
             typical[:2] = GIVEN_SHARE * self.least
         return typical
@@ -73,7 +79,12 @@ class Equations:
     @property
     def count(self) -> int:
         """Of sizes to be found."""
-        return 2 if self.systematic is None else 3
+        return len(self.components) + 2
+
+    @property
+    def components(self) -> tuple[Covariance, ...]:
+        """Covariances whose sizes are estimated beside those of the random errors."""
+        return (() if self.systematic is None else (self.systematic,)) + self.walks
 
     @cached_property
     def of_position(self) -> Residuals:
@@ -100,7 +111,7 @@ class Equations:
     def noise(self, log_sizes: LogSizes) -> RobotNoise:
         """The errors of the poses, where their sizes are these and there is a systematic part."""
         assert self.systematic is not None
-        metres, radians, systematic = np.sqrt(self.variances(log_sizes)).tolist()
+        metres, radians, systematic = np.sqrt(self.variances(log_sizes)[:3]).tolist()
         left = systematic * np.sqrt(np.diag(self.systematic).reshape(-1, 2, 3).mean((0, 2)))
         shown = SHOWN * np.array(self.given or (0.0, 0.0))
         return RobotNoise(
@@ -116,8 +127,9 @@ class Equations:
         """V of the residuals."""
         random = self.random(log_sizes)
         covariance = np.zeros((*random.shape, random.shape[-1]))
-        if self.systematic is not None:
-            covariance += self.variances(log_sizes)[..., 2, None, None] * self.systematic
+        variances = self.variances(log_sizes)[..., 2:]
+        for k, part in enumerate(self.components):
+            covariance += variances[..., k, None, None] * part
         for part in (self.known, self.confirmed):
             if part is not None:
                 covariance += part
@@ -127,13 +139,18 @@ class Equations:
 
     def log_prior(self, log_sizes: LogSizes) -> Each:
         """Log density of the weak priors of the sizes, up to a constant."""
-        z = (log_sizes - np.log(self.typical)) / FACTOR_STD[: self.count]
+        z = (log_sizes - np.log(self.typical)) / _FACTORS[: self.count]
         ratio = (log_sizes[..., 0] - log_sizes[..., 1] - np.log(REACH)) / RATIO_STD
         return -((z**2).sum(-1) + ratio**2) / 2
 
+    @property
+    def log_prior_volume(self) -> float:
+        """Logarithm of the volume of the priors of the sizes, up to a constant that models of equal sizes share."""
+        return float(np.log(_FACTORS[: self.count]).sum())
+
     def log_prior_slope(self, log_sizes: LogSizes) -> tuple[LogSizes, Float[ndarray, "c c"]]:
         """Its gradient and negative Hessian."""
-        std = FACTOR_STD[: self.count]
+        std = _FACTORS[: self.count]
         z = (log_sizes - np.log(self.typical)) / std
         ratio = (log_sizes[0] - log_sizes[1] - np.log(REACH)) / RATIO_STD
         apart = np.zeros(self.count)

@@ -7,7 +7,7 @@ The posterior of the latter follows from that of θ and e (universal kriging: Cr
 1993, section 3.4).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -96,7 +96,7 @@ def decomposed(problem: Problem) -> tuple[Float[ndarray, "h h"], Float[ndarray, 
     arm = problem.arms[0]
     n = len(arm.rigs)
     used = np.arange(n) if problem.used is None else np.flatnonzero(problem.used)
-    rotations = arm.error_covariance.reshape(n, 6, n, 6)[np.ix_(used, range(3, 6), used, range(3, 6))]
+    rotations = arm.error_covariance.reshape(n, 6, n, 6)[np.ix_(used, np.arange(3, 6), used, np.arange(3, 6))]
     values, vectors = np.linalg.eigh(rotations.reshape(3 * len(used), -1))
     return vectors, np.maximum(values, 0.0)
 
@@ -127,7 +127,7 @@ def smooth_model(
         jacobian=equations.jacobian,
     )
     both = found.turned(np.column_stack([equations.residual, equations.jacobian]))
-    return SmoothModel(**vars(found) | {"residual": both[:, 0], "jacobian": both[:, 1:]})
+    return replace(found, residual=both[:, 0], jacobian=both[:, 1:])
 
 
 def solved(model: SmoothModel, log_sizes: LogSizes) -> SmoothSolution:

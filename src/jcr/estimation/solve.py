@@ -364,6 +364,7 @@ def _solve_smooth(problem: Problem, state: State, averaged: bool) -> Solution:
         if float(step @ np.linalg.solve(found.covariance, step)) < settled:
             break
     model = smooth.smooth_model(problem, state, basis)
+    region = Region.of_unknowns(np.delete(model.equations.jacobian, SCALE, axis=1), UNKNOWNS)
     found, information = smooth.likeliest(model, state.robot_log_sizes, SETTLED)
     likely = replace(state, robot_log_sizes=found.log_sizes)
     step, covariance, budget = (
