@@ -288,7 +288,7 @@ def _best_fit(read: list[tuple[Capture, ReadOptions]], progress: Progress | None
     fits = []
     for capture, options in read:
         gripper = capture.base_from_gripper[rows][found.image_index]
-        noise = solve_hand_eye(gripper, found.recon_from_camera).robot_noise
+        noise = solve_hand_eye(gripper, found.recon_from_camera, in_sequence=False).robot_noise
         off = f"{1e3 * noise.translation:.2g} mm and {np.degrees(noise.rotation):.2g}°"
         fits.append((float(noise.translation + ARM * noise.rotation), off, capture, options))
     (best, off, capture, options), *others = sorted(fits, key=lambda fit: fit[0])

@@ -188,7 +188,7 @@ def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covari
     return budget_of((random, systematic, intrinsics, images), covariance)
 
 
-def budget_of(parts: Sequence[Square], covariance: Square) -> Budget:
+def budget_of(parts: Sequence[Float[ndarray, "_ _"]], covariance: Float[ndarray, "_ _"]) -> Budget:
     """Return the covariance of X and scale by its causes: random and systematic robot errors, intrinsics, images.
 
     The parts share the excess of the covariance over their sum.
