@@ -17,7 +17,7 @@ from jcr.findings import Finding, FindingKind
 from jcr.geometry import rotation_exp, transform
 from jcr.live.cameras import Camera, Frame
 from jcr.live.folder import LiveFolder
-from jcr.live.progress import Progress, Reached
+from jcr.live.progress import Accuracy, Progress
 from jcr.live.robot import RobotState
 from jcr.live.session import Answer, LiveSession, SessionOptions
 from jcr.records import HandEye, Plan, Requirement
@@ -64,7 +64,7 @@ class Scripted:
             raise fault
         images = tuple(self.live.names)
         history = tuple(
-            Reached(images=k, translation_mm=10.0 / k, rotation_deg=1.0 / k, accepted=True)
+            Accuracy(images=k, translation_mm=10.0 / k, rotation_deg=1.0 / k, accepted=True)
             for k in range(3, len(images) + 1)
         )
         findings = ()

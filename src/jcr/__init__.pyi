@@ -22,8 +22,8 @@ from .findings import FindingKind as FindingKind
 from .live.calibration import LiveCalibration as LiveCalibration
 from .live.cameras import Camera as Camera
 from .live.cameras import Frame as Frame
+from .live.progress import Accuracy as Accuracy
 from .live.progress import Progress as Progress
-from .live.progress import Reached as Reached
 from .live.robot import RobotState as RobotState
 from .live.ros import read_ros_camera_info as read_ros_camera_info
 from .live.ros import read_ros_depth as read_ros_depth

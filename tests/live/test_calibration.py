@@ -225,7 +225,7 @@ def test_a_robot_whose_model_is_refused_gives_no_joint_targets_and_is_named_once
     assert "joints" not in shown and "cannot reach" not in shown
     page = page_content(SessionState(images=live.live.images, progress=state), REQUIRED, notation)
     (warning,) = [sentence(one) for one in state.findings if one.kind is FindingKind.ROBOT_UNUSED]
-    assert [page.headline, *page.lines].count(warning[:1].upper() + warning[1:]) == 1
+    assert [page["headline"], *page["lines"]].count(warning[:1].upper() + warning[1:]) == 1
 
 
 def test_what_is_no_image_or_no_pose_is_named_with_its_remedy(tmp_path: Path, tabletop: Path):

@@ -135,10 +135,10 @@ def test_the_page_is_drawn_while_the_image_that_it_replaces_goes(tmp_path: Path,
     taken.run([0, 1, ("retake", 1)])
     before = taken.session.state
     taken.folder.remove("images/000.png")
-    assert page_content(before, (2.0, 0.3), taken.session.notation).replaces == 1
+    assert page_content(before, (2.0, 0.3), taken.session.notation)["replaces"] == 1
     (left,) = taken.folder.images
     between = type(before)(images=(left,), replaces="images/000.png")
-    assert page_content(between, (2.0, 0.3), taken.session.notation).replaces is None
+    assert page_content(between, (2.0, 0.3), taken.session.notation)["replaces"] is None
 
 
 def test_requests_and_commands_of_several_threads_come_one_after_the_other(tmp_path: Path, tabletop: Path):

@@ -34,7 +34,7 @@ from jcr.geometry import apply, largest_motion
 from jcr.least_squares import one_blas_thread
 from jcr.live.folder import LiveFolder
 from jcr.live.next_pose import Attempts, Reach, propose, propose_before_calibration
-from jcr.live.progress import Progress, Reached
+from jcr.live.progress import Accuracy, Progress
 from jcr.live.stillness import ImageSummary
 from jcr.options import checked_options
 from jcr.records import Capture, HandEye, Intrinsics, Reconstruction, Tracks
@@ -339,7 +339,7 @@ class LiveCalibration:
         """Write the accuracy with this number of images; entries of more images belong to other images."""
         required = hand_eye.requirement
         assert required is not None
-        reached = Reached(
+        reached = Accuracy(
             images=images,
             translation_mm=float(required.reached_mm),
             rotation_deg=float(required.reached_deg),
@@ -436,9 +436,9 @@ def _points(case: Case, hand_eye: HandEye) -> Float[ndarray, "p 3"]:
     return apply(hand_eye.base_from_recon, hand_eye.scale * tracks.points_in_recon[some])
 
 
-def _read_history(file: Path) -> tuple[Reached, ...]:
+def _read_history(file: Path) -> tuple[Accuracy, ...]:
     """Return the accuracies as they were written; none of a file that cannot be read, for it decides nothing."""
     try:
-        return tuple(Reached(**one) for one in json.loads(read_bytes(file)))
+        return tuple(Accuracy(**one) for one in json.loads(read_bytes(file)))
     except (OSError, ValueError, TypeError):
         return ()

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import cv2
 from jaxtyping import UInt8, UInt16
@@ -175,21 +175,8 @@ def open_camera(source: str, options: CameraOptions | None = None) -> Iterator[C
         cv2.utils.logging.setLogLevel(before)
 
 
-@runtime_checkable
-class Device(Protocol):
-    """Part of cv2.VideoCapture that sets a camera up."""
-
-    def set(self, propid: int, value: float, /) -> bool:
-        """Set a property."""
-        ...
-
-    def get(self, propid: int, /) -> float:
-        """Return a property."""
-        ...
-
-
-def apply_options(video: Device, options: CameraOptions, source: str) -> None:
-    """Fix size, exposure and focus; raise InputError where the camera does not follow.
+def apply_options(video: Any, options: CameraOptions, source: str) -> None:
+    """Fix size, exposure and focus of a cv2.VideoCapture; raise InputError where the camera does not follow.
 
     A driver may take a value and not follow it, so each is read back (videoio's page on VideoCaptureProperties).
     """
@@ -212,7 +199,7 @@ def apply_options(video: Device, options: CameraOptions, source: str) -> None:
         _fix(video, cv2.CAP_PROP_FOCUS, options.focus, "--focus", source)
 
 
-def _fix(video: Device, prop: int, value: float, option: str, source: str) -> None:
+def _fix(video: Any, prop: int, value: float, option: str, source: str) -> None:
     """Set a property; raise InputError where its value differs after that."""
     if not video.set(prop, value) or abs(video.get(prop) - value) > 0.01 * abs(value) + 1.0:
         raise InputError(

@@ -1,8 +1,6 @@
 """Content of the live page: one record of a session's state, drawn by templates and figures of the report."""
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -38,50 +36,6 @@ FEW_FEATURES = 150
 """Number of SIFT features in an image of NOW_PX below which registration is at risk."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ImageCard:
-    """Image in the list of the page."""
-
-    number: int
-    """Number in commands, from 1."""
-    name: str
-    """File in the folder."""
-    fault: str
-    """Finding about it; empty where there is none."""
-    state: str
-    """"registered", "not registered", or "new" before it is calibrated."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PageContent:
-    """Everything that changes on the page except the 3D view; the templates draw nothing else."""
-
-    kind: str
-    """"good", "fair", "bad" or empty: colour of the headline."""
-    headline: str
-    """State in a few words."""
-    lines: Sequence[str]
-    """Actions to take, and further findings."""
-    replaces: int | None
-    """Number of the image that the next one replaces."""
-    is_over: bool
-    """Whether no more images are taken."""
-    has_report: bool
-    """Whether the report of the calibration at the end can be opened."""
-    can_undo: bool
-    """Whether there is a change that can be taken back."""
-    tiles: Sequence[Tile]
-    """Accuracies beside what is required."""
-    next_pose: str
-    """Place of the next pose and expected accuracy; empty where none is proposed."""
-    next_lines: Sequence[str]
-    """Next pose in the notation of the arm."""
-    courses: Sequence[Figure]
-    """Accuracy after each image."""
-    images: Sequence[ImageCard]
-    """Images, the newest first."""
-
-
 def whole_page(session: LiveSession) -> str:
     """Return the page as a browser loads it; its script requests the parts after that."""
     checks = [
@@ -113,25 +67,35 @@ def page_parts(session: LiveSession, state: SessionState, has_report: bool) -> d
 
 def page_content(
     state: SessionState, required: tuple[float, float], notation: Notation, has_report: bool = False
-) -> PageContent:
-    """Return the content for a state; `required` are mm and degrees."""
+) -> dict[str, Any]:
+    """Return everything that the templates draw of a state; `required` are mm and degrees.
+
+    "kind" is the colour of the headline ("good", "fair", "bad" or empty), "replaces" the number of the image that the
+    next one replaces, "images" the cards of the list, the newest first.
+    """
     progress, names = state.progress, state.names
     kind, headline, lines = _verdict(state, required)
-    has_next = progress.next_pose is not None and not state.is_over and not progress.requirement_met
-    return PageContent(
-        kind=kind,
-        headline=_capitalised(headline),
-        lines=[_capitalised(line) for line in lines],
-        replaces=names.index(state.replaces) + 1 if state.replaces in names else None,
-        is_over=state.is_over,
-        has_report=has_report,
-        can_undo=state.can_undo,
-        tiles=_tiles(state, required),
-        next_pose=next_sentence(progress) if has_next else "",
-        next_lines=_next_lines(progress, notation) if has_next else [],
-        courses=_courses(progress, required),
-        images=_cards(state)[::-1],
-    )
+    has_next = _is_proposed(state)
+    return {
+        "kind": kind,
+        "headline": _capitalised(headline),
+        "lines": [_capitalised(line) for line in lines],
+        "replaces": names.index(state.replaces) + 1 if state.replaces in names else None,
+        "is_over": state.is_over,
+        "has_report": has_report,
+        "can_undo": state.can_undo,
+        "tiles": _tiles(state, required),
+        "next_pose": next_sentence(progress) if has_next else "",
+        "next_lines": _next_lines(progress, notation) if has_next else [],
+        "courses": _courses(progress, required),
+        "images": _cards(state)[::-1],
+    }
+
+
+def _is_proposed(state: SessionState) -> bool:
+    """Test whether a next pose is shown."""
+    progress = state.progress
+    return progress.next_pose is not None and not state.is_over and not progress.requirement_met
 
 
 def _next_lines(progress: Progress, notation: Notation) -> list[str]:
@@ -141,16 +105,20 @@ def _next_lines(progress: Progress, notation: Notation) -> list[str]:
     ]
 
 
-def _cards(state: SessionState) -> list[ImageCard]:
-    """Return the images of the list."""
+def _cards(state: SessionState) -> list[dict[str, Any]]:
+    """Return the images of the list: number in commands, file, finding about it, and whether it is registered."""
     progress = state.progress
     one_image = [one for one in progress.findings if len(one.images) == 1 and one.severity != "informs"]
     against = {one.images[0]: sentence(one) for one in one_image[::-1]}
-    registered = dict.fromkeys(progress.images, "not registered") | dict.fromkeys(
-        progress.registered, "registered"
-    )
+    registered = dict.fromkeys(progress.images, "not registered")
+    registered |= dict.fromkeys(progress.registered, "registered")
     return [
-        ImageCard(number=number, name=name, fault=against.get(name, ""), state=registered.get(name, "new"))
+        {
+            "number": number,
+            "name": name,
+            "fault": against.get(name, ""),
+            "state": registered.get(name, "new"),
+        }
         for number, name in enumerate(state.names, 1)
     ]
 
@@ -253,7 +221,7 @@ def _scene(state: SessionState) -> dict[str, Any]:
     """Return the data of the 3D view: points, images, the next pose, and cameras where a calibration places them."""
     progress, found = state.progress, state.progress.hand_eye
     x = np.eye(4) if found is None else found.gripper_from_camera
-    faults_of = {one.name: one.fault for one in _cards(state)}
+    faults_of = {one["name"]: one["fault"] for one in _cards(state)}
     views = [
         scene_view(
             Path(one.name).name,
@@ -266,8 +234,11 @@ def _scene(state: SessionState) -> dict[str, Any]:
     ]
     points = np.zeros((0, 3)) if progress.points_in_base is None else progress.points_in_base
     colors = np.tile(np.array(TRACK_COLOR, np.uint8), (len(points), 1))
-    is_proposed = progress.next_pose is not None and not state.is_over and not progress.requirement_met
-    next_poses = [progress.next_pose.base_from_gripper] if is_proposed and progress.next_pose else []
+    next_poses = (
+        [progress.next_pose.base_from_gripper]
+        if progress.next_pose is not None and _is_proposed(state)
+        else []
+    )
     intrinsics = (found.intrinsics if found is not None else None) or ANY_CAMERA
     poses = [*(one.base_from_gripper for one in state.images), *next_poses]
     shown_in_base = np.array([np.zeros(3), *(pose[:3, 3] for pose in poses)])

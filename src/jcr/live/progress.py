@@ -21,7 +21,7 @@ FIRST_ADVICE = "rotate the wrist by 20° or more, and move, between images"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reached:
+class Accuracy:
     """Accuracy of the calibration with the first images."""
 
     images: int
@@ -50,7 +50,7 @@ class Progress:
     """Findings about single images and about the calibration, strongest first."""
     hand_eye: HandEye | None = None
     """Calibration; None while fewer than three images are registered."""
-    history: tuple[Reached, ...] = ()
+    history: tuple[Accuracy, ...] = ()
     """Accuracy after each image that gave a calibration."""
     next_pose: NextPose | None = None
     """Gripper pose that improves the calibration most; None below two images."""
@@ -62,7 +62,7 @@ class Progress:
     """Reconstructed points of the scene (m); None without a calibration."""
 
     @property
-    def now(self) -> Reached | None:
+    def now(self) -> Accuracy | None:
         """Accuracy of the calibration; None where there is none with these images."""
         return self.history[-1] if self.hand_eye is not None and self.history else None
 
