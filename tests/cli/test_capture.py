@@ -8,7 +8,7 @@ import pytest
 
 from jcr.cli.capture import Arguments, _conclude
 from jcr.live.session import SessionOptions
-from jcr.records import Finding, Kind, Requirement
+from jcr.records import Finding, FindingKind, Requirement
 
 
 def result(converged: bool, reached_mm: float) -> Any:
@@ -16,7 +16,9 @@ def result(converged: bool, reached_mm: float) -> Any:
     required = Requirement(
         translation_mm=2.0, rotation_deg=0.3, asked=True, distance_mm=500.0, reached_mm=reached_mm, reached_deg=0.1
     )  # fmt: skip
-    findings = () if converged else (Finding.of(Kind.NO_RECONSTRUCTION, "rejects", text="no map", remedy=""),)
+    findings = (
+        () if converged else (Finding.of(FindingKind.NO_RECONSTRUCTION, "rejects", text="no map", remedy=""),)
+    )
     hand_eye = SimpleNamespace(requirement=required, findings=findings)
     verdict = "accepted" if converged else "rejected"
     return SimpleNamespace(
