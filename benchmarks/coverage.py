@@ -24,12 +24,12 @@ from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.seen import seen_uncertainty, within_95
 from jcr.calibration.stage import calibrate
 from jcr.camera import parameters, unproject, with_parameters
-from jcr.check import spread_rows
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.estimation.intrinsics_prior import ESTIMATED, Camera, camera_with_prior
 from jcr.estimation.wrist import adjust_wrist
 from jcr.geometry import apply, step_between
+from jcr.pipeline.check import spread_rows
 from jcr.records import Capture, Estimate, HandEye, Intrinsics, Reconstruction
 from simulation.arms import PresetName
 from simulation.problems import INTRINSICS, BentProblem, bent_problem, error, observed

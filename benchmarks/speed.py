@@ -165,7 +165,7 @@ def colmap_alone(place: str) -> None:
 def run_by_stage(place: str) -> None:
     """Run all stages in a process of its own, and write the processor seconds of each into stages.json."""
     import jcr
-    from jcr import attempts, stages
+    from jcr.pipeline import stages
     from jcr.report import html
 
     spent: dict[str, float] = dict.fromkeys(STAGES, 0.0)

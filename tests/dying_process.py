@@ -2,7 +2,7 @@
 
 import os
 
-from jcr.batch import Row, Task
+from jcr.pipeline.batch import Row, Task
 
 
 def dies_on_bad(task: Task) -> Row:

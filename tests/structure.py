@@ -19,8 +19,6 @@ from PIL import Image
 
 import capture_writers as writers
 from fuzz_targets import NAMES, SIZE, small_capture, sound_run
-from jcr.batch import STATE as BATCH
-from jcr.batch import _finished
 from jcr.calibration.known_transform import read_hand_eye
 from jcr.capture.added import read_added
 from jcr.capture.camera_info import read_camera_info
@@ -31,9 +29,11 @@ from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError, RejectedError
 from jcr.live.folder import LiveFolder
 from jcr.live.server import sample_pose
+from jcr.pipeline.batch import STATE as BATCH
+from jcr.pipeline.batch import _finished
+from jcr.pipeline.run_folder import RunFolder
 from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Capture
-from jcr.run_folder import RunFolder
 from jcr.segments.labels import _read_names
 from simulation.problems import hand_eye_problem
 from simulation.ros_bag import write_bag
@@ -232,9 +232,9 @@ def _of_runs(folder: Path, capture: Capture, in_file: Any, found: dict[str, Docu
 
 
 def _batch_state(folder: Path, capture: Capture, in_file: Any) -> None:
-    from jcr.batch import Row, Task
     from jcr.capture.options import ReadOptions
-    from jcr.results import RunOptions
+    from jcr.pipeline.batch import Row, Task
+    from jcr.pipeline.results import RunOptions
 
     task = Task(
         capture=capture.folder,

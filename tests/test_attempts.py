@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-from jcr import attempts
 from jcr import reconstruct as backends
 from jcr.calibration import stage as calibration_stage
 from jcr.calibration.checks import capture as capture_checks
@@ -246,8 +245,8 @@ def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
     present: set[str], tmp_path: Path, tabletop: Path, monkeypatch: pytest.MonkeyPatch
 ):
     from jcr.capture.read import read_capture
-    from jcr.pipeline import calibrate
-    from jcr.run_folder import RunFolder
+    from jcr.pipeline.run import calibrate
+    from jcr.pipeline.run_folder import RunFolder
 
     problem = hand_eye_problem(np.random.default_rng(3), 12)
     capture = replace(read_capture(tabletop), base_from_gripper=problem.base_from_gripper)
@@ -295,8 +294,8 @@ def test_where_nothing_is_found_each_attempt_reports_why(
     present: set[str], tmp_path: Path, tabletop: Path, monkeypatch: pytest.MonkeyPatch
 ):
     from jcr.capture.read import read_capture
-    from jcr.pipeline import calibrate
-    from jcr.run_folder import RunFolder
+    from jcr.pipeline.run import calibrate
+    from jcr.pipeline.run_folder import RunFolder
 
     def door(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
         raise RejectedError(f"{options.backend} saw nothing")
@@ -318,8 +317,8 @@ def test_input_that_calibration_cannot_use_is_no_reason_for_another_back_end(
     present: set[str], tmp_path: Path, tabletop: Path, monkeypatch: pytest.MonkeyPatch
 ):
     from jcr.capture.read import read_capture
-    from jcr.pipeline import RunOptions, calibrate
-    from jcr.run_folder import RunFolder
+    from jcr.pipeline.run import RunOptions, calibrate
+    from jcr.pipeline.run_folder import RunFolder
 
     problem = hand_eye_problem(np.random.default_rng(3), 12)
     capture, made = read_capture(tabletop), []

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from dying_process import dies_on_bad
-from jcr import batch as module
-from jcr.batch import BatchOptions, Row, Task, batch, run_one
 from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
 from jcr.cli import dispatch
-from jcr.pipeline import RunOptions
+from jcr.pipeline import batch as module
+from jcr.pipeline.batch import BatchOptions, Row, Task, batch, run_one
+from jcr.pipeline.run import RunOptions
 
 pytestmark = pytest.mark.slow
 

@@ -8,8 +8,6 @@ from .calibration.seen import SeenInBase as SeenInBase
 from .capture.options import ReadOptions as ReadOptions
 from .capture.read import read_capture as read_capture
 from .cell.cameras_json import CamerasFile as CamerasFile
-from .check import Examination as Examination
-from .check import check_capture as check_capture
 from .depth.options import DepthOptions as DepthOptions
 from .errors import InputError as InputError
 from .errors import RejectedError as RejectedError
@@ -32,11 +30,22 @@ from .live.server import Listen as Listen
 from .live.server import LiveServer as LiveServer
 from .live.session import LiveSession as LiveSession
 from .live.session import SessionOptions as SessionOptions
-from .pipeline import add_camera as add_camera
-from .pipeline import build_map as build_map
-from .pipeline import calibrate as calibrate
-from .pipeline import measure as measure
-from .pipeline import run as run
+from .pipeline.check import Examination as Examination
+from .pipeline.check import check_capture as check_capture
+from .pipeline.results import RunOptions as RunOptions
+from .pipeline.results import RunResult as RunResult
+from .pipeline.results import SavedRun as SavedRun
+from .pipeline.results import load_run as load_run
+from .pipeline.run import add_camera as add_camera
+from .pipeline.run import build_map as build_map
+from .pipeline.run import calibrate as calibrate
+from .pipeline.run import measure as measure
+from .pipeline.run import run as run
+from .pipeline.touch import Touched as Touched
+from .pipeline.touch import touch as touch
+from .pipeline.verify import Verification as Verification
+from .pipeline.verify import VerifyOptions as VerifyOptions
+from .pipeline.verify import verify_run as verify_run
 from .pointmaps.global_alignment.align import global_align as global_align
 from .pointmaps.global_alignment.alignment import Alignment as Alignment
 from .pointmaps.global_alignment.alignment import AlignOptions as AlignOptions
@@ -56,10 +65,6 @@ from .records import PosePairs as PosePairs
 from .records import Reconstruction as Reconstruction
 from .records import Requirement as Requirement
 from .records import RobotNoise as RobotNoise
-from .results import RunOptions as RunOptions
-from .results import RunResult as RunResult
-from .results import SavedRun as SavedRun
-from .results import load_run as load_run
 from .scene.distance import DistanceGrid as DistanceGrid
 from .scene.map_file import load_map as load_map
 from .scene.options import CloudOptions as CloudOptions
@@ -71,10 +76,5 @@ from .scene.scene_map import SceneMap as SceneMap
 from .segments.measure import Measured as Measured
 from .segments.options import SegmentOptions as SegmentOptions
 from .segments.options import TabletopOptions as TabletopOptions
-from .touch_test import Touched as Touched
-from .touch_test import touch as touch
-from .verify import Verification as Verification
-from .verify import VerifyOptions as VerifyOptions
-from .verify import verify_run as verify_run
 
 __version__: str

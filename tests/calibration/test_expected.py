@@ -14,7 +14,7 @@ from jcr.calibration.calibration_json import CalibrationFile, calibration_file
 from jcr.calibration.expected import Ahead, assumed, expected, typical_camera
 from jcr.calibration.poses import calibrate_poses
 from jcr.calibration.robot_errors import errors_of
-from jcr.check import check_capture
+from jcr.pipeline.check import check_capture
 from jcr.records import Intrinsics, NextPose, PosePairs
 from simulation.problems import HandEyeProblem, hand_eye_problem
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jcr import pipeline, stages
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file, write_calibration
 from jcr.calibration.expected import assumed_of_poses
 from jcr.calibration.options import CalibrateOptions
@@ -22,9 +21,10 @@ from jcr.cli.result import show, show_calibration
 from jcr.errors import InputError, RejectedError
 from jcr.findings import Finding, FindingKind, sentence
 from jcr.geometry import inverse, scale_translation, step_between
+from jcr.pipeline import run, stages
+from jcr.pipeline.results import PosesResult, RunOptions
 from jcr.records import HandEye, PosePairs
 from jcr.report.html import poses_report_html
-from jcr.results import PosesResult, RunOptions
 from simulation.problems import HandEyeProblem, disturbed, hand_eye_problem
 
 DISAGREE = Finding(
@@ -222,5 +222,5 @@ def test_options_that_cannot_be_are_refused_before_any_work(
 ):
     monkeypatch.setattr(stages, "choose", lambda *_: pytest.fail("images were reconstructed"))
     with pytest.raises(InputError, match=message):
-        pipeline.calibrate(read_capture(tabletop), tmp_path / "out", RunOptions(calibrate=options))
+        run.calibrate(read_capture(tabletop), tmp_path / "out", RunOptions(calibrate=options))
     assert not (tmp_path / "out").exists()

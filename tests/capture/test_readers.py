@@ -110,7 +110,7 @@ def test_samples_of_markers_are_solved_without_images(name: str, tmp_path: Path,
 
 
 def test_a_scale_that_is_not_one_tells_of_a_marker_of_another_size(tmp_path: Path, problem: HandEyeProblem):
-    from jcr.pipeline import calibrate_poses
+    from jcr.pipeline.run import calibrate_poses
 
     cameras = scale_translation(problem.recon_from_camera, problem.scale)
     for size, words in ((1.0, None), (1.1, "10.0 % too large")):
@@ -122,7 +122,7 @@ def test_a_scale_that_is_not_one_tells_of_a_marker_of_another_size(tmp_path: Pat
 
 
 def test_an_orbit_hides_the_scale_and_a_marker_gives_it_back(tmp_path: Path):
-    from jcr.pipeline import calibrate_poses
+    from jcr.pipeline.run import calibrate_poses
 
     orbit = hand_eye_problem(np.random.default_rng(5), 12, "orbit")
     cameras = scale_translation(orbit.recon_from_camera, orbit.scale)
@@ -503,7 +503,7 @@ def test_swapped_poses_of_samples_are_named(tmp_path: Path, problem: HandEyeProb
     """Gripper poses given as base in gripper, the commonest mistake of all."""
     cameras = scale_translation(problem.recon_from_camera, problem.scale)
     path = writers.write_moveit(tmp_path, np.linalg.inv(problem.base_from_gripper), cameras)
-    from jcr.pipeline import calibrate_poses
+    from jcr.pipeline.run import calibrate_poses
 
     result = calibrate_poses(read_source(path), tmp_path / "out")
     assert not result.converged and "inverses" in result.calibration.warnings[0]

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from in_process import run_jcr
-from jcr import stages
+from jcr.pipeline import stages
 
 FIRST = "images/00.jpg"
 

@@ -22,7 +22,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jcr import attempts, pipeline, run_folder
 from jcr.calibration.calibration_json import read_calibration
 from jcr.calibration.checks import capture as capture_checks
 from jcr.calibration.stage import calibrate
@@ -31,8 +30,9 @@ from jcr.cli import dispatch
 from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import forward_kinematics
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
+from jcr.pipeline import run, run_folder
+from jcr.pipeline.run_folder import RunFolder
 from jcr.records import Capture, Reconstruction
-from jcr.run_folder import RunFolder
 from simulation.faults import Faults, faulty_capture, reconstructed
 from simulation.problems import hand_eye_problem
 
@@ -530,7 +530,7 @@ def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(
 
     monkeypatch.setattr(run_folder, "write_reconstruction", killed)
     with pytest.raises(KeyboardInterrupt):
-        pipeline.calibrate(read_capture(sound), out, backend="colmap")
+        run.calibrate(read_capture(sound), out, backend="colmap")
     assert not (out / "run.json").exists()
 
 

@@ -17,7 +17,7 @@ import jcr
 from jcr.capture.images import read_image
 from jcr.live.calibration import LiveCalibration
 from jcr.live.folder import LiveFolder
-from jcr.run_folder import LIVE
+from jcr.pipeline.run_folder import LIVE
 
 pytestmark = pytest.mark.slow
 
@@ -25,7 +25,7 @@ KILLS = int(os.environ.get("JCR_TEST_KILLS", "2"))
 IMAGES = 5
 PROCESSES = multiprocessing.get_context("forkserver")
 PROCESSES.set_forkserver_preload(
-    ["jcr.pipeline", "jcr.live.calibration", "jcr.sfm.growing", "jcr.report.html"]
+    ["jcr.pipeline.run", "jcr.live.calibration", "jcr.sfm.growing", "jcr.report.html"]
 )
 
 

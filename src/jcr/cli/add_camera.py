@@ -40,7 +40,7 @@ def main(arguments: Arguments) -> int:
 
     from jcr.cell.cameras_json import in_words
     from jcr.errors import InputError
-    from jcr.pipeline import add_camera
+    from jcr.pipeline.run import add_camera
     from jcr.progress import progress_bars
 
     if not arguments.images:

@@ -6,17 +6,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from jcr.batch import BatchOptions
 from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output
 from jcr.cli.source import run_options
 from jcr.depth.options import DepthOptions
+from jcr.pipeline.batch import BatchOptions
 from jcr.reconstruct import ReconstructOptions
 from jcr.scene.options import CloudOptions, MapOptions
 
 if TYPE_CHECKING:
-    from jcr.batch import Row
+    from jcr.pipeline.batch import Row
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +46,8 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Run all and print the table."""
-    from jcr.batch import batch, is_accepted
     from jcr.errors import InputError, RejectedError
+    from jcr.pipeline.batch import batch, is_accepted
     from jcr.progress import progress_bars
 
     if len(arguments.paths) < 2:

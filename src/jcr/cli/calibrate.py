@@ -40,7 +40,7 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Calibrate and print what was found."""
-    from jcr.pipeline import calibrate, calibrate_poses
+    from jcr.pipeline.run import calibrate, calibrate_poses
     from jcr.progress import progress_bars
     from jcr.records import PosePairs
 

@@ -13,7 +13,7 @@ from jcr.cli.source import looked_at
 
 if TYPE_CHECKING:
     from jcr.calibration.expected import Expectation
-    from jcr.check import Examination
+    from jcr.pipeline.check import Examination
     from jcr.records import Capture, PosePairs
 
 
@@ -55,8 +55,8 @@ class Arguments:
 def main(arguments: Arguments) -> int:
     """Examine the capture and print what was found."""
     from jcr.calibration.options import CalibrateOptions, check_options
-    from jcr.check import check_capture, read_and_compare
     from jcr.errors import InputError, RejectedError
+    from jcr.pipeline.check import check_capture, read_and_compare
     from jcr.progress import progress_bars
 
     if arguments.suggest < 0:
@@ -84,7 +84,7 @@ def main(arguments: Arguments) -> int:
 
 
 def _as_text(capture: "Capture | PosePairs", found: "Examination") -> str:
-    from jcr.check import QUICK
+    from jcr.pipeline.check import QUICK
     from jcr.rounding import significant
 
     rotation = np.degrees(found.largest_rotation_rad)

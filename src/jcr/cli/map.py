@@ -38,7 +38,7 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Build the map and print its path."""
-    from jcr.pipeline import build_map
+    from jcr.pipeline.run import build_map
     from jcr.progress import progress_bars
 
     with progress_bars() as progress:

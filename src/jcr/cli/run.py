@@ -52,8 +52,8 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Run every stage and print what was found."""
-    from jcr.mapping import require_dense
-    from jcr.pipeline import finished, run
+    from jcr.pipeline.mapping import require_dense
+    from jcr.pipeline.run import finished, run
     from jcr.progress import progress_bars
 
     map_options = None if arguments.no_map else arguments.map

@@ -33,7 +33,7 @@ class Arguments:
 def main(arguments: Arguments) -> int:
     """Print each error beside what was expected."""
     from jcr.errors import RejectedError
-    from jcr.touch_test import UNLIKELY, touch
+    from jcr.pipeline.touch import UNLIKELY, touch
 
     found = touch(arguments.out, arguments.points)
     lines = [

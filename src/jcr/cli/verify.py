@@ -10,10 +10,10 @@ import tyro
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output, warn
 from jcr.cli.source import looked_at, with_images
-from jcr.verify import VerifyOptions
+from jcr.pipeline.verify import VerifyOptions
 
 if TYPE_CHECKING:
-    from jcr.verify import Verification
+    from jcr.pipeline.verify import Verification
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +42,8 @@ class Arguments:
 def main(arguments: Arguments) -> int:
     """Verify and print what to do."""
     from jcr.errors import RejectedError
+    from jcr.pipeline.verify import verify_run
     from jcr.progress import progress_bars
-    from jcr.verify import verify_run
 
     with (
         progress_bars() as progress,

@@ -10,7 +10,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jcr import __version__, stages
+from jcr import __version__
 from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.cues import check_known_length
 from jcr.calibration.options import CalibrateOptions, check_options
@@ -23,11 +23,12 @@ from jcr.cell.added import camera_of, keep_camera, read_added_cameras
 from jcr.errors import InputError, RejectedError
 from jcr.extras import is_installed
 from jcr.options import checked_options
+from jcr.pipeline import stages
+from jcr.pipeline.results import PosesResult, RunOptions, RunResult, SavedRun, load_run
+from jcr.pipeline.run_folder import CAPTURE, REPORT, RunFolder, locked
 from jcr.progress import Progress, silent
 from jcr.reconstruct import BackendName, check_board
 from jcr.records import Capture, PosePairs
-from jcr.results import PosesResult, RunOptions, RunResult, SavedRun, load_run
-from jcr.run_folder import CAPTURE, REPORT, RunFolder, locked
 from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
@@ -89,7 +90,7 @@ def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, str | 
     # What a camera on the base sees moves with the gripper, not with the base.
     if options.map is None or capture.mount == "base":
         return replace(options, map=None), None
-    from jcr.mapping import require_dense
+    from jcr.pipeline.mapping import require_dense
     from jcr.scene.map_file import PACKAGES
 
     require_dense(options.depth)
@@ -170,7 +171,7 @@ def build_map(
     `add` are captures of further images, oldest first, read with the options `read`. They change the map but not the
     calibration, and are used in every later map of the folder. Dense depth is estimated if the folder has none.
     """
-    from jcr.mapping import require_map
+    from jcr.pipeline.mapping import require_map
 
     before = RunFolder(Path(out))
     options = RunOptions.of(
@@ -226,7 +227,7 @@ def add_camera(
         keep_camera(folder.path, capture, camera)
         result = stages.located(result, folder, options, report)
         if folder.has_map():
-            from jcr.mapping import measured
+            from jcr.pipeline.mapping import measured
 
             cloud, scene = folder.cloud(), folder.scene()
             result = replace(result, cloud=cloud, scene=scene, measured=measured(cloud, result.calibration))
@@ -238,7 +239,7 @@ def measure(out: str | Path) -> "Measured":
 
     Raises InputError if there is no map, or if there is no support plane.
     """
-    from jcr.mapping import measured
+    from jcr.pipeline.mapping import measured
 
     folder = RunFolder(Path(out))
     return measured(folder.cloud(), folder.calibration())

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 from jcr import __version__
 from jcr.allocator import give_back
-from jcr.attempts import NothingFoundError, Tried, again, choose, timings_of
 from jcr.boards.proposal import proposed_for
 from jcr.calibration.calibration_json import calibration_file, failed_file
 from jcr.capture.added import write_added
@@ -15,10 +14,11 @@ from jcr.cell.cameras_json import CamerasFile, cameras_file
 from jcr.cell.carried import carried_scene, refined
 from jcr.depth.densify import densify
 from jcr.findings import sentence
+from jcr.pipeline.results import RunOptions, RunResult
+from jcr.pipeline.run_folder import MOVING, RunFolder, State, state_of
+from jcr.pipeline.selection import NothingFoundError, Tried, again, choose, timings_of
 from jcr.progress import Progress
 from jcr.records import Attempt, Capture, CellCamera
-from jcr.results import RunOptions, RunResult
-from jcr.run_folder import MOVING, RunFolder, State, state_of
 
 
 def calibrated(capture: Capture, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
@@ -106,7 +106,7 @@ def mapped(
     result: RunResult, added: Capture, folder: RunFolder, options: RunOptions, progress: Progress
 ) -> RunResult:
     """With cloud, map, and what stands on the table; `added` are further images for it."""
-    from jcr.mapping import make_map  # labels and sizes need half of SciPy, a calibration does not
+    from jcr.pipeline.mapping import make_map  # labels and sizes need half of SciPy, a calibration does not
 
     start = time.perf_counter()
     made = make_map(result, added, options, progress)

@@ -24,10 +24,10 @@ from jcr.errors import InputError, RejectedError
 from jcr.extras import extra
 from jcr.files import write_text
 from jcr.findings import Verdict, sentence, verdict_of
-from jcr.pipeline import RunOptions, calibrate, run
+from jcr.pipeline.run import RunOptions, calibrate, run
+from jcr.pipeline.run_folder import CAPTURE, RunFolder, fingerprint
 from jcr.progress import Progress, silent
 from jcr.report.render import render
-from jcr.run_folder import CAPTURE, RunFolder, fingerprint
 
 STATE = "batch.json"
 """In each run folder: its row of the table, and a fingerprint of what it was made from."""
