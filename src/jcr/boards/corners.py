@@ -26,9 +26,9 @@ FEWEST_POINTS = 4
 FEWEST_IMAGES = 2
 """Fewest images of a body."""
 SAME_PLACE = 0.006
-"""Of the image's width: rms distance of corners from where those of other images, triangulated, are projected."""
+"""Largest rms distance of corners from the projections of triangulated ones, as a share of the image's width."""
 MOST_PAIRS = 100
-"""Of images from which a body's place is triangulated to see which others agree."""
+"""Largest number of pairs of images from which a body is triangulated to find those that agree."""
 
 
 @dataclass(frozen=True)
@@ -41,14 +41,14 @@ class _Seen:
 
     @property
     def images(self) -> Int[ndarray, " i"]:
-        """Those that show enough of its corners."""
+        """Rows of the images that show enough of its corners."""
         return np.flatnonzero(np.isfinite(self.x_px[..., 0]).sum(1) >= FEWEST_POINTS)
 
 
 def with_boards(
     capture: Capture, reconstruction: Reconstruction, spec: str, progress: Progress | None = None
 ) -> Reconstruction:
-    """A reconstruction with the corners of what `--board` names among its tracks.
+    """Add the corners of the boards that `--board` names to the tracks of a reconstruction.
 
     Raises InputError for a board that is none.
     """
@@ -81,7 +81,7 @@ def with_boards(
 
 
 def _bodies(sightings: Sequence[Sequence[Sighting]]) -> Iterator[_Seen]:
-    """Each body that any image shows."""
+    """Yield each body that any image shows."""
     for number in sorted({s.body for shown in sightings for s in shown}):
         own = [(k, s) for k, shown in enumerate(sightings) for s in shown if s.body == number]
         x_in_body = {i: x for _, s in own for i, x in zip(s.index, s.x_in_body, strict=True)}
@@ -95,7 +95,7 @@ def _bodies(sightings: Sequence[Sequence[Sighting]]) -> Iterator[_Seen]:
 def _at_one_place(
     seen: _Seen, cameras: Float[ndarray, "m 4 4"], intrinsics: Intrinsics
 ) -> Int[ndarray, " a"]:
-    """The most images that agree on where the body is; none where no two do."""
+    """Return the largest set of images that agree on the body's position; empty where no two do."""
     images = seen.images
     pairs = list(combinations(images.tolist(), 2))
     if len(pairs) > MOST_PAIRS:
@@ -114,7 +114,7 @@ def _at_one_place(
 def _agreeing(
     seen: _Seen, by: Int[ndarray, " b"], cameras: Float[ndarray, "m 4 4"], intrinsics: Intrinsics
 ) -> Int[ndarray, " a"]:
-    """Images in which the corners are where these images, together, place them."""
+    """Return the images in which the corners are where these images triangulate them."""
     points = _triangulated(seen.x_px[by], cameras[by], intrinsics)
     limit_px, agreeing = SAME_PLACE * intrinsics.width, list[int]()
     for k in seen.images:
@@ -148,7 +148,7 @@ def _with_corners(
     cameras: Float[ndarray, "m 4 4"],
     intrinsics: Intrinsics,
 ) -> tuple[Tracks, Body]:
-    """The tracks with what these images show of a body; its corners are further points."""
+    """Return the tracks with the corners of a body in these images as further points."""
     points = _triangulated(seen.x_px[images], cameras[images], intrinsics)
     shown = np.isfinite(seen.x_px[images, :, 0]) & np.isfinite(points[:, 0])
     kept = np.flatnonzero(shown.any(0))

@@ -41,7 +41,7 @@ class Sighting:
     body: int
     """Number of the tag; 0 for a board."""
     index: tuple[int, ...]
-    """Which of the body's points."""
+    """Numbers of the body's points."""
     x_in_body: Float[ndarray, "k 3"]
     """Metres, z = 0."""
     x_px: Float[ndarray, "k 2"]
@@ -56,7 +56,7 @@ class Board:
 
 
 def boards(spec: str) -> list[Board]:
-    """The readings of a board's name, the literal one first.
+    """Return the possible boards of a board's name, the literal one first.
 
     A ChArUco board has others: printed by OpenCV before 4.6, with its sides swapped, or with a marker of unknown size.
     With SIDE in place of the length of a side, and MARKER in place of that of a marker, the unit is the side. Raises
@@ -82,12 +82,12 @@ def boards(spec: str) -> list[Board]:
 
 
 def is_of_unknown_size(spec: str) -> bool:
-    """Whether a board's name leaves its side open."""
+    """Test whether a board's name leaves its side open."""
     return SIDE in spec.split(":")
 
 
 def side_of(spec: str) -> float:
-    """The side of a square, or of a tag, that a board's name states (m); 1 where it is the unit."""
+    """Return the side of a square or tag that a board's name states (m); 1 where it is the unit."""
     kind, *parts = spec.split(":")
     return _length(parts[0] if kind in ("aruco", "apriltag") else parts[1])
 
@@ -184,7 +184,7 @@ def _chessboard(count: tuple[int, int], square: float) -> Callable[[UInt8[ndarra
 
 
 def _starts_dark(grey: UInt8[ndarray, "h w"], x_px: Float[ndarray, "down across 2"]) -> bool:
-    """Whether the square after the first corner is one of the dark ones, which tells the board's two ends apart."""
+    """Test whether the square after the first corner is dark, which distinguishes the board's two ends."""
     centre = (x_px[:-1, :-1] + x_px[1:, :-1] + x_px[:-1, 1:] + x_px[1:, 1:]) / 4
     u, v = np.moveaxis(np.rint(centre).astype(int), -1, 0)
     shade = grey[v.clip(0, grey.shape[0] - 1), u.clip(0, grey.shape[1] - 1)].astype(float)
@@ -251,7 +251,7 @@ def _single_tags(
 def most_seen(
     readings: Sequence[Board], images: Sequence[UInt8[ndarray, "h w 3"]]
 ) -> tuple[Board, list[list[Sighting]]]:
-    """The reading of the board that finds most points in the images, and its sightings per image.
+    """Return the possible board that finds most points in the images, and its sightings per image.
 
     Other readings, and images without the lines that a detector drew into them, are tried only where the
     literal one finds the board in fewer than half of the images.

@@ -32,14 +32,14 @@ FEWEST_FOR_INTRINSICS = 4
 
 @dataclass(frozen=True)
 class Pose:
-    """Of one body in one image."""
+    """Pose of one body in one image."""
 
     camera_from_body: Float[ndarray, "4 4"]
     rms_px: float
 
 
 def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | None = None) -> Reconstruction:
-    """Cameras in metres, or in sides of unknown length; the recon frame is the board's, or that of the tag seen most.
+    """Reconstruct cameras from a board or tags, in metres or sides; the recon frame is that of the body seen most.
 
     `look_for` names the board as `board.KINDS` has it. Unknown intrinsics are calibrated from the board. Raises
     InputError for a board that is none, and RejectedError when fewer than three images show it.
@@ -91,7 +91,7 @@ def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | Non
 def _intrinsics(
     capture: Capture, board: Board, seen: Sequence[Sequence[Sighting]]
 ) -> tuple[Intrinsics, list[str]]:
-    """The given intrinsics, or a focal length, centre and two radial coefficients from the board's points."""
+    """Return the given intrinsics, or a focal length, centre and two radial coefficients from the board's points."""
     if capture.intrinsics is not None:
         return capture.intrinsics, []
     shown = [s for sightings in seen for s in sightings]
@@ -122,7 +122,7 @@ def _intrinsics(
 
 
 def pose_of_body(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:
-    """The body's pose, unless its points lie on a line, miss, or leave open which way it is tilted."""
+    """Return the body's pose; None where its points lie on a line, miss, or fit two poses."""
     x, x_px = sighting.x_in_body, sighting.x_px
     seen, camera = x_px, (intrinsics.matrix, np.array(intrinsics.distortion))
     if intrinsics.model == "fisheye":
@@ -156,7 +156,7 @@ def pose_of_body(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:
 def locate_cameras_and_bodies(
     poses: Sequence[dict[int, Pose]],
 ) -> tuple[dict[int, Float[ndarray, "4 4"]], dict[int, Float[ndarray, "4 4"]]]:
-    """Cameras by row and bodies by number in one frame, chained from the body seen most often.
+    """Return cameras by row and bodies by number in one frame, chained from the body seen most often.
 
     A camera is placed by the body that it sees best, a body by the camera that sees it best.
     """
@@ -187,7 +187,7 @@ def adjust_bodies(
     sightings: Sequence[Sequence[Sighting]],
     intrinsics: Intrinsics,
 ) -> tuple[Float[ndarray, "m 4 4"], dict[int, Float[ndarray, "4 4"]]]:
-    """All cameras and bodies adjusted to all points at once; the first body stays."""
+    """Adjust all cameras and bodies to all points; the first body stays."""
     numbers = list(bodies)
     count, of_body = len(cameras), {body: k for k, body in enumerate(numbers)}
     start = np.concatenate([cameras, np.stack([bodies[body] for body in numbers])])

@@ -1,0 +1,1 @@
+"""Dense depth on known cameras."""

@@ -28,7 +28,7 @@ REACH = 1.5
 CONTRADICTION = 0.015
 """Relative difference of depths by which one surface lies before another, beyond noise of depth and poses."""
 LEAST_SHARE = 0.005
-"""Of a new image's pixels that must get a depth, or it shows nothing of the scene."""
+"""Least share of a new image's pixels with depth; with less it shows nothing of the scene."""
 
 
 def extend(
@@ -38,7 +38,7 @@ def extend(
     added: Capture,
     report: Progress,
 ) -> Reconstruction:
-    """The reconstruction with further images, oldest first, whose gripper poses are known.
+    """Return the reconstruction with further images, oldest first, whose gripper poses are known.
 
     Their rows come last, numbered from `capture_size`, the images of the capture; where a later image contradicts
     an earlier one, the earlier's confidence is 0. Raises InputError for an image that shares no view with the
@@ -87,7 +87,7 @@ def extend(
 
 
 def _joined(dense: Pointmaps, found: Pointmaps, colors: UInt8[ndarray, "m h w 3"], new: int) -> Pointmaps:
-    """The pointmaps of a reconstruction, and those found of its last images, `new` in number; `colors` are of all.
+    """Return the pointmaps of a reconstruction and of its last `new` images; `colors` are of all.
 
     The confidence is in the unit of the back end's own, so that one threshold serves both.
     """
@@ -111,7 +111,7 @@ def _joined(dense: Pointmaps, found: Pointmaps, colors: UInt8[ndarray, "m h w 3"
 def _neighbours(
     tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"], old: int
 ) -> dict[int, Int[ndarray, " _"]]:
-    """Rows that each new image is compared with, and each old one that takes part: those rows have keys, too.
+    """Return the rows that each new image, and each old one that takes part, is compared with.
 
     Old images take part with a depth of their own, so that depths can be cross-checked.
     """
@@ -152,7 +152,7 @@ def _forget_contradicted(
 
 
 def contradicted(earlier: View, later: View, pinhole: Intrinsics) -> Bool[ndarray, "h w"]:
-    """Pixels of an earlier view whose point the later one sees through, or whose ray meets the later's surface."""
+    """Return the pixels of an earlier view that the later one sees through, or whose ray meets the later's surface."""
     x_earlier, known, earlier_from_recon = earlier
     x_later, known_later, later_from_recon = later
     gone = np.zeros(known.shape, bool)
@@ -175,7 +175,7 @@ def contradicted(earlier: View, later: View, pinhole: Intrinsics) -> Bool[ndarra
 def _pixels(
     camera_from_recon: Float[ndarray, "4 4"], x_in_recon: Float[ndarray, "n 3"], pinhole: Intrinsics
 ) -> tuple[ndarray, ndarray, ndarray, Bool[ndarray, " n"]]:
-    """Nearest pixel u, v (n,), depth (n,), and whether it lies in the image (else the pixel is 0, 0)."""
+    """Return the nearest pixel u, v (n,), depth (n,), and whether it lies in the image (else the pixel is 0, 0)."""
     x_in_camera = apply(camera_from_recon, x_in_recon)
     z = x_in_camera[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -185,7 +185,7 @@ def _pixels(
 
 
 def _nearest_around(depth: Float[ndarray, "h w"], known: Bool[ndarray, "h w"]) -> Float[ndarray, "h w"]:
-    """The smallest depth known in 5x5 pixels; 0 where the pixel itself has none."""
+    """Return the smallest known depth in 5x5 pixels; 0 where the pixel itself has none."""
     nearest = cv2.erode(np.where(known, depth, np.inf).astype(np.float32), np.ones((5, 5), np.uint8))
     return np.where(known, nearest, 0.0)
 
@@ -193,7 +193,7 @@ def _nearest_around(depth: Float[ndarray, "h w"], known: Bool[ndarray, "h w"]) -
 def _with_projections(
     tracks: Tracks, recon_from_new: Float[ndarray, "k 4 4"], pinhole: Intrinsics, first: int
 ) -> Tracks:
-    """The tracks, with what points of theirs would lie in the frames of new images; for choosing views only."""
+    """Return the tracks with the projections of their points in new images, for the choice of views."""
     image, x_px, point = [tracks.image], [tracks.x_px], [tracks.point]
     for row, new_from_recon in enumerate(inverse(recon_from_new), start=first):
         u, v, _, inside = _pixels(new_from_recon, tracks.points_in_recon, pinhole)

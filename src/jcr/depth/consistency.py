@@ -1,4 +1,4 @@
-"""What other images show at a depth: compiled checks across views, 16 pixels of a row at once in vector registers."""
+"""Consistency of depths and colours across views, compiled for 16 pixels of a row at once in vector registers."""
 
 from typing import Any, no_type_check
 
@@ -22,12 +22,12 @@ table often gets the object's depth; the neighbours that look past the object th
 def evidence(
     inverse_depth: Float[ndarray, "m h w"], known: Bool[ndarray, "m h w"], sees: Bool[ndarray, "m h w"]
 ) -> Float[ndarray, "m h _"]:
-    """What `agreement` compares: inverse depths, 0 where not `known`, negative where the image sees through no point."""
+    """Return the maps for `agreement`: inverse depths, 0 where not `known`, negative where not `sees`."""
     return padded(np.where(known, np.where(sees, inverse_depth, -inverse_depth), 0))
 
 
 def padded(maps: Float[ndarray, "..."]) -> Float[ndarray, "..."]:
-    """Maps (m,h,w,…) as float32 with w continued by zeros to a multiple of the lanes."""
+    """Return maps (m,h,w,…) as float32 with w continued by zeros to a multiple of the lanes."""
     margins = [(0, 0)] * maps.ndim
     margins[2] = (0, -maps.shape[2] % LANES)
     return np.pad(maps.astype(np.float32, copy=False), margins)
@@ -36,7 +36,7 @@ def padded(maps: Float[ndarray, "..."]) -> Float[ndarray, "..."]:
 @compiled
 @no_type_check
 def agreement(i, compared, others, a, b, centre, k, width, tolerance):
-    """Maps (4,h,w) of image i: mean inverse depth with the images that agree, how many agree, how many see through.
+    """Return maps (4,h,w) of image i: mean inverse depth of images that agree, their number, number that see through.
 
     The fourth is the information of those that agree: the sum of squares of how far (px) the point moves in them per
     inverse depth. `compared` is the `evidence` of images of this `width`; `a` (n,3,3) is K R and `b` (n,3) K t to
@@ -58,7 +58,7 @@ def agreement(i, compared, others, a, b, centre, k, width, tolerance):
 @compiled
 @no_type_check
 def colours_agree(i, inverse_depth, surfaces, others, a, b, k, width, tolerance):
-    """How many others (3,h,w) show the points of image i in their colour, how many in another, how many see through.
+    """Return numbers (3,h,w) of images that show the points of image i in their colour, in another, and see through.
 
     `inverse_depth` (h,w) is 0 where no point is asked for; `surfaces` (m,h,w,4) holds every image's matched inverse
     depth, or 0, and its colour. A point is hidden from an image whose matched depth there is nearer, and not counted.
@@ -77,7 +77,7 @@ def colours_agree(i, inverse_depth, surfaces, others, a, b, k, width, tolerance)
 @inlined
 @no_type_check
 def _row(v, n, a, b, k, width, height):
-    """What a ray's x, its constant part and inverse depth add to x, y and z in the n-th other image, in row v.
+    """Return the factors of a ray's x, of 1 and of inverse depth in x, y and z of the n-th other image, in row v.
 
     Then the largest x and y there, and cx and 1/fx.
     """
@@ -89,12 +89,12 @@ def _row(v, n, a, b, k, width, height):
 
 
 def _numbers(builder: Any, row: Any) -> list[Any]:
-    """The numbers of a tuple, each in all lanes."""
+    """Return the numbers of a tuple, each in all lanes."""
     return [Lanes.repeated(builder, number, LANES) for number in cgutils.unpack_tuple(builder, row)]
 
 
 def _other_pixels(here: Any, u: Any, rows: list[list[Any]]) -> tuple[Any, ...]:
-    """Pixel x, y, depth z (by that here) of 16 pixels from u on in another image, and whether they lie in it.
+    """Return pixel x, y, relative depth z of 16 pixels from u on in another image, and whether they lie in it.
 
     `here` are their inverse depths, `rows` is what `_row` returns. Outside, x and y are 0.
     """
@@ -110,7 +110,7 @@ def _other_pixels(here: Any, u: Any, rows: list[list[Any]]) -> tuple[Any, ...]:
 
 
 def _between_pixels(image: Any, width: Any, x: Any, y: Any) -> tuple[Any, Any]:
-    """Inverse depth between pixels, where all four are known, or else the nearest's; and whether that one sees."""
+    """Return the inverse depth between pixels, or the nearest's where one is unknown, and whether that one sees."""
     left, top = x.as_ints(), y.as_ints()
     first = top * width + left
     (p, q), (r, s) = (at.gathered(image, LANES).as_pairs() for at in (first, first + width))

@@ -28,7 +28,7 @@ def dense_pointmaps(
     priors: bool = True,
     threads: int | None = None,
 ) -> Pointmaps:
-    """Points in the recon frame, per pixel of undistorted images, with confidence, reason and sigma.
+    """Estimate points in the recon frame for the pixels of undistorted images, with confidence, reason and sigma.
 
     The confidence is the correlation times the number of images that agree, 0 for no estimate.
 

@@ -26,7 +26,7 @@ def densify(
     options: DepthOptions | None = None,
     progress: Progress | None = None,
 ) -> Reconstruction:
-    """The reconstruction with pointmaps of its images; those that it has, predicted by a network, stay as they are.
+    """Return the reconstruction with pointmaps of its images; those that a network predicted stay.
 
     Only cameras, intrinsics and tracks are used, so that it may come before or after the calibration.
     Raises InputError where an image cannot be read.
@@ -57,21 +57,21 @@ def densify(
 def undistorted(
     folder: Path, names: Sequence[str], intrinsics: Intrinsics, size_px: int = DepthOptions.pointmap_size_px
 ) -> tuple[Intrinsics, UInt8[ndarray, "m h w 3"]]:
-    """The pinhole grid of pointmaps whose long side is `size_px` at most, and the images on it."""
+    """Return the pinhole grid of pointmaps whose long side is `size_px` at most, and the images on it."""
     pinhole = pinhole_inside(intrinsics, size_px)
     undistort = undistortion(intrinsics, pinhole)
     return pinhole, np.stack([undistort(read_image(folder / name)) for name in names])
 
 
 def _planes(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Float[ndarray, "m 2 3"]:
-    """For each image the two planes that span where its surfaces may lie."""
+    """Return the two planes of each image that bound its surfaces."""
     return sweep_planes(
         _raised(tracks, recon_from_camera) if tracks.from_board else tracks, recon_from_camera
     )
 
 
 def _raised(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Tracks:
-    """The points, and the same ones as near to the cameras as things beside the board may come."""
+    """Return the points, and the same points raised as far towards the cameras as objects beside the board may rise."""
     on_board = tracks.points_in_recon
     middle = recon_from_camera[:, :3, 3].mean(0)
     raised = on_board + RISE * (middle - on_board)

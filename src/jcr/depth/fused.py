@@ -18,7 +18,7 @@ from jcr.geometry import apply
 from jcr.records import BOTH, MATCHED, NO_DEPTH, PRIOR, Intrinsics
 
 LEAST_CORRELATION = 0.3
-"""Where even the best neighbours correlate less, what is found there is no estimate."""
+"""Least correlation with the best neighbours; below it there is no estimate."""
 AGREEMENT = (0.01, 0.005, 0.003, 0.003)
 """Per round: largest relative difference of two depths of one point that are averaged. On simulated views the
 rounds halve the median error and the share of gross ones."""
@@ -30,8 +30,8 @@ so that it is more than the scatter of one."""
 PRIOR_FLOOR = 0.002
 """Relative sigma of a depth that rests on a plane, beside what the pixels scatter that carry it."""
 PAIR_CORRELATION = 0.5
-"""Of a depth on which two images agree and no third: it counts where it lies on its region's plane, too. Without the
-plane, a third of such depths are off by 5 mm."""
+"""Largest deviation from its region's plane of a depth on which two images agree and no third; without the plane, a
+third of such depths are off by 5 mm."""
 BOTH_CONFIDENCE = 2.0
 """Factor of the confidence of a matched depth on its region's plane: at most a quarter as many are off by 5 mm."""
 PRIOR_CONFIDENCE = 0.5
@@ -62,7 +62,7 @@ def fused_depth(
     threads: int,
     report: Callable[[float], None],
 ) -> FusedDepth:
-    """The depths that views agree on, and with `priors` those of planes that nothing seen contradicts.
+    """Return the depths that views agree on, and with `priors` those of planes that no view contradicts.
 
     A matched depth needs two images that agree (one, if there are no more than two) and, but for `changing` scenes, more
     than twice as many as see through it. To see through, an image's own depth must have as many that agree: what is
@@ -131,12 +131,12 @@ def _check(
 
 
 def _where(there: Bool[ndarray, "m h w"], values: Float[ndarray, "m h w"]) -> Float[ndarray, "m h w"]:
-    """The values there, and 0 elsewhere."""
+    """Return the values there, and 0 elsewhere."""
     return np.where(there, values, 0).astype(np.float32)
 
 
 def _stacked(priors: Sequence[Prior]) -> Prior:
-    """Of all images, (m,h,w) each."""
+    """Return the maps of all images, (m,h,w) each."""
     return Prior(**{one.name: np.stack([getattr(p, one.name) for p in priors]) for one in fields(Prior)})
 
 
@@ -189,7 +189,7 @@ def _support(
     recon_from_camera: Float[ndarray, "m 4 4"],
     pinhole: Intrinsics,
 ) -> Float[ndarray, "4"]:
-    """The plane of most matched points, in the recon frame."""
+    """Return the plane of most matched points, in the recon frame."""
     direction = rays(pinhole).reshape(-1, 3)
     x_in_recon = []
     for pose, per_depth, there in zip(recon_from_camera, inverse_depth, matched, strict=True):

@@ -18,27 +18,28 @@ class Lanes:
     """One number or condition a lane: the result of an instruction that `builder` emits."""
 
     def __init__(self, builder: Any, value: Any) -> None:
+        """Take a value of a vector type that an instruction gives."""
         self.builder, self.value, self.count = builder, value, value.type.count
 
     @classmethod
     def constant(cls, builder: Any, numbers: Any, kind: Any = FLOAT) -> "Lanes":
-        """Given numbers, one a lane."""
+        """Return given numbers, one a lane."""
         return cls(builder, ir.Constant(ir.VectorType(kind, len(numbers)), [kind(n) for n in numbers]))
 
     @classmethod
     def repeated(cls, builder: Any, number: Any, count: int) -> "Lanes":
-        """A scalar in all `count` lanes."""
+        """Return a scalar in all `count` lanes."""
         empty = ir.Constant(ir.VectorType(number.type, count), ir.Undefined)
         return cls(builder, builder.insert_element(empty, number, INT(0))).at([0] * count)
 
     @classmethod
     def read(cls, builder: Any, start: Any, place: Any, count: int, kind: Any = FLOAT) -> "Lanes":
-        """`count` consecutive numbers from a place on."""
+        """Return `count` consecutive numbers from a place on."""
         there = builder.bitcast(builder.gep(start, [place]), ir.VectorType(kind, count).as_pointer())
         return cls(builder, builder.load(there, align=4))
 
     def gathered(self, start: Any, used: int) -> "Lanes":
-        """64 bits from each of these places after `start`; the lanes from `used` on are 0."""
+        """Return 64 bits from each of these places after `start`; the lanes from `used` on are 0."""
         b, found = self.builder, ir.Constant(ir.VectorType(LONG, self.count), [LONG(0)] * self.count)
         for lane in range(used):
             place = b.zext(b.extract_element(self.value, INT(lane)), LONG)
@@ -47,7 +48,7 @@ class Lanes:
         return Lanes(b, found)
 
     def _same(self, other: Any) -> Any:
-        """The other operand; a number stands for itself in every lane."""
+        """Return the other operand; a number stands for itself in every lane."""
         kind = self.value.type.element
         return other if isinstance(other, Lanes) else Lanes.constant(self.builder, [other] * self.count, kind)
 
@@ -69,41 +70,42 @@ class Lanes:
     __ge__ = partialmethod(_compare, ">=")
 
     def __abs__(self) -> "Lanes":
+        """Return the absolute values."""
         return (self < 0.0).choose(self * -1.0, self)
 
     def choose(self, yes: Any, no: Any) -> "Lanes":
-        """`yes` in the lanes where this condition holds, `no` in the others; numbers stand for floats."""
+        """Return `yes` in the lanes where this condition holds, `no` in the others; numbers stand for floats."""
         zero = Lanes.constant(self.builder, [0.0] * self.count)
         return Lanes(
             self.builder, self.builder.select(self.value, zero._same(yes).value, zero._same(no).value)
         )
 
     def as_ints(self) -> "Lanes":
-        """The numbers as int32: those of floats without their fraction, the low bits of longer ones."""
+        """Return the numbers as int32: floats without their fraction, the low bits of longer ones."""
         convert = self.builder.fptosi if self.value.type.element == FLOAT else self.builder.trunc
         return Lanes(self.builder, convert(self.value, ir.VectorType(INT, self.count)))
 
     def as_floats(self) -> "Lanes":
-        """The numbers of int32 as float32."""
+        """Return the numbers of int32 as float32."""
         return Lanes(self.builder, self.builder.sitofp(self.value, ir.VectorType(FLOAT, self.count)))
 
     def as_pairs(self, kind: Any = FLOAT) -> "tuple[Lanes, Lanes]":
-        """The two numbers that lie in the 64 bits of every lane."""
+        """Return the two numbers in the 64 bits of every lane."""
         pairs = Lanes(self.builder, self.builder.bitcast(self.value, ir.VectorType(kind, 2 * self.count)))
         return pairs.at(range(0, 2 * self.count, 2)), pairs.at(range(1, 2 * self.count, 2))
 
     def inverted(self) -> "Lanes":
-        """One over the numbers."""
+        """Return the inverse of the numbers."""
         return self._same(1.0) / self
 
     def root(self) -> "Lanes":
-        """The square roots."""
+        """Return the square roots."""
         kind = ir.FunctionType(self.value.type, [self.value.type])
         root = cgutils.get_or_insert_function(self.builder.module, kind, f"llvm.sqrt.v{self.count}f32")
         return Lanes(self.builder, self.builder.call(root, [self.value]))
 
     def at(self, lanes: Any) -> "Lanes":
-        """The numbers of some lanes, in a given order."""
+        """Return the numbers of some lanes, in a given order."""
         chosen = Lanes.constant(self.builder, lanes, INT).value
         return Lanes(self.builder, self.builder.shuffle_vector(self.value, self.value, chosen))
 

@@ -19,19 +19,19 @@ from jcr.records import Intrinsics
 COMPARED = 5
 """Neighbours that an image is matched with, the first that are given."""
 ASKED = 3
-"""Of them, those that a pixel is matched with at full resolution: the ones it correlated best with at half."""
+"""Number of neighbours that a pixel is matched with at full resolution, the best ones at half resolution."""
 _COARSE = ((0.2, 2), (0.1, 2), (0.05, 2), (0.025, 2))
 _FINE = ((0.01, 2), (0.003, 1))
 """Per pass at half and at full resolution: relative change of inverse depth that is tried, and how often."""
 _PEAK = 0.003
 """Relative change of inverse depth, to either side, by which the peak is found in the end."""
 LEAST = 0.25
-"""Of the nearest inverse depth that tracks tell, the least that is searched."""
+"""Least inverse depth of the search, as a share of the largest one of the tracks."""
 
 
 @dataclass(frozen=True)
 class Relative:
-    """How the pixels of one image move to its neighbours': u ~ a·ray + b·(inverse depth), z of the neighbour last."""
+    """Projection of an image's pixels into its neighbours: u ~ a·ray + b·(inverse depth)."""
 
     others: Int[ndarray, " n"]
     """Rows of the neighbours."""
@@ -44,7 +44,7 @@ class Relative:
 def relative(
     i: int, others: Int[ndarray, " n"], recon_from_camera: Float[ndarray, "m 4 4"], pinhole: Intrinsics
 ) -> Relative:
-    """Image i beside others, in the grid of `pinhole`."""
+    """Return the projection of image i into others, in the grid of `pinhole`."""
     motion = inverse(recon_from_camera[others]) @ recon_from_camera[i]
     a = pinhole.matrix @ motion[:, :3, :3]
     b = motion[:, :3, 3] @ pinhole.matrix.T
@@ -58,7 +58,7 @@ def relative(
 
 
 def grid(pinhole: Intrinsics) -> Float[ndarray, "4"]:
-    """fx, fy, cx, cy, as the compiled loops take them."""
+    """Return fx, fy, cx, cy for the compiled loops."""
     return np.array([pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy], np.float32)
 
 
@@ -95,7 +95,7 @@ class _Level:
         return self.packed[others], motions, windows(continued(self.colors[i], self.greys[i]), space), k
 
     def enlarged(self, map_of_half: ndarray) -> ndarray:
-        """A map of the level below, each number for the pixels that it covers here."""
+        """Return a map of the level below at this resolution, each number for the pixels that it covers."""
         h, w = self.pinhole.height, self.pinhole.width
         row = np.minimum(np.arange(h) // 2, map_of_half.shape[1] - 1)
         column = np.minimum(np.arange(blocks_of(w)) // 2, map_of_half.shape[2] - 1)
@@ -111,7 +111,7 @@ def match_depth(
     threads: int,
     report: Callable[[float], None],
 ) -> tuple[Float[ndarray, "m h w"], Float[ndarray, "m h w"]]:
-    """Inverse depth (per recon unit) and correlation (-1 to 1) of every pixel's best plane; images are independent here.
+    """Return inverse depth (per recon unit) and correlation (-1 to 1) of every pixel's best plane, image by image.
 
     `planes` of `views.sweep_planes` span what is searched, and half of the first guesses are parallel to them. The
     result is the same whatever the number of threads.

@@ -26,7 +26,7 @@ REACH_M = (0.1, 6.0)
 def with_measured_depth(
     capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye
 ) -> tuple[Reconstruction, tuple[str, ...]]:
-    """The reconstruction with the depth images in its pointmaps, and what the user should know of them.
+    """Return the reconstruction with the depth images in its pointmaps, and notes about them.
 
     Depth is divided by what the robot says it is too long. Where images match a depth too, the two are averaged if they
     agree, and else the matched one stays, for several images say it; planes that were filled in give way.
@@ -83,7 +83,7 @@ def with_measured_depth(
 
 
 def _sampled(depth: Float[ndarray, "h w"], at: ndarray) -> tuple[Float[ndarray, "p q"], Bool[ndarray, "p q"]]:
-    """The depth (m) at pixels (u, v), and where it is one: of no edge, and within reach."""
+    """Return the depth (m) at pixels (u, v), and where it is valid: at no edge, and within range."""
     height, width = depth.shape
     u, v = at[..., 0], at[..., 1]
     inside = (u >= 1) & (v >= 1) & (u < width - 1) & (v < height - 1)

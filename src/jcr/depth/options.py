@@ -1,4 +1,4 @@
-"""How dense depth is estimated; apart from the stage, so that the command line's help imports little."""
+"""Options of dense depth, apart from the stage, so that the command line's help imports little."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -8,7 +8,7 @@ import tyro
 
 @dataclass(frozen=True)
 class DepthOptions:
-    """How the dense depth that the map needs is estimated on the cameras of a reconstruction."""
+    """Options of the dense depth that the map needs."""
 
     dense: Annotated[
         bool,

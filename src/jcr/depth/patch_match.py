@@ -80,7 +80,7 @@ def _score(v, u, tried, packed, windows, k, near, starts, each):
 @inlined
 @no_type_check
 def _faces(p0, p1, p2, inverse_depth, rx, ry):
-    """Whether the surface on the plane is seen from before, not too slanted."""
+    """Test whether the camera sees the front of the plane, not too slanted."""
     if inverse_depth <= 0:
         return False
     normal, ray = p0 * p0 + p1 * p1 + p2 * p2, rx * rx + ry * ry + np.float32(1)
@@ -155,7 +155,7 @@ def _try_beside(found, v, u, k, step, tried):
 @compiled
 @no_type_check
 def random_planes(family, span, k, h, w, seed):
-    """A plane for each pixel: half of them parallel to the family's between its two, half with any normal.
+    """Return a random plane for each pixel: half of them between the family's two, half with any normal.
 
     The inverse depth of these lies in the span.
     """
@@ -184,7 +184,7 @@ def random_planes(family, span, k, h, w, seed):
 @compiled
 @no_type_check
 def spread_planes(found, asked, packed, motions, windows, k, search, seed):
-    """One pass over the image: each pixel takes its neighbours' planes, or a changed one, where that scores better.
+    """Pass over the image once: each pixel takes its neighbours' planes, or a changed one, where it scores better.
 
     Passes alternate in direction (Bleyer et al. 2011, section 3.2), with the lowest bit of the seed. `search` is the
     span of inverse depths, the relative change of it that is tried, and of the normal, how often it is: the change
@@ -216,7 +216,7 @@ def spread_planes(found, asked, packed, motions, windows, k, search, seed):
 @compiled
 @no_type_check
 def best_neighbours(found, asked, packed, motions, windows, k, count):
-    """Of the neighbours asked, the `count` (count,h,w) with which each pixel's plane correlates best, the best first."""
+    """Return the `count` neighbours (count,h,w) with which each pixel's plane correlates best, the best first."""
     slots, h, w = asked.shape
     near, starts = np.empty((slots, 12, LANES), np.float32), np.empty((slots, LANES), np.int32)
     each, tried = np.empty((slots, LANES), np.float32), np.empty((7, LANES), np.float32)
@@ -240,7 +240,7 @@ def best_neighbours(found, asked, packed, motions, windows, k, count):
 @compiled
 @no_type_check
 def peaks(found, asked, packed, motions, windows, k, step):
-    """Inverse depth (h,w) at the peak of the parabola through each plane's score and those a relative step off."""
+    """Return inverse depth (h,w) at the peak of the parabola through each plane's score and two beside it."""
     slots, h, w = asked.shape
     near, starts = np.empty((slots, 12, LANES), np.float32), np.empty((slots, LANES), np.int32)
     each, tried = np.empty((slots, LANES), np.float32), np.empty((7, LANES), np.float32)

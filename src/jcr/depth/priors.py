@@ -37,18 +37,18 @@ OFF_PLANE = 0.015
 FEWEST_VIEWS = 2
 """Others that must show a point in its colour."""
 PATCH = 0.02
-"""Of the image, that a region without a plane of its own has at most to be taken for a part of the support plane."""
+"""Largest share of the image of a region without a plane that may be a part of the support plane."""
 WHOLE = 0.8
-"""Of its pixels at which the support plane must then hold: a thing that stands on it moves against it."""
+"""Least share of its pixels at which the support plane must hold; an object on it moves against it."""
 _POINTS, _TRIALS = 4000, 400
-"""Of the search for the support plane."""
+"""Number of samples in the search for the support plane."""
 _PAIRS = 600
 """Pixels of an image whose brightness is compared with other images'."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Prior:
-    """What the planes say of one image, or of all."""
+    """Depths of the planes of one image, or of all."""
 
     inverse_depth: Float[ndarray, "*m h w"]
     holds: Bool[ndarray, "*m h w"]
@@ -65,7 +65,7 @@ class Prior:
 
 
 def support_plane(x_in_recon: Float[ndarray, "n 3"], tolerance: float, seed: int = 0) -> Float[ndarray, "4"]:
-    """The plane (unit normal n, d with n·x + d = 0) on which most points lie (RANSAC, then total least squares)."""
+    """Return the plane (unit normal n, d with n·x + d = 0) of most points, by RANSAC and total least squares."""
     draw = np.random.default_rng(seed)
     some = x_in_recon[draw.choice(len(x_in_recon), min(_POINTS, len(x_in_recon)), replace=False)]
     corner = some[draw.integers(len(some), size=(_TRIALS, 3))]
@@ -145,7 +145,7 @@ def planar_prior(
     recon_from_camera: Float[ndarray, "4 4"],
     pinhole: Intrinsics,
 ) -> Prior:
-    """The planes of image i's regions; `support` is in the recon frame.
+    """Return the planes of image i's regions; `support` is in the recon frame.
 
     `surfaces` hold the matched inverse depths of all images and their colours, gain-compensated and a little smooth, as
     `colours_agree` takes them.
@@ -199,7 +199,7 @@ def planar_prior(
 def _plane_in_camera(
     plane: Float[ndarray, "4"], recon_from_camera: Float[ndarray, "4 4"]
 ) -> Float[ndarray, "3"]:
-    """A plane (n, d) of the recon frame as p with p·x = 1 in a camera's; 0 where it runs through the camera."""
+    """Return a plane (n, d) of the recon frame as p with p·x = 1 in a camera's; 0 where it runs through the camera."""
     offset = float(plane[:3] @ recon_from_camera[:3, 3] + plane[3])
     return -recon_from_camera[:3, :3].T @ plane[:3] / offset if offset else np.zeros(3)
 
@@ -207,7 +207,7 @@ def _plane_in_camera(
 def _deviations(
     label: Int[ndarray, "h w"], middle: Float[ndarray, "r 2"], shape: Float[ndarray, "r 3"]
 ) -> Float[ndarray, "h w"]:
-    """Standard deviations of the pixels that carry its region's plane by which each pixel is away from their mean."""
+    """Return each pixel's Mahalanobis distance from the pixels that support its region's plane."""
     pixel = np.stack(np.meshgrid(np.arange(label.shape[1]), np.arange(label.shape[0])), -1)
     du, dv = np.moveaxis(pixel - middle[label], -1, 0)
     xx, xy, yy = np.moveaxis(shape[label], -1, 0)

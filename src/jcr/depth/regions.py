@@ -20,8 +20,8 @@ FEWEST = 12
 SAMPLED = 400
 """Matched pixels of a region that take part in the drawing."""
 SPREAD = 0.08
-"""Of a region's variance across, that of the pixels which carry its plane has at least: those along one edge say nothing
-of the slope across it, and they may be the next thing's."""
+"""Least share of a region's variance across that the pixels which support its plane have: pixels along one edge do not
+determine the slope across it, and may belong to the next object."""
 
 
 def colour_regions(color: Float[ndarray, "h w 3"]) -> tuple[Int[ndarray, "h w"], int]:
@@ -86,7 +86,7 @@ def _joined(first, second, weight, n):
 @compiled
 @no_type_check
 def region_planes(label, count, inverse_depth, matched, support, k, tolerance, seed):
-    """For each region the plane (count,3) that most of its matched pixels lie on, and what speaks for it.
+    """Return each region's plane (count,3), on which most of its matched pixels lie, and its support.
 
     Gives planes, whether each is the support's, inliers, matched pixels, root mean square of the inliers' relative
     residuals, and mean (count,2) and inverse covariance (count,3: xx, xy, yy) in the image of the pixels that carry it.
@@ -134,7 +134,7 @@ def region_planes(label, count, inverse_depth, matched, support, k, tolerance, s
 @compiled
 @no_type_check
 def _by_region(label, count, matched):
-    """Of each region the moments (count,6), how many pixels are matched, and where these begin in the list of all."""
+    """Return each region's moments (count,6), number of matched pixels, and where these begin in the list of all."""
     h, w = label.shape
     whole = np.zeros((count, 6))
     fixed = np.zeros(count, np.int64)
@@ -158,7 +158,7 @@ def _by_region(label, count, matched):
 @inlined
 @no_type_check
 def _add(moments, u, v):
-    """A pixel to their number and the sums of u, v, uu, uv, vv."""
+    """Add a pixel to the number and the sums of u, v, uu, uv, vv."""
     moments[0] += 1
     moments[1] += u
     moments[2] += v
@@ -179,7 +179,7 @@ def _covariance(moments):
 @inlined
 @no_type_check
 def _narrow(moments):
-    """The smaller eigenvalue of the covariance."""
+    """Return the smaller eigenvalue of the covariance."""
     _, _, xx, xy, yy = _covariance(moments)
     return 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
 
@@ -217,7 +217,7 @@ def _supporters(samples, p, tolerance):
 @inlined
 @no_type_check
 def _best_plane(samples, support, tolerance, state):
-    """Of planes through three samples each the one with which most agree, or the support; and whether it is that."""
+    """Return the plane through three samples with which most agree, or the support plane, and which of the two it is."""
     of_support = (support[0], support[1], support[2])
     plane, most, n = of_support, 0, len(samples)
     for _ in range(TRIALS):
@@ -245,7 +245,7 @@ def _row(samples, t):
 @inlined
 @no_type_check
 def _fit(samples, plane, tolerance):
-    """The plane of least squares through the samples that agree with one, and whether they determine it."""
+    """Return the least-squares plane of the samples that agree with one, and whether they determine it."""
     xx, xy, yy, x, y, n = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     xd, yd, d = 0.0, 0.0, 0.0
     for t in range(len(samples)):
@@ -261,7 +261,7 @@ def _fit(samples, plane, tolerance):
 @inlined
 @no_type_check
 def _solve(a, b, c, right):
-    """p with a·p, b·p, c·p = right by Cramer's rule, and the determinant, without which p means nothing."""
+    """Return p with a·p, b·p, c·p = right by Cramer's rule, and the determinant, without which p means nothing."""
     bc, ca, ab = _cross(b, c), _cross(c, a), _cross(a, b)
     determinant = a[0] * bc[0] + a[1] * bc[1] + a[2] * bc[2]
     p0 = (right[0] * bc[0] + right[1] * ca[0] + right[2] * ab[0]) / determinant

@@ -11,7 +11,7 @@ from jcr.records import Tracks
 def choose_neighbours(
     tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"], count: int
 ) -> list[Int[ndarray, " _"]]:
-    """For each image the rows of up to `count` others that share most points under a useful angle.
+    """Return the rows of up to `count` others for each image that share most points under a useful angle.
 
     The angle's weight has the form of MVSNet's (Yao et al., ECCV 2018, section 4.1), its best at 15°.
     """
@@ -31,7 +31,7 @@ def choose_neighbours(
 
 
 def sweep_planes(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Float[ndarray, "m 2 3"]:
-    """For each image two planes p·x_in_camera = 1, so that p·(x/z, y/z, 1) is a pixel's inverse depth.
+    """Return two planes p·x_in_camera = 1 for each image, so that p·(x/z, y/z, 1) is a pixel's inverse depth.
 
     All have the slope of the plane that the image's points lie on best, mostly the table (least absolute
     deviations of inverse depth); between them lie the points from percentile 1 to 99, with some slack.

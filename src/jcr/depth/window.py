@@ -37,7 +37,7 @@ COLOR_SIGMA = 25.5
 
 
 def quads(grey: UInt16[ndarray, "h w"]) -> UInt64[ndarray, "h w"]:
-    """Four greys in each pixel: its own in the lowest bits, then the one to the right, the one below, and its right one.
+    """Return four greys in each pixel, from the lowest bits: its own, the right one, the one below, and its right one.
 
     A bilinear interpolation is then one read from memory.
     """
@@ -49,7 +49,7 @@ def quads(grey: UInt16[ndarray, "h w"]) -> UInt64[ndarray, "h w"]:
 @compiled
 @no_type_check
 def windows(image, space):
-    """Two numbers (h,blocks,taps,2,lanes) for each tap of each pixel's window: its weight, and what its grey counts.
+    """Return weight and weighted grey (h,blocks,taps,2,lanes) of each tap of each pixel's window.
 
     `image` (4,h,w), its colours and grey, is continued by the reach of a window and to whole blocks. The weights of a
     window have the sum 1, and a tap's is its likeness to the central colour (Schönberger et al., ECCV 2016, eq. 6, with
@@ -66,17 +66,17 @@ def windows(image, space):
 
 
 def blocks_of(columns: int) -> int:
-    """Columns that hold whole blocks of lanes."""
+    """Return the number of columns in whole blocks of lanes."""
     return -(-columns // LANES) * LANES
 
 
 def floats_of_windows(h: int, w: int) -> int:
-    """Numbers that `windows` writes for an image."""
+    """Return the number of floats that `windows` writes for an image."""
     return h * blocks_of(w) * TAPS * 2
 
 
 def continued(color: UInt8[ndarray, "h w 3"], grey: UInt16[ndarray, "h w"]) -> Float[ndarray, "4 _ _"]:
-    """An image as `windows` takes it."""
+    """Return an image for `windows`: colours and grey, continued by the reach of a window."""
     around = ((MARGIN, MARGIN), (MARGIN, MARGIN + -grey.shape[1] % LANES))
     channels = [*np.moveaxis(color, -1, 0), grey]
     return np.stack([np.pad(channel.astype(np.float32), around, "edge") for channel in channels])
@@ -158,7 +158,7 @@ def correlate(typing, out, slot, packed, starts, motions, windows, place, tried)
 
 
 def _window_there(motion: list[Lanes], plane: list[Lanes], size: list[Lanes]) -> tuple[list[Lanes], Lanes]:
-    """Centre x, y of the windows in the padded other images, and the steps from tap to tap; and whether they lie there.
+    """Return centre x, y of the windows in the padded other images, steps from tap to tap, and whether they lie there.
 
     The window is small: its homography is taken as affine about the centre, which spares the divisions.
     """
@@ -179,7 +179,7 @@ def _window_there(motion: list[Lanes], plane: list[Lanes], size: list[Lanes]) ->
 
 
 def _correlation(image: Any, start: Lanes, width: Lanes, window: list[Lanes], weights: list[Lanes]) -> Lanes:
-    """Σ c·g over the standard deviation of g, with noise, of the greys g interpolated at the taps of each lane."""
+    """Return Σ c·g over the standard deviation of g, with noise, of greys g interpolated at the taps of each lane."""
     x, y, xu, yu, xv, yv = window
     steps = [float(n) for n in range(-REACH, REACH + 1)]
     along = [(xu * n, yu * n) for n in steps]
@@ -196,7 +196,7 @@ def _correlation(image: Any, start: Lanes, width: Lanes, window: list[Lanes], we
 
 
 def _interpolated(image: Any, start: Lanes, width: Lanes, x: Lanes, y: Lanes) -> Lanes:
-    """The grey at (x, y) of the image that begins at `start`."""
+    """Return the grey at (x, y) of the image that begins at `start`."""
     left, top = x.as_ints(), y.as_ints()
     upper, lower = (top * width + left + start).gathered(image, LANES).as_pairs(INT)
     fx, fy = x - left.as_floats(), y - top.as_floats()

@@ -17,7 +17,7 @@ from jcr.features.verify import View
 from jcr.geometry import transform
 
 PRIOR_STD_M = 0.2
-"""Of t_X around zero: a camera sits on the flange or near it."""
+"""Standard deviation of t_X around zero: a camera is mounted on the flange or near it."""
 ROBOT_STD_M = 2e-3
 LEAST_DIRECTION_STD = 0.01
 """rad; of a two-view translation, which forward motion and plane scenes leave loose."""
@@ -31,7 +31,7 @@ class RoughX:
 
     gripper_from_camera: Float[ndarray, "4 4"]
     covariance: Float[ndarray, "6 6"]
-    """Of (translation, rotation vector) in gripper axes."""
+    """Covariance of (translation, rotation vector) in gripper axes, m and rad."""
 
 
 def translation_of_x(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> RoughX | None:
@@ -61,7 +61,7 @@ def translation_of_x(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> RoughX |
 def scene_points(
     view: View, found: Gate, motion: Float[ndarray, "n n 4 4"], x: RoughX
 ) -> Float[ndarray, "p 3"]:
-    """Points that confirmed pairs see, in the frame of the first gripper (m), by the midpoint of two rays."""
+    """Return points that confirmed pairs see, in the frame of the first gripper (m), as midpoints of two rays."""
     first_from_camera = motion[0] @ x.gripper_from_camera
     kept = [np.zeros((0, 3))]
     for pair in found.confirmed:
@@ -82,7 +82,7 @@ def midpoints(
     ray_i: Float[ndarray, "m 2"],
     ray_j: Float[ndarray, "m 2"],
 ) -> tuple[Float[ndarray, "m 3"], "np.ndarray"]:
-    """Points nearest to both rays, in frame a, and which lie before both cameras with an angle between the rays."""
+    """Return the points nearest to both rays in frame a, and which are in front of both cameras with parallax."""
     d_i, d_j = (
         np.concatenate([ray, np.ones((len(ray), 1))], 1) @ pose[:3, :3].T
         for ray, pose in ((ray_i, a_from_i), (ray_j, a_from_j))

@@ -20,7 +20,7 @@ TOLERANCE = math.radians(1.5)
 LEAST_SUPPORT = 3.0
 """Pairs that must agree at the best one; with fewer any focal length does."""
 MATCHES = 200
-"""Of a pair that are asked which reading lies in front of the cameras."""
+"""Largest number of a pair's matches by which points in front of both cameras are counted."""
 
 
 def focal_by_robot(

@@ -18,11 +18,11 @@ from jcr.features.two_view import Reading
 from jcr.geometry import inverse, rotation_angle
 
 ROBOT_STD = math.radians(0.3)
-"""Of a reported gripper rotation, where nothing else is known: an industrial arm errs by 0.05°, a servo arm by 1°."""
+"""Standard deviation of a reported gripper rotation; an industrial arm errs by 0.05°, a servo arm by 1°."""
 SYSTEMATIC = 0.015
 """Share of the angle by which cameras and robots disagree systematically; real captures show 0.001 to 0.021."""
 SYSTEMATIC_OF_GUESS = 0.04
-"""The same where the focal length is a guess that the robot has confirmed."""
+"""Systematic share where the focal length is estimated from the gripper's angles."""
 SIGMAS = 3.0
 LARGEST_STD = math.radians(3)
 """A pair that knows its rotation less well neither confirms nor contradicts."""
@@ -31,7 +31,7 @@ SURE_STD = math.radians(2.5)
 UPRIGHT_ENOUGH = math.radians(15)
 """An image is rotated by multiples of 90° where that leaves no more than this, for it costs no resampling."""
 LEAST_PAIRS = 4
-"""That must agree about it: three wrong ones can agree by chance."""
+"""Least number of pairs that agree on X's rotation; three wrong ones can agree by chance."""
 
 
 Key = tuple[int, int]
@@ -45,19 +45,19 @@ class Pair:
     i: int
     j: int
     rows: Int[ndarray, "m 2"]
-    """Of the keypoints of i and j."""
+    """Rows of the matched keypoints of i and j."""
     readings: tuple[Reading, ...]
     """Best first; empty where none could be found."""
 
     @property
     def key(self) -> Key:
-        """Rows of the images."""
+        """Rows of the two images."""
         return self.i, self.j
 
 
 @dataclass(frozen=True)
 class Gate:
-    """What the robot says of a capture's pairs."""
+    """Pairs of a capture, classified by the gripper's motions."""
 
     confirmed: tuple[Pair, ...]
     """Each with the reading that agrees best in front."""
@@ -69,7 +69,7 @@ class Gate:
 
 
 def angle_tolerance(angle: float, std: float, systematic: float = SYSTEMATIC) -> float:
-    """By how much (rad) a pair's angle may differ from the gripper's."""
+    """Return the largest difference (rad) between a pair's angle and the gripper's."""
     return SIGMAS * math.sqrt(std**2 + 2 * ROBOT_STD**2 + (systematic * angle) ** 2)
 
 
@@ -79,7 +79,7 @@ def judge(
     systematic: float = SYSTEMATIC,
     known: RotationOfX | None = None,
 ) -> Gate:
-    """The pairs by what the gripper's motions say of them.
+    """Classify the pairs by the gripper's motions.
 
     First by angle alone; among those that pass, X's rotation is sought; with it, every reading of every pair is judged
     by its whole rotation. `known` is X's rotation where more pairs than these have spoken.
@@ -116,7 +116,7 @@ def judge(
 
 
 def rotation_tolerance(reading: Reading, angle: float, of_x: RotationOfX, systematic: float) -> float:
-    """By how much (rad) a pair's whole rotation may contradict X's."""
+    """Return the largest angle (rad) between a pair's rotation and the one that X predicts."""
     own = float(np.trace(reading.covariance[:3, :3]))
     of_mean = 4 * math.sin(min(angle, math.pi) / 2) ** 2 * float(np.trace(of_x.covariance))
     robot = 3 * max(2 * ROBOT_STD**2, of_x.sigma**2)
@@ -128,7 +128,7 @@ def _sure(reading: Reading) -> bool:
 
 
 def _led(pair: Pair, reading: Reading) -> Pair:
-    """The pair with one of its readings in front."""
+    """Return the pair with one of its readings first."""
     return replace(pair, readings=(reading, *(other for other in pair.readings if other is not reading)))
 
 
@@ -152,7 +152,7 @@ def _common_rotation(
 def base_from_camera_rotations(
     base_from_gripper: Float[ndarray, "n 4 4"], of_x: RotationOfX
 ) -> Float[ndarray, "n 3 3"]:
-    """Of every image, registered or not."""
+    """Return the rotations base_from_camera of all images, shape (n, 3, 3)."""
     return base_from_gripper[:, :3, :3] @ of_x.rotation
 
 
@@ -175,7 +175,7 @@ def rolls(base_from_camera: Float[ndarray, "n 3 3"]) -> Float[ndarray, " n"]:
 
 
 def by_quarters(roll: float) -> float:
-    """The angle, or the whole multiples of 90° that are near it; in [0, 2π), to a degree."""
+    """Return the nearest multiple of 90° if it is near, else the angle to a degree; rad in [0, 2π)."""
     quarters = round(roll / (math.pi / 2)) * math.pi / 2
     nearest = quarters if abs(roll - quarters) <= UPRIGHT_ENOUGH else math.radians(round(math.degrees(roll)))
     return nearest % (2 * math.pi)

@@ -98,12 +98,6 @@ class LearnedFeatures:
         )
         return rows.numpy() + [first.start, second.start]
 
-    def descriptors(self, row: int, roll: float) -> tuple[int, Float[ndarray, "k d"]]:
-        """Return the row of an image's first keypoint at an angle (rad), and the unit descriptors from there on."""
-        with _one_thread():
-            found = self._found(row, roll)
-        return found.start, found.descriptor.numpy()
-
     def _find_all(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], pool: ThreadPoolExecutor) -> None:
         """Find the keypoints of all rotated images that have none yet."""
         wanted = dict.fromkeys(

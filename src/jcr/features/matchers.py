@@ -1,4 +1,4 @@
-"""Which pairs of a capture's images match: features of any kind, and the two-view geometry of their matches."""
+"""Verified two-view geometries of matched features, for any kind of features."""
 
 import os
 from collections.abc import Sequence
@@ -20,11 +20,11 @@ class Features(Protocol):
     """Keypoints of a capture's images, of any kind."""
 
     x_px: list[Float[ndarray, "_ 2"]]
-    """Of every image found so far; pixel centres are whole numbers."""
+    """Keypoints of every image found so far, px; pixel centres are whole numbers."""
 
     @property
     def minds_roll(self) -> bool:
-        """Whether images must be rotated upright for it."""
+        """True if the features need images that are rotated upright."""
         ...
 
     @property
@@ -35,12 +35,7 @@ class Features(Protocol):
     def matches(
         self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], coarse: bool = False
     ) -> list[Int[ndarray, "_ 2"]]:
-        """Rows of the keypoints that match, of each pair, its images rotated (rad) before; `coarse`: where matching is
-        slow, of the best keypoints alone."""
-        ...
-
-    def descriptors(self, row: int, roll: float) -> tuple[int, Float[ndarray, "k d"]]:
-        """Row of the first keypoint of an image rotated by an angle (rad), and the unit descriptors from there on."""
+        """Return rows of matching keypoints of pairs, their images rotated (rad) before; `coarse`: of the best ones."""
         ...
 
 
@@ -54,7 +49,6 @@ class Matcher:
         self._features, self._scale = features, scale
         self._camera, self.known, self.seed = camera, known, seed
         self.minds_roll, self.every_pair = features.minds_roll, features.every_pair
-        self.descriptors = features.descriptors
         self.raw: dict[Key, Int[ndarray, "_ 2"]] = {}
         """All matches of the pairs that were tried last, right or wrong."""
         self.x_px = self._at_work()
@@ -63,7 +57,7 @@ class Matcher:
     def geometries(
         self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], coarse: bool = False
     ) -> Geometries:
-        """Verified two-view geometries of pairs, their images rotated (rad) before; `coarse` as of the features."""
+        """Return verified two-view geometries of pairs, their images rotated (rad) before; `coarse` as in Features."""
         self.raw |= dict(zip(pairs, self._features.matches(pairs, rolls, coarse), strict=True))
         self.x_px = self._at_work()
         with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -71,7 +65,7 @@ class Matcher:
             return {key: geometry for key, geometry in zip(pairs, found, strict=True) if geometry is not None}
 
     def verified(self, key: Key, rows: Int[ndarray, "m 2"]) -> pycolmap.TwoViewGeometry | None:
-        """The geometry of some of a pair's matches; None where too few agree on one."""
+        """Return the geometry of some of a pair's matches; None where too few agree on one."""
         return matched(self.x_px, self._camera, *key, rows, self.seed, self.known)
 
     def _at_work(self) -> list[Float[ndarray, "_ 2"]]:

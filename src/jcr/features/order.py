@@ -9,16 +9,16 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 DECIMALS = 9
-"""Of a pose's numbers that count: what a file's format rounds changes no order."""
+"""Number of decimals of a pose that count, so that rounding by a file format changes no order."""
 
 
 def order_key(base_from_gripper: Float[ndarray, "4 4"]) -> tuple[float, ...]:
-    """What a gripper pose is sorted by: the position (m), x first, then the rotation."""
+    """Return the sort key of a gripper pose: position (m), x first, then rotation."""
     # Adding zero makes -0 and 0 the same.
     pose = np.round(base_from_gripper, DECIMALS) + 0.0
     return (*pose[:3, 3].tolist(), *pose[:3, :3].ravel().tolist())
 
 
 def order_by_pose(base_from_gripper: Float[ndarray, "n 4 4"]) -> Int[ndarray, " n"]:
-    """Rows of gripper poses in the order of reconstruction; equal poses stay as they are listed."""
+    """Return rows of gripper poses in the order of reconstruction; equal poses keep their order."""
     return np.array(sorted(range(len(base_from_gripper)), key=lambda k: order_key(base_from_gripper[k])))

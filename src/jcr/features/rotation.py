@@ -25,7 +25,7 @@ class RotationOfX:
 
     rotation: Float[ndarray, "3 3"]
     covariance: Float[ndarray, "3 3"]
-    """Of a rotation vector in gripper axes, rad."""
+    """Covariance of a rotation vector in gripper axes, rad²."""
     agreeing: Bool[ndarray, " p"]
     residual: Float[ndarray, " p"]
     """rad, per pair."""
@@ -33,7 +33,7 @@ class RotationOfX:
     """Robust size of the residuals of those that agree, rad."""
 
     def std(self) -> float:
-        """Of the worst direction, rad."""
+        """Return the standard deviation of the worst direction, rad."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
 
 

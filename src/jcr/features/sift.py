@@ -10,9 +10,9 @@ from numpy import ndarray
 from PIL import Image
 
 KEYPOINTS = 2000
-"""Of an image at most, those of the highest contrast."""
+"""Largest number of keypoints of an image, by contrast."""
 CONTRAST = 0.01
-"""Of a keypoint at least. With COLMAP's 0.02 elephant_floor has 420 an image, and 2 of its 15 images register."""
+"""Least contrast of a keypoint. With COLMAP's 0.02 elephant_floor has 420 an image, and 2 of its 15 images register."""
 RATIO = 0.8
 """A match must be so much nearer than the second nearest (Lowe 2004)."""
 FARTHEST = 0.7
@@ -23,7 +23,7 @@ Sift = tuple[Float[ndarray, "k 2"], Float32[ndarray, "k 128"]]
 
 
 def grey_of(pixels: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[ndarray, "h2 w2"]:
-    """An image as features are found in it, of this width and height.
+    """Return an image in grey, resized to this width and height for the detector.
 
     Areas share the pixels at their borders; Pillow's BOX gives those to one, and moves 2400 px by 0.25 px.
     """
@@ -32,7 +32,7 @@ def grey_of(pixels: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[nda
 
 
 def detect(grey: UInt8[ndarray, "h w"]) -> Sift:
-    """Keypoints (px; pixel centres are whole numbers) and their descriptors, of unit length."""
+    """Return keypoints (px; pixel centres are whole numbers) and unit descriptors."""
     # Without the precise upscaling every point is off by a quarter of a pixel.
     sift = cv2.SIFT.create(nfeatures=KEYPOINTS, contrastThreshold=CONTRAST, enable_precise_upscale=True)
     points, descriptors = sift.detectAndCompute(grey, None)
@@ -46,7 +46,7 @@ def detect(grey: UInt8[ndarray, "h w"]) -> Sift:
 def matches(
     first: Float32[ndarray, "k 128"], second: Float32[ndarray, "l 128"]
 ) -> tuple[Int[ndarray, " m"], Int[ndarray, " m"]]:
-    """Rows of descriptors that are each other's nearest, and clearly nearer than the next of the second image."""
+    """Return rows of descriptors that are mutual nearest neighbours and pass the ratio test."""
     if len(first) < 2 or len(second) < 2:
         return np.zeros(0, int), np.zeros(0, int)
     cosine = first @ second.T
@@ -60,5 +60,5 @@ def matches(
 
 
 def _distance(cosine: Float32[ndarray, " k"]) -> Float32[ndarray, " k"]:
-    """Between unit vectors."""
+    """Return the distance of unit vectors with this cosine."""
     return np.sqrt(np.maximum(2 - 2 * cosine, 0))

@@ -58,15 +58,10 @@ class SiftFeatures:
     def matches(
         self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], coarse: bool = False
     ) -> list[Int[ndarray, "_ 2"]]:
-        """Rows of the keypoints that match, of each pair; neither the rotations of the images (rad) nor `coarse` change
-        them."""
+        """Return rows of matching keypoints of each pair; SIFT uses neither the rotations (rad) nor `coarse`."""
 
         def of_pair(key: Key) -> Int[ndarray, "_ 2"]:
             return np.stack(matches(self._descriptors[key[0]], self._descriptors[key[1]]), 1)
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             return list(pool.map(of_pair, pairs))
-
-    def descriptors(self, row: int, roll: float) -> tuple[int, Float[ndarray, "k 128"]]:
-        """0, and the unit descriptors of all keypoints; the rotation changes nothing."""
-        return 0, self._descriptors[row]

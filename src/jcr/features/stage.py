@@ -1,4 +1,4 @@
-"""Which images see the same: matches that the robot checks, for every kind of features.
+"""Search for the pairs of images that match and that the gripper poses confirm, for every kind of features.
 
 Pairs that the gripper rotates little against each other are matched as they are; those that the robot confirms give X's
 rotation, and with it every image is rotated upright before the others are matched. While too few agree, rotations by 90°
@@ -41,32 +41,30 @@ ENOUGH = 150
 
 @dataclass(frozen=True, kw_only=True)
 class Matched:
-    """What matching found."""
+    """Verified pairs of a capture and the intrinsics that they were verified with."""
 
     geometries: Geometries
-    """Those that a mapper may believe."""
+    """Geometries for the mapper."""
     gate: Gate | None
     """None where the robot poses were not used."""
     intrinsics: Intrinsics
-    """At the working size: given, or as the robot and the images have it."""
-    upright: Float[ndarray, " n"] | None = None
-    """Angles (rad) by which the images were rotated, once X's rotation was known."""
+    """Intrinsics at the working size, given or estimated from the gripper's angles."""
     still: Bool[ndarray, "r c"] | None = None
     """Parts of the image that do not move with the scene, as match.still has them; None where there are none."""
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    """As those of records.Reconstruction."""
+    """Notes and warnings for records.Reconstruction."""
 
 
 @dataclass(kw_only=True)
 class _Search:
-    """What is known while pairs are matched."""
+    """State of the search for matching pairs."""
 
     matcher: Matcher
     motion: Float[ndarray, "n n 4 4"]
     view: View
     known: bool
-    """Whether the intrinsics are given."""
+    """True if the intrinsics are given."""
     geometries: Geometries = field(default_factory=dict)
     pairs: dict[Key, Pair] = field(default_factory=dict)
     still: Bool[ndarray, "r c"] | None = None
@@ -96,8 +94,7 @@ class _Search:
         )
 
     def match_in_full(self, pairs: Iterable[Key], rolls: Float[ndarray, " n"] | None = None) -> None:
-        """Those of pairs that few of the best keypoints match once more, with all; their images rotated by `rolls`, or
-        as they matched."""
+        """Match pairs with few matches again with all keypoints, rotated by `rolls`, or as before."""
         few = [key for key in pairs if key not in self.pairs or len(self.pairs[key].rows) < ENOUGH]
         self._match_rotated(
             {(i, j): self.rotations[i, j] if rolls is None else (rolls[i], rolls[j]) for i, j in few}, False
@@ -145,7 +142,7 @@ class _Search:
                 self.geometries[key], self.pairs[key] = clean, pair_of(self.view, *key, clean)
 
     def without_first_motion(self, pairs: Sequence[Pair]) -> dict[Key, tuple[Pair, pycolmap.TwoViewGeometry]]:
-        """What else moves in pairs beside their first geometry."""
+        """Return second geometries of pairs, from matches that are not in the first ones."""
         found = {}
         for pair in pairs:
             raw = self._visible(pair.key, self.matcher.raw.get(pair.key, np.zeros((0, 2), dtype=int)))
@@ -156,7 +153,7 @@ class _Search:
         return found
 
     def second_motions_confirmed(self, found: Gate) -> Gate:
-        """The gate after contradicted pairs were asked for a second geometry: the first may be of a thing that moved."""
+        """Return the gate after second geometries replaced contradicted ones, which a moved object may cause."""
         others = self.without_first_motion(found.contradicted)
         judged = robot.judge([pair for pair, _ in others.values()], self.motion, self.systematic, found.of_x)
         for pair in judged.confirmed:
@@ -164,7 +161,7 @@ class _Search:
         return self.gate(found) if judged.confirmed else found
 
     def _visible(self, key: Key, rows: Int[ndarray, "m 2"]) -> Int[ndarray, "visible 2"]:
-        """Without matches in parts of the image that do not move."""
+        """Return the matches outside of parts of the image that do not move."""
         if self.still is None or not len(rows):
             return rows
         i, j = key
@@ -172,19 +169,19 @@ class _Search:
         return rows[~(dark | hidden(self.matcher.x_px[j][rows[:, 1]], self.still))]
 
     def _seen(self, key: Key, geometry: pycolmap.TwoViewGeometry) -> pycolmap.TwoViewGeometry | None:
-        """The geometry, verified again where some of its matches lie in parts that do not move."""
+        """Return the geometry, verified again without matches in parts that do not move."""
         inside = np.asarray(geometry.inlier_matches, dtype=int).reshape(-1, 2)
         if len(self._visible(key, inside)) == len(inside):
             return geometry
         return self.matcher.verified(key, self._visible(key, self.matcher.raw[key]))
 
     def gate(self, known: Gate | None = None) -> Gate:
-        """The robot's judgement of all pairs so far."""
+        """Return the gate of all pairs so far."""
         of_x = None if known is None else known.of_x
         return robot.judge(list(self.pairs.values()), self.motion, self.systematic, of_x)
 
     def _better(self, new: Pair, old: Pair) -> bool:
-        """Whether a new geometry of the same pair is confirmed where the old one is not, or has more matches."""
+        """Test whether a pair's new geometry is confirmed where the old one is not, or has more matches."""
         first, second = (self._agrees(pair) for pair in (new, old))
         # The later one is of images rotated upright, whose keypoints all pairs share.
         return first if first != second else 2 * len(new.rows) > len(old.rows)
@@ -207,7 +204,7 @@ def match_with_robot(
     original: tuple[int, int],
     report: Callable[[float], None] = lambda fraction: None,
 ) -> Matched:
-    """The pairs of images that match and that the robot does not contradict.
+    """Match pairs of images and return those that the gripper poses do not contradict.
 
     `original` is the size of the images as they were taken, for notes. `intrinsics` are at the working size, and a first
     guess unless `known`. Where X's rotation cannot be found from the pairs, the robot poses are not used: they may be of
@@ -248,7 +245,6 @@ def match_with_robot(
         geometries=kept,
         gate=found,
         intrinsics=search.view.intrinsics,
-        upright=upright,
         still=search.still,
         notes=notes,
         warnings=warnings,
@@ -256,20 +252,19 @@ def match_with_robot(
 
 
 def _without_robot(search: _Search, original: tuple[int, int]) -> Matched:
-    """All pairs that match, matched in full, where the robot poses are not used."""
+    """Return all pairs that match, where the gripper poses are not used."""
     search.match_in_full(list(search.geometries))
     return Matched(
         geometries=search.geometries,
         gate=None,
         intrinsics=search.view.intrinsics,
-        upright=None,
         still=search.still,
         notes=_left_out_parts(search, original),
     )
 
 
 def _believed(found: Gate, stale: set[int], known: bool) -> set[Key]:
-    """The pairs that the robot does not contradict, and those of images whose own pose is contradicted by all."""
+    """Return the pairs that the gripper poses do not contradict, and those of images whose pose is wrong."""
     believed = {pair.key for pair in found.confirmed}
     believed |= {pair.key for pair in found.contradicted if stale & set(pair.key)}
     # Of a pair whose rotation is not measured, only what the known rotation explains would be right.
@@ -277,7 +272,7 @@ def _believed(found: Gate, stale: set[int], known: bool) -> set[Key]:
 
 
 def _upright(search: _Search, pairs: Sequence[Key], upright: Float[ndarray, " n"], found: Gate) -> Gate:
-    """The gate after pairs that should see the same were matched, their images rotated upright."""
+    """Match pairs with images rotated upright and return the gate after it."""
     search.match(pairs, upright)
     search.match_in_full(pairs, upright)
     return search.gate(found)
@@ -290,7 +285,7 @@ def _without_partners(found: Gate, count: int) -> set[int]:
 
 
 def _with_intrinsics(search: _Search, guess: Intrinsics) -> Gate:
-    """The gate through the intrinsics that are known, or else through those by which most pairs agree with the robot."""
+    """Return the gate with the given intrinsics, or with those for which most pairs agree with the gripper."""
     if search.known:
         return search.gate()
     size = guess.width, guess.height
@@ -302,7 +297,7 @@ def _with_intrinsics(search: _Search, guess: Intrinsics) -> Gate:
 
 
 def _guessed(search: _Search, pairs: Sequence[Key], angle: Float[ndarray, "n n"], found: Gate) -> Gate:
-    """The gate after rotations by 90° of further pairs, the least rotated first, until X's rotation is known."""
+    """Match further pairs rotated by multiples of 90° until X's rotation is known, and return the gate."""
     confirmed = {pair.key for pair in found.confirmed}
     left = sorted((key for key in pairs if key not in confirmed), key=lambda key: float(angle[key]))
     for start in range(0, min(len(left), GUESSED_AT_MOST), GUESSED_AT_ONCE):
@@ -341,7 +336,7 @@ def _contradicted_by_all(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> set[
 
 
 def _left_out(found: Gate) -> tuple[str, ...]:
-    """How many pairs the robot contradicts, where these are many."""
+    """Return a note about the pairs that the gripper poses contradict, where these are many."""
     count = len(found.contradicted)
     total = count + len(found.confirmed)
     if count <= WORTH_SAYING * total:
@@ -352,7 +347,7 @@ def _left_out(found: Gate) -> tuple[str, ...]:
 
 
 def _wrong_poses(stale: set[int], names: Sequence[str]) -> tuple[str, ...]:
-    """Which reported gripper rotations the matches contradict."""
+    """Return a warning about gripper rotations that the matches contradict."""
     if not stale:
         return ()
     listed = ", ".join(names[row] for row in sorted(stale))

@@ -11,10 +11,10 @@ from jcr.features.gate import Key
 
 CELL_PX = 16
 NEAR_PX = 2.5
-"""Between the positions of a keypoint in two images that did not move."""
+"""Largest distance of a keypoint's positions in two images that counts as no motion."""
 LEAST_PAIRS = 4
 LEAST_SHARE = 0.2
-"""Of the pairs whose matches lie in a cell at all: by chance a point of the scene keeps its pixel in one pair or two."""
+"""Least share of the pairs with matches in a cell; by chance a point keeps its pixel in one or two."""
 LEAST_CELLS = 3
 
 
@@ -44,12 +44,12 @@ def still_cells(
 
 
 def hidden(x_px: Float[ndarray, "k 2"], still: Bool[ndarray, "r c"]) -> Bool[ndarray, " k"]:
-    """Which keypoints lie in a part that does not move."""
+    """Test which keypoints lie in a part that does not move."""
     return still[tuple(_cells(x_px, still.shape).T)]
 
 
 def in_words(still: Bool[ndarray, "r c"], size: tuple[int, int], original: tuple[int, int]) -> str:
-    """The parts as rectangles in pixels of the original images."""
+    """Return the parts as text: rectangles in pixels of the original images."""
     scale = np.array(original) / np.array(size)
     places = []
     for rows, columns in find_objects(_parts(still)):

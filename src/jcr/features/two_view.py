@@ -18,7 +18,7 @@ STEPS = 8
 SETTLED = 1e-5
 """rad; of a step, a hundredth of the standard deviation of the surest reading."""
 LEAST_SIGMA_PX = 0.3
-"""Of a match; no detector is better over a whole image."""
+"""Least standard deviation of a match; no detector is better over a whole image."""
 LARGEST_SIGMA_PX = 3.0
 """An alternative that fits its own inliers worse is none."""
 
@@ -30,14 +30,14 @@ class Reading:
     rotation: Float[ndarray, "3 3"]
     """i_from_j."""
     direction: Float[ndarray, "3"]
-    """From camera i to camera j, in camera i's frame; a unit vector."""
+    """Unit vector from camera i to camera j, in the frame of camera i."""
     covariance: Float[ndarray, "5 5"]
-    """Of (rotation vector in camera i's axes, two components of the direction), rad."""
+    """Covariance of (rotation vector in axes of camera i, two components of the direction), rad²."""
     sigma_px: float
     """Robust size of the matches' distances from their epipolar lines."""
 
     def angle_std(self) -> float:
-        """Of the angle of rotation, rad."""
+        """Return the standard deviation of the angle of rotation, rad."""
         rotation = self.covariance[:3, :3]
         axis = np.linalg.norm(_axis(self.rotation))
         if axis < 1e-3:
@@ -53,7 +53,7 @@ def readings(
     j_from_i_essential: Float[ndarray, "3 3"] | None,
     j_from_i_homography: Float[ndarray, "3 3"] | None,
 ) -> list[Reading]:
-    """All ways to read matched directions (x/z, y/z), best first; empty where none fits.
+    """Return the motions that explain matched directions (x/z, y/z), best first; empty where none fits.
 
     The matrices are of normalised coordinates, each where one was found.
     """
@@ -93,7 +93,7 @@ def _by_step(
     ray_j: Float[ndarray, "m 2"],
     focal_px: float,
 ) -> Float[ndarray, "m 5"]:
-    """Derivatives of `sampson_px` by the step of `_retracted`."""
+    """Return the derivatives of `sampson_px` by the step of `_retracted`."""
     of_direction, h_i, h_j = skew(direction), _homogeneous(ray_i), _homogeneous(ray_j)
     essential = of_direction @ rotation
     by_step = np.concatenate(
@@ -112,14 +112,14 @@ def _homogeneous(ray: Float[ndarray, "m 2"]) -> Float[ndarray, "m 3"]:
 
 
 def _norm(line_i: Float[ndarray, "m 3"], line_j: Float[ndarray, "m 3"]) -> Float[ndarray, " m"]:
-    """Of the gradient of x_i · E x_j by the four coordinates of a match."""
+    """Return the length of the gradient of x_i · E x_j by the four coordinates of a match."""
     return np.maximum(np.sqrt((line_i[:, :2] ** 2).sum(1) + (line_j[:, :2] ** 2).sum(1)), 1e-12)
 
 
 def _of_essential(
     j_from_i: Float[ndarray, "3 3"], ray_i: Float[ndarray, "m 2"], ray_j: Float[ndarray, "m 2"]
 ) -> list[tuple[ndarray, ndarray]]:
-    """The one of four decompositions that puts most points in front of both cameras."""
+    """Return the one of four decompositions that puts most points in front of both cameras."""
     _, rotation, translation, _ = cv2.recoverPose(j_from_i, ray_i, ray_j, np.eye(3), distanceThresh=1e6)[:4]
     return [(rotation.T, _unit(-rotation.T @ translation[:, 0]))]
 

@@ -18,7 +18,7 @@ from jcr.records import Intrinsics
 Geometries = dict[Key, pycolmap.TwoViewGeometry]
 
 MIN_INLIERS = 25
-"""With COLMAP's 15, a view of a board was registered by the wrong squares, 30 cm from its place."""
+"""Least number of inliers; with COLMAP's 15 a view of a board was registered 30 cm off, by the wrong squares."""
 STATIONARY_PX = 4.0
 """Matches that keep their pixel while the gripper moves: fingers, or text drawn into the images."""
 
@@ -42,7 +42,7 @@ def _verification(seed: int, known: bool, matches: int) -> pycolmap.TwoViewGeome
 
 @dataclass(frozen=True)
 class View:
-    """What verification needs of the images, at the working size."""
+    """Keypoints, rays and intrinsics of the images at the working size."""
 
     x_px: Sequence[Float[ndarray, "_ 2"]]
     """Keypoints of every image; pixel centres are whole numbers."""
@@ -53,7 +53,7 @@ class View:
 
     @staticmethod
     def of(x_px: Sequence[Float[ndarray, "_ 2"]], intrinsics: Intrinsics) -> "View":
-        """The keypoints with their rays."""
+        """Return the keypoints with their rays."""
         return View(x_px, intrinsics, [unproject(intrinsics, x)[:, :2] for x in x_px])
 
     def pair(
@@ -64,7 +64,7 @@ class View:
         essential: Float[ndarray, "3 3"] | None,
         homography: Float[ndarray, "3 3"] | None,
     ) -> Pair:
-        """Matched keypoints with all readings of their geometry; matrices of normalised coordinates, j from i."""
+        """Return a pair with all readings of its geometry; matrices of normalised coordinates, j from i."""
         ray_i, ray_j = self.rays[i][rows[:, 0]], self.rays[j][rows[:, 1]]
         return Pair(i, j, rows, tuple(readings(ray_i, ray_j, self.intrinsics.fx, essential, homography)))
 
@@ -78,7 +78,7 @@ def matched(
     seed: int,
     known: bool,
 ) -> pycolmap.TwoViewGeometry | None:
-    """The geometry that explains some matches of keypoints; None where too few agree on one."""
+    """Return the geometry on which most matches agree; None where too few do."""
     way = np.linalg.norm(x_px[i][rows[:, 0]] - x_px[j][rows[:, 1]], axis=1)
     rows = rows[way > STATIONARY_PX]
     if len(rows) < MIN_INLIERS:
@@ -116,21 +116,21 @@ def matrices(
 
 
 def _between_centres(fundamental: Float[ndarray, "3 3"]) -> Float[ndarray, "3 3"]:
-    """A fundamental matrix of COLMAP's pixels as one of ours."""
+    """Return COLMAP's fundamental matrix for pixels whose centres are whole numbers."""
     move = np.eye(3)
     move[:2, 2] = HALF_PIXEL
     return move.T @ fundamental @ move
 
 
 def write_keypoints(database: Path, x_px: Sequence[Float[ndarray, "_ 2"]]) -> None:
-    """Into a database that has the images already."""
+    """Write keypoints into a database that has the images already."""
     with closing(pycolmap.Database.open(database)) as db:
         for row, x in enumerate(x_px):
             db.write_keypoints(row + 1, (x + HALF_PIXEL).astype(np.float32))
 
 
 def read_geometries(database: Path) -> Geometries:
-    """Of all pairs of images in a database that were verified, by rows."""
+    """Return the geometries of all verified pairs in a database, by rows of the images."""
     with closing(pycolmap.Database.open(database)) as db:
         ids, geometries = db.read_two_view_geometries()
     found = {}
@@ -142,7 +142,7 @@ def read_geometries(database: Path) -> Geometries:
 
 
 def write_geometries(database: Path, geometries: Geometries) -> None:
-    """These and no others."""
+    """Replace all geometries of a database by these."""
     with closing(pycolmap.Database.open(database)) as db:
         db.clear_two_view_geometries()
         for (i, j), geometry in geometries.items():

@@ -1,0 +1,1 @@
+"""Alignment of cameras by the colours of their images, without features."""

@@ -33,7 +33,7 @@ class Stage:
     per_image: int
     """Points."""
     rounds: int
-    """At most, of a search along all rays and Gauss-Newton, until the search finds nothing better."""
+    """Largest number of rounds of search along all rays and Gauss-Newton."""
     sigma: float
     """Difference of colours (0 to 1) that counts half."""
 
@@ -47,12 +47,12 @@ class Found:
 
 
 def axes_meet(base_from_camera: Float[ndarray, "*batch n 4 4"]) -> Float[ndarray, "*batch 3"]:
-    """The point nearest to all optical axes."""
+    """Return the point nearest to all optical axes."""
     return nearest_to_lines(base_from_camera[..., :3, 3], base_from_camera[..., :3, 2])
 
 
 def with_cost(level: Level, cameras: Cameras, stage: Stage) -> Found:
-    """The cameras with the cost of their colours' differences, at the best depth of each point."""
+    """Return the cameras with the cost of their colour differences, at the best depth of each point."""
     host, x_px = strongest(level, _per_image(level, stage))
     return Found(cameras, on_rays(level, cameras, host, x_px, _depths(cameras), stage.sigma, AGREED)[1])
 
@@ -105,7 +105,7 @@ def align_photometrically(
 def after_descent(
     level: Level, cameras: Cameras, points: Points, sigma: float, directions: Float[ndarray, "p q"]
 ) -> tuple[Cameras, Points]:
-    """A few steps of Levenberg and Marquardt; the cameras move together where there are 7 parameters.
+    """Take a few steps of Levenberg and Marquardt; the cameras move together where there are 7 parameters.
 
     Not least_squares.py: thousands of depths are eliminated, and steps cost so much more than the energy that a
     thousandth of it is not worth another one.

@@ -47,9 +47,9 @@ FREED = (Stage(60, 300, 3, 0.12), Stage(120, 300, 3, 0.1))
 """Found without the robot poses."""
 FINEST = Stage(240, 300, 3, 0.1)
 BEFORE_GAINS = Stage(60, 300, 1, 0.2)
-"""Where brightness is compared, before it is even."""
+"""Stage after which brightness is compared."""
 GAIN_ROUNDS = 3
-"""How often gains are estimated: each time more points agree."""
+"""Number of estimates of the gains; each time more points agree."""
 LEAST_GAIN = 0.05
 """Difference of log brightness below which it is left alone: shading and gloss look like as much."""
 GUESSED_FOCAL = 0.8
@@ -59,14 +59,14 @@ LEAST_AGREED = 0.25
 LEAST_POINTS = 100
 """Fewer than this count as this many."""
 LEAST_SHARE = 0.4
-"""Of the points of others that an image shows, over the median of the images: those with wrong poses have 0.1 to 0.25 of
-it, those of a robot that is 5 mm and 1 degree off 0.8."""
+"""Least share of the other images' points that an image shows, relative to the median image: images with wrong poses
+have 0.1 to 0.25 of it, those of a robot that is 5 mm and 1° off 0.8."""
 REGION = 0.05
 """m. Points within it share their errors: they are pixels of one edge, seen from many sides."""
 
 
 def reconstruct_direct(capture: Capture, progress: Progress | None = None) -> Reconstruction:
-    """Camera poses by the colours of a capture's images, with the robot's poses to start from.
+    """Reconstruct camera poses by photometric alignment, initialised from the gripper poses.
 
     Known intrinsics stay, else a focal length is estimated. The unit is the robot's metre only roughly, the frame
     is the first camera's; `evidence` has the covariance. Raises InputError with fewer than three images, and
@@ -122,7 +122,7 @@ def reconstruct_direct(capture: Capture, progress: Progress | None = None) -> Re
 
 
 def exposure_gains(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:
-    """By what to multiply the images so that they are equally bright, though the camera chose its exposure again."""
+    """Return the factors that make the images equally bright, where the camera changed its exposure."""
     factor = np.ones(level.count)
     for _ in range(GAIN_ROUNDS):
         even = level.times(factor)
@@ -134,7 +134,7 @@ def exposure_gains(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:
 def images_that_fit(
     level: Level, cameras: Cameras, intrinsics_known: bool
 ) -> tuple[Int[ndarray, " m"], Cameras]:
-    """The images that show what the others do, and their cameras on the robot's poses, which the rest do not bend.
+    """Return the images that agree with the others, and their cameras, aligned without the images that do not.
 
     Each image shows a share of the other images' points in their colour. One whose share is far below the others' even
     when its camera is free is not where the robot reports it, or not of this scene. Raises RejectedError where fewer
@@ -193,7 +193,7 @@ def camera_covariance(
 
 
 def _tracks(level: Level, cameras: Cameras, points: Points, sigma: float, intrinsics: Intrinsics) -> Tracks:
-    """The points, where their host sees them and where the others do that show their colour."""
+    """Return tracks of the points: their pixels in the host and in the images that show their colour."""
     _, u, v, seen = in_view(level, cameras, points)
     shown = seen & (squared_misfit(level, points, u, v) < sigma**2)
     image, point = np.nonzero(shown)

@@ -18,7 +18,7 @@ from jcr.geometry import inverse, skew
 from jcr.records import Intrinsics
 
 BLUR_PX = 1.0
-"""Of every level: a step between two plain surfaces becomes a slope that linear steps can follow."""
+"""Standard deviation of the blur of every level, px: an edge becomes a slope that linear steps can follow."""
 SEEN_BY = 0.6
 """Share of the other images, the best ones, that judge a depth: the rest may look at something in between."""
 NEAREST = 0.05
@@ -50,7 +50,7 @@ class Level:
         return len(self.color) // self.grid.height
 
     def rows(self, which: Int[ndarray, " m"]) -> "Level":
-        """Some of the images."""
+        """Return some of the images."""
         color, by_u, by_v = (
             x.reshape(self.count, self.grid.height, *x.shape[1:])[which].reshape(-1, *x.shape[1:])
             for x in (self.color, self.by_u, self.by_v)
@@ -58,7 +58,7 @@ class Level:
         return Level(color, by_u, by_v, self.grid)
 
     def times(self, factor: Float[ndarray, " n"]) -> "Level":
-        """With each image brighter or darker."""
+        """Return the images multiplied by gains."""
         of_row = np.repeat(factor, self.grid.height).astype(np.float32)[:, None, None]
         return Level(of_row * self.color, of_row * self.by_u, of_row * self.by_v, self.grid)
 
@@ -80,10 +80,10 @@ class Points:
     color: Float32[ndarray, "k 3"]
     depth: Float[ndarray, " k"]
     agreed: Bool[ndarray, " k"]
-    """Whether most of the images that should see the point show its colour."""
+    """True for points whose colour most of the images that should see them show."""
 
     def where(self, kept: Bool[ndarray, " k"] | slice) -> "Points":
-        """Some of them."""
+        """Return some of the points."""
         return Points(**{name: values[kept] for name, values in vars(self).items()})
 
 
@@ -104,7 +104,7 @@ class Equations:
 
 
 def make_level(images: Float32[ndarray, "n h w 3"], grid: Intrinsics, height: int) -> Level:
-    """The images (0 to 1) reduced to a height in pixels, and blurred."""
+    """Return the images (0 to 1) reduced to a height in pixels, and blurred."""
     small = resized(grid, max(1, round(grid.width * height / grid.height)), height)
     blurred = []
     for image in images:
@@ -117,7 +117,7 @@ def make_level(images: Float32[ndarray, "n h w 3"], grid: Intrinsics, height: in
 
 
 def strongest(level: Level, per_image: int) -> tuple[Int[ndarray, " k"], Int[ndarray, "k 2"]]:
-    """Image and pixel of the strongest changes of colour, one from each block of pixels, so that they spread."""
+    """Return image and pixel of the strongest changes of colour, one from each block of pixels."""
     n, h, w = level.count, level.grid.height, level.grid.width
     block = max(2, int(np.sqrt(h * w / (3 * per_image))))
     change = (level.by_u**2 + level.by_v**2).sum(-1).reshape(n, h, w)
@@ -146,7 +146,7 @@ def on_rays(
     sigma: float,
     least: float,
 ) -> tuple[Points, float]:
-    """Points at those depths, of the ones tried for their host, at which the other images agree best with their colour.
+    """Return points at the tried depths at which the other images agree best with their colour.
 
     `sigma` is the difference of colours that counts half. Points are agreed on whose cost, a mean of
     r²/(r² + sigma²) over the best views, is below `least`. Also returns the mean cost of all points.
@@ -190,12 +190,12 @@ def _squared(difference: Float32[ndarray, "n k 3"]) -> Float32[ndarray, "n k"]:
 
 
 def in_host(level: Level, cameras: Cameras, points: Points) -> Float[ndarray, "k 3"]:
-    """The points in the camera frame of their hosts."""
+    """Return the points in the camera frame of their hosts."""
     return points.depth[:, None] * unproject(zoomed(level.grid, cameras.zoom), points.x_px)
 
 
 def in_base(level: Level, cameras: Cameras, points: Points) -> Float[ndarray, "k 3"]:
-    """The points in the frame of the cameras' poses."""
+    """Return the points in the frame of the cameras' poses."""
     pose = cameras.base_from_camera[points.host]
     return np.einsum("kij,kj->ki", pose[:, :3, :3], in_host(level, cameras, points)) + pose[:, :3, 3]
 
@@ -203,7 +203,7 @@ def in_base(level: Level, cameras: Cameras, points: Points) -> Float[ndarray, "k
 def in_view(
     level: Level, cameras: Cameras, points: Points
 ) -> tuple[Float32[ndarray, "n k 3"], Float32[ndarray, "n k"], Float32[ndarray, "n k"], Bool[ndarray, "n k"]]:
-    """Points in every camera's frame, their pixels u and v, and whether they are in view; their host does not count."""
+    """Return points in every camera's frame, their pixels u and v, and whether a camera but their host sees them."""
     camera_from_base = inverse(cameras.base_from_camera).astype(np.float32)
     x = in_base(level, cameras, points).astype(np.float32) @ camera_from_base[:, :3, :3].swapaxes(1, 2)
     x += camera_from_base[:, None, :3, 3]
@@ -215,7 +215,7 @@ def in_view(
 
 
 def _ahead(x_in_camera: Float32[ndarray, "n k 3"]) -> Float32[ndarray, "n k 3"]:
-    """The points, none nearer to the camera's plane than NEAREST."""
+    """Return the points, none nearer to the camera's plane than NEAREST."""
     ahead = x_in_camera.copy()
     np.maximum(ahead[..., 2], np.float32(NEAREST), out=ahead[..., 2])
     return ahead
@@ -231,7 +231,7 @@ def _sample(
 
 
 def relative_exposures(level: Level, cameras: Cameras, points: Points, sigma: float) -> Float[ndarray, " n"]:
-    """How bright each image is beside the others (their geometric mean is 1), from points that they share."""
+    """Return each image's brightness relative to the others (geometric mean 1), from points that they share."""
     _, u, v, seen = in_view(level, cameras, points)
     shown, own = _sample(level.color, level, u, v).mean(-1), points.color.mean(-1)
     dark = 10 * _FAINT
@@ -299,8 +299,7 @@ def equations(level: Level, cameras: Cameras, points: Points, sigma: float, tied
 def _linearised(
     level: Level, cameras: Cameras, points: Points, sigma: float
 ) -> Iterator[tuple[slice, ndarray, ndarray, ndarray, ndarray, ndarray]]:
-    """Per chunk of points: weighted residuals (n,k,3), and their derivatives by the twists (…,6) of the image that
-    looks and of the host, by the log focal length and by the log depth."""
+    """Yield weighted residuals (n,k,3) of chunks of points and derivatives by twists, log focal length, log depth."""
     poses = cameras.base_from_camera
     rotation = (poses[:, None, :3, :3].swapaxes(-1, -2) @ poses[None, :, :3, :3]).astype(np.float32)
     for start in range(0, len(points.host), _CHUNK):

@@ -1,4 +1,4 @@
-"""Where the camera sits on the gripper, found from nothing by trying places all around."""
+"""Initial estimate of the hand-eye transform for photometric alignment, by a search over all viewing directions."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -25,7 +25,7 @@ ROTATIONS, TILTS, TILT_DEG = 24, 6, 15.0
 SCREENED_POINTS = 40
 """Per image, by which starts are ranked before any is improved."""
 KEPT, KEPT_BASINS = 24, 6
-"""Of the starts, after screening; and of the different places to which they led."""
+"""Numbers of initial estimates after screening, and of the different results that are refined."""
 SAME_M, SAME_DEG = 0.03, 5.0
 """Starts that ended closer than this found the same."""
 CLEARLY_BETTER = 0.9
@@ -43,7 +43,7 @@ def search(
     intrinsics_known: bool,
     report: Progress,
 ) -> Found:
-    """The hand-eye transform under which colours agree best; RejectedError where a different one is as good."""
+    """Return the hand-eye transform of best agreement of colours; raise RejectedError where another one is as good."""
     if not len(strongest(levels[COARSEST.height], COARSEST.per_image)[0]):
         raise RejectedError(
             "direct alignment: the images show one colour and no edges", "put different objects in view"
@@ -102,7 +102,7 @@ def _best_first(found: Sequence[Found]) -> list[Found]:
 
 
 def different(found: Sequence[Found]) -> list[Found]:
-    """The best of each place to which several led, best first."""
+    """Return the best of each group of equal results, best first."""
     kept: list[Found] = []
     for each in _best_first(found):
         if all(not _same(each.cameras, other.cameras) for other in kept):

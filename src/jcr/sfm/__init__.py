@@ -1,0 +1,1 @@
+"""Structure from motion: mapping, registration of new images and given cameras."""

@@ -15,7 +15,7 @@ from jcr.sfm.options import ColmapOptions
 _FILM_DIAGONAL_MM = 43.27
 """Diagonal of the 36 x 24 mm frame that EXIF's equivalent focal length refers to."""
 _START_FOCALS = (0.8, 0.5, 1.2)
-"""In long sides, for a camera without known intrinsics. COLMAP's 1.2 alone fails on two of three real wrist
+"""Initial focal lengths in long sides, without known intrinsics. COLMAP's 1.2 alone fails on two of three real wrist
 cameras (true values 0.5 to 0.7); from 0.8 all three converge."""
 
 
@@ -54,13 +54,13 @@ def reconstruct_colmap(
 
 
 def starting_intrinsics(capture: Capture) -> tuple[list[Intrinsics], bool, tuple[str, ...]]:
-    """The intrinsics from which the mapping starts, tried in turn; whether they are known; and warnings about them."""
+    """Return the initial intrinsics, tried in turn; whether they are given; and warnings about them."""
     given, warnings = usable_intrinsics(capture.intrinsics)
     return [given] if given else _guessed_intrinsics(capture), given is not None, warnings
 
 
 def _guessed_intrinsics(capture: Capture) -> list[Intrinsics]:
-    """Starting points for unknown intrinsics: EXIF's 35 mm focal length if there is one, then a ladder."""
+    """Return initial intrinsics: EXIF's 35 mm focal length if there is one, then usual ones."""
     width, height = capture.image_size
     with Image.open(capture.folder / capture.images[0]) as opened:
         exif = opened.getexif().get_ifd(ExifTags.IFD.Exif)

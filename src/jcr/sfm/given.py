@@ -22,7 +22,7 @@ from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 from jcr.sfm.mapping import enter, quiet_colmap, sift_features, tracks_of
 from jcr.sfm.options import ColmapOptions
-from jcr.sfm.placed import model_of
+from jcr.sfm.pose_primed import model_of
 
 MIN_POINTS = 50
 
@@ -30,7 +30,7 @@ MIN_POINTS = 50
 def reconstruct_given(
     capture: Capture, cameras: Path, options: ColmapOptions, progress: Progress | None = None
 ) -> Reconstruction:
-    """The capture's images that the model at `cameras` knows, with its poses fixed.
+    """Reconstruct the images that the model at `cameras` contains, with its poses fixed.
 
     Raises InputError when the model knows fewer than three, RejectedError when nothing can be triangulated.
     """
@@ -67,7 +67,7 @@ def reconstruct_given(
 
 
 def _rows(names: Sequence[str]) -> Callable[[str], int | None]:
-    """Of an image the row of that name, with as much of its folder as the model tells; None where there is none."""
+    """Return a function from an image's path to the row of that name, with its folders where stated, or None."""
     by_path = {Path(name).parts: row for row, name in enumerate(names)}
     by_name = {Path(name).name: row for row, name in enumerate(names)}
 
@@ -93,7 +93,7 @@ def _triangulated(
     options: ColmapOptions,
     report: Progress,
 ) -> Tracks:
-    """Points of matched features, with intrinsics and cameras fixed."""
+    """Triangulate points of matched features, with intrinsics and cameras fixed."""
     with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
         cameras = enter(database, len(images), [intrinsics], True, options.working_size_px)

@@ -41,7 +41,7 @@ from jcr.sfm.mapping import (
     tracks_of,
 )
 from jcr.sfm.options import ColmapOptions
-from jcr.sfm.placed import poses_of
+from jcr.sfm.pose_primed import poses_of
 
 OPTIONS = ColmapOptions()
 """As of a calibration that is given none: it finds the features and pairs of the same working size and seed."""

@@ -1,5 +1,4 @@
-"""Structure from motion with pycolmap: features, matches that the robot checks, incremental mapping, bundle adjustment,
-and the observations aligned to a tenth of a pixel (least_squares_matching.py).
+"""Structure from motion with pycolmap: matching, mapping, bundle adjustment, alignment of the observations.
 
 COLMAP has the centre of the top-left pixel at (0.5, 0.5); this file is the border where that half pixel,
 the working size and COLMAP's camera models are converted.
@@ -24,43 +23,28 @@ from numpy import ndarray
 from jcr.allocator import give_back
 from jcr.camera import HALF_PIXEL, fold_distance_px, resized
 from jcr.errors import RejectedError
-from jcr.features.guided import guided
 from jcr.features.kept import KeepingMatcher, KeptFeatures
 from jcr.features.matchers import Matcher
 from jcr.features.sift import grey_of
 from jcr.features.sift_features import SiftFeatures
 from jcr.features.stage import Matched, match_with_robot
-from jcr.features.verify import View, read_geometries, write_geometries, write_keypoints
-from jcr.geometry import inverse
+from jcr.features.verify import write_geometries, write_keypoints
 from jcr.progress import Progress
 from jcr.records import Intrinsics, Reconstruction, Tracks
 from jcr.sfm.options import ColmapOptions
-from jcr.sfm.placed import (
-    LEAST_SHARED,
-    joined,
-    poses_of,
-    predicted_cameras,
-    resectioned,
-    retriangulated,
-    shared_points,
-)
-from jcr.sfm.primed import primed
+from jcr.sfm.pose_primed import map_from_gripper_poses, poses_of, with_missing_images
 from jcr.sfm.track_refinement import align_tracks
 
 _MIN_REGISTERED = 3
-_GUIDED_PARTNERS = 6
-"""Images with which one that was left out is matched along epipolar lines."""
-_PREDICTED_STD = 0.008
-"""rad, of directions predicted by X and the robot."""
 _MANY, _GROWN = 40, 1.3
-"""Of more images than the first, COLMAP adjusts all only when the map has grown by the second (its default: 1.1)."""
+"""Number of images above which COLMAP adjusts all only after growth by the second (its default is 1.1)."""
 _ENOUGH = 1e-6
 """Relative change of a cost that ends an adjustment: with COLMAP's 0 it takes three times as long, and cameras come out
 1e-5 of their distance elsewhere."""
 _ROUGHLY = 1e-3
-"""The same of an adjustment that others follow."""
+"""Relative change of the cost that ends an adjustment before the last one."""
 _MOST_OBSERVATIONS = 60_000
-"""Of a map; the robot limits what more could add, and the calibration adjusts no more (calibration/case.py)."""
+"""Largest number of observations of a map; the robot's errors limit what more could add."""
 _SIFT_THREADS = 8
 """Largest number of images whose features are found at once; each takes 240 bytes a pixel while it is worked on."""
 _FEW_FEATURES = 1000
@@ -77,7 +61,7 @@ def structure_from_motion(
     names: Sequence[str],
     kept: KeptFeatures | None,
 ) -> Reconstruction:
-    """Camera poses and tracks of images of one camera; the same, bit for bit, for the same seed.
+    """Reconstruct camera poses and tracks of images of one camera; one seed gives one result, bit for bit.
 
     The gripper poses check the matches (`match.stage`); `names` are those of the images, for notes. SIFT features and
     pairs that are `kept` are not found again.
@@ -94,9 +78,7 @@ def structure_from_motion(
         matched = matched_pairs(
             database, matcher, base_from_gripper, all_intrinsics[0], cameras, known, names, report
         )
-        model, matched = _map_of_pairs(
-            database, matcher, matched, cameras, base_from_gripper, names, known, seed, report
-        )
+        model = _map_of_pairs(database, matched, cameras, base_from_gripper, known, seed, report)
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise _not_registered(database, len(images), model)
         _thin(model, seed)
@@ -130,38 +112,34 @@ def structure_from_motion(
 
 def _map_of_pairs(
     database: Path,
-    matcher: Matcher,
     matched: Matched,
     cameras: list[pycolmap.Camera],
     base_from_gripper: Float[ndarray, "n 4 4"],
-    names: Sequence[str],
     known: bool,
     seed: int,
     report: Progress,
-) -> tuple[pycolmap.Reconstruction | None, Matched]:
-    """The map of the matched pairs, of many images from the robot's poses, and the pairs with those added that place
-    images which COLMAP's mapper left out."""
-    count, model = len(matcher.x_px), None
-    if known and matched.gate is not None and count > _MANY:
-        model = primed(
-            database,
-            cameras[0],
-            matched.gate,
-            matched.geometries,
-            base_from_gripper,
-            lambda made: adjust_robustly(made, True, _ROUGHLY),
+) -> pycolmap.Reconstruction | None:
+    """Return the map of the matched pairs: primed by the gripper poses, or by COLMAP's mapper where these contradict."""
+    count, model = len(base_from_gripper), None
+
+    def adjust(made: pycolmap.Reconstruction, scale_px: float) -> None:
+        adjust_robustly(made, known, _ROUGHLY, scale_px)
+
+    if matched.gate is not None:
+        model = map_from_gripper_poses(
+            database, cameras[0], matched.gate, matched.geometries, base_from_gripper, adjust
         )
     if model is None or model.num_reg_images() < count:
         model = map_incrementally(database, count, cameras, known, seed, report, model)
     if model is not None and model.num_reg_images() < count:
-        return _with_predicted_images(database, model, matcher, matched, base_from_gripper, names)
-    return model, matched
+        model = with_missing_images(database, model, base_from_gripper, adjust)
+    return model
 
 
 def enter(
     database: Path, count: int, all_intrinsics: Sequence[Intrinsics], known: bool, working_size_px: int
 ) -> list[pycolmap.Camera]:
-    """A new database of `count` images without features; the intrinsics, at the working size, as COLMAP's cameras."""
+    """Create a database of `count` images without features, and return COLMAP's cameras at the working size."""
     width, height = all_intrinsics[0].width, all_intrinsics[0].height
     scale = min(1.0, working_size_px / max(width, height))
     size = round(width * scale), round(height * scale)
@@ -188,7 +166,7 @@ def matcher_of(
     report: Progress,
     kept: KeptFeatures | None = None,
 ) -> Matcher:
-    """The matcher of some kind of features; SIFT's are found here, those of networks when they are matched."""
+    """Return the matcher of some kind of features; SIFT is found here, networks find theirs when they match."""
     if options.features == "sift":
         found = sift_features(images, camera, report, kept)
         if kept is None:
@@ -225,7 +203,7 @@ def matched_pairs(
     names: Sequence[str],
     report: Progress,
 ) -> Matched:
-    """The pairs that a mapper may believe, written into the database; intrinsics that the robot found come first."""
+    """Match, write the pairs for the mapper into the database, and put intrinsics from the gripper's angles first."""
     report("matching", 0.0)
     working = resized(intrinsics, cameras[0].width, cameras[0].height)
     matched = match_with_robot(
@@ -254,7 +232,7 @@ def map_incrementally(
     report: Progress,
     begun: pycolmap.Reconstruction | None = None,
 ) -> pycolmap.Reconstruction | None:
-    """The model with most images over all starting cameras; with relaxed demands if that is below three.
+    """Return the model with most images over all initial cameras, with relaxed thresholds if it has fewer than three.
 
     A model that is `begun` is resumed with the images that it lacks. The share of images in the model is reported; it
     falls back where another start is tried.
@@ -281,99 +259,8 @@ def map_incrementally(
     return best
 
 
-def _with_predicted_images(
-    database: Path,
-    model: pycolmap.Reconstruction,
-    matcher: Matcher,
-    matched: Matched,
-    base_from_gripper: Float[ndarray, "n 4 4"],
-    names: Sequence[str],
-) -> tuple[pycolmap.Reconstruction, Matched]:
-    """The model with images that the mapper left out and the robot helps to place, which `matched` then names, too."""
-    predicted = predicted_cameras(model, base_from_gripper)
-    if predicted is None:
-        return model, matched
-    rows = sorted(image_id - 1 for image_id in model.reg_image_ids())
-    left = [row for row in range(len(base_from_gripper)) if row not in rows]
-    camera = model.camera(1)
-    intrinsics = matched.intrinsics if matcher.known else intrinsics_of(camera, matched.intrinsics)
-    _match_guided(database, matcher, View.of(matcher.x_px, intrinsics), camera, matched, predicted, left)
-    poses = dict(zip(rows, poses_of(model, rows), strict=True))
-    apart = _second_model(database, left, camera, matcher.known, matcher.seed)
-    together = joined(apart, predicted) if apart is not None else {}
-    for row in left:
-        if (pose := resectioned(database, model, row, predicted[row])) is not None:
-            together.pop(row, None)
-            poses[row] = pose
-    resected = poses.keys() - set(rows)
-    if not resected and not together:
-        return model, matched
-    larger = retriangulated(database, camera, poses | together, lambda made: adjust_robustly(made, True))
-    notes, warnings = list(matched.notes), list(matched.warnings)
-    if together and shared_points(larger, set(together)) < LEAST_SHARED:
-        listed = ", ".join(names[row] for row in sorted(together))
-        warnings.append(
-            f"{listed} make a model of their own that nothing in the images ties to the rest: left out; add images "
-            "between them"
-        )
-        if not resected:
-            return model, replace(matched, warnings=tuple(warnings))
-        larger = retriangulated(database, camera, poses, lambda made: adjust_robustly(made, True))
-    elif together:
-        listed = ", ".join(names[row] for row in sorted(together))
-        notes.append(f"{listed} were mapped apart, and joined through the robot's motion")
-    if resected:
-        listed = ", ".join(names[row] for row in sorted(resected))
-        notes.append(f"{listed} were placed near the pose that the robot predicts")
-    return larger, replace(matched, notes=tuple(notes), warnings=tuple(warnings))
-
-
-def _match_guided(
-    database: Path,
-    matcher: Matcher,
-    view: View,
-    camera: pycolmap.Camera,
-    matched: Matched,
-    predicted: Float[ndarray, "n 4 4"],
-    left: Sequence[int],
-) -> None:
-    """Further verified pairs of images that are not mapped, along predicted epipolar lines, into the database."""
-    found = read_geometries(database)
-    upright = np.zeros(len(predicted)) if matched.upright is None else matched.upright
-    toward = predicted[:, :3, 2]
-    for row in left:
-        near = np.argsort(-(toward @ toward[row]), kind="stable")
-        for other in [int(k) for k in near if k != row][:_GUIDED_PARTNERS]:
-            i, j = min(row, other), max(row, other)
-            if (i, j) in found:
-                continue
-            i_from_j = inverse(predicted[i]) @ predicted[j]
-            geometry = guided(matcher, view, camera, (i, j), i_from_j, upright, _PREDICTED_STD)
-            if geometry is not None:
-                found[i, j] = geometry
-    write_geometries(database, found)
-
-
-def _second_model(
-    database: Path, left: Sequence[int], camera: pycolmap.Camera, known: bool, seed: int
-) -> pycolmap.Reconstruction | None:
-    """What the mapper makes of the images that are left, its intrinsics those of the map; None where it makes
-    nothing."""
-    if len(left) < 2:
-        return None
-    with closing(pycolmap.Database.open(database)) as db:
-        db.update_camera(camera)
-    pipeline = pipeline_options(known, seed)
-    pipeline.image_names = [f"{row:05d}" for row in left]
-    pipeline.mapper.init_min_num_inliers, pipeline.mapper.init_min_tri_angle = 50, 8.0
-    pipeline.mapper.abs_pose_min_num_inliers = 15
-    models = pycolmap.incremental_mapping(database, database.parent, database.parent, pipeline)
-    largest = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
-    return largest if largest is not None and largest.num_reg_images() >= 2 else None
-
-
 def pipeline_options(known: bool, seed: int) -> pycolmap.IncrementalPipelineOptions:
-    """COLMAP's incremental mapping, the same for the same seed."""
+    """Return the options of COLMAP's incremental mapping; one seed gives one result."""
     pipeline = pycolmap.IncrementalPipelineOptions()
     mapper = pipeline.mapper
     pipeline.min_model_size = 2
@@ -396,7 +283,7 @@ def _models(
     report: Progress,
     begun: pycolmap.Reconstruction | None,
 ) -> dict[int, pycolmap.Reconstruction]:
-    """COLMAP's models from one start, or from a model; the share of images registered so far reported."""
+    """Return COLMAP's models from one initial camera or from a model, and report the share of registered images."""
     registered, folder = 0, database.parent
     if begun is not None:
         registered, folder = begun.num_reg_images(), database.parent / "begun"
@@ -420,8 +307,10 @@ def _models(
     )
 
 
-def adjust_robustly(model: pycolmap.Reconstruction, fix_intrinsics: bool, enough: float = _ENOUGH) -> None:
-    """One more bundle adjustment under a Cauchy loss, for COLMAP's least squares lets mismatches pull.
+def adjust_robustly(
+    model: pycolmap.Reconstruction, fix_intrinsics: bool, enough: float = _ENOUGH, scale_px: float = 0.5
+) -> None:
+    """Adjust all cameras and points under a Cauchy loss of this scale, for COLMAP's least squares lets mismatches pull.
 
     It halves the error of the camera centres (0.20 to 0.11 mm rms over 12 simulated views). A relative change of the
     cost of less than `enough` ends it.
@@ -430,7 +319,7 @@ def adjust_robustly(model: pycolmap.Reconstruction, fix_intrinsics: bool, enough
     options.print_summary = False
     options.refine_focal_length = options.refine_extra_params = not fix_intrinsics
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = 0.5
+    options.ceres.loss_function_scale = scale_px
     options.ceres.solver_options.num_threads = 1
     options.ceres.solver_options.function_tolerance = enough
     config = pycolmap.BundleAdjustmentConfig()
@@ -442,7 +331,7 @@ def adjust_robustly(model: pycolmap.Reconstruction, fix_intrinsics: bool, enough
 
 
 def _thin(model: pycolmap.Reconstruction, seed: int) -> None:
-    """Leave a random choice of the points of a model with more observations than add something."""
+    """Delete points at random until the model has at most _MOST_OBSERVATIONS observations."""
     points = sorted(model.point3D_ids())
     if model.compute_num_observations() <= _MOST_OBSERVATIONS:
         return
@@ -455,7 +344,7 @@ def _thin(model: pycolmap.Reconstruction, seed: int) -> None:
 def _align_observations(
     model: pycolmap.Reconstruction, images: Sequence[UInt8[ndarray, "h w 3"]], intrinsics: Intrinsics
 ) -> Float[ndarray, " k"] | None:
-    """Least-squares matching of the model's observations, in the images that features were found in.
+    """Align the model's observations by least-squares matching, in the images that features were found in.
 
     The standard deviation of each is returned in pixels of the original images, in the order of `tracks_of`.
     """
@@ -470,7 +359,7 @@ def _align_observations(
 
 
 def _not_registered(database: Path, n_images: int, model: pycolmap.Reconstruction | None) -> RejectedError:
-    """How many registered, the likely reason, what to do instead."""
+    """Return the error: number of registered images, likely reason and remedy."""
     with closing(pycolmap.Database.open(database)) as db:
         features = int(np.median([db.num_keypoints_for_image(row + 1) for row in range(n_images)]))
         matched = db.num_verified_image_pairs()
@@ -491,7 +380,7 @@ def _not_registered(database: Path, n_images: int, model: pycolmap.Reconstructio
 
 
 def tracks_of(model: pycolmap.Reconstruction, image_ids: Sequence[int], size: tuple[int, int]) -> Tracks:
-    """Every observation of every triangulated point by images `image_ids`, in pixels of images of `size`."""
+    """Return all observations of the points by images `image_ids`, in pixels of images of `size`."""
     camera = model.camera(model.image(image_ids[0]).camera_id)
     original_from_working = np.array([size[0] / camera.width, size[1] / camera.height])
     seen = _observations(model, image_ids)
@@ -508,7 +397,7 @@ def tracks_of(model: pycolmap.Reconstruction, image_ids: Sequence[int], size: tu
 
 
 def _observations(model: pycolmap.Reconstruction, image_ids: Sequence[int]) -> list[tuple[int, int, int]]:
-    """Row of `image_ids`, row of the image's keypoints and row of the points in the order of their ids."""
+    """Return (row of `image_ids`, row of the image's keypoints, row of the points by id) of each observation."""
     row_of = {image_id: row for row, image_id in enumerate(image_ids)}
     return [
         (row_of[element.image_id], element.point2D_idx, point)
@@ -519,7 +408,7 @@ def _observations(model: pycolmap.Reconstruction, image_ids: Sequence[int]) -> l
 
 
 def camera_of(intrinsics: Intrinsics, known: bool) -> pycolmap.Camera:
-    """COLMAP's one camera: the given intrinsics, or a focal length and two radial coefficients to refine."""
+    """Return COLMAP's camera: the given intrinsics, or a focal length and two radial coefficients to refine."""
     centre = [intrinsics.cx + HALF_PIXEL, intrinsics.cy + HALF_PIXEL]
     if not known:
         name, params = "RADIAL", [intrinsics.fx, *centre, 0.0, 0.0]
@@ -538,7 +427,7 @@ def camera_of(intrinsics: Intrinsics, known: bool) -> pycolmap.Camera:
 
 
 def intrinsics_of(camera: pycolmap.Camera, like: Intrinsics) -> Intrinsics:
-    """Of a camera that `camera_of` made for unknown intrinsics; in images of the size of `like`."""
+    """Return the intrinsics of a camera that `camera_of` made without known ones, for images of the size of `like`."""
     focal, cx, cy, k1, k2 = (float(p) for p in camera.params)
     distortion = (k1, k2, 0.0, 0.0, 0.0)
     centre = cx - HALF_PIXEL, cy - HALF_PIXEL
@@ -548,7 +437,7 @@ def intrinsics_of(camera: pycolmap.Camera, like: Intrinsics) -> Intrinsics:
 
 @contextmanager
 def quiet_colmap() -> Iterator[None]:
-    """COLMAP writes its log to stderr through glog: within, only fatal errors.
+    """Silence COLMAP's log, which it writes to stderr through glog, but for fatal errors.
 
     Importing pycolmap replaces what SIGTERM does by glog's handler, which prints a page of C++ frames. Python does not
     know of it: what Python has for the signal is set again, and glog's handler is gone for good.

@@ -1,4 +1,4 @@
-"""What a user can choose of the COLMAP back end."""
+"""Options of the COLMAP back end."""
 
 from dataclasses import dataclass
 
@@ -14,4 +14,4 @@ class ColmapOptions:
     seed: int = 0
     """Same seed, same result, bit for bit."""
     features: FeatureName = "sift"
-    """What is matched between images."""
+    """Kind of features that are matched between images."""

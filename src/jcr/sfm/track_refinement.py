@@ -28,14 +28,14 @@ MOST_PX = 4.0
 """An observation farther from its keypoint is another feature; COLMAP, too, keeps none that is farther off."""
 LEAST_CORRELATION = 0.9
 KEYPOINT_STD_PX = 0.3
-"""Of a keypoint, and of an aligned observation at most."""
+"""Standard deviation of a keypoint, and largest one of an aligned observation, px."""
 _REDUCED = (4, 2, 1)
 """Sizes of the patch: of the images reduced so much. Each starts where the one before it ended."""
 _RADIUS, _WINDOW = 7, 4.5
 """Pixels: of the patch, and the standard deviation of its weights."""
 _STEPS, _SETTLED_PX = 15, 0.01
 _BEND_AT_PX = 6.0
-"""From the reference's keypoint, where derivatives of the warp are taken."""
+"""Distance from the reference's keypoint at which derivatives of the warp are taken."""
 _FREE = 8
 """Unknowns: shift x y, gain, offset, affine part by rows."""
 _STEEPEST = 5.0
@@ -52,7 +52,7 @@ def align_tracks(
     recon_from_camera: Float[ndarray, "m 4 4"],
     intrinsics: Intrinsics,
 ) -> Tracks:
-    """The tracks with the observations moved that could be aligned to their track's reference, and how surely.
+    """Align observations to their track's reference and return the tracks with standard deviations.
 
     The images are of the size of `intrinsics`, to which the tracks belong; rows of cameras and images are those of the
     tracks. The reference is the observation that shows the surface at the median scale. It stays where it is.
@@ -116,8 +116,7 @@ def _align_in_threads(
 def _with_references(
     variance: Float[ndarray, " k"], reference: Int[ndarray, " p"], of_reference: Int[ndarray, " k"]
 ) -> Float[ndarray, " k"]:
-    """Variances with those of the references, whose patches are as good as those that were aligned to them: the mean
-    of the inverse."""
+    """Return variances of all observations; a reference has the harmonic mean of those aligned to it."""
     aligned = variance < KEYPOINT_STD_PX**2
     count = np.bincount(of_reference, aligned, len(variance))[reference]
     inverse_sum = np.bincount(of_reference, aligned / variance, len(variance))[reference]
@@ -134,12 +133,12 @@ def _reduced(greys: UInt8[ndarray, "m h w"], by: int) -> UInt8[ndarray, "m h2 w2
 
 
 def _resized(x_px: Float[ndarray, "k 2"], factor: Float[ndarray, "2"]) -> Float[ndarray, "k 2"]:
-    """The same places in images resized by `factor`."""
+    """Return pixels in images resized by `factor`."""
     return (x_px + 0.5) * factor - 0.5
 
 
 def _facing(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Float[ndarray, "p 3"]:
-    """For each point the mean direction of the cameras that see it: the normal of its plane, of any length.
+    """Return the mean direction of the cameras that see each point, the normal of its plane, of any length.
 
     Planes through neighbouring points gave the same: the affine part is free.
     """
@@ -286,7 +285,7 @@ def _patch(grey, x_px, affine, bend, offsets, patch):
 @compiled
 @no_type_check
 def _smooth(grey, x, y):
-    """The image between its pixels: a cubic B-spline with the pixels as its coefficients, which blurs by 0.58 px.
+    """Interpolate the image by a cubic B-spline with the pixels as coefficients, which blurs by 0.58 px.
 
     Without the blur the interpolation would be rougher between pixels than on them and pull towards one of the two.
     """

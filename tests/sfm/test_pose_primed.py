@@ -1,5 +1,6 @@
-"""The map of many images from the robot's poses: where they are right, roughly right, and wrong in two images."""
+"""Pose-primed mapping: poses that are roughly right, of another X, exchanged, shuffled; images that nothing ties."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,9 @@ import pytest
 
 from jcr.features.stage import Matched
 from jcr.features.verify import write_geometries, write_keypoints
-from jcr.geometry import Transforms, nearest_rotation, rotation_between_deg
+from jcr.geometry import Transforms, nearest_rotation, rotation_between_deg, rotation_exp, transform
 from jcr.sfm.mapping import adjust_robustly, camera_of, enter, map_incrementally, quiet_colmap
-from jcr.sfm.placed import poses_of
-from jcr.sfm.primed import primed
+from jcr.sfm.pose_primed import map_from_cameras, map_from_gripper_poses, poses_of, with_missing_images
 from points_of_a_table import IMAGES, INTRINSICS, PointsOfATable, matched_pairs_of
 
 pytestmark = pytest.mark.slow
@@ -40,13 +40,13 @@ def begun_model(
     database: Path, matched: Matched, base_from_gripper: Transforms
 ) -> pycolmap.Reconstruction | None:
     assert matched.gate is not None
-    return primed(
+    return map_from_gripper_poses(
         database,
         camera_of(INTRINSICS, True),
         matched.gate,
         matched.geometries,
         base_from_gripper,
-        lambda model: adjust_robustly(model, True, 1e-3),
+        lambda model, scale_px: adjust_robustly(model, True, 1e-3, scale_px),
     )
 
 
@@ -87,4 +87,53 @@ def test_images_with_each_other_s_poses_are_left_to_the_mapper(tmp_path: Path, t
     camera = camera_of(INTRINSICS, True)
     whole = map_incrementally(database, IMAGES, [camera], True, 0, lambda *_: None, model)
     assert whole is not None and whole.num_reg_images() == IMAGES
+    assert off_mm(table, whole) < 1.0
+
+
+def rough_cameras(table: PointsOfATable) -> dict[int, Transforms]:
+    """Return the cameras by a hand-eye transform that is 12 mm and 1° off."""
+    off = transform(rotation_exp(np.radians([0.6, -0.6, 0.53])), np.array([8e-3, -8e-3, 4e-3]))
+    return dict(enumerate(table.base_from_camera @ off))
+
+
+def adjust(model: pycolmap.Reconstruction, scale_px: float) -> None:
+    adjust_robustly(model, True, 1e-3, scale_px)
+
+
+def test_an_initial_x_may_be_12_mm_and_a_degree_off(tmp_path: Path, table: PointsOfATable):
+    matched = matched_pairs_of(table, table.base_from_gripper)
+    database = database_of(tmp_path, table, matched)
+    exact = map_from_cameras(
+        database, camera_of(INTRINSICS, True), dict(enumerate(table.base_from_camera)), adjust
+    )
+    rough = map_from_cameras(database, camera_of(INTRINSICS, True), rough_cameras(table), adjust)
+    assert rough.num_reg_images() == IMAGES
+    assert rough.num_points3D() > 0.99 * exact.num_points3D()
+    assert off_mm(table, rough) < 1.0
+
+
+def test_shuffled_poses_prime_no_map(tmp_path: Path, table: PointsOfATable):
+    matched = matched_pairs_of(table, table.base_from_gripper)
+    shuffled = table.base_from_gripper[np.random.default_rng(0).permutation(IMAGES)]
+    assert begun_model(database_of(tmp_path, table, matched), matched, shuffled) is None
+
+
+def test_images_that_nothing_ties_to_the_others_are_left_out(tmp_path: Path, table: PointsOfATable):
+    """Twenty images and ten others, without a common match: gripper poses alone would hold them together."""
+    matched = matched_pairs_of(table, table.base_from_gripper)
+    apart = {key: one for key, one in matched.geometries.items() if (key[0] < 20) == (key[1] < 20)}
+    database = database_of(tmp_path, table, replace(matched, geometries=apart))
+    model = map_from_cameras(database, camera_of(INTRINSICS, True), rough_cameras(table), adjust)
+    assert sorted(model.reg_image_ids()) == list(range(1, 21))
+
+
+def test_missing_images_are_added_from_the_map_s_own_x(tmp_path: Path, table: PointsOfATable):
+    matched = matched_pairs_of(table, table.base_from_gripper)
+    database, camera = database_of(tmp_path, table, matched), camera_of(INTRINSICS, True)
+    some = {row: pose for row, pose in rough_cameras(table).items() if row not in (4, 11, 12, 29)}
+    model = map_from_cameras(database, camera, some, adjust)
+    reported = table.base_from_gripper.copy()
+    reported[11] = reported[25]  # a stale pose
+    whole = with_missing_images(database, model, reported, adjust)
+    assert sorted(image_id - 1 for image_id in whole.reg_image_ids()) == [k for k in range(IMAGES) if k != 11]
     assert off_mm(table, whole) < 1.0
