@@ -8,6 +8,8 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -145,6 +147,24 @@ def test_silence_ends_the_wait_and_samples_of_a_watched_arm_are_refused(tmp_path
         assert posted(server, POSE)[0] == 409
         with pytest.raises(jcr.InputError, match="no sample for 0 s"):
             server.await_samples(0.1)
+
+
+def test_the_last_answer_is_sent_before_the_server_ends(serving: Callable[..., Any]):
+    got: list[tuple[int, dict]] = []
+    with serving() as (server, taken):
+        begun, real = threading.Event(), server.session.take
+
+        def slow(state: RobotState, waits: bool) -> dict[str, Any]:
+            begun.set()
+            time.sleep(0.5)
+            return real(state, waits)
+
+        server.session.take = slow
+        client = threading.Thread(target=lambda: got.append(posted(server, POSE)))
+        client.start()
+        assert begun.wait(60)
+    client.join()
+    assert got == [(200, {"accepted": True, "done": False})] and len(taken) == 1
 
 
 def played_script(address: str, port: int, token: str, pose: list[float]) -> list[str]:
