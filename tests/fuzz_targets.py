@@ -246,7 +246,12 @@ def recordings(folder: Path, capture: Capture) -> dict[str, Target]:
 
     (folder / "set" / "data").mkdir(parents=True)
     table = folder / "set" / "data" / "0.parquet"
-    columns = {"timestamp": [0.0, 0.1], "episode_index": [0, 0], "state": [[0.0, 1.0], [2.0, 3.0]]}
+    columns = {
+        "timestamp": [0.0, 0.1],
+        "episode_index": [0, 0],
+        "frame_index": [0, 1],
+        "state": [[0.0, 1.0], [2.0, 3.0]],
+    }
     pq.write_table(pa.table(columns), table)
     info = {"codebase_version": "v2.1", "total_episodes": 1, "data_path": "data/0.parquet"}
     info |= {"video_path": "videos/0.mp4", "fps": 10, "features": {"state": {"shape": [2]}}}

@@ -271,6 +271,21 @@ def test_poses_are_interpolated_at_nanosecond_stamps(tmp_path: Path, capture: Ca
     assert np.allclose(got.base_from_gripper[:, 0, 3] - capture.base_from_gripper[:3, 0, 3], 0.075, atol=1e-9)
 
 
+def test_an_image_without_a_pose_near_its_time_and_a_damaged_sample_are_left_out(
+    tmp_path: Path, capture: Capture
+):
+    writers.write_tum(tmp_path, capture)
+    file = tmp_path / "poses.txt"
+    lines = file.read_text().splitlines()
+    lines[9] = lines[9].rsplit(" ", 1)[0] + " nan"  # the second sample of the fifth image
+    del lines[4:6]  # both samples of the third image
+    file.write_text("\n".join(lines))
+    got = jcr.read_capture(tmp_path, ReadOptions(max_gap_ms=500.0))
+    kept = [k for k in range(12) if k not in (2, 4)]
+    assert sum("no pose within 500 ms" in note for note in got.notes) == 2
+    assert np.allclose(got.base_from_gripper, capture.base_from_gripper[kept], atol=1e-6)
+
+
 def test_a_run_keeps_what_it_read_so_that_it_can_go_on(tmp_path: Path, capture: Capture):
     source = tmp_path / "source"
     got = jcr.read_capture(writers.write_table(source, capture))
@@ -314,11 +329,6 @@ FAULTS = {
         lambda f: edit_line(f, 3, lambda line: line.rsplit(",", 1)[0]),
         {},
         "row 3 has 7 columns, not 8",
-    ),
-    "image not there": (
-        lambda f: edit_line(f, 1, lambda line: "images/99.jpg" + line[line.index(",") :]),
-        {},
-        r"99\.jpg; add them",
     ),
     "image outside": (
         lambda f: edit_line(f, 1, lambda line: "../99.jpg" + line[line.index(",") :]),
@@ -403,6 +413,11 @@ ROW_FAULTS |= {
         {},
         "pose 2 is 812.5 m from the base",
     ),
+    "image not there": (
+        lambda f: edit_line(f, 1, lambda line: "images/99.jpg" + line[line.index(",") :]),
+        {},
+        "99.jpg: no such image",
+    ),
     "image": (lambda f: (f.parent / "images/01.jpg").unlink(), {}, "no such image"),
 }
 """Faults of one row alone."""
@@ -423,7 +438,7 @@ def test_a_row_that_holds_no_pose_is_left_out_with_its_reason(fault: str, tmp_pa
     spoil, _, words = ROW_FAULTS[fault]
     spoil(writers.write_table(tmp_path, capture))
     got = jcr.read_capture(tmp_path)
-    row = 0 if "quaternion" in fault else 1
+    row = 0 if "quaternion" in fault or "there" in fault else 1
     assert got.images == capture.images[:row] + capture.images[row + 1 :]
     assert np.allclose(got.base_from_gripper, np.delete(capture.base_from_gripper, row, 0), atol=1e-9)
     assert any(re.search(f"left out: .*{words}", note) for note in got.notes)

@@ -1,7 +1,7 @@
 """Pairing of gripper poses with images: by the images' names, by their time stamps, or by their order."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING
@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.capture.conventions import tolerated
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, first_few, shown
 from jcr.capture.pose_track import pose_track
@@ -21,8 +22,8 @@ if TYPE_CHECKING:
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _LATEST_NS = np.iinfo(np.int64).max
 """The last nanosecond that fits 64 bits, in the year 2262."""
-Paired = tuple[list[str], Float[ndarray, "n 4 4"], tuple[str, ...]]
-"""Images relative to the folder, their base_from_gripper, and notes on the pairing."""
+Paired = tuple[list[str], Float[ndarray, "n 4 4"], Mapping[int, str], tuple[str, ...]]
+"""Images relative to the folder, their base_from_gripper, messages of the rows without one, and notes."""
 
 
 def pair_with_images(folder: Path, file: Path, table: "PoseTable", options: ReadOptions) -> Paired:
@@ -41,7 +42,7 @@ def pair_with_images(folder: Path, file: Path, table: "PoseTable", options: Read
             "their names"
         )
     how = f"rows paired with images in order of their names: {taken[0]} … {taken[-1]}"
-    return taken, table.base_from_gripper, (how,)
+    return taken, table.base_from_gripper, table.faults, (how,)
 
 
 def paired_by_name(
@@ -100,7 +101,7 @@ def _paired_by_name(folder: Path, file: Path, table: "PoseTable") -> Paired:
         f"{len(here)} images have no pose in {file.name} and are left out: {first_few(here)}" if here else ""
     )
     absent = [name for name in located if not (folder / name).is_file()]
-    if len(absent) == len(located) or (absent and here):
+    if len(absent) > tolerated(len(located)):
         raise InputError(
             f"{file}: names {len(absent)} of {len(located)} images that are not in {folder}: {first_few(absent)}; add "
             f"them or drop their rows{' (' + left_out + ')' if here else ''}"
@@ -111,7 +112,7 @@ def _paired_by_name(folder: Path, file: Path, table: "PoseTable") -> Paired:
     if other:
         found = " is ".join(other[0])
         notes.insert(0, f"{len(other)} names in {file.name} are not those of files: {found}, and so on")
-    return located, table.base_from_gripper, tuple(notes)
+    return located, table.base_from_gripper, table.faults, tuple(notes)
 
 
 def _paired_by_time(
@@ -127,14 +128,10 @@ def _paired_by_time(
         return None
     sound = np.isfinite(table.base_from_gripper).all((1, 2))
     poses, gap_ns = pose_track(table.stamp_ns[sound], table.base_from_gripper[sound]).at(stamps)
-    fresh = gap_ns <= 1e6 * options.max_gap_ms
-    if not fresh.all():
-        stale = int(gap_ns.argmax())
-        raise InputError(
-            f"{file}: no pose within {options.max_gap_ms:.0f} ms around {taken[stale]}; drop that image "
-            "or raise --max-gap-ms"
-        )
-    return taken, poses, (f"poses interpolated at the {len(taken)} images' time stamps",)
+    stale = np.flatnonzero(gap_ns > 1e6 * options.max_gap_ms).tolist()
+    why = f"no pose within {options.max_gap_ms:.0f} ms around it; drop the image or raise --max-gap-ms"
+    notes = (f"poses interpolated at the {len(taken)} images' time stamps",)
+    return taken, poses, {k: f"{file}: {taken[k]}: {why}" for k in stale}, notes
 
 
 def _located(folder: Path, names: Sequence[str], file: Path) -> list[str]:

@@ -101,8 +101,8 @@ def read(path: Path, options: ReadOptions) -> Capture:
         raise InputError(f"{path}: holds no table of poses ({', '.join(TABLES[:4])}); name it with --poses")
     folder = path if path.is_dir() else path.parent
     table = read_pose_table(file, options)
-    images, poses, notes = pair_with_images(folder, file, table, options)
-    capture, _ = checked_capture(folder, images, poses, str(file), table.faults)
+    images, poses, faults, notes = pair_with_images(folder, file, table, options)
+    capture, _ = checked_capture(folder, images, poses, str(file), faults)
     depths = depth_beside(folder, capture.images)
     capture = replace(capture, source=file, notes=(*notes, *capture.notes), depths=depths)
     return replace(with_camera_info(capture, options), pose_convention=table.convention)
