@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from jcr.capture.depth_images import read_depth
 from jcr.capture.images import read_image
 from jcr.extras import extra
-from jcr.geometry import ARM, rotation_between_deg, transform
+from jcr.geometry import rotation_between_deg, transform
 from jcr.records import Capture
-from simulation.problems import disturbed
 
 FPS, TF_HZ = 30.0, 100.0
 START_NS = 1_700_000_000_123_456_789
@@ -43,7 +42,6 @@ def write_bag(
     fps: float = FPS,
     tf_hz: float = TF_HZ,
     compressed: bool = True,
-    jitter: float = 0.0,
 ) -> Path:
     """A bag in which the arm stops at every view of a capture and moves smoothly between them.
 
@@ -67,7 +65,7 @@ def write_bag(
     with writer:
         connections: dict[str, Any] = {}
         for stamp_ns, topic, message in _messages(
-            store.types, capture, seconds, fps, tf_hz, compressed, kind, jitter
+            store.types, capture, seconds, fps, tf_hz, compressed, kind
         ):
             name = message.__msgtype__
             if topic not in connections:
@@ -99,7 +97,6 @@ def _messages(
     tf_hz: float,
     compressed: bool,
     kind: str,
-    jitter: float,
 ) -> Iterator[tuple[int, str, Any]]:
     """What is recorded, in order of time."""
 
@@ -127,7 +124,6 @@ def _messages(
         at = START_NS + round(1e9 * time_s)
         poses, speeds, rows = pose_at(capture.base_from_gripper, seconds, np.array([time_s]))
         if what == "tf":
-            poses = disturbed(poses, (jitter, jitter / ARM), rng)
             yield at, "/tf", tf(at, "base_link", "tool0", poses[0])
             continue
         yield from _depth_images(types, header, capture, at, float(rows[0]))

@@ -53,10 +53,10 @@ FAULTS = (
     ),
     PlantedFault(
         "capture",
-        "src/jcr/capture/robot_poses.py",
+        "src/jcr/capture/conventions.py",
         '"cm": 1e-2',
         '"cm": 1e-3',
-        ("tests/capture/test_readers.py",),
+        ("tests/capture/test_first_day.py", "tests/capture/test_readers.py"),
     ),
     PlantedFault(
         "features",
