@@ -75,8 +75,8 @@ FAULTS = (
     PlantedFault(
         "photometric",
         "src/jcr/photometric/residuals.py",
-        "misfit / (misfit + np.float32(sigma**2))",
-        "misfit / (misfit + np.float32(sigma))",
+        "misfit = np.sort(np.where(seen, misfit / (misfit + np.float32(sigma**2)), 2.0), axis=0)",
+        "misfit = np.sort(np.where(seen, misfit / (misfit + np.float32(sigma)), 2.0), axis=0)",
         ("tests/photometric/test_direct.py",),
     ),
     PlantedFault(
