@@ -19,7 +19,7 @@ from typing import Any
 
 import jcr
 from jcr.calibration.calibration_json import CalibrationFile
-from jcr.cell.cameras_json import CamerasFile
+from jcr.cell.placement import CamerasFile
 from jcr.cli import COMMANDS, dispatch
 from jcr.cli.models import SCALES
 from jcr.depth.depth_npz import About as DepthAbout

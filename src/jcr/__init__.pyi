@@ -7,7 +7,7 @@ from .calibration.options import CalibrateOptions as CalibrateOptions
 from .calibration.seen import SeenInBase as SeenInBase
 from .capture.options import ReadOptions as ReadOptions
 from .capture.read import read_capture as read_capture
-from .cell.cameras_json import CamerasFile as CamerasFile
+from .cell.placement import CamerasFile as CamerasFile
 from .depth.options import DepthOptions as DepthOptions
 from .errors import InputError as InputError
 from .errors import RejectedError as RejectedError

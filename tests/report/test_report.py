@@ -26,8 +26,7 @@ from jcr.capture.conventions import numbers_from_poses, poses_from_numbers
 from jcr.capture.formats.capture_json import kept
 from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
-from jcr.cell.cameras_json import cameras_file
-from jcr.cell.found import ArmFound, CameraFound, CellFound, ImageFound
+from jcr.cell.placement import ArmPlacement, CameraPlacement, CellPlacement, ImageUse, TransformUncertainty
 from jcr.cli.output import Output
 from jcr.cli.result import show
 from jcr.errors import RejectedError
@@ -35,6 +34,7 @@ from jcr.estimation.observability import excitation
 from jcr.findings import no_reconstruction
 from jcr.findings.sentences import worst_direction
 from jcr.geometry import apply, inverse, rotation_exp, transform
+from jcr.intrinsics_json import IntrinsicsAndStd
 from jcr.pipeline.results import RunResult
 from jcr.records import (
     COVARIANCE_ORDER,
@@ -365,42 +365,27 @@ def test_every_camera_of_the_cell_is_in_the_scene(run: RunResult):
             base_from_gripper=poses[:1],
         ),
     )
+    top = CellCamera(name="top", mount="base", images=("t",), image_size=size)
     found = [
-        CameraFound(
-            name=name,
-            mount=kind,
-            arm=arm,
-            images=images,
-            parent_from_camera=mount,
-            covariance=1e-6 * np.eye(6),
-            scene_distance=1.0,
-            intrinsics=run.intrinsics,
+        CameraPlacement.of(
+            camera,
+            [
+                ImageUse(image=i, used=i != "b", points=90, reprojection_px=0.3, reason=None)
+                for i in camera.images
+            ],
+            (),
+            mount,
+            TransformUncertainty.of(1e-6 * np.eye(6), mount, 1.0),
+            IntrinsicsAndStd.of(run.intrinsics, None),
         )
-        for name, kind, arm, images in (
-            (
-                "top",
-                "base",
-                None,
-                (ImageFound(image="t", used=True, points=90, reprojection_px=0.3, reason=None),),
-            ),
-            (
-                "second",
-                "gripper",
-                None,
-                tuple(
-                    ImageFound(image=i, used=i != "b", points=90, reprojection_px=0.3, reason=None)
-                    for i in "abc"
-                ),
-            ),
-            (
-                "other",
-                "gripper",
-                "right",
-                (ImageFound(image="a", used=True, points=90, reprojection_px=0.3, reason=None),),
-            ),
-        )
+        for camera in (top, *others)
     ]
-    content = cameras_file(CellFound(tuple(found), (ArmFound("right", base, 1e-6 * np.eye(6)),), None), "0.0")
+    arm = ArmPlacement(
+        name="right",
+        base_from_other_base=base.tolist(),
+        uncertainty=TransformUncertainty.of(1e-6 * np.eye(6)),
+    )
+    content = CellPlacement(tuple(found), (arm,)).file("0.0")
     capture = replace(run.capture, others=others)
     page = report_html(replace(run, capture=capture, cloud=None, scene=None, cameras=content))
     scene = json.loads(Elements(page).scripts[0])

@@ -9,8 +9,8 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.camera import usable_intrinsics
-from jcr.cell.found import CameraFound
 from jcr.cell.localise import Shared, distance
+from jcr.cell.placement import CameraPlacement
 from jcr.findings import Concerns, Finding, FindingKind
 from jcr.records import CellCamera, Intrinsics
 
@@ -73,11 +73,10 @@ class CameraViews:
 
     def refused(
         self, kind: FindingKind, concerns: Concerns = "none", *images: str, **numbers: Any
-    ) -> CameraFound:
+    ) -> CameraPlacement:
         """The camera is not placed, for this finding, as Finding.of makes it."""
         return self.not_placed(Finding.of(kind, "rejects", concerns, *images, **numbers))
 
-    def not_placed(self, *why: Finding) -> CameraFound:
-        """The camera with why it is not placed."""
-        reasons = [reason or "the camera was not placed" for reason in self.reasons]
-        return CameraFound.not_placed(self.camera, why, self.counts, reasons)
+    def not_placed(self, *why: Finding) -> CameraPlacement:
+        """Return the camera with the findings for which it is not placed."""
+        return CameraPlacement.rejected(self.camera, why, self.counts, self.reasons)

@@ -1,70 +1,56 @@
-"""What the place of a further camera shows against it: an image that contradicts it, a large ±, crowded points."""
+"""Checks of a further camera's pose: an image that contradicts it, large uncertainty, crowded points, distance."""
 
-from dataclasses import replace
+from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 
-from jcr.cell.found import CameraFound
 from jcr.cell.localise import LEAST_SPREAD, spread
+from jcr.cell.placement import ImageUse
 from jcr.cell.rigs import Member
 from jcr.estimation.hand_eye import MAX_STD
 from jcr.findings import Finding, FindingKind
+from jcr.records import Intrinsics, Mount
 
 MEDIAN_PX = 3.0
-"""Images of a camera that miss by more, of one 1600 px wide, do not fit one place."""
+"""Largest median reprojection error of an image that fits one pose, for images 1600 px wide."""
 FAR_FROM_GRIPPER = 0.5
-"""m: the camera of a gripper that is farther from its frame is likely to be another's."""
+"""Distance (m) from the gripper's frame beyond which a camera is likely to be mounted elsewhere."""
 
 
-def with_faults(found: CameraFound, member: Member, faults: tuple[Finding, ...]) -> CameraFound:
-    """A camera with what its images show against it, and with the shifts of that in its covariance.
-
-    Such a fault explains a rejection, and rejects where its shift makes the place too uncertain.
-    """
-    assert found.covariance is not None
-    for fault in faults:
-        found = replace(found, covariance=found.covariance + fault.covariance[:6, :6])
-        if not found.converged or place_uncertain(found, member) is not None:
-            fault = replace(fault, severity="rejects")
-        found = found.with_findings(fault)
-    return found
-
-
-def contradicting_image(found: CameraFound, member: Member) -> Finding | None:
-    """That an image contradicts the place that fits all of the camera's together."""
-    worst = max(found.images, key=lambda image: image.reprojection_px or 0.0)
-    px = worst.reprojection_px or 0.0
-    if px <= MEDIAN_PX * max(1.0, member.camera.image_size[0] / 1600):
+def contradicting_image(images: Sequence[ImageUse], member: Member) -> Finding | None:
+    """Return the finding of an image that contradicts the pose of all the camera's images."""
+    worst = max(images, key=lambda image: image.reprojection_px or 0.0)
+    px, camera = worst.reprojection_px or 0.0, member.camera
+    if px <= MEDIAN_PX * max(1.0, camera.image_size[0] / 1600):
         return None
-    return Finding.of(FindingKind.IMAGE_MISSES, "rejects", "mount", worst.image, value=px, mount=found.mount)
+    return Finding.of(FindingKind.IMAGE_MISSES, "rejects", "mount", worst.image, value=px, mount=camera.mount)
 
 
-def place_uncertain(found: CameraFound, member: Member) -> Finding | None:
-    """That the camera's place is known too little; of unknown intrinsics with how well the focal length is known."""
-    assert found.covariance is not None and found.intrinsics is not None and found.intrinsics_std is not None
-    metres, radians = np.sqrt(np.diag(found.covariance)).reshape(2, 3).max(1).tolist()
+def place_uncertain(
+    covariance: Float[ndarray, "6 6"], intrinsics: Intrinsics, focal_std_px: float, is_given: bool
+) -> Finding | None:
+    """Return the finding of a pose that is too uncertain; for unknown intrinsics with that of the focal length."""
+    metres, radians = np.sqrt(np.diag(covariance)).reshape(2, 3).max(1).tolist()
     if metres <= MAX_STD[0] and radians <= MAX_STD[1]:
         return None
-    details, unknown = {"rotation": radians}, member.camera.intrinsics is None
-    if unknown:
-        details["focal_std"] = float(found.intrinsics_std[0] / found.intrinsics.fx)
-    return Finding.of(
-        FindingKind.PLACE_UNCERTAIN, "rejects", "intrinsics" if unknown else "images", value=metres, **details
-    )
+    details = {"rotation": radians} | ({} if is_given else {"focal_std": focal_std_px / intrinsics.fx})
+    remedy = "images" if is_given else "intrinsics"
+    return Finding.of(FindingKind.PLACE_UNCERTAIN, "rejects", remedy, value=metres, **details)
 
 
 def crowded_points(member: Member) -> Finding | None:
-    """That the points span little of every image."""
+    """Return the finding of points that span little of every image."""
     widest = max(spread(one) for one in member.seen.shared if one is not None)
     if widest >= LEAST_SPREAD:
         return None
     return Finding.of(FindingKind.POINTS_CROWDED, "warns", "images", value=widest)
 
 
-def far_from_gripper(found: CameraFound) -> Finding | None:
-    """That a camera said to be on a gripper is far from it."""
-    assert found.parent_from_camera is not None
-    away = float(np.linalg.norm(found.parent_from_camera[:3, 3]))
-    if found.mount == "base" or away <= FAR_FROM_GRIPPER:
+def far_from_gripper(parent_from_camera: Float[ndarray, "4 4"], mount: Mount) -> Finding | None:
+    """Return the finding of a camera that is said to be on a gripper and is far from it."""
+    away = float(np.linalg.norm(parent_from_camera[:3, 3]))
+    if mount == "base" or away <= FAR_FROM_GRIPPER:
         return None
     return Finding.of(FindingKind.FAR_FROM_GRIPPER, "warns", "mount", value=away)

@@ -6,13 +6,13 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.cell.cameras_json import CameraPlaced, CamerasFile
+from jcr.cell.placement import CameraPlacement, CamerasFile
 from jcr.records import CellCamera
 
 
 def base_from_camera(
     camera: CellCamera,
-    found: CameraPlaced,
+    found: CameraPlacement,
     cameras: CamerasFile,
     base_from_gripper: Mapping[int, Float[ndarray, "4 4"]],
 ) -> dict[int, Float[ndarray, "4 4"]]:

@@ -12,8 +12,8 @@ from numpy import ndarray
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
 from jcr.cell.camera_views import CameraViews
-from jcr.cell.found import CameraFound
 from jcr.cell.localise import Shared
+from jcr.cell.placement import CameraPlacement
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.estimation.pose_effects import arm_rows
 from jcr.estimation.problem import Arm
@@ -66,7 +66,7 @@ class Rigs:
         self.arms: list[str] = []
         self._of_arms: list[tuple[Int[ndarray, " n"], Float[ndarray, "n 4 4"], HandEye]] = []
 
-    def add(self, seen: CameraViews) -> Member | CameraFound:
+    def add(self, seen: CameraViews) -> Member | CameraPlacement:
         """The camera's images among the rigs; or why it cannot be placed."""
         if not len(seen.rows):
             most = int(np.argmax(seen.counts))
@@ -76,7 +76,7 @@ class Rigs:
             return self._on_other_arm(seen, seen.camera.arm)
         return self._on_same_gripper(seen) if seen.camera.mount == "gripper" else self._fixed(seen)
 
-    def _fixed(self, seen: CameraViews) -> Member | CameraFound:
+    def _fixed(self, seen: CameraViews) -> Member | CameraPlacement:
         places = seen.places
         names = [seen.camera.images[k] for k in seen.rows]
         metres, radians = _apart(places[:, None], places)
@@ -105,7 +105,7 @@ class Rigs:
             Finding.of(FindingKind.AT_ANOTHER_CAMERA, "warns", "mount", one, camera=own) for one in images
         )
 
-    def _on_same_gripper(self, seen: CameraViews) -> Member | CameraFound:
+    def _on_same_gripper(self, seen: CameraViews) -> Member | CameraPlacement:
         assert seen.camera.frame is not None
         rig, unused = np.full(len(seen.shared), -1), dict[int, str]()
         for k in seen.rows.tolist():
@@ -138,7 +138,7 @@ class Rigs:
         seen = seen.without(dict.fromkeys(taken[astray].tolist(), why))
         return Member(seen=seen, rig=rig, rig_from_camera=on_rig[middle], arm=0)
 
-    def _on_other_arm(self, seen: CameraViews, arm: str) -> Member | CameraFound:
+    def _on_other_arm(self, seen: CameraViews, arm: str) -> Member | CameraPlacement:
         assert seen.camera.base_from_gripper is not None
         if arm in self.arms:
             return seen.refused(FindingKind.SECOND_ON_ARM, arm=arm)

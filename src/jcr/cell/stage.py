@@ -1,4 +1,4 @@
-"""Further cameras of a cell, placed with the calibration of the capture's own: images first, then robots.
+"""Placement of the further cameras of a cell, given the calibration of the capture's own camera.
 
 Every image of another camera is localised in the reconstruction (localise.py); all images are adjusted together with
 the arms' poses (estimation/). The calibration of the capture's own camera stays as it was found: what is found here of
@@ -6,6 +6,7 @@ others rests on the same images.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -19,15 +20,15 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.camera import usable_intrinsics
 from jcr.capture.images import read_image
 from jcr.cell.camera_views import CameraViews
-from jcr.cell.found import ArmFound, CameraFound, CellFound, ImageFound
 from jcr.cell.images import CellImages, cell_images
 from jcr.cell.localise import Shared, guessed_intrinsics, known_images, localised
-from jcr.cell.place_checks import (
-    contradicting_image,
-    crowded_points,
-    far_from_gripper,
-    place_uncertain,
-    with_faults,
+from jcr.cell.place_checks import contradicting_image, crowded_points, far_from_gripper, place_uncertain
+from jcr.cell.placement import (
+    ArmPlacement,
+    CameraPlacement,
+    CellPlacement,
+    ImageUse,
+    TransformUncertainty,
 )
 from jcr.cell.rigs import Member, Rigs
 from jcr.estimation.image_equations import median_reprojection_px
@@ -36,6 +37,7 @@ from jcr.estimation.problem import State
 from jcr.estimation.solve import Solution
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import inverse, scale_translation
+from jcr.intrinsics_json import IntrinsicsAndStd
 from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress, silent, steps
 from jcr.records import Capture, CellCamera, HandEye, Reconstruction
@@ -53,23 +55,17 @@ def place_cameras(
     hand_eye: HandEye,
     options: CalibrateOptions | None = None,
     progress: Progress | None = None,
-) -> CellFound:
-    """The cameras of `others` that see the scene of a capture whose own camera is calibrated.
+) -> CellPlacement:
+    """Place the cameras of `others` that see the scene of a capture whose own camera is calibrated.
 
-    One that cannot be placed is in the result with the reason.
+    A camera that cannot be placed is in the result with the reason.
     """
     options, progress = options or CalibrateOptions(), progress or silent
     if not others:
-        return CellFound((), (), None)
+        return CellPlacement(())
     if not hand_eye.is_sound:
         why = (Finding.of(FindingKind.OWN_REJECTED, "rejects", camera=capture.camera_name),)
-        refused = [
-            CameraFound.not_placed(
-                one, why, [0] * len(one.images), ["the camera was not placed"] * len(one.images)
-            )
-            for one in others
-        ]
-        return CellFound(tuple(refused), (), None)
+        return CellPlacement(tuple(CameraPlacement.rejected(one, why) for one in others))
     used = np.flatnonzero(hand_eye.inliers)
     rows = reconstruction.image_index[used]
     # In metres from the first: the equations that follow are better for it, and distances can be spoken of.
@@ -85,31 +81,37 @@ def place_cameras(
         found[camera.name].append(localised(known, pixels, start, intrinsics is not None))
     rigs = Rigs(capture, hand_eye, own, rows)
     placed: list[Member] = []
-    failed: list[CameraFound] = []
+    failed: list[CameraPlacement] = []
     for camera in others:
         member = rigs.add(CameraViews.of(camera, found[camera.name]))
-        if isinstance(member, CameraFound):
+        if isinstance(member, CameraPlacement):
             failed.append(member)
         else:
             placed.append(member)
     if not placed:
-        return CellFound(tuple(failed), (), None)
+        return CellPlacement(tuple(failed))
     images = cell_images(capture, reconstruction, hand_eye, known, placed, rigs, options)
     of = {member.camera.name: _place_of(member, c) for c, member in enumerate(placed, start=1)}
     answer, faults = _examined(images, placed, list(of.values()), hand_eye)
     cameras = {camera.name: camera for camera in failed}
     for c, (member, shown) in enumerate(zip(placed, faults, strict=True), start=1):
         name = member.camera.name
-        cameras[name] = with_faults(_found(member, c, answer, of[name], hand_eye), member, shown)
+        cameras[name] = _placement(member, c, answer, of[name], hand_eye, shown)
     arms = []
     for k, arm in enumerate(rigs.arms, start=1):
         transform, covariance = answer.transform(lambda p, k=k: p.z[0] @ inverse(p.z[k]))
-        arms.append(ArmFound(arm, transform, covariance))
-    return CellFound(tuple(cameras[camera.name] for camera in others), tuple(arms), answer, of)
+        arms.append(
+            ArmPlacement(
+                name=arm,
+                base_from_other_base=transform.tolist(),
+                uncertainty=TransformUncertainty.of(covariance),
+            )
+        )
+    return CellPlacement(tuple(cameras[camera.name] for camera in others), tuple(arms), answer, of)
 
 
 def _place_of(member: Member, c: int) -> Callable[[State], Float[ndarray, "4 4"]]:
-    """Where the camera, the c-th of the images', is on its parent."""
+    """Return parent_from_camera of the c-th camera as a function of the state."""
     rig, arm = int(member.rig[member.rig >= 0][0]), member.arm
 
     def parent_from_camera(placed: State) -> Float[ndarray, "4 4"]:
@@ -126,7 +128,7 @@ def _examined(
     places: Sequence[Callable[[State], Float[ndarray, "4 4"]]],
     hand_eye: HandEye,
 ) -> tuple[Solution, list[tuple[Finding, ...]]]:
-    """All images adjusted, and what those of each camera show against it (calibration/checks/camera.py).
+    """Adjust all images, and test those of each camera (calibration/checks/effects.py).
 
     Where they contradict intrinsics that were given, or leave doubt of them, the images are adjusted as if none had
     been: of one image the given ones would weigh more than what it shows, and the answer be wrong by many sigmas.
@@ -142,7 +144,7 @@ def _examined(
         arm = None if member.arm in tested else member.arm
         tested.add(arm)
         imaged = _imaged(
-            images, answer, _found(member, c, answer, place, hand_eye), c, (arm, place), is_given
+            images, answer, _placement(member, c, answer, place, hand_eye), c, (arm, place), is_given
         )
         _, faults = effects(imaged)
         contradiction = None
@@ -159,7 +161,7 @@ def _examined(
 def _imaged(
     images: CellImages,
     answer: Solution,
-    found: CameraFound,
+    found: CameraPlacement,
     c: int,
     arm_and_place: tuple[int | None, Callable[[State], Float[ndarray, "4 4"]]],
     is_given: bool,
@@ -184,14 +186,15 @@ def _imaged(
     )
 
 
-def _found(
+def _placement(
     member: Member,
     c: int,
     answer: Solution,
     parent_from_camera: Callable[[State], Float[ndarray, "4 4"]],
     hand_eye: HandEye,
-) -> CameraFound:
-    """Where the camera, the c-th, is, and what speaks against its place."""
+    faults: Sequence[Finding] = (),
+) -> CameraPlacement:
+    """Return the placement of the c-th camera with its findings; the shifts of `faults` add to its covariance."""
     camera, problem = member.camera, answer.problem
     assert problem.observations is not None
     transform, covariance = answer.transform(parent_from_camera)
@@ -199,35 +202,45 @@ def _found(
     of_all = median_reprojection_px(problem, answer.images.view)
     medians = of_all[problem.observations.camera == c].tolist()
     px = dict(zip((k for k, _ in member.used), medians, strict=True))
-    images = tuple(
-        ImageFound(image=image, used=reason is None, points=count, reprojection_px=px.get(k), reason=reason)
-        for k, (image, count, reason) in enumerate(
-            zip(camera.images, member.seen.counts, member.seen.reasons, strict=True)
-        )
+    uses = zip(camera.images, member.seen.counts, member.seen.reasons, strict=True)
+    images = [
+        ImageUse(image=image, used=reason is None, points=count, reprojection_px=px.get(k), reason=reason)
+        for k, (image, count, reason) in enumerate(uses)
+    ]
+    intrinsics, std = problem.intrinsics(answer.state)[c], np.sqrt(np.diag(answer.intrinsics_covariance(c)))
+
+    def uncertain() -> Finding | None:
+        return place_uncertain(covariance, intrinsics, float(std[0]), camera.intrinsics is not None)
+
+    # An image that contradicts the pose also makes it uncertain.
+    checked = (
+        contradicting_image(images, member) or uncertain(),
+        *member.findings,
+        crowded_points(member),
+        far_from_gripper(transform, camera.mount),
     )
-    found = CameraFound(
-        name=camera.name,
-        mount=camera.mount,
-        arm=camera.arm,
-        images=images,
-        parent_from_camera=transform,
-        covariance=covariance,
-        scene_distance=member.seen.distance * answer.state.scale,
-        intrinsics=problem.intrinsics(answer.state)[c],
-        intrinsics_std=np.sqrt(np.diag(answer.intrinsics_covariance(c))),
+    findings = [finding for finding in checked if finding is not None]
+    for fault in faults:
+        covariance = covariance + fault.covariance[:6, :6]
+        rejected = any(one.severity == "rejects" for one in findings)
+        findings.append(replace(fault, severity="rejects") if rejected or uncertain() else fault)
+    distance_m = member.seen.distance * answer.state.scale
+    return CameraPlacement.of(
+        camera,
+        images,
+        findings,
+        transform,
+        TransformUncertainty.of(covariance, transform, distance_m),
+        IntrinsicsAndStd.of(intrinsics, std),
     )
-    # An image that contradicts the place also makes it uncertain.
-    doubt = contradicting_image(found, member) or place_uncertain(found, member)
-    checked = (doubt, *member.findings, crowded_points(member), far_from_gripper(found))
-    return found.with_findings(*(finding for finding in checked if finding is not None))
 
 
 def _by_faults(
     answer: Solution, derivative: Float[ndarray, "6 p"], hand_eye: HandEye
 ) -> Float[ndarray, "6 6"]:
-    """What the calibration of the capture's own camera counts beside its images and robot, carried over.
+    """Return the covariance that faults of the capture's own calibration, such as a slip, add to a further camera.
 
-    Wrong intrinsics, a slip: what widens gripper_from_camera and scale there moves along with all that varies with them.
+    The part of its covariance beside images and robot moves everything that varies with it.
     """
     size = np.sqrt(np.diag(hand_eye.covariance))
     more = (hand_eye.covariance - answer.covariance[:7, :7]) / np.outer(size, size)

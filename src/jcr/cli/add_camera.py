@@ -38,7 +38,7 @@ def main(arguments: Arguments) -> int:
     """Locate the camera and print its pose."""
     import re
 
-    from jcr.cell.cameras_json import in_words
+    from jcr.cell.placement import in_words
     from jcr.errors import InputError
     from jcr.pipeline.run import add_camera
     from jcr.progress import progress_bars

@@ -26,7 +26,7 @@ def show(result: "RunResult | SavedRun | PosesResult", output: Output, after: st
     Returns exit status 0, or raises RejectedError where it is rejected.
     """
     from jcr.calibration.words import verdict_in_words
-    from jcr.cell.cameras_json import in_words
+    from jcr.cell.placement import in_words
     from jcr.findings import sentence
     from jcr.pipeline.results import PosesResult
 

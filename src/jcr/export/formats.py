@@ -22,7 +22,7 @@ from jcr.pipeline.run_folder import RunFolder
 
 if TYPE_CHECKING:
     from jcr.calibration.calibration_json import CalibrationFile
-    from jcr.cell.cameras_json import CameraPlaced
+    from jcr.cell.placement import CameraPlacement
     from jcr.export.views import PosedImages
     from jcr.records import Capture, Intrinsics, Reconstruction
 
@@ -166,7 +166,7 @@ class Run:
             for arm in cameras.arms
         ]
 
-    def _camera(self, name: str) -> "CameraPlaced":
+    def _camera(self, name: str) -> "CameraPlacement":
         """Return a further camera by its name; raise InputError where it was not placed."""
         cameras = self.folder.cameras()
         for camera in () if cameras is None else cameras.cameras:
@@ -176,7 +176,7 @@ class Run:
             f"--camera {name}: {self.folder.path} has placed no camera of that name; see its cameras.json"
         )
 
-    def _mount_of(self, camera: "CameraPlaced", child: str) -> ros.CameraMount:
+    def _mount_of(self, camera: "CameraPlacement", child: str) -> ros.CameraMount:
         """Return the mount of a further camera."""
         parent = self.options.base_frame if camera.mount == "base" else self.options.parent_frame
         intrinsics = None if camera.intrinsics is None else camera.intrinsics.record()

@@ -12,7 +12,7 @@ from numpy import ndarray
 
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.calibration.options import CalibrateOptions
-from jcr.cell.cameras_json import CamerasFile
+from jcr.cell.placement import CamerasFile
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError
 from jcr.findings import Verdict, verdict_of

@@ -27,8 +27,8 @@ from jcr.capture.added import FOLDER as ADDED
 from jcr.capture.formats.capture_json import kept
 from jcr.capture.plain_files import first_fault
 from jcr.capture.read import read_capture
-from jcr.cell.cameras_json import FILE as CAMERAS
-from jcr.cell.cameras_json import CamerasFile, read_cameras, write_cameras
+from jcr.cell.placement import FILE as CAMERAS
+from jcr.cell.placement import CamerasFile, read_cameras, write_cameras
 from jcr.depth.depth_npz import FILE as DEPTH
 from jcr.depth.depth_npz import FORMAT as DEPTH_FORMAT
 from jcr.depth.depth_npz import is_made_from, read_depth, write_depth

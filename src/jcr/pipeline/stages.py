@@ -10,8 +10,8 @@ from jcr.boards.proposal import proposed_for
 from jcr.calibration.calibration_json import calibration_file, failed_file
 from jcr.capture.added import write_added
 from jcr.cell.added import read_added_cameras
-from jcr.cell.cameras_json import CamerasFile, cameras_file
 from jcr.cell.carried import carried_scene, refined
+from jcr.cell.placement import CamerasFile
 from jcr.depth.densify import densify
 from jcr.findings import sentence
 from jcr.pipeline.results import RunOptions, RunResult
@@ -85,7 +85,7 @@ def cameras(
     found = place_cameras(
         result.capture, others, result.reconstruction, result.hand_eye, options.calibrate, progress
     )
-    return cameras_file(found, __version__)
+    return found.file(__version__)
 
 
 def densified(result: RunResult, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:

@@ -273,11 +273,11 @@ def _place_twice(
     for camera in placed.cameras:
         if camera.parent_from_camera is None:
             raise RejectedError(f"cannot tell: {camera.doubt}")
-    assert placed.answer is not None
-    before, after = (placed.of[camera.name] for camera in cameras)
-    j = placed.answer.derivative(after) - placed.answer.derivative(before)
-    covariance = j @ placed.answer.covariance @ j.T
-    offset = step_between(before(placed.answer.state), after(placed.answer.state))
+    assert placed.solution is not None
+    before, after = (placed.poses[camera.name] for camera in cameras)
+    j = placed.solution.derivative(after) - placed.solution.derivative(before)
+    covariance = j @ placed.solution.covariance @ j.T
+    offset = step_between(before(placed.solution.state), after(placed.solution.state))
     notes = tuple(text for camera in placed.cameras for text in camera.warnings)
     found = _of_two(offset, covariance, options, cameras[1].images, notes, "in the mapped scene")
     return replace(found, fixed=cameras[0].name)

@@ -3,8 +3,10 @@
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 
-from jcr.cell.cameras_json import ArmPlaced, CameraPlaced, CamerasFile, TransformUncertainty
+from jcr.cell.placement import ArmPlacement, CameraPlacement, CamerasFile, TransformUncertainty
 from jcr.report.render import Section
 from jcr.rounding import significant
 
@@ -15,7 +17,7 @@ def cameras_section(cameras: CamerasFile) -> Section:
     return Section("cameras", {"cards": cards})
 
 
-def _camera(camera: CameraPlaced) -> dict[str, Any]:
+def _camera(camera: CameraPlacement) -> dict[str, Any]:
     """Return the card of a camera with its images."""
     arm = "" if camera.arm is None else f" of arm {camera.arm}"
     name = "base_from_camera" if camera.mount == "base" else f"gripper_from_camera{arm}"
@@ -37,28 +39,22 @@ def _camera(camera: CameraPlaced) -> dict[str, Any]:
     }
 
 
-def _arm(arm: ArmPlaced) -> dict[str, Any]:
+def _arm(arm: ArmPlacement) -> dict[str, Any]:
     """Return the card of an arm."""
     name = "base_from_other_base"
-    placed = _transform(name, arm.base_from_other_base, arm.uncertainty)
+    placed = _transform(name, np.array(arm.base_from_other_base), arm.uncertainty)
     return placed | {"title": f"arm {arm.name}: {name}", "rejected": False, "remarks": (), "images": ()}
 
 
 def _transform(
-    name: str, matrix: list[list[float]] | None, uncertainty: TransformUncertainty | None
+    name: str, matrix: Float[ndarray, "4 4"] | None, uncertainty: TransformUncertainty | None
 ) -> dict[str, Any]:
     """Return the matrix as text, to read and to copy, and its standard deviations; None without a transform."""
     if matrix is None or uncertainty is None:
         return {"name": name, "matrix": None}
-    scene = ""
-    if uncertainty.at_scene_mm is not None and uncertainty.scene_distance_m is not None:
-        far = f"{uncertainty.scene_distance_m:.2f} m away"
-        scene = f"; ± {significant(uncertainty.at_scene_mm)} mm at the scene, {far}"
-    millimetres = ", ".join(significant(value) for value in uncertainty.translation_std_mm)
-    degrees = ", ".join(significant(value) for value in uncertainty.rotation_std_deg)
     return {
         "name": name,
         "matrix": "\n".join("".join(f"{value:>10.6f}" for value in row)[1:] for row in matrix),
-        "copied": str(np.round(np.array(matrix), 9).tolist()),
-        "std": f"± {millimetres} mm, {degrees} ° (1 σ){scene}",
+        "copied": str(matrix.round(9).tolist()),
+        "std": uncertainty.in_words,
     }

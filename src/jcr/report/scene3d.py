@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from jcr.cell.cameras_json import CameraPlaced
+from jcr.cell.placement import CameraPlacement
 from jcr.cell.poses import base_from_camera as poses_of
 from jcr.geometry import apply_similarity, inverse
 from jcr.pipeline.results import RunResult
@@ -216,7 +216,7 @@ def _others(result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]) -> lis
 
 def _places(
     result: RunResult,
-    found: CameraPlaced,
+    found: CameraPlacement,
     known: dict[str, CellCamera],
     by_row: dict[int, Float[ndarray, "4 4"]],
 ) -> list[Float[ndarray, "4 4"]]:

@@ -88,7 +88,7 @@ class Viewer:
             self._palette = label_colors(len(self.scene.label_names))
             report("view", 0.6)
             self._add_map(self.scene)
-            self._add_sphere(self.scene)
+            self._add_sphere()
         self.show_points()
         self._add_click()
         self.choose_image()
@@ -160,7 +160,7 @@ class Viewer:
             for k, pose in enumerate(self.capture.base_from_gripper)
         ]
         self._photo = server.scene.add_image("/photo", np.zeros((2, 2, 4), np.uint8), 0.1, 0.1, visible=False)
-        with gui.add_folder("Capture"):
+        with gui.add_folder("Capture", expand_by_default=False):
             self.image = gui.add_slider("image", 0, len(self.calibration.images) - 1, 1, 0)
             self._about_image = gui.add_markdown("")
             look = gui.add_button("look from this camera")
@@ -178,7 +178,7 @@ class Viewer:
         """Add the controls of the drawn points."""
         names = [MAP] * (self.scene is not None) + [CLOUD] * (self.cloud is not None) + ["none"]
         gui, several = self.server.gui, self.scene is not None and len(self.scene.label_names) > 1
-        with gui.add_folder("Points"):
+        with gui.add_folder("Points", expand_by_default=False):
             self.shown = gui.add_dropdown("show", names, initial_value=names[0])
             self.by_label = gui.add_checkbox("coloured by label", False, visible=several)
             self._legend = gui.add_html("")
@@ -190,13 +190,12 @@ class Viewer:
     def _add_map(self, scene: SceneMap) -> None:
         """Add the border of unknown space and the level slice, with their controls."""
         gui, (low, high) = self.server.gui, scene.box
-        with gui.add_folder("Map"):
+        with gui.add_folder("Map", expand_by_default=False):
             self.show_unknown = gui.add_checkbox("unknown", False, hint="border of the seen space")
             self.unknown = gui.add_dropdown("unknown is", ("occupied", "free"), initial_value="occupied")
             self.slice_of = gui.add_dropdown("slice", ("none", *get_args(SliceOf)), initial_value="none")
-            self.slice_at = gui.add_slider(
-                "height (m)", float(low[2]), float(high[2]), 0.005, round(float(low[2] + high[2]) / 2, 3)
-            )
+            bottom, top = float(low[2].round(3)), float(high[2].round(3))
+            self.slice_at = gui.add_slider("height (m)", bottom, top, 0.005, round(self._support() + 0.02, 3))
             self._slice_legend = gui.add_html("")
         vertices, faces = unknown_border(scene)
         self._unknown = None
@@ -211,18 +210,14 @@ class Viewer:
         for control in (self.slice_of, self.slice_at, self.show_unknown, self.unknown):
             control.on_update(lambda _: self.show_slice())
 
-    def _add_sphere(self, scene: SceneMap) -> None:
-        """Add the sphere that shows collisions, 0.15 m above the most frequent height of the surface."""
+    def _add_sphere(self) -> None:
+        """Add the sphere that shows collisions, 0.15 m above the support."""
         gui = self.server.gui
-        with gui.add_folder("Sphere to drag"):
+        with gui.add_folder("Sphere to drag", expand_by_default=False):
             self.show_sphere = gui.add_checkbox("sphere", True)
             self.radius = gui.add_slider("radius (mm)", 5.0, 150.0, 5.0, 30.0)
             self.answer = gui.add_markdown("")
-        solid = self._solid()
-        counts, edges = np.histogram(solid[:, 2], bins=100)
-        low, high = scene.box[:, 2]
-        support = float(np.clip(edges[counts.argmax()], low, high - 0.02))
-        start = np.array([*np.median(solid, axis=0)[:2], support + 0.15])
+        start = np.array([*np.median(self._solid(), axis=0)[:2], self._support() + 0.15])
         self.gizmo = self.server.scene.add_transform_controls(
             "/sphere", scale=0.12, disable_rotations=True, position=start
         )
@@ -234,7 +229,7 @@ class Viewer:
 
     def _add_click(self) -> None:
         """Add the answer to a click on a point."""
-        with self.server.gui.add_folder("Click a point"):
+        with self.server.gui.add_folder("Click a point", expand_by_default=False):
             self.clicked = self.server.gui.add_markdown("Click a point to see its values.")
         self._mark = self.server.scene.add_icosphere("/clicked", 0.004, (255, 220, 0), visible=False)
 
@@ -394,6 +389,13 @@ class Viewer:
         if self.scene is not None:
             points = self._surface.points_in_base
         return points if len(points) else np.zeros((1, 3))
+
+    def _support(self) -> float:
+        """Return the most frequent height (m) of the surface, inside the workspace."""
+        assert self.scene is not None
+        counts, edges = np.histogram(self._solid()[:, 2], bins=100)
+        low, high = self.scene.box[:, 2]
+        return float(np.clip(edges[counts.argmax()], low, high - 0.02))
 
     def _place_eye(self) -> None:
         """Set the initial view obliquely from above, with points and cameras in it."""

@@ -1,0 +1,271 @@
+"""Placement of further cameras and arms of a cell: the records, and their file cameras.json."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from pydantic import Field, ValidationError, model_validator
+
+from jcr.arrays_json import Covariance6, Matrix, Part, Spread, Spread3
+from jcr.calibration.findings_json import FindingJson, derived, require_one_verdict
+from jcr.capture.plain_files import first_fault, is_written, read_json
+from jcr.errors import InputError
+from jcr.files import write_text
+from jcr.findings import Finding, Verdict, doubt_of, strongest_first
+from jcr.geometry import skew
+from jcr.intrinsics_json import IntrinsicsAndStd
+from jcr.records import CellCamera, Mount
+from jcr.rounding import significant
+
+if TYPE_CHECKING:
+    from jcr.estimation.problem import State
+    from jcr.estimation.solve import Solution
+
+FILE, FORMAT = "cameras.json", "jcr.cameras/1"
+
+
+class TransformUncertainty(Part):
+    """One-sigma uncertainty of a transform, along axes of its parent frame."""
+
+    translation_std_mm: Spread3
+    rotation_std_deg: Spread3
+    covariance: Covariance6
+    """Covariance of the step (geometry.retract) to the true transform: translation (m) and rotation vector (rad), in
+    axes of its parent."""
+    at_scene_mm: Spread | None = None
+    """One sigma along the worst axis of a point `scene_distance_m` before the camera."""
+    scene_distance_m: Spread | None = None
+
+    @classmethod
+    def of(
+        cls,
+        covariance: Float[ndarray, "6 6"],
+        parent_from_camera: Float[ndarray, "4 4"] | None = None,
+        scene_distance_m: float | None = None,
+    ) -> "TransformUncertainty":
+        """Return the uncertainty; for a camera also that of a point on its optical axis at a distance (m)."""
+        std, at_scene = np.sqrt(np.diag(covariance)), None
+        if parent_from_camera is not None and scene_distance_m is not None:
+            by_step = np.hstack([np.eye(3), -skew(scene_distance_m * parent_from_camera[:3, 2])])
+            at_scene = 1e3 * float(np.sqrt(np.linalg.eigvalsh(by_step @ covariance @ by_step.T)[-1]))
+        return cls(
+            translation_std_mm=(1e3 * std[:3]).tolist(),
+            rotation_std_deg=np.degrees(std[3:]).tolist(),
+            covariance=covariance.tolist(),
+            at_scene_mm=at_scene,
+            scene_distance_m=scene_distance_m,
+        )
+
+    @property
+    def in_words(self) -> str:
+        """Standard deviations as one line."""
+        x, y, z = self.translation_std_mm
+        rx, ry, rz = self.rotation_std_deg
+        scene = ""
+        if self.at_scene_mm is not None and self.scene_distance_m is not None:
+            scene = f"; ± {significant(self.at_scene_mm)} mm at the scene, {self.scene_distance_m:.2f} m away"
+        return f"± {x:.2f} {y:.2f} {z:.2f} mm, {rx:.3f} {ry:.3f} {rz:.3f} ° (1 σ){scene}"
+
+
+class ImageUse(Part):
+    """Use of one image of a further camera."""
+
+    image: str
+    used: bool
+    points: int
+    """Points shared with the images of the capture's own camera."""
+    reprojection_px: float | None
+    reason: str | None
+    """Reason why the image was not used."""
+
+
+class CameraPlacement(Part):
+    """Pose of one further camera; without transforms where it was not placed."""
+
+    name: str
+    mount: Mount
+    arm: str | None
+    """null: the capture's own arm."""
+    base_from_camera: Matrix | None = None
+    """Pose of a fixed camera; null for one on a gripper."""
+    gripper_from_camera: Matrix | None = None
+    """Pose of a camera on a gripper; null for a fixed one."""
+    uncertainty: TransformUncertainty | None = None
+    intrinsics: IntrinsicsAndStd | None = None
+    images: list[ImageUse] = Field(alias="pictures")
+    findings: list[FindingJson] = []
+    """Strongest first."""
+    verdict: Verdict
+    """Verdict of the worst finding."""
+    converged: bool
+    warnings: list[str]
+    """Findings that reject or warn, in words."""
+
+    @classmethod
+    def of(
+        cls,
+        camera: CellCamera,
+        images: Sequence[ImageUse],
+        findings: Sequence[Finding],
+        parent_from_camera: Float[ndarray, "4 4"] | None = None,
+        uncertainty: TransformUncertainty | None = None,
+        intrinsics: IntrinsicsAndStd | None = None,
+    ) -> "CameraPlacement":
+        """Return the placement of a camera with its findings."""
+        key = "base_from_camera" if camera.mount == "base" else "gripper_from_camera"
+        return cls(
+            name=camera.name,
+            mount=camera.mount,
+            arm=camera.arm,
+            uncertainty=uncertainty,
+            intrinsics=intrinsics,
+            pictures=list(images),
+            **derived(strongest_first(findings)),
+            **{} if parent_from_camera is None else {key: parent_from_camera.tolist()},
+        )
+
+    @classmethod
+    def rejected(
+        cls,
+        camera: CellCamera,
+        why: Sequence[Finding],
+        counts: Sequence[int] | None = None,
+        reasons: Sequence[str | None] | None = None,
+    ) -> "CameraPlacement":
+        """Return a camera that was not placed, with the shared points of each image and why it was not used."""
+        n = len(camera.images)
+        uses = zip(camera.images, counts or [0] * n, reasons or [None] * n, strict=True)
+        images = [
+            ImageUse(
+                image=image,
+                used=False,
+                points=count,
+                reprojection_px=None,
+                reason=reason or "the camera was not placed",
+            )
+            for image, count, reason in uses
+        ]
+        return cls.of(camera, images, why)
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> "CameraPlacement":
+        """Check that transform, uncertainty and findings belong together."""
+        if (self.parent_from_camera is None) is not (self.uncertainty is None):
+            raise ValueError("a transform without its uncertainty, or the other way round")
+        if self.base_from_camera is not None and self.mount == "gripper":
+            raise ValueError("base_from_camera of a camera that moves with the gripper")
+        if self.converged and self.parent_from_camera is None:
+            raise ValueError("converged without a transform")
+        require_one_verdict(self.findings, self.verdict, self.converged)
+        return self
+
+    @property
+    def parent_from_camera(self) -> Float[ndarray, "4 4"] | None:
+        """base_from_camera of a fixed camera, else gripper_from_camera of its own arm."""
+        pose = self.base_from_camera if self.mount == "base" else self.gripper_from_camera
+        return None if pose is None else np.array(pose)
+
+    @property
+    def covariance(self) -> Float[ndarray, "6 6"] | None:
+        """Covariance of the transform."""
+        return None if self.uncertainty is None else np.array(self.uncertainty.covariance)
+
+    @property
+    def doubt(self) -> str | None:
+        """Reason of the rejection; None where it is accepted."""
+        return doubt_of(self.findings)
+
+    @property
+    def in_words(self) -> list[str]:
+        """A few lines for the terminal."""
+        if self.parent_from_camera is None or self.uncertainty is None:
+            return [f"{self.name}: not placed: {self.doubt}"]
+        arm = "" if self.arm is None else f" of arm {self.arm}"
+        name = "base_from_camera" if self.mount == "base" else f"gripper_from_camera{arm}"
+        used = [image for image in self.images if image.used]
+        points = sum(image.points for image in used)
+        rejected = ["rejected: " if self.doubt else "", *[""] * len(self.warnings)]
+        return [
+            f"{self.name}: {name} ({len(used)} of {len(self.images)} images, {points} points)",
+            *_rows(self.parent_from_camera),
+            f"  {self.uncertainty.in_words}",
+            *(f"  {first}{text}" for first, text in zip(rejected, self.warnings, strict=False)),
+            *(f"  not used: {image.image}: {image.reason}" for image in self.images if not image.used),
+        ]
+
+
+class ArmPlacement(Part):
+    """Pose of the base of another arm."""
+
+    name: str
+    base_from_other_base: Matrix
+    """The transform from its base to that of the capture's own arm."""
+    uncertainty: TransformUncertainty
+
+
+class CamerasFile(Part):
+    """Content of cameras.json."""
+
+    format: Literal["jcr.cameras/1"] = FORMAT
+    cameras: list[CameraPlacement]
+    arms: list[ArmPlacement]
+    version: str
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the content as it is written."""
+        return self.model_dump(by_alias=True)
+
+
+@dataclass(frozen=True)
+class CellPlacement:
+    """Placement of all further cameras and arms, with the solution that it comes from."""
+
+    cameras: tuple[CameraPlacement, ...]
+    arms: tuple[ArmPlacement, ...] = ()
+    solution: "Solution | None" = None
+    """None where no camera could be placed."""
+    poses: "dict[str, Callable[[State], Float[ndarray, '4 4']]]" = field(default_factory=dict)
+    """parent_from_camera of each placed camera as a function of the solution's state."""
+
+    def file(self, version: str) -> CamerasFile:
+        """Return the content of cameras.json."""
+        return CamerasFile(cameras=list(self.cameras), arms=list(self.arms), version=version)
+
+
+def write_cameras(folder: Path, content: CamerasFile) -> None:
+    """Write cameras.json of a run folder, whole or not at all."""
+    write_text(folder / FILE, json.dumps(content.as_json(), indent=2, allow_nan=False) + "\n")
+
+
+def read_cameras(folder: Path) -> CamerasFile | None:
+    """Read cameras.json of a run folder, None where it has none; raise InputError where it was damaged."""
+    file = folder / FILE
+    if not is_written(file):
+        return None
+    read_json(file)  # raises InputError with the place of a fault
+    try:
+        return CamerasFile.model_validate_json(file.read_bytes(), strict=True)
+    except ValidationError as error:
+        raise InputError(
+            f"{file}: {first_fault(error)}; place the cameras again (jcr run, jcr add-camera)"
+        ) from None
+
+
+def in_words(content: CamerasFile) -> list[str]:
+    """Return a few lines for each camera and arm."""
+    lines = [line for camera in content.cameras for line in camera.in_words]
+    for arm in content.arms:
+        rows = _rows(np.array(arm.base_from_other_base))
+        lines += [f"base_from_{arm.name}_base", *rows, f"  {arm.uncertainty.in_words}"]
+    return lines
+
+
+def _rows(a_from_b: Float[ndarray, "4 4"]) -> list[str]:
+    """Return a matrix as indented lines."""
+    with np.printoptions(precision=6, suppress=True):
+        return [f"  {row}" for row in str(a_from_b).splitlines()]
