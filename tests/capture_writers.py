@@ -10,7 +10,6 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from jcr.capture.images import encode_png
-from jcr.capture.options import ReadOptions
 from jcr.capture.urdf_chain import read_chain
 from jcr.estimation.kinematics import forward_kinematics
 from jcr.geometry import inverse
@@ -177,19 +176,27 @@ def write_easy_handeye2(
     return folder / "wrist.samples"
 
 
-IMAGE_FORMATS: dict[str, tuple[Callable[[Path, Capture], Path], ReadOptions]] = {
-    "csv": (write_table, ReadOptions()),
-    "tsv": (
-        lambda folder, capture: write_table(folder, capture, "rpy", "image,x,y,z,roll,pitch,yaw", "\t"),
-        ReadOptions(),
+def write_list(folder: Path, capture: Capture) -> Path:
+    """poses.json with named images."""
+    copy_images(capture, folder)
+    write_camera_info(capture, folder)
+    keys, rows = ("x", "y", "z", "qx", "qy", "qz", "qw"), rows_as("quat-xyzw", capture.base_from_gripper)
+    named = zip(capture.images, rows.tolist(), strict=True)
+    poses = [{"image": name, "pose": dict(zip(keys, row, strict=True))} for name, row in named]
+    (folder / "poses.json").write_text(json.dumps({"poses": poses}))
+    return folder
+
+
+CORPUS: dict[str, Callable[[Path, Capture], Path]] = {
+    "poses.csv": write_table,
+    "poses.tsv": lambda folder, capture: write_table(
+        folder, capture, "rpy", "image,x,y,z,roll,pitch,yaw", "\t"
     ),
-    "npy": (write_npy, ReadOptions()),
-    "tum": (lambda folder, capture: write_tum(folder, capture), ReadOptions()),
-    "ethz-asl": (
-        lambda folder, capture: write_tum(folder, capture, "# t, x, y, z, q_x, q_y, q_z, q_w"),
-        ReadOptions(),
-    ),
+    "poses.npy": write_npy,
+    "poses.txt": write_tum,
+    "poses.json": write_list,
 }
+"""Writers of each kind of file of poses, with the images beside it."""
 
 
 LIMIT = '<limit lower="-3" upper="3" effort="1" velocity="1"/>'

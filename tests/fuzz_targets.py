@@ -93,17 +93,9 @@ def targets(folder: Path) -> dict[str, Target]:
         return lambda file: read_source(path, NAMES, into=path.parent / "frames")
 
     found["capture.json"] = Target(folder / "capture" / "capture.json", capture_json.read)
-    for name, write in (
-        ("poses.csv", lambda place: writers.write_table(place, capture)),
-        (
-            "poses.tsv",
-            lambda place: writers.write_table(place, capture, "rpy", "image,x,y,z,roll,pitch,yaw", "\t"),
-        ),
-        ("poses.npy", lambda place: writers.write_npy(place, capture)),
-        ("poses.txt", lambda place: writers.write_tum(place, capture)),
-    ):
-        write(folder / name.replace(".", "-"))
+    for name, write in writers.CORPUS.items():
         place = folder / name.replace(".", "-")
+        write(place, capture)
         found[name] = Target(place / name, whole(place))
     for name, write in (
         ("samples.yaml", writers.write_moveit),

@@ -187,14 +187,7 @@ def _of_others(folder: Path, capture: Capture, cameras: np.ndarray, in_file: Any
     writers.write_table(place, capture)
     in_file("camera_info.yaml", place / "camera_info.yaml", source(place), as_yaml)
     lists = folder / "lists"
-    writers.copy_images(capture, lists)
-    keys = ("x", "y", "z", "qx", "qy", "qz", "qw")
-    rows = writers.rows_as("quat-xyzw", capture.base_from_gripper).tolist()
-    poses = [
-        {"image": name, "pose": dict(zip(keys, row, strict=True))}
-        for name, row in zip(capture.images, rows, strict=True)
-    ]
-    as_json(lists / "poses.json", {"poses": poses})
+    writers.write_list(lists, capture)
     in_file("poses.json", lists / "poses.json", source(lists))
     alone = folder / "camera_info"
     alone.mkdir()

@@ -71,7 +71,7 @@ NAMES = [
     "calibration.json", "camera_info.yaml", "cameras.bin", "capture.json", "cloud.ply",
     "depth.npz", "episode.parquet", "images.bin", "map.safetensors", "pairs.npz", "picture.bmp", "picture.gif",
     "picture.jpg", "picture.png", "picture.tif", "picture.webp", "points.csv", "points.npy", "points.ply", 
-    "poses.csv",
+    "poses.csv", "poses.json",
     "poses.npy", "poses.tsv", "poses.txt", "reconstruction.npz", "reference.json", "samples.yaml", "scan.bag",
     "scan.mcap", "weights.pth", "wrist.samples",
 ]  # fmt: skip
