@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy import ndarray
-from scipy.special import chdtr, chdtrc, chdtri, fdtrc, gammaincinv
+from scipy.special import betaln, chdtr, chdtrc, chdtri, fdtrc, gammaincinv
 
 Number = float | int | np.number | ndarray
 
@@ -41,6 +41,11 @@ class f:  # noqa: N801
 
     @staticmethod
     def logsf(x: Number, over: Number, under: Number) -> Any:
-        """Logarithm of the probability of more than x; minus infinity where that is too small for a number."""
-        with np.errstate(divide="ignore"):
-            return np.log(fdtrc(over, under, x))
+        """Return the logarithm of the probability of more than x, finite where the probability itself underflows.
+
+        There it is the leading term of the incomplete beta function at a small argument (DLMF 8.17.7).
+        """
+        tail, half = np.asarray(fdtrc(over, under, x)), np.asarray(under) / 2
+        share = np.maximum(under / (under + np.asarray(over) * np.asarray(x, float)), 1e-300)
+        leading = half * np.log(share) - np.log(half) - betaln(half, np.asarray(over) / 2)
+        return np.where(tail > 1e-290, np.log(np.maximum(tail, 1e-300)), leading)[()]

@@ -29,9 +29,11 @@ def calibrated(capture: Capture, folder: RunFolder, options: RunOptions, progres
     watches = capture.mount == "base"
     seen = carried_scene(capture, folder.path / MOVING) if watches else capture
     state = state_of(seen, options.made_with).model_copy(update={"capture": str(capture.folder.resolve())})
+    # The arm's kinematics are those of the reported poses, and not of their inverses.
+    own = replace(options, calibrate=replace(options.calibrate, robot=None)) if watches else options
     try:
-        tried, attempts = _reused(seen, folder, options, state, progress) or _chosen(
-            seen, folder, options, state, progress
+        tried, attempts = _reused(seen, folder, own, state, progress) or _chosen(
+            seen, folder, own, state, progress
         )
     except NothingFoundError as error:
         raise _failed(capture, folder, options, state, error) from None

@@ -25,7 +25,7 @@ def check_robot(case: Case) -> Checked:
     if len(used) < MIN_EXAMINED or arm is None or joints is None:
         return Checked()
     hand_eye = case.hand_eye
-    gripper, camera = case.base_from_gripper[used], case.reconstruction.recon_from_camera[used]
+    gripper, camera = case.base_from_gripper[used], case.recon_from_camera[used]
     systematic = of_poses(case.robot.systematic, used)
     offsets = joint_offsets(hand_eye.before or hand_eye, gripper, camera, systematic, arm, joints[used])
     examined = RobotExamined(hand_eye.robot_noise, offsets)
