@@ -51,10 +51,10 @@ class Arguments:
     """Folder of the capture; an unfinished capture is continued."""
     camera: Annotated[str, tyro.conf.arg(metavar="DEVICE")] = "0"
     """V4L2 device number, realsense[:SERIAL], URL of a stream (rtsp://…), or a recording (video file, .bag)."""
-    optics: CameraOptions = field(default_factory=CameraOptions)
+    settings: CameraOptions = field(default_factory=CameraOptions)
     poses: Annotated[str, tyro.conf.arg(metavar="SOURCE")] = "http"
     """Source of gripper poses: ur:HOST[:PORT] (Universal Robots), franka:HOST, xarm:HOST, typed (by hand),
-    or http (a program sends them, jcr docs capture)."""
+    or http (a program posts them, jcr docs http)."""
     pose_convention: ConventionName = "auto"
     """Notation of typed poses and of the printed next pose; auto: the arm's own."""
     pose_units: UnitsName = "auto"
@@ -72,7 +72,7 @@ class Arguments:
     intrinsics_from: Path | None = None
     """JSON file with the camera's "intrinsics" (a capture.json or calibration.json); unset: those stored in the camera
     (RealSense), otherwise estimated."""
-    collect: SessionOptions = field(default_factory=SessionOptions)
+    session: SessionOptions = field(default_factory=SessionOptions)
     output: Output = field(default_factory=Output)
 
 
@@ -86,7 +86,7 @@ def main(arguments: Arguments) -> int:
     from jcr.live.session import LiveSession
     from jcr.pipeline.run_folder import locked
 
-    options = arguments.collect
+    options = arguments.session
     if options.until_accurate and options.require is None:
         raise InputError("--until-accurate: needs --require MM DEG, the accuracy that is meant")
     states, listen, given = (
@@ -103,7 +103,7 @@ def main(arguments: Arguments) -> int:
         answers.append(answer)
         _print("\n".join(lines))
 
-    with locked(arguments.out), open_camera(arguments.camera, arguments.optics) as camera:
+    with locked(arguments.out), open_camera(arguments.camera, arguments.settings) as camera:
         folder = LiveFolder(arguments.out, given or camera.intrinsics, arguments.robot)
         calibration = LiveCalibration(folder, options={"require": options.require}, reach=options.reach_m)
         gripper = None if states is None else lambda: next(states())
@@ -147,7 +147,7 @@ def _conclude(
     facts["result"] = None if result is None else str(result.out)
     facts["verdict"] = None if result is None else result.verdict
     arguments.output.result("\n".join(lines) + "\n", facts)
-    if arguments.collect.until_accurate:
+    if arguments.session.until_accurate:
         is_met = is_accepted and required is not None and required.met and requirement_met
         return 0 if is_met else 3
     return 3 if images >= LEAST_IMAGES and not is_accepted else 0
