@@ -81,8 +81,7 @@ def predict(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) -> Pos
 
 
 def grid_of(size: tuple[int, int], long_edge: int = LONG_EDGE) -> ImageGrid:
-    """Return the grid of an image: the long edge becomes `long_edge`, then each edge the nearest multiple of the
-    patch."""
+    """Return the grid of an image: the long edge becomes `long_edge`, edges are rounded to multiples of the patch."""
     edges = (round(edge * long_edge / max(size)) for edge in size)
     width, height = (max(1, (edge + PATCH // 2) // PATCH) * PATCH for edge in edges)
     return ImageGrid.uncropped(size, (width, height))

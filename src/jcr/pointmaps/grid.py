@@ -1,4 +1,4 @@
-"""Images as the network was trained on them, and the intrinsics that go with the pixels it sees.
+"""Images in the resolution of a network, and the intrinsics of their pixels.
 
 Pixel (0, 0) is the centre of the top-left pixel. A resize by s maps x' = (x + 0.5)·s − 0.5 (the image's outer
 edges stay its outer edges, which is what Pillow's resize does); a crop subtracts its corner. Forgetting the
@@ -32,7 +32,7 @@ PATCH = 16
 
 @dataclass(frozen=True)
 class ImageGrid:
-    """Where the network's pixels lie in an undistorted image: resized to `resized_size`, then cropped."""
+    """Pixel grid of a network in an undistorted image, which is resized to `resized_size` and then cropped."""
 
     original_size: tuple[int, int]
     """Width, height in pixels, upright and undistorted."""
@@ -40,16 +40,16 @@ class ImageGrid:
     crop_corner: tuple[int, int]
     """Left, top of the crop in the resized image."""
     size: tuple[int, int]
-    """Width, height of what the network sees."""
+    """Width, height of the grid."""
 
     @classmethod
     def uncropped(cls, original_size: tuple[int, int], size: tuple[int, int]) -> "ImageGrid":
-        """The whole image resized to `size`."""
+        """Return the grid of the whole image resized to `size`."""
         return cls(original_size, size, (0, 0), size)
 
     @classmethod
     def shrunk(cls, original_size: tuple[int, int], long_edge: int) -> "ImageGrid":
-        """The whole image, its long edge reduced to `long_edge` where it is longer."""
+        """Return the grid of the whole image, its long edge reduced to `long_edge` where it is longer."""
         scale = min(1.0, long_edge / max(original_size))
         return cls.uncropped(
             original_size, (round(original_size[0] * scale), round(original_size[1] * scale))
@@ -61,21 +61,21 @@ class ImageGrid:
         return np.array(self.resized_size) / np.array(self.original_size)
 
     def grid_from_original(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
-        """Pixels (...,2) of the original image in the network's grid."""
+        """Map pixels (...,2) of the original image to the grid."""
         return (x_px + 0.5) * self.scale - 0.5 - np.array(self.crop_corner)
 
     def original_from_grid(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
-        """Pixels (...,2) of the network's grid in the original image."""
+        """Map pixels (...,2) of the grid to the original image."""
         return (x_px + np.array(self.crop_corner) + 0.5) / self.scale - 0.5
 
     def grid_intrinsics(self, original: Intrinsics) -> Intrinsics:
-        """The pinhole of the grid, given the pinhole of the original image (its distortion is dropped)."""
+        """Return the pinhole of the grid from that of the original image; its distortion is dropped."""
         return cropped(
             resized(without_distortion(original), *self.resized_size), *self.crop_corner, *self.size
         )
 
     def original_intrinsics(self, grid: Intrinsics) -> Intrinsics:
-        """The pinhole of the original image, given that of the grid."""
+        """Return the pinhole of the original image from that of the grid."""
         left, top = self.crop_corner
         whole = cropped(without_distortion(grid), -left, -top, *self.resized_size)
         return resized(whole, *self.original_size)
@@ -84,7 +84,7 @@ class ImageGrid:
 def image_grid(
     original_size: tuple[int, int], long_edge: int = 512, patch: int = PATCH, keep_square: bool = False
 ) -> ImageGrid:
-    """The published resize and crop for an image of `original_size` (width, height).
+    """Return the published resize and crop for an image of `original_size` (width, height).
 
     512: the long edge becomes 512 and both edges are cropped around the centre to multiples of the patch; a
     square image is cropped to 4:3, DUSt3R having seen none. 224: the short edge becomes 224, then a square is
@@ -107,7 +107,7 @@ def image_grid(
 
 @dataclass(frozen=True, kw_only=True)
 class PreparedImages:
-    """A capture's images as the network reads them."""
+    """Images of a capture on the grid of a network."""
 
     colors: UInt8[ndarray, "n h w 3"]
     grid: ImageGrid
@@ -123,7 +123,7 @@ class PreparedImages:
         return None if self.pinhole is None else self.grid.grid_intrinsics(self.pinhole)
 
     def original_px(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
-        """Pixels (...,2) of the network's grid in the capture's images, distorted as the camera made them."""
+        """Map pixels (...,2) of the grid to the capture's distorted images."""
         undistorted_px = self.grid.original_from_grid(x_px)
         if (
             self.pinhole is None
@@ -158,7 +158,7 @@ def prepare_images(
 def read_colors(
     capture: Capture, grid: ImageGrid, intrinsics: Intrinsics | None, pinhole: Intrinsics | None
 ) -> UInt8[ndarray, "n h w 3"]:
-    """The images of a capture on a grid, made images of `pinhole` first where the camera has distortion.
+    """Read the images of a capture on a grid, undistorted to `pinhole` first where the camera has distortion.
 
     Raises InputError for an image that cannot be read.
     """
@@ -173,7 +173,7 @@ def read_colors(
 
 
 def resize_and_crop(image: UInt8[ndarray, "h w 3"], grid: ImageGrid) -> UInt8[ndarray, "h2 w2 3"]:
-    """An image on the network's grid, by the published filters: Lanczos to shrink, bicubic to enlarge."""
+    """Resize and crop an image to the grid by the published filters: Lanczos to shrink, bicubic to enlarge."""
     shrinks = max(grid.original_size) > max(grid.resized_size)
     filter_ = Image.Resampling.LANCZOS if shrinks else Image.Resampling.BICUBIC
     resized = Image.fromarray(image).resize(grid.resized_size, filter_)

@@ -1,4 +1,4 @@
-"""Pointmaps of pairs of images, as a record and a file: what global alignment reads, whoever predicted them."""
+"""Pairwise pointmaps as a record and an npz file, the input of global alignment."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from jcr.pointmaps.grid import ImageGrid
 from jcr.records import Intrinsics
 
 ARRAYS = {"edges": 2, "pts3d": 4, "conf": 3, "pts3d_in_other_view": 4, "conf2": 3}
-"""Keys every file has, and their dimensions; the names are those of DUSt3R's own output."""
+"""Required keys of a file and their numbers of dimensions, named as in DUSt3R's output."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,19 +36,19 @@ class PairPredictions:
     colors: UInt8[ndarray, "n h w 3"] | None = None
     """RGB at the pointmaps' pixels."""
     intrinsics: Intrinsics | None = None
-    """Of the pointmaps' pixel grid, pixel (0, 0) being a centre; None: unknown, to be estimated."""
+    """Intrinsics of the pointmaps' pixel grid; None: unknown, to be estimated."""
     grid: ImageGrid | None = None
-    """Where the grid's pixels lie in the original images."""
+    """Position of the grid's pixels in the original images; None: unknown."""
     is_metric: bool = False
 
     @property
     def image_count(self) -> int:
-        """Images that the edges join."""
+        """Number of images that the edges join."""
         return len(self.images) or int(self.edges.max()) + 1
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the images, for messages: their numbers where they have none."""
+        """Names of the images for messages, or their numbers."""
         return self.images or tuple(f"#{k}" for k in range(self.image_count))
 
     @property
@@ -88,7 +88,7 @@ def read_arrays(path: Path) -> dict[str, ndarray]:
 
 
 def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPredictions:
-    """Checked predictions from the arrays of a file, `source` being its name in messages.
+    """Return checked predictions from the arrays of a file, named `source` in messages.
 
     Raises InputError for what is missing or does not agree.
     """
@@ -130,7 +130,7 @@ def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPrediction
 
 
 def _check_edges(edges: ndarray, names: int, source: str) -> int:
-    """The number of images: `names`, or where that is 0 as many as the edges count; InputError for wrong edges."""
+    """Return the number of images, `names` or else that of the edges; raise InputError for wrong edges."""
     if len(edges) == 0:
         raise InputError(f"{source}: no pair in it; predict at least one")
     if edges.dtype.kind not in "iu":
@@ -142,7 +142,7 @@ def _check_edges(edges: ndarray, names: int, source: str) -> int:
 
 
 def _check_values(name: str, array: ndarray, source: str) -> None:
-    """InputError for points or confidences of a pair that are not finite, or confidences below 0."""
+    """Raise InputError for points or confidences that are not finite, or confidences below 0."""
     # One edge at a time: a mask of all pairs would take a quarter of the pairs' memory.
     for edge, values in enumerate(array):
         if not np.isfinite(values).all():
@@ -156,7 +156,10 @@ def _check_values(name: str, array: ndarray, source: str) -> None:
 def camera_of_arrays(
     arrays: dict[str, ndarray], size: tuple[int, int], source: str
 ) -> tuple[Intrinsics | None, ImageGrid | None]:
-    """`intrinsics` and `grid` of a file for pointmaps of `size` (width, height); InputError if wrong."""
+    """Return `intrinsics` and `grid` of a file for pointmaps of `size` (width, height).
+
+    Raises InputError for wrong ones.
+    """
     intrinsics = grid = None
     if "intrinsics" in arrays:
         if arrays["intrinsics"].shape != (4,) or not (arrays["intrinsics"][:2] > 0).all():

@@ -1,9 +1,9 @@
-"""Correspondences between views by colour, starting where predicted pointmaps and cameras put them.
+"""Photometric matching between views, initialised from predicted pointmaps and cameras.
 
-A pointmap gives where each pixel of a view lies in another, to a few pixels. The other view is drawn as it would look
-from the first by that, which undoes rotation, scale and slant, and what is left over is the optical flow between the
-two (Lucas and Kanade, 1981; OpenCV's pyramid). That is exact to a fraction of a pixel of the camera's own images,
-whatever the resolution of the network, and independent of its predictions.
+A pointmap predicts the position of each pixel of a view in another view to a few pixels. The other view is warped by
+this prediction, which removes rotation, scale and slant; the remaining optical flow (Lucas and Kanade, 1981; OpenCV's
+pyramid) is accurate to a fraction of a pixel of the camera's own images, independent of the network's resolution and
+predictions.
 """
 
 from dataclasses import dataclass
@@ -19,35 +19,35 @@ from jcr.records import Intrinsics
 
 WINDOW = (21, 21)
 LEVELS = 3
-"""Of the pyramid above the image itself: displacements of some 60 pixels are found."""
+"""Levels of the pyramid above the image; the largest displacement is about 60 pixels."""
 WIDEST_DEG = 70.0
-"""Angle between views beyond which a surface looks too different to be compared."""
+"""Largest angle between two views that are compared."""
 LARGEST_RETURN_PX = 0.5
-"""Largest distance between a keypoint and where the flow there and back puts it."""
+"""Largest distance between a keypoint and its position after the flow there and back."""
 LEAST_CORRELATION = 0.8
-"""Of the patches around both ends, which brightness and contrast leave alone."""
+"""Least normalised correlation of the patches around both ends."""
 PATCH_RADIUS = 5
 STEP_RADIUS, LARGEST_STEP = 5, 0.04
 """Pixels around a keypoint within which depth must not change by more than this share."""
 LARGEST_STD_PX = 0.1
-"""One sigma of a match, across the direction in which its window fixes it least."""
+"""Largest standard deviation of a match in the least determined direction of its window."""
 LARGEST_GAP = 0.15
-"""By how much the distance of a point from the other camera may differ from that view's own depth, in logarithms."""
+"""Largest difference of a point's depth from the other view's own depth, in logarithms."""
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Cameras and a depth per pixel of each image, as estimated so far."""
+    """Estimated cameras and depth of each image."""
 
     pinhole: Intrinsics
     recon_from_camera: Float[ndarray, "n 4 4"]
     depth: Float[ndarray, "n h w"]
-    """Depth along z; 0 where nothing is known."""
+    """Depth along z; 0 where it is unknown."""
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Keypoints of views, and where others show them."""
+    """Keypoints of views and their matches in other views."""
 
     start: Float[ndarray, "p 3"]
     """View, x, y of each keypoint."""
@@ -59,7 +59,7 @@ class Matches:
 
 
 def photometric_matches(gray: UInt8[ndarray, "n h w"], geometry: Geometry, keypoints: int) -> Matches:
-    """Where other views show up to `keypoints` corners of each view."""
+    """Match up to `keypoints` corners of each view in the other views."""
     count, height, width = gray.shape
     directions = rays(geometry.pinhole)
     axis = geometry.recon_from_camera[:, :3, 2]
@@ -90,14 +90,14 @@ def photometric_matches(gray: UInt8[ndarray, "n h w"], geometry: Geometry, keypo
 
 
 def _smooth_surface(depth: Float[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
-    """Where depth is known and without a step around a pixel: an outline is no point of a surface."""
+    """Return the mask of pixels with known depth and no depth step around them, which outlines have."""
     window = np.ones((2 * STEP_RADIUS + 1,) * 2, np.uint8)
     nearest, farthest = cv2.erode(depth, window), cv2.dilate(depth, window)
     return (nearest > 0) & (farthest < (1 + LARGEST_STEP) * nearest)
 
 
 def _textured_both_ways(gray: UInt8[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
-    """Where a window's content fixes it in all directions: along a straight edge a match stays where it was predicted.
+    """Return the mask of pixels whose window determines the flow in all directions, unlike a straight edge.
 
     The variance of the flow is the noise's over the smaller eigenvalue of the gradients' summed products (the
     structure tensor), whose share of noise is taken off.
@@ -126,7 +126,7 @@ def _locate_corners(
     n: int,
     m: int,
 ) -> tuple[Bool[ndarray, " k"], Float[ndarray, "k 2"]]:
-    """Which corners of `start` are seen in `end`, the image of view m, and where."""
+    """Locate corners of `start` in `end`, the image of view m; return the mask of those found and all positions."""
     k = geometry.pinhole
     x_in_end = apply(inverse(geometry.recon_from_camera[m]), x_in_recon)
     z = np.where((geometry.depth[n] > 0) & (x_in_end[..., 2] > 1e-9), x_in_end[..., 2], np.nan)
@@ -160,7 +160,7 @@ def _locate_corners(
 def _flow(
     one: UInt8[ndarray, "h w"], other: UInt8[ndarray, "h w"], at: Float[ndarray, "k 2"]
 ) -> tuple[Float[ndarray, "k 2"], UInt8[ndarray, "k 1"]]:
-    """Where points of one image are in the other, which looks nearly like it; and whether that was found."""
+    """Track points of one image in another that looks nearly like it; return positions and status."""
     moved, found, _ = cv2.calcOpticalFlowPyrLK(
         one, other, at, at.copy(), winSize=WINDOW, maxLevel=LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
     )
@@ -168,7 +168,7 @@ def _flow(
 
 
 def _sampled(values: Float[ndarray, "h w"], x_px: Float[ndarray, "k 2"]) -> Float[ndarray, " k"]:
-    """Between pixels, linearly."""
+    """Sample an image between pixels, linearly."""
     x = x_px.astype(np.float32)
     return cv2.remap(values.astype(np.float32), x[None, :, 0], x[None, :, 1], cv2.INTER_LINEAR)[0]
 
@@ -179,7 +179,7 @@ def _correlation(
     other: UInt8[ndarray, "h w"],
     there: Float[ndarray, "k 2"],
 ) -> Float[ndarray, " k"]:
-    """Normalised correlation of the patches around both ends."""
+    """Return the normalised correlation of the patches around both ends."""
     if not len(at):
         return np.zeros(0)
     y, x = np.mgrid[-PATCH_RADIUS : PATCH_RADIUS + 1, -PATCH_RADIUS : PATCH_RADIUS + 1].reshape(2, 1, -1)

@@ -46,8 +46,7 @@ class PosedPointmaps:
 
 
 def fit_pinhole(maps: PosedPointmaps) -> tuple[Intrinsics, float]:
-    """Fit the pinhole of the grid that projects all points onto their pixels; return it with the median misfit in
-    pixels.
+    """Fit a pinhole of the grid to all points and pixels; return it with the median misfit in pixels.
 
     u = fx · x/z + cx is linear in the unknowns; residuals beyond the common spread lose their weight (Geman
     and McClure). The misfit is infinite where half the points lie behind their camera.

@@ -1,0 +1,1 @@
+"""DUSt3R and MASt3R: network, weights, and prediction of pairs."""

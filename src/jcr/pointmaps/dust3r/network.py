@@ -1,4 +1,4 @@
-"""DUSt3R's network (Wang et al., CVPR 2024): two images in, two pointmaps in the first camera's frame out.
+"""Network of DUSt3R (Wang et al., CVPR 2024): pointmaps of two images in the first camera's frame.
 
 A ViT encodes each image on its own; two decoders read each other's tokens through cross-attention (CroCo v2,
 Weinzaepfel et al., ICCV 2023); a head per view maps tokens into a 3D point and a confidence per pixel,
@@ -26,14 +26,14 @@ Rotary = Float[Tensor, "2 n 2 frequencies"]
 
 
 class Features(NamedTuple):
-    """Encoded images: all that one image alone gives, whatever it is paired with."""
+    """Encoded images, independent of the images they are paired with."""
 
     tokens: Tensor
-    """(b,n,c)"""
+    """Tokens of the encoder (b,n,c)."""
     grid: tuple[int, int]
     """Rows and columns of tokens."""
     finest: tuple[Tensor | None, Tensor | None] = (None, None)
-    """A DPT head's finest level (b,256,h/4,w/4) as first and as second view; None: made for each pair."""
+    """Finest level of a DPT head (b,256,h/4,w/4) as first and as second view; None: computed for each pair."""
 
 
 class Pointmap(NamedTuple):
@@ -45,7 +45,7 @@ class Pointmap(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """The fields of a published configuration; ValueError for one that this network does not cover."""
+    """Fields of a published configuration; one that this network does not cover raises ValueError."""
 
     enc_embed_dim: int = 768
     enc_depth: int = 12
@@ -82,7 +82,7 @@ class Config:
 
 
 class Dust3r(nn.Module):
-    """The network, built from the fields of a published configuration (`Config`).
+    """Network, built from the fields of a published configuration (`Config`).
 
     Raises ValueError for a configuration that this network does not cover, TypeError for an unknown field.
     """
@@ -94,7 +94,7 @@ class Dust3r(nn.Module):
         self.rope_base = float(config.pos_embed.removeprefix("RoPE"))
         self.head_dims = (enc_dim // config.enc_num_heads, dec_dim // config.dec_num_heads)
         self.mixed_precision: bool | None = None
-        """bfloat16 inside encoder, decoder and heads; None: where the device is CUDA."""
+        """Whether encoder, decoder and heads use bfloat16; None: where the device is CUDA."""
 
         self.patch_embed = PatchEmbed(enc_dim)
         self.mask_token = nn.Parameter(torch.zeros(1, 1, dec_dim))  # only its pre-training used it
@@ -118,11 +118,11 @@ class Dust3r(nn.Module):
     def forward(
         self, image1: Float[Tensor, "b 3 h w"], image2: Float[Tensor, "b 3 h2 w2"]
     ) -> tuple[Pointmap, Pointmap]:
-        """Pointmaps of images in [-1, 1] whose height and width are multiples of 16, as they stand (portrait too)."""
+        """Return pointmaps of images in [-1, 1] whose height and width are multiples of 16, portrait included."""
         return self.decode(self.encode(image1), self.encode(image2))
 
     def encode(self, images: Float[Tensor, "b 3 h w"], many_pairs: bool = False) -> Features:
-        """Features of images in [-1, 1]; each image needs this once, however many pairs it is in.
+        """Return the features of images in [-1, 1]; each image is encoded once for all its pairs.
 
         With `many_pairs` the heads' finest level is made here too, a fifth of a head's work, and kept.
         """
@@ -145,7 +145,7 @@ class Dust3r(nn.Module):
             return Features(tokens, grid, finest)
 
     def decode(self, features1: Features, features2: Features) -> tuple[Pointmap, Pointmap]:
-        """Pointmaps of both images in the first one's camera frame; (1, 2) does not give (2, 1)."""
+        """Return pointmaps of both images in the first camera's frame; (1, 2) does not give (2, 1)."""
         with self._autocast(features1.tokens):
             layers1, layers2 = self.decoder_layers(features1, features2)
             return (
@@ -154,7 +154,7 @@ class Dust3r(nn.Module):
             )
 
     def decoder_layers(self, features1: Features, features2: Features) -> tuple[list[Tensor], list[Tensor]]:
-        """Per view: the encoder's tokens, then those after each decoder block, the last ones normalised."""
+        """Return per view the encoder's tokens, then the tokens after each decoder block, the last ones normalised."""
         rotary1, rotary2 = (
             rotary_embedding(grid_positions(f.grid, f.tokens.device), self.head_dims[1], self.rope_base)
             for f in (features1, features2)
@@ -170,7 +170,7 @@ class Dust3r(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are."""
+        """Device of the weights."""
         return self.mask_token.device
 
     def _autocast(self, like: Tensor) -> torch.autocast:
@@ -179,13 +179,13 @@ class Dust3r(nn.Module):
 
 
 def grid_positions(grid: tuple[int, int], device: torch.device) -> Int[Tensor, "n 2"]:
-    """Row and column of each token, row by row."""
+    """Return row and column of each token, row by row."""
     rows, columns = (torch.arange(size, device=device) for size in grid)
     return torch.cartesian_prod(rows, columns)
 
 
 def rotary_embedding(position: Int[Tensor, "n 2"], head_dim: int, base: float) -> Rotary:
-    """Cosines and sines of position · base^(−2k/D), D = head_dim/2 (RoPE, Su et al. 2021, per axis)."""
+    """Return cosines and sines of position · base^(−2k/D), D = head_dim/2 (RoPE, Su et al. 2021, per axis)."""
     per_axis = head_dim // 2
     exponent = torch.arange(0, per_axis, 2, device=position.device).float() / per_axis
     angle = position[..., None] * base**-exponent
@@ -247,6 +247,8 @@ class CrossAttention(nn.Module):
 
 
 class Mlp(nn.Module):
+    """Perceptron with one hidden layer."""
+
     def __init__(self, dim: int, ratio: float) -> None:
         super().__init__()
         self.fc1 = nn.Linear(dim, int(dim * ratio))
@@ -257,6 +259,8 @@ class Mlp(nn.Module):
 
 
 class EncoderBlock(nn.Module):
+    """Transformer block of the encoder."""
+
     def __init__(self, dim: int, heads: int, mlp_ratio: float) -> None:
         super().__init__()
         self.norm1, self.norm2 = (nn.LayerNorm(dim, eps=1e-6) for _ in range(2))
@@ -269,6 +273,8 @@ class EncoderBlock(nn.Module):
 
 
 class DecoderBlock(nn.Module):
+    """Transformer block of a decoder, with cross-attention to the other image."""
+
     def __init__(self, dim: int, heads: int, mlp_ratio: float) -> None:
         super().__init__()
         self.norm1, self.norm2, self.norm3, self.norm_y = (nn.LayerNorm(dim, eps=1e-6) for _ in range(4))
@@ -283,7 +289,7 @@ class DecoderBlock(nn.Module):
 
 
 def pointmap(raw: Float[Tensor, "b 4 h w"]) -> Pointmap:
-    """Points and confidence from a head's four channels: the length d of xyz becomes exp(d) − 1."""
+    """Return points and confidence from a head's four channels: the length d of xyz becomes exp(d) − 1."""
     xyz, c = raw.float().permute(0, 2, 3, 1).split([3, 1], -1)
     length = xyz.norm(dim=-1, keepdim=True)
     return Pointmap(xyz * (length.expm1() / length.clamp(min=1e-8)), 1 + c[..., 0].exp())
@@ -297,7 +303,7 @@ class LinearHead(nn.Module):
         self.proj = nn.Linear(dec_dim, 4 * PATCH**2)
 
     def finest(self, tokens: FeatureMap) -> None:
-        """Nothing here comes from one image alone."""
+        """Return None: no part of the output comes from one image alone."""
 
     def forward(self, layers: list[Tensor], grid: tuple[int, int], finest: Tensor | None = None) -> Pointmap:
         with torch.autocast(layers[-1].device.type, enabled=False):
@@ -306,13 +312,15 @@ class LinearHead(nn.Module):
 
 
 class DptHead(nn.Module):
+    """Head of the dense prediction transformer (Ranftl et al. 2021)."""
+
     def __init__(self, enc_dim: int, dec_dim: int, dec_depth: int) -> None:
         super().__init__()
         self.layers = (0, dec_depth // 2, 3 * dec_depth // 4, dec_depth)
         self.dpt = Dpt((enc_dim, dec_dim, dec_dim, dec_dim))
 
     def finest(self, tokens: FeatureMap) -> Float[Tensor, "b 256 4*h 4*w"]:
-        """The finest level, from the encoder's tokens: the one part that does not use the other image."""
+        """Return the finest level from the encoder's tokens, the only part that does not use the other image."""
         return self.dpt.finest(tokens)
 
     def forward(self, layers: list[Tensor], grid: tuple[int, int], finest: Tensor | None = None) -> Pointmap:
@@ -374,7 +382,7 @@ class Scratch(nn.Module):
 
     def forward(self, finest: Tensor, coarser: list[Tensor]) -> FeatureMap:
         level2, level3, level4 = (conv(x) for conv, x in zip(self.layer_rn[1:], coarser, strict=True))
-        # Of an odd grid the stride-2 level comes out a row or column too large.
+        # With an odd grid the stride-2 level is a row or column too large.
         x = self.refinenet4(level4)[..., : level3.shape[-2], : level3.shape[-1]]
         x = self.refinenet3(x + self.refinenet3.resConfUnit1(level3))
         x = self.refinenet2(x + self.refinenet2.resConfUnit1(level2))
@@ -399,6 +407,8 @@ class Fusion(nn.Module):
 
 
 class ResidualUnit(nn.Module):
+    """Two convolutions with a residual connection."""
+
     def __init__(self, width: int) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(width, width, 3, 1, 1)

@@ -1,4 +1,4 @@
-"""Published weights into the network: .pth, safetensors or a folder, without executing a pickle.
+"""Loading of published weights from .pth, safetensors or a folder, without executing a pickle.
 
 Weights come in two layouts: a .pth of {'args': Namespace(model="AsymmetricCroCo3DStereo(...)"), 'model':
 state dict}, and a folder of config.json with model.safetensors, which is also what the hub has.
@@ -28,11 +28,11 @@ class LoadedNetwork:
 
     network: Dust3r
     is_metric: bool
-    """Its points are meant to be in metres."""
+    """Whether its points are meant to be in metres."""
 
 
 def load_weights(weights: Weights, device: str = "cpu") -> LoadedNetwork:
-    """A network with the weights of a .pth, a .safetensors beside its config.json, or a folder with one of these.
+    """Load a network from a .pth, a .safetensors beside its config.json, or a folder with one of these.
 
     Their licence is printed on stderr. Raises InputError for what is missing, damaged or not of this network.
     """
@@ -57,7 +57,7 @@ def load_weights(weights: Weights, device: str = "cpu") -> LoadedNetwork:
 
 
 def _file_in(folder: Path) -> Path:
-    """The one weights file of a folder."""
+    """Return the only weights file of a folder."""
     if (folder / HUB_FILES[1]).is_file():
         return folder / HUB_FILES[1]
     files = [path for path in sorted(folder.iterdir()) if path.suffix in _READERS]
@@ -115,7 +115,7 @@ _READERS = {".pth": _read_pth, ".pt": _read_pth, ".safetensors": _read_safetenso
 
 
 def _parse_model(text: str) -> dict[str, object]:
-    """The keyword arguments of "Name(key=literal, ...)", inf being a literal too; ValueError for all else."""
+    """Return the keyword arguments of "Name(key=literal, ...)", with inf as a literal; raise ValueError for all else."""
 
     class InfinityIsNumber(ast.NodeTransformer):
         def visit_Name(self, node: ast.Name) -> ast.AST:
@@ -132,7 +132,7 @@ def _parse_model(text: str) -> dict[str, object]:
 
 
 def _build(config: dict[str, object], state: dict[str, Tensor], path: Path) -> Dust3r:
-    """The network of a configuration with its tensors, shared with the file they are mapped from."""
+    """Return the network of a configuration with its tensors, shared with the file that they are mapped from."""
     config = dict(config)
     for mast3r_only in ("two_confs", "desc_conf_mode", "desc_mode", "local_feat_dim"):
         config.pop(mast3r_only, None)
@@ -180,5 +180,5 @@ def _announce(note: str) -> None:
 
 
 def _line(error: BaseException) -> str:
-    """The first sentence of a message, on one line."""
+    """Return the first sentence of a message, on one line."""
     return " ".join(str(error).split()).split(". ")[0][:160] or type(error).__name__

@@ -13,7 +13,7 @@ from jcr.pointmaps.pairs import PairPredictions
 from jcr.records import Intrinsics
 
 LEAST_PIXELS = 50
-"""Several for each coarse cell that tells how far residuals go together."""
+"""Least number of pixels per image: several for each coarse cell of the correlation of residuals."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,15 +32,15 @@ class AlignOptions:
 
 @dataclass(frozen=True)
 class Pinhole:
-    """The projection the images share, up to the focal lengths that alignment estimates."""
+    """Common projection of the images, up to the focal lengths that alignment estimates."""
 
     principal_point_px: tuple[float, float]
     aspect: float
-    """fy over fx."""
+    """Ratio fy / fx."""
     focal_px: float | None
-    """fx where it is given; None: to be estimated."""
+    """Given fx; None: estimated."""
     shared: bool
-    """One focal length for all images."""
+    """Whether all images have one focal length."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,7 @@ class Alignment:
     depth: Float[ndarray, "n h w"]
     """Depth along the optical axis, recon units."""
     confidence: Float[ndarray, "n h w"]
-    """The network's, averaged over the pairs, each pair counting as far as it agrees with this depth."""
+    """Confidence of the network, averaged over the pairs, weighted by their agreement with this depth."""
     pair_scale: Float[ndarray, " e"]
     """σ_e: recon units per unit of the pair's pointmaps (paper eq. 1)."""
     pair_residual: Float[ndarray, " e"]
@@ -79,7 +79,7 @@ class Alignment:
 
 
 def pinhole_of(predictions: PairPredictions, options: AlignOptions) -> Pinhole:
-    """What is known of the projection before alignment.
+    """Return the known part of the projection before alignment.
 
     Raises InputError where a given focal length is asked for and the predictions carry none.
     """

@@ -9,11 +9,11 @@ from jcr.pointmaps.global_alignment.observations import ImageObservations
 from jcr.pointmaps.global_alignment.pointmap_residuals import Noise, State, agreement, residuals
 
 DEPTH_ITERATIONS = 2
-"""The median it starts from is within a percent or two of the answer."""
+"""The initial median is within two per cent of the result."""
 
 
 def initial_depth(observations: ImageObservations, state: State) -> Float[ndarray, " m"]:
-    """Median over the pairs of the depth each one predicts; first views alone where the image has any."""
+    """Return the median over the pairs of the predicted depth, of first views alone where the image has any."""
     o, n = observations, observations.second_count
     scale = np.exp(o.log_range + state.log_pair_scale[o.pair].astype(np.float32)[:, None])
     if n < len(o.pair):
@@ -29,8 +29,10 @@ def initial_depth(observations: ImageObservations, state: State) -> Float[ndarra
 def fused_depth(
     observations: ImageObservations, state: State, noise: Noise
 ) -> tuple[Float[ndarray, " m"], Float[ndarray, " m"]]:
-    """Depth of the observed pixels by Gauss-Newton from `initial_depth`, and their weight averaged over the
-    pointmaps, each counting as far as it agrees and as its noise allows."""
+    """Estimate the depth of the observed pixels by Gauss-Newton from `initial_depth`, and their mean weight.
+
+    Each pointmap counts by its agreement and its noise.
+    """
     log_depth = np.log(initial_depth(observations, state))
     weight = observations.weight
     for _ in range(DEPTH_ITERATIONS):

@@ -40,16 +40,16 @@ from jcr.pointmaps.pairs import PairPredictions
 from jcr.progress import Progress
 
 COARSE_PIXELS = 300
-"""Per image: enough to come within the noise, and seven times cheaper than the default."""
+"""Pixels per image of the first stage, which comes within the noise at a seventh of the cost."""
 COARSE_TOLERANCE = 1e-3
 FINE_TOLERANCE = 1e-4
-"""Of the last step (rad, or relative): a tenth of what the noise of predictions leaves."""
+"""Largest last step (rad, or relative), a tenth of the noise that predictions leave."""
 ITERATIONS = 30
 START_SPREAD = 0.01
-"""Of the pairs' errors, relative to the depth and in radians, until it is measured."""
+"""Initial spread of the pairs' errors, relative to the depth and in radians."""
 LEAST_SPREAD = 1e-5
 GAUGE_WEIGHT = 1e3
-"""Of the fixed sum of the log pair scales, over the information of the pointmaps on one of them."""
+"""Weight of the fixed sum of the log pair scales, over the information of the pointmaps on one of them."""
 NORMAL_SQUARE_MEDIAN = 0.455
 """Median of the square of a unit normal."""
 DEPTH_CHUNK = 4096
@@ -64,7 +64,7 @@ UNDETERMINED = "the pointmaps of the pairs have too little in common to be align
 
 @dataclass(frozen=True)
 class Problem:
-    """Predictions with all that is settled about them before anything is estimated."""
+    """Predictions with the fixed parameters of their alignment."""
 
     predictions: PairPredictions
     pinhole: Pinhole
@@ -72,22 +72,22 @@ class Problem:
 
     @classmethod
     def of(cls, predictions: PairPredictions, options: AlignOptions) -> "Problem":
-        """What the predictions and `options` give."""
+        """Return the problem of some predictions under `options`."""
         return cls(predictions, pinhole_of(predictions, options), weight_is_log(predictions))
 
     @property
     def layout(self) -> Layout:
-        """The unknowns."""
+        """Layout of the unknowns."""
         count = self.predictions.image_count
         focals = 0 if self.pinhole.focal_px else 1 if self.pinhole.shared else count
         return Layout(count, len(self.predictions.edges), focals)
 
     def observe(self, image: int, pixels: Int[ndarray, " m"] | slice) -> ImageObservations:
-        """All pointmaps at some pixels of one image."""
+        """Gather all pointmaps at some pixels of one image."""
         return observe(self.predictions, self.pinhole, image, pixels, self.log_weight)
 
     def observe_all(self, count: int) -> list[ImageObservations]:
-        """About `count` pixels of every image."""
+        """Gather all pointmaps at about `count` pixels of every image."""
         return [self.observe(k, pixels) for k, pixels in enumerate(choose_pixels(self.predictions, count))]
 
 
@@ -100,15 +100,15 @@ class Solution:
     """Covariance of the cameras' steps, r = 6n, from the equations of the last step; zero for the first camera."""
     images: list[ImageObservations]
     noise: list[Noise]
-    """Per image, of its pointmaps."""
+    """Noise of the pointmaps of each image."""
     pair_spread: Float[ndarray, "6"]
-    """One sigma per axis of the pairs' errors: translation, rotation."""
+    """Standard deviation per axis of the pairs' errors: translation, rotation."""
     settled: bool
     """Whether the last step was small enough."""
 
 
 def solve(problem: Problem, options: AlignOptions) -> Solution:
-    """Cameras, focal lengths, pair scales and the depths of `options.pixels` pixels per image."""
+    """Estimate cameras, focal lengths, pair scales and the depths of `options.pixels` pixels per image."""
     images = problem.observe_all(min(COARSE_PIXELS, options.pixels))
     state = initial_state(images, problem.predictions.edges, problem.pinhole)
     pair_spread = START_SPREAD * np.repeat([np.exp(np.median(np.concatenate(state.log_depth))), 1.0], 3)
@@ -160,13 +160,16 @@ class _Linearised:
     ties: PairTies
     reduced: ReducedEquations
     selection: csr_array
-    """Takes a step of all unknowns to the local ones of these equations."""
+    """Matrix from a step of all unknowns to the local unknowns of these equations."""
 
 
 def _linearised(
     images: list[ImageObservations], state: State, layout: Layout, pair_spread: Float[ndarray, "6"]
 ) -> tuple[list[Noise], list[_Linearised]]:
-    """Noise of every image's pointmaps, and the equations weighted by it; RejectedError where they are singular."""
+    """Return the noise of every image's pointmaps and the equations weighted by it.
+
+    Raises RejectedError where the equations are singular.
+    """
     misfit = [residuals(o, state, log_depth) for o, log_depth in zip(images, state.log_depth, strict=True)]
     noise = measure_noise(images, misfit)
     observer_axes = adjoint(inverse(state.recon_from_camera))
@@ -225,7 +228,7 @@ def _after_step(
     linearised: list[_Linearised],
     step: Float[ndarray, " p"],
 ) -> tuple[State, Float[ndarray, "e 6"]]:
-    """The state after a step of the unknowns that are not eliminated, and the variances of the pairs' errors."""
+    """Return the state after a step of the unknowns that are not eliminated, and the variances of the pairs' errors."""
     log_depth, pair_error = [], np.zeros_like(state.pair_error)
     variance = np.zeros_like(state.pair_error)
     for o, before, image in zip(images, state.log_depth, linearised, strict=True):
@@ -252,7 +255,7 @@ def _after_step(
 def _spread(
     error: Float[ndarray, "e 6"], variance: Float[ndarray, "e 6"], before: Float[ndarray, "6"]
 ) -> Float[ndarray, "6"]:
-    """Spread of the pairs' translations and rotations, from the errors found under the spread `before`.
+    """Estimate the spread of the pairs' translations and rotations from the errors under the spread `before`.
 
     The evidence fixed point σ² = Σ x² / Σ (1 − var(x)/σ²) (MacKay, "Bayesian interpolation", 1992, eq. 30),
     with medians in place of the sums: pairs that are altogether wrong do not count.
@@ -263,7 +266,7 @@ def _spread(
 
 
 def dense_alignment(problem: Problem, solution: Solution, progress: Progress | None = None) -> Alignment:
-    """The record of a solution, in its own recon frame, with the depth of every pixel."""
+    """Return the alignment of a solution in its own recon frame, with the depth of every pixel."""
     predictions, state = problem.predictions, solution.state
     count, (height, width) = predictions.image_count, predictions.conf.shape[1:]
     depth = np.empty((count, height * width), np.float32)
@@ -298,7 +301,7 @@ def dense_alignment(problem: Problem, solution: Solution, progress: Progress | N
 
 
 def _pair_residuals(predictions: PairPredictions, solution: Solution) -> Float[ndarray, " e"]:
-    """Residual of each pair, the larger of its two views'."""
+    """Return the residual of each pair, the larger of its two views'."""
     residual = np.zeros(len(predictions.edges))
     for o, noise in zip(solution.images, solution.noise, strict=True):
         np.maximum.at(residual, o.pair, np.sqrt(2 * noise.across**2 + noise.along**2))
@@ -306,7 +309,7 @@ def _pair_residuals(predictions: PairPredictions, solution: Solution) -> Float[n
 
 
 def _warnings(residual: Float[ndarray, " e"], settled: bool) -> tuple[str, ...]:
-    """What speaks against an alignment."""
+    """Return warnings on an alignment that did not settle or whose pairs disagree."""
     warnings, middle = [], float(np.median(residual))
     if not settled:
         warnings.append(f"the alignment had not settled after {ITERATIONS} iterations and may be wrong")
@@ -318,7 +321,7 @@ def _warnings(residual: Float[ndarray, " e"], settled: bool) -> tuple[str, ...]:
 
 
 def _notes(predictions: PairPredictions, residual: Float[ndarray, " e"]) -> tuple[str, ...]:
-    """Which pairs count little."""
+    """Return a note that names the pairs that contradict the others."""
     bad = np.flatnonzero(residual > CONTRADICTION * float(np.median(residual)))
     if not len(bad):
         return ()
@@ -329,7 +332,7 @@ def _notes(predictions: PairPredictions, residual: Float[ndarray, " e"]) -> tupl
 
 
 def _selection(o: ImageObservations, layout: Layout, to_twist: Float[ndarray, "n 6 6"]) -> csr_array:
-    """Matrix that takes a step of all unknowns to the local ones of an image's equations."""
+    """Return the matrix from a step of all unknowns to the local unknowns of an image's equations."""
     n, maps = o.second_count, len(o.pair)
     twists, scales = np.arange(6 * n).reshape(n, 6, 1), 6 * n + np.arange(maps)
     blocks, block = (n, 6, 6), np.arange(6)

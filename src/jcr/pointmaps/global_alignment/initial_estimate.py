@@ -1,4 +1,4 @@
-"""Where alignment starts from: a focal length, pairwise similarities in closed form, and a spanning tree."""
+"""Initial estimate of global alignment: focal length, pairwise similarities in closed form, and a spanning tree."""
 
 from dataclasses import dataclass
 
@@ -26,7 +26,7 @@ class PairSimilarities:
 
 
 def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"], pinhole: Pinhole) -> State:
-    """A start good to a few percent: every image's own depth, chained along the pairs that agree best."""
+    """Estimate the state to a few per cent: every image's own depth, chained along the pairs that agree best."""
     focal = _focal(images, pinhole)
     depth, unit = _depths(images, focal, len(edges))
     pairs = _similarities(images, edges, focal, depth, unit)
@@ -46,7 +46,7 @@ def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"], p
 
 
 def _focal(images: list[ImageObservations], pinhole: Pinhole) -> Float[ndarray, " n"]:
-    """fx per image: median over the first views of pixel radius over tangent of the angle off the axis.
+    """Estimate fx per image: the median over the first views of pixel radius over tangent of the angle off the axis.
 
     Raises InputError where no first view shows it.
     """
@@ -69,7 +69,7 @@ def _focal(images: list[ImageObservations], pinhole: Pinhole) -> Float[ndarray, 
 def _depths(
     images: list[ImageObservations], focal: Float[ndarray, " n"], pairs: int
 ) -> tuple[list[Float[ndarray, " _"]], Float[ndarray, " e"]]:
-    """Depth per image in a unit of its own, and the log of each pair's unit in that of its first image."""
+    """Estimate the depth of each image in its own unit, and the log of each pair's unit in that of its first image."""
     depth = []
     unit = np.zeros(pairs)
     for o, f in zip(images, focal, strict=True):
@@ -90,7 +90,7 @@ def _depths(
 
 
 def _depth_by_resection(o: ImageObservations, focal: float) -> Float[ndarray, " m"]:
-    """Depth of an image that is first in no pair: its camera is resected from the view with most inliers."""
+    """Estimate the depth of an image that is first in no pair by resection from the view with most inliers."""
     x_px = (o.pixel_offset.T / focal).astype(np.float64)
     best_depth, best_inliers = np.ones(len(x_px)), -1
     for direction, log_range, weight in zip(o.direction, o.log_range, o.weight, strict=True):
@@ -142,13 +142,13 @@ def _distances(
     y_from_x: Float[ndarray, "k 4 4"],
     ratio: Float[ndarray, " k"],
 ) -> Float[ndarray, "k m"]:
-    """Distance of y from the transformed x."""
+    """Return the distance of y from the transformed x."""
     transformed = ratio[:, None, None] * (y_from_x[:, :3, :3] @ x) + y_from_x[:, :3, 3:]
     return np.linalg.norm(np.swapaxes(y, 1, 2) - transformed, axis=1)
 
 
 def _contradiction(edges: Int[ndarray, "e 2"], pairs: PairSimilarities, images: int) -> Float[ndarray, " e"]:
-    """How far a pair's rotation is from the way around by a third image (rad); 0 where there is none.
+    """Return the angle of each pair's rotation from the composition over a third image (rad); 0 where there is none.
 
     A pair whose two pointmaps fit each other but not the scene is seen by nothing else. Of all ways around,
     the first quartile counts: with a third of the pairs wrong, most ways around a right one are wrong too.
@@ -168,7 +168,7 @@ def _contradiction(edges: Int[ndarray, "e 2"], pairs: PairSimilarities, images: 
 def _chain(
     edges: Int[ndarray, "e 2"], pairs: PairSimilarities, cost: Float[ndarray, " e"]
 ) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, " n"]]:
-    """Cameras and log units of the images along the minimum spanning tree (Prim) that grows from image 0."""
+    """Chain cameras and log units of the images along the minimum spanning tree (Prim) from image 0."""
     count = int(edges.max()) + 1
     recon_from_camera = np.tile(np.eye(4), (count, 1, 1))
     log_scale = np.zeros(count)

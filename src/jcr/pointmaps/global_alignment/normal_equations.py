@@ -2,7 +2,7 @@
 
 Depths are eliminated pixel by pixel (Schur complement; Triggs et al., "Bundle adjustment: a modern
 synthesis", 2000, section 6). So are the rigid errors of the pairs' second views: they stand for the pair
-poses P_e of eq. 1, free there, here tied to the cameras by a spread that is measured (see `align_fast`).
+poses P_e of eq. 1, free there, here tied to the cameras by a spread that is measured (gauss_newton.py).
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from jcr.pointmaps.global_alignment.pointmap_residuals import Noise, Residuals, 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the unknowns stand in the reduced system: steps of the cameras, log focals, log pair scales."""
+    """Order of the unknowns in the reduced system: steps of the cameras, log focals, log pair scales."""
 
     images: int
     pairs: int
@@ -31,7 +31,7 @@ class Layout:
         return 6 * self.images + self.focals + self.pairs
 
     def focal(self, image: int) -> int | None:
-        """Column of the log focal of an image; None where it is given."""
+        """Return the column of the log focal of an image; None where it is given."""
         if self.focals == 0:
             return None
         return 6 * self.images + (image if self.focals > 1 else 0)
@@ -45,7 +45,7 @@ class Layout:
 def depth_equations(
     r: Residuals, noise: Noise, weight: Float[ndarray, "k m"]
 ) -> tuple[Float[ndarray, " m"], Float[ndarray, " m"]]:
-    """Gauss-Newton hessian and gradient of the log depths alone, every pointmap independent."""
+    """Return the Gauss-Newton hessian and gradient of the log depths alone, every pointmap independent."""
     weight = weight / r.distance
     w_across = weight / noise.across[:, None] ** 2
     w_along = weight / noise.along[:, None] ** 2
@@ -72,7 +72,7 @@ class ImageEquations:
     coupling: Float[ndarray, "c m"]
 
     def depth_step(self, local_step: Float[ndarray, " c"]) -> Float[ndarray, " m"]:
-        """Change of log depth once the local unknowns have moved."""
+        """Return the change of log depth after a step of the local unknowns."""
         return -(self.depth_gradient + local_step.astype(np.float32) @ self.coupling) / self.depth_hessian
 
     def reduced(self, ties: "PairTies") -> "ReducedEquations":
@@ -99,7 +99,7 @@ class ImageEquations:
 
 @dataclass(frozen=True)
 class PairTies:
-    """What holds the errors of an image's second views near zero."""
+    """Prior on the errors of an image's second views."""
 
     axes: Float[ndarray, "n 6 6"]
     """Adjoint of the observers: twists in recon axes to twists in theirs."""
@@ -109,7 +109,7 @@ class PairTies:
 
     @property
     def information(self) -> Float[ndarray, "n 6 6"]:
-        """Of the errors' changes, recon axes."""
+        """Information on the errors' changes, recon axes."""
         return self.axes.transpose(0, 2, 1) @ (self.axes / self.spread[:, None] ** 2)
 
     @property
@@ -130,12 +130,12 @@ class ReducedEquations:
     """Variances of the pairs' errors where the cameras are given, in the observers' axes."""
 
     def pair_step(self, local_step: Float[ndarray, " c"]) -> Float[ndarray, "n 6"]:
-        """Change of the pairs' errors (recon axes) once the local unknowns have moved."""
+        """Return the change of the pairs' errors (recon axes) after a step of the local unknowns."""
         return (self.gain @ local_step + self.offset).reshape(-1, 6)
 
 
 def image_equations(observations: ImageObservations, r: Residuals, noise: Noise) -> ImageEquations:
-    """Gauss-Newton equations of one image's pointmaps with residuals `r` of spread `noise`.
+    """Return the Gauss-Newton equations of one image's pointmaps with residuals `r` of spread `noise`.
 
     With v the change of a modelled point, the change of (across, along) has the squared norm
     vᵀ (α I + β x̂ x̂ᵀ) v, α = w_across/|x|², β = w_along/|x|² − α; every block below is that form for two of
@@ -202,12 +202,12 @@ def _pull(
     toward: Float[ndarray, "k 3 m"],
     v: Float[ndarray, "3 m"],
 ) -> Float[ndarray, "k 3 m"]:
-    """(α I + β x̂ x̂ᵀ) v."""
+    """Return (α I + β x̂ x̂ᵀ) v."""
     return alpha[:, None] * v + (beta * _dot(toward, v))[:, None] * toward
 
 
 def _moments(x: Float[ndarray, "3 m"], force: Float[ndarray, "n 3 m"]) -> Float[ndarray, "n 6 m"]:
-    """(I, −[X])ᵀ applied to forces at points X: force and moment, what a twist feels."""
+    """Return (I, −[X])ᵀ applied to forces at points X: force and moment."""
     out = np.empty((len(force), 6, x.shape[1]), np.float32)
     out[:, :3] = force
     for row, (a, b) in enumerate(((1, 2), (2, 0), (0, 1)), start=3):
@@ -216,7 +216,7 @@ def _moments(x: Float[ndarray, "3 m"], force: Float[ndarray, "n 3 m"]) -> Float[
 
 
 def _isotropic(alpha: Float[ndarray, "n m"], x: Float[ndarray, "3 m"]) -> Float[ndarray, "n 6 6"]:
-    """Σ α (I, −[X])ᵀ (I, −[X]) over the pixels, from the weights' moments of X."""
+    """Return Σ α (I, −[X])ᵀ (I, −[X]) over the pixels, from the weights' moments of X."""
     products = (x[:, None] * x).reshape(9, -1)
     moments = alpha @ np.concatenate([np.ones_like(x[:1]), x, products]).T
     second = moments[:, 4:].reshape(-1, 3, 3)
@@ -229,4 +229,5 @@ def _isotropic(alpha: Float[ndarray, "n m"], x: Float[ndarray, "3 m"]) -> Float[
 
 
 def _dot(a: Float[ndarray, "k 3 m"], v: Float[ndarray, "3 m"]) -> Float[ndarray, "k m"]:
+    """Return the dot products over the components."""
     return np.einsum("kcm,cm->km", a, v)

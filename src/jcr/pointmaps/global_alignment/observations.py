@@ -1,4 +1,4 @@
-"""The pointmaps of all pairs at chosen pixels of one image, laid out for vector arithmetic."""
+"""Pointmaps of all pairs at chosen pixels of one image, as arrays."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from jcr.pointmaps.pairs import PairPredictions
 CELL_SIDE = 4
 """Residuals are correlated over an image; their cell means on a 4x4 grid measure by how much."""
 POOR = 0.2
-"""Share of a good pixel's weight under which a cell's best pixel is not worth having."""
+"""Share of a good pixel's weight below which a cell's best pixel is left out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ class ImageObservations:
 
 
 def choose_pixels(predictions: PairPredictions, count: int) -> list[Int[ndarray, " _"]]:
-    """Flat indices per image: the most confident pixel of each of about `count` equal cells.
+    """Choose per image the most confident pixel of each of about `count` equal cells; return flat indices.
 
     Equal cells keep the whole field of view, which a plain ranking by confidence would give up. Cells without
     a pixel worth having (sky) are left out. Raises InputError for an image without any confidence.
@@ -90,12 +90,12 @@ def choose_pixels(predictions: PairPredictions, count: int) -> list[Int[ndarray,
 
 
 def weigh(confidence: Float[ndarray, "*k"], log_weight: bool) -> Float[ndarray, "*k"]:
-    """Weights of confidences, at least 0."""
+    """Return the weights of confidences, at least 0."""
     return np.log(np.maximum(confidence, 1.0)) if log_weight else confidence
 
 
 def weight_is_log(predictions: PairPredictions) -> bool:
-    """Whether confidences follow DUSt3R, from 1 up and weighing log C as published; else they are weights."""
+    """Test whether confidences follow DUSt3R, from 1 up with weight log C; else they are weights."""
     largest = max(float(conf.max()) for conf in predictions.conf)
     return largest > 1.0
 

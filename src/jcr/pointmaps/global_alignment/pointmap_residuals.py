@@ -1,4 +1,4 @@
-"""How far pairwise pointmaps are from a reconstruction, and how each of them is weighted.
+"""Residuals of pairwise pointmaps against a reconstruction, and their weights.
 
 A predicted point errs differently *across* its line of sight (where in the observer's image it appears) and
 *along* it (how far it is): networks know directions several times better than distances, and their errors in
@@ -24,12 +24,12 @@ from jcr.pointmaps.global_alignment.observations import CELL_SIDE, ImageObservat
 ROBUST_WIDTH = 3.0
 """Standard deviations at which a residual's weight has fallen to a quarter (Geman-McClure)."""
 LEAST_NOISE = np.float32(1e-4)
-"""No network comes near it; far below it the rounding of float32 sums would be taken for evidence."""
+"""Least standard deviation; far below it the rounding of float32 sums would count as evidence."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """All that alignment estimates."""
+    """Unknowns of the alignment."""
 
     recon_from_camera: Float[ndarray, "n 4 4"]
     log_focal: Float[ndarray, " n"]
@@ -102,14 +102,16 @@ def residuals(observations: ImageObservations, state: State, log_depth: Float[nd
 
 
 def agreement(r: Residuals, noise: Noise) -> Float[ndarray, "k m"]:
-    """Geman-McClure weights of the residuals, in (0, 1]."""
+    """Return the Geman-McClure weights of the residuals, in (0, 1]."""
     u = r.across_squared / noise.across[:, None] ** 2 + r.along**2 / noise.along[:, None] ** 2
     return (1.0 + u * np.float32(ROBUST_WIDTH**-2)) ** -2
 
 
 def measure_noise(images: list[ImageObservations], misfit: list[Residuals]) -> list[Noise]:
-    """Noise of every pointmap, per image: spreads of its own, but at least a third of what is usual for its
-    kind of view (no pair shall outweigh all others by a lucky fit), and the inflations of its kind."""
+    """Estimate the noise of every pointmap, per image: its own spreads and the inflations of its kind of view.
+
+    A spread is at least a third of the usual one of its kind, so that no pair outweighs all others by a lucky fit.
+    """
     own = [_own_noise(o, r) for o, r in zip(images, misfit, strict=True)]
     second = np.concatenate([o.second for o in images])
     usual = np.ones((2, len(fields(Noise))), np.float32)
@@ -133,7 +135,7 @@ def measure_noise(images: list[ImageObservations], misfit: list[Residuals]) -> l
 
 
 def _own_noise(observations: ImageObservations, r: Residuals) -> Noise:
-    """Spread per pointmap, medians over those of unit normals, and how far cells agree."""
+    """Estimate the spread per pointmap from medians, and the inflation from the agreement within cells."""
     across = np.maximum(np.sqrt(np.median(r.across_squared, axis=1) / 1.386), LEAST_NOISE)
     along = np.maximum(1.4826 * np.median(np.abs(r.along), axis=1), LEAST_NOISE)
     weight = observations.weight * agreement(r, Noise(across, along, across, along))
@@ -144,7 +146,7 @@ def _own_noise(observations: ImageObservations, r: Residuals) -> Noise:
 def _inflation(
     o: ImageObservations, weight: Float[ndarray, "k m"], parts: Float[ndarray, "k c m"]
 ) -> Float[ndarray, " k"]:
-    """Variance of residuals' cell means over what independent residuals would have (the design effect)."""
+    """Return the variance of the residuals' cell means over that of independent residuals (the design effect)."""
     total = np.maximum(weight.sum(axis=1), 1e-12)
     cell_total = weight @ o.cell
     weighted = weight[:, None] * parts
