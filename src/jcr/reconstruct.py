@@ -57,15 +57,10 @@ def _direct(capture: Capture, options: "ReconstructOptions", progress: Progress 
 def _dust3r(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
     """Reconstruct by DUSt3R or MASt3R, whose files have one more head, which is left out, and points in metres."""
     extra("torch", "networks", f"--backend {options.backend}")
-    from jcr.pointmaps.dust3r.dust3r import Dust3rOptions, reconstruct_dust3r
+    from jcr.pointmaps.dust3r.dust3r import reconstruct_dust3r
 
-    made = Dust3rOptions(
-        weights=weights_of(options),
-        device=device_of(options),
-        pair_graph=options.pair_graph,
-        backend=options.backend,
-    )
-    return reconstruct_dust3r(capture, made, progress)
+    weights, device = weights_of(options), device_of(options)
+    return reconstruct_dust3r(capture, weights, device, options.pair_graph, options.backend, progress)
 
 
 def _da3(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:

@@ -15,6 +15,7 @@ from jcr.errors import InputError
 from jcr.geometry import apply, fit_similarity, inverse, rotation_between_deg, transform
 from jcr.hub import Weights
 from jcr.pointmaps import predictions
+from jcr.pointmaps.grid import PreparedImages
 from jcr.pointmaps.pairs import pairs_from_arrays
 from jcr.pointmaps.predictions import reconstruct_predictions
 from jcr.records import Capture, Intrinsics, Reconstruction
@@ -227,17 +228,18 @@ def test_a_network_gives_the_same_record(
 ) -> None:
     """The dust3r back end around synthetic predictions on the grid it prepared."""
     from jcr.pointmaps.dust3r import dust3r
-    from jcr.pointmaps.dust3r.dust3r import Dust3rOptions
 
     made = pairs_from_arrays(pair_arrays(truth), "synthetic")
+    weights = Weights(Path("X"), "X", "Y")
 
-    def predict(capture: Capture, options: object, progress: object) -> tuple:
-        images = predictions._images(capture, np.arange(COUNT), {}, (WIDTH, HEIGHT), "synthetic")
-        return images, made, ("weights X: licence Y",)
+    def prepare(capture: Capture) -> PreparedImages:
+        return predictions._images(capture, np.arange(COUNT), {}, (WIDTH, HEIGHT), "synthetic")
 
-    monkeypatch.setattr(dust3r, "predict", predict)
-    options = Dust3rOptions(weights=Weights(Path("X"), "X", "Y"))
-    result = dust3r.reconstruct_dust3r(capture, options)
+    monkeypatch.setattr(dust3r, "load_weights", lambda weights, device: None)
+    monkeypatch.setattr(dust3r, "prepare_images", prepare)
+    monkeypatch.setattr(dust3r, "predict_pairs", lambda *arguments: (made, ("a note",)))
+    result = dust3r.reconstruct_dust3r(capture, weights, "cpu", "auto", "dust3r")
+    assert "a note" in result.notes
     assert result.backend == "dust3r" and "weights X: licence Y" in result.notes
     assert_poses(result, truth["gt_poses"], millimetres=3, degrees=0.3)
     unknown = Capture(
@@ -246,7 +248,7 @@ def test_a_network_gives_the_same_record(
         base_from_gripper=capture.base_from_gripper,
         image_size=capture.image_size,
     )
-    found = dust3r.reconstruct_dust3r(unknown, options).intrinsics
+    found = dust3r.reconstruct_dust3r(unknown, weights, "cpu", "auto", "dust3r").intrinsics
     # The principal point stays where the network has it; the focal length is aligned.
     assert found.fx == pytest.approx(5 * truth["gt_focal"], rel=0.01)
     assert (found.cx, found.cy) == pytest.approx((2.5 * WIDTH - 0.5, 2.5 * HEIGHT - 0.5))

@@ -19,7 +19,6 @@ from jcr.records import Capture, Intrinsics
 if TYPE_CHECKING:
     import torch
 
-    from jcr.pointmaps.dust3r.dust3r import Dust3rOptions
     from jcr.pointmaps.dust3r.network import Dust3r
     from jcr.pointmaps.dust3r.weights import LoadedNetwork
 
@@ -237,12 +236,12 @@ def test_a_network_runs_on_the_device_that_is_asked_for(
 ) -> None:
     used: list[str] = []
 
-    def predict(capture: object, options: "Dust3rOptions", progress: object) -> None:
-        used.append(options.device)
+    def load(weights: Weights, device: str) -> None:
+        used.append(device)
         raise InputError("far enough")
 
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
-    monkeypatch.setattr("jcr.pointmaps.dust3r.dust3r.predict", predict)
+    monkeypatch.setattr("jcr.pointmaps.dust3r.dust3r.load_weights", load)
     command = ["run", str(tabletop), str(tmp_path / "out"), "--backend", "dust3r", "--weights", str(tmp_path)]
     assert dispatch([*command, "--device", device]) == 2
     assert used == [expected]
@@ -280,7 +279,9 @@ def test_a_hub_id_comes_from_the_cache(
 def test_pairs_are_predicted_from_a_checkpoint_and_a_damaged_one_is_named(
     tmp_path: Path, linear: "Dust3r"
 ) -> None:
-    from jcr.pointmaps.dust3r.dust3r import Dust3rOptions, predict
+    from jcr.pointmaps.dust3r.dust3r import reconstruct_dust3r
+    from jcr.pointmaps.dust3r.predictor import predict_pairs
+    from jcr.pointmaps.grid import prepare_images
 
     rng = np.random.default_rng(0)
     names = tuple(f"{k}.png" for k in range(3))
@@ -294,12 +295,12 @@ def test_pairs_are_predicted_from_a_checkpoint_and_a_damaged_one_is_named(
         intrinsics=Intrinsics(70.0, 70.0, 39.5, 29.5, 80, 60),
     )
     weights = write_pth(tmp_path / "weights.pth", linear, LINEAR_MODEL)
-    options = Dust3rOptions(weights=Weights(weights, str(weights), "unknown"))
-    _, pairs, notes = predict(capture, options)
+    images = prepare_images(capture)
+    pairs, notes = predict_pairs(load(weights), images, names, capture.base_from_gripper)
     assert pairs.images == names and pairs.conf.shape == (6, 384, 512)
     assert pairs.intrinsics is not None and pairs.intrinsics.cx == pytest.approx(255.5)
     assert pairs.intrinsics.fx == pytest.approx(70 * 512 / 80)
-    assert notes == (f"weights {weights}: licence unknown",)
+    assert notes == ()
     weights.write_bytes(b"no weights")
     with pytest.raises(InputError, match=str(weights)):
-        predict(capture, options)
+        reconstruct_dust3r(capture, Weights(weights, str(weights), "unknown"), "cpu", "auto", "dust3r")
