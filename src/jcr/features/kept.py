@@ -15,6 +15,7 @@ import pycolmap
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from jcr.features import sift, verify
 from jcr.features.gate import Key
 from jcr.features.matchers import Features, Matcher
 from jcr.features.order import order_key
@@ -24,9 +25,18 @@ from jcr.files import read_bytes, written_whole
 from jcr.records import Capture
 
 FOLDER = "live/features"
-"""In the folder of a capture."""
+"""Folder of the kept features below that of a capture."""
 FORMAT = "jcr.features/2"
-"""To be changed with whatever changes the features, the matches or the geometries of a pair."""
+"""Format of the files; it changes with the code that finds features, matches and geometries."""
+THRESHOLDS = (
+    sift.KEYPOINTS,
+    sift.CONTRAST,
+    sift.RATIO,
+    sift.FARTHEST,
+    verify.MIN_INLIERS,
+    verify.STATIONARY_PX,
+)
+"""Constants on which features, matches and geometries depend; files made with others are not found."""
 _MATRICES = ("E", "F", "H")
 
 MatchedPair = tuple[Int[ndarray, "m 2"], pycolmap.TwoViewGeometry | None]
@@ -34,25 +44,25 @@ MatchedPair = tuple[Int[ndarray, "m 2"], pycolmap.TwoViewGeometry | None]
 
 
 def file_digest(file: Path) -> str:
-    """The SHA-256 of a file, in hexadecimal digits."""
+    """Return the SHA-256 of a file in hexadecimal digits."""
     return hashlib.sha256(read_bytes(file)).hexdigest()
 
 
 @dataclass(frozen=True)
 class KeptFeatures:
-    """What is kept of the images of a capture, by their rows."""
+    """Features and pairs of a capture's images on disk, by the rows of the images."""
 
     folder: Path
     is_written: bool
-    """Whether what is found is written, too: only a capture that is being taken changes its folder."""
+    """True if new features and pairs are written; only a capture that is being taken changes its folder."""
     digests: list[str] = field(default_factory=list)
-    """Of the images' files."""
+    """SHA-256 of the images' files."""
     order_keys: list[tuple[float, ...]] = field(default_factory=list)
-    """Of the images' gripper poses: pairs are matched from the image that comes first in a reconstruction."""
+    """Sort keys of the gripper poses: pairs are matched from the image that comes first in a reconstruction."""
 
     @staticmethod
     def of(capture: Capture) -> "KeptFeatures | None":
-        """To be read, of a capture that was calibrated while it was taken; None of another."""
+        """Return what a capture that was calibrated while it was taken keeps, to be read; None for other captures."""
         if not (capture.folder / FOLDER).is_dir():
             return None
         kept = KeptFeatures(capture.folder / FOLDER, False)
@@ -62,7 +72,7 @@ class KeptFeatures:
 
     @staticmethod
     def growing(folder: Path) -> "KeptFeatures":
-        """To be read and written, of the folder of a capture, so far without images."""
+        """Return the store of a capture's folder, to be read and written, without images yet."""
         (folder / FOLDER).mkdir(parents=True, exist_ok=True)
         return KeptFeatures(folder / FOLDER, True)
 
@@ -72,11 +82,11 @@ class KeptFeatures:
         self.order_keys.append(order_key(base_from_gripper))
 
     def in_order(self, key: Key) -> Key:
-        """A pair with that image first which comes first in a reconstruction."""
+        """Return a pair with the image first that comes first in a reconstruction."""
         return key if self.order_keys[key[0]] <= self.order_keys[key[1]] else (key[1], key[0])
 
     def features(self, row: int, size: tuple[int, int]) -> Sift | None:
-        """Of an image at a working size (px); None where there are none."""
+        """Return the features of an image at a working size (px); None where none are kept."""
         file = _read(self._of_image(row, size))
         return None if file is None else (file["x_px"], file["descriptors"])
 
@@ -85,7 +95,7 @@ class KeptFeatures:
         _write(self._of_image(row, size), {"x_px": found[0], "descriptors": found[1]})
 
     def pair(self, key: Key, depends: str) -> MatchedPair | None:
-        """Of two images; None where it is not known. `depends`: all by which geometries of the same images differ."""
+        """Return the pair of two images; None where none is kept. `depends` names the settings of its geometry."""
         file = _read(self._of_pair(key, depends))
         if file is None:
             return None
@@ -122,13 +132,14 @@ class KeepingMatcher(Matcher):
     def __init__(
         self, features: Features, camera: pycolmap.Camera, known: bool, seed: int, kept: KeptFeatures
     ) -> None:
+        """Read pairs from `kept`, and write new ones to it where it is to be written."""
         super().__init__(features, np.ones(2), camera, known, seed)
         self._kept, self._depends = kept, _camera_text(camera, known, seed)
 
     def geometries(
         self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], coarse: bool = False
     ) -> Geometries:
-        """Verified two-view geometries of pairs; neither the rotations of the images (rad) nor `coarse` change them."""
+        """Return verified two-view geometries of pairs; neither the rotations (rad) nor `coarse` change them."""
         matched_as = {key: self._kept.in_order(key) for key in pairs}
         there = {key: self._kept.pair(matched_as[key], self._depends) for key in pairs}
         new = [k for k, key in enumerate(pairs) if there[key] is None]
@@ -150,12 +161,12 @@ class KeepingMatcher(Matcher):
 
 
 def _camera_text(camera: pycolmap.Camera, known: bool, seed: int) -> str:
-    """All of a matcher by which geometries of the same images differ."""
+    """Return the settings of a matcher on which the geometries of two images depend."""
     return f"{camera.model.name} {camera.width} {camera.height} {camera.params.tolist()} {known} {seed}"
 
 
 def _reversed(pair: MatchedPair) -> MatchedPair:
-    """The same matches from the second image to the first."""
+    """Return matches and geometry from the second image to the first."""
     rows, geometry = pair
     if geometry is not None:
         geometry.invert()
@@ -163,7 +174,7 @@ def _reversed(pair: MatchedPair) -> MatchedPair:
 
 
 def _name(*depends: str) -> str:
-    return hashlib.sha256("\n".join((FORMAT, *depends)).encode()).hexdigest()[:32]
+    return hashlib.sha256("\n".join((FORMAT, *map(repr, THRESHOLDS), *depends)).encode()).hexdigest()[:32]
 
 
 def _write(path: Path, arrays: dict[str, ndarray]) -> None:
@@ -172,7 +183,7 @@ def _write(path: Path, arrays: dict[str, ndarray]) -> None:
 
 
 def _read(path: Path) -> dict[str, ndarray] | None:
-    """All arrays of a file; None where there is none, or a damaged one: it is made again."""
+    """Return all arrays of a file; None where it is missing or damaged."""
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             return dict(file)

@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
@@ -22,7 +21,7 @@ from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 from jcr.sfm.mapping import enter, quiet_colmap, sift_features, tracks_of
 from jcr.sfm.options import ColmapOptions
-from jcr.sfm.pose_primed import model_of
+from jcr.sfm.pose_primed import triangulated
 
 MIN_POINTS = 50
 
@@ -103,6 +102,5 @@ def _triangulated(
         pairs = all_pairs(len(images))
         write_keypoints(database, matcher.x_px)
         write_geometries(database, matcher.geometries(pairs, np.zeros((len(pairs), 2))))
-        model = model_of(database, cameras[0], dict(enumerate(recon_from_camera)))
-        model = pycolmap.triangulate_points(model, database, folder, Path(folder))
+        model = triangulated(database, cameras[0], dict(enumerate(recon_from_camera)))
         return tracks_of(model, range(1, len(images) + 1), (intrinsics.width, intrinsics.height))

@@ -44,7 +44,7 @@ from jcr.sfm.options import ColmapOptions
 from jcr.sfm.pose_primed import poses_of
 
 OPTIONS = ColmapOptions()
-"""As of a calibration that is given none: it finds the features and pairs of the same working size and seed."""
+"""Options of a calibration without options, which finds features and pairs of the same working size and seed."""
 FEW = 5
 """Images up to which all are mapped again with each: the first pair may have been an unlucky one."""
 AGAIN = 1.3
@@ -105,7 +105,7 @@ class Growing:
 
     @property
     def is_to_be_mapped_again(self) -> bool:
-        """Whether the next image is a reason to map all again."""
+        """Test whether all images are mapped again with the next one."""
         count = len(self._rows) + 1
         is_poor = self._model is None or self._gate.of_x is None
         if self._mapped_of <= FEW or is_poor:
@@ -114,14 +114,14 @@ class Growing:
 
     @property
     def registered(self) -> list[int]:
-        """Rows of the capture whose cameras are in the map."""
+        """Rows of the capture with a camera in the map."""
         if self._model is None:
             return []
         inside = {image_id - 1 for image_id in self._model.reg_image_ids()}
         return [place for place, row in enumerate(self._rows) if row in inside]
 
     def matched_with(self, place: int) -> int:
-        """How many other images one matches, that the robot does not contradict."""
+        """Return the number of other images that an image matches and the gripper poses do not contradict."""
         return self._matched_with[self._rows[place]]
 
     def add(self, capture: Capture, image: UInt8[ndarray, "h w 3"]) -> None:
@@ -150,7 +150,7 @@ class Growing:
             self._model.deregister_frame(self._model.image(row + 1).frame_id)
 
     def reconstruction(self) -> Reconstruction | None:
-        """As the map stands, rows counted as in the capture; None of fewer than two cameras."""
+        """Return the map as a reconstruction, rows counted as in the capture; None with fewer than two cameras."""
         places = self.registered
         if self._model is None or len(places) < 2:
             return None
@@ -173,7 +173,7 @@ class Growing:
         self._temporary.cleanup()
 
     def _motion(self) -> Float[ndarray, "r r 4 4"]:
-        """Between the grippers of all rows; of images that were removed, the identity's."""
+        """Return the motions between the grippers of all rows; removed images have the identity as pose."""
         poses = np.tile(np.eye(4), (len(self._view.x_px), 1, 1))
         poses[self._rows] = self._capture.base_from_gripper
         return motions(poses)
@@ -212,7 +212,7 @@ class Growing:
         return judged.confirmed if self._known else (*judged.confirmed, *judged.undecided)
 
     def _moving(self, key: Key, geometry: pycolmap.TwoViewGeometry) -> pycolmap.TwoViewGeometry | None:
-        """The geometry, verified again where some of its matches lie in parts that do not move with the scene."""
+        """Return the geometry, verified again without matches in parts that do not move with the scene."""
         if self._still is None:
             return geometry
         matcher = self._matcher

@@ -89,25 +89,39 @@ def map_from_cameras(
     Images with few points, and those that few points tie to the rest, are left out: gripper poses alone would hold them.
     """
     poses, model = recon_from_camera, pycolmap.Reconstruction()
-    with tempfile.TemporaryDirectory(prefix="jcr-primed-") as folder:
-        for largest_px, refinements, scale_px in PASSES:
-            model = model_of(database, camera, poses)
-            options = pycolmap.IncrementalPipelineOptions()
-            options.num_threads = options.mapper.num_threads = 1
-            options.ba_global_max_refinements = refinements
-            options.random_seed = options.triangulation.random_seed = 0
-            options.mapper.filter_max_reproj_error = largest_px
-            options.triangulation.merge_max_reproj_error = largest_px
-            options.triangulation.complete_max_reproj_error = largest_px
-            model = pycolmap.triangulate_points(
-                model, database, folder, Path(folder), refine_intrinsics=False, options=options
-            )
-            for row in poses.keys() - _tied(model):
-                model.deregister_frame(model.image(row + 1).frame_id)
-            adjust(model, scale_px)
-            rows = sorted(image_id - 1 for image_id in model.reg_image_ids())
-            poses, camera = dict(zip(rows, poses_of(model, rows), strict=True)), model.camera(1)
+    for largest_px, refinements, scale_px in PASSES:
+        model = triangulated(database, camera, poses, largest_px, refinements)
+        for row in poses.keys() - _tied(model):
+            model.deregister_frame(model.image(row + 1).frame_id)
+        adjust(model, scale_px)
+        rows = sorted(image_id - 1 for image_id in model.reg_image_ids())
+        poses, camera = dict(zip(rows, poses_of(model, rows), strict=True)), model.camera(1)
     return model
+
+
+def triangulated(
+    database: Path,
+    camera: pycolmap.Camera,
+    recon_from_camera: Cameras,
+    largest_px: float = 4.0,
+    refinements: int = 5,
+) -> pycolmap.Reconstruction:
+    """Return a model of fixed cameras with points from all verified matches; the same, bit for bit, for the same input.
+
+    Points with a reprojection error above `largest_px` are left out.
+    """
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.ba_global_max_refinements = refinements
+    options.random_seed = options.triangulation.random_seed = 0
+    options.mapper.filter_max_reproj_error = largest_px
+    options.triangulation.merge_max_reproj_error = largest_px
+    options.triangulation.complete_max_reproj_error = largest_px
+    model = model_of(database, camera, recon_from_camera)
+    with tempfile.TemporaryDirectory(prefix="jcr-points-") as folder:
+        return pycolmap.triangulate_points(
+            model, database, folder, Path(folder), refine_intrinsics=False, options=options
+        )
 
 
 def poses_of(model: pycolmap.Reconstruction, rows: Sequence[int]) -> Float[ndarray, "m 4 4"]:
