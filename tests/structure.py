@@ -29,8 +29,6 @@ from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError, RejectedError
 from jcr.live.folder import LiveFolder
 from jcr.live.server import sample_pose
-from jcr.pipeline.batch import STATE as BATCH
-from jcr.pipeline.batch import _finished
 from jcr.pipeline.run_folder import RunFolder
 from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Capture
@@ -220,41 +218,7 @@ def _of_runs(folder: Path, capture: Capture, in_file: Any, found: dict[str, Docu
     names = folder / "names.json"
     as_json(names, {"1": "mug", "2": "box"})
     in_file("labels/names.json", names, lambda: _read_names(names))
-    _batch_state(folder, capture, in_file)
     _archive(folder, found)
-
-
-def _batch_state(folder: Path, capture: Capture, in_file: Any) -> None:
-    from jcr.capture.options import ReadOptions
-    from jcr.pipeline.batch import Row, Task
-    from jcr.pipeline.results import RunOptions
-
-    task = Task(
-        capture=capture.folder,
-        out=folder / "batch",
-        run=RunOptions(),
-        calibrate_only=True,
-        read=ReadOptions(),
-    )
-    task.out.mkdir()
-    row = vars(
-        Row(
-            capture=str(capture.folder),
-            out=str(task.out),
-            status="accepted",
-            backend="colmap",
-            images=4,
-            used=4,
-            offset_std_mm=1.0,
-            turn_std_deg=0.1,
-            scale_std_percent=0.1,
-            held_out_mm=1.0,
-            held_out_deg=0.1,
-            seconds=1.0,
-        )
-    )
-    as_json(task.out / BATCH, {"made_from": "x", "row": row})
-    in_file(f"{BATCH} of a batch", task.out / BATCH, lambda: _finished(task, "x"))
 
 
 def _archive(folder: Path, found: dict[str, Document]) -> None:

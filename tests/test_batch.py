@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -39,7 +40,8 @@ def captures(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> list[P
                 image = Image.new("RGB", (320, 240), (90 + 8 * k, 90, 90))
             image.save(root / name / frame["image"], quality=95)
         (root / name / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": intrinsics}))
-    (root / "broken" / "images" / "01.jpg").write_bytes(b"no picture")
+    for name in ("01.jpg", "02.jpg"):  # two that are left are too few
+        (root / "broken" / "images" / name).write_bytes(b"no picture")
     return [root / name for name in ("a", "b", "broken", "plain")]
 
 
@@ -53,7 +55,7 @@ def test_a_bad_capture_fails_alone_and_what_is_finished_is_not_run_again(
     printed = capsys.readouterr()
     rows = {Path(row["capture"]).name: Row(**row) for row in json.loads(printed.out)["captures"]}
     assert "of 4 captures failed or are rejected" in printed.err and printed.err.count("\n") == 1
-    assert rows["broken"].status == "failed" and "01.jpg: not a readable image" in rows["broken"].reason
+    assert rows["broken"].status == "failed" and "not a readable image" in rows["broken"].reason
     assert rows["plain"].status == "rejected" and "registered" in rows["plain"].reason
     assert rows["a"].images == 4 and rows["b"].images == 5 and rows["b"].offset_std_mm is not None
 
@@ -71,6 +73,35 @@ def test_a_bad_capture_fails_alone_and_what_is_finished_is_not_run_again(
     assert str(out / "summary.html") in capsys.readouterr().out
     again = {name: (out / name / "calibration.json").stat().st_mtime_ns for name in stamps}
     assert again["a"] > stamps["a"] and again["b"] == stamps["b"] and again["plain"] == stamps["plain"]
+
+
+def test_deleted_results_and_changed_facts_of_a_capture_are_made_again(tmp_path: Path, captures: list[Path]):
+    """Joints, the robot and a result that is gone count as the images and poses do."""
+    capture, out = tmp_path / "capture", tmp_path / "all"
+    shutil.copytree(captures[1], capture)
+
+    def stamp() -> int:
+        (row,) = batch([capture], out, RunOptions(), replace(COMPLETE, processes=1))
+        assert row.status != "failed", row.reason
+        return (out / "capture" / "calibration.json").stat().st_mtime_ns
+
+    first = stamp()
+    assert stamp() == first
+    (out / "capture" / "report.html").unlink()
+    second = stamp()
+    assert second > first and (out / "capture" / "report.html").is_file()
+    content = json.loads((capture / "capture.json").read_text())
+    content["robot"] = "ur5e"
+    (capture / "capture.json").write_text(json.dumps(content))
+    assert stamp() > second
+
+
+def test_cores_are_counted_where_processes_cannot_be_bound_to_them(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, captures: list[Path]
+):
+    monkeypatch.delattr(module.os, "sched_getaffinity", raising=False)  # as on macOS
+    (row,) = batch([captures[2]], tmp_path / "all", RunOptions(), BatchOptions(calibrate_only=True))
+    assert row.status == "failed" and "not a readable image" in row.reason
 
 
 def test_a_process_that_dies_takes_no_other_capture_with_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):

@@ -1,7 +1,7 @@
 """Files are written whole or not at all: a temporary name beside the target, fsync, rename; and only files are read."""
 
 import os
-import tempfile
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,17 +13,13 @@ from jcr.errors import InputError
 def written_whole(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; on success it replaces `path`, on failure it goes."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part" + path.suffix, dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
+    temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}.part{path.suffix}"
+    # The system applies the umask, so a result is as readable as any file that the user makes.
+    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     try:
         yield temporary
         with open(temporary, "rb+") as stream:
             os.fsync(stream.fileno())
-        # mkstemp makes files private; a result is as readable as any file the user makes.
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -49,6 +45,12 @@ def remove_unfinished(folder: Path) -> None:
     """Delete what writers that were killed had begun in a folder."""
     for begun in folder.glob(".*.????????.part*"):
         begun.unlink()
+
+
+def write_new(path: Path, data: bytes) -> None:
+    """Write `data` to `path` unless the file has it already; then its time stamp stays, too."""
+    if not path.is_file() or path.read_bytes() != data:
+        write_bytes(path, data)
 
 
 def write_bytes(path: Path, data: bytes) -> None:

@@ -1,9 +1,7 @@
 """Many captures: each run on its own, over processes of this machine or a Ray cluster, and a table that ranks them."""
 
 import csv
-import hashlib
 import io
-import json
 import logging
 import multiprocessing
 import os
@@ -24,13 +22,11 @@ from jcr.errors import InputError, RejectedError
 from jcr.extras import extra
 from jcr.files import write_text
 from jcr.findings import Verdict, sentence, verdict_of
-from jcr.pipeline.run import RunOptions, calibrate, run
-from jcr.pipeline.run_folder import CAPTURE, RunFolder, fingerprint
+from jcr.pipeline.run import RunOptions, finished, run
+from jcr.pipeline.run_folder import CAPTURE, RunFolder, locked
 from jcr.progress import Progress, silent
 from jcr.report.render import render
 
-STATE = "batch.json"
-"""In each run folder: its row of the table, and a fingerprint of what it was made from."""
 RETRIES = 3
 """How often a task is started again whose Ray node died."""
 
@@ -125,26 +121,20 @@ def run_one(task: Task) -> Row:
     """The row of one capture, run unless it was finished before; whatever goes wrong is in the row."""
     start = time.perf_counter()
     try:
-        capture = read_capture(task.capture, task.read, into=task.out / CAPTURE)
-        made_from = fingerprint(capture, task.run.reconstruct.as_json())
-        others = json.dumps(
-            [asdict(task.run), asdict(task.read), task.calibrate_only], sort_keys=True, default=str
-        )
-        made_from += hashlib.sha256(others.encode()).hexdigest()
-        if (row := _finished(task, made_from)) is not None:
-            return row
-        try:
-            result = (calibrate if task.calibrate_only else run)(capture, task.out, task.run)
-            content, reason = result.calibration, ""
-        except RejectedError as error:
-            content, reason = RunFolder(task.out).calibration(), str(error)
+        with locked(task.out):
+            capture = read_capture(task.capture, task.read, into=task.out / CAPTURE)
+        options = replace(task.run, map=None) if task.calibrate_only else task.run
+        reason = ""
+        if (before := finished(capture, task.out, options)) is not None:
+            content = before.calibration
+        else:
+            try:
+                content = run(capture, task.out, options).calibration
+            except RejectedError as error:
+                content, reason = RunFolder(task.out).calibration(), str(error)
         row = replace(_row(task, content), seconds=round(time.perf_counter() - start, 2))
         named = next((sentence(one) for one in content.findings if one.severity != "informs"), "")
-        row = replace(row, reason=reason or named)
-        write_text(
-            task.out / STATE, json.dumps({"made_from": made_from, "row": asdict(row)}, indent=1) + "\n"
-        )
-        return row
+        return replace(row, reason=reason or named)
     except InputError as error:
         return _failed(task, str(error))
     except Exception as error:  # a bug shows in its row, and does not take the other captures with it
@@ -153,15 +143,6 @@ def run_one(task: Task) -> Row:
 
 def _failed(task: Task, reason: str) -> Row:
     return Row(capture=str(task.capture), out=str(task.out), status="failed", reason=reason)
-
-
-def _finished(task: Task, made_from: str) -> Row | None:
-    try:
-        state = json.loads((task.out / STATE).read_text("utf-8"))
-        row = Row(**state["row"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return None
-    return row if state.get("made_from") == made_from else None
 
 
 def _row(task: Task, content: CalibrationFile) -> Row:
@@ -211,7 +192,8 @@ def _names(captures: Sequence[Path]) -> list[str]:
 
 
 def _on_this_machine(tasks: list[Task], options: BatchOptions) -> Iterator[Row]:
-    cores = len(os.sched_getaffinity(0))
+    # macOS cannot bind a process to cores.
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     processes = min(options.processes or max(1, cores // 2), len(tasks))
     with _threads_per_process(max(1, cores // processes)):
         left = yield from _over_pool(tasks, processes)

@@ -26,6 +26,7 @@ from jcr.options import checked_options
 from jcr.pipeline import stages
 from jcr.pipeline.results import PosesResult, RunOptions, RunResult, SavedRun, load_run
 from jcr.pipeline.run_folder import CAPTURE, REPORT, RunFolder, locked
+from jcr.pipeline.selection import NothingFoundError
 from jcr.progress import Progress, silent
 from jcr.reconstruct import BackendName, check_board
 from jcr.records import Capture, PosePairs
@@ -63,7 +64,11 @@ def run(
         importing = None if options.map is None else beside.submit(_why_no_map, options.estimates_depth)
         capture = folder.keep_capture(capture)
         added = None if options.map is None else read_added(folder.path, capture)
-        result = stages.calibrated(capture, folder, options, progress or silent)
+        try:
+            result = stages.calibrated(capture, folder, options, progress or silent)
+        except NothingFoundError:
+            folder.keep_complete(capture, options)
+            raise
         missing = missing if importing is None else importing.result()
         if missing is not None:
             options, added, result = replace(options, map=None), None, result.noted(missing)

@@ -197,7 +197,8 @@ class RunFolder:
             found = self.state()
         except InputError:
             return None
-        return found if found.reconstruct == state.reconstruct else None
+        same = found.reconstruct == state.reconstruct and (self.path / RECONSTRUCTION).is_file()
+        return found if same else None
 
     def reuse_reconstruction(self, state: State) -> tuple[Reconstruction, State] | None:
         """The reconstruction of an earlier run of the same, with its pointmaps, and that run's state."""
@@ -291,10 +292,12 @@ class RunFolder:
 
     def is_complete(self, capture: Capture, options: Any) -> bool:
         """Whether a run of the same is finished, and its files were neither changed nor removed since."""
-        files = [RECONSTRUCTION, CALIBRATION, REPORT] + ([] if options.map is None else [CLOUD, MAP])
-        if not all((self.path / name).is_file() for name in files):
-            return False
         try:
+            files = [REPORT]
+            if self.calibration().parent_from_camera is not None:
+                files += [RECONSTRUCTION] + ([] if options.map is None else [CLOUD, MAP])
+            if not all((self.path / name).is_file() for name in files):
+                return False
             return self.state().complete == self._completion(capture, options)
         except InputError:
             return False

@@ -183,6 +183,7 @@ def _failed(
     board = proposed_for(capture, options.reconstruct.board)
     if folder.earlier(state) is None:
         folder.forget_reconstruction()
+        folder.keep_state(state)
     content = failed_file(
         capture,
         error.attempts[-1].backend,

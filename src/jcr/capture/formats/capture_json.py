@@ -19,7 +19,7 @@ from jcr.capture.options import MAX_FRAMES, ReadOptions
 from jcr.capture.plain_files import contained, read_json, shown
 from jcr.errors import InputError
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
-from jcr.files import write_bytes, write_text
+from jcr.files import write_new, write_text
 from jcr.records import Capture
 
 FILE, URDF = "capture.json", "robot.urdf"
@@ -136,7 +136,7 @@ def kept(capture: Capture, folder: Path) -> Capture:
         return capture
     others = (name for camera in capture.others for name in camera.images)
     for name in filter(None, (*capture.images, *(capture.depths or ()), *others)):
-        write_bytes(folder / name, (capture.folder / name).read_bytes())
+        write_new(folder / name, (capture.folder / name).read_bytes())
     write(folder, capture, source=str(capture.source))
     return replace(read(folder), cameras=capture.cameras, notes=capture.notes)
 
