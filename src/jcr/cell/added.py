@@ -17,7 +17,7 @@ FOLDER, FILE = "cameras", "cameras.json"
 
 
 def read_added_cameras(run_folder: Path, capture: Capture) -> tuple[CellCamera, ...]:
-    """The cameras added to a run so far; InputError where their file or an image was damaged."""
+    """Read the cameras added to a run; raise InputError where their file or an image was damaged."""
     folder = run_folder / FOLDER
     if not is_written(folder / FILE):
         return ()
@@ -32,7 +32,7 @@ def read_added_cameras(run_folder: Path, capture: Capture) -> tuple[CellCamera, 
 
 
 def camera_of(name: str, files: Sequence[Path], intrinsics: Path | None, taken: Sequence[str]) -> CellCamera:
-    """A fixed camera of images where they lie; InputError for images that cannot be those of one camera.
+    """Return a fixed camera of image files; raise InputError for images that cannot be those of one camera.
 
     `intrinsics` is a JSON file as capture.json has them, or one that holds them as "intrinsics"; `taken` are names
     that other cameras have.

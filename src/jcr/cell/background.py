@@ -1,4 +1,4 @@
-"""What moves before a fixed camera, by itself: the images with all that stands still taken out.
+"""Removal of the static background from the images of a fixed camera.
 
 Behind a thing in the gripper stands the rest of the cell, with more features than the thing has. Where many images
 show the same colour at a pixel, that is what stands there; an image keeps what differs from it, and fades to grey
@@ -28,7 +28,7 @@ GROWN, SOFT = 0.012, 0.008
 
 
 def moving_parts(images: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndarray, "h w 3"]]:
-    """The images of a fixed camera with what stands still faded to grey."""
+    """Return the images of a fixed camera with the static background faded to grey."""
     height, width = images[0].shape[:2]
     small = min(REDUCED, width), max(1, round(height * min(REDUCED, width) / width))
     reduced = np.stack(
@@ -49,7 +49,7 @@ def moving_parts(images: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndarra
 
 
 def _background(reduced: Float[ndarray, "n h w 3"]) -> tuple[Float[ndarray, "h w 3"], ndarray]:
-    """At each pixel the colour on which most images agree, and whether enough of them do."""
+    """Return at each pixel the colour on which most images agree, and whether enough of them do."""
     agreeing = np.stack(
         [(np.abs(reduced - one).max(-1) < LEVELS).sum(0) for one in reduced]
     )  # (n,h,w): images like each

@@ -1,4 +1,4 @@
-"""What the images of one further camera share with the images of known pose, before it is placed."""
+"""Points that the images of a further camera share with images of known pose."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,18 +17,18 @@ from jcr.records import CellCamera, Intrinsics
 
 @dataclass(frozen=True)
 class CameraViews:
-    """What the images of one camera share with the images of known pose, in the order of its images."""
+    """Points that the images of one camera share with images of known pose, in the order of its images."""
 
     camera: CellCamera
     shared: tuple[Shared | None, ...]
     counts: tuple[int, ...]
-    """Points."""
+    """Number of shared points of each image."""
     reasons: tuple[str | None, ...]
-    """Why each is not used."""
+    """Reason why each image is not used; None for used ones."""
 
     @staticmethod
     def of(camera: CellCamera, found: Sequence[Shared | int]) -> "CameraViews":
-        """Of what localised() said of each image."""
+        """Return the views of a camera from the results of localised() for its images."""
         return CameraViews(
             camera,
             tuple(one if isinstance(one, Shared) else None for one in found),
@@ -46,12 +46,12 @@ class CameraViews:
 
     @property
     def places(self) -> Float[ndarray, "k 4 4"]:
-        """Of these."""
+        """recon_from_camera of the localised images."""
         return np.stack([one.recon_from_camera for one in self.shared if one is not None])
 
     @property
     def distance(self) -> float:
-        """Of the scene."""
+        """Median distance of the scene (recon units)."""
         return float(np.median([distance(one) for one in self.shared if one is not None]))
 
     @property
@@ -68,13 +68,13 @@ class CameraViews:
         return all(one is None or one.intrinsics == intrinsics for one in self.shared)
 
     def without(self, reasons: Mapping[int, str]) -> "CameraViews":
-        """With why some images are not used."""
+        """Return the views with the reasons why some images are not used."""
         return replace(self, reasons=tuple(reasons.get(k, before) for k, before in enumerate(self.reasons)))
 
     def refused(
         self, kind: FindingKind, concerns: Concerns = "none", *images: str, **numbers: Any
     ) -> CameraPlacement:
-        """The camera is not placed, for this finding, as Finding.of makes it."""
+        """Return the camera rejected for a finding, as Finding.of makes it."""
         return self.not_placed(Finding.of(kind, "rejects", concerns, *images, **numbers))
 
     def not_placed(self, *why: Finding) -> CameraPlacement:

@@ -25,7 +25,7 @@ from jcr.records import Capture, HandEye, Reconstruction
 
 
 def exchanged(capture: Capture) -> Capture:
-    """The capture as if its base were the gripper: for reconstruction and calibration of a camera that is fixed.
+    """Return the capture with base and gripper exchanged, for the calibration of a fixed camera.
 
     The arm's name, URDF and joints are left out, for the kinematics are those of the poses as they were.
     """
@@ -52,7 +52,7 @@ def carried_scene(capture: Capture, moving: Path) -> Capture:
 def refined(
     capture: Capture, reconstruction: Reconstruction, found: HandEye, options: CalibrateOptions | None = None
 ) -> HandEye:
-    """The calibration of the exchanged capture with the robot's errors where they are.
+    """Refine the calibration of the exchanged capture with the errors of the reported gripper poses.
 
     Its gripper_from_camera is base_from_camera, its base_from_recon gripper_from_recon; residuals are of the gripper
     poses as they were reported. One that is rejected stays as it was, with what explains it where that is known.
@@ -88,7 +88,7 @@ def refined(
 
 
 def _explained(capture: Capture, reconstruction: Reconstruction, found: HandEye) -> HandEye:
-    """A failure, with the reason where the images are those of a camera on the gripper."""
+    """Return a failed calibration, with the reason where the camera is on the gripper."""
     rows = reconstruction.image_index
     on_gripper = solve_hand_eye(
         capture.base_from_gripper[rows], reconstruction.recon_from_camera, in_sequence=False

@@ -48,8 +48,10 @@ class CellImages:
     def with_freed(
         self, prior: Camera, camera: int, combinations: Float[ndarray, "e p"] | None = None
     ) -> "CellImages":
-        """Return the cell with another prior of a camera's intrinsics, and combinations of the columns of its
-        score_test.Alternatives free too."""
+        """Return the cell with another prior of a camera's intrinsics.
+
+        `combinations` of the columns of its score_test.Alternatives are free too.
+        """
         problem = with_camera(self.problem, prior, camera)
         if combinations is not None:
             mine = np.flatnonzero(self.observations.camera == camera)

@@ -1,4 +1,4 @@
-"""Where an image of another camera was taken from, in the reconstruction of the capture's own camera.
+"""Localisation of another camera's image in the reconstruction of the capture's own camera.
 
 Features that it shares with two or more images of known pose become points; the image's place follows from those that
 agree (P3P in RANSAC, with a focal length where none is given). Points and all their observations are kept, for the
@@ -56,13 +56,13 @@ def known_images(
     intrinsics: Intrinsics,
     recon_from_camera: Float[ndarray, "m 4 4"],
 ) -> Known:
-    """Images of one camera, whose poses are known, made ready."""
+    """Return images of known poses of one camera with their features."""
     found = tuple(features(image, intrinsics) for image in images)
     return Known(intrinsics, recon_from_camera, found)
 
 
 def guessed_intrinsics(size: tuple[int, int]) -> Intrinsics:
-    """Of images of a size, where nothing is known of their camera."""
+    """Return initial intrinsics for an image size."""
     width, height = size
     focal = FOCAL_OF_WIDTH * max(size)
     return Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
@@ -71,7 +71,7 @@ def guessed_intrinsics(size: tuple[int, int]) -> Intrinsics:
 def localised(
     known: Known, image: UInt8[ndarray, "h w 3"], intrinsics: Intrinsics, is_given: bool
 ) -> Shared | int:
-    """The image's place, or how few points it shares with the known images where these do not show it."""
+    """Return the pose of an image, or the number of points that it shares where these are too few."""
     found = features(image, intrinsics)
     of_image = [matches(found.descriptors, other.descriptors) for other in known.found]
     seen = _Matched(
@@ -94,7 +94,7 @@ class _Matched:
 
 
 def _located(known: Known, seen: _Matched, intrinsics: Intrinsics, is_given: bool) -> Shared | int:
-    """As `localised`, of what was matched."""
+    """Return the pose of an image from its matches, as `localised`."""
     feature, row, count = seen.feature, seen.row, len(seen.x_px)
     rays = unproject(known.intrinsics, seen.row_x_px)[:, :2]
     gate = GATE_PX / known.intrinsics.fx
@@ -137,11 +137,11 @@ def _located(known: Known, seen: _Matched, intrinsics: Intrinsics, is_given: boo
 
 
 def spread(shared: Shared) -> float:
-    """Share of the image's area within which its points lie, as their standard deviations span it."""
+    """Return the share of the image's area that the standard deviations of its points span."""
     sides = 4 * np.sqrt(np.linalg.eigvalsh(np.cov(shared.x_px.T)))
     return float(sides.prod() / (shared.intrinsics.width * shared.intrinsics.height))
 
 
 def distance(shared: Shared) -> float:
-    """Median depth of the points, in the reconstruction's unit."""
+    """Return the median depth of the points, in the reconstruction's unit."""
     return float(np.median(apply(inverse(shared.recon_from_camera), shared.points_in_recon)[:, 2]))

@@ -1,4 +1,4 @@
-"""Where the images of a cell's further cameras were taken from, in the base of the capture's own arm."""
+"""Poses of the images of a cell's further cameras in the base frame of the capture's own arm."""
 
 from collections.abc import Mapping
 
@@ -16,7 +16,7 @@ def base_from_camera(
     cameras: CamerasFile,
     base_from_gripper: Mapping[int, Float[ndarray, "4 4"]],
 ) -> dict[int, Float[ndarray, "4 4"]]:
-    """Of every image that was used, by its number, as far as its gripper's pose is known.
+    """Return base_from_camera of every used image, by its number, as far as its gripper's pose is known.
 
     `base_from_gripper` is that of the capture's own arm, by the row of the capture.
     """

@@ -1,4 +1,4 @@
-"""Which images of a cell move as one: those of the capture's own camera, of cameras on its gripper, and of other arms.
+"""Rigs of a cell: images that move as one with the capture's own camera, its gripper, or another arm.
 
 A camera whose images contradict how it is mounted is refused here, before anything is adjusted.
 """
@@ -47,6 +47,7 @@ class Member:
 
     @property
     def camera(self) -> CellCamera:
+        """Camera of the images."""
         return self.seen.camera
 
     @property
@@ -56,7 +57,7 @@ class Member:
 
 
 class Rigs:
-    """What moves as one: the capture's own camera at each used image, then what other cameras add."""
+    """Rigs: the capture's own camera at each used image, then those that other cameras add."""
 
     def __init__(
         self, capture: Capture, hand_eye: HandEye, own: Float[ndarray, "m 4 4"], rows: Int[ndarray, " m"]
@@ -67,7 +68,7 @@ class Rigs:
         self._of_arms: list[tuple[Int[ndarray, " n"], Float[ndarray, "n 4 4"], HandEye]] = []
 
     def add(self, seen: CameraViews) -> Member | CameraPlacement:
-        """The camera's images among the rigs; or why it cannot be placed."""
+        """Add the images of a camera to the rigs; return a rejected placement where it cannot be placed."""
         if not len(seen.rows):
             most = int(np.argmax(seen.counts))
             best, count = seen.camera.images[most], float(seen.counts[most])
@@ -96,7 +97,7 @@ class Rigs:
         )
 
     def _at_own_camera(self, place: Float[ndarray, "4 4"]) -> tuple[Finding, ...]:
-        """That a camera stands where the capture's own camera was at an image."""
+        """Return the finding of a camera that coincides with a pose of the capture's own camera."""
         metres, radians = _apart(np.stack(self.poses[: len(self._rows)]), place)
         near = np.flatnonzero((metres < AT_A_FRAME[0]) & (radians < AT_A_FRAME[1]))
         images = [self._capture.images[self._rows[row]] for row in near[:1]]
@@ -183,6 +184,6 @@ class Rigs:
 def _apart(
     places: Float[ndarray, "*#k 4 4"], others: Float[ndarray, "*#k 4 4"]
 ) -> tuple[Float[ndarray, "..."], Float[ndarray, "..."]]:
-    """Distance (m) and angle (rad) between places, which broadcast."""
+    """Return distance (m) and angle (rad) between poses, which broadcast."""
     step = step_between(places, others)
     return np.linalg.norm(step[..., :3], axis=-1), np.linalg.norm(step[..., 3:], axis=-1)
