@@ -18,7 +18,7 @@ def test_chi_squared_is_that_of_scipy(name: str) -> None:
 
 
 def test_the_tail_of_f_is_that_of_scipy_down_to_nothing() -> None:
-    x = np.array([0.0, 1.0, 30.0, 1e9])
+    x = np.array([0.0, 1.0, 30.0, 1e3])
     np.testing.assert_allclose(f_distribution.logsf(x, 3, 200), stats.f.logsf(x, 3, 200), rtol=1e-8)
     # Beyond the smallest number the logarithm stays finite and keeps its order.
     values = f_distribution.logsf(np.array([1e5, 1e7, 1e9]), 3, 200)
