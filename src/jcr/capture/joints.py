@@ -84,11 +84,11 @@ def read_arm(options: ReadOptions) -> RecordedArm:
             raise InputError(f"{file}: {option} {given}; its links are {', '.join(urdf.link_map)}")
     chain = joints_to(urdf, str(options.gripper_frame))
     parents = [joint.parent for joint in chain]
-    if base not in parents:
+    if base not in parents and base != options.gripper_frame:
         raise InputError(
             f"{file}: no joints lead from {base} to {options.gripper_frame}; name the robot's base with --base-frame"
         )
-    chain = chain[parents.index(base) :]
+    chain = chain[parents.index(base) :] if base in parents else []
     moving = [joint for joint in chain if joint.type != "fixed"]
     if other := [joint for joint in moving if joint.type not in ("revolute", "continuous", "prismatic")]:
         raise InputError(
