@@ -121,7 +121,8 @@ class LiveFolder:
         """
         size = (image.shape[1], image.shape[0])
         if self.size is not None and self.size != size:
-            raise other_size("the camera's image", size, self.size, str(self.folder))
+            remedy = "set its old resolution or name a new folder"
+            raise other_size("the camera's image", size, self.size, f"those in {self.folder}", remedy)
         if self.intrinsics is not None:
             read_intrinsics(self.intrinsics, size, self.folder / FILE)
         stem = f"{self._next_number:03d}"
