@@ -335,9 +335,43 @@ def _link(named: re.Match[str]) -> str:
     return f"([{named[1]}](../{file.parent.name}/{file.name}))"
 
 
+FINDINGS = """\
+# Findings
+
+`calibration.json`, and `cameras.json` for each further camera, list `findings` as data, strongest first.
+The `verdict` is that of the strongest:
+
+| severity | verdict | exit status |
+|---|---|---|
+| `rejects` | rejected | 3 |
+| `warns` | accepted with warnings | 0 |
+| `informs` | accepted | 0 |
+
+Among findings of one severity, causes come before their consequences. Fields of a finding:
+
+| field | meaning |
+|---|---|
+| `kind` | one of the kinds below; programs read this field, not the sentence |
+| `images`, `joints` | images and joints (the first joint is 1) that it concerns; empty where it concerns all or none |
+| `value`, `std` | size with its standard deviation, in the unit given below |
+| `p` | chance of this value or a larger one without a fault |
+| `shift` | change of the calibration if the fault were modelled, in the order of `uncertainty.order`; its \
+outer product is part of the covariance and of `uncertainty.budget.faults` |
+| `intrinsics_shift` | the same for the intrinsics, in the order of `uncertainty.joint.order`; null where \
+only the transform changes |
+| `concerns` | what the remedy changes: `reconstruction`, `motion`, `images`, `intrinsics`, `poses`, \
+`mount`, `robot` or `none` |
+| `details` | further numbers in m, rad, px or shares of 1, and names |
+| `text`, `remedy` | one sentence each, made of the other fields |
+
+`warnings`, `notes`, `converged` and `observability.advice` are made of the findings. Below,
+each kind has its message, with … for numbers and names."""
+"""Introduction of the page of the findings."""
+
+
 def findings_page() -> str:
-    """Return the page of the findings: the introduction by hand, then each kind from its row of the table."""
-    parts = [(REFERENCE / "findings.md").read_text("utf-8").partition("\n## ")[0].rstrip()]
+    """Return the page of the findings: the introduction, then each kind from its row of the table."""
+    parts = [FINDINGS]
     for group, title in GROUPS.items():
         parts += ["", f"## {title}"]
         for kind in FindingKind:

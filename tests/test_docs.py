@@ -19,6 +19,7 @@ from benchmarks.__main__ import Arguments as BenchArguments
 from jcr.cli import COMMANDS, dispatch
 from jcr.cli.usage import parsed
 from jcr.errors import InputError
+from jcr.findings import FindingKind
 from jcr.pages import page as page_named
 from jcr.pages import pages
 from places import ROOT
@@ -26,7 +27,7 @@ from simulation.__main__ import Arguments as SimulationArguments
 
 SOURCE = ROOT / "src" / "jcr"
 # Pages of results show the command of the day on which they were measured.
-MADE = {"api.md", "cli.md", "formats.md"}
+MADE = {"api.md", "cli.md", "findings.md", "formats.md"}
 MANUAL = [
     page
     for page in sorted((ROOT / "docs").rglob("*.md"))
@@ -118,8 +119,8 @@ def test_pages_of_the_reference_are_made_from_the_source():
     assert all(f"## jcr {name}" in made["cli.md"] for name in COMMANDS)
     assert all(f"## jcr.{name}" in made["api.md"] for name in jcr.__all__)
     assert "| `gripper_from_camera`" in made["formats.md"]
-    for name in ("backends.md", "findings.md"):
-        assert made[name] == (ROOT / "docs" / "reference" / name).read_text()
+    assert all(f"### `{kind}`" in made["findings.md"] for kind in FindingKind)
+    assert made["backends.md"] == (ROOT / "docs" / "reference" / "backends.md").read_text()
 
 
 def test_pages_are_printed_and_listed(capsys: pytest.CaptureFixture[str]):

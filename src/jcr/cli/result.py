@@ -60,7 +60,7 @@ def _next_commands(result: "RunResult | SavedRun | PosesResult") -> str:
     out, has_images = shlex.quote(str(result.out)), not isinstance(result, PosesResult)
     if not result.converged:
         source = RunFolder(result.out).state().capture if has_images else "CAPTURE"
-        commands = (f"jcr check {shlex.quote(source)}", "jcr docs findings", "jcr docs captures")
+        commands = (f"jcr check {shlex.quote(source)}", "jcr docs troubleshooting", "jcr docs captures")
     else:
         shown = f"jcr view {out}" if RunFolder(result.out).has_map() else f"jcr export {out} urdf"
         test = f"jcr verify {out} NEW_IMAGES" if has_images else f"jcr compare {out} OTHER"
