@@ -216,7 +216,7 @@ def test_in_a_browser(viewer: "Viewer", tmp_path: Path):
             rows, columns = np.nonzero(
                 minimum_filter(drawn, 3)[200:, 320:450]
             )  # of the table, left of the panel
-        assert "coloured by label" in chromium.js("document.body.innerText")
+        assert "Sphere to drag" in chromium.js("document.body.innerText")
 
         viewer.clicked.content = "not yet"
         middle = len(rows) // 2
