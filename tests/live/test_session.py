@@ -223,7 +223,7 @@ def test_a_full_disk_refuses_the_image_and_the_capture_goes_on(
         (lambda first, k: first, "stream frozen"),
         (
             lambda first, k: cv2.resize(np.roll(first, 9, 0), (320, 160)),
-            "c of 640x480 pixels; set its old resolution",
+            "c of 640x480; set its old resolution",
         ),
         (lambda first, k: np.roll(first, 9, 0)[: 480 - k % 2], "size of the camera's images changes"),
     ],
