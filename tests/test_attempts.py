@@ -19,6 +19,7 @@ from jcr.errors import InputError, RejectedError
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import rotation_exp, transform
+from jcr.pipeline import selection
 from jcr.reconstruct import Backend, ReconstructOptions
 from jcr.records import Capture, HandEye, Intrinsics, Pointmaps, Reconstruction, Tracks
 from simulation.problems import HandEyeProblem, hand_eye_problem
@@ -37,7 +38,7 @@ GARBAGE = {
 def quick(monkeypatch: pytest.MonkeyPatch):
     """The search for other readings of the poses takes seconds and is tested elsewhere, and there are no images."""
     monkeypatch.setattr(capture_checks, "better_reading", lambda *_: None)
-    monkeypatch.setattr(attempts, "view_findings", lambda _: ())
+    monkeypatch.setattr(selection, "view_findings", lambda _: ())
 
 
 @pytest.fixture
@@ -46,7 +47,7 @@ def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     names: set[str] = set()
     monkeypatch.setattr(Backend, "has_weights", lambda self: not self.hub_id or self.name in names)
     monkeypatch.setattr(Backend, "is_installed", lambda self: True)
-    monkeypatch.setattr(backends, "_has_xfeat", lambda: "xfeat" in names)
+    monkeypatch.setattr(backends, "xfeat_is_installed", lambda: "xfeat" in names)
     return names
 
 
@@ -87,9 +88,9 @@ def capture_of(problem: HandEyeProblem) -> Capture:
 
 def chosen(problem: HandEyeProblem, poses: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> HandEye:
     """What COLMAP's calibration is, of the first images, that have these camera poses."""
-    monkeypatch.setattr(attempts, "reconstruct", lambda *_: reconstruction("colmap", poses))
+    monkeypatch.setattr(selection, "reconstruct", lambda *_: reconstruction("colmap", poses))
     options = ReconstructOptions(backend="colmap")
-    return attempts.choose(capture_of(problem), options, CalibrateOptions()).hand_eye
+    return selection.choose(capture_of(problem), options, CalibrateOptions()).hand_eye
 
 
 def auto_result(
@@ -108,8 +109,8 @@ def auto_result(
             raise answer
         return reconstruction(options.backend, answer, observations)
 
-    monkeypatch.setattr(attempts, "reconstruct", answered)
-    choice = attempts.choose(capture_of(problem), ReconstructOptions(), CalibrateOptions())
+    monkeypatch.setattr(selection, "reconstruct", answered)
+    choice = selection.choose(capture_of(problem), ReconstructOptions(), CalibrateOptions())
     assert [attempt.backend for attempt in choice.attempts] == tried
     kept = [attempt for attempt in choice.attempts if attempt.why_not is None]
     assert [attempt.backend for attempt in kept] == [choice.reconstruction.backend]
@@ -185,7 +186,7 @@ def test_of_two_that_are_rejected_the_one_that_shows_the_cause_is_kept(
             uncertain, intrinsics
         ),
     }
-    monkeypatch.setattr(attempts, "calibrate", lambda _, made, __: of_backend[made.backend])
+    monkeypatch.setattr(selection, "calibrate", lambda _, made, __: of_backend[made.backend])
     poses = problem.recon_from_camera
     kept, tried = auto_result(problem, {"mast3r": poses, "colmap": poses}, monkeypatch)
     assert tried == ["mast3r", "colmap"] and kept.backend == "colmap"
@@ -218,7 +219,7 @@ def test_what_plenty_of_features_reject_colours_do_not_accept(
 ):
     """Direct alignment tests no camera: a stronger fault, which features reject, would get the less honest answer."""
     present |= {"xfeat", "da3"}
-    monkeypatch.setattr(attempts, "TEXTURED", 10)
+    monkeypatch.setattr(selection, "TEXTURED", 10)
     problem = hand_eye_problem(np.random.default_rng(3), 8)
     good = problem.recon_from_camera
     shuffled = good[np.random.default_rng(4).permutation(8)]
@@ -264,8 +265,8 @@ def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
         now_s[0] += 3.0
         return calibration_stage.calibrate(*arguments)
 
-    monkeypatch.setattr(attempts, "reconstruct", door)
-    monkeypatch.setattr(attempts, "calibrate", slow)
+    monkeypatch.setattr(selection, "reconstruct", door)
+    monkeypatch.setattr(selection, "calibrate", slow)
     result = calibrate(capture, tmp_path)
     content = json.loads((tmp_path / "calibration.json").read_text())
     colmap, direct = content["attempts"]
@@ -300,7 +301,7 @@ def test_where_nothing_is_found_each_attempt_reports_why(
     def door(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
         raise RejectedError(f"{options.backend} saw nothing")
 
-    monkeypatch.setattr(attempts, "reconstruct", door)
+    monkeypatch.setattr(selection, "reconstruct", door)
     with pytest.raises(RejectedError, match="direct saw nothing; back end colmap failed"):
         calibrate(read_capture(tabletop), tmp_path)
     tried = RunFolder(tmp_path).calibration().attempts
@@ -327,8 +328,8 @@ def test_input_that_calibration_cannot_use_is_no_reason_for_another_back_end(
         made.append(options.backend)
         return reconstruction(options.backend, problem.recon_from_camera)
 
-    monkeypatch.setattr(attempts, "reconstruct", door)
-    monkeypatch.setattr(attempts, "densify", without_surface)
+    monkeypatch.setattr(selection, "reconstruct", door)
+    monkeypatch.setattr(selection, "densify", without_surface)
     lost = CalibrateOptions(known_length=(capture.images[0], 0.0, 0.0, 9.0, 9.0, 50.0))
     with pytest.raises(InputError, match="no surface was found"):
         calibrate(capture, tmp_path / "auto", RunOptions(calibrate=lost))
@@ -360,20 +361,20 @@ def test_a_known_length_ends_on_surfaces_and_nothing_else_needs_depth_before_the
         "reconstruct",
         lambda _, options, __: reconstruction(options.backend, answers[options.backend]),
     )
-    monkeypatch.setattr(attempts, "densify", deeper)
+    monkeypatch.setattr(selection, "densify", deeper)
     names = tuple(f"{k:02d}.png" for k in range(8))
     capture = Capture(
         folder=Path(), images=names, base_from_gripper=problem.base_from_gripper, image_size=(640, 480)
     )
     chosen = []
-    choice = attempts.choose(
+    choice = selection.choose(
         capture, ReconstructOptions(), CalibrateOptions(), None, lambda made: chosen.append(made)
     )
     assert not densified and chosen == [choice.reconstruction] and choice.reconstruction.pointmaps is None
     for length, why in (("nowhere.png", "nowhere"), ("00.png", "no surface was found")):
         lost = CalibrateOptions(known_length=(length, 0.0, 0.0, 9.0, 9.0, 50.0))
         with pytest.raises(InputError, match=why):
-            attempts.choose(capture, ReconstructOptions(), lost)
+            selection.choose(capture, ReconstructOptions(), lost)
     assert densified == ["colmap", "colmap"]
 
 

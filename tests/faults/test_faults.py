@@ -30,7 +30,7 @@ from jcr.cli import dispatch
 from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import forward_kinematics
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
-from jcr.pipeline import run, run_folder
+from jcr.pipeline import run, run_folder, selection
 from jcr.pipeline.run_folder import RunFolder
 from jcr.records import Capture, Reconstruction
 from simulation.faults import Faults, faulty_capture, reconstructed
@@ -523,7 +523,7 @@ def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(
     out = tmp_path / "out"
     shutil.copytree(done, out)
     kept = RunFolder(done).reconstruction()
-    monkeypatch.setattr(attempts, "reconstruct", lambda *_: kept)
+    monkeypatch.setattr(selection, "reconstruct", lambda *_: kept)
 
     def killed(*_) -> None:
         raise KeyboardInterrupt
