@@ -186,7 +186,7 @@ def test_a_thin_prism_becomes_part_of_the_intrinsics():
 
 def test_an_unmeasured_prism_of_estimated_intrinsics_is_within_sigma():
     """Here the prism hides in the tangential distortion: the pair places points alike, and ± says how far X is off."""
-    found, hand_eye = calibrated(NAMED["thin prism"][0], 3, estimated=True)
+    found, hand_eye = calibrated(NAMED["thin prism"][0], 3, given=False)
     step = step_between(hand_eye.gripper_from_camera, found.gripper_from_camera)
     assert np.degrees(np.linalg.norm(step[3:])) > 1.0 and outcome(found, hand_eye).is_sound
     camera = hand_eye.intrinsics

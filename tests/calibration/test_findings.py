@@ -17,7 +17,7 @@ from jcr.calibration.verdict import with_findings
 from jcr.calibration.words import summary
 from jcr.errors import InputError
 from jcr.estimation.hand_eye import solve_hand_eye
-from jcr.findings import Finding, FindingKind, remedy, sentence, text
+from jcr.findings import Finding, FindingKind, kinds_of, remedy, sentence, text
 from jcr.findings.table import GROUPS
 from jcr.geometry import rotation_exp, transform
 from jcr.records import Capture, HandEye, Intrinsics, PosePairs, Reconstruction, Tracks

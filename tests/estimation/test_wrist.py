@@ -6,6 +6,7 @@ from scipy.stats import chi2
 
 import jcr
 from jcr.camera import parameters, with_parameters
+from jcr.estimation import solve
 from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.intrinsics_prior import ESTIMATED, MEASURED, camera_with_prior
 from jcr.estimation.solve import Solution
@@ -117,6 +118,13 @@ def test_intrinsics_go_as_far_from_what_was_given_as_their_standard_deviation_le
     ]
     assert sigmas[1] < 3 < sigmas[0]
     assert usual.budget.intrinsics[2, 2] > 0 and not exact.budget.intrinsics.any()
+
+
+def counted(monkeypatch) -> list[int]:
+    """Return a list that has one more entry for each time that images are linearised."""
+    calls, linearised = [], solve.linearised
+    monkeypatch.setattr(solve, "linearised", lambda *given: (calls.append(1), linearised(*given))[1])
+    return calls
 
 
 def test_an_adjustment_that_begins_near_ends_where_one_from_poses_does(monkeypatch):
