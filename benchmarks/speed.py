@@ -165,13 +165,13 @@ def colmap_alone(place: str) -> None:
 def run_by_stage(place: str) -> None:
     """Run all stages in a process of its own, and write the processor seconds of each into stages.json."""
     import jcr
-    from jcr.pipeline import stages
+    from jcr.pipeline import selection, stages
     from jcr.report import html
 
     spent: dict[str, float] = dict.fromkeys(STAGES, 0.0)
     parts = (
-        (attempts, "reconstruct", "reconstruct"),
-        (attempts, "calibrate", "calibrate"),
+        (selection, "reconstruct", "reconstruct"),
+        (selection, "calibrate", "calibrate"),
         (stages, "densify", "densify"),
         (stages, "mapped", "map"),
         (html, "report_html", "report"),

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jcr.reconstruct.reconstruction_npz import read_reconstruction
 
 from benchmarks.cameras import COUNT, answered, wanted
 from benchmarks.faults import IMAGES, OBSERVED, calibrated
@@ -24,6 +23,7 @@ from jcr.capture.read import read_capture
 from jcr.estimation.arms import arm_named
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.geometry import step_between
+from jcr.reconstruction_npz import read_reconstruction
 from jcr.records import HandEye
 from simulation.boards import Sheet, with_sheet
 from simulation.cells import Kind, cell_problem
