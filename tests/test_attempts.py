@@ -357,7 +357,7 @@ def test_a_known_length_ends_on_surfaces_and_nothing_else_needs_depth_before_the
         return without_surface(capture, made)
 
     monkeypatch.setattr(
-        attempts,
+        selection,
         "reconstruct",
         lambda _, options, __: reconstruction(options.backend, answers[options.backend]),
     )
