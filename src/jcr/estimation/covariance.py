@@ -196,12 +196,17 @@ def budget_of(parts: Sequence[Float[ndarray, "_ _"]], covariance: Float[ndarray,
     parts = [part[:7, :7] for part in parts]
     to_whole = _between(sum(parts[1:], parts[0]), covariance[:7, :7])
     random, systematic, intrinsics, _ = (to_whole @ part @ to_whole.T for part in parts)
+    images = covariance[:7, :7] - random - systematic - intrinsics
+    # With degenerate motions the numbers are so large that rounding leaves the products unsymmetric.
+    random, systematic, intrinsics, images = (
+        (part + part.T) / 2 for part in (random, systematic, intrinsics, images)
+    )
     return Budget(
         robot_random=random,
         robot_systematic=systematic,
         intrinsics=intrinsics,
         # Unobservable directions are in it, and the rounding of their large numbers.
-        images=covariance[:7, :7] - random - systematic - intrinsics,
+        images=images,
         faults=np.zeros((7, 7)),
     )
 
