@@ -38,7 +38,8 @@ def adjusted(case: Case) -> Case:
 
     A rejected fit is replaced too: without intrinsics the fit from poses alone is poor, and the adjustment is not. On
     correspondences between pointmaps, whose errors neighbours share, it is replaced only where the leave-one-out error
-    becomes smaller. The case stays as it is where the adjustment fails because points lie behind the cameras.
+    becomes smaller. The fit stays where the motions leave a direction unobservable, which images do not change, and
+    where the adjustment fails because points lie behind the cameras.
     """
     if not case.is_adjustable:
         return _considered(case)
@@ -48,6 +49,8 @@ def adjusted(case: Case) -> Case:
     except np.linalg.LinAlgError:
         return case
     case = replace(case, adjusted=found)
+    if not case.hand_eye.observability.observable:
+        return case
     refined = judged(refined_by(case, found))
     nearer, than = refined.leave_one_out, case.hand_eye.leave_one_out
     if case.tracks.from_pointmaps and (nearer is None or than is None or nearer.length_m >= than.length_m):
