@@ -23,10 +23,10 @@ from jcr.features.kept import FOLDER
 from jcr.geometry import apply, inverse, retract, rotation_angle, step_between
 from jcr.live.calibration import LiveCalibration
 from jcr.live.progress import Progress
-from jcr.pipeline.results import RunResult
 from jcr.pipeline.run import calibrate
-from jcr.pipeline.run_folder import LIVE
 from jcr.records import Intrinsics
+from jcr.results import RunResult
+from jcr.run_folder import LIVE
 from simulation.arms import (
     EFFECTIVE_POSES,
     PRESETS,

@@ -9,10 +9,10 @@ import numpy as np
 from benchmarks.page import mm_deg, table
 from jcr.capture.read import read_capture
 from jcr.geometry import fit_similarity
-from jcr.pipeline.results import RunResult
 from jcr.pipeline.run import RunOptions
 from jcr.pipeline.run import run as run_all
 from jcr.reconstruct import ReconstructOptions
+from jcr.results import RunResult
 from simulation.capture import SimulateOptions, simulate
 from simulation.pairs import pairs_of_capture, write_pairs
 from simulation.problems import HandEyeProblem, error

@@ -37,10 +37,10 @@ from jcr.geometry import (
     step_between,
     transform,
 )
-from jcr.pipeline.results import RunResult
 from jcr.pipeline.run import RunOptions, calibrate
 from jcr.reconstruct import ReconstructOptions
 from jcr.records import Capture, HandEye, Intrinsics, coefficients_of
+from jcr.results import RunResult
 
 FEWEST_IMAGES, FEWEST_CORNERS, WORST_PX = 3, 4, 2.0
 """Fewest images of a corner and corners of an image; rms misfit above which an image shows another thing."""

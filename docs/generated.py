@@ -26,9 +26,9 @@ from jcr.depth.depth_npz import About as DepthAbout
 from jcr.findings import FindingKind
 from jcr.findings.table import GROUPS, Row
 from jcr.pages import pages
-from jcr.pipeline.run_folder import State
 from jcr.reconstruct import BACKENDS
 from jcr.reconstruction_npz import About
+from jcr.run_folder import State
 
 REFERENCE = Path(__file__).parent / "reference"
 SCHEMAS = REFERENCE / "schemas"

@@ -29,9 +29,9 @@ from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError, RejectedError
 from jcr.live.folder import LiveFolder
 from jcr.live.server import sample_pose
-from jcr.pipeline.run_folder import RunFolder
 from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Capture
+from jcr.run_folder import RunFolder
 from jcr.segments.labels import _read_names
 from simulation.problems import hand_eye_problem
 from simulation.ros_bag import write_bag

@@ -18,7 +18,7 @@ from fuzz_targets import sound_run
 from jcr.capture.images import encode_png
 from jcr.capture.options import ReadOptions
 from jcr.options import checked_options
-from jcr.pipeline.results import RunOptions
+from jcr.results import RunOptions
 
 
 def python(code: str) -> subprocess.CompletedProcess[str]:

@@ -247,7 +247,7 @@ def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
 ):
     from jcr.capture.read import read_capture
     from jcr.pipeline.run import calibrate
-    from jcr.pipeline.run_folder import RunFolder
+    from jcr.run_folder import RunFolder
 
     problem = hand_eye_problem(np.random.default_rng(3), 12)
     capture = replace(read_capture(tabletop), base_from_gripper=problem.base_from_gripper)
@@ -296,7 +296,7 @@ def test_where_nothing_is_found_each_attempt_reports_why(
 ):
     from jcr.capture.read import read_capture
     from jcr.pipeline.run import calibrate
-    from jcr.pipeline.run_folder import RunFolder
+    from jcr.run_folder import RunFolder
 
     def door(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
         raise RejectedError(f"{options.backend} saw nothing")
@@ -319,7 +319,7 @@ def test_input_that_calibration_cannot_use_is_no_reason_for_another_back_end(
 ):
     from jcr.capture.read import read_capture
     from jcr.pipeline.run import RunOptions, calibrate
-    from jcr.pipeline.run_folder import RunFolder
+    from jcr.run_folder import RunFolder
 
     problem = hand_eye_problem(np.random.default_rng(3), 12)
     capture, made = read_capture(tabletop), []

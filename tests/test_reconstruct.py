@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from jcr import reconstruct as backends
+from jcr import run_folder
 from jcr.calibration.options import CalibrateOptions
 from jcr.cli import dispatch
 from jcr.errors import InputError
-from jcr.pipeline import run_folder
 from jcr.reconstruct import (
     BACKENDS,
     Backend,

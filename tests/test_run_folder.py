@@ -14,10 +14,10 @@ from fuzz_targets import sound_run
 from jcr.calibration.options import CalibrateOptions
 from jcr.cli import call, dispatch
 from jcr.errors import InputError
-from jcr.pipeline.results import RunOptions
-from jcr.pipeline.run_folder import MadeWith, RunFolder, state_of
 from jcr.reconstruct import ReconstructOptions
 from jcr.records import Capture, CellCamera
+from jcr.results import RunOptions
+from jcr.run_folder import MadeWith, RunFolder, state_of
 
 
 @pytest.fixture(scope="module")

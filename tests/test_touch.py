@@ -8,8 +8,8 @@ import pytest
 
 from jcr.cli import dispatch
 from jcr.errors import InputError
-from jcr.pipeline.run_folder import RunFolder
 from jcr.pipeline.touch import touch
+from jcr.run_folder import RunFolder
 
 pytestmark = pytest.mark.slow
 

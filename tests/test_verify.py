@@ -23,9 +23,9 @@ from jcr.estimation.solve import solve
 from jcr.estimation.systematic import arm_errors, posed, smooth_errors
 from jcr.estimation.wrist import pose_problem
 from jcr.geometry import inverse, rotation_exp, scale_translation, transform
-from jcr.pipeline.run_folder import MadeWith, RunFolder, state_of
 from jcr.reconstruct import ReconstructOptions
 from jcr.records import Capture, Reconstruction, Tracks
+from jcr.run_folder import MadeWith, RunFolder, state_of
 from jcr.sfm.register import register
 from simulation.problems import bent_problem
 from simulation.taken import with_robot_noise

@@ -22,9 +22,9 @@ from jcr.errors import InputError, RejectedError
 from jcr.findings import Finding, FindingKind, sentence
 from jcr.geometry import inverse, scale_translation, step_between
 from jcr.pipeline import run, stages
-from jcr.pipeline.results import PosesResult, RunOptions
 from jcr.records import HandEye, PosePairs
 from jcr.report.html import poses_report_html
+from jcr.results import PosesResult, RunOptions
 from simulation.problems import HandEyeProblem, disturbed, hand_eye_problem
 
 DISAGREE = Finding(

@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from jcr import run_folder
 from jcr.calibration.calibration_json import read_calibration
 from jcr.calibration.checks import capture as capture_checks
 from jcr.calibration.stage import calibrate
@@ -30,9 +31,9 @@ from jcr.cli import dispatch
 from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import forward_kinematics
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
-from jcr.pipeline import run, run_folder, selection
-from jcr.pipeline.run_folder import RunFolder
+from jcr.pipeline import run, selection
 from jcr.records import Capture, Reconstruction
+from jcr.run_folder import RunFolder
 from simulation.faults import Faults, faulty_capture, reconstructed
 from simulation.problems import hand_eye_problem
 

@@ -15,8 +15,8 @@ from safetensors.numpy import load_file
 
 from jcr.calibration.calibration_json import read_calibration
 from jcr.cli import dispatch, main
-from jcr.pipeline.run_folder import RunFolder
 from jcr.reconstruction_npz import read_reconstruction
+from jcr.run_folder import RunFolder
 from jcr.scene.cloud_ply import read_cloud
 from jcr.scene.map_file import load_map
 

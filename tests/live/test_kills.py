@@ -17,7 +17,7 @@ import jcr
 from jcr.capture.images import read_image
 from jcr.live.calibration import LiveCalibration
 from jcr.live.folder import LiveFolder
-from jcr.pipeline.run_folder import LIVE
+from jcr.run_folder import LIVE
 
 pytestmark = pytest.mark.slow
 

@@ -35,7 +35,6 @@ from jcr.findings import no_reconstruction
 from jcr.findings.sentences import worst_direction
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.intrinsics_json import IntrinsicsAndStd
-from jcr.pipeline.results import RunResult
 from jcr.records import (
     COVARIANCE_ORDER,
     BoardFound,
@@ -51,6 +50,7 @@ from jcr.report.html import failed_report_html, report_html
 from jcr.report.images import MAGNIFIED, reprojections_px
 from jcr.report.motion import excitation_bars
 from jcr.report.sketch import sketch
+from jcr.results import RunResult
 from jcr.rounding import decimals_of, significant
 from jcr.scene.cloud import point_cloud
 from jcr.scene.options import MapOptions

@@ -19,8 +19,8 @@ from chromium import Chromium
 from jcr.camera import project
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse
-from jcr.pipeline.run_folder import RunFolder
 from jcr.records import Capture
+from jcr.run_folder import RunFolder
 from jcr.viewer.robot import read_robot
 from simulation.truth import Truth, read_truth
 from waiting import until

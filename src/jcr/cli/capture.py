@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from jcr.live.robot import States
     from jcr.live.server import Listen, LiveServer
     from jcr.live.session import Answer, LiveSession
-    from jcr.pipeline.results import RunResult
+    from jcr.results import RunResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +84,7 @@ def main(arguments: Arguments) -> int:
     from jcr.live.folder import LiveFolder
     from jcr.live.server import LiveServer
     from jcr.live.session import LiveSession
-    from jcr.pipeline.run_folder import locked
+    from jcr.run_folder import locked
 
     options = arguments.session
     if options.until_accurate and options.require is None:

@@ -32,7 +32,7 @@ def main(arguments: Arguments) -> int:
     """Print the sizes; 3 when the calibration they rest on is rejected."""
     from jcr.errors import RejectedError
     from jcr.pipeline.run import measure
-    from jcr.pipeline.run_folder import RunFolder
+    from jcr.run_folder import RunFolder
 
     measured = measure(arguments.out)
     arguments.output.result(table(measured), content(measured))

@@ -8,7 +8,7 @@ from jcr.cli.output import Output, warn
 from jcr.errors import RejectedError
 
 if TYPE_CHECKING:
-    from jcr.pipeline.results import PosesResult, RunResult, SavedRun
+    from jcr.results import PosesResult, RunResult, SavedRun
 
 
 def show_calibration(result: "RunResult | SavedRun | PosesResult", output: Output) -> None:
@@ -28,7 +28,7 @@ def show(result: "RunResult | SavedRun | PosesResult", output: Output, after: st
     from jcr.calibration.words import verdict_in_words
     from jcr.cell.placement import in_words
     from jcr.findings import sentence
-    from jcr.pipeline.results import PosesResult
+    from jcr.results import PosesResult
 
     content, cameras = result.calibration, getattr(result, "cameras", None)
     facts, text = content.model_dump(), ""
@@ -54,8 +54,8 @@ def show(result: "RunResult | SavedRun | PosesResult", output: Output, after: st
 
 def _next_commands(result: "RunResult | SavedRun | PosesResult") -> str:
     """Three commands that make sense now, a line each."""
-    from jcr.pipeline.results import PosesResult
-    from jcr.pipeline.run_folder import RunFolder
+    from jcr.results import PosesResult
+    from jcr.run_folder import RunFolder
 
     out, has_images = shlex.quote(str(result.out)), not isinstance(result, PosesResult)
     if not result.converged:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 from jcr.capture.options import ReadOptions
 
 if TYPE_CHECKING:
-    from jcr.pipeline.results import RunOptions
     from jcr.progress import Progress
     from jcr.records import Capture, PosePairs
+    from jcr.results import RunOptions
 
 
 def _announce(path: Path) -> None:
@@ -27,7 +27,7 @@ def source(path: Path, options: ReadOptions, out: Path, progress: "Progress") ->
     """What lies at a path, a recording's frames put in the run folder `out`; remarks of the reader on stderr."""
     _announce(path)
     from jcr.capture.read import read_source
-    from jcr.pipeline.run_folder import CAPTURE, locked
+    from jcr.run_folder import CAPTURE, locked
 
     with locked(out):
         found = read_source(path, options, into=out / CAPTURE, progress=progress)
@@ -38,7 +38,7 @@ def source(path: Path, options: ReadOptions, out: Path, progress: "Progress") ->
 
 def run_options(arguments: Any, **chosen: Any) -> "RunOptions":
     """The options of the stages among a command's arguments, `chosen` ones in their place."""
-    from jcr.pipeline.results import RunOptions
+    from jcr.results import RunOptions
 
     given = {
         one.name: getattr(arguments, one.name) for one in fields(RunOptions) if hasattr(arguments, one.name)

@@ -35,8 +35,8 @@ class Arguments:
 def main(arguments: Arguments) -> int:
     """Serve the page until Ctrl-C."""
     from jcr.extras import extra
-    from jcr.pipeline.run_folder import RunFolder
     from jcr.progress import progress_bars
+    from jcr.run_folder import RunFolder
 
     folder = RunFolder(arguments.out)
     folder.calibration()  # raises at once where there is none

@@ -18,7 +18,7 @@ from jcr.export.provenance import Provenance
 from jcr.files import write_text
 from jcr.geometry import transform
 from jcr.options import checked_options
-from jcr.pipeline.run_folder import RunFolder
+from jcr.run_folder import RunFolder
 
 if TYPE_CHECKING:
     from jcr.calibration.calibration_json import CalibrationFile

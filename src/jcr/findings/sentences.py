@@ -10,7 +10,7 @@ from jcr.rounding import significant, with_std
 
 if TYPE_CHECKING:
     from jcr.findings.finding import Finding
-    from jcr.records.requirement import Requirement
+    from jcr.findings.requirement import Requirement
 
 SHORT = "not as exact as needed"
 SURE = 4.0

@@ -41,7 +41,7 @@ from jcr.records import Capture, HandEye, Intrinsics, Reconstruction, Tracks
 from jcr.sfm.growing import Growing
 
 if TYPE_CHECKING:
-    from jcr.pipeline.results import RunResult
+    from jcr.results import RunResult
 
 HISTORY = "live/history.json"
 """File in the folder of the capture with the accuracy after each image."""
@@ -79,7 +79,7 @@ class LiveCalibration:
         self._opened = ExitStack()
         if not isinstance(folder, LiveFolder):
             if exclusive:
-                from jcr.pipeline.run_folder import locked
+                from jcr.run_folder import locked
 
                 self._opened.enter_context(locked(Path(folder)))
             given = None if intrinsics is None else intrinsics_as_json(intrinsics)
@@ -150,9 +150,9 @@ class LiveCalibration:
 
         `out` is the run folder; None: the folder `result` of the capture. Raises as `jcr.calibrate` does.
         """
-        from jcr.pipeline.results import RunOptions
         from jcr.pipeline.run import calibrate
-        from jcr.pipeline.run_folder import LIVE
+        from jcr.results import RunOptions
+        from jcr.run_folder import LIVE
 
         with self._lock:
             options = RunOptions(calibrate=self._options)

@@ -24,7 +24,7 @@ from jcr.live.terminal import Action
 
 if TYPE_CHECKING:
     from jcr.live.calibration import LiveCalibration
-    from jcr.pipeline.results import RunResult
+    from jcr.results import RunResult
 
 SAME_PLACE = (0.005, np.radians(1.0))
 """m, rad: a second image from within this adds nothing."""

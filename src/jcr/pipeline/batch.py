@@ -23,9 +23,9 @@ from jcr.extras import extra
 from jcr.files import write_text
 from jcr.findings import Verdict, sentence, verdict_of
 from jcr.pipeline.run import RunOptions, finished, run
-from jcr.pipeline.run_folder import CAPTURE, RunFolder, locked
 from jcr.progress import Progress, silent
 from jcr.report.render import render
+from jcr.run_folder import CAPTURE, RunFolder, locked
 
 RETRIES = 3
 """How often a task is started again whose Ray node died."""

@@ -9,10 +9,10 @@ from jcr.calibration.calibration_json import CalibrationFile
 from jcr.depth.measured import with_measured_depth
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError
-from jcr.pipeline.results import RunOptions, RunResult
 from jcr.progress import Progress
 from jcr.reconstruct import device_of
 from jcr.records import Capture, PointCloud
+from jcr.results import RunOptions, RunResult
 from jcr.scene.cloud import point_cloud
 from jcr.scene.map_file import require_packages
 from jcr.segments.measure import Measured, measure

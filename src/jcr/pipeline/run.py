@@ -24,12 +24,12 @@ from jcr.errors import InputError, RejectedError
 from jcr.extras import is_installed
 from jcr.options import checked_options
 from jcr.pipeline import stages
-from jcr.pipeline.results import PosesResult, RunOptions, RunResult, SavedRun, load_run
-from jcr.pipeline.run_folder import CAPTURE, REPORT, RunFolder, locked
 from jcr.pipeline.selection import NothingFoundError
 from jcr.progress import Progress, silent
 from jcr.reconstruct import BackendName, check_board
 from jcr.records import Capture, PosePairs
+from jcr.results import PosesResult, RunOptions, RunResult, SavedRun, load_run
+from jcr.run_folder import CAPTURE, REPORT, RunFolder, locked
 from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 

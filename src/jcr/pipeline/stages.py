@@ -14,11 +14,11 @@ from jcr.cell.carried import carried_scene, refined
 from jcr.cell.placement import CamerasFile
 from jcr.depth.densify import densify
 from jcr.findings import sentence
-from jcr.pipeline.results import RunOptions, RunResult
-from jcr.pipeline.run_folder import MOVING, RunFolder, State, state_of
 from jcr.pipeline.selection import NothingFoundError, Tried, again, choose, timings_of
 from jcr.progress import Progress
 from jcr.records import Attempt, Capture, CellCamera
+from jcr.results import RunOptions, RunResult
+from jcr.run_folder import MOVING, RunFolder, State, state_of
 
 
 def calibrated(capture: Capture, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:

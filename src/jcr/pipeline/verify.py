@@ -25,10 +25,10 @@ from jcr.estimation.wrist import pose_problem
 from jcr.findings import Verdict, sentence
 from jcr.geometry import Poses, step_between
 from jcr.options import checked_options
-from jcr.pipeline.run_folder import MadeWith, RunFolder
 from jcr.progress import Progress, silent
 from jcr.reconstruct import reconstruct
 from jcr.records import Capture, CellCamera, HandEye, PosePairs, Reconstruction
+from jcr.run_folder import MadeWith, RunFolder
 from jcr.sfm.register import register
 
 ROUNDING = 1e-9

@@ -4,9 +4,9 @@ Frames: `base`, `gripper`, `camera` (OpenCV optical: x right, y down, z forward)
 and unit). Pixel (0, 0) is the *centre* of the top-left pixel, as in OpenCV. Metres and radians.
 """
 
+from jcr.findings.requirement import *
 from jcr.records.assessed import *
 from jcr.records.calibration import *
 from jcr.records.capture import *
 from jcr.records.cloud import *
 from jcr.records.reconstruction import *
-from jcr.records.requirement import *

@@ -8,11 +8,11 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from jcr.findings import Finding, FindingKind, remedy, verdict_of
+from jcr.findings.requirement import Requirement
 from jcr.findings.sentences import unobservable
 from jcr.records.assessed import Assessed
 from jcr.records.capture import Intrinsics
 from jcr.records.notebook import table
-from jcr.records.requirement import Requirement
 
 
 @dataclass(frozen=True, kw_only=True)

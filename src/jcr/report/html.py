@@ -9,7 +9,6 @@ from jcr.capture.formats.capture_json import origin
 from jcr.capture.formats.table import TABLES
 from jcr.errors import printable
 from jcr.geometry import scale_translation
-from jcr.pipeline.results import PosesResult, RunResult
 from jcr.records import Capture
 from jcr.report.cell_cameras import cameras_section
 from jcr.report.details import Options, details_section
@@ -22,6 +21,7 @@ from jcr.report.scene3d import scene_section
 from jcr.report.seen import seen_section
 from jcr.report.transform import transform_section
 from jcr.report.verdict import failure_section, head, notes_section
+from jcr.results import PosesResult, RunResult
 from jcr.rounding import significant
 from jcr.scene.samples import sample_surface
 

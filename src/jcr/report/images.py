@@ -13,10 +13,10 @@ from numpy import ndarray
 from jcr.camera import is_distorted, project, resized, undistortion, unproject, without_distortion
 from jcr.capture.images import read_image
 from jcr.geometry import apply, inverse
-from jcr.pipeline.results import RunResult
 from jcr.records import Capture, ImageVerdict, Intrinsics, Reconstruction
 from jcr.report.raster import image_url
 from jcr.report.render import Section
+from jcr.results import RunResult
 from jcr.rounding import significant
 
 LARGEST, SMALLEST, PIXELS = 1024, 160, 6e6

@@ -8,9 +8,9 @@ import numpy as np
 
 from jcr.capture.conventions import CONVENTIONS, OF_ARM, numbers_from_poses, units_of
 from jcr.estimation.observability import WEAK
-from jcr.pipeline.results import PosesResult, RunResult
 from jcr.records import Excitation, NextPose
 from jcr.report.render import Section
+from jcr.results import PosesResult, RunResult
 from jcr.rounding import significant
 
 ANY_CONVENTION = "quat-xyzw"

@@ -6,10 +6,10 @@ import numpy as np
 
 from jcr.calibration.words import leave_one_out_text
 from jcr.geometry import step_between
-from jcr.pipeline.results import PosesResult, RunResult
 from jcr.records import HandEye
 from jcr.report.images import shown_names
 from jcr.report.render import Section
+from jcr.results import PosesResult, RunResult
 from jcr.rounding import significant
 
 NOTICEABLE = 1.05

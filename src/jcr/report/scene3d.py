@@ -12,11 +12,11 @@ from numpy import ndarray
 from jcr.cell.placement import CameraPlacement
 from jcr.cell.poses import base_from_camera as poses_of
 from jcr.geometry import apply_similarity, inverse
-from jcr.pipeline.results import RunResult
 from jcr.records import CellCamera, Intrinsics
 from jcr.report.images import image_numbers, shown_names
 from jcr.report.raster import TRACK_COLOR, label_colors
 from jcr.report.render import Section
+from jcr.results import RunResult
 from jcr.scene.samples import SurfacePoints, point_size
 
 POINTS = 60_000

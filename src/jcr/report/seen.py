@@ -10,10 +10,10 @@ from numpy import ndarray
 from jcr.calibration.seen import within_95
 from jcr.calibration.words import given_in_words, seen_in_words
 from jcr.capture.images import read_image
-from jcr.pipeline.results import RunResult
 from jcr.report.figures import Figure, Shape
 from jcr.report.raster import image_url
 from jcr.report.render import Section
+from jcr.results import RunResult
 from jcr.rounding import significant
 
 ACROSS = 640

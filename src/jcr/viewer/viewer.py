@@ -19,10 +19,10 @@ from jcr.capture.images import read_image
 from jcr.findings import sentence, verdict_of
 from jcr.findings.sentences import reached_in_words
 from jcr.geometry import apply, apply_similarity, scale_translation
-from jcr.pipeline.run_folder import RunFolder
 from jcr.progress import Progress, silent
 from jcr.report.raster import TRACK_COLOR, label_colors
 from jcr.report.render import render
+from jcr.run_folder import RunFolder
 from jcr.scene.samples import Slice, level_slice, sample_surface
 from jcr.scene.scene_map import SceneMap, Unknown
 from jcr.viewer.robot import read_robot

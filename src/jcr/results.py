@@ -16,9 +16,9 @@ from jcr.cell.placement import CamerasFile
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError
 from jcr.findings import Verdict, verdict_of
-from jcr.pipeline.run_folder import MadeWith, RunFolder
 from jcr.reconstruct import BACKENDS, ReconstructOptions, tries, with_cameras_of
 from jcr.records import Capture, HandEye, Intrinsics, PointCloud, PosePairs, Reconstruction
+from jcr.run_folder import MadeWith, RunFolder
 from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
