@@ -32,10 +32,10 @@ from .live.session import LiveSession as LiveSession
 from .live.session import SessionOptions as SessionOptions
 from .pipeline.check import Examination as Examination
 from .pipeline.check import check_capture as check_capture
-from .pipeline.results import RunOptions as RunOptions
-from .pipeline.results import RunResult as RunResult
-from .pipeline.results import SavedRun as SavedRun
-from .pipeline.results import load_run as load_run
+from .results import RunOptions as RunOptions
+from .results import RunResult as RunResult
+from .results import SavedRun as SavedRun
+from .results import load_run as load_run
 from .pipeline.run import add_camera as add_camera
 from .pipeline.run import build_map as build_map
 from .pipeline.run import calibrate as calibrate
