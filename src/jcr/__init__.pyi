@@ -32,10 +32,6 @@ from .live.session import LiveSession as LiveSession
 from .live.session import SessionOptions as SessionOptions
 from .pipeline.check import Examination as Examination
 from .pipeline.check import check_capture as check_capture
-from .results import RunOptions as RunOptions
-from .results import RunResult as RunResult
-from .results import SavedRun as SavedRun
-from .results import load_run as load_run
 from .pipeline.run import add_camera as add_camera
 from .pipeline.run import build_map as build_map
 from .pipeline.run import calibrate as calibrate
@@ -65,6 +61,10 @@ from .records import PosePairs as PosePairs
 from .records import Reconstruction as Reconstruction
 from .records import Requirement as Requirement
 from .records import RobotNoise as RobotNoise
+from .results import RunOptions as RunOptions
+from .results import RunResult as RunResult
+from .results import SavedRun as SavedRun
+from .results import load_run as load_run
 from .scene.distance import DistanceGrid as DistanceGrid
 from .scene.map_file import load_map as load_map
 from .scene.options import CloudOptions as CloudOptions
