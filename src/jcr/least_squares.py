@@ -88,16 +88,17 @@ def minimise(
     `linearised` returns the residuals and their derivatives by a step (p,), `moved` takes the step. The iteration ends
     where a step lowers the cost by less than `tolerance` of it.
     """
-    Linear = tuple[Unknowns, Float[ndarray, "k m"], Float[ndarray, "k m p"]]
 
-    def step(now: Linear, normal: tuple[ndarray, ndarray], damping: float) -> Linear:
+    def step(
+        now: tuple[Unknowns, ndarray, ndarray], normal: tuple[ndarray, ndarray], damping: float
+    ) -> tuple[Unknowns, ndarray, ndarray]:
         hessian, gradient = normal
         diagonal = hessian.diagonal()
         damped = hessian + np.diag(damping * diagonal + UNSEEN * diagonal.max(initial=1e-300))
         tried = moved(now[0], -np.linalg.solve(damped, gradient))
         return (tried, *linearised(tried))
 
-    begin: Linear = (start, *linearised(start))
+    begin = (start, *linearised(start))
     exact = EXACT * _cost(loss, begin[1])
     found, cost, _, settled = damped_gauss_newton(
         lambda now: _equations(loss, *now[1:]),

@@ -19,7 +19,7 @@ from jcr.capture.options import MAX_FRAMES, ReadOptions
 from jcr.capture.plain_files import contained, read_json, shown
 from jcr.errors import InputError
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
-from jcr.files import write_new, write_text
+from jcr.files import write_bytes, write_new, write_text
 from jcr.records import Capture
 
 FILE, URDF = "capture.json", "robot.urdf"
