@@ -75,6 +75,7 @@ def without_surface(capture: Capture, made: Reconstruction, *_: object, **__: ob
         confidence=nothing,
         colors=np.zeros((*nothing.shape, 3), np.uint8),
         reason=nothing.astype(np.uint8),
+        depth_std=nothing,
     )
     return replace(made, pointmaps=pointmaps)
 

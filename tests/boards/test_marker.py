@@ -277,9 +277,9 @@ def test_the_table_of_real_captures_holds_each_against_its_reference(tmp_path):
     off[:3, 3] += [0.03, 0.0, 0.04]
     (tmp_path / "bench" / "reference.json").write_text(json.dumps({"gripper_from_camera": off.tolist()}))
     table = run_real(tmp_path, ["bench=charuco:7x6:0.030:0.022:DICT_4X4_50"])
-    off_mm = [float(line.split("|")[4]) for line in table.splitlines() if "DICT_4X4_50` |" in line]
+    off_mm = [float(line.split("|")[5]) for line in table.splitlines() if "DICT_4X4_50` |" in line]
     assert off_mm == pytest.approx([50.0], abs=1.0)
     with pytest.raises(InputError, match="other: no such capture"):
         run_real(tmp_path, ["other=chessboard:8x5:0.025"])
-    with pytest.raises(InputError, match=r"no folder below it holds a reference\.json"):
+    with pytest.raises(InputError, match=r"no folder below it holds a capture\.json"):
         run_real(tmp_path / "bench", [])

@@ -41,6 +41,8 @@ _MANY, _GROWN = 40, 1.3
 _ENOUGH = 1e-6
 """Relative change of a cost that ends an adjustment: with COLMAP's 0 it takes three times as long, and cameras come out
 1e-5 of their distance elsewhere."""
+PRIMED_FROM = 40
+"""Number of images above which the gripper poses prime the map."""
 _ROUGHLY = 1e-3
 """Relative change of the cost that ends an adjustment before the last one."""
 _MOST_OBSERVATIONS = 60_000
@@ -119,13 +121,17 @@ def _map_of_pairs(
     seed: int,
     report: Progress,
 ) -> pycolmap.Reconstruction | None:
-    """Return the map of the matched pairs: primed by the gripper poses, or by COLMAP's mapper where these contradict."""
+    """Return the map of the matched pairs: of many images primed by the gripper poses, else by COLMAP's mapper.
+
+    On twelve real captures of 8 to 24 images priming had one capture 2 mm farther from its reference and one with an
+    image less; it saves time where there are many images.
+    """
     count, model = len(base_from_gripper), None
 
     def adjust(made: pycolmap.Reconstruction, scale_px: float) -> None:
         adjust_robustly(made, known, _ROUGHLY, scale_px)
 
-    if matched.gate is not None:
+    if known and matched.gate is not None and count > PRIMED_FROM:
         model = map_from_gripper_poses(
             database, cameras[0], matched.gate, matched.geometries, base_from_gripper, adjust
         )
