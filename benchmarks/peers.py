@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from benchmarks.adam import AdamOptions, align_adam
 from benchmarks.page import apart, mm_deg, table
 from jcr.calibration.case import of_images
 from jcr.calibration.stage import calibrate
@@ -343,6 +342,8 @@ SIZES, IMAGES, STEPS, FEW_STEPS = ((128, 96), (512, 384)), 10, 300, 3
 
 def alignment_page() -> Iterator[str]:
     """Yield the claim and the table of seconds and errors of global alignment, ours and the published one."""
+    from benchmarks.adam import AdamOptions, align_adam  # torch, without which the other peers run
+
     rows, ratio, fast_s = [], 0.0, 0.0
     for size in SIZES:
         predictions, truth = synthetic_pairs(complete_pairs(IMAGES), size)
