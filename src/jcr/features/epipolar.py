@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.features.gate import Gate, Pair, predicted
+from jcr.features.gate import Gate
 from jcr.features.rotation import linear_parts
-from jcr.features.two_view import sampson_px
 from jcr.features.verify import View
 from jcr.geometry import transform
 
@@ -95,13 +94,3 @@ def midpoints(
     s_j = (cosine * (d_i @ way) - d_j @ way) / sine2
     points = (a_from_i[:3, 3] + s_i[:, None] * d_i + a_from_j[:3, 3] + s_j[:, None] * d_j) / 2
     return points, (s_i > 0.02) & (s_j > 0.02) & (sine2 > np.sin(np.radians(1)) ** 2)
-
-
-def distance_px(
-    view: View, pair: Pair, motion: Float[ndarray, "n n 4 4"], gripper_from_camera: Float[ndarray, "4 4"]
-) -> Float[ndarray, " m"]:
-    """Distances of a pair's matches from the epipolar lines that the robot predicts."""
-    camera = predicted(motion[pair.key], gripper_from_camera)
-    length = max(float(np.linalg.norm(camera[:3, 3])), 1e-9)
-    ray_i, ray_j = view.rays[pair.i][pair.rows[:, 0]], view.rays[pair.j][pair.rows[:, 1]]
-    return np.abs(sampson_px(camera[:3, :3], camera[:3, 3] / length, ray_i, ray_j, view.intrinsics.fx))

@@ -129,18 +129,6 @@ def write_keypoints(database: Path, x_px: Sequence[Float[ndarray, "_ 2"]]) -> No
             db.write_keypoints(row + 1, (x + HALF_PIXEL).astype(np.float32))
 
 
-def read_geometries(database: Path) -> Geometries:
-    """Return the geometries of all verified pairs in a database, by rows of the images."""
-    with closing(pycolmap.Database.open(database)) as db:
-        ids, geometries = db.read_two_view_geometries()
-    found = {}
-    for pair_id, geometry in zip(ids, geometries, strict=True):
-        first, second = pycolmap.pair_id_to_image_pair(pair_id)
-        if len(geometry.inlier_matches):
-            found[first - 1, second - 1] = geometry
-    return found
-
-
 def write_geometries(database: Path, geometries: Geometries) -> None:
     """Replace all geometries of a database by these."""
     with closing(pycolmap.Database.open(database)) as db:
