@@ -127,6 +127,14 @@ def test_images_that_nothing_ties_to_the_others_are_left_out(tmp_path: Path, tab
     assert sorted(model.reg_image_ids()) == list(range(1, 21))
 
 
+def test_cameras_that_no_match_ties_make_a_model_without_images(tmp_path: Path, table: PointsOfATable):
+    matched = matched_pairs_of(table, table.base_from_gripper)
+    apart = {key: one for key, one in matched.geometries.items() if key == (0, 1)}
+    database = database_of(tmp_path, table, replace(matched, geometries=apart))
+    cameras = {row: pose for row, pose in rough_cameras(table).items() if row in (0, 5, 9)}
+    assert map_from_cameras(database, camera_of(INTRINSICS, True), cameras, adjust).num_reg_images() == 0
+
+
 def test_missing_images_are_added_from_the_map_s_own_x(tmp_path: Path, table: PointsOfATable):
     matched = matched_pairs_of(table, table.base_from_gripper)
     database, camera = database_of(tmp_path, table, matched), camera_of(INTRINSICS, True)

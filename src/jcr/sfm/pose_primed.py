@@ -87,9 +87,12 @@ def map_from_cameras(
     """Return a model of rough cameras after triangulation of all verified matches and adjustment, in turn.
 
     Images with few points, and those that few points tie to the rest, are left out: gripper poses alone would hold them.
+    The model has no image where fewer than two remain.
     """
     poses, model = recon_from_camera, pycolmap.Reconstruction()
     for largest_px, refinements, scale_px in PASSES:
+        if len(poses) < 2:
+            return pycolmap.Reconstruction()
         model = triangulated(database, camera, poses, largest_px, refinements)
         for row in poses.keys() - _tied(model):
             model.deregister_frame(model.image(row + 1).frame_id)

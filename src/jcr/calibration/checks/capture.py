@@ -11,16 +11,17 @@ from jcr.findings import Finding, FindingKind
 
 
 def check_registered(case: Case) -> Checked:
-    """That too few images are used where the motions of all would do and those of these alone do not.
+    """Report that too few images are used: the motions of all would be observable, those of the used images are not.
 
-    What is unobservable is then no fault of the motions, and moving otherwise no remedy.
+    The motions are then not the cause, and other motions are no remedy.
     """
     hand_eye, capture = case.hand_eye, case.capture
     every = len(case.used) == len(capture)
-    if every or hand_eye.observability.observable or not observability(capture.base_from_gripper).observable:
+    if every or not hand_eye.observability.findings or observability(capture.base_from_gripper).findings:
         return Checked()
+    rejected = any(one.severity == "rejects" for one in hand_eye.findings)
     counts = {"value": float(len(case.used)), "of": float(len(capture))}
-    few = Finding.of(FindingKind.FEW_USED, "rejects", "reconstruction", **counts)
+    few = Finding.of(FindingKind.FEW_USED, "rejects" if rejected else "warns", "reconstruction", **counts)
     findings = tuple(
         replace(one, concerns="reconstruction") if one.kind is FindingKind.UNOBSERVABLE else one
         for one in hand_eye.findings
