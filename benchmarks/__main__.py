@@ -21,6 +21,8 @@ from jcr.errors import InputError
 from jcr.extras import DISTRIBUTION, is_installed
 from jcr.files import write_text
 
+COMMANDS = {"align": "benchmarks.align_pairs", "fetch-captures": "benchmarks.real_captures.fetch"}
+"""Modules of what is no bench, with arguments of its own."""
 if TYPE_CHECKING:
     BenchName = str
 else:
@@ -32,8 +34,9 @@ class Arguments:
     """Measure, and print a Markdown table with the machine, versions, commit and date.
 
     examples:
-      python -m benchmarks calibrate
-      python -m benchmarks run --out docs/results
+      python -m benchmarks speed
+      python -m benchmarks map --out docs/results
+      python -m benchmarks fetch-captures captures
       python -m benchmarks real captures --boards bench=charuco:7x5:0.030:0.022:DICT_4X4_50
       python -m benchmarks all captures --out docs/results
       python -m benchmarks align PAIRS.npz OUT.npz --method adam
@@ -111,9 +114,8 @@ def _machine() -> str:
 
 if __name__ == "__main__":
     try:
-        if sys.argv[1:2] == ["align"]:
-            align_pairs = import_module("benchmarks.align_pairs")
-            sys.exit(align_pairs.main(sys.argv[2:]))
+        if sys.argv[1:2] and (command := COMMANDS.get(sys.argv[1])):
+            sys.exit(import_module(command).main(sys.argv[2:]))
         sys.exit(main(tyro.cli(Arguments, prog="python -m benchmarks")))
     except InputError as error:
         sys.stderr.write(f"error: {error}\n")

@@ -1,0 +1,238 @@
+"""`python -m benchmarks fetch-captures DIR`: build real captures from the public repositories that hold them."""
+
+import hashlib
+import io
+import json
+import re
+import subprocess
+import sys
+import tarfile
+import tempfile
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+from numpy import ndarray
+from PIL import Image
+from scipy.io import loadmat
+
+from jcr.capture.conventions import poses_from_numbers
+from jcr.capture.formats import capture_json
+from jcr.capture.options import UnitsName
+from jcr.errors import InputError
+from jcr.estimation.arms import RobotName, arm_named
+from jcr.estimation.kinematics import forward_kinematics
+from jcr.files import write_bytes
+from jcr.records import Capture, Intrinsics, coefficients_of
+
+RECIPES = Path(__file__).with_name("recipes.toml")
+NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
+"""Number in a text, of any notation that the repositories use."""
+WIDTHS = {"matrix": 16, "quat-xyzw": 7}
+"""Numbers of a pose, by its convention, where these are not six."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """Public repository of a capture, and the places and notations of its parts."""
+
+    repository: str
+    commit: str
+    licence: str
+    images: str
+    """Path of the images in the repository, `*` for what differs."""
+    poses: str
+    """Path of one file with a pose a row, or of one file an image."""
+    key: str = ""
+    """Field of JSON that holds the numbers of a pose."""
+    doubles: dict[str, int] = field(default_factory=dict)
+    """Places in the doubles of a MATLAB table: first rotation, step to the next, count, position after a rotation."""
+    convention: str = "matrix"
+    units: UnitsName = "auto"
+    """Notation and units of the numbers, as in jcr.capture.conventions."""
+    robot: RobotName | None = None
+    """Arm whose joint angles (rad) are stored in place of poses."""
+    joints: list[int] = field(default_factory=list)
+    """Places of its joints among the numbers."""
+    use_images: str | list[int] = ":"
+    use_poses: str | list[int] = ":"
+    """Rows, or a slice of them, that belong together."""
+    intrinsics: list[float] = field(default_factory=list)
+    """fx, fy, cx, cy and distortion that are stored in the repository; none where empty."""
+    board: str = ""
+    """Board in the images, as in `--board`."""
+    sha256: str = ""
+    """Hash of images and poses."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Build captures from public repositories, for the bench of real captures.
+
+    Commits are fetched with git, shallow and without the files that a capture does not need. The images belong to
+    their authors, whose licences recipes.toml names; do not pass them on.
+
+    examples:
+      python -m benchmarks fetch-captures captures
+      python -m benchmarks fetch-captures captures --only floor_carton --clones floor_carton=/src/robot_cal_tools
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder for the captures."""
+    only: tuple[str, ...] = ()
+    """Names of the captures to build (unset: all)."""
+    clones: tuple[str, ...] = ()
+    """NAME=PATH of repositories that are on this machine already."""
+
+
+def recipes(path: Path = RECIPES) -> dict[str, Recipe]:
+    """Return the recipes by the names of their captures."""
+    return {name: Recipe(**content) for name, content in tomllib.loads(path.read_text()).items()}
+
+
+def main(words: Sequence[str]) -> int:
+    """Build the captures, report each on stderr, and return 1 if one failed, else 0."""
+    arguments = tyro.cli(Arguments, prog="python -m benchmarks fetch-captures", args=words)
+    known, failed = recipes(), 0
+    clones = dict(text.split("=", 1) for text in arguments.clones)
+    if unknown := {*arguments.only, *clones} - known.keys():
+        raise InputError(f"{', '.join(sorted(unknown))}: no such capture; there are {', '.join(known)}")
+    for name in arguments.only or known:
+        try:
+            build(known[name], arguments.out / name, clones.get(name))
+        except InputError as error:
+            failed += 1
+            sys.stderr.write(f"{name}: {error}\n")
+        else:
+            sys.stderr.write(f"{name}: done\n")
+    return int(failed > 0)
+
+
+def build(recipe: Recipe, out: Path, clone: str | None = None) -> Path:
+    """Write the capture of a recipe into `out` and return `out`.
+
+    Raises InputError where the repository cannot be had, or its content is not that of the recipe.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        files = _files(recipe, clone or _fetched(recipe, Path(folder)))
+    images = _chosen(_matching(files, recipe.images), recipe.use_images)
+    poses = _poses(recipe, files)
+    if len(images) != len(poses):
+        raise InputError(
+            f"{recipe.repository}: {len(images)} images and {len(poses)} poses; correct the recipe"
+        )
+    found = digest([files[name] for name in images], poses)
+    if recipe.sha256 not in ("", found):
+        raise InputError(f"{recipe.repository}: content is not that of the recipe (sha256 {found})")
+    # Images that have the same name in folders of their own are named by their folders.
+    apart = len({Path(name).name for name in images}) == len(images)
+    names = [Path(name).name if apart else f"{Path(name).parent.name}{Path(name).suffix}" for name in images]
+    for name, image in zip(names, images, strict=True):
+        write_bytes(out / "images" / name, files[image])
+    with Image.open(io.BytesIO(files[images[0]])) as image:
+        size = image.size
+    capture = Capture(
+        folder=out,
+        images=tuple(f"images/{name}" for name in names),
+        base_from_gripper=poses,
+        image_size=size,
+        intrinsics=_intrinsics(recipe.intrinsics, size),
+    )
+    source = {"repository": recipe.repository, "commit": recipe.commit, "licence": recipe.licence}
+    capture_json.write(out, capture, source=source | {"board": recipe.board})
+    return out
+
+
+def digest(images: Sequence[bytes], poses: Float[ndarray, "n 4 4"]) -> str:
+    """Return the SHA-256 of image files and of poses rounded to 1e-6."""
+    text = json.dumps((np.round(poses, 6) + 0.0).tolist()).encode()
+    return hashlib.sha256(b"".join([*images, text])).hexdigest()
+
+
+def _fetched(recipe: Recipe, folder: Path) -> str:
+    """Fetch the commit of a recipe without files, which git adds when they are read."""
+    _git(str(folder), "init", "--quiet", "--bare")
+    _git(str(folder), "remote", "add", "origin", recipe.repository)
+    _git(str(folder), "fetch", "--quiet", "--depth=1", "--filter=blob:none", "origin", recipe.commit)
+    return str(folder)
+
+
+def _files(recipe: Recipe, repository: str) -> dict[str, bytes]:
+    """Return the content of the files of a recipe by their paths."""
+    names = _git(repository, "ls-tree", "-r", "-z", "--name-only", recipe.commit).decode().split("\0")
+    wanted = [*_matching(names, recipe.images), *_matching(names, recipe.poses)]
+    if not wanted:
+        raise InputError(f"{recipe.repository}: no file {recipe.images} at {recipe.commit[:10]}")
+    archive = io.BytesIO(_git(repository, "archive", recipe.commit, "--", *wanted))
+    with tarfile.open(fileobj=archive) as tar:
+        return {one.name: tar.extractfile(one).read() for one in tar if one.isfile()}  # type: ignore[union-attr]
+
+
+def _git(repository: str, *words: str) -> bytes:
+    """Run git on a repository and return its output."""
+    done = subprocess.run(["git", "-C", repository, *words], capture_output=True)
+    if done.returncode:
+        raise InputError(f"git {words[0]}: {done.stderr.decode(errors='replace').strip().splitlines()[-1]}")
+    return done.stdout
+
+
+def _matching(names: Sequence[str] | dict[str, bytes], pattern: str) -> list[str]:
+    """Return the names of a pattern, in the order of the numbers in them."""
+    form = re.compile("[^/]*".join(map(re.escape, pattern.split("*"))))
+    return sorted(filter(form.fullmatch, names), key=lambda name: [int(n) for n in re.findall(r"\d+", name)])
+
+
+def _chosen(values: Any, rows: str | list[int]) -> Any:
+    """Return the chosen rows of a list or array; a slice is written as in Python."""
+    if isinstance(rows, str):
+        return values[slice(*(int(part) if part else None for part in rows.split(":")))]
+    return [values[row] for row in rows]
+
+
+def _poses(recipe: Recipe, files: dict[str, bytes]) -> Float[ndarray, "n 4 4"]:
+    """Return base_from_gripper of the chosen rows."""
+    names = _matching(files, recipe.poses)
+    width = len(recipe.joints) or WIDTHS.get(recipe.convention, 6)
+    rows = [row[-width:] for name in names for row in _numbers(recipe, files[name], width, len(names) > 1)]
+    numbers = np.array(_chosen(rows, recipe.use_poses))
+    if recipe.robot:
+        return forward_kinematics(arm_named(recipe.robot), numbers[:, recipe.joints])
+    return poses_from_numbers(numbers, recipe.convention, recipe.units, recipe.poses)
+
+
+def _numbers(recipe: Recipe, content: bytes, width: int, alone: bool) -> list[list[float]]:
+    """Return the numbers of each pose in one file, which holds one pose or, a line each, all."""
+    if recipe.poses.endswith(".npy"):
+        return np.reshape(np.load(io.BytesIO(content)), (-1, 16)).tolist()
+    if recipe.poses.endswith(".mat"):
+        return _doubles(content, **recipe.doubles)
+    if recipe.key:
+        loaded = json.loads(content)
+        return [one[recipe.key] for one in (loaded if isinstance(loaded, list) else [loaded])]
+    text = content.decode()
+    rows = [[float(x) for x in NUMBER.findall(part)] for part in ([text] if alone else text.splitlines())]
+    return [row for row in rows if len(row) >= width]
+
+
+def _doubles(content: bytes, first: int, step: int, count: int, position: int) -> list[list[float]]:
+    """Return the matrices of a MATLAB table, whose objects SciPy leaves as bytes: columns of each rotation, position."""
+    workspace = loadmat(io.BytesIO(content))["__function_workspace__"].tobytes()
+    values = np.frombuffer(workspace, "<f8")
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    for pose, start in zip(poses, range(first, first + step * count, step), strict=True):
+        pose[:3, :3] = values[start : start + 9].reshape(3, 3).T
+        pose[:3, 3] = values[start + position : start + position + 3]
+    return poses.reshape(-1, 16).tolist()
+
+
+def _intrinsics(numbers: Sequence[float], size: tuple[int, int]) -> Intrinsics | None:
+    """Return stored intrinsics."""
+    if not numbers:
+        return None
+    fx, fy, cx, cy, *distortion = numbers
+    return Intrinsics(fx, fy, cx, cy, *size, coefficients_of(distortion or [0.0] * 5))
