@@ -12,6 +12,7 @@ import yaml
 import jcr
 from jcr.capture import camera_info
 from jcr.capture.formats import capture_json, colmap
+from jcr.capture.plain_files import validated
 from jcr.export import ros
 from jcr.intrinsics_json import IntrinsicsAndStd
 from jcr.records import Intrinsics
@@ -25,13 +26,11 @@ CAMERAS = [RATIONAL, FISHEYE, Intrinsics(500.0, 500.0, 320.0, 240.0, *SIZE, (0.1
 
 
 @pytest.mark.parametrize("intrinsics", CAMERAS)
-def test_a_intrinsics_survives_capture_json_camera_info_and_calibration_json(
+def test_intrinsics_survive_capture_json_camera_info_and_calibration_json(
     intrinsics: Intrinsics, tmp_path: Path
 ):
-    read = camera_info.read_intrinsics(
-        json.loads(json.dumps(camera_info.intrinsics_as_json(intrinsics))), SIZE, tmp_path
-    )
-    assert read == intrinsics
+    entry = camera_info.IntrinsicsEntry.of(intrinsics).model_dump_json(exclude_unset=True)
+    assert camera_info.IntrinsicsEntry.model_validate_json(entry).record(SIZE, "here") == intrinsics
     mount = ros.CameraMount(
         parent="tool0", child="optical", parent_from_child=np.eye(4), intrinsics=intrinsics
     )
@@ -44,7 +43,7 @@ def test_a_intrinsics_survives_capture_json_camera_info_and_calibration_json(
 
 
 @pytest.mark.parametrize("intrinsics", CAMERAS)
-def test_a_intrinsics_survives_colmap(intrinsics: Intrinsics, tmp_path: Path):
+def test_intrinsics_survive_colmap(intrinsics: Intrinsics, tmp_path: Path):
     import pycolmap
 
     from jcr.sfm.mapping import camera_of
@@ -78,15 +77,14 @@ def test_other_camera_models_are_refused_by_name(model: str, count: int, words: 
 
 def test_a_capture_names_the_models_that_there_are():
     intrinsics = {"fx": 500, "fy": 500, "cx": 320, "cy": 240}
+    entry = camera_info.IntrinsicsEntry
     with pytest.raises(
-        jcr.InputError,
-        match="distortion model 'omni' is not known; give one of pinhole, rational, thin_prism, fisheye",
+        jcr.InputError, match="model: Input should be 'pinhole', 'rational', 'thin_prism' or 'fisheye'"
     ):
-        camera_info.read_intrinsics(intrinsics | {"model": "omni"}, SIZE, Path("capture.json"))
-    with pytest.raises(jcr.InputError, match="5 numbers, not the 4 of a fisheye intrinsics, k1,k2,k3,k4"):
-        camera_info.read_intrinsics(
-            intrinsics | {"model": "fisheye", "distortion": [0] * 5}, SIZE, Path("capture.json")
-        )
+        validated(entry, intrinsics | {"model": "omni"}, "capture.json")
+    fisheye = validated(entry, intrinsics | {"model": "fisheye", "distortion": [0.0] * 5}, "capture.json")
+    with pytest.raises(jcr.InputError, match="5 numbers, not the 4 of a fisheye model, k1,k2,k3,k4"):
+        fisheye.record(SIZE, "capture.json")
 
 
 def through(intrinsics: Intrinsics, image: np.ndarray, original: Intrinsics) -> np.ndarray:

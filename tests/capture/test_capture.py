@@ -59,6 +59,11 @@ def test_a_sound_capture_is_read_as_it_is(capture: Path):
     assert read.image_size == (640, 480)
     assert read.intrinsics is not None and read.intrinsics.fx == content["intrinsics"]["fx"]
     assert len(jcr.read_capture(capture / "capture.json")) == 4
+    # Other keys are ignored, and a byte order mark, which some editors put before JSON, is no fault.
+    edit(capture, lambda c: c.update(intrinsics=None, anything={"else": 1}))
+    file = capture / "capture.json"
+    file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+    assert jcr.read_capture(capture).intrinsics is None
 
 
 def test_standard_deviations_of_intrinsics_are_read_as_far_as_they_are_stated_and_written_again(
@@ -84,37 +89,15 @@ def test_standard_deviations_of_intrinsics_that_cannot_be_are_refused(capture: P
         jcr.read_capture(capture)
 
 
-def test_unknown_intrinsics_and_other_keys_are_fine(capture: Path):
-    edit(capture, lambda c: c.update(intrinsics=None, anything={"else": 1}))
-    assert jcr.read_capture(capture).intrinsics is None
-
-
-def test_a_byte_order_mark_is_no_fault(capture: Path):
-    """Some editors put one before the JSON that they save."""
-    file = capture / "capture.json"
-    file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
-    assert len(jcr.read_capture(capture)) == len(json.loads(file.read_text("utf-8-sig"))["frames"])
-
-
-def test_exif_rotation_is_honoured(capture: Path):
-    for k in range(4):
-        file = capture / "images" / f"{k:02d}.jpg"
-        upright = read_image(file)
-        exif = Image.Exif()
-        exif[0x0112] = 6  # the camera was rotated: rotate by 90° clockwise to show
-        Image.fromarray(np.rot90(upright)).save(file.with_suffix(".png"), exif=exif)
-        assert (read_image(file.with_suffix(".png")) == upright).all()
-        file.unlink()
-    edit(capture, lambda c: [f.update(image=f["image"].replace("jpg", "png")) for f in c["frames"]])
-    assert jcr.read_capture(capture).image_size == (640, 480)
-
-
 @pytest.mark.parametrize("orientation", [1, 3, 6])
-def test_what_exif_rotates_is_said(capture: Path, orientation: int):
+def test_images_are_rotated_as_their_exif_tag_says_with_a_note(capture: Path, orientation: int):
     exif = Image.Exif()
     exif[0x0112] = orientation
+    turns = {1: 0, 3: 2, 6: 1}[orientation]
     for file in sorted((capture / "images").glob("*.jpg")):
-        Image.open(file).save(file, quality=95, exif=exif)
+        upright = read_image(file)
+        Image.fromarray(np.rot90(upright, turns)).save(file, quality=95, exif=exif)
+        assert np.abs(read_image(file).astype(int) - upright).mean() < 5
     found = jcr.read_capture(capture)
     assert found.orientation == orientation
     said = [note for note in found.notes if f"EXIF orientation {orientation}: the images are rotated" in note]
@@ -126,31 +109,22 @@ def test_what_exif_rotates_is_said(capture: Path, orientation: int):
             jcr.read_capture(capture)
 
 
-@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
-@pytest.mark.parametrize("shape", [(48, 64), (48, 64, 3)])
-def test_the_bits_that_are_used_are_read(tmp_path: Path, bits: int, shape: tuple[int, ...]):
-    ramp = np.linspace(0, 255, 64).round().astype(np.uint16)
-    shown = np.broadcast_to(ramp.reshape(1, 64, *[1] * (len(shape) - 2)), shape)
-    (tmp_path / "deep.png").write_bytes(
-        cv2.imencode(".png", (shown << (bits - 8)).astype(np.uint16))[1].tobytes()
-    )
-    assert (read_image(tmp_path / "deep.png")[..., 0] == ramp).all()
-
-
 @pytest.mark.parametrize("ending", [".png", ".tif"])
-def test_a_defective_pixel_does_not_show_how_many_bits_are_used(tmp_path: Path, ending: str):
-    """And a TIFF is read as a PNG is: Pillow keeps of its colours the upper eight bits, which are black here."""
-    deep = np.broadcast_to(np.arange(64, dtype=np.uint16)[:, None] << 6, (48, 64, 3)).copy()
-    deep[5, 7, 0] = 65535
+@pytest.mark.parametrize("bits", [8, 12, 16])
+@pytest.mark.parametrize("shape", [(64, 64), (64, 64, 3)])
+def test_the_bits_in_use_of_16_bit_images_are_read(
+    tmp_path: Path, ending: str, bits: int, shape: tuple[int, ...]
+):
+    """A defective pixel does not count. Pillow keeps the upper eight bits of coloured ones, which may be black."""
+    ramp = np.arange(64, dtype=np.uint16) << 2
+    deep = np.broadcast_to(ramp.reshape(1, 64, *[1] * (len(shape) - 2)) << (bits - 8), shape).copy()
+    deep[(5, 7, 0)[: deep.ndim]] = 65535
     cv2.imwrite(str(tmp_path / f"deep{ending}"), deep)
     shown = read_image(tmp_path / f"deep{ending}")
-    assert (shown[..., 1] == deep[..., 1] >> 4).all() and shown[5, 7, 2] == 255
+    assert (shown[6:, :, 1] == ramp).all()
 
 
-def test_sixteen_bit_grey_and_cmyk_are_read(tmp_path: Path):
-    ramp = np.tile(np.linspace(0, 65535, 64).astype(np.uint16), (48, 1))
-    Image.fromarray(ramp).save(tmp_path / "grey.png")
-    assert np.allclose(read_image(tmp_path / "grey.png")[0, :, 1], ramp[0] // 256, atol=1)
+def test_cmyk_is_read(tmp_path: Path):
     Image.new("CMYK", (64, 48), (0, 255, 255, 0)).save(tmp_path / "red.jpg")
     assert read_image(tmp_path / "red.jpg")[0, 0, 0] > 200
 
@@ -198,7 +172,10 @@ FAULTS = {
         lambda c: edit(c, lambda j: j["intrinsics"].update(distortion=[0, 0])),
         "not the 5 of a pinhole",
     ),
-    "intrinsics negative": (lambda c: edit(c, lambda j: j["intrinsics"].update(fx=-600)), "must be positive"),
+    "intrinsics negative": (
+        lambda c: edit(c, lambda j: j["intrinsics"].update(fx=-600)),
+        r"intrinsics\.fx: Input should be greater than 0",
+    ),
     "path outside": (
         lambda c: edit(c, lambda j: j["frames"][1].update(image="../x.jpg")),
         r"frame 1: '\.\./x\.jpg' leads out",
@@ -226,7 +203,7 @@ FRAME_FAULTS = {
     ),
     "pose missing": (
         lambda c: edit(c, lambda j: j["frames"][1].pop("base_from_gripper")),
-        r"frame 1 \(images/01\.jpg\) is missing; add the gripper pose",
+        r"frame 1 \(images/01\.jpg\): base_from_gripper: Field required",
     ),
     "image twice": (
         lambda c: edit(c, lambda j: j["frames"][1].update(image="images/00.jpg")),
@@ -296,14 +273,10 @@ def test_joints_and_other_cameras_stay_with_the_frames_that_are_used(capture: Pa
     assert second.frame is not None and second.frame.tolist() == [0, 2]
 
 
-@pytest.mark.slow
-def test_a_decompression_bomb_is_refused_before_it_is_unpacked(tmp_path: Path):
-    Image.new("1", (20_000, 20_000)).save(tmp_path / "bomb.png")
+def test_a_decompression_bomb_and_an_animation_are_refused(tmp_path: Path):
+    Image.new("1", (8_000, 8_001)).save(tmp_path / "bomb.png")
     with pytest.raises(jcr.InputError, match="million pixels"):
         read_image(tmp_path / "bomb.png")
-
-
-def test_an_animation_is_refused(tmp_path: Path):
     frames = [Image.new("RGB", (64, 48), color) for color in ("red", "green")]
     frames[0].save(tmp_path / "two.gif", save_all=True, append_images=frames[1:])
     with pytest.raises(jcr.InputError, match="holds 2 images"):
@@ -336,21 +309,18 @@ def test_joints_and_the_robot_are_kept_and_written_again(capture: Path, tmp_path
     assert read.robot is None and "robot 'cobot 9' is not one of ur3e" in read.notes[0]
 
 
-def test_options_that_a_capture_json_is_not_read_by_are_noted(capture: Path):
-    assert jcr.read_capture(capture, {"pose_inverted": True, "format": "capture"}).notes == ()
-    (note,) = jcr.read_capture(capture, {"pose_convention": "kuka", "urdf": "arm.urdf"}).notes
-    assert note.startswith("--pose-convention and --urdf are not used")
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda c: set_joints(c, [*JOINTS[:2], None, None]), r"frame 2 .*: no joints; give them for all"),
+        (
+            lambda c: set_joints(c, [*JOINTS[:2], None, None]),
+            r"frame 2 .*: no joints, others have 6; give them for all",
+        ),
         (lambda c: set_joints(c, [[90.0] * 6] * 4), r"up to 90 rad; these look like degrees"),
         (lambda c: (set_joints(c, JOINTS), c.update(robot="panda")), r"6 joints, but a panda has 7"),
         (lambda c: c.update(urdf="../arm.urdf"), r"leads out of"),
-        (lambda c: c.update(urdf="arm.urdf"), r"urdf arm.urdf is not there"),
-        (lambda c: c.update(urdf=3), r"urdf must be a path"),
+        (lambda c: c.update(urdf="arm.urdf"), r"urdf: arm.urdf is not there"),
+        (lambda c: c.update(urdf=3), r"urdf: Input should be a valid string"),
     ],
 )
 def test_joints_that_cannot_be_are_refused_in_one_line(capture: Path, change, message):
@@ -363,10 +333,10 @@ def test_joints_that_cannot_be_are_refused_in_one_line(capture: Path, change, me
 @pytest.mark.parametrize(
     ("row", "words"),
     [
-        (None, r"frame 3 .*: no joints; give them for all"),
-        (JOINTS[3][:5], r"frame 3 .*: 5 angles, but the first frame has 6"),
-        ([float("nan")] * 6, r"must be a list of finite angles"),
-        ("0 1 2", r"not numbers; write a list"),
+        (None, r"frame 3 .*: no joints, others have 6; give them for all"),
+        (JOINTS[3][:5], r"frame 3 .*: 5 joint angles, others have 6"),
+        ([float("nan")] * 6, r"frame 3 .*: joints.0: Input should be a finite number"),
+        ("0 1 2", r"frame 3 .*: joints: Input should be a valid list"),
     ],
 )
 def test_a_frame_with_unusable_joints_is_left_out(capture: Path, row, words: str):

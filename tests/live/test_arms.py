@@ -120,7 +120,7 @@ FILMED = """
         frames = list(camera.frames)
     rays = [rs.rs2_deproject_pixel_to_point(record_realsense.intrinsics(rs), x, 1.0) for x in json.loads(sys.argv[2])]
     depth = np.unique(frames[0].depth_mm).tolist()
-    print(json.dumps([len(frames), frames[0].image.shape, depth, camera.intrinsics, rays]))
+    print(json.dumps([len(frames), frames[0].image.shape, depth, camera.intrinsics.model_dump(), rays]))
 """
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jcr.capture.formats import capture_json
 from jcr.capture.images import other_size
 from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import is_written, read_json, shown
+from jcr.capture.plain_files import read_json, shown
 from jcr.capture.read import read_source
 from jcr.errors import InputError
 from jcr.files import write_bytes
@@ -25,7 +25,7 @@ def read_added(run_folder: Path, capture: Capture) -> Capture:
     """
     folder = run_folder / FOLDER
     file = folder / capture_json.FILE
-    if not is_written(file):
+    if not file.is_file():
         return Capture(
             folder=folder,
             images=(),

@@ -2,186 +2,172 @@
 
 A camera bolted to the gripper has one image for each frame, or null; a fixed one that sees the scene has any number;
 one on another arm has frames of its own. The entry without images names the camera of the capture's
-own frames and what it is bolted to.
+own frames and its mount.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
+from pydantic import AfterValidator, BaseModel, ConfigDict, StringConstraints, TypeAdapter, model_validator
 
-from jcr.capture.camera_info import intrinsics_as_json, read_intrinsics_of_size, read_std, std_as_json
-from jcr.capture.checks import image_sizes, read_rigid, require_frames
-from jcr.capture.images import other_size
-from jcr.capture.plain_files import contained, first_few, shown
+from jcr.capture.camera_info import IntrinsicsEntry, StdEntry
+from jcr.capture.checks import RigidMatrix, require_frames
+from jcr.capture.images import read_image, size_of_all
+from jcr.capture.plain_files import contained, first_few, validated
 from jcr.errors import InputError
 from jcr.records import Capture, CellCamera, Mount
 
-KEYS = {"mount", "watches", "arm", "frames", "images", "intrinsics", "intrinsics_std"}
-NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
-MOUNTS: tuple[Mount, ...] = ("gripper", "base")
+NAME = r"[A-Za-z][A-Za-z0-9_]{0,63}"
+"""Pattern of the names of cameras and arms."""
+Name = Annotated[str, StringConstraints(pattern=f"^{NAME}$")]
 
 
-def with_cameras(capture: Capture, cameras: Any, file: Path, used: Sequence[bool] | None = None) -> Capture:
-    """Return the capture with the cameras of "cameras"; InputError where they cannot be.
+class CameraFrame(BaseModel):
+    """Image of a camera on another arm, and that arm's gripper pose in its own base."""
+
+    model_config = ConfigDict(strict=True, frozen=True)
+    image: str
+    base_from_gripper: RigidMatrix
+
+
+class CameraEntry(BaseModel):
+    """Camera in "cameras" of a capture.json."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+    mount: Mount
+    watches: Literal["scene", "gripper"] | None = None
+    """Subject of the images; unset: the gripper for a fixed camera without images, else the scene."""
+    arm: Name | None = None
+    """Other arm that carries the camera."""
+    frames: list[CameraFrame] | None = None
+    """Images of a camera on another arm."""
+    images: list[str | None] | None = None
+    intrinsics: IntrinsicsEntry | None = None
+    intrinsics_std: StdEntry | None = None
+
+    @property
+    def is_own(self) -> bool:
+        """Whether the entry is that of the camera of the capture's frames."""
+        return self.images is None and self.frames is None
+
+    @model_validator(mode="after")
+    def _agrees(self) -> "CameraEntry":
+        """Raise ValueError where mount, arm, frames and images contradict each other."""
+        is_fixed, watches = self.mount == "base", self.watches or "scene"
+        if self.is_own and self.watches is not None and is_fixed is not (self.watches == "gripper"):
+            raise ValueError(
+                "the frames have gripper poses, so a fixed camera's images in them must show what the gripper "
+                "carries; list images of the scene as its images"
+            )
+        if not self.is_own and watches == "gripper":
+            raise ValueError(
+                "watches the gripper; give its images a capture of their own, whose camera has mount base"
+            )
+        if (self.arm is None) is not (self.frames is None) or (self.arm is not None and is_fixed):
+            raise ValueError(
+                "a camera on another arm has mount gripper, that arm's name as arm, and frames of its own"
+            )
+        if not self.is_own and not any(self.images or self.frames or ()):
+            raise ValueError("no images; list some, or remove the camera")
+        return self
+
+
+def _one_own(cameras: dict[str, CameraEntry]) -> dict[str, CameraEntry]:
+    """Return the cameras; raise ValueError where several of them are without images."""
+    if len(own := [name for name, camera in cameras.items() if camera.is_own]) > 1:
+        raise ValueError(f"{first_few(own)} have no images; only one can be the camera of the frames")
+    return cameras
+
+
+CameraEntries = Annotated[dict[Name, CameraEntry], AfterValidator(_one_own)]
+_ADAPTER = TypeAdapter(CameraEntries)
+
+
+def with_cameras(capture: Capture, cameras: Any, where: str, used: Sequence[bool] | None = None) -> Capture:
+    """Return the capture with the cameras of "cameras"; raise InputError, begun with `where`, where they cannot be.
 
     `used` tells for each frame of the file whether the capture has it, all by default.
     """
-    if cameras is None:
-        return capture
-    if not isinstance(cameras, dict) or not all(isinstance(camera, dict) for camera in cameras.values()):
+    entries: dict[str, CameraEntry] = validated(_ADAPTER, cameras, f"{where}: cameras")
+    own = next((name for name, entry in entries.items() if entry.is_own), None)
+    if own is not None:
+        capture = replace(capture, camera_name=own, mount=entries[own].mount)
+    elif capture.camera_name in entries:
         raise InputError(
-            f'{file}: cameras must be {{"NAME": {{"mount": "base" or "gripper", "images": [...]}}}}'
+            f"{where}: camera {capture.camera_name} is the frames' own; give the other another name"
         )
-    own = [name for name, camera in cameras.items() if "images" not in camera and "frames" not in camera]
-    if len(own) > 1:
-        raise InputError(
-            f"{file}: cameras {first_few(own)} have no images; only one can be the camera of the frames: list the "
-            "images of the others"
-        )
-    others = []
-    for name, camera in cameras.items():
-        where = f"{file}: camera {name[:64]}"
-        _check(name, camera, where)
-        if name in own:
-            watches = camera.get("watches", "gripper" if camera["mount"] == "base" else "scene")
-            if (camera["mount"] == "base") is not (watches == "gripper"):
-                raise InputError(
-                    f"{where}: the frames have gripper poses, so a fixed camera's images in them must show what the "
-                    "gripper carries; list images of the scene as its images"
-                )
-            capture = replace(capture, camera_name=name, mount=camera["mount"])
-        else:
-            others.append(_camera(name, camera, capture, where, used))
-    if twice := {name for name in (camera.name for camera in others) if name == capture.camera_name}:
-        raise InputError(
-            f"{file}: camera {first_few(sorted(twice))} is the frames' own; give the other another name"
-        )
+    used = [True] * len(capture) if used is None else used
+    others = [
+        _camera(name, entry, capture, f"{where}: camera {name}", used)
+        for name, entry in entries.items()
+        if name != own
+    ]
     return replace(capture, others=tuple(others))
 
 
-def _check(name: str, camera: dict[str, Any], where: str) -> None:
-    """Raise InputError where the keys of a camera cannot be."""
-    if not NAME.fullmatch(name):
-        raise InputError(f"{where}: a name has letters, digits and _, and begins with a letter")
-    if unknown := sorted(camera.keys() - KEYS):
-        raise InputError(f"{where}: {first_few(unknown)} is not known; there are {', '.join(sorted(KEYS))}")
-    if camera.get("mount") not in MOUNTS:
-        raise InputError(f"{where}: mount is {shown(camera.get('mount'))}; write {' or '.join(MOUNTS)}")
-    if camera.get("watches", "scene") not in ("scene", "gripper"):
-        raise InputError(f"{where}: watches {shown(camera['watches'])}; write scene or gripper")
-    if "images" in camera and camera.get("watches") == "gripper":
-        raise InputError(
-            f"{where}: watches the gripper; give its images a capture of their own, whose camera has mount base"
-        )
-    if (camera.get("arm") is None) is not ("frames" not in camera) or (
-        camera.get("arm") and camera["mount"] == "base"
-    ):
-        raise InputError(
-            f"{where}: a camera on another arm has mount gripper, that arm's name as arm, and frames of its own"
-        )
-
-
-def _camera(
-    name: str, camera: dict[str, Any], capture: Capture, where: str, used: Sequence[bool] | None
-) -> CellCamera:
+def _camera(name: str, entry: CameraEntry, capture: Capture, where: str, used: Sequence[bool]) -> CellCamera:
     """Return a further camera with its images, all of one size."""
-    arm, poses, frame = camera.get("arm"), None, None
-    if arm is not None:
-        images, poses = _frames(camera["frames"], str(arm), where)
+    poses, frame = None, None
+    if entry.frames is not None:
+        listed: Sequence[str | None] = [one.image for one in entry.frames]
+        poses = np.array([one.base_from_gripper for one in entry.frames])
     else:
-        listed = camera["images"]
-        if not isinstance(listed, list) or not all(
-            image is None or isinstance(image, str) for image in listed
-        ):
-            raise InputError(f"{where}: images must be a list of paths")
-        images = [image for image in listed if image is not None]
-        if camera["mount"] == "gripper":
-            used = [True] * len(capture) if used is None else used
+        listed = entry.images or ()
+        if entry.mount == "gripper":
             if len(listed) != len(used):
                 raise InputError(
                     f"{where}: {len(listed)} images for {len(used)} frames; give one for each, or null"
                 )
-            of_frames = [image for image, is_used in zip(listed, used, strict=True) if is_used]
-            images = [image for image in of_frames if image is not None]
-            frame = np.flatnonzero([image is not None for image in of_frames])
-    if not images:
-        raise InputError(f"{where}: no images; list some, or remove the camera")
-    require_frames(len(images), where, 0)
+            listed = [image for image, is_used in zip(listed, used, strict=True) if is_used]
+            frame = np.flatnonzero([image is not None for image in listed])
+    images = [image for image in listed if image is not None]
+    require_frames(len(images), where, 1)
     for image in images:
         contained(capture.folder, image, where)
     if len(set(images)) < len(images) or set(images) & set(capture.images):
         raise InputError(f"{where}: an image is named twice, or is one of the frames' own")
-    sizes = image_sizes(capture.folder, images)
-    if other := [k for k, size in enumerate(sizes) if size != sizes[0]]:
-        raise other_size(f"{where}: {images[other[0]]}", sizes[other[0]], sizes[0], images[0])
-    intrinsics = read_intrinsics_of_size(camera.get("intrinsics"), sizes[0], where)
-    std = read_std(camera.get("intrinsics_std"), intrinsics, where)
+    size = size_of_all({name: read_image(capture.folder / name).shape[1::-1] for name in images}, where)
+    intrinsics = None if entry.intrinsics is None else entry.intrinsics.record(size, f"{where}: intrinsics")
+    std = entry.intrinsics_std
     return CellCamera(
         name=name,
-        mount=camera["mount"],
+        mount=entry.mount,
         images=tuple(images),
-        image_size=sizes[0],
+        image_size=size,
         intrinsics=intrinsics,
-        intrinsics_std=std,
+        intrinsics_std=None if std is None else std.array(intrinsics, f"{where}: intrinsics_std"),
         frame=frame,
-        arm=None if arm is None else str(arm),
+        arm=entry.arm,
         base_from_gripper=poses,
     )
 
 
-def _frames(frames: Any, arm: str, where: str) -> tuple[list[str], Float[ndarray, "k 4 4"]]:
-    """Return the images of a camera on another arm, and the gripper poses of that arm."""
-    if not NAME.fullmatch(arm):
-        raise InputError(
-            f"{where}: arm {shown(arm)}: a name has letters, digits and _, and begins with a letter"
-        )
-    if not isinstance(frames, list) or not all(
-        isinstance(frame, dict) and isinstance(frame.get("image"), str) and "base_from_gripper" in frame
-        for frame in frames
-    ):
-        raise InputError(
-            f"{where}: frames must be a list of image and base_from_gripper (in the arm's own base)"
-        )
-    poses = [
-        read_rigid(frame["base_from_gripper"], f"{where}: base_from_gripper of {frame['image']}")
-        for frame in frames
-    ]
-    return [frame["image"] for frame in frames], np.array(poses).reshape(-1, 4, 4)
-
-
 def cameras_as_json(capture: Capture) -> dict[str, Any]:
-    """Return the "cameras" of a capture.json; nothing where there is only the wrist camera."""
+    """Return the "cameras" of a capture.json; empty where there is only the wrist camera."""
     if not capture.others and capture.mount == "gripper":
         return {}
-    out: dict[str, Any] = {capture.camera_name: {"mount": capture.mount}}
-    for camera in capture.others:
-        entry: dict[str, Any] = {"mount": camera.mount}
-        if camera.base_from_gripper is not None:
-            entry["arm"] = camera.arm
-            entry["frames"] = [
-                {"image": image, "base_from_gripper": pose.tolist()}
-                for image, pose in zip(camera.images, camera.base_from_gripper, strict=True)
-            ]
-        else:
-            entry["images"] = _listed(camera, len(capture))
-        entry["intrinsics"] = None if camera.intrinsics is None else intrinsics_as_json(camera.intrinsics)
-        if camera.intrinsics_std is not None:
-            entry["intrinsics_std"] = std_as_json(camera.intrinsics_std)
-        out[camera.name] = entry
-    return {"cameras": out}
+    entries = {capture.camera_name: CameraEntry(mount=capture.mount)}
+    entries |= {camera.name: _entry(camera, len(capture)) for camera in capture.others}
+    return {name: entry.model_dump(mode="json", exclude_unset=True) for name, entry in entries.items()}
 
 
-def _listed(camera: CellCamera, count: int) -> Sequence[str | None]:
-    """Return the images of a camera, with None at the frames of the capture that have none."""
-    if camera.frame is None:
-        return camera.images
-    listed: list[str | None] = [None] * count
-    for row, image in zip(camera.frame, camera.images, strict=True):
-        listed[row] = image
-    return listed
+def _entry(camera: CellCamera, count: int) -> CameraEntry:
+    """Return the entry of a camera beside a capture of `count` frames."""
+    entry: dict[str, Any] = {"mount": camera.mount}
+    if camera.base_from_gripper is not None:
+        pairs = zip(camera.images, camera.base_from_gripper, strict=True)
+        frames = [CameraFrame(image=image, base_from_gripper=pose) for image, pose in pairs]
+        entry |= {"arm": camera.arm, "frames": frames}
+    else:
+        listed: list[str | None] = [*camera.images]
+        if camera.frame is not None:
+            listed = [None] * count
+            for row, image in zip(camera.frame, camera.images, strict=True):
+                listed[row] = image
+        entry["images"] = listed
+    entry["intrinsics"] = None if camera.intrinsics is None else IntrinsicsEntry.of(camera.intrinsics)
+    if camera.intrinsics_std is not None:
+        entry["intrinsics_std"] = StdEntry.of(camera.intrinsics_std)
+    return CameraEntry(**entry)

@@ -4,14 +4,15 @@ import hashlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+from pydantic import BeforeValidator, PlainSerializer
 
 from jcr.capture.conventions import METRES_LIMIT, far_rows, likely_unit, tolerated
-from jcr.capture.images import ROTATED, HowStored, other_size, read_image, read_stored
+from jcr.capture.images import other_size, read_oriented
 from jcr.capture.options import MAX_FRAMES, MIN_FRAMES
 from jcr.capture.plain_files import contained, first_few
 from jcr.errors import InputError
@@ -19,7 +20,8 @@ from jcr.findings import Finding, FindingKind
 from jcr.geometry import require_rigid, step_between
 from jcr.records import Capture
 
-MIRRORED = (2, 4, 5, 7)
+ROTATED = {3: "rotated by 180°", 6: "rotated by 90° clockwise", 8: "rotated by 90° counter-clockwise"}
+"""Rotation that shows an image of each EXIF orientation (EXIF 2.32, tag 274); the others mirror it."""
 SAME_POSE = (0.5e-3, np.radians(0.05))
 """Position (m) and rotation (rad) within which gripper poses count as the same."""
 
@@ -41,28 +43,30 @@ def checked_capture(
     for k, name in enumerate(images):
         contained(folder, name, f"{where}: frame {k}")
     found = dict(faults or {})
-    far, _, many = far_rows(base_from_gripper[:, :3, 3])
+    far, farthest, many = far_rows(base_from_gripper[:, :3, 3])
     if many:
-        check_metres(base_from_gripper[far], where)
+        name, short, a_metre = likely_unit(farthest)
+        raise InputError(
+            f"{where}: the gripper is up to {farthest:.4g} from the base; these look like {name}: "
+            f"divide the translations by {a_metre} (a pose table: --pose-units {short}-rad or {short}-deg)"
+        )
     for k in far:
         found[k] = (
             f"{where}: the pose of {images[k]} is over {METRES_LIMIT:.0f} m from the base; record it again"
         )
-    stored = _decoded(folder, images, found)
+    decoded = _decoded(folder, images, found)
     rows = [k for k in range(len(images)) if k not in found]
     if found and (len(found) > tolerated(len(images)) or len(rows) < min(MIN_FRAMES, len(images))):
         others = (
             f" ({len(found)} of {len(images)} frames cannot be used: {first_few([images[k] for k in found])})"
         )
         raise InputError(found[min(found)] + (others if len(found) > 1 else ""))
-    kept = [images[k] for k in rows]
     capture = Capture(
         folder=folder,
-        images=tuple(kept),
+        images=tuple(images[k] for k in rows),
         base_from_gripper=base_from_gripper[rows],
-        image_size=stored[rows[0]][0],
-        orientation=_common_orientation(folder, kept, [stored[k][1] for k in rows]),
-        bits=tuple(sorted({stored[k][1].bits for k in rows})),
+        image_size=decoded[rows[0]][0],
+        orientation=_common_orientation(folder, {images[k]: decoded[k][1] for k in rows}),
         notes=tuple(f"left out: {found[k]}" for k in sorted(found)),
     )
     return capture, rows
@@ -70,30 +74,29 @@ def checked_capture(
 
 def _decoded(
     folder: Path, images: Sequence[str], found: dict[int, str]
-) -> dict[int, tuple[tuple[int, int], HowStored]]:
-    """Return size (px) and storage of each image, decoded once; images that cannot be used are added to `found`."""
-    stored, digests = dict[int, tuple[tuple[int, int], HowStored]](), dict[bytes, int]()
+) -> dict[int, tuple[tuple[int, int], int]]:
+    """Return size (px) and orientation of each image; images that cannot be used are added to `found`."""
+    decoded, digests = dict[int, tuple[tuple[int, int], int]](), dict[bytes, int]()
     for k in range(len(images)):
         if k in found:
             continue
         try:
-            pixels, how = read_stored(folder / images[k])
+            pixels, orientation = read_oriented(folder / images[k])
         except InputError as error:
             found[k] = str(error)
             continue
-        stored[k] = (pixels.shape[1], pixels.shape[0]), how
+        decoded[k] = (pixels.shape[1], pixels.shape[0]), orientation
         same = digests.setdefault(hashlib.sha256(pixels.tobytes()).digest(), k)
         if same != k:
             found[k] = (
                 f"{folder / images[k]}: the same image as {images[same]}; drop one of the frames or take it again"
             )
-    sizes = {k: size for k, (size, _) in stored.items()}
-    for k, size in sizes.items():
-        (usual, _), *_ = Counter(sizes.values()).most_common(1)
-        if size != usual:
-            like = images[next(j for j in sizes if sizes[j] == usual)]
-            found[k] = str(other_size(f"{folder / images[k]}: image", size, usual, like))
-    return stored
+    usual = Counter(size for size, _ in decoded.values()).most_common(1)
+    for k, (size, _) in decoded.items():
+        if size != usual[0][0]:
+            like = images[next(j for j in decoded if decoded[j][0] == usual[0][0])]
+            found[k] = str(other_size(f"{folder / images[k]}: image", size, usual[0][0], like))
+    return decoded
 
 
 def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
@@ -117,7 +120,7 @@ def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> No
 
 
 def read_rigid(value: Any, where: str) -> Float[ndarray, "4 4"]:
-    """Return a rigid 4x4 from nested lists; InputError with the distance from rigid and a guess of the cause."""
+    """Return a rigid 4x4 from nested lists; raise InputError that says how it differs from rigid."""
     try:
         matrix = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -127,53 +130,36 @@ def read_rigid(value: Any, where: str) -> Float[ndarray, "4 4"]:
     return require_rigid(matrix, where)
 
 
-def check_metres(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None:
-    """Raise InputError where a gripper pose is too far from the base to be in metres."""
-    far, farthest, _ = far_rows(base_from_gripper[:, :3, 3])
-    if far:
-        name, short, a_metre = likely_unit(farthest)
+def _rigid(value: Any) -> Float[ndarray, "4 4"]:
+    """Return the rigid transform of a file's rows; an array is one already, and stays as it is to the last bit."""
+    return value if isinstance(value, ndarray) else read_rigid(value, "matrix")
+
+
+RigidMatrix = Annotated[Any, BeforeValidator(_rigid), PlainSerializer(lambda pose: pose.tolist())]
+"""Rigid transform (4,4) in a file."""
+
+
+def _common_orientation(folder: Path, orientation_of: Mapping[str, int]) -> int:
+    """Return the EXIF orientation of all images; raise InputError where they differ or mirror the images."""
+    (first, orientation), *others = orientation_of.items()
+    remedy = "remove the tag from all images (exiftool -Orientation= FILES)"
+    if orientation not in (1, *ROTATED):
         raise InputError(
-            f"{where}: the gripper is up to {farthest:.4g} from the base; these look like {name}: "
-            f"divide the translations by {a_metre} (a pose table: --pose-units {short}-rad or {short}-deg)"
+            f"{folder / first}: EXIF orientation {orientation} mirrors the image, as no camera does; {remedy}"
         )
-
-
-def image_sizes(folder: Path, images: Sequence[str]) -> list[tuple[int, int]]:
-    """Return width and height (px) of every image, each decoded once; InputError where one is no image."""
-    return [read_image(folder / name).shape[1::-1] for name in images]
-
-
-def _common_orientation(folder: Path, images: Sequence[str], stored: Sequence[HowStored]) -> int:
-    """Return the EXIF orientation of all images; InputError where they differ, as the axes of a camera cannot."""
-    first = stored[0].orientation
-    for name, how in zip(images, stored, strict=True):
-        if (other := how.orientation) != first:
-            raise InputError(
-                f"{folder / name}: EXIF orientation {other}, but {images[0]} has {first}: rotated to be shown, their "
-                "cameras' axes differ; remove the tag from all images (exiftool -Orientation= FILES)"
-            )
-    if first in MIRRORED:
+    if other := [one for one in others if one[1] != orientation]:
         raise InputError(
-            f"{folder / images[0]}: EXIF orientation {first}: {ROTATED[first]}, and no camera sees a mirrored world; "
-            "remove the tag (exiftool -Orientation= FILES)"
+            f"{folder / other[0][0]}: EXIF orientation {other[0][1]}, but {first} has {orientation}: rotated to be "
+            f"shown, their cameras' axes differ; {remedy}"
         )
-    return first
+    return orientation
 
 
 def how_rotated(capture: Capture) -> Finding | None:
     """Return the finding on images that their EXIF tag rotates; None without such a tag."""
     if capture.orientation == 1:
         return None
-    return Finding(
-        kind=FindingKind.IMAGES_ROTATED,
-        severity="warns",
-        value=float(capture.orientation),
-        details={"rotated": ROTATED[capture.orientation]},
+    details = {"rotated": ROTATED[capture.orientation]}
+    return Finding.of(
+        FindingKind.IMAGES_ROTATED, "warns", "none", value=float(capture.orientation), **details
     )
-
-
-def how_scaled(capture: Capture) -> str | None:
-    """Return a note on the bits that are read of 16-bit images; None of 8-bit images."""
-    if max(capture.bits) == 8:
-        return None
-    return f"images of 16 bits, {' or '.join(map(str, capture.bits))} of them used: read by the upper eight of those"

@@ -1,8 +1,7 @@
 """Reading and writing of images, and measures of their exposure and sharpness."""
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -20,16 +19,6 @@ BLURRED = 0.25
 """Share of the usual sharpness below which an image is called blurred."""
 ORIENTATION = 0x0112
 """EXIF tag of the orientation."""
-ROTATED = {
-    2: "mirrored",
-    3: "rotated by 180°",
-    4: "mirrored and rotated by 180°",
-    5: "mirrored and rotated by 90°",
-    6: "rotated by 90° clockwise",
-    7: "mirrored and rotated by 90°",
-    8: "rotated by 90° counter-clockwise",
-}
-"""Transformation that shows an image of each orientation (EXIF 2.32, tag 274)."""
 PNG_DEPTH = 24
 """Byte of a PNG's header with the bits of a sample."""
 BITS_PER_SAMPLE = 258
@@ -49,39 +38,29 @@ DARK, BRIGHT = 12, 243
 """Mean grey levels of 255 beyond which an image shows nothing."""
 
 
-@dataclass(frozen=True)
-class HowStored:
-    """Storage of the pixels in a file."""
-
-    orientation: int
-    """EXIF orientation: 1 as the sensor has it; others are rotated, or mirrored, to be shown."""
-    bits: int
-    """Bits in use of each colour."""
-
-
 def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
-    """Read RGB (h,w,3) uint8, rotated upright by its EXIF tag; InputError when the file is no readable image."""
-    return read_stored(path)[0]
+    """Read RGB (h,w,3) uint8, rotated upright by its EXIF tag; raise InputError where the file is no readable image."""
+    return read_oriented(path)[0]
 
 
-def read_stored(path: Path) -> tuple[UInt8[ndarray, "h w 3"], HowStored]:
-    """Read an image as `read_image`, and how its file stores it."""
+def read_oriented(path: Path) -> tuple[UInt8[ndarray, "h w 3"], int]:
+    """Read an image as `read_image`, and the EXIF orientation of its file: 1 as the sensor has it."""
     require_file(path)
     try:
         with warnings.catch_warnings():
             # Pillow's own bomb warning would end a run that treats warnings as errors; our limit is lower.
             warnings.simplefilter("ignore")
             with Image.open(path) as opened:
-                _refuse_size(path, opened.size)
+                if opened.size[0] * opened.size[1] > MAX_PIXELS:
+                    raise Image.DecompressionBombError
                 # Phones write MPO: a JPEG with previews behind it, whose first image is the photograph.
                 count = getattr(opened, "n_frames", 1)
                 if opened.format != "MPO" and count > 1:
                     raise InputError(f"{path}: holds {count} images; save one as PNG or JPEG")
                 opened.load()
-                orientation, bits = opened.getexif().get(ORIENTATION, 1), 8
+                orientation = opened.getexif().get(ORIENTATION, 1)
                 if (deep := _sixteen_bit(path, opened)) is not None:
-                    bits = _bits(deep)
-                    eight = np.minimum(deep >> (bits - 8), 255)
+                    eight = np.minimum(deep >> (_bits(deep) - 8), 255)
                     shown = Image.fromarray(eight.astype(np.uint8))
                     shown.getexif()[ORIENTATION] = orientation
                     opened = shown
@@ -94,8 +73,7 @@ def read_stored(path: Path) -> tuple[UInt8[ndarray, "h w 3"], HowStored]:
         raise InputError(f"{path}: over {MAX_PIXELS // 1_000_000} million pixels; shrink the image") from None
     except Exception as error:  # decoders raise whatever a damaged file makes them
         raise InputError(f"{path}: not a readable image ({error}); save it again as PNG or JPEG") from None
-    known = orientation if isinstance(orientation, int) and orientation in ROTATED else 1
-    return pixels, HowStored(known, bits)
+    return pixels, orientation if orientation in range(1, 9) else 1
 
 
 def _sixteen_bit(path: Path, opened: Image.Image) -> UInt16[ndarray, "h w *rgb"] | None:
@@ -137,14 +115,6 @@ def _bits(deep: UInt16[ndarray, "h w *rgb"]) -> int:
     return next(bits for bits in (8, 10, 12, 14, 16) if largest < 1 << bits)
 
 
-def _refuse_size(path: Path, size: tuple[int, int]) -> None:
-    """Raise InputError for an image of too many pixels."""
-    if size[0] * size[1] > MAX_PIXELS:
-        raise InputError(
-            f"{path}: {size[0]}x{size[1]} is over {MAX_PIXELS // 1_000_000} million pixels; shrink the image"
-        )
-
-
 def other_size(
     what: str,
     size: Sequence[object],
@@ -156,6 +126,14 @@ def other_size(
     return InputError(
         f"{what} of {size[0]}x{size[1]} pixels, {whose} of {expected[0]}x{expected[1]}; {remedy}"
     )
+
+
+def size_of_all(sizes: Mapping[str, tuple[int, int]], where: str) -> tuple[int, int]:
+    """Return the size (px) that all named images have; raise InputError where one has another."""
+    (first, size), *others = sizes.items()
+    if other := [one for one in others if one[1] != size]:
+        raise other_size(f"{where}: {other[0][0]}", other[0][1], size, first)
+    return size
 
 
 def brightness_and_sharpness(image: UInt8[ndarray, "h w 3"]) -> tuple[float, float]:

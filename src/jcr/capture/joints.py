@@ -1,4 +1,4 @@
-"""Forward kinematics of a URDF, for recordings of joint angles instead of gripper poses."""
+"""Gripper poses of recorded joint angles, by the forward kinematics of yourdfpy."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,9 +11,8 @@ from numpy import ndarray
 from jcr.capture.conventions import RADIANS_LIMIT
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import Stamps, bracket
-from jcr.capture.urdf_chain import chain_of, joints_to, load_urdf, source_of
+from jcr.capture.urdf_chain import chain_of, joints_to, load_urdf
 from jcr.errors import InputError
-from jcr.geometry import rotation_exp, transform
 
 if TYPE_CHECKING:
     import yourdfpy
@@ -21,29 +20,30 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedArm:
-    """Joints of a URDF from the robot's base to its gripper, and the units in which their positions are recorded."""
+    """Arm of a URDF, its base and gripper frames, and the units in which its joints are recorded."""
 
     urdf: "yourdfpy.URDF"
-    chain: tuple["yourdfpy.Joint", ...]
+    base: str
+    gripper: str
     joints: tuple[str, ...]
     """Names of the joints that move the gripper, in the order of the chain."""
     unit: Float[ndarray, " j"]
-    """Radians or metres per recorded unit of each."""
+    """Radians or metres per recorded unit of each joint."""
     turn: Float[ndarray, " j"]
-    """Recorded units of a full turn of each; 0 for a joint that slides."""
+    """Recorded units of a full turn of each joint; 0 for a sliding joint."""
 
     def columns(self, names: Sequence[str], where: str) -> list[int]:
-        """Return where the arm's joints stand among recorded `names`; InputError with those that are missing."""
+        """Return the indices of the arm's joints in recorded `names`; raise InputError where some are missing."""
         missing = [joint for joint in self.joints if joint not in names]
         if missing:
             raise InputError(
-                f"{where}: no angle of {', '.join(missing)}, which move {self.chain[-1].child} in the URDF; recorded "
-                f"are {', '.join(names)}"
+                f"{where}: no angle of {', '.join(missing)}, which move {self.gripper} in the URDF; recorded are "
+                f"{', '.join(names)}"
             )
         return [list(names).index(joint) for joint in self.joints]
 
     def angles(self, recorded: Float[ndarray, "n j"]) -> Float[ndarray, "n j"] | None:
-        """Return joint angles (rad) of recorded positions; None where the arm is no chain of rotating joints."""
+        """Return joint angles (rad) of recorded positions; None where the URDF has no single such chain."""
         try:
             chain_of(self.urdf, len(self.joints), "the URDF")
         except InputError:
@@ -51,60 +51,53 @@ class RecordedArm:
         return recorded * self.unit
 
     def poses(self, recorded: Float[ndarray, "n j"]) -> Float[ndarray, "n 4 4"]:
-        """Return base_from_gripper (n,4,4) of recorded positions; InputError on degrees instead of radians."""
+        """Return base_from_gripper (n,4,4) of recorded positions; raise InputError on degrees read as radians."""
         positions = recorded * self.unit
         if (largest := float(np.abs(positions).max(initial=0.0))) > 2 * RADIANS_LIMIT:
             raise InputError(
                 f"joint angles go up to {largest:.0f} rad; if they are degrees, add --pose-units m-deg"
             )
-        poses = np.tile(np.eye(4), (len(positions), 1, 1))
-        for joint in self.chain:
-            poses = poses @ (np.eye(4) if joint.origin is None else joint.origin)
-            if joint.type == "fixed":
-                continue
-            name, factor, offset = source_of(self.urdf, joint)
-            axis = np.asarray(joint.axis, float) / np.linalg.norm(joint.axis)
-            along = (factor * positions[:, self.joints.index(name)] + offset)[:, None] * axis
-            slides, zero = joint.type == "prismatic", np.zeros_like(along)
-            poses = poses @ transform(rotation_exp(zero if slides else along), along if slides else zero)
+        poses = np.empty((len(positions), 4, 4))
+        for pose, row in zip(poses, positions, strict=True):
+            self.urdf.update_cfg(dict(zip(self.joints, row, strict=True)))
+            pose[:] = self.urdf.get_transform(self.gripper, self.base)
         return poses
 
 
 def read_arm(options: ReadOptions) -> RecordedArm:
-    """Read the arm in the URDF of the options; InputError listing its links where they name none or no arm."""
+    """Read the arm between the frames of the options; raise InputError where the URDF has no such arm."""
     file = options.urdf
     assert file is not None
     urdf = load_urdf(file)
-    children = {joint.child for joint in urdf.robot.joints}
-    root = next((link.name for link in urdf.robot.links if link.name not in children), None)
-    base = options.base_frame or root
-    for option, link in (("--base-frame", base), ("--gripper-frame", options.gripper_frame)):
+    base, gripper = options.base_frame or urdf.base_link, options.gripper_frame
+    for option, link in (("--base-frame", base), ("--gripper-frame", gripper)):
         if link not in urdf.link_map:
             given = "is not given" if link is None else f"{link} is not in it"
             raise InputError(f"{file}: {option} {given}; its links are {', '.join(urdf.link_map)}")
-    chain = joints_to(urdf, str(options.gripper_frame))
+    chain = joints_to(urdf, str(gripper))
     parents = [joint.parent for joint in chain]
-    if base not in parents and base != options.gripper_frame:
+    if base not in (*parents, gripper):
         raise InputError(
-            f"{file}: no joints lead from {base} to {options.gripper_frame}; name the robot's base with --base-frame"
+            f"{file}: no joints lead from {base} to {gripper}; name the robot's base with --base-frame"
         )
     chain = chain[parents.index(base) :] if base in parents else []
     moving = [joint for joint in chain if joint.type != "fixed"]
-    if other := [joint for joint in moving if joint.type not in ("revolute", "continuous", "prismatic")]:
-        raise InputError(
-            f"{file}: joint {other[0].name} is {other[0].type}; only rotating and sliding ones are known"
-        )
-    names = tuple(dict.fromkeys(source_of(urdf, joint)[0] for joint in moving))
+    names = tuple(dict.fromkeys(joint.mimic.joint if joint.mimic else joint.name for joint in moving))
     if not names:
         raise InputError(
-            f"{file}: nothing moves between {base} and {options.gripper_frame}; name a link behind the last joint"
+            f"{file}: nothing moves between {base} and {gripper}; name a link behind the last joint"
+        )
+    if unknown := [name for name in names if name not in urdf.actuated_joint_names]:
+        raise InputError(
+            f"{file}: a joint mimics {unknown[0]}, which is not an independent joint of the URDF; correct it"
         )
     angle = np.radians(1.0) if options.pose_units.endswith("deg") else 1.0
     length = 1e-3 if options.pose_units.startswith("mm") else 1.0
     slides = np.array([urdf.joint_map[name].type == "prismatic" for name in names])
     return RecordedArm(
         urdf=urdf,
-        chain=tuple(chain),
+        base=base,
+        gripper=str(gripper),
         joints=names,
         unit=np.where(slides, length, angle),
         turn=np.where(slides, 0.0, 2 * np.pi / angle),
@@ -125,7 +118,7 @@ class JointTrack:
         return self.arm.poses(rows), gap
 
     def angles(self, stamp_ns: Stamps) -> Float[ndarray, "n j"] | None:
-        """Return interpolated joint angles (rad); None where the arm is no chain of rotating joints."""
+        """Return interpolated joint angles (rad); None where the URDF has no single such chain."""
         return self.arm.angles(self._between(stamp_ns)[0])
 
     def _between(self, stamp_ns: Stamps) -> tuple[Float[ndarray, "n j"], Int[ndarray, " n"]]:

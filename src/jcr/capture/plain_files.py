@@ -1,20 +1,17 @@
 """Reading of text, YAML, JSON and arrays from untrusted files: plain data inside the folder, or an InputError."""
 
 import json
-import os
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy import ndarray
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from jcr.errors import InputError
 from jcr.files import read_bytes, require_file
-
-if TYPE_CHECKING:
-    from pydantic import ValidationError
 
 LONGEST = 255
 """Bytes of the longest file name that file systems take."""
@@ -24,20 +21,6 @@ NAMED = 10
 """Names that a message lists; of more it gives the number."""
 LONGEST_SHOWN = 80
 """Characters of the longest value that a message quotes."""
-
-
-def is_written(file: Path) -> bool:
-    """Return whether a file that jcr may have written is there; InputError where something else has its name."""
-    if not os.path.lexists(file) and (not os.path.lexists(file.parent) or file.parent.is_dir()):
-        return False
-    if not os.path.lexists(file):
-        raise InputError(f"{file.parent}: is no folder; remove it, or name another run")
-    if not file.is_file():
-        kind = (
-            "a folder" if file.is_dir() else "a link to nothing" if not file.exists() else "no regular file"
-        )
-        raise InputError(f"{file}: is {kind}; remove it, or name another run")
-    return True
 
 
 def read_text(file: Path) -> str:
@@ -121,7 +104,16 @@ def first_few(names: Sequence[str]) -> str:
     return ", ".join(name[:LONGEST] for name in names[:NAMED]) + more
 
 
-def first_fault(error: "ValidationError") -> str:
+def validated(schema: type[BaseModel] | TypeAdapter, content: Any, where: str) -> Any:
+    """Return the content of a file as its schema has it; raise InputError, begun with `where`, for another one."""
+    validate = schema.validate_python if isinstance(schema, TypeAdapter) else schema.model_validate
+    try:
+        return validate(content)
+    except ValidationError as error:
+        raise InputError(f"{where}: {first_fault(error)}; correct it there") from None
+
+
+def first_fault(error: ValidationError) -> str:
     """Return the first fault that a schema finds, with its place."""
     first = error.errors()[0]
     place = ".".join(str(part)[:LONGEST_SHOWN] for part in first["loc"])

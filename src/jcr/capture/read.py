@@ -10,11 +10,10 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from jcr.capture.checks import how_rotated, how_scaled, require_frames, require_motion
+from jcr.capture.checks import how_rotated, require_frames, require_motion
 from jcr.capture.formats import Format, bag, capture_json, colmap, lerobot, samples, table
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.capture.pairing import image_names
-from jcr.capture.plain_files import read_json
 from jcr.errors import InputError
 from jcr.findings import sentence
 from jcr.geometry import inverse
@@ -77,19 +76,13 @@ def read_source(
     found = _inverted(form.read(path, options), options)
     require_frames(len(found), str(path), at_least)
     require_motion(found.base_from_gripper, str(path))
-    if not isinstance(found, Capture):
-        return found
-    rotated = how_rotated(found)
-    remarks = (
-        None if rotated is None else sentence(rotated),
-        how_scaled(found),
-        capture_json.unused_options(options) if form.name == "capture" else None,
-    )
-    return replace(found, notes=(*found.notes, *filter(None, remarks)))
+    if isinstance(found, Capture) and (rotated := how_rotated(found)) is not None:
+        return replace(found, notes=(*found.notes, sentence(rotated)))
+    return found
 
 
 def format_of(path: Path, options: ReadOptions | None = None) -> str:
-    """Return the name of the format that the files at a path show; InputError when they show none."""
+    """Return the name of the format that the files at a path show; raise InputError when they show none."""
     for form in FORMATS.values():
         if form.recognises(path) or (
             form.name == "table" and options is not None and options.poses is not None
@@ -122,12 +115,14 @@ def _inverted(found: Any, options: ReadOptions) -> Any:
 
 def _extracted(path: Path, options: ReadOptions, into: Path, form: Format, progress: Progress) -> Capture:
     """Return the capture of a recording in the folder `into`; read again where its files or the options changed."""
-    made_from = _made_from(path, options)
+    made_from, file = _made_from(path, options), into / capture_json.FILE
     with _locked(into):
-        if _content(into).get("made_from") != made_from:
+        before = capture_json.read_content(file).model_extra if file.is_file() else None
+        if before is None or before.get("made_from") != made_from:
             capture = _inverted(form.read(path, options, into, progress), options)
             capture_json.write(into, capture, notes=capture.notes, made_from=made_from)
-        return replace(capture_json.read(into), notes=tuple(_content(into)["notes"]))
+        extra = capture_json.read_content(file).model_extra or {}
+        return replace(capture_json.read(into), notes=tuple(extra["notes"]))
 
 
 def _made_from(path: Path, options: ReadOptions) -> list[Any]:
@@ -139,13 +134,6 @@ def _made_from(path: Path, options: ReadOptions) -> list[Any]:
     ]
     digest = hashlib.sha256(json.dumps(states).encode()).hexdigest()
     return [str(path.resolve()), digest, json.loads(json.dumps(asdict(options), default=str))]
-
-
-def _content(folder: Path) -> dict[str, Any]:
-    """Return the content of the capture.json of a folder, empty where there is none."""
-    file = folder / capture_json.FILE
-    content = read_json(file) if file.is_file() else None
-    return content if isinstance(content, dict) else {}
 
 
 @contextmanager

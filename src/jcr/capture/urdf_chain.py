@@ -1,4 +1,4 @@
-"""Chains of joints in a URDF."""
+"""Arms in URDF files: chains of rotating joints as the estimation's `Arm`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -30,8 +30,7 @@ def read_chain(file: Path, dof: int) -> Arm:
 def load_urdf(file: Path) -> "yourdfpy.URDF":
     """Read the robot of a URDF file, without its meshes.
 
-    Raises InputError where the file is none, or where its joints are not finite and rigid or lead back to where they
-    began.
+    Raises InputError where the file is no URDF, or where a joint is not finite and rigid or its joints form a loop.
     """
     import lxml.etree as etree  # pyright: ignore[reportMissingImports]
     import yourdfpy
@@ -39,20 +38,19 @@ def load_urdf(file: Path) -> "yourdfpy.URDF":
     try:
         # yourdfpy repairs what is no XML, with two lines of its own on stderr.
         etree.fromstring(read_text(file).encode(), etree.XMLParser(resolve_entities=False, no_network=True))
-        urdf = yourdfpy.URDF.load(file, load_meshes=False, build_scene_graph=False)
-        for joint in urdf.robot.joints:
+        plain = yourdfpy.URDF.load(file, load_meshes=False, build_scene_graph=False)
+        for joint in plain.robot.joints:
             _check(joint, f"{file}: joint {joint.name}")
-            joints_to(urdf, joint.child)
-            source_of(urdf, joint)
+            joints_to(plain, joint.child)
+        return yourdfpy.URDF(plain.robot, load_meshes=False, build_collision_scene_graph=False)
     except InputError:
         raise
     except Exception as error:  # the parser raises whatever its XML library does
         raise InputError(f"{file}: not a readable URDF ({error}); expand xacro first") from None
-    return urdf
 
 
 def joints_to(urdf: "yourdfpy.URDF", link: str) -> list["yourdfpy.Joint"]:
-    """Return the joints from the root of a URDF to a link; InputError where they lead back to it."""
+    """Return the joints from the root of a URDF to a link; raise InputError where they lead back to it."""
     by_child = {joint.child: joint for joint in urdf.robot.joints}
     chain = []
     while link in by_child:
@@ -61,26 +59,6 @@ def joints_to(urdf: "yourdfpy.URDF", link: str) -> list["yourdfpy.Joint"]:
         chain.insert(0, by_child[link])
         link = by_child[link].parent
     return chain
-
-
-def source_of(urdf: "yourdfpy.URDF", joint: "yourdfpy.Joint") -> tuple[str, float, float]:
-    """Return the joint that a joint follows through `mimic`, itself without one, with its factor and offset.
-
-    Raises InputError where joints mimic each other, or one that is not in the URDF.
-    """
-    factor, offset = 1.0, 0.0
-    for _ in range(len(urdf.robot.joints) + 1):
-        if joint.mimic is None:
-            return joint.name, factor, offset
-        multiplier = 1.0 if joint.mimic.multiplier is None else joint.mimic.multiplier
-        offset += factor * (joint.mimic.offset or 0.0)
-        factor *= multiplier
-        if joint.mimic.joint not in urdf.joint_map:
-            raise InputError(
-                f"joint {joint.name} mimics {joint.mimic.joint}, which is not in the URDF; correct it"
-            )
-        joint = urdf.joint_map[joint.mimic.joint]
-    raise InputError(f"joint {joint.name} mimics itself through other joints; correct the URDF")
 
 
 def chain_of(urdf: "yourdfpy.URDF", dof: int, where: str) -> Arm:
@@ -126,15 +104,11 @@ def chain_of(urdf: "yourdfpy.URDF", dof: int, where: str) -> Arm:
 def _check(joint: "yourdfpy.Joint", where: str) -> None:
     """Raise InputError where the origin, axis or limits of a joint cannot be."""
     if joint.origin is not None:
-        if np.shape(joint.origin) != (4, 4):
-            raise InputError(f"{where}: its origin is no position and angles; correct it there")
-        require_rigid(joint.origin, f"{where}: origin")
+        require_rigid(np.reshape(joint.origin, (4, 4)), f"{where}: origin")
     axis = np.asarray(joint.axis, float)
     if axis.shape != (3,) or not (np.isfinite(axis).all() and np.linalg.norm(axis) > 1e-9):
         raise InputError(f"{where}: its axis is no direction; correct it there")
-    limit = joint.limit
-    ends = [] if limit is None else [end for end in (limit.lower, limit.upper) if end is not None]
-    if not np.isfinite(ends).all():
+    if not np.isfinite(_limits(joint)).all():
         raise InputError(f"{where}: its limits are not finite; correct them there")
 
 
@@ -143,4 +117,4 @@ def _limits(joint: "yourdfpy.Joint") -> tuple[float, float]:
     limit = joint.limit
     if joint.type == "continuous" or limit is None or limit.lower is None or limit.upper is None:
         return ANY_ANGLE
-    return (limit.lower, limit.upper) if limit.upper > limit.lower else ANY_ANGLE
+    return (limit.lower, limit.upper) if not limit.upper <= limit.lower else ANY_ANGLE

@@ -1,14 +1,15 @@
 """Cameras added to a run after its calibration: copies of their images in the run folder."""
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from jcr.capture.camera_info import read_intrinsics_of_size
+from jcr.capture.camera_info import IntrinsicsEntry
 from jcr.capture.cell_cameras import NAME, cameras_as_json, with_cameras
-from jcr.capture.images import read_image
-from jcr.capture.plain_files import is_written, read_json
+from jcr.capture.images import read_image, size_of_all
+from jcr.capture.plain_files import read_json, validated
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.records import Capture, CellCamera
@@ -19,7 +20,7 @@ FOLDER, FILE = "cameras", "cameras.json"
 def read_added_cameras(run_folder: Path, capture: Capture) -> tuple[CellCamera, ...]:
     """Read the cameras added to a run; raise InputError where their file or an image was damaged."""
     folder = run_folder / FOLDER
-    if not is_written(folder / FILE):
+    if not (folder / FILE).is_file():
         return ()
     alone = replace(capture, folder=folder, others=())
     content = read_json(folder / FILE)
@@ -27,7 +28,7 @@ def read_added_cameras(run_folder: Path, capture: Capture) -> tuple[CellCamera, 
         raise InputError(
             f"{folder / FILE}: damaged; remove {folder}, and add the cameras again (jcr add-camera)"
         )
-    read = with_cameras(alone, content, folder / FILE)
+    read = with_cameras(alone, content, str(folder / FILE))
     return tuple(replace(camera, folder=folder) for camera in read.others)
 
 
@@ -37,26 +38,20 @@ def camera_of(name: str, files: Sequence[Path], intrinsics: Path | None, taken: 
     `intrinsics` is a JSON file as capture.json has them, or one that holds them as "intrinsics"; `taken` are names
     that other cameras have.
     """
-    if not NAME.fullmatch(name):
+    if not re.fullmatch(NAME, name):
         raise InputError(f"--name {name}: a name has letters, digits and _, and begins with a letter")
     if name in taken:
         raise InputError(f"--name {name}: the cell has a camera of that name; choose another")
-    sizes = [read_image(file).shape[1::-1] for file in files]
-    for file, size in zip(files, sizes, strict=True):
-        if size != sizes[0]:
-            raise InputError(
-                f"{file}: {size[0]}x{size[1]} pixels, but {files[0]} has {sizes[0][0]}x{sizes[0][1]}; images of "
-                "one camera have one size: add each camera by itself"
-            )
+    size = size_of_all({str(file): read_image(file).shape[1::-1] for file in files}, f"--name {name}")
     known = None
     if intrinsics is not None:
         content = read_json(intrinsics)
         if isinstance(content, dict) and isinstance(content.get("intrinsics"), dict):
             content = content["intrinsics"]
-        known = read_intrinsics_of_size(content, sizes[0], f"{files[0]}, {intrinsics}")
+        known = validated(IntrinsicsEntry, content, str(intrinsics)).record(size, f"{files[0]}, {intrinsics}")
     images = tuple(str(file.resolve()) for file in files)
     return CellCamera(
-        name=name, mount="base", images=images, image_size=sizes[0], intrinsics=known, folder=Path("/")
+        name=name, mount="base", images=images, image_size=size, intrinsics=known, folder=Path("/")
     )
 
 
@@ -70,7 +65,7 @@ def keep_camera(run_folder: Path, capture: Capture, camera: CellCamera) -> CellC
         write_bytes(folder / images[-1], source.read_bytes())
     kept = replace(camera, images=tuple(images), folder=folder)
     every = (*read_added_cameras(run_folder, capture), kept)
-    content = cameras_as_json(replace(capture, others=every))["cameras"]
+    content = cameras_as_json(replace(capture, others=every))
     del content[capture.camera_name]
     write_text(folder / FILE, json.dumps(content, indent=1) + "\n")
     return kept

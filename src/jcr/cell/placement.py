@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from jcr.arrays_json import Covariance6, Matrix, Part, Spread, Spread3
 from jcr.calibration.findings_json import FindingJson, derived, require_one_verdict
-from jcr.capture.plain_files import first_fault, is_written, read_json
+from jcr.capture.plain_files import first_fault, read_json
 from jcr.errors import InputError
 from jcr.files import write_text
 from jcr.findings import Finding, Verdict, doubt_of, strongest_first
@@ -245,7 +245,7 @@ def write_cameras(folder: Path, content: CamerasFile) -> None:
 def read_cameras(folder: Path) -> CamerasFile | None:
     """Read cameras.json of a run folder, None where it has none; raise InputError where it was damaged."""
     file = folder / FILE
-    if not is_written(file):
+    if not file.is_file():
         return None
     read_json(file)  # raises InputError with the place of a fault
     try:

@@ -13,13 +13,14 @@ import tyro
 from jcr.capture.options import ConventionName, UnitsName
 from jcr.cli.output import Output
 from jcr.errors import InputError
-from jcr.estimation.arms import CHOICES, ROBOT_NAMES, RobotName
+from jcr.estimation.arms import CHOICES, RobotName
 from jcr.live.cameras import CameraOptions
 from jcr.live.session import LEAST_IMAGES, SessionOptions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from jcr.capture.camera_info import IntrinsicsEntry
     from jcr.live.folder import LiveFolder
     from jcr.live.notation import Notation
     from jcr.live.robot import States
@@ -209,13 +210,14 @@ def _notation(arguments: Arguments, folder: "LiveFolder") -> "Notation":
     convention = arguments.pose_convention
     if convention == "auto":
         convention = NOTATIONS.get(arguments.poses.partition(":")[0], "auto")
-    name = folder.rest.get("robot")
-    return Notation(convention, arguments.pose_units, arm_named(name) if name in ROBOT_NAMES else None)
+    name = folder.robot
+    return Notation(convention, arguments.pose_units, None if name is None else arm_named(name))
 
 
-def _intrinsics(file: Path | None) -> dict[str, Any] | None:
+def _intrinsics(file: Path | None) -> "IntrinsicsEntry | None":
     """Return the intrinsics in a JSON file; raise InputError where it has none."""
-    from jcr.capture.plain_files import read_json
+    from jcr.capture.camera_info import IntrinsicsEntry
+    from jcr.capture.plain_files import read_json, validated
 
     if file is None:
         return None
@@ -223,4 +225,4 @@ def _intrinsics(file: Path | None) -> dict[str, Any] | None:
     given = content.get("intrinsics") if isinstance(content, dict) else None
     if not isinstance(given, dict):
         raise InputError(f'--intrinsics-from {file}: holds no "intrinsics"; name a capture.json with some')
-    return {key: given[key] for key in ("model", "fx", "fy", "cx", "cy", "distortion") if key in given}
+    return validated(IntrinsicsEntry, given, f"--intrinsics-from {file}")

@@ -21,7 +21,7 @@ from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import RobotErrors, robot_errors
 from jcr.calibration.stage import checked
-from jcr.capture.camera_info import intrinsics_as_json
+from jcr.capture.camera_info import IntrinsicsEntry
 from jcr.capture.checks import read_rigid
 from jcr.capture.conventions import far_rows, likely_unit
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
@@ -82,14 +82,14 @@ class LiveCalibration:
                 from jcr.run_folder import locked
 
                 self._opened.enter_context(locked(Path(folder)))
-            given = None if intrinsics is None else intrinsics_as_json(intrinsics)
+            given = None if intrinsics is None else IntrinsicsEntry.of(intrinsics)
             folder = LiveFolder(Path(folder), given, robot)
         self.live = folder
         self._lock = threading.RLock()
         """Held while the capture, the map or the progress is changed."""
         self._options = checked_options(options, CalibrateOptions)
         check_options(self._options)
-        name = self._options.robot or folder.rest.get("robot")
+        name = self._options.robot or folder.robot
         self._reach = Reach(None if name is None else arm_named(name), reach)
         self._map: Growing | None = None
         self._mapped: list[str] = []
@@ -211,12 +211,12 @@ class LiveCalibration:
             )
         new = ImageSummary.of(image)
         for one in self.live.images:
-            if one.name == without or not new.is_like(self.live.summary(one.name)):
+            if one.image == without or not new.is_like(self.live.summary(one.image)):
                 continue
             metres, radians = largest_motion(np.stack([one.base_from_gripper, base_from_gripper]))
             moved = metres >= MOVED[0] or radians >= MOVED[1]
             kind = FindingKind.FRAME_REPEATED if moved else FindingKind.SAMPLE_REPEATED
-            return Finding.of(kind, "rejects", "images", one.name, value=metres, rotation=radians)
+            return Finding.of(kind, "rejects", "images", one.image, value=metres, rotation=radians)
         return None
 
     def _refuse(self, refused: Finding, base_from_gripper: Float[ndarray, "4 4"]) -> Progress:

@@ -13,6 +13,7 @@ import cv2
 from jaxtyping import UInt8, UInt16
 from numpy import ndarray
 
+from jcr.capture.camera_info import IntrinsicsEntry
 from jcr.errors import InputError
 
 TIMEOUT_S = 10.0
@@ -52,8 +53,8 @@ class Camera:
     """Frames of a device or stream taken after they are requested, never from a buffer; InputError when it is lost."""
     latest: Callable[[], Frame | None]
     """Function that returns the newest frame."""
-    intrinsics: dict[str, Any] | None = None
-    """Intrinsics in the form of capture.json, where the camera's maker stored them in it."""
+    intrinsics: IntrinsicsEntry | None = None
+    """Intrinsics, where the camera's maker stored them in it."""
 
 
 class NewestFrame:

@@ -224,11 +224,11 @@ def _scene(state: SessionState) -> dict[str, Any]:
     faults_of = {one["name"]: one["fault"] for one in _cards(state)}
     views = [
         scene_view(
-            Path(one.name).name,
-            faults_of[one.name] or one.name,
-            not faults_of[one.name],
+            Path(one.image).name,
+            faults_of[one.image] or one.image,
+            not faults_of[one.image],
             one.base_from_gripper,
-            one.base_from_gripper @ x if found is not None and one.name in progress.registered else None,
+            one.base_from_gripper @ x if found is not None and one.image in progress.registered else None,
         )
         for one in state.images
     ]

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from jcr.capture.camera_info import IntrinsicsEntry
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.live.cameras import TIMEOUT_S, Camera, CameraOptions, Frame, NewestFrame, RecordedFrames
@@ -124,15 +125,15 @@ def _apply_options(rs: ModuleType, profile: Any, options: CameraOptions) -> None
         sensor.set_option(option, value)
 
 
-def intrinsics_of_realsense(rs: ModuleType, stored: Any) -> dict[str, Any] | None:
+def intrinsics_of_realsense(rs: ModuleType, stored: Any) -> IntrinsicsEntry | None:
     """Return intrinsics for capture.json; None where OpenCV's coefficients differ from the maker's by FITTED_PX.
 
     librealsense has distortions of its own ("Projection in Intel RealSense SDK 2.0"), among them an inverse one. Its
     own deprojection gives the ray of each pixel, and the coefficients are linear in where rays go.
     """
-    intrinsics = {"fx": stored.fx, "fy": stored.fy, "cx": stored.ppx, "cy": stored.ppy}
+    intrinsics = IntrinsicsEntry(fx=stored.fx, fy=stored.fy, cx=stored.ppx, cy=stored.ppy)
     if not any(stored.coeffs):
-        return intrinsics | {"distortion": [0.0] * 5}
+        return intrinsics
     u, v = np.meshgrid(np.linspace(0, stored.width - 1, 25), np.linspace(0, stored.height - 1, 19))
     x_px = np.stack([u.ravel(), v.ravel()], axis=1)
     rays = np.array([rs.rs2_deproject_pixel_to_point(stored, pixel.tolist(), 1.0) for pixel in x_px])
@@ -143,4 +144,5 @@ def intrinsics_of_realsense(rs: ModuleType, stored: Any) -> dict[str, Any] | Non
     matrix, goal = np.vstack([by_x, by_y]), np.concatenate([seen[:, 0] - x, seen[:, 1] - y])
     coefficients = np.linalg.lstsq(matrix, goal, rcond=None)[0]
     off_px = max(stored.fx, stored.fy) * np.abs(matrix @ coefficients - goal).max()
-    return intrinsics | {"distortion": coefficients.tolist()} if off_px < FITTED_PX else None
+    fitted = intrinsics.model_copy(update={"distortion": coefficients.tolist()})
+    return fitted if off_px < FITTED_PX else None

@@ -13,9 +13,9 @@ import tyro
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.capture.formats.capture_json import FrameEntry
 from jcr.errors import InputError, RejectedError
 from jcr.live.cameras import Camera, Frame
-from jcr.live.folder import TakenImage
 from jcr.live.notation import Notation
 from jcr.live.progress import Progress, progress_lines
 from jcr.live.robot import MOVED_ON, REST, TRY_AGAIN, RobotState, States, is_farther, next_rest
@@ -78,7 +78,7 @@ class SessionState:
     """Last event in words; empty where the rest of the state shows it."""
     is_refusal: bool = False
     """Whether the event is the reason why an image was not kept."""
-    images: tuple[TakenImage, ...] = ()
+    images: tuple[FrameEntry, ...] = ()
     can_undo: bool = False
     """Whether there is a change that can be taken back."""
     replaces: str | None = None
@@ -95,7 +95,7 @@ class SessionState:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the images."""
-        return tuple(one.name for one in self.images)
+        return tuple(one.image for one in self.images)
 
 
 class LiveSession:
@@ -257,12 +257,12 @@ class LiveSession:
 
     def _frame(self, state: RobotState, current: Callable[[], RobotState] | None) -> Frame | str:
         """Return a frame at rest, or the reason why none is kept."""
-        others = [one for one in self.folder.images if one.name != self.state.replaces]
+        others = [one for one in self.folder.images if one.image != self.state.replaces]
         pose = state.base_from_gripper
         for one in others:
             if not is_farther(one.base_from_gripper, pose, SAME_PLACE):
-                return f"the gripper is where {one.name} was taken; move to another pose"
-        kept = [self.folder.summary(one.name) for one in others]
+                return f"the gripper is where {one.image} was taken; move to another pose"
+        kept = [self.folder.summary(one.image) for one in others]
         found = frame_at_rest(self._frames, kept, self.options.patience)
         if isinstance(found, Frame) and current is not None:
             try:
@@ -291,7 +291,7 @@ class LiveSession:
         self._tell({"retake": name}, [event])
         if self._gripper is None:
             return
-        there = next(one.base_from_gripper for one in self.folder.images if one.name == name)
+        there = next(one.base_from_gripper for one in self.folder.images if one.image == name)
         try:
             now = self._gripper().base_from_gripper
         except InputError as error:

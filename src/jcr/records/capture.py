@@ -106,8 +106,6 @@ class Capture:
     """The arm's URDF file, not relative to `folder`; None where none was given."""
     orientation: int = 1
     """EXIF's, of all images: 1 as the sensor has them; others were rotated upright, and the camera frame is theirs."""
-    bits: tuple[int, ...] = (8,)
-    """Of each colour that the images' files use; of more than 8 the upper eight are read."""
     pose_convention: str | None = None
     """How its robot writes poses, a name of capture.conventions.CONVENTIONS; None where its file does not tell."""
     depths: tuple[str | None, ...] | None = None

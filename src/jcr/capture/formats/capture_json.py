@@ -1,22 +1,21 @@
-"""The capture folder: `capture.json` and the images it names."""
+"""The capture folder: `capture.json` and the images that it names."""
 
 import json
-from dataclasses import asdict, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from jcr.capture.camera_info import intrinsics_as_json, read_intrinsics, read_std, std_as_json
+from jcr.capture.camera_info import IntrinsicsEntry, StdEntry
 from jcr.capture.cell_cameras import cameras_as_json, with_cameras
-from jcr.capture.checks import checked_capture, read_rigid, require_frames
+from jcr.capture.checks import RigidMatrix, checked_capture, require_frames
 from jcr.capture.conventions import CONVENTIONS
-from jcr.capture.depth_images import depth_of_frames
 from jcr.capture.formats import Format
 from jcr.capture.options import MAX_FRAMES, ReadOptions
-from jcr.capture.plain_files import contained, read_json, shown
+from jcr.capture.plain_files import contained, read_json, shown, validated
 from jcr.errors import InputError
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.files import write_bytes, write_new, write_text
@@ -27,15 +26,52 @@ MAX_BYTES = 32_000_000
 """Size of the largest capture.json: a larger one takes long to read, and is no capture."""
 MOST_ROTATION = 6 * np.pi + 0.01
 """Largest joint angle, rad: no joint rotates farther to either side."""
-OF_EVERY_FORMAT = ("format", "pose_inverted")
-"""Options that a capture.json is read by, too."""
 
 
-def read(path: Path, options: ReadOptions | None = None) -> Capture:
-    """Read the capture in a folder, or named by its capture.json; no option changes how (`unused_options`)."""
-    folder, file = (path, path / FILE) if path.is_dir() else (path.parent, path)
+def _plausible(angles: list[float]) -> list[float]:
+    """Return joint angles (rad); raise ValueError where they look like degrees."""
+    if (largest := max(map(abs, angles))) > MOST_ROTATION:
+        raise ValueError(f"up to {largest:.4g} rad; these look like degrees: convert them")
+    return angles
+
+
+class FrameEntry(BaseModel):
+    """Frame of a capture.json: an image with the data recorded at it."""
+
+    model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False)
+    image: str
+    """Path in the folder of the capture."""
+    base_from_gripper: RigidMatrix
+    joints: Annotated[list[float], Field(min_length=1), AfterValidator(_plausible)] | None = None
+    """Joint angles (rad), from the base on."""
+    depth: str | None = None
+    """Path of a depth camera's image."""
+    time_s: float | None = None
+    """Time on the camera's clock."""
+
+
+class CaptureFile(BaseModel):
+    """Content of a capture.json; other keys are kept."""
+
+    model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False, extra="allow")
+    frames: list[Any]
+    """Entries that FrameEntry validates one by one, so that a few of them may be faulty."""
+    intrinsics: IntrinsicsEntry | None = None
+    intrinsics_std: StdEntry | None = None
+    pose_convention: Any = None
+    robot: Any = None
+    urdf: str | None = None
+    cameras: dict[str, Any] | None = None
+
+    def as_text(self) -> str:
+        """Return the text of the file."""
+        return json.dumps(self.model_dump(mode="json", exclude_unset=True), indent=1) + "\n"
+
+
+def read_content(file: Path) -> CaptureFile:
+    """Read a capture.json; raise InputError where the file is none."""
     if not file.is_file():
-        raise InputError(f"{folder}: holds no capture.json; name a capture folder")
+        raise InputError(f"{file.parent}: holds no capture.json; name a capture folder")
     if (size := file.stat().st_size) > MAX_BYTES:
         raise InputError(
             f"{file}: {size / 1e6:.0f} MB; {MAX_BYTES // 1_000_000} MB at most, which hold {MAX_FRAMES} frames"
@@ -43,79 +79,112 @@ def read(path: Path, options: ReadOptions | None = None) -> Capture:
     content = read_json(file)
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
         raise InputError(f'{file}: has no list "frames"; expected {{"frames": [...], "intrinsics": ...}}')
-    frames, faults = content["frames"], dict[int, str]()
-    require_frames(len(frames), str(file), 0)
-    images = [_image_name(frame, i, file) for i, frame in enumerate(frames)]
-    poses, joints = np.full((len(frames), 4, 4), np.nan), _joints(frames, images, file, faults)
-    for i, (name, frame) in enumerate(zip(images, frames, strict=True)):
-        where = f"{file}: base_from_gripper of frame {i} ({name})"
-        try:
-            if "base_from_gripper" not in frame:
-                raise InputError(f"{where} is missing; add the gripper pose")
-            poses[i] = read_rigid(frame["base_from_gripper"], where)
-        except InputError as error:
-            faults.setdefault(i, str(error))
-    capture, rows = checked_capture(folder, images, poses, str(file), faults)
-    joints = None if joints is None else joints[rows]
-    used = [i in rows for i in range(len(frames))]
-    frames = [frames[i] for i in rows]
-    robot, notes = _robot(content.get("robot"), joints, file)
-    intrinsics = read_intrinsics(content.get("intrinsics"), capture.image_size, file)
-    convention = content.get("pose_convention")
-    capture = replace(
-        capture,
-        pose_convention=convention if isinstance(convention, str) and convention in CONVENTIONS else None,
-        intrinsics=intrinsics,
-        intrinsics_std=read_std(content.get("intrinsics_std"), intrinsics, file),
-        notes=(*capture.notes, *notes),
-        joints=joints,
-        robot=robot,
-        urdf=_urdf(content.get("urdf"), file),
-        depths=depth_of_frames(frames, folder, str(file)),
+    return validated(CaptureFile, content, str(file))
+
+
+def frame_of(content: CaptureFile, row: int, file: Path) -> FrameEntry:
+    """Return a frame of a capture.json; raise InputError that names its image where the frame cannot be used."""
+    return validated(
+        FrameEntry, content.frames[row], f"{file}: frame {row} ({_image_name(content, row, file)})"
     )
-    return with_cameras(capture, content.get("cameras"), file, used)
 
 
-def unused_options(options: ReadOptions) -> str | None:
-    """Return a note on given options that a capture.json does not need; None where there are none."""
-    usual = asdict(ReadOptions())
-    given = [
-        f"--{name.replace('_', '-')}"
-        for name, value in asdict(options).items()
-        if name not in OF_EVERY_FORMAT and value != usual[name]
-    ]
-    if not given:
-        return None
-    are = "is" if len(given) == 1 else "are"
-    return f"{' and '.join(given)} {are} not used: capture.json holds 4x4 poses in metres, and its own intrinsics"
+def read(path: Path, options: ReadOptions | None = None) -> Capture:
+    """Read the capture in a folder, or named by its capture.json; no option changes how."""
+    folder, file = (path, path / FILE) if path.is_dir() else (path.parent, path)
+    content = read_content(file)
+    count = len(content.frames)
+    require_frames(count, str(file), 0)
+    images = [_image_name(content, row, file) for row in range(count)]
+    frames, faults = dict[int, FrameEntry](), dict[int, str]()
+    for row in range(count):
+        try:
+            frames[row] = frame_of(content, row, file)
+        except InputError as error:
+            faults[row] = str(error)
+    dof = next((len(frame.joints) for frame in frames.values() if frame.joints), 0)
+    for row, frame in frames.items():
+        if (angles := len(frame.joints or ())) != dof:
+            what = "no joints" if not angles else f"{angles} joint angles"
+            faults[row] = (
+                f"{file}: frame {row} ({images[row]}): {what}, others have {dof}; give them for all or for none"
+            )
+    poses = np.full((count, 4, 4), np.nan)
+    for row in frames.keys() - faults.keys():
+        poses[row] = frames[row].base_from_gripper
+    capture, rows = checked_capture(folder, images, poses, str(file), faults)
+    for row in rows:
+        if (depth := frames[row].depth) is not None:
+            _inside(folder, depth, f"{file}: depth of frame {row}")
+    stated = stated_fields(content, [frames[row] for row in rows], capture.image_size, file)
+    notes = (*capture.notes, *stated.pop("notes"))
+    capture = replace(capture, **stated, notes=notes)
+    if content.cameras is None:
+        return capture
+    return with_cameras(capture, content.cameras, str(file), [row in rows for row in range(count)])
+
+
+def stated_fields(
+    content: CaptureFile, frames: Sequence[FrameEntry], size: tuple[int, int], file: Path
+) -> dict[str, Any]:
+    """Return the fields of the Capture of some frames that a capture.json states, other cameras apart."""
+    intrinsics = None
+    if content.intrinsics is not None:
+        intrinsics = content.intrinsics.record(size, f"{file}: intrinsics")
+    std = content.intrinsics_std
+    angles = [frame.joints for frame in frames if frame.joints is not None]
+    joints = np.array(angles) if angles and len(angles) == len(frames) else None
+    robot, notes = content.robot, ()
+    if robot is not None and robot not in ROBOT_NAMES:
+        known = ", ".join(ROBOT_NAMES)
+        robot, notes = None, (f"robot {shown(robot)} is not one of {known}: its kinematics are not used",)
+    if robot is not None and joints is not None and joints.shape[1] != (dof := arm_named(robot).dof):
+        raise InputError(
+            f"{file}: frames have {joints.shape[1]} joints, but a {robot} has {dof}; correct either"
+        )
+    urdf = None if content.urdf is None else _inside(file.parent, content.urdf, f"{file}: urdf")
+    depths = tuple(frame.depth for frame in frames)
+    convention = content.pose_convention
+    return {
+        "intrinsics": intrinsics,
+        "intrinsics_std": None if std is None else std.array(intrinsics, f"{file}: intrinsics_std"),
+        "joints": joints,
+        "robot": robot,
+        "urdf": urdf,
+        "depths": depths if any(depths) else None,
+        "pose_convention": convention if isinstance(convention, str) and convention in CONVENTIONS else None,
+        "notes": notes,
+    }
 
 
 def write(folder: Path, capture: Capture, **remarks: Any) -> None:
     """Write capture.json for images that lie in `folder` already; `remarks` are keys that readers ignore."""
-    frames: list[dict[str, Any]] = [
-        {"image": name, "base_from_gripper": pose.tolist()}
-        for name, pose in zip(capture.images, capture.base_from_gripper, strict=True)
-    ]
-    if capture.joints is not None:
-        for frame, row in zip(frames, capture.joints.tolist(), strict=True):
-            frame["joints"] = row
-    for frame, name in zip(frames, capture.depths or (), strict=False):
-        if name is not None:
-            frame["depth"] = name
-    arm = {} if capture.robot is None else {"robot": capture.robot}
+    optional: Mapping[str, Sequence[Any]] = {
+        "joints": [] if capture.joints is None else capture.joints.tolist(),
+        "depth": capture.depths or [],
+    }
+    frames = []
+    for row, (name, pose) in enumerate(zip(capture.images, capture.base_from_gripper, strict=True)):
+        more = {key: values[row] for key, values in optional.items() if values and values[row] is not None}
+        frames.append(FrameEntry(image=name, base_from_gripper=pose, **more))
+    given = capture.intrinsics
+    stated: dict[str, Any] = {
+        "frames": frames,
+        "intrinsics": None if given is None else IntrinsicsEntry.of(given),
+    }
+    if capture.intrinsics_std is not None:
+        stated["intrinsics_std"] = StdEntry.of(capture.intrinsics_std)
+    stated |= {
+        key: value for key in ("pose_convention", "robot") if (value := getattr(capture, key)) is not None
+    }
     if capture.urdf is not None:
         # Beside the images, whatever it was called: a capture is complete in its folder.
         if capture.urdf.resolve() != (folder / URDF).resolve():
             write_bytes(folder / URDF, capture.urdf.read_bytes())
-        arm["urdf"] = URDF
-    intrinsics = None if capture.intrinsics is None else intrinsics_as_json(capture.intrinsics)
-    stated: dict[str, Any] = {"frames": frames, "intrinsics": intrinsics}
-    if capture.intrinsics_std is not None:
-        stated["intrinsics_std"] = std_as_json(capture.intrinsics_std)
-    if capture.pose_convention is not None:
-        stated["pose_convention"] = capture.pose_convention
-    stated |= arm | cameras_as_json(capture) | remarks
-    write_text(folder / FILE, json.dumps(stated, indent=1) + "\n")
+        stated["urdf"] = URDF
+    if cameras := cameras_as_json(capture):
+        stated["cameras"] = cameras
+    write_text(folder / FILE, CaptureFile(**stated, **remarks).as_text())
 
 
 def origin(folder: Path) -> Path:
@@ -141,80 +210,18 @@ def kept(capture: Capture, folder: Path) -> Capture:
     return replace(read(folder), cameras=capture.cameras, notes=capture.notes)
 
 
-def _joints(
-    frames: list[Any], images: list[str], file: Path, faults: dict[int, str]
-) -> Float[ndarray, "n dof"] | None:
-    """Return joint angles (rad) of all frames, None where no frame has them; frames that lack some are `faults`."""
-    rows = dict[int, Float[ndarray, " dof"]]()
-    for i, (name, frame) in enumerate(zip(images, frames, strict=True)):
-        where = f"{file}: joints of frame {i} ({name})"
-        if frame.get("joints") is None:
-            faults[i] = f"{where}: no joints; give them for all frames or for none"
-            continue
-        try:
-            rows[i] = read_joints(frame["joints"], where)
-        except InputError as error:
-            faults[i] = str(error)
-            continue
-        count = len(next(iter(rows.values())))
-        if len(rows[i]) != count:
-            faults[i] = f"{where}: {len(rows[i])} angles, but the first frame has {count}; give all of each"
-    if not rows and all(frame.get("joints") is None for frame in frames):
-        faults.clear()
-        return None
-    joints = np.full((len(frames), len(next(iter(rows.values()), ()))), np.nan)
-    for i in rows.keys() - faults.keys():
-        joints[i] = rows[i]
-    return joints
+def _inside(folder: Path, name: str, where: str) -> Path:
+    """Return a file of the folder; raise InputError where the folder has no such file."""
+    if not (file := contained(folder, name, where)).is_file():
+        raise InputError(f"{where}: {name} is not there; add it, or remove the key")
+    return file
 
 
-def read_joints(value: Any, where: str) -> Float[ndarray, " dof"]:
-    """Return joint angles (rad) of one frame from a list; InputError where it holds anything else."""
-    try:
-        row = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{where}: not numbers; write a list of angles in radians") from None
-    if row.ndim != 1 or len(row) == 0 or not np.isfinite(row).all():
-        raise InputError(f"{where}: must be a list of finite angles in radians")
-    if np.abs(row).max() > MOST_ROTATION:
-        raise InputError(f"{where}: up to {np.abs(row).max():.4g} rad; these look like degrees: convert them")
-    return row
-
-
-def _robot(
-    name: Any, joints: Float[ndarray, "n dof"] | None, file: Path
-) -> tuple[str | None, tuple[str, ...]]:
-    """Return the name of a known arm, and a note where it is not known."""
-    if name is None:
-        return None, ()
-    if name not in ROBOT_NAMES:
-        return None, (
-            f"robot {shown(name)} is not one of {', '.join(ROBOT_NAMES)}: its kinematics are not used",
-        )
-    dof = arm_named(name).dof
-    if joints is not None and joints.shape[1] != dof:
-        raise InputError(
-            f"{file}: frames have {joints.shape[1]} joints, but a {name} has {dof}; correct either"
-        )
-    return name, ()
-
-
-def _urdf(name: Any, file: Path) -> Path | None:
-    """Return the path of the URDF inside the capture; InputError where it is not there."""
-    if name is None:
-        return None
-    if not isinstance(name, str):
-        raise InputError(f"{file}: urdf must be a path inside the capture, as text")
-    contained(file.parent, name, f"{file}: urdf")
-    if not (file.parent / name).is_file():
-        raise InputError(f"{file}: urdf {name} is not there; add it, or remove the key")
-    return file.parent / name
-
-
-def _image_name(frame: Any, index: int, file: Path) -> str:
-    """Return the image of a frame; InputError where it names none."""
+def _image_name(content: CaptureFile, row: int, file: Path) -> str:
+    """Return the image of a frame; raise InputError where it names none."""
+    frame = content.frames[row]
     if not isinstance(frame, dict) or not isinstance(frame.get("image"), str):
-        raise InputError(f'{file}: frame {index} has no "image"; give the image\'s path as text')
+        raise InputError(f'{file}: frame {row} has no "image"; give the image\'s path as text')
     return frame["image"]
 
 

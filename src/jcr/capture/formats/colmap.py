@@ -13,11 +13,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.camera import HALF_PIXEL
-from jcr.capture.camera_info import checked_intrinsics
+from jcr.capture.camera_info import IntrinsicsEntry
 from jcr.capture.formats import Format, table
-from jcr.capture.images import other_size
 from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import contained
+from jcr.capture.plain_files import contained, validated
 from jcr.errors import InputError
 from jcr.geometry import inverse, transform
 from jcr.records import COEFFICIENTS, Capture, DistortionModel, Intrinsics
@@ -175,16 +174,21 @@ def _intrinsics(camera: "pycolmap.Camera", folder: Path, size: tuple[int, int]) 
         raise InputError(
             f"{folder}: camera model {name}, which jcr does not know; run colmap image_undistorter"
         )
-    if (width, height) != size:
-        raise other_size(f"{folder}: cameras", (width, height), size, remedy="use the same images")
     two_focals = name in ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
     focals, rest = (params[:2], params[2:]) if two_focals else (params[:1] * 2, params[1:])
-    centre, rest = [value - HALF_PIXEL for value in rest[:2]], rest[2:]
-    wanted = _COEFFICIENTS[name]
-    value = dict(zip(wanted, rest, strict=True))
-    model: DistortionModel = "fisheye" if "FISHEYE" in name else "rational" if any(rest[5:]) else "pinhole"
-    distortion = [value.get(key, 0.0) for key in COEFFICIENTS[model]]
-    return checked_intrinsics([*focals, *centre], distortion, size, str(folder), model)
+    value = dict(zip(_COEFFICIENTS[name], rest[2:], strict=True))
+    model: DistortionModel = "fisheye" if "FISHEYE" in name else "rational" if any(rest[7:]) else "pinhole"
+    entry = {
+        "fx": focals[0],
+        "fy": focals[1],
+        "cx": rest[0] - HALF_PIXEL,
+        "cy": rest[1] - HALF_PIXEL,
+        "distortion": [value.get(key, 0.0) for key in COEFFICIENTS[model]],
+        "model": model,
+        "width": width,
+        "height": height,
+    }
+    return validated(IntrinsicsEntry, entry, str(folder)).record(size, f"{folder}: cameras")
 
 
 FORMAT = Format(
