@@ -35,7 +35,7 @@ error_mm = 1e3 * np.linalg.norm(hand_eye.gripper_from_camera[:3, 3] - truth[:3, 
 error_deg = rotation_between_deg(hand_eye.gripper_from_camera[:3, :3], truth[:3, :3])
 
 print()
-print(summary(result.calibration))
+print(summary(result.calibration), end="")
 error_scale = 100 * (hand_eye.scale / true_scale - 1)
 print(f"against the truth: {error_mm:.3f} mm, {error_deg:.4f}°, scale {error_scale:+.3f} % ({seconds:.0f} s)")
 print(f"report: {result.out / 'report.html'}")

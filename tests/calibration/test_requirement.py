@@ -16,9 +16,9 @@ from jcr.calibration.seen import within_95
 from jcr.calibration.words import summary
 from jcr.capture.read import read_capture
 from jcr.cli import dispatch
-from jcr.cli.output import Output
+from jcr.cli.output import VerboseOutput
 from jcr.cli.result import show, show_calibration
-from jcr.errors import InputError, RejectedError
+from jcr.errors import InputError
 from jcr.findings import Finding, FindingKind, sentence
 from jcr.geometry import inverse, scale_translation, step_between
 from jcr.pipeline import run, stages
@@ -128,7 +128,7 @@ def test_the_images_that_are_missing_are_counted_and_proposed():
     assert content.short is not None and content.verdict == "rejected" and not hand_eye.converged
     show = sentence(content.short)
     assert f"add {required.more_images} image" in show
-    assert "within what is needed" in summary(content)
+    assert "\nRemedy      add " in summary(content) and "; expected " in summary(content)
     assert 'class="verdict bad"' in html and "Rejected:" in html
     assert CalibrationFile.model_validate_json(json.dumps(content.model_dump()), strict=True) == content
 
@@ -159,18 +159,23 @@ def test_the_command_ends_with_3_where_what_was_asked_is_not_reached(capsys: pyt
     for asked in (None, (0.5, 0.1)):
         hand_eye = calibrate_poses(given, CalibrateOptions(require=asked))
         result = _poses_result(given, page(given, hand_eye)[0], hand_eye)
+        show_calibration(result, VerboseOutput())
+        status = show(result, VerboseOutput())
+        said = capsys.readouterr()
+        quaternion = Rotation.from_matrix(hand_eye.gripper_from_camera[:3, :3]).as_quat(canonical=True)
+        is_shown = " ".join(f"{part:8.5f}" for part in quaternion) in said.out
+        assert not said.err and said.out.count("\n") <= 14
         if asked is None:
-            show_calibration(result, Output())
-            said = capsys.readouterr().out
-            quaternion = Rotation.from_matrix(hand_eye.gripper_from_camera[:3, :3]).as_quat(canonical=True)
-            assert "(95 % of errors)" in said
-            assert "qx qy qz qw: " in said and " ".join(f"{part:.6f}" for part in quaternion) in said
-            assert show(result, Output()) == 0
-            said = capsys.readouterr()
-            assert said.out.startswith("accepted\nnext: jcr export out urdf\n") and not said.err
-            continue
-        with pytest.raises(RejectedError, match="not as exact as needed: .* 0.5 mm and 0.1° are asked for"):
-            show(result, Output())
+            assert status == 0 and is_shown and "(95 %)" in said.out
+            assert (
+                said.out.startswith("ACCEPTED (limit 5 mm, 1°). ")
+                and "\nNext        jcr export out ros2" in said.out
+            )
+        else:
+            assert status == 3 and not is_shown
+            verdict, cause, remedy, *_ = said.out.splitlines()
+            assert verdict.startswith("REJECTED (limit 0.5 mm, 0.1° not met). ")
+            assert "0.5 mm and 0.1° are asked for" in cause and remedy.startswith("Remedy ")
 
 
 @pytest.mark.slow

@@ -57,7 +57,7 @@ def test_what_decides_is_named_quiet_or_not(tmp_path: Path, capsys: pytest.Captu
     samples = write_easy_handeye2(tmp_path, problem.base_from_gripper, cameras)
     assert dispatch(["calibrate", str(samples), str(tmp_path / "out"), "--quiet"]) == 0
     printed = capsys.readouterr()
-    assert printed.err.startswith("warning: with 4 images") and printed.err.count("\n") == 1
+    assert "\nWARNING     with 4 images" in printed.out and not printed.err
     rejected = ROOT / "tests" / "calibrations" / "rejected.json"
     shutil.copy(rejected, tmp_path / "out" / "calibration.json")
     assert dispatch(["export", str(tmp_path / "out"), "urdf", "--force", "--quiet"]) == 0

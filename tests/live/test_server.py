@@ -242,8 +242,8 @@ def test_an_interrupted_command_goes_on_and_the_example_client_talks_to_it(tmp_p
     result, printed = running.communicate(timeout=60)
     # The poses are not those of the images.
     assert running.returncode == 3, printed
-    assert result.splitlines()[0].startswith(f"{out}/result: rejected; ")
-    assert result.splitlines()[-1] == f"next: jcr check {out}"
+    assert result.splitlines()[0].startswith("REJECTED ")
+    assert result.splitlines()[-1] == f"Next        jcr check {out}"
     assert talked.returncode == 0 and talked.stdout.count("images/00") == 3, talked.stdout + talked.stderr
     # From the second image on there is a pose to go to.
     assert "next: [[" in talked.stdout.splitlines()[-1]

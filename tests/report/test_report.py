@@ -27,7 +27,7 @@ from jcr.capture.formats.capture_json import kept
 from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
 from jcr.cell.placement import ArmPlacement, CameraPlacement, CellPlacement, ImageUse, TransformUncertainty
-from jcr.cli.output import Output
+from jcr.cli.output import VerboseOutput
 from jcr.cli.result import show
 from jcr.errors import RejectedError
 from jcr.estimation.observability import excitation
@@ -320,10 +320,10 @@ def test_what_was_done_is_a_note_and_what_to_act_on_a_warning(
     assert "a &lt;pose&gt; is off" in warned and "a &lt;note&gt;" not in warned
     assert "a &lt;note&gt; &amp; more" in noted.partition("</details>")[0]
     written = log(content)
-    assert "warning: a <pose> is off\n" in written and "note: a <note> & more\n" in written
-    assert show(run, Output(json=True)) == 0
+    assert "\nWARNING     a <pose> is off\n" in written and "\nnote: a <note> & more\n" in written
+    assert show(run, VerboseOutput(json=True)) == 0
     printed = capsys.readouterr()
-    assert "warning: a <pose> is off\n" in printed.err and "note: a <note> & more\n" in printed.err
+    assert not printed.err
     as_json = json.loads(printed.out)
     assert as_json["notes"] == content.notes and as_json["warnings"] == content.warnings
     del as_json["notes"]  # as before there were any

@@ -10,7 +10,8 @@ from jcr.capture.plain_files import first_fault
 from jcr.findings import Finding, Verdict, remedy, text, verdict_of, warnings_of
 
 
-def _with_words(finding: Finding) -> dict[str, Any]:
+def as_json(finding: Finding) -> dict[str, Any]:
+    """Return a finding as files have it: its fields, its text and its remedy."""
     return vars(finding) | {"text": text(finding), "remedy": remedy(finding)}
 
 
@@ -26,7 +27,7 @@ def _without_words(value: Any) -> Any:
 
 
 _FINDING = TypeAdapter(Finding)
-FindingJson = Annotated[Finding, BeforeValidator(_without_words), PlainSerializer(_with_words)]
+FindingJson = Annotated[Finding, BeforeValidator(_without_words), PlainSerializer(as_json)]
 """With its text and remedy, which are for people and made again when it is read."""
 
 

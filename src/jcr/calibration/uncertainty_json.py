@@ -122,6 +122,11 @@ class Uncertainty(Part):
     joint: Joint | None = None
     """Null where the intrinsics were not estimated."""
 
+    @property
+    def corner(self) -> Seen | None:
+        """Point uncertainty in the worst corner of the image; None where the intrinsics were not estimated."""
+        return None if self.seen is None or self.joint is None else self.seen.corners
+
     @classmethod
     def of(cls, estimate: Estimate, in_use: InUse | None) -> "Uncertainty":
         """That of an estimate, and how exact it is in use."""

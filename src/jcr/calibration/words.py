@@ -1,88 +1,242 @@
-"""A calibration in words: what terminal, log.txt and report say of it alike, each thing put into words once."""
+"""Calibration in words: the summary on the terminal, and the details of log.txt and `--verbose`."""
+
+from collections.abc import Iterable, Sequence
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from jcr.calibration.calibration_json import CalibrationFile, GivenIntrinsicsKept
-from jcr.calibration.uncertainty_json import SeenAndCorners, UncertaintyBudget
-from jcr.findings import is_explained, sentence, verdict_of
-from jcr.findings.sentences import network_scale, reached_in_words
-from jcr.records import Attempt, BoardFound, DepthCheck, LeaveOneOut
+from jcr.calibration.calibration_json import CalibrationFile, GivenIntrinsicsKept, Proposal
+from jcr.calibration.uncertainty_json import SeenAndCorners, Uncertainty, UncertaintyBudget
+from jcr.findings import (
+    Finding,
+    FindingKind,
+    remedy,
+    sentence,
+    text,
+    verdict_of,
+    without_consequences,
+)
+from jcr.findings.sentences import network_scale
+from jcr.records import Attempt, BoardFound, DepthCheck, LeaveOneOut, Requirement
 from jcr.rounding import significant, with_std
 
-NOTHING = 0.02
-"""Of the largest part of a budget: its square is nothing beside that of the whole."""
+NEGLIGIBLE = 0.02
+"""Share of the largest part of a budget below which a part is left out: its square is 0.04 % of the whole."""
+MOST_LINES = 14
+"""Lines of a summary on the terminal, with the two that name the report and the next command."""
+BACKEND_NAMES = {"colmap": "COLMAP", "dust3r": "DUSt3R", "mast3r": "MASt3R", "da3": "Depth Anything 3"}
+SCALE_SOURCES = {"board": "the board", "known length": "the known length", "depth camera": "the depth camera"}
 
 
-def summary(content: CalibrationFile) -> str:
-    """What was found, what was left out, and what would help."""
-    lines = found(content)
-    lines += [f"  not used: {image.image}: {image.reason}" for image in content.images if not image.used]
-    if content.next_poses and not is_explained(content.findings):
-        last = content.next_poses[-1]
-        # Files of earlier versions expect of the camera alone.
-        then = f"the camera ± {' '.join(significant(1e3 * std) for std in last.expected_std[:3])} mm"
-        if last.within_95_mm is not None and last.rotation_95_deg is not None:
-            seen = f"{significant(last.within_95_mm)} mm and {significant(last.rotation_95_deg)}°"
-            then = f"a seen point within {seen} (95 % of errors), {then}"
-        near = ", ".join(pose.like for pose in content.next_poses)
-        if content.mostly_systematic:
-            lines.append(
-                "most of ± comes from systematic robot errors: more images of the same region will hardly help; images "
-                "of another region of the workspace, or the joint angles (capture.json: joints and robot), would"
-            )
-        required = content.requirement
-        reach = required is not None and bool(required.more_images)
-        lines.append(
-            f"{len(content.next_poses)} more views, like {near} but rotated (next_poses in calibration.json), "
-            f"would give {then}{', within what is needed' if reach else ''}"
+def labelled(label: str, *lines: str) -> list[str]:
+    """Return lines behind a label in a column of 12 characters."""
+    return [f"{label if k == 0 else '':<12}{line}" for k, line in enumerate(lines)]
+
+
+def headline(content: CalibrationFile) -> str:
+    """Return the verdict, the required accuracy, the images used, the back end and the time, in one line."""
+    verdict = verdict_in_words(content.findings)
+    limit = "" if content.requirement is None else f" ({_limit(content, content.requirement)})"
+    backend = BACKEND_NAMES.get(content.backend, content.backend)
+    used = f"{content.images_used} of {len(content.images)} images"
+    return f"{verdict}{limit}. {used}, {backend}, {sum(content.timings_s.values()):.0f} s"
+
+
+def verdict_in_words(findings: Iterable[Finding]) -> str:
+    """Return the verdict in capitals, with the number of warnings."""
+    findings = without_consequences(tuple(findings))
+    verdict = verdict_of(findings)
+    warnings = sum(one.severity == "warns" for one in findings)
+    if verdict != "accepted with warnings":
+        return verdict.upper()
+    return f"ACCEPTED with {warnings} warning{'s' * (warnings > 1)}"
+
+
+def _limit(content: CalibrationFile, required: Requirement) -> str:
+    """Return the requirement, and where in the image it is not met."""
+    limit = f"limit {required.translation_mm:g} mm, {required.rotation_deg:g}°"
+    if not required.met:
+        return f"{limit} not met"
+    corner = None if content.uncertainty is None else content.uncertainty.corner
+    if corner is None or required.at != "seen":
+        return limit
+    exceeded = [
+        size
+        for size, is_larger in (
+            (f"{significant(corner.within_95_mm)} mm", corner.within_95_mm > required.translation_mm),
+            (f"{significant(corner.rotation_95_deg)}°", corner.rotation_95_deg > required.rotation_deg),
         )
-    return "\n".join(lines) + "\n"
+        if is_larger
+    ]
+    return f"{limit} met at the image centre, not in the corner: {', '.join(exceeded)}" if exceeded else limit
 
 
-def found(content: CalibrationFile) -> list[str]:
-    """The transform and how sure it is, a line each; of a failure its reason."""
+def summary(content: CalibrationFile, most: int = MOST_LINES) -> str:
+    """Return at most `most` lines, two of which are left to the caller: verdict, transform, accuracy, what to act on.
+
+    A rejected calibration has its cause and remedy instead of the transform.
+    """
+    lines = [headline(content), *(_transform(content) if content.converged else ())]
+    proposed = _proposed(content.next_poses)
+    if content.converged and content.short is None and proposed:
+        lines += labelled("To improve", proposed)
+    return "\n".join([*lines, *actions(content.findings, most - 2 - len(lines), proposed)]) + "\n"
+
+
+def _transform(content: CalibrationFile) -> list[str]:
+    """Return the transform with its standard deviations, the accuracy and the intrinsics."""
+    uncertainty = content.uncertainty
+    assert uncertainty is not None and content.parent_from_camera is not None
+    matrix = np.array(content.parent_from_camera)
+    quat_xyzw = Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True)
+    x, q = (" ".join(f"{number:8.5f}" for number in part) for part in (matrix[:3, 3], quat_xyzw))
+    offset = " ".join(significant(size) for size in uncertainty.translation_std_mm)
+    rotation = " ".join(significant(size) for size in uncertainty.rotation_std_deg)
+    return [
+        f"{content.mount}_from_camera (optical frame; m, quaternion xyzw)",
+        f"  {x}   {q}",
+        f"  1σ: {offset} mm, {rotation}°",
+        *labelled("Accuracy", _accuracy(content, uncertainty), _tested(content, uncertainty)),
+        *_intrinsics(content),
+    ]
+
+
+def _accuracy(content: CalibrationFile, uncertainty: Uncertainty) -> str:
+    """Return the bounds of 95 % of the errors, at the centre and in the corner, or as `--require-at` has it."""
+    required = content.requirement
+    if required is None:
+        return "unknown"
+    bound = f"{significant(required.reached_mm)} mm, {significant(required.reached_deg)}° (95 %)"
+    if required.at == "camera":
+        return f"the camera's own place: {bound}"
+    if required.at == "scene":
+        return f"mapped points: {bound}"
+    at = f"a point at {significant(1e-3 * required.distance_mm)} m: {bound}"
+    if (corner := uncertainty.corner) is None:
+        return at
+    return f"{at} at the image centre; {significant(corner.within_95_mm)} mm in the corner"
+
+
+def _tested(content: CalibrationFile, uncertainty: Uncertainty) -> str:
+    """Return the leave-one-out error, and the scale's standard deviation with its sources."""
+    parts = [] if content.held_out is None else [f"leave-one-out: {leave_one_out_text(content.held_out)}"]
+    used = [SCALE_SOURCES[one.name] for one in content.lengths if one.used and one.name in SCALE_SOURCES]
+    sources = " and ".join(["the robot", *used]) if used else "the robot alone"
+    return "; ".join([*parts, f"scale ±{uncertainty.scale_std_percent:.2g} %, from {sources}"])
+
+
+def _intrinsics(content: CalibrationFile) -> list[str]:
+    """Return the intrinsics that belong to the transform; nothing where poses alone were given."""
+    camera = content.intrinsics
+    if camera is None:
+        return []
+    given = content.with_given_intrinsics is not None
+    how = "given" if camera.std is None else "given, refined" if given else "estimated"
+    numbers = " ".join(f"{name} {getattr(camera, name):.1f}" for name in ("fx", "fy", "cx", "cy"))
+    return labelled("Intrinsics", f"{how}: {numbers}; use them together with the transform")
+
+
+def actions(findings: Sequence[Finding], most: int, proposed: str = "") -> list[str]:
+    """Return cause and remedy of a rejection, then warnings, on at most `most` lines.
+
+    `proposed` are the images to add; they take the place of that remedy.
+    """
+    findings, lines = without_consequences(findings), list[str]()
+    if verdict_of(findings) == "rejected":
+        cause, *findings = findings
+        lines = [
+            *labelled("Cause", text(cause)),
+            *labelled("Remedy", *filter(None, [_remedy(cause, proposed)])),
+        ]
+    for one in findings:
+        if (
+            one.kind is FindingKind.NOT_EXACT_ENOUGH
+        ):  # the verdict states the requirement, another line the accuracy
+            lines += labelled("WARNING", f"the limit is not met; {_remedy(one, proposed)}")
+        elif one.severity != "informs":
+            lines += labelled("WARNING", sentence(one))
+    if len(lines) <= most:
+        return lines
+    return [
+        *lines[: most - 1],
+        *labelled("", f"{len(lines) - most + 1} more with --verbose and in the report"),
+    ]
+
+
+def _remedy(finding: Finding, proposed: str) -> str:
+    """Return the remedy of a finding; where this is more images, those proposed."""
+    is_images = finding.kind is FindingKind.NOT_EXACT_ENOUGH and finding.concerns == "images"
+    return proposed if is_images and proposed else remedy(finding)
+
+
+def _proposed(poses: Sequence[Proposal]) -> str:
+    """Return the gripper poses to add, and the accuracy expected with all of them; empty where none is proposed."""
+    if not poses:
+        return ""
+    last, then = poses[-1], ""
+    if last.within_95_mm is not None and last.rotation_95_deg is not None:
+        then = f"; expected {significant(last.within_95_mm)} mm, {significant(last.rotation_95_deg)}° (95 %)"
+    count = f"{len(poses)} image{'s' * (len(poses) > 1)}"
+    return f"add {count} (poses in calibration.json, next_poses){then}"
+
+
+def details(content: CalibrationFile) -> list[str]:
+    """Return the lines of `--verbose` and log.txt: attempts, times, matrix, budget, comparisons, images, findings."""
+    tried = (
+        f"attempt {k}: {attempt_in_words(attempt, len(content.images))}"
+        for k, attempt in enumerate(content.attempts, start=1)
+    )
+    findings = (
+        f"{one.severity}: {sentence(one)}{'' if one.p is None else f' (p = {one.p:.0e})'}"
+        for one in content.findings
+    )
+    informs = {sentence(one) for one in content.findings}
+    return [
+        f"jcr {content.version}, back end {content.backend}",
+        *tried,
+        *(f"{stage}: {seconds:.2f} s" for stage, seconds in content.timings_s.items()),
+        *_sizes(content),
+        *(f"{image.image}: {image.reason or 'used'}" for image in content.images),
+        *findings,
+        *(f"note: {note}" for note in content.notes if note not in informs),
+    ]
+
+
+def _sizes(content: CalibrationFile) -> list[str]:
+    """Return the matrix, the budget of its uncertainty, and the comparisons of lengths; nothing of a failure."""
     uncertainty, scale = content.uncertainty, content.scale
     if uncertainty is None or scale is None:
-        return [f"no calibration: {content.doubt}"]
+        return []
     with np.printoptions(precision=6, suppress=True):
         matrix = str(np.array(content.parent_from_camera)).splitlines()
-    x, y, z = uncertainty.translation_std_mm
-    rx, ry, rz = uncertainty.rotation_std_deg
-    lines = [
-        f"{content.mount}_from_camera ({content.images_used} of {len(content.images)} images, "
-        f"back end {content.backend})",
-        *(f"  {row}" for row in matrix),
-        f"  x y z (m), qx qy qz qw: {_as_quaternion(np.array(content.parent_from_camera))}",
-        f"  ± {x:.2f} {y:.2f} {z:.2f} mm, {rx:.3f} {ry:.3f} {rz:.3f} ° (1 σ; worst {uncertainty.worst})",
-    ]
+    lines = [f"{content.mount}_from_camera", *(f"  {row}" for row in matrix)]
+    lines.append(f"least certain {uncertainty.worst}")
     if uncertainty.budget is not None:
         parts = "; ".join(f"{name} {size}" for name, size in budget_in_words(uncertainty.budget).items())
-        lines.append(f"  from: {parts}")
-    if content.requirement is not None:
-        lines.append(f"  {reached_in_words(content.requirement)}")
-    if (seen := uncertainty.seen) is not None and uncertainty.joint is not None:
-        lines.append(f"  {seen_in_words(seen)}")
+        lines.append(f"1σ comes from {parts}")
+    if uncertainty.seen is not None and uncertainty.joint is not None:
+        lines.append(seen_in_words(uncertainty.seen))
     if content.with_given_intrinsics is not None:
-        lines.append(f"  {given_in_words(content.with_given_intrinsics)}")
+        lines.append(given_in_words(content.with_given_intrinsics))
     lines.append(f"scale {scale:.6g} m per unit ± {uncertainty.scale_std_percent:.2g} %")
     if content.scale_check is not None:
-        lines.append(f"  {network_scale(content.scale_check.off_percent, content.scale_check.std_percent)}")
+        lines.append(network_scale(content.scale_check.off_percent, content.scale_check.std_percent))
     if content.depth_check is not None:
         lines.append(depth_in_words(content.depth_check))
     if content.board is not None:
         lines.append(board_in_words(content.board))
-    if (held_out := content.held_out) is not None:
-        lines.append(
-            f"leave-one-out error: {leave_one_out_text(held_out)}{pixels(held_out)} ({held_out.how})"
-        )
+    if content.held_out is not None:
+        lines.append(f"leave-one-out error: {leave_one_out_text(content.held_out)} ({content.held_out.how})")
     return lines
 
 
+def log(content: CalibrationFile) -> str:
+    """Return the text of log.txt: the summary with every warning, then the details."""
+    return summary(content, 1000) + "\n" + "\n".join(details(content)) + "\n"
+
+
 def board_in_words(board: BoardFound) -> str:
-    """What a board beside features came to."""
+    """Return the side, the images and the bend of a board beside features."""
     stated = "" if board.stated_mm is None else f", {board.stated_mm:g} mm stated"
     return (
         f"board: sides of {with_std(board.side_mm, board.side_std_mm)} mm by the robot{stated}; "
@@ -92,35 +246,24 @@ def board_in_words(board: BoardFound) -> str:
 
 
 def seen_in_words(seen: SeenAndCorners) -> str:
-    """What the uncertainty of a point that the camera sees is made of, and where it is largest."""
+    """Return the parts of the point uncertainty, across the ray, along it, and in the corner of the image."""
     return (
-        f"of a seen point: {significant(seen.lateral_95_mm)} mm across the ray and {significant(seen.along_95_mm)} mm "
-        f"along it, {significant(seen.corners.within_95_mm)} mm in a corner of the image, with the intrinsics of this "
-        "run and exact gripper poses"
+        f"point uncertainty: {significant(seen.lateral_95_mm)} mm across the ray and "
+        f"{significant(seen.along_95_mm)} mm along it, {significant(seen.corners.within_95_mm)} mm in a corner of the "
+        "image, with the intrinsics of this run and exact gripper poses"
     )
 
 
 def given_in_words(given: GivenIntrinsicsKept) -> str:
-    """How far the given intrinsics lead from the estimated ones where it matters."""
+    """Return how far apart the given and the estimated intrinsics place a point, each with its own transform."""
     return (
         f"with the given intrinsics and their transform (with_given_intrinsics) the same point is "
         f"{significant(given.differs_mm)} mm from there, and within {significant(given.seen.within_95_mm)} mm"
     )
 
 
-def verdict_in_words(content: CalibrationFile) -> str:
-    """The verdict, with the first reason where it is rejected or accepted with warnings."""
-    reasons = [sentence(one) for one in content.findings if one.severity != "informs"]
-    return ": ".join((verdict_of(content.findings), *reasons[:1]))
-
-
-def _as_quaternion(matrix: Float[ndarray, "4 4"]) -> str:
-    quat_xyzw = Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True)
-    return " ".join(f"{number:.6f}" for number in (*matrix[:3, 3], *quat_xyzw))
-
-
 def budget_in_words(budget: UncertaintyBudget) -> dict[str, str]:
-    """What the uncertainty comes from, largest first, each with its size; negligible parts are left out."""
+    """Return the size of each part of the uncertainty, largest first; negligible parts are left out."""
     named = {
         "random robot errors": budget.robot_random,
         "systematic robot errors": budget.robot_systematic,
@@ -131,7 +274,7 @@ def budget_in_words(budget: UncertaintyBudget) -> dict[str, str]:
         named["faults found"] = budget.faults
     ranked = sorted(named.items(), key=lambda item: -item[1].translation_mm)
     least_mm, least_deg = (
-        NOTHING * max(getattr(share, unit) for share in named.values())
+        NEGLIGIBLE * max(getattr(share, unit) for share in named.values())
         for unit in ("translation_mm", "rotation_deg")
     )
     return {
@@ -141,26 +284,8 @@ def budget_in_words(budget: UncertaintyBudget) -> dict[str, str]:
     }
 
 
-def log(content: CalibrationFile) -> str:
-    """log.txt: which back ends were tried, how long each stage took, what was found, what the user should know."""
-    tried = [
-        f"attempt {k}: {attempt_in_words(attempt, len(content.images))}"
-        for k, attempt in enumerate(content.attempts, start=1)
-    ]
-    lines = [
-        f"jcr {content.version}, back end {content.backend}",
-        *tried,
-        *(f"{stage}: {seconds:.2f} s" for stage, seconds in content.timings_s.items()),
-        *found(content),
-        *(f"{image.image}: {image.reason or 'used'}" for image in content.images),
-        *(f"warning: {warning}" for warning in content.warnings),
-        *(f"note: {note}" for note in content.notes),
-    ]
-    return "\n".join(lines) + "\n"
-
-
 def attempt_in_words(attempt: Attempt, images: int) -> str:
-    """The back end, what it registered of this many images, whether it was kept, and how long it took."""
+    """Return the back end, the images it registered of this many, whether it was kept, and its time."""
     registered = (
         "nothing" if attempt.images_registered is None else f"{attempt.images_registered} of {images} images"
     )
@@ -171,17 +296,13 @@ def attempt_in_words(attempt: Attempt, images: int) -> str:
 
 
 def leave_one_out_text(held_out: LeaveOneOut) -> str:
-    """By how much images left out are missed."""
-    return f"{significant(held_out.translation_mm)} mm and {significant(held_out.rotation_deg)}°"
-
-
-def pixels(held_out: LeaveOneOut) -> str:
-    """The same in their images, to follow it; empty where no image tells."""
-    return "" if held_out.reprojection_px is None else f", {significant(held_out.reprojection_px)} px"
+    """Return the leave-one-out error in mm, degrees and, where known, pixels."""
+    px = "" if held_out.reprojection_px is None else f", {significant(held_out.reprojection_px)} px"
+    return f"{significant(held_out.translation_mm)} mm, {significant(held_out.rotation_deg)}°{px}"
 
 
 def depth_in_words(check: DepthCheck) -> str:
-    """What the robot says of a depth camera: its scale, and its noise near and far."""
+    """Return the scale of a depth camera against the robot's, and its noise near and far."""
     off, std = check.off_percent, check.std_percent
     size = f"are {abs(off):.2g} ± {std:.1g} % too {'long' if off > 0 else 'short'} compared with the robot's"
     if abs(off) < 2 * std:

@@ -8,8 +8,8 @@ import tyro
 
 from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
-from jcr.cli.output import Output
-from jcr.cli.result import show, show_calibration
+from jcr.cli.output import VerboseOutput
+from jcr.cli.result import calibrated, show, show_calibration
 from jcr.cli.source import run_options, source
 from jcr.depth.options import DepthOptions
 from jcr.reconstruct import ReconstructOptions
@@ -31,7 +31,7 @@ class Arguments:
     """Folder of the capture, or another format (jcr docs captures)."""
     out: Annotated[Path, tyro.conf.Positional]
     """Folder for the results."""
-    output: Output = field(default_factory=Output)
+    output: VerboseOutput = field(default_factory=VerboseOutput)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
     read: ReadOptions = field(default_factory=ReadOptions)
@@ -39,19 +39,20 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> int:
-    """Calibrate and print what was found."""
+    """Calibrate and print the result."""
+    from jcr.calibration.words import labelled
     from jcr.pipeline.run import calibrate, calibrate_poses
     from jcr.progress import progress_bars
     from jcr.records import PosePairs
 
-    options = run_options(arguments)
+    options, out = run_options(arguments), arguments.out
     with progress_bars() as progress:
-        capture = source(arguments.capture, arguments.read, arguments.out, progress)
+        capture = source(arguments.capture, arguments.read, out, progress)
         if isinstance(capture, PosePairs):
-            found = calibrate_poses(capture, arguments.out, arguments.calibrate)
+            found = calibrate_poses(capture, out, arguments.calibrate)
             show_calibration(found, arguments.output)
-            about = "the scale is 1, as the marker's size says\n" if found.scale_is_one else ""
-            return show(found, arguments.output, f"{about}report: {found.out / 'report.html'}\n")
-        result = calibrate(capture, arguments.out, options, progress=progress)
+            more = labelled("Scale", "1, as the marker's size says") if found.scale_is_one else ()
+            return show(found, arguments.output, *more)
+        result = calibrated(lambda: calibrate(capture, out, options, progress=progress), out)
     show_calibration(result, arguments.output)
-    return show(result, arguments.output, f"report: {result.out / 'report.html'}\n")
+    return show(result, arguments.output)

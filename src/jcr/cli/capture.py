@@ -127,23 +127,16 @@ def _conclude(
     requirement_met: bool,
 ) -> int:
     """Print the result and the next command; return 3 where it is rejected or not what `--until-accurate` requires."""
-    from jcr.findings import sentence
-    from jcr.findings.sentences import reached_in_words
+    from jcr.calibration.words import labelled, summary
 
     out, images = arguments.out, len(folder.names)
     required = None if result is None else result.hand_eye.requirement
     is_accepted = result is not None and result.converged
-    lines = []
-    if result is not None and required is not None:
-        rejected = [sentence(one) for one in result.hand_eye.findings if one.severity == "rejects"][:1]
-        lines += [f"{result.out}: {'; '.join([result.verdict, *rejected])}", reached_in_words(required)]
-    lines.append(f"{images} images in {out}")
+    lines = [] if result is None else summary(result.calibration).splitlines()
+    command = f"jcr run {out} {Path('out') / out.resolve().name}" if is_accepted else f"jcr check {out}"
     if images < LEAST_IMAGES:
-        lines[-1] += f"; {LEAST_IMAGES} or more are needed: the same command resumes"
-    elif not is_accepted:
-        lines.append(f"next: jcr check {out}")
-    else:
-        lines.append(f"next: jcr run {out} {Path('out') / out.resolve().name}")
+        command = f"the same command resumes; {LEAST_IMAGES} or more images are needed"
+    lines += [*labelled("Capture", f"{images} images in {out}"), *labelled("Next", command)]
     facts = {"capture": str(out), "images": folder.names, "answers": answers}
     facts["result"] = None if result is None else str(result.out)
     facts["verdict"] = None if result is None else result.verdict

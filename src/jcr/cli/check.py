@@ -1,5 +1,6 @@
 """`jcr check`: checks a capture before any heavy work."""
 
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -8,11 +9,10 @@ import numpy as np
 import tyro
 
 from jcr.capture.options import ReadOptions
-from jcr.cli.output import Output
+from jcr.cli.output import VerboseOutput
 from jcr.cli.source import looked_at
 
 if TYPE_CHECKING:
-    from jcr.calibration.expected import Expectation
     from jcr.pipeline.check import Examination
     from jcr.records import Capture, PosePairs
 
@@ -49,13 +49,13 @@ class Arguments:
     """Box that contains all proposed gripper positions (m, base frame)."""
     seed: int = 0
     """Seed of the registration and of the proposals."""
-    output: Output = field(default_factory=Output)
+    output: VerboseOutput = field(default_factory=VerboseOutput)
 
 
 def main(arguments: Arguments) -> int:
-    """Examine the capture and print what was found."""
+    """Examine the capture and print the verdict."""
     from jcr.calibration.options import CalibrateOptions, check_options
-    from jcr.errors import InputError, RejectedError
+    from jcr.errors import InputError
     from jcr.pipeline.check import check_capture, read_and_compare
     from jcr.progress import progress_bars
 
@@ -77,45 +77,49 @@ def main(arguments: Arguments) -> int:
             progress,
             arguments.thorough,
         )
-    arguments.output.result(_as_text(capture, found), _as_json(capture, found))
-    if found.faults:
-        raise RejectedError(f"rejected: {found.faults[0]}")
-    return 0
+        facts = _as_json(capture, found)
+        arguments.output.result("" if arguments.output.json else _as_text(arguments, capture, found), facts)
+    return 3 if found.verdict == "rejected" else 0
 
 
-def _as_text(capture: "Capture | PosePairs", found: "Examination") -> str:
-    from jcr.pipeline.check import QUICK
+def _as_text(arguments: Arguments, capture: "Capture | PosePairs", found: "Examination") -> str:
+    """Return the verdict with its cause and remedy, or with what a calibration is expected to reach."""
+    from jcr.calibration.words import MOST_LINES, actions, labelled, verdict_in_words
+    from jcr.findings import sentence
+
+    is_rejected = found.verdict == "rejected"
+    outcome = "a calibration would be rejected" if is_rejected else "good to calibrate"
+    lines = [f"{verdict_in_words(found.findings)}: {outcome}. {_as_read(capture)}"]
+    rotation = np.degrees(found.largest_rotation_rad)
+    motion = f"up to {1e3 * found.largest_move_m:.0f} mm and {rotation:.0f}° between two poses"
+    if not is_rejected:
+        lines += [*labelled("Motion", motion), *_expected(len(capture), found)]
+    closing = labelled("Next", "jcr docs troubleshooting")
+    if not is_rejected:
+        closing = labelled(
+            "Next", shlex.join(["jcr", "run", str(arguments.capture), f"out/{arguments.capture.stem}"])
+        )
+    notes = [line for note in found.notes for line in labelled("Note", note)]
+    acting = actions(found.findings, MOST_LINES - len(lines) - 1)
+    room = MOST_LINES - len(lines) - len(acting) - 1
+    if arguments.output.verbose:
+        acting += [f"{one.severity}: {sentence(one)}" for one in found.findings]
+    lines += [*acting, *(notes if arguments.output.verbose else notes[:room])]
+    return "\n".join([*lines, *_suggested(capture, found), *closing]) + "\n"
+
+
+def _suggested(capture: "Capture | PosePairs", found: "Examination") -> list[str]:
+    """Return the proposed gripper poses, each with the accuracy expected once it is added."""
+    from jcr.calibration.words import labelled
     from jcr.rounding import significant
 
-    rotation = np.degrees(found.largest_rotation_rad)
-    lines = [
-        _as_read(capture),
-        f"the gripper moves by up to {1e3 * found.largest_move_m:.0f} mm and rotates by up to {rotation:.0f}°",
-    ]
-    # Of what disagrees, what was expected of it and how well the rest agrees are no comfort.
-    if found.expected is not None and not found.faults:
-        lines += _expected(found.expected, len(found.counted), found.hand_eye is not None)
-    if found.hand_eye is not None and not found.faults:
-        noise = found.hand_eye.robot_noise
-        looked = len(found.hand_eye.inliers)
-        agreement = f"{1e3 * noise.translation:.2f} mm and {np.degrees(noise.rotation):.3f}°"
-        lines.append(
-            f"poses and images agree to {agreement} per axis ({int(found.hand_eye.inliers.sum())} of {looked} images"
-            f"{f'; --thorough looks at all {len(capture)}' if looked == QUICK < len(capture) else ''})"
-        )
-    lines += [f"fault: {fault}" for fault in found.faults]
-    lines += [f"remark: {remark}" for remark in found.remarks]
+    lines = []
     for k, pose in enumerate(found.suggestions, start=1):
-        matrix = np.array2string(pose.base_from_gripper, precision=4, suppress_small=True)
-        then = f"{significant(pose.within_95_mm)} mm and {significant(pose.rotation_95_deg)}°"
-        lines += [
-            f"add pose {k}: {1e3 * pose.moved_m:.0f} mm and {np.degrees(pose.rotation_rad):.0f}° from that of "
-            f"{capture.images[pose.like]}; then within {then}; base_from_gripper:",
-            *(f"  {row}" for row in matrix.splitlines()),
-        ]
-    if not found.faults:
-        lines.append(f"{found.verdict}: good to calibrate")
-    return "\n".join(lines) + "\n"
+        matrix = np.array2string(pose.base_from_gripper, precision=4, suppress_small=True).splitlines()
+        then = f"{significant(pose.within_95_mm)} mm, {significant(pose.rotation_95_deg)}°"
+        near = f"{1e3 * pose.moved_m:.0f} mm, {np.degrees(pose.rotation_rad):.0f}° from {capture.images[pose.like]}"
+        lines += labelled(f"Add pose {k}", f"{near}; then {then} (95 %); base_from_gripper:", *matrix)
+    return lines
 
 
 def _as_read(capture: "Capture | PosePairs") -> str:
@@ -128,23 +132,38 @@ def _as_read(capture: "Capture | PosePairs") -> str:
     return f"{len(capture)} images of {width}x{height}, intrinsics {intrinsics}"
 
 
-def _expected(expected: "Expectation", images: int, is_measured: bool) -> list[str]:
-    """What the calibration of this many images would report, in the words of that report."""
+def _expected(images: int, found: "Examination") -> list[str]:
+    """Return the accuracy that the calibration is expected to report, and how well poses and images agree."""
+    from jcr.calibration.words import labelled
+    from jcr.pipeline.check import QUICK
     from jcr.rounding import significant
 
-    seen, std = expected.seen, expected.std
-    of = "found in the images" if is_measured else "usual"
-    offset = " ".join(significant(1e3 * value) for value in std[:3])
-    rotation = " ".join(significant(float(np.degrees(value))) for value in std[3:6])
-    return [
-        f"expected of {images} images: a point seen at {significant(1e-3 * seen.distance_mm)} m is placed within "
-        f"{significant(seen.within_95_mm)} mm and {significant(seen.rotation_95_deg)}° (95 % of errors)",
-        f"  the camera on the gripper ± {offset} mm, {rotation} °, scale {significant(100 * std[6])} % (1 σ); "
-        f"robot errors and image noise as {of}",
-    ]
+    lines = []
+    if found.expected is not None:
+        seen, std = found.expected.seen, found.expected.std
+        offset = " ".join(significant(1e3 * value) for value in std[:3])
+        rotation = " ".join(significant(float(np.degrees(value))) for value in std[3:6])
+        errors = "found in the images" if found.hand_eye is not None else "usual"
+        lines = labelled(
+            "Expected",
+            f"a point at {significant(1e-3 * seen.distance_mm)} m: {significant(seen.within_95_mm)} mm, "
+            f"{significant(seen.rotation_95_deg)}° (95 %), from {len(found.counted)} images; errors as {errors}",
+            f"1σ: {offset} mm, {rotation}°, scale {significant(100 * std[6])} %",
+        )
+    if found.hand_eye is not None:
+        noise, inliers = found.hand_eye.robot_noise, found.hand_eye.inliers
+        agreement = f"{1e3 * noise.translation:.2f} mm, {np.degrees(noise.rotation):.3f}° per axis"
+        looked = f"{int(inliers.sum())} of {len(inliers)} images"
+        if len(inliers) == QUICK < images:
+            looked += f"; distortion and focus show with all {images}: --thorough"
+        lines += labelled("Agreement", f"poses and images: {agreement} ({looked})")
+    return lines
 
 
 def _as_json(capture: "Capture | PosePairs", found: "Examination") -> dict[str, Any]:
+    from jcr.calibration.findings_json import as_json
+    from jcr.findings import warnings_of
+
     noise = None if found.hand_eye is None else found.hand_eye.robot_noise
     return {
         "verdict": found.verdict,
@@ -178,6 +197,7 @@ def _as_json(capture: "Capture | PosePairs", found: "Examination") -> dict[str, 
             }
             for pose in found.suggestions
         ],
-        "faults": list(found.faults),
-        "remarks": list(found.remarks),
+        "findings": [as_json(one) for one in found.findings],
+        "warnings": list(warnings_of(found.findings)),
+        "notes": list(found.notes),
     }

@@ -23,6 +23,14 @@ class Output:
         sys.stdout.flush()
 
 
+@dataclass(frozen=True)
+class VerboseOutput(Output):
+    """Output of a command that leaves out details."""
+
+    verbose: bool = False
+    """Print the details as well: what uncertainty comes from, images left out, notes, p-values."""
+
+
 def plain(record: object) -> dict[str, Any]:
     """The fields of a record for JSON, its arrays as lists."""
     return {

@@ -1,68 +1,80 @@
-"""How a calibration is printed on the terminal, the same for every command that ends with one."""
+"""Output of the commands that end with a calibration: verdict, transform, warnings, next command."""
 
 import shlex
 import sys
+from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jcr.cli.output import Output, warn
-from jcr.errors import RejectedError
+from jcr.cli.output import VerboseOutput
 
 if TYPE_CHECKING:
+    from jcr.cell.placement import CameraPlacement
     from jcr.results import PosesResult, RunResult, SavedRun
 
+    Result = RunResult | SavedRun | PosesResult
 
-def show_calibration(result: "RunResult | SavedRun | PosesResult", output: Output) -> None:
-    """Print the calibration for people as soon as it stands; with --json all comes at the end."""
-    from jcr.calibration.words import summary
+
+def calibrated(action: "Callable[[], Result]", out: Path) -> "Result":
+    """Return the result of a run; where no back end found anything, what it left in `out`, which has the reason."""
+    from jcr.pipeline.selection import NothingFoundError
+    from jcr.results import load_run
+
+    try:
+        return action()
+    except NothingFoundError:
+        return load_run(out)
+
+
+def show_calibration(result: "Result", output: VerboseOutput) -> None:
+    """Print the summary as soon as the calibration stands; with --json all comes at the end."""
+    from jcr.calibration.words import MOST_LINES, summary
 
     if not output.json:
-        sys.stdout.write(summary(result.calibration))
+        cameras = getattr(result, "cameras", None)
+        placed = 0 if cameras is None else len(cameras.cameras)
+        sys.stdout.write(summary(result.calibration, MOST_LINES - placed))
         sys.stdout.flush()
 
 
-def show(result: "RunResult | SavedRun | PosesResult", output: Output, after: str = "") -> int:
-    """Print what follows the calibration: further cameras, the verdict and `after` it; doubts and notes on stderr.
+def show(result: "Result", output: VerboseOutput, *more: str) -> int:
+    """Print the lines after the summary, and return the exit status: 3 where it or a further camera is rejected.
 
-    Returns exit status 0, or raises RejectedError where it is rejected.
+    These are further cameras, `more` lines, the report and the next command; with --verbose the details; with --json
+    everything at once.
     """
-    from jcr.calibration.words import verdict_in_words
-    from jcr.cell.placement import in_words
-    from jcr.findings import sentence
-    from jcr.results import PosesResult
+    from jcr.calibration.words import details, labelled
 
     content, cameras = result.calibration, getattr(result, "cameras", None)
-    facts, text = content.model_dump(), ""
+    placed = [] if cameras is None else cameras.cameras
+    facts = content.model_dump()
     if cameras is not None:
         facts |= {name: cameras.as_json()[name] for name in ("cameras", "arms")}
-        text += "\n".join(in_words(cameras)) + "\n"
-    text += f"{verdict_in_words(content)}\n"
-    output.result(text + after + _next_commands(result), facts)
-    for remark in content.remarks:
-        warn(remark)
-    # Notes on poses that were given are the reader's, which has printed them.
-    for note in () if isinstance(result, PosesResult) else content.notes:
-        sys.stderr.write(f"note: {note}\n")
-    if content.doubt is not None:
-        raise RejectedError(f"rejected: {content.doubt}")
-    for camera in () if cameras is None else cameras.cameras:
-        if camera.doubt is not None:
-            raise RejectedError(f"camera {camera.name} is rejected: {camera.doubt}")
-    if content.short is not None:
-        warn(sentence(content.short))
-    return 0
+    lines = [line for camera in placed for line in labelled("Camera", _camera_in_words(camera))]
+    lines += [*more, *labelled("Report", str(result.out / "report.html")), *labelled("Next", _next(result))]
+    if output.verbose:
+        lines += ["", *details(content), *(line for camera in placed for line in camera.in_words)]
+    output.result("\n".join(lines) + "\n", facts)
+    return 0 if content.converged and all(camera.converged for camera in placed) else 3
 
 
-def _next_commands(result: "RunResult | SavedRun | PosesResult") -> str:
-    """Three commands that make sense now, a line each."""
-    from jcr.results import PosesResult
-    from jcr.run_folder import RunFolder
+def _camera_in_words(camera: "CameraPlacement") -> str:
+    """Return the verdict on a further camera, with its uncertainty or the reason, in one line."""
+    from jcr.rounding import significant
 
-    out, has_images = shlex.quote(str(result.out)), not isinstance(result, PosesResult)
+    if camera.doubt is not None or camera.uncertainty is None:
+        return f"{camera.name}: REJECTED: {camera.doubt}"
+    mm, deg = (
+        max(std) for std in (camera.uncertainty.translation_std_mm, camera.uncertainty.rotation_std_deg)
+    )
+    return (
+        f"{camera.name}: {camera.verdict.upper()}, {camera.mount}_from_camera ±{significant(mm)} mm, "
+        f"{significant(deg)}° (1σ, worst axis; cameras.json)"
+    )
+
+
+def _next(result: "Result") -> str:
+    """Return the command that makes sense now."""
     if not result.converged:
-        source = RunFolder(result.out).state().capture if has_images else "CAPTURE"
-        commands = (f"jcr check {shlex.quote(source)}", "jcr docs troubleshooting", "jcr docs captures")
-    else:
-        shown = f"jcr view {out}" if RunFolder(result.out).has_map() else f"jcr export {out} urdf"
-        test = f"jcr verify {out} NEW_IMAGES" if has_images else f"jcr compare {out} OTHER"
-        commands = (shown, f"jcr export {out} ros2", test)
-    return "next: " + "\n      ".join(commands) + "\n"
+        return "jcr docs troubleshooting"
+    return f"jcr export {shlex.quote(str(result.out))} ros2"

@@ -3,19 +3,22 @@
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
-from jcr.cli.output import Output
-from jcr.cli.result import show, show_calibration
+from jcr.cli.output import VerboseOutput
+from jcr.cli.result import calibrated, show, show_calibration
 from jcr.cli.source import run_options, source, with_images
 from jcr.depth.options import DepthOptions
 from jcr.reconstruct import ReconstructOptions
 from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
+
+if TYPE_CHECKING:
+    from jcr.results import RunResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +41,7 @@ class Arguments:
     """Folder of the capture, or another format (jcr docs captures)."""
     out: Annotated[Path, tyro.conf.Positional]
     """Folder for the results."""
-    output: Output = field(default_factory=Output)
+    output: VerboseOutput = field(default_factory=VerboseOutput)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
     read: ReadOptions = field(default_factory=ReadOptions)
@@ -51,7 +54,7 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> int:
-    """Run every stage and print what was found."""
+    """Run every stage and print the result."""
     from jcr.pipeline.mapping import require_dense
     from jcr.pipeline.run import finished, run
     from jcr.progress import progress_bars
@@ -59,19 +62,22 @@ def main(arguments: Arguments) -> int:
     map_options = None if arguments.no_map else arguments.map
     if map_options is not None:
         require_dense(arguments.depth)  # before a recording is read
-    options = run_options(arguments, map=map_options)
+    options, out = run_options(arguments, map=map_options), arguments.out
     with progress_bars() as progress:
-        found = source(arguments.capture, arguments.read, arguments.out, progress)
+        found = source(arguments.capture, arguments.read, out, progress)
         capture = with_images(found, arguments.capture, "nothing to map; use `jcr calibrate`")
-        if (before := finished(capture, arguments.out, options)) is not None:
-            sys.stderr.write(f"unchanged: {arguments.out} is the run of this capture with these options\n")
+        if (before := finished(capture, out, options)) is not None:
+            sys.stderr.write(f"unchanged: {out} is the run of this capture with these options\n")
             show_calibration(before, arguments.output)
-            return show(before, arguments.output, f"report: {before.out / 'report.html'}\n")
-        result = run(
-            capture,
-            arguments.out,
-            options,
-            progress=progress,
-            calibrated=lambda found: show_calibration(found, arguments.output),
-        )
-    return show(result, arguments.output, f"report: {result.out / 'report.html'}\n")
+            return show(before, arguments.output)
+        shown = list[object]()
+
+        def show_early(result: "RunResult") -> None:
+            """Print the calibration before depth and map are made."""
+            show_calibration(result, arguments.output)
+            shown.append(result)
+
+        result = calibrated(lambda: run(capture, out, options, progress=progress, calibrated=show_early), out)
+    if not shown:
+        show_calibration(result, arguments.output)
+    return show(result, arguments.output)

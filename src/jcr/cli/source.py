@@ -24,15 +24,13 @@ def _announce(path: Path) -> None:
 
 
 def source(path: Path, options: ReadOptions, out: Path, progress: "Progress") -> "Capture | PosePairs":
-    """What lies at a path, a recording's frames put in the run folder `out`; remarks of the reader on stderr."""
+    """What lies at a path, a recording's frames put in the run folder `out`."""
     _announce(path)
     from jcr.capture.read import read_source
     from jcr.run_folder import CAPTURE, locked
 
     with locked(out):
         found = read_source(path, options, into=out / CAPTURE, progress=progress)
-    for note in found.notes:
-        sys.stderr.write(f"note: {note}\n")
     return found
 
 

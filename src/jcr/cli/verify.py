@@ -8,7 +8,7 @@ import numpy as np
 import tyro
 
 from jcr.capture.options import ReadOptions
-from jcr.cli.output import Output, warn
+from jcr.cli.output import VerboseOutput
 from jcr.cli.source import looked_at, with_images
 from jcr.pipeline.verify import VerifyOptions
 
@@ -36,12 +36,11 @@ class Arguments:
     """The new images and their poses: a capture folder, or another format (jcr docs captures)."""
     read: ReadOptions = field(default_factory=ReadOptions)
     verify: VerifyOptions = field(default_factory=VerifyOptions)
-    output: Output = field(default_factory=Output)
+    output: VerboseOutput = field(default_factory=VerboseOutput)
 
 
 def main(arguments: Arguments) -> int:
     """Verify and print what to do."""
-    from jcr.errors import RejectedError
     from jcr.pipeline.verify import verify_run
     from jcr.progress import progress_bars
 
@@ -53,27 +52,28 @@ def main(arguments: Arguments) -> int:
         found = verify_run(arguments.out, capture, arguments.verify, progress)
     cameras = (found, *found.others)
     facts = _as_json(found) | {"cameras": {one.fixed: _as_json(one) for one in found.others}}
-    arguments.output.result("".join(map(_as_text, cameras)), facts)
-    for one in cameras:
-        for note in one.notes:
-            warn(note)
-    for one in cameras:
-        if one.moved:
-            raise RejectedError(one.advice)
-    return 0
+    lines = [line for one in cameras for line in _as_lines(one, arguments.output.verbose)]
+    arguments.output.result("\n".join(lines) + "\n", facts)
+    return 3 if any(one.moved for one in cameras) else 0
 
 
-def _as_text(found: "Verification") -> str:
-    drift = f"{1e3 * found.drift_m:.2f} mm and {np.degrees(found.drift_rad):.3f}°"
+def _as_lines(found: "Verification", verbose: bool) -> list[str]:
+    """Return the verdict on one camera, the remedy, the drift with its standard deviation, and warnings."""
+    from jcr.calibration.words import labelled
+
+    drift = f"{1e3 * found.drift_m:.2f} mm, {np.degrees(found.drift_rad):.3f}° from the calibration"
     offset, std = _spaced(1e3 * found.offset[:3], 2), _spaced(1e3 * found.std[:3], 2)
     angle, angle_std = _spaced(np.degrees(found.offset[3:]), 3), _spaced(np.degrees(found.std[3:]), 3)
     parent = "gripper" if found.fixed is None else "base"
-    return (
-        f"{found.verdict}: {found.finding}: {drift} from the calibration, p = {found.p_value:.2g}\n"
-        f"  drift in {parent} axes {offset} ± {std} mm, {angle} ± {angle_std} ° (1 σ)\n"
-        f"  {len(found.images)} images, {found.how}; a drift of {1e3 * found.detectable[0]:.1f} mm or "
-        f"{np.degrees(found.detectable[1]):.2f}° would be noticed 9 times in 10\n"
-    )
+    noticed = f"{1e3 * found.detectable[0]:.1f} mm or {np.degrees(found.detectable[1]):.2f}°"
+    lines = [
+        f"{found.verdict.upper()}: {found.finding}, {drift}",
+        *(labelled("Remedy", found.advice) if found.moved else ()),
+        *labelled("Drift", f"{offset} ± {std} mm, {angle} ± {angle_std}° (1σ, {parent} axes)"),
+        *labelled("Images", f"{len(found.images)}, {found.how}; 9 of 10 drifts of {noticed} are noticed"),
+        *(line for note in found.notes for line in labelled("WARNING", note)),
+    ]
+    return [*lines, f"p = {found.p_value:.2g}"] if verbose else lines
 
 
 def _spaced(values: np.ndarray, digits: int) -> str:

@@ -101,8 +101,6 @@ def _quantities(finding: "Finding") -> dict[str, Any]:
     for name, number in finding.details.items():
         if not isinstance(number, str):
             named |= {f"{name}_mm": 1e3 * number, f"{name}_deg": np.degrees(number)}
-    if finding.p is not None:
-        named["chance"] = f"p = {finding.p:.0e}"
     if (value := finding.value) is not None:
         named |= {"mm": 1e3 * value, "percent": 100 * value, "way": _Way(value), "size": abs(value)}
         named |= {"size_percent": 100 * abs(value), "size_deg": np.degrees(abs(value))}
@@ -280,7 +278,7 @@ def not_registered(finding: "Finding") -> str:
 def intrinsics(finding: "Finding") -> str:
     if finding.p is None:
         return f"the images show {' and '.join(_of_image_parts(finding))}"
-    return f"the images show {' and '.join(_of_parameters(finding))} ({filled('{chance}', finding)})"
+    return f"the images show {' and '.join(_of_parameters(finding))}"
 
 
 def _of_image_parts(finding: "Finding") -> list[str]:

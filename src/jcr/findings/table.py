@@ -106,33 +106,33 @@ class FindingKind(StrEnum):
         evidence="m, 95 % of errors are smaller", help="the images in `next_poses`; or the arm's name")
     FOCUS_BY_DISTANCE = "focal length changes with distance", Row("camera",
         "the focal length {way:grows|shrinks} by {size_percent:.1f} ± {std_percent} % from the nearest "
-        "view to the farthest ({chance})", "lock the focus, or --focus varies", explains=MISFIT,
+        "view to the farthest", "lock the focus, or --focus varies", explains=MISFIT,
         means="autofocus", evidence="share, from the nearest view to the farthest; the chance `p`")
     FOCUS_BY_IMAGE = "focal length differs between images", Row("camera",
-        "the focal length differs between images by {percent:.1f} % (rms, each ± {std_percent} %; {chance})",
+        "the focal length differs between images by {percent:.1f} % (rms, each ± {std_percent} %)",
         "lock the focus and take the images again, or --focus varies", explains=MISFIT,
         means="autofocus or zoom", evidence="share, rms")
     ZOOM = "focal length changed once", Row("camera",
-        "the focal length changes by {percent:+.1f} ± {std_percent} % after {images[0]} ({chance}): the "
+        "the focal length changes by {percent:+.1f} ± {std_percent} % after {images[0]}: the "
         "zoom or focus was moved", "calibrate the images before or after it, or --focus varies",
         explains=MISFIT, means="between two `images`", evidence="share; the chance `p`")
     ROLLING_SHUTTER = "images sheared alike", Row("camera",
-        "the images are sheared by {value:.1f} ± {std} px from top to bottom ({chance}), as by the rolling "
+        "the images are sheared by {value:.1f} ± {std} px from top to bottom, as by the rolling "
         "shutter of a moving camera", "take the images at rest", explains=MISFIT, means="a rolling shutter",
         evidence="px from top to bottom; the chance `p`")
     ROLLING_SHUTTER_BY_IMAGE = "images sheared each by itself", Row("camera",
-        "each image is sheared by itself, {value:.1f} px from top to bottom (rms, {chance}), as by the "
+        "each image is sheared by itself, {value:.1f} px from top to bottom (rms), as by the "
         "rolling shutter of a moving camera", "take the images at rest", explains=MISFIT,
         means="a rolling shutter", evidence="px from top to bottom, rms")
     THIN_PRISM = "thin prism", Row("camera",
-        "the images show a thin-prism distortion of up to {value:.1f} ± {std} px ({chance}): the sensor is "
+        "the images show a thin-prism distortion of up to {value:.1f} ± {std} px: the sensor is "
         "tilted, or the optics are decentred",
-        "use the transform with the estimated intrinsics, which have the thin prism coefficients s1 to s4",
+        "use the transform with the estimated intrinsics, which have the coefficients s1 to s4",
         explains=MISFIT, means="a tilted sensor, or decentred optics",
         evidence="px, where it is largest; the chance `p`")
     CENTRE_SAGS = "principal point moves with gravity", Row("camera",
-        "the principal point moves with gravity, by {value:.1f} ± {std} px when it lies in the image "
-        "({chance}): the optics are image-stabilised or loose",
+        "the principal point moves with gravity, by {value:.1f} ± {std} px when it lies in the image"
+        ": the optics are image-stabilised or loose",
         "switch image stabilisation off, or fix the optics", explains=MISFIT,
         means="image-stabilised or loose optics",
         evidence="px, when gravity lies in the image; the chance `p`")
@@ -142,20 +142,20 @@ class FindingKind(StrEnum):
         means="the given intrinsics are not those of the images; parameters in `details`",
         evidence="the chance `p`")
     SLIP = "camera moved on the gripper", Row("order",
-        "the camera seems to have moved on the gripper by {mm:.1f} mm and {deg:.2f}° after {images[0]} "
-        "({chance})", sentences.one_part, explains=MISFIT, evidence="m; the chance `p`",
+        "the camera seems to have moved on the gripper by {mm:.1f} mm and {deg:.2f}° after {images[0]}",
+        sentences.one_part, explains=MISFIT, evidence="m; the chance `p`",
         help="calibrate the longer part alone")
     DRIFT = "camera drifts on the gripper", Row("order",
         "the camera seems to drift on the gripper by {mm:.1f} mm and {deg:.2f}° from the first image to "
-        "the last ({chance})", "tighten its mount, let it warm up, and take the images again",
+        "the last", "tighten its mount, let it warm up, and take the images again",
         explains=MISFIT, evidence="m; the chance `p`")
     BASE_MOVED = "robot base moved against the scene", Row("order",
         "the robot's base and the scene moved against each other by {mm:.1f} mm and {deg:.2f}° after "
-        "{images[0]} ({chance})", sentences.one_part, explains=MISFIT, evidence="m; the chance `p`",
+        "{images[0]}", sentences.one_part, explains=MISFIT, evidence="m; the chance `p`",
         help="calibrate the longer part alone; bolt the base")
     DELAY = "gripper poses early or late", Row("order",
         "the gripper poses look as if read {size:.3f} ± {std} of the time from one image to the next too "
-        "{way:late|early} ({chance})", "stop the arm at each image, or read pose and image by the same clock",
+        "{way:late|early}", "stop the arm at each image, or read pose and image by the same clock",
         explains=MISFIT, evidence="intervals between images; the chance `p`")
     WRONG_MOUNT = "wrong mount", Row("robot",
         "the images fit a camera that the gripper carries, not a fixed one",
@@ -167,18 +167,18 @@ class FindingKind(StrEnum):
         help="master the joints")
     LENGTHS = "robot lengths differ by direction", Row("strain",
         "along {axis} the robot's positions are {size_percent:.1f} ± {std_percent} % too {way:long|short} "
-        "beside those across it ({chance})",
+        "beside those across it",
         "check that axis (a lift, a rail, a gantry): its gear ratio, its unit", explains=MISFIT,
         means="positions along one axis of the base (`details`) are too long beside those across it",
         evidence="share, positive: too long; the chance `p`")
     BASE_LEANS = "robot base leans with reach", Row("strain",
         "the robot's base leans {way:towards|away from} the gripper by {size_deg:.1f} ± {std_deg}° per "
-        "metre of reach, which its poses do not say ({chance})", "bolt the stand to the floor, or brace it",
+        "metre of reach, which its poses do not say", "bolt the stand to the floor, or brace it",
         explains=MISFIT, means="a stand that bends as the arm reaches out",
         evidence="rad per m, positive: towards the gripper; the chance `p`")
     TOOL_SAGS = "tool sags", Row("strain",
         "the gripper rotates by {size_deg:.2f} ± {std_deg}° where it is level, as a tool does that sags "
-        "under its weight ({chance})",
+        "under its weight",
         "stiffen its mount, and check the zero of the wrist's joints, which looks like it", explains=MISFIT,
         means="the gripper rotates with its tilt, as under its weight; the zero of a wrist joint that is "
         "off looks alike", evidence="rad, where it is level; the chance `p`")

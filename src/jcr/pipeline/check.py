@@ -1,4 +1,4 @@
-"""Judging a capture before any heavy work: files, motion, what it shows, what to add, how it was written."""
+"""Check of a capture before any heavy work: files, motion, features, poses to add, and the pose convention."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -36,8 +36,15 @@ from jcr.errors import InputError, RejectedError
 from jcr.estimation.foreseen import ForeseenCamera
 from jcr.estimation.hand_eye import SCALE_STD, solve_hand_eye
 from jcr.estimation.observability import observability
-from jcr.findings import Finding, FindingKind, Verdict, remedy, sentence, without_consequences
-from jcr.findings.sentences import unobservable
+from jcr.findings import (
+    Finding,
+    FindingKind,
+    Verdict,
+    no_reconstruction,
+    sentence,
+    strongest_first,
+    verdict_of,
+)
 from jcr.geometry import ARM, largest_motion
 from jcr.progress import Progress
 from jcr.records import Capture, HandEye, NextPose, Observability, PosePairs
@@ -47,12 +54,12 @@ from jcr.sfm.options import ColmapOptions
 CLEARER = 3.0
 """Factor by which poses in one convention must fit the images better than in the others."""
 QUICK, QUICK_SIZE_PX = 8, 800
-"""Images that tell in seconds whether the poses are theirs, and the long side at which they do."""
+"""Number of images that are registered first, and their long side (px): both take seconds."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Examination:
-    """What is known of a capture before it is calibrated."""
+    """Result of the check of a capture."""
 
     sharpness: Float[ndarray, " n"]
     """Variance of the Laplacian, relative to the median image's; empty where there are no images."""
@@ -61,27 +68,26 @@ class Examination:
     """Largest angle between two gripper poses."""
     observability: Observability
     expected: Expectation | None
-    """What a calibration of the images that count would report; None of fewer than three."""
+    """Accuracy that a calibration of the counted images would report; None of fewer than three."""
     counted: Int[ndarray, " c"]
     """Rows of the images that are expected to register: those that did; of images not tried, those that are clear."""
     suggestions: tuple[NextPose, ...]
     hand_eye: HandEye | None
     """The calibration by sparse features; None where the images were not registered."""
-    faults: tuple[str, ...]
-    """Why a calibration of this capture would be rejected."""
-    remarks: tuple[str, ...]
+    findings: tuple[Finding, ...]
+    """Findings of the calibration and of the images, strongest first."""
+    notes: tuple[str, ...]
+    """Remarks on the files, their exposure and their pairing, in words."""
 
     @property
     def expected_std(self) -> Float[ndarray, "7"] | None:
-        """Of that calibration, in records.COVARIANCE_ORDER."""
+        """Standard deviations of that calibration, in records.COVARIANCE_ORDER."""
         return None if self.expected is None else self.expected.std
 
     @property
     def verdict(self) -> Verdict:
-        """What its calibration would be."""
-        if self.faults:
-            return "rejected"
-        return "accepted" if self.hand_eye is None else self.hand_eye.verdict
+        """Verdict that a calibration of the capture is expected to get."""
+        return verdict_of(self.findings)
 
 
 def check_capture(
@@ -108,7 +114,7 @@ def check_capture(
     alone, shown = _examine_alone(capture), _Compared()
     if isinstance(capture, PosePairs):
         shown = _compare_pairs(capture, robot_noise)
-    elif look and not any(one.severity == "rejects" for one in alone.views):
+    elif look and verdict_of(alone.views) != "rejected":
         shown = _compare_with_images(capture, alone.robot, robot_noise, seed, progress, thorough)
     counted = alone.clear if shown.registered is None else shown.registered
     rows = counted if len(counted) >= FEWEST else np.arange(len(capture))
@@ -117,12 +123,9 @@ def check_capture(
         assumptions = assumed(gripper, _camera(capture), robot_noise)
     x = None if shown.assumptions is None else assumptions.gripper_from_camera
     seen = shown.observability or observability(gripper, x)
-    alone_seen = seen.findings if shown.hand_eye is None else ()
-    weak = [f"{unobservable(one)}; {remedy(one)}" for one in alone_seen if "nearly" in one.details]
-    unseen = [f"{unobservable(one)}; {remedy(one)}" for one in alone_seen if "nearly" not in one.details]
-    faults = [*shown.faults, *unseen]
-    views = as_causes(alone.views) if faults else alone.views
-    causes = [sentence(one) for one in views if one.severity == "rejects"]
+    found = [*shown.findings, *(() if shown.hand_eye is not None else seen.findings), *alone.unused]
+    is_rejected = verdict_of(found) == "rejected"
+    found += as_causes(alone.views) if is_rejected else alone.views
     ahead = Ahead.of(assumptions, gripper, alone.robot.of(rows), suggest, reach, seed)
     suggestions = [ahead.next_pose(count, ahead.expected(count)) for count in range(1, suggest + 1)]
     return Examination(
@@ -134,30 +137,27 @@ def check_capture(
         counted=counted,
         suggestions=tuple(replace(one, like=int(rows[one.like])) for one in suggestions),
         hand_eye=shown.hand_eye,
-        faults=tuple(dict.fromkeys((*causes, *faults))),
-        remarks=(
-            *alone.remarks,
-            *weak,
-            *shown.remarks,
-            *(sentence(one) for one in views if one.severity == "warns"),
-        ),
+        findings=strongest_first({sentence(one): one for one in found}.values()),
+        notes=(*alone.notes, *shown.notes),
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Alone:
-    """What files, poses and images show by themselves."""
+    """Findings of files, poses and images by themselves."""
 
     robot: RobotErrors
     move_m: float
     rotation_rad: float
-    """The largest between two gripper poses."""
+    """Largest angle between two gripper poses."""
     clear: Int[ndarray, " c"]
     """Rows of the images that are sharp and well exposed."""
     sharpness: Float[ndarray, " n"]
     views: tuple[Finding, ...]
-    """What the images alone show against the capture."""
-    remarks: tuple[str, ...]
+    """Findings of the images alone."""
+    notes: tuple[str, ...]
+    unused: tuple[Finding, ...] = ()
+    """Finding of a robot whose model is not used."""
 
 
 def _examine_alone(capture: Capture | PosePairs) -> _Alone:
@@ -170,14 +170,14 @@ def _examine_alone(capture: Capture | PosePairs) -> _Alone:
         clear=np.arange(len(gripper)),
         sharpness=np.zeros(0),
         views=(),
-        remarks=tuple(capture.notes),
+        notes=tuple(capture.notes),
     )
     if alone.move_m < 5e-3 and alone.rotation_rad > np.radians(5):
         divided = (
             f"the gripper moves by at most {1e3 * alone.move_m:.2g} mm while it rotates by "
             f"{np.degrees(alone.rotation_rad):.0f}°: the positions may have been divided by 1000"
         )
-        alone = replace(alone, remarks=(*alone.remarks, divided))
+        alone = replace(alone, notes=(*alone.notes, divided))
     return _with_images(alone, capture) if isinstance(capture, Capture) else alone
 
 
@@ -189,19 +189,19 @@ def _with_images(alone: _Alone, capture: Capture) -> _Alone:
         exposure_fault(grey) is None and name not in blurred
         for name, grey in zip(capture.images, brightness, strict=True)
     ]
-    unused = () if robot.unused is None else (sentence(robot.unused),)
     return replace(
         alone,
         robot=robot,
         clear=np.flatnonzero(clear),
         sharpness=sharpness,
         views=views,
-        remarks=(*alone.remarks, *_remarks(capture, brightness), *unused),
+        notes=(*alone.notes, *_remarks(capture, brightness)),
+        unused=() if robot.unused is None else (robot.unused,),
     )
 
 
 def _camera(capture: Capture | PosePairs) -> ForeseenCamera | None:
-    """The camera before its images are matched."""
+    """Return the camera as it is assumed before its images are matched."""
     if isinstance(capture, PosePairs):
         return None
     return typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
@@ -209,20 +209,20 @@ def _camera(capture: Capture | PosePairs) -> ForeseenCamera | None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Compared:
-    """What a comparison of gripper poses with cameras shows."""
+    """Comparison of gripper poses with cameras."""
 
     hand_eye: HandEye | None = None
     """None where no cameras were found."""
-    faults: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    notes: tuple[str, ...] = ()
     registered: Int[ndarray, " c"] | None = None
     """Rows of the images that a calibration would use; None where not all were looked at."""
     assumptions: Assumptions | None = None
-    """What is found of camera and robot; None where nothing was, or it would be rejected."""
+    """Camera and robot as found; None where nothing was found, or it would be rejected."""
 
     @property
     def observability(self) -> Observability | None:
-        """Of the poses that were compared; None where some were not."""
+        """Observability of the compared poses; None where some were not compared."""
         if self.hand_eye is None or self.registered is None:
             return None
         return self.hand_eye.observability
@@ -236,12 +236,13 @@ def _compare_with_images(
     progress: Progress | None,
     thorough: bool,
 ) -> _Compared:
-    """The gripper poses compared with few small images and, where that is not enough, with all of them."""
+    """Compare the gripper poses with few small images and, where that is not enough, with all of them."""
     if not thorough and len(capture) > QUICK:
         rows = spread_rows(len(capture))
         few = _of_rows(capture, rows)
         shown = _compare_registered(few, robot.of(rows), robot_noise, seed, progress, QUICK_SIZE_PX)
-        if not shown.faults and shown.registered is not None and len(shown.registered) == QUICK:
+        is_sound = verdict_of(shown.findings) != "rejected"
+        if is_sound and shown.registered is not None and len(shown.registered) == QUICK:
             return replace(shown, registered=None)
     return _compare_registered(capture, robot, robot_noise, seed, progress)
 
@@ -253,7 +254,7 @@ def read_and_compare(
     into: str | Path | None = None,
     progress: Progress | None = None,
 ) -> Capture | PosePairs:
-    """Read a capture; where its file leaves open how the poses are written, as its images show.
+    """Read a capture; where its file leaves the pose convention open, find the one that the images fit.
 
     Raises InputError where the images do not tell either.
     """
@@ -304,7 +305,7 @@ def _best_fit(read: list[tuple[Capture, ReadOptions]], progress: Progress | None
 
 
 def spread_rows(count: int) -> Int[ndarray, " k"]:
-    """Of `count` images the rows of those that are looked at first."""
+    """Return the rows of the images, out of `count`, that are examined first."""
     return np.linspace(0, count - 1, min(count, QUICK)).round().astype(int)
 
 
@@ -324,7 +325,7 @@ def _compare_registered(
     progress: Progress | None,
     size_px: int | None = None,
 ) -> _Compared:
-    """The gripper poses compared with cameras that are reconstructed from features, and what else that shows."""
+    """Compare the gripper poses with cameras that are reconstructed from features."""
     options = ColmapOptions(seed=seed)
     if size_px is not None:
         options = replace(options, working_size_px=size_px)
@@ -334,30 +335,25 @@ def _compare_registered(
         board = None
         if size_px is None:
             board = proposed([read_image(capture.folder / name) for name in capture.images])
-        return _Compared(faults=(str(error),), remarks=() if board is None else (sentence(board),))
+        return _Compared(findings=(*no_reconstruction(error), *(() if board is None else (board,))))
     rows = found.image_index
     options_then = CalibrateOptions(robot_noise=_mm_deg(robot_noise))
     case = checked(capture, found, options_then, robot.of(rows))
     shown = _compare_by_calibration(capture, case)
     return replace(
         shown,
-        remarks=(*shown.remarks, *found.notes),
+        notes=found.notes,
         registered=rows[case.hand_eye.inliers],
         assumptions=assumed_of(case) if case.hand_eye.converged else None,
     )
 
 
 def _compare_by_calibration(capture: Capture, case: Case) -> _Compared:
-    """What a calibration finds, and of poses that it left out why."""
+    """Return the findings of a calibration, with those of the poses that it left out."""
     hand_eye = case.hand_eye
     if hand_eye.converged:
         hand_eye = hand_eye.with_findings(*left_out_poses(capture, case.reconstruction, hand_eye))
-    faults, remarks = _reasons(hand_eye)
-    return _Compared(
-        hand_eye=hand_eye,
-        faults=faults,
-        remarks=remarks,
-    )
+    return _Compared(hand_eye=hand_eye, findings=hand_eye.findings)
 
 
 def _compare_pairs(pairs: PosePairs, noise: tuple[float, float] | None) -> _Compared:
@@ -367,23 +363,12 @@ def _compare_pairs(pairs: PosePairs, noise: tuple[float, float] | None) -> _Comp
     if hand_eye.converged:
         scale_std = SCALE_STD if pairs.is_metric and is_one(hand_eye) else None
         assumptions = assumed_of_poses(hand_eye, pairs.base_from_gripper[used], scale_std)
-    faults, remarks = _reasons(hand_eye)
     return _Compared(
         hand_eye=hand_eye,
-        faults=faults,
-        remarks=remarks,
+        findings=hand_eye.findings,
         registered=np.flatnonzero(used),
         assumptions=assumptions,
     )
-
-
-def _reasons(hand_eye: HandEye) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the sentences of the findings that reject, and of those that warn."""
-    said = without_consequences(hand_eye.findings)
-    rejects, warns = (
-        tuple(sentence(one) for one in said if one.severity == severity) for severity in ("rejects", "warns")
-    )
-    return rejects, warns
 
 
 def _mm_deg(noise: tuple[float, float] | None) -> tuple[float, float] | None:
@@ -391,14 +376,14 @@ def _mm_deg(noise: tuple[float, float] | None) -> tuple[float, float] | None:
 
 
 def _brightness_and_sharpness_of_each(capture: Capture) -> tuple[Float[ndarray, " n"], Float[ndarray, " n"]]:
-    """Mean grey level and relative sharpness of every image."""
+    """Return the mean grey level and the relative sharpness of every image."""
     looks = [brightness_and_sharpness(read_image(capture.folder / name)) for name in capture.images]
     brightness, sharpness = np.array(looks).T
     return brightness, sharpness / max(float(np.median(sharpness)), 1e-9)
 
 
 def _remarks(capture: Capture, brightness: Float[ndarray, " n"]) -> Iterator[str]:
-    """What stands out in the exposure of images and in intrinsics."""
+    """Yield remarks on the exposure of images and on intrinsics."""
     for name, grey in zip(capture.images, brightness, strict=True):
         if (fault := exposure_fault(grey)) is not None:
             yield f"{name} is {fault}; expose it again"
