@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import jcr
-from jcr.calibration.calibration_json import CalibrationFile
+from jcr.calibration.record import Calibration
 from jcr.cell.placement import CamerasFile
 from jcr.cli import COMMANDS, dispatch
 from jcr.cli.models import SCALES
@@ -35,7 +35,7 @@ SCHEMAS = REFERENCE / "schemas"
 EXAMPLE = Path(__file__).parents[1] / "examples" / "01_quick_start.py"
 FORMATS = {
     "calibration.json": (
-        CalibrationFile,
+        Calibration,
         "The hand-eye transform, its covariance, and what was made of each image.",
     ),
     "cameras.json": (CamerasFile, "Further cameras and arms of the cell, where there are some."),

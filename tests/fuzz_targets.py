@@ -9,14 +9,14 @@ import numpy as np
 from PIL import Image
 
 import capture_writers as writers
-from jcr.calibration.calibration_json import (
-    calibration_file,
-    read_calibration,
-    write_calibration,
-)
 from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_poses
+from jcr.calibration.record import (
+    calibration_of,
+    read_calibration,
+    write_calibration,
+)
 from jcr.capture.camera_info import read_camera_info
 from jcr.capture.formats import capture_json
 from jcr.capture.formats.lerobot import Info, read_episode
@@ -140,7 +140,7 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
         recon_from_camera=cameras,
         is_metric=True,
     )
-    found = calibration_file(pairs, pairs, calibrate_poses(pairs), {}, "0")
+    found = calibration_of(pairs, pairs, calibrate_poses(pairs), {}, "0")
     write_calibration(folder / "calibration.json", found)
     height, width = SIZE[1], SIZE[0]
     tracks = Tracks(
@@ -282,7 +282,7 @@ def sound_run(out: Path) -> Path:
     attempt = Attempt(
         backend="colmap", images_registered=RUN_IMAGES, reconstruct_s=1.0, calibrate_s=0.5, why_not=None
     )
-    content = calibration_file(pairs, pairs, calibrate_poses(pairs), {}, "0", [attempt]).model_dump()
+    content = calibration_of(pairs, pairs, calibrate_poses(pairs), {}, "0", [attempt]).as_json()
     intrinsics = {
         "fx": 90.0,
         "fy": 90.0,

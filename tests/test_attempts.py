@@ -277,7 +277,7 @@ def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
     assert (colmap["reconstruct_s"], direct["reconstruct_s"]) == (20.0, 400.0)
     assert (colmap["calibrate_s"], direct["calibrate_s"]) == (3.0, 3.0)
     assert content["timings_s"] == {"reconstruct": 420.0, "calibrate": 6.0, "report": 0.0}
-    assert result.calibration.model_dump()["attempts"] == content["attempts"]
+    assert result.calibration.as_json()["attempts"] == content["attempts"]
     printed = (tmp_path / "log.txt").read_text().splitlines()
     assert printed[1].startswith("attempt 1: colmap registered 12 of 12 images, not kept (rejected: ")
     assert printed[2] == (
@@ -288,7 +288,7 @@ def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
     calibrate(capture, tmp_path)
     again = RunFolder(tmp_path).calibration()
     assert made == ["colmap", "direct"]
-    assert again.model_dump()["attempts"] == content["attempts"]
+    assert again.as_json()["attempts"] == content["attempts"]
     assert again.timings_s == {"reconstruct": 0.0, "calibrate": 3.0, "report": 0.0}
 
 

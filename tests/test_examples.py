@@ -154,7 +154,7 @@ def test_the_api_is_called_as_it_is_shown(done: Path, tmp_path: Path):
     capture = jcr.read_capture(EXAMPLES / "tabletop")
     result = jcr.calibrate(capture, out)
     assert result.converged
-    from jcr.calibration.calibration_json import read_calibration
+    from jcr.calibration.record import read_calibration
 
     assert read_calibration(out).converged and callable(jcr.calibrate)
     assert callable(jcr.run) and callable(jcr.build_map)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import jcr
-from jcr.calibration.calibration_json import calibration_file, write_calibration
 from jcr.calibration.drift import drift
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.record import calibration_of, write_calibration
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
 from jcr.cli import dispatch
@@ -184,9 +184,7 @@ def out(tmp_path_factory: pytest.TempPathFactory, capture: Capture, reconstructi
     (folder / "out").mkdir()
     hand_eye = calibrate(old, reconstruction)
     assert hand_eye.converged
-    write_calibration(
-        folder / "out/calibration.json", calibration_file(old, reconstruction, hand_eye, {}, "0")
-    )
+    write_calibration(folder / "out/calibration.json", calibration_of(old, reconstruction, hand_eye, {}, "0"))
     made_with = MadeWith(reconstruct=ReconstructOptions(), calibrate=CalibrateOptions())
     state = state_of(jcr.read_capture(old.folder), made_with)
     RunFolder(folder / "out").keep_reconstruction(reconstruction, state)

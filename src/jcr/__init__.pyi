@@ -1,10 +1,9 @@
 """Public names of jcr; `__init__.py` imports each when it is first used."""
 
-from .calibration.calibration_json import CalibrationFile as CalibrationFile
 from .calibration.difference import Difference as Difference
 from .calibration.difference import compare as compare
 from .calibration.options import CalibrateOptions as CalibrateOptions
-from .calibration.seen import SeenInBase as SeenInBase
+from .calibration.record import Calibration as Calibration
 from .capture.options import ReadOptions as ReadOptions
 from .capture.read import read_capture as read_capture
 from .cell.placement import CamerasFile as CamerasFile
@@ -17,6 +16,7 @@ from .export.formats import export_run as export_run
 from .export.options import ExportOptions as ExportOptions
 from .findings import Finding as Finding
 from .findings import FindingKind as FindingKind
+from .geometry import Similarity as Similarity
 from .live.calibration import LiveCalibration as LiveCalibration
 from .live.cameras import Camera as Camera
 from .live.cameras import Frame as Frame
@@ -61,6 +61,7 @@ from .records import PosePairs as PosePairs
 from .records import Reconstruction as Reconstruction
 from .records import Requirement as Requirement
 from .records import RobotNoise as RobotNoise
+from .results import CalibrationResult as CalibrationResult
 from .results import RunOptions as RunOptions
 from .results import RunResult as RunResult
 from .results import SavedRun as SavedRun

@@ -1,11 +1,11 @@
-"""Arrays, and parts of files, as the JSON that jcr writes holds them."""
+"""Arrays and parts of files: NumPy arrays in Python, lists in the JSON that jcr writes."""
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer
 
 from jcr.geometry import require_rigid
 
@@ -17,14 +17,21 @@ class Part(BaseModel):
         extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True, from_attributes=True
     )
 
+    def __eq__(self, other: object) -> bool:
+        """Compare the JSON of both, for arrays have no truth value."""
+        return (
+            isinstance(other, Part) and type(self) is type(other) and self.model_dump() == other.model_dump()
+        )
+
 
 def _listed(array: Any) -> Any:
     return array.tolist() if isinstance(array, ndarray) else array
 
 
-def _rigid(rows: list[list[float]]) -> list[list[float]]:
-    require_rigid(np.array(rows), "the matrix")
-    return rows
+def _rigid(rows: list[list[float]]) -> Float[ndarray, "4 4"]:
+    matrix = np.array(rows)
+    require_rigid(matrix, "the matrix")
+    return matrix
 
 
 LEAST_EIGENVALUE = 1e-14
@@ -33,7 +40,7 @@ LOST_DIGITS = 1e-3
 """By which an eigenvalue of a part may be below 0: of motions that show little, the last digits are not exact."""
 
 
-def _part(rows: list[list[float]]) -> list[list[float]]:
+def _part(rows: list[list[float]]) -> Float[ndarray, "n n"]:
     matrix = np.array(rows)
     std = np.sqrt(np.maximum(np.diag(matrix), 0.0))
     largest = np.outer(std, std)  # Cauchy-Schwarz
@@ -43,15 +50,15 @@ def _part(rows: list[list[float]]) -> list[list[float]]:
         raise ValueError("no covariance: not symmetric")
     if _least_eigenvalue(matrix, std) < -LOST_DIGITS:
         raise ValueError("no covariance: some combination of errors has a negative variance")
-    return rows
+    return matrix
 
 
-def _whole(rows: list[list[float]]) -> list[list[float]]:
-    matrix = np.array(_part(rows))
+def _whole(rows: list[list[float]]) -> Float[ndarray, "n n"]:
+    matrix = _part(rows)
     std = np.sqrt(np.diag(matrix))
     if not std.all() or _least_eigenvalue(matrix, std) < LEAST_EIGENVALUE:
         raise ValueError("no covariance: some error, or a combination of errors, has no variance")
-    return rows
+    return matrix
 
 
 def _least_eigenvalue(matrix: Float[ndarray, "n n"], std: Float[ndarray, " n"]) -> float:
@@ -60,19 +67,35 @@ def _least_eigenvalue(matrix: Float[ndarray, "n n"], std: Float[ndarray, " n"]) 
 
 
 Spread = Annotated[float, Field(ge=0)]
-"""A standard deviation, or a size."""
+"""Standard deviation, or a size."""
 Listed = BeforeValidator(_listed)
-"""Takes an array for the lists that stand for it in JSON."""
+"""Validator that takes an array for the lists that stand for it in JSON."""
+AsArray = AfterValidator(np.array)
+AsLists = PlainSerializer(_listed, return_type=list)
 Spreads = Annotated[list[Spread], Listed]
 Spread3 = Annotated[list[Spread], Field(min_length=3, max_length=3), Listed]
 Numbers4 = Annotated[list[float], Field(min_length=4, max_length=4)]
 Numbers6 = Annotated[list[float], Field(min_length=6, max_length=6)]
-Numbers7 = Annotated[list[float], Field(min_length=7, max_length=7), Listed]
-Square = Annotated[list[list[float]], Listed]
-Matrix = Annotated[list[Numbers4], Field(min_length=4, max_length=4), AfterValidator(_rigid), Listed]
-"""Of a rigid transform."""
-Covariance6 = Annotated[list[Numbers6], Field(min_length=6, max_length=6), AfterValidator(_whole), Listed]
-Covariance7 = Annotated[list[Numbers7], Field(min_length=7, max_length=7), AfterValidator(_whole), Listed]
-"""Of everything that was estimated: positive definite."""
-PartCovariance7 = Annotated[list[Numbers7], Field(min_length=7, max_length=7), AfterValidator(_part), Listed]
-"""What one cause adds to it, which may be nothing."""
+_Numbers7 = Annotated[list[float], Field(min_length=7, max_length=7)]
+if TYPE_CHECKING:
+    Numbers3 = Numbers7 = Numbers = Square = Matrix = Covariance6 = Covariance7 = PartCovariance7 = ndarray
+else:
+    Numbers = Annotated[list[float], AsArray, Listed, AsLists]
+    Numbers3 = Annotated[list[float], Field(min_length=3, max_length=3), AsArray, Listed, AsLists]
+    Numbers7 = Annotated[list[float], Field(min_length=7, max_length=7), AsArray, Listed, AsLists]
+    Square = Annotated[list[list[float]], AsArray, Listed, AsLists]
+    Matrix = Annotated[
+        list[Numbers4], Field(min_length=4, max_length=4), AfterValidator(_rigid), Listed, AsLists
+    ]
+    """Rigid transform."""
+    Covariance6 = Annotated[
+        list[Numbers6], Field(min_length=6, max_length=6), AfterValidator(_whole), Listed, AsLists
+    ]
+    Covariance7 = Annotated[
+        list[_Numbers7], Field(min_length=7, max_length=7), AfterValidator(_whole), Listed, AsLists
+    ]
+    """Covariance of everything that was estimated: positive definite."""
+    PartCovariance7 = Annotated[
+        list[_Numbers7], Field(min_length=7, max_length=7), AfterValidator(_part), Listed, AsLists
+    ]
+    """Part of a covariance that one cause adds, which may be nothing."""

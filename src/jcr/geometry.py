@@ -8,6 +8,7 @@ t ← t + v and R ← exp(w) R. v moves the origin of b whatever w is, which kee
 """
 
 import warnings
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -149,6 +150,24 @@ def scale_translation(
 ) -> Float[ndarray, "... 4 4"]:
     """S_λ: the transforms with their translations multiplied by scales (...), their rotations untouched."""
     return transform(a_from_b[..., :3, :3], np.asarray(scale)[..., None] * a_from_b[..., :3, 3])
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """Similarity a_from_b: x_in_a = R · (scale · x_in_b) + t."""
+
+    rigid: Float[ndarray, "4 4"]
+    """Rotation R and translation t (m)."""
+    scale: float
+    """Metres per unit of b."""
+
+    def __call__(self, x_in_b: Vectors) -> Vectors:
+        """Return points (…,3) in a."""
+        return apply(self.rigid, self.scale * np.asarray(x_in_b, float))
+
+    def of_cameras(self, b_from_camera: Transforms) -> Transforms:
+        """Return the rigid transforms a_from_camera (…,4,4) of cameras whose poses in b have its unit."""
+        return self.rigid @ scale_translation(b_from_camera, self.scale)
 
 
 def apply_similarity(a_from_b: Transform, scale: float, x_in_b: Vectors) -> Vectors:

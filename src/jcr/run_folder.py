@@ -20,8 +20,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jcr import __version__
-from jcr.calibration.calibration_json import CalibrationFile, read_calibration, write_calibration
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.record import Calibration, read_calibration, write_calibration
 from jcr.calibration.words import log
 from jcr.capture.added import FOLDER as ADDED
 from jcr.capture.formats.capture_json import kept
@@ -131,7 +131,7 @@ class RunFolder:
         """What the calibration was made with; raises as `state` does."""
         return self.state().options
 
-    def calibration(self) -> CalibrationFile:
+    def calibration(self) -> Calibration:
         """calibration.json; InputError where there is none, or it was damaged."""
         return read_calibration(self.path)
 
@@ -154,7 +154,7 @@ class RunFolder:
         except InputError:
             return None
 
-    def calibrated(self) -> tuple[CalibrationFile, Reconstruction]:
+    def calibrated(self) -> tuple[Calibration, Reconstruction]:
         """A calibration and the reconstruction behind it.
 
         Raises InputError where either is missing or damaged, nothing was found, or they are not of the same images.
@@ -164,7 +164,7 @@ class RunFolder:
             raise InputError(
                 f"{self.path}: is for a camera that watches the gripper; this needs a camera on the gripper"
             )
-        if calibration.gripper_from_camera is None:
+        if calibration.parent_from_camera is None:
             raise InputError(
                 f"{self.path}: found no calibration ({calibration.doubt}); fix the capture, run it again"
             )
@@ -254,7 +254,7 @@ class RunFolder:
         for name in OF_RECONSTRUCTION:
             (self.path / name).unlink(missing_ok=True)
 
-    def keep_calibration(self, content: CalibrationFile) -> None:
+    def keep_calibration(self, content: Calibration) -> None:
         """Write calibration.json and log.txt; what was made from another one goes first, so that the two never mix."""
         try:
             same = self.calibration().model_dump(exclude=PASSING) == content.model_dump(exclude=PASSING)
@@ -265,7 +265,7 @@ class RunFolder:
                 (self.path / name).unlink(missing_ok=True)
         self.amend_calibration(content)
 
-    def amend_calibration(self, content: CalibrationFile) -> None:
+    def amend_calibration(self, content: Calibration) -> None:
         """Write calibration.json and log.txt with more of the same calibration: times, warnings of the map."""
         write_calibration(self.path / CALIBRATION, content)
         write_text(self.path / LOG, log(content))

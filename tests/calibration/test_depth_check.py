@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from analytic_scene import FOCAL_PX, HEIGHT, WIDTH, cast_depth, looking_at_table
-from jcr.calibration.calibration_json import CalibrationFile, calibration_file
 from jcr.calibration.checks.depth_camera import depth_check
+from jcr.calibration.record import Calibration, calibration_of
 from jcr.calibration.words import details
 from jcr.camera import rays
 from jcr.capture.depth_images import read_depth
@@ -115,12 +115,12 @@ def test_the_robot_shows_that_the_depth_is_too_long_and_how_noisy(measured: tupl
     noise = np.hypot(check.noise_m, check.noise_per_m * depth**2)
     assert noise == pytest.approx(NOISE_PER_M * depth**2, rel=0.35)
     assert (check.std_m(depth) > noise).all()
-    content = calibration_file(
+    content = calibration_of(
         capture, reconstruction, replace(hand_eye, scale_evidence=ScaleEvidence(depth=check)), {}, "0"
     )
     said = f"depth camera: its lengths are {check.off_percent:.2g} ± {check.std_percent:.1g} % too long "
     assert any(line.startswith(said) for line in details(content))
-    assert CalibrationFile.model_validate_json(json.dumps(content.model_dump()), strict=True) == content
+    assert Calibration.model_validate_json(json.dumps(content.as_json()), strict=True) == content
     assert depth_check(replace(capture, depths=None), reconstruction, hand_eye) is None
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from benchmarks.coverage import FACTOR, predicted
-from jcr.calibration.calibration_json import CalibrationFile, calibration_file
 from jcr.calibration.expected import Ahead, assumed, expected, typical_camera
 from jcr.calibration.poses import calibrate_poses
+from jcr.calibration.record import Calibration, calibration_of
 from jcr.calibration.robot_errors import errors_of
 from jcr.pipeline.check import check_capture
 from jcr.records import Intrinsics, NextPose, PosePairs
@@ -31,7 +31,7 @@ def test_what_is_expected_is_what_is_reported():
 
 @pytest.mark.slow
 def test_check_expects_of_the_bundled_capture_what_its_run_reports(tabletop: Path, done: Path):
-    uncertainty = CalibrationFile.model_validate_json((done / "calibration.json").read_text()).uncertainty
+    uncertainty = Calibration.model_validate_json((done / "calibration.json").read_text()).uncertainty
     found = check_capture(tabletop).expected
     assert uncertainty is not None and uncertainty.seen is not None and found is not None
     assert abs(np.log(found.seen.within_95_mm / uncertainty.seen.within_95_mm)) < WITHIN
@@ -115,6 +115,6 @@ def test_a_robot_that_is_found_worse_than_assumed_is_not_promised_away():
     )
     found = calibrate_poses(pairs)
     assert not found.converged
-    promised = calibration_file(pairs, pairs, found, {}, "").next_poses[-1].expected_std
+    promised = calibration_of(pairs, pairs, found, {}, "").next_poses[-1].expected_std
     _, proposed = expected_with(problem, noise, 2)
     assert np.allclose(promised, proposed[-1].expected_std, rtol=0.5)

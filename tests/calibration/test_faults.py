@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from benchmarks.faults import calibrated, outcome
-from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.checks.camera import is_material
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_poses
+from jcr.calibration.record import calibration_of
 from jcr.calibration.stage import calibrate
 from jcr.camera import project, unproject
 from jcr.cell.carried import exchanged, refined
@@ -246,13 +246,13 @@ def test_positions_that_are_all_too_long_are_said_to_be_beyond_what_images_show_
     capture, reconstruction = reconstructed(found, False)
     unknown = calibrate(capture, reconstruction)
     assert unknown.converged and not unknown.warnings
-    file = calibration_file(capture, reconstruction, unknown, {}, "")
+    file = calibration_of(capture, reconstruction, unknown, {}, "")
     (alone,) = (sentence(one) for one in file.findings if one.kind is FindingKind.SCALE_FROM_ROBOT)
     assert alone in file.notes
     # Simulated observations are metric as the scene is; the robot's positions are not.
     metric = calibrate(capture, replace(reconstruction, is_metric=True, metric_std=0.002))
     assert "4.8 ± 0.2 % larger than given" in metric.warnings[0]
-    assert alone not in calibration_file(capture, reconstruction, metric, {}, "").notes
+    assert alone not in calibration_of(capture, reconstruction, metric, {}, "").notes
 
 
 def test_what_differs_from_image_to_image_is_a_fault_where_it_is_surely_larger_than_its_noise():

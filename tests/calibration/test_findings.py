@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jcr.calibration.calibration_json import (
-    calibration_file,
+from jcr.calibration.poses import calibrate_poses
+from jcr.calibration.record import (
+    calibration_of,
     read_calibration,
 )
-from jcr.calibration.poses import calibrate_poses
 from jcr.calibration.stage import calibrate
 from jcr.calibration.verdict import with_findings
 from jcr.calibration.words import summary
@@ -175,7 +175,7 @@ def test_what_a_cause_explains_is_not_another_fault():
         recon_from_camera=problem.recon_from_camera,
         is_metric=False,
     )
-    content = calibration_file(pairs, pairs, calibrate_poses(pairs), {}, "0")
+    content = calibration_of(pairs, pairs, calibrate_poses(pairs), {}, "0")
     assert content.findings[0].kind is FindingKind.POSE_CONVENTION and FindingKind.UNCERTAIN in {
         one.kind for one in content.findings
     }
@@ -250,9 +250,9 @@ def test_findings_are_in_the_file_and_come_back(tmp_path: Path):
     hand_eye = with_findings(
         hand_eye, (replace(example(FindingKind.SLIP), concerns="mount", shift=(1e-3,) * 7),)
     )
-    content = calibration_file(pairs, pairs, hand_eye, {}, "0")
+    content = calibration_of(pairs, pairs, hand_eye, {}, "0")
     file = tmp_path / "calibration.json"
-    file.write_text(json.dumps(content.model_dump()))
+    file.write_text(json.dumps(content.as_json()))
     written = json.loads(file.read_text())
     assert written["verdict"] == "accepted with warnings" and written["converged"]
     kinds = [one["kind"] for one in written["findings"]]

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.record import calibration_of
 from jcr.calibration.stage import calibrate
 from jcr.records import Capture, HandEye, Intrinsics, Reconstruction
 from simulation.problems import INTRINSICS, HandEyeProblem, error, hand_eye_problem, observed
@@ -89,7 +89,7 @@ def test_more_views_are_not_promised_to_make_up_for_a_wrong_intrinsics() -> None
     for intrinsics in (INTRINSICS, scaled(1.03), scaled(1.2)):
         _, capture, reconstruction = pictured(0, 5, intrinsics)
         hand_eye = calibrate(capture, reconstruction, CalibrateOptions(next_poses=2))
-        content = calibration_file(capture, reconstruction, hand_eye, {}, "")
+        content = calibration_of(capture, reconstruction, hand_eye, {}, "")
         offset.append(hand_eye.gripper_from_camera[:3, 3])
         promised.append(np.linalg.norm(content.next_poses[-1].expected_std[:3]))
         reported.append(np.sqrt(np.trace(hand_eye.covariance[:3, :3])))

@@ -12,8 +12,8 @@ from jcr.calibration.seen import (
     Scene,
     in_use,
     joint_covariance,
+    point_in_base,
     scene_uncertainty,
-    seen_in_base,
     seen_uncertainty,
     with_given_intrinsics,
     within_95,
@@ -95,12 +95,14 @@ def test_intrinsics_and_transform_together_place_a_point_better_than_each_is_kno
 def test_errors_of_the_gripper_pose_stand_beside_those_of_the_calibration():
     estimate, start = estimated()
     assert estimate.intrinsics is not None
-    hand_eye = replace(start, estimate=estimate)
-    pose = inverse(np.linalg.inv(hand_eye.gripper_from_camera))
-    found = seen_in_base(hand_eye, estimate.intrinsics, X_PX, DISTANCE_M, pose)
+    pose = inverse(np.linalg.inv(estimate.gripper_from_camera))
+    ray = unproject(estimate.intrinsics, X_PX)
+    depth_m = DISTANCE_M * ray[:, 2] / np.linalg.norm(ray, axis=1)
+    x_in_base, found = point_in_base(estimate, start.robot_noise, X_PX, depth_m, pose)
+    assert x_in_base == pytest.approx(apply(pose, placed(estimate.gripper_from_camera, estimate.intrinsics)))
     here = seen_uncertainty(estimate, estimate.intrinsics, X_PX, DISTANCE_M)
     assert np.trace(found.calibration, axis1=1, axis2=2) == pytest.approx(np.trace(here, axis1=1, axis2=2))
-    noise, rng = hand_eye.robot_noise, np.random.default_rng(0)
+    noise, rng = start.robot_noise, np.random.default_rng(0)
     steps = rng.normal(size=(4000, 6)) * np.repeat((noise.translation, noise.rotation), 3)
     drawn = np.array(
         [

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from jcr.calibration.calibration_json import read_calibration
+from jcr.calibration.record import read_calibration
 from jcr.cli.capture import Arguments, _conclude
 from jcr.live.session import SessionOptions
 from jcr.records import Requirement

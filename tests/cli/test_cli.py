@@ -44,7 +44,7 @@ def test_a_run_leaves_every_file_and_nothing_half_written(done: Path):
     } <= names
     assert not [name for name in names if ".part" in name]
     content = json.loads((done / "calibration.json").read_text())
-    assert content["format"] == "jcr.calibration/1"
+    assert content["format"] == "jcr.calibration/2"
     assert content["converged"] is True
     assert np.shape(content["uncertainty"]["covariance"]) == (7, 7)
     assert len(content["images"]) == 12

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import jcr
-from jcr.calibration.calibration_json import read_calibration
+from jcr.calibration.record import read_calibration
 from jcr.camera import project, unproject
 from jcr.capture.images import read_image
 from jcr.cli import dispatch

@@ -24,8 +24,8 @@ from PIL import Image
 
 import jcr
 from jcr import run_folder
-from jcr.calibration.calibration_json import read_calibration
 from jcr.calibration.checks import capture as capture_checks
+from jcr.calibration.record import read_calibration
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.cli import dispatch

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from jcr.calibration.calibration_json import read_calibration
+from jcr.calibration.record import read_calibration
 from jcr.cli import dispatch, main
 from jcr.reconstruction_npz import read_reconstruction
 from jcr.run_folder import RunFolder

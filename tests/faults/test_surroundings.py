@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from capture_writers import write_easy_handeye2
-from jcr.calibration.calibration_json import read_calibration
+from jcr.calibration.record import read_calibration
 from jcr.errors import InputError
 from jcr.geometry import scale_translation
 from jcr.reconstruction_npz import read_reconstruction

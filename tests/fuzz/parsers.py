@@ -15,7 +15,7 @@ TESTS = Path(__file__).parents[1]
 sys.path[:0] = [str(TESTS), str(TESTS.parent)]
 READERS = [
     "jcr.capture",
-    "jcr.calibration.calibration_json",
+    "jcr.calibration.record",
     "jcr.cli.query",
     "jcr.scene.cloud_ply",
     "jcr.live",

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 import jcr
 from chromium import Chromium
 from conftest import shrunk_capture
-from jcr.calibration.calibration_json import CalibrationFile, calibration_file, failed_file
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.record import Calibration, calibration_of, failed_calibration
 from jcr.calibration.stage import calibrate
 from jcr.calibration.words import log
 from jcr.capture.conventions import numbers_from_poses, poses_from_numbers
@@ -89,7 +89,7 @@ def run(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     )
     reconstruction, label = _cast(truth, tabletop)
     hand_eye = calibrate(capture, reconstruction, CalibrateOptions(next_poses=2))
-    content = calibration_file(capture, reconstruction, hand_eye, {"reconstruct": 1.0}, "0.0")
+    content = calibration_of(capture, reconstruction, hand_eye, {"reconstruct": 1.0}, "0.0")
     names = ("none", *(f"<i>{thing.name}" for thing in truth.objects))
     cloud = point_cloud(capture, reconstruction, hand_eye, label, label_names=names)
     scene = build_scene(cloud, MapOptions(cell=CELL, max_seconds=4.0))
@@ -210,7 +210,7 @@ class Elements(HTMLParser):
 
 
 def test_numbers_are_those_of_the_calibration_file(run: RunResult, page: str):
-    written = json.loads(json.dumps(run.calibration.model_dump()))
+    written = json.loads(json.dumps(run.calibration.as_json()))
     elements = Elements(page)
     assert json.loads(elements.copied("the matrix")) == written["gripper_from_camera"]
     x = np.array(written["gripper_from_camera"])
@@ -232,9 +232,7 @@ def test_numbers_are_those_of_the_calibration_file(run: RunResult, page: str):
     is_rotation(Rotation.from_quat([float(values[f"q{axis}"]) for axis in "xyzw"]))
 
     leave_one_out = written["held_out"]
-    said = (
-        f"{significant(leave_one_out['translation_mm'])} mm and {significant(leave_one_out['rotation_deg'])}°"
-    )
+    said = f"{significant(leave_one_out['translation_mm'])} mm, {significant(leave_one_out['rotation_deg'])}°"
     assert f"Leave-one-out error {said}" in elements.text
     required = run.calibration.requirement
     assert required is not None
@@ -327,7 +325,7 @@ def test_what_was_done_is_a_note_and_what_to_act_on_a_warning(
     as_json = json.loads(printed.out)
     assert as_json["notes"] == content.notes and as_json["warnings"] == content.warnings
     del as_json["notes"]  # as before there were any
-    assert CalibrationFile.model_validate_json(json.dumps(as_json), strict=True).notes == []
+    assert Calibration.model_validate_json(json.dumps(as_json), strict=True).notes == []
 
 
 def test_page_is_one_small_file(page: str):
@@ -416,7 +414,7 @@ def test_cameras_alone_are_reported_without_tracks_points_or_map(run: RunResult)
     )
     reconstruction = replace(result.reconstruction, backend="marker", tracks=nothing)
     hand_eye = calibrate(capture, reconstruction)
-    content = calibration_file(capture, reconstruction, hand_eye, {}, "0.0")
+    content = calibration_of(capture, reconstruction, hand_eye, {}, "0.0")
     bare = replace(result, cloud=None, scene=None, reconstruction=reconstruction)
     page = report_html(replace(bare, capture=capture, calibration=content, hand_eye=hand_eye))
     assert "back end marker" in Elements(page).text and 'class="marks"' not in page
@@ -431,7 +429,7 @@ def test_untrusted_calibration_is_not_recommended(run: RunResult):
     capture = replace(capture, base_from_gripper=still)
     reconstruction = replace(result.reconstruction, recon_from_camera=cameras[:UNREGISTERED])
     hand_eye = calibrate(capture, reconstruction)
-    content = calibration_file(capture, reconstruction, hand_eye, {}, "0.0")
+    content = calibration_of(capture, reconstruction, hand_eye, {}, "0.0")
     bare = replace(result, cloud=None, scene=None, reconstruction=reconstruction)
     page = report_html(replace(bare, capture=capture, calibration=content, hand_eye=hand_eye))
     text = Elements(page).text
@@ -483,7 +481,7 @@ def test_a_capture_that_was_copied_keeps_its_name_and_path(tmp_path: Path, table
     read = jcr.read_capture(scan, ReadOptions(pose_convention="ur"))
     copied = kept(read, tmp_path / "out" / "capture")
     assert copied.folder.name == "capture" and copied.pose_convention == "ur"
-    failed = failed_file(
+    failed = failed_calibration(
         copied, "colmap", no_reconstruction(RejectedError("nothing matched")), {"reconstruct": 1.0}, "0.0"
     )
     elements = Elements(failed_report_html(copied, failed))
@@ -517,7 +515,7 @@ def test_a_run_without_camera_poses_reports_why_with_its_images(run: RunResult):
     capture = run.capture
     fault, remedy = "only 2 of 12 images share features", "lay <textured> things on the table"
     error = RejectedError(fault, remedy)
-    failed = failed_file(capture, "colmap", no_reconstruction(error), {"reconstruct": 2.0}, "0.0")
+    failed = failed_calibration(capture, "colmap", no_reconstruction(error), {"reconstruct": 2.0}, "0.0")
     elements = Elements(failed_report_html(capture, failed))
     assert f"No calibration: {fault}." in elements.text and f"{remedy.capitalize()}." in elements.text
     names = [a.get("alt") for tag, a in elements.found if tag == "img"]

@@ -10,8 +10,7 @@ from numpy import ndarray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from jcr.arrays_json import Covariance7, Matrix, Spread3
-from jcr.calibration.calibration_json import read_content, validated
-from jcr.calibration.uncertainty_json import UncertaintyBudget
+from jcr.calibration.record import UncertaintyBudget, read_content, validated
 from jcr.capture.plain_files import first_fault
 from jcr.errors import InputError
 from jcr.geometry import require_rigid

@@ -17,8 +17,16 @@ from jcr.camera import NORMALIZED, by_parameters, by_point, parameters, unprojec
 from jcr.distributions import chi2
 from jcr.estimation.model_error import second_moment_px2
 from jcr.estimation.points import PointsPlaced
-from jcr.geometry import by_similarity, retract, skew
-from jcr.records import Estimate, HandEye, Intrinsics, InUse, SceneUncertainty, Seen, WithGivenIntrinsics
+from jcr.geometry import apply, by_similarity, retract, skew
+from jcr.records import (
+    Estimate,
+    Intrinsics,
+    InUse,
+    RobotNoise,
+    SceneUncertainty,
+    Seen,
+    WithGivenIntrinsics,
+)
 
 Pixels = Float[ndarray, "*points 2"]
 Distances = Float[ndarray, "*#points"] | float
@@ -65,27 +73,31 @@ def seen_uncertainty(
     return by @ joint_covariance(estimate) @ np.swapaxes(by, -1, -2) + of_model
 
 
-def seen_in_base(
-    hand_eye: HandEye,
-    intrinsics: Intrinsics,
+def point_in_base(
+    estimate: Estimate,
+    noise: RobotNoise,
     x_px: Pixels,
-    distance_m: Distances,
+    depth_m: Distances,
     base_from_gripper: Float[ndarray, "4 4"],
-) -> SeenInBase:
-    """The same in the base frame, seen from a reported gripper pose, whose errors stand beside those of the
-    calibration."""
-    x = hand_eye.gripper_from_camera
-    p_in_gripper = _in_camera(intrinsics, x_px, distance_m) @ x[:3, :3].T + x[:3, 3]
+) -> tuple[Float[ndarray, "*points 3"], SeenInBase]:
+    """Return the base-frame coordinates (m) of points at pixels, z = `depth_m` in the camera, and their covariances.
+
+    `noise` is that of the reported gripper pose, whose errors add to those of the calibration.
+    """
+    intrinsics, x = estimate.intrinsics, estimate.gripper_from_camera
+    assert intrinsics is not None
+    ray = unproject(intrinsics, x_px)
+    distance_m = np.asarray(depth_m) * np.linalg.norm(ray, axis=-1) / ray[..., 2]
+    p_in_gripper = apply(x, np.asarray(depth_m)[..., None] * ray / ray[..., 2:])
     base_from_camera_axes = base_from_gripper[:3, :3] @ x[:3, :3]
-    in_camera = seen_uncertainty(hand_eye.estimate, intrinsics, x_px, distance_m)
-    noise = hand_eye.robot_noise
+    in_camera = seen_uncertainty(estimate, intrinsics, x_px, distance_m)
     lever = skew(p_in_gripper @ base_from_gripper[:3, :3].T)
     square = lever @ np.swapaxes(lever, -1, -2)
     random, systematic = (
         metres**2 * np.eye(3) + radians**2 * square
         for metres, radians in ((noise.translation, noise.rotation), noise.systematic_left)
     )
-    return SeenInBase(
+    return apply(base_from_gripper, p_in_gripper), SeenInBase(
         calibration=base_from_camera_axes @ in_camera @ base_from_camera_axes.T,
         robot_random=random,
         robot_systematic=systematic,

@@ -5,8 +5,14 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jcr.calibration.calibration_json import CalibrationFile, GivenIntrinsicsKept, Proposal
-from jcr.calibration.uncertainty_json import SeenAndCorners, Uncertainty, UncertaintyBudget
+from jcr.calibration.record import (
+    Calibration,
+    GivenIntrinsicsKept,
+    Proposal,
+    SeenAndCorners,
+    Uncertainty,
+    UncertaintyBudget,
+)
 from jcr.findings import (
     Finding,
     FindingKind,
@@ -33,7 +39,7 @@ def labelled(label: str, *lines: str) -> list[str]:
     return [f"{label if k == 0 else '':<12}{line}" for k, line in enumerate(lines)]
 
 
-def headline(content: CalibrationFile) -> str:
+def headline(content: Calibration) -> str:
     """Return the verdict, the required accuracy, the images used, the back end and the time, in one line."""
     verdict = verdict_in_words(content.findings)
     limit = "" if content.requirement is None else f" ({_limit(content, content.requirement)})"
@@ -52,7 +58,7 @@ def verdict_in_words(findings: Iterable[Finding]) -> str:
     return f"ACCEPTED with {warnings} warning{'s' * (warnings > 1)}"
 
 
-def _limit(content: CalibrationFile, required: Requirement) -> str:
+def _limit(content: Calibration, required: Requirement) -> str:
     """Return the requirement, and where in the image it is not met."""
     limit = f"limit {required.translation_mm:g} mm, {required.rotation_deg:g}°"
     if not required.met:
@@ -71,7 +77,7 @@ def _limit(content: CalibrationFile, required: Requirement) -> str:
     return f"{limit} met at the image centre, not in the corner: {', '.join(exceeded)}" if exceeded else limit
 
 
-def summary(content: CalibrationFile, most: int = MOST_LINES) -> str:
+def summary(content: Calibration, most: int = MOST_LINES) -> str:
     """Return at most `most` lines, two of which are left to the caller: verdict, transform, accuracy, what to act on.
 
     A rejected calibration has its cause and remedy instead of the transform.
@@ -83,7 +89,7 @@ def summary(content: CalibrationFile, most: int = MOST_LINES) -> str:
     return "\n".join([*lines, *actions(content.findings, most - 2 - len(lines), proposed)]) + "\n"
 
 
-def _transform(content: CalibrationFile) -> list[str]:
+def _transform(content: Calibration) -> list[str]:
     """Return the transform with its standard deviations, the accuracy and the intrinsics."""
     uncertainty = content.uncertainty
     assert uncertainty is not None and content.parent_from_camera is not None
@@ -101,7 +107,7 @@ def _transform(content: CalibrationFile) -> list[str]:
     ]
 
 
-def _accuracy(content: CalibrationFile, uncertainty: Uncertainty) -> str:
+def _accuracy(content: Calibration, uncertainty: Uncertainty) -> str:
     """Return the bounds of 95 % of the errors, at the centre and in the corner, or as `--require-at` has it."""
     required = content.requirement
     if required is None:
@@ -117,7 +123,7 @@ def _accuracy(content: CalibrationFile, uncertainty: Uncertainty) -> str:
     return f"{at} at the image centre; {significant(corner.within_95_mm)} mm in the corner"
 
 
-def _tested(content: CalibrationFile, uncertainty: Uncertainty) -> str:
+def _tested(content: Calibration, uncertainty: Uncertainty) -> str:
     """Return the leave-one-out error, and the scale's standard deviation with its sources."""
     parts = [] if content.held_out is None else [f"leave-one-out: {leave_one_out_text(content.held_out)}"]
     used = [SCALE_SOURCES[one.name] for one in content.lengths if one.used and one.name in SCALE_SOURCES]
@@ -125,13 +131,13 @@ def _tested(content: CalibrationFile, uncertainty: Uncertainty) -> str:
     return "; ".join([*parts, f"scale ±{uncertainty.scale_std_percent:.2g} %, from {sources}"])
 
 
-def _intrinsics(content: CalibrationFile) -> list[str]:
+def _intrinsics(content: Calibration) -> list[str]:
     """Return the intrinsics that belong to the transform; nothing where poses alone were given."""
     camera = content.intrinsics
     if camera is None:
         return []
     given = content.with_given_intrinsics is not None
-    how = "given" if camera.std is None else "given, refined" if given else "estimated"
+    how = "used" if camera.std is None else "given, refined" if given else "estimated"
     numbers = " ".join(f"{name} {getattr(camera, name):.1f}" for name in ("fx", "fy", "cx", "cy"))
     return labelled("Intrinsics", f"{how}: {numbers}; use them together with the transform")
 
@@ -180,7 +186,7 @@ def _proposed(poses: Sequence[Proposal]) -> str:
     return f"add {count} (poses in calibration.json, next_poses){then}"
 
 
-def details(content: CalibrationFile) -> list[str]:
+def details(content: Calibration) -> list[str]:
     """Return the lines of `--verbose` and log.txt: attempts, times, matrix, budget, comparisons, images, findings."""
     tried = (
         f"attempt {k}: {attempt_in_words(attempt, len(content.images))}"
@@ -202,7 +208,7 @@ def details(content: CalibrationFile) -> list[str]:
     ]
 
 
-def _sizes(content: CalibrationFile) -> list[str]:
+def _sizes(content: Calibration) -> list[str]:
     """Return the matrix, the budget of its uncertainty, and the comparisons of lengths; nothing of a failure."""
     uncertainty, scale = content.uncertainty, content.scale
     if uncertainty is None or scale is None:
@@ -230,7 +236,7 @@ def _sizes(content: CalibrationFile) -> list[str]:
     return lines
 
 
-def log(content: CalibrationFile) -> str:
+def log(content: Calibration) -> str:
     """Return the text of log.txt: the summary with every warning, then the details."""
     return summary(content, 1000) + "\n" + "\n".join(details(content)) + "\n"
 

@@ -47,7 +47,7 @@ def show(result: "Result", output: VerboseOutput, *more: str) -> int:
 
     content, cameras = result.calibration, getattr(result, "cameras", None)
     placed = [] if cameras is None else cameras.cameras
-    facts = content.model_dump()
+    facts = content.as_json()
     if cameras is not None:
         facts |= {name: cameras.as_json()[name] for name in ("cameras", "arms")}
     lines = [line for camera in placed for line in labelled("Camera", _camera_in_words(camera))]

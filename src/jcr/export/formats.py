@@ -21,7 +21,7 @@ from jcr.options import checked_options
 from jcr.run_folder import RunFolder
 
 if TYPE_CHECKING:
-    from jcr.calibration.calibration_json import CalibrationFile
+    from jcr.calibration.record import Calibration
     from jcr.cell.placement import CameraPlacement
     from jcr.export.views import PosedImages
     from jcr.records import Capture, Intrinsics, Reconstruction
@@ -94,7 +94,7 @@ class Run:
             )
 
     @cached_property
-    def calibration(self) -> "CalibrationFile":
+    def calibration(self) -> "Calibration":
         """calibration.json."""
         return self.folder.calibration()
 
@@ -226,7 +226,7 @@ class Run:
             raise InputError(
                 f"{self.folder.path}: a fixed camera watched the gripper: its images show no scene in the base frame"
             )
-        base_from_recon = np.array(self.calibration.base_from_recon)
+        base_from_recon = self.calibration.base_from_recon.rigid
         return posed_images(self.capture, self.reconstruction, base_from_recon, scale)
 
 

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Literal, get_args
 
-from jcr.calibration.calibration_json import CalibrationFile
+from jcr.calibration.record import Calibration
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, RejectedError
@@ -145,7 +145,7 @@ def _failed(task: Task, reason: str) -> Row:
     return Row(capture=str(task.capture), out=str(task.out), status="failed", reason=reason)
 
 
-def _row(task: Task, content: CalibrationFile) -> Row:
+def _row(task: Task, content: Calibration) -> Row:
     row = Row(
         capture=str(task.capture),
         out=str(task.out),

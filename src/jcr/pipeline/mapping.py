@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from jcr.allocator import give_back
-from jcr.calibration.calibration_json import CalibrationFile
+from jcr.calibration.record import Calibration
 from jcr.depth.measured import with_measured_depth
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError
@@ -66,7 +66,7 @@ def make_map(result: RunResult, added: Capture, options: RunOptions, progress: P
         return Mapped(cloud, scene, sizes and sizes.result(), (*remarks, *notes))
 
 
-def measured(cloud: PointCloud, calibration: CalibrationFile, support: Support | None = None) -> Measured:
+def measured(cloud: PointCloud, calibration: Calibration, support: Support | None = None) -> Measured:
     """The support plane, found where it is not given, and what stands on it; InputError when none carries the scene."""
     uncertainty = calibration.uncertainty
     return measure(cloud, 0.0 if uncertainty is None else uncertainty.scale_std_percent / 100, support)

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jcr import __version__
-from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.cues import check_known_length
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.poses import calibrate_poses as calibrate_poses_stage
 from jcr.calibration.poses import is_one
+from jcr.calibration.record import calibration_of
 from jcr.capture.added import read_added, with_images
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
@@ -147,7 +147,7 @@ def calibrate_poses(
         start = time.perf_counter()
         hand_eye = calibrate_poses_stage(pairs, options)
         timings = {"calibrate": round(time.perf_counter() - start, 3)}
-        content = calibration_file(pairs, pairs, hand_eye, timings, __version__)
+        content = calibration_of(pairs, pairs, hand_eye, timings, __version__)
         folder.forget_reconstruction()
         folder.keep_calibration(content)
         result = PosesResult(

@@ -7,7 +7,7 @@ from dataclasses import replace
 from jcr import __version__
 from jcr.allocator import give_back
 from jcr.boards.proposal import proposed_for
-from jcr.calibration.calibration_json import calibration_file, failed_file
+from jcr.calibration.record import calibration_of, failed_calibration
 from jcr.capture.added import write_added
 from jcr.cell.added import read_added_cameras
 from jcr.cell.carried import carried_scene, refined
@@ -43,9 +43,7 @@ def calibrated(capture: Capture, folder: RunFolder, options: RunOptions, progres
     hand_eye = tried.hand_eye
     if watches:
         hand_eye = refined(capture, tried.reconstruction, hand_eye, options.calibrate)
-    content = calibration_file(
-        capture, tried.reconstruction, hand_eye, tried.timings_s, __version__, attempts
-    )
+    content = calibration_of(capture, tried.reconstruction, hand_eye, tried.timings_s, __version__, attempts)
     if content.verdict == "rejected" or content.short is not None:
         board = proposed_for(capture, options.reconstruct.board)
         content = content if board is None else content.with_findings(board)
@@ -184,7 +182,7 @@ def _failed(
     if folder.earlier(state) is None:
         folder.forget_reconstruction()
         folder.keep_state(state)
-    content = failed_file(
+    content = failed_calibration(
         capture,
         error.attempts[-1].backend,
         error.findings,

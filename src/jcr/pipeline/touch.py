@@ -60,14 +60,11 @@ def touch(out: str | Path, points: str | Path) -> Touched:
     folder, points = RunFolder(Path(out)), Path(points)
     calibration, reconstruction = folder.calibrated()
     capture = folder.capture()
-    assert (
-        calibration.uncertainty is not None and calibration.scale is not None
-    )  # wherever there is a transform
     rows = _rows(points)
-    x, scale = np.array(calibration.gripper_from_camera), calibration.scale
-    base_from_recon = np.array(calibration.base_from_recon)
+    x, base_from_recon = calibration.gripper_from_camera, calibration.base_from_recon
+    scale = base_from_recon.scale
     found = np.array([surface_at(capture, reconstruction, image, px, points.name) for image, px, _ in rows])
-    mapped = apply(base_from_recon, scale * found)
+    mapped = base_from_recon(found)
     row_of = {capture.images[row]: k for k, row in enumerate(reconstruction.image_index)}
     jacobian = np.empty((len(rows), 3, 7))
     for k, (image, _, _) in enumerate(rows):
@@ -76,7 +73,7 @@ def touch(out: str | Path, points: str | Path) -> Touched:
         rotation = capture.base_from_gripper[reconstruction.image_index[seen_by], :3, :3]
         jacobian[k] = rotation @ np.column_stack([np.eye(3), -skew(arm), arm])
     stacked = jacobian.reshape(-1, 7)
-    covariance = stacked @ np.array(calibration.uncertainty.covariance) @ stacked.T
+    covariance = stacked @ calibration.covariance @ stacked.T
     covariance += _touch_variance(calibration) * np.eye(len(covariance))
     error = np.array([tip for _, _, tip in rows]) - mapped
     squared = float(error.ravel() @ np.linalg.solve(covariance, error.ravel()))

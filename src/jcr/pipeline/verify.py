@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 
-from jcr.calibration.calibration_json import CalibrationFile
 from jcr.calibration.drift import Cause, Drift, detectable, drift
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import of_poses, robot_errors
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
@@ -165,7 +165,7 @@ def _read(new: Capture | str | Path) -> Capture:
     return found
 
 
-def _calibrated_on(folder: RunFolder, calibration: CalibrationFile, new: Capture) -> Capture:
+def _calibrated_on(folder: RunFolder, calibration: Calibration, new: Capture) -> Capture:
     """The capture of a run; InputError where new images cannot be compared with it."""
     if not calibration.converged:
         raise InputError(
@@ -189,7 +189,7 @@ def _require_size(folder: Path, now: tuple[int, int], then: tuple[int, int]) -> 
 
 
 def _in_old_scene(
-    then: tuple[CalibrationFile, Capture, Reconstruction, CalibrateOptions],
+    then: tuple[Calibration, Capture, Reconstruction, CalibrateOptions],
     new: Capture,
     located: Sequence[CameraPose | int],
     lost: Sequence[str],
@@ -315,7 +315,7 @@ def _same_poses(new: Capture, then: Capture) -> tuple[str, ...]:
 
 
 def fitted(
-    calibration: CalibrationFile,
+    calibration: Calibration,
     capture: Capture,
     reconstruction: Reconstruction,
     options: CalibrateOptions,
@@ -331,17 +331,17 @@ def fitted(
         capture.base_from_gripper[reconstruction.image_index][row_used],
         reconstruction.recon_from_camera[row_used],
     )
-    x, z = np.array(calibration.gripper_from_camera), np.array(calibration.base_from_recon)
+    x, similarity = calibration.gripper_from_camera, calibration.base_from_recon
     problem, state = pose_problem(
         *poses,
-        (x, calibration.scale or 1.0, z),
+        (x, similarity.scale, similarity.rigid),
         error_covariance=systematic,
         noise_floor=options.robot_noise_m_rad,
     )
     return solve(problem, state, averaged=False), poses
 
 
-def _used(calibration: CalibrationFile, reconstruction: Reconstruction) -> Bool[ndarray, " m"]:
+def _used(calibration: Calibration, reconstruction: Reconstruction) -> Bool[ndarray, " m"]:
     return np.array([calibration.images[row].used for row in reconstruction.image_index])
 
 
@@ -373,23 +373,22 @@ def _is_moved(offset: Float[ndarray, "6"], p_value: float, options: VerifyOption
 
 
 def _by_recalibration(
-    calibration: CalibrationFile,
+    calibration: Calibration,
     new: Capture,
     options_then: MadeWith,
     options: VerifyOptions,
     progress: Progress | None,
 ) -> Verification:
     """Another scene: a calibration of its own, and the difference of the two against both covariances."""
-    assert calibration.uncertainty is not None  # a converged calibration has one
     if calibration.intrinsics is not None:
         new = replace(new, intrinsics=calibration.intrinsics.record())
     reconstruction = reconstruct(new, options_then.reconstruct, progress)
     hand_eye = calibrate(new, reconstruction, options_then.calibrate)
     if not hand_eye.converged:
         raise RejectedError(f"cannot tell: a new calibration from these images failed ({hand_eye.doubt})")
-    before = np.array(calibration.gripper_from_camera)
+    before = calibration.gripper_from_camera
     offset = step_between(before, hand_eye.gripper_from_camera)
-    covariance = np.array(calibration.uncertainty.covariance)[:6, :6] + hand_eye.covariance[:6, :6]
+    covariance = calibration.covariance[:6, :6] + hand_eye.covariance[:6, :6]
     images = tuple(new.images[row] for row in reconstruction.image_index[hand_eye.inliers])
     return _of_two(
         offset, covariance, options, images, (), "against a calibration of its own in another scene"

@@ -12,7 +12,6 @@ from jcr.findings.requirement import Requirement
 from jcr.findings.sentences import unobservable
 from jcr.records.assessed import Assessed
 from jcr.records.capture import Intrinsics
-from jcr.records.notebook import table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -498,29 +497,6 @@ class HandEye(Assessed):
             verdict_of(one for one in self.findings if one.kind is not FindingKind.NOT_EXACT_ENOUGH)
             != "rejected"
         )
-
-    def _repr_html_(self) -> str:
-        """A table, for notebooks."""
-        return self.as_html()
-
-    def as_html(self, note: str = "") -> str:
-        """The transform with its standard deviations, the verdict and what warns, as a table, and a note below."""
-        from jcr.geometry import rotation_log  # SciPy, which help need not wait for
-
-        std = np.sqrt(np.diag(self.covariance))
-        mm = 1e3 * self.gripper_from_camera[:3, 3]
-        degrees = np.degrees(rotation_log(self.gripper_from_camera[:3, :3]))
-        used = f"{int(self.inliers.sum())} of {len(self.inliers)} poses used"
-        rows = [("", "translation", "rotation vector")] + [
-            (
-                axis,
-                f"{mm[k]:.2f} ± {1e3 * std[k]:.2f} mm",
-                f"{degrees[k]:.3f} ± {np.degrees(std[3 + k]):.3f}°",
-            )
-            for k, axis in enumerate("xyz")
-        ]
-        verdict = ": ".join(filter(None, (self.verdict, "; ".join(self.warnings))))
-        return table(f"gripper_from_camera, {verdict}; {used}", rows, f"1σ, gripper axes. {note}")
 
 
 @dataclass(frozen=True, kw_only=True)

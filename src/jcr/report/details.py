@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jcr.calibration.calibration_json import CalibrationFile
+from jcr.calibration.record import Calibration
 from jcr.calibration.words import attempt_in_words, budget_in_words
 from jcr.extras import is_installed
 from jcr.findings.sentences import LENGTHS
@@ -24,7 +24,7 @@ PACKAGES = ("numpy", "scipy", "torch", "pycolmap")
 
 
 def details_section(
-    calibration: CalibrationFile,
+    calibration: Calibration,
     options: Options,
     reconstruction: Reconstruction | None = None,
     map_history: Mapping[str, str] | None = None,
@@ -50,18 +50,18 @@ def details_section(
     return Section("details", {"blocks": {title: rows for title, rows in blocks.items() if rows}})
 
 
-def _times(calibration: CalibrationFile) -> dict[str, str]:
+def _times(calibration: Calibration) -> dict[str, str]:
     """Return the seconds of the stages and the attempts."""
     timings = calibration.timings_s
     rows = {stage: f"{seconds:.1f} s" for stage, seconds in timings.items()}
     rows["together"] = f"{sum(timings.values()):.1f} s"
-    if calibration.gripper_from_camera is not None:  # else the failure lists them
+    if calibration.parent_from_camera is not None:  # else the failure lists them
         for k, attempt in enumerate(calibration.attempts, start=1):
             rows[f"attempt {k}"] = attempt_in_words(attempt, len(calibration.images))
     return rows
 
 
-def _intrinsics(calibration: CalibrationFile) -> dict[str, str]:
+def _intrinsics(calibration: Calibration) -> dict[str, str]:
     """Return the intrinsics with standard deviations; none where they are unknown."""
     if (found := calibration.intrinsics) is None:
         return {}
@@ -78,7 +78,7 @@ def _plus_minus(std: list[float] | None, first: int) -> str:
     return "" if std is None else f" ± {significant(max(std[first : first + 2]))}"
 
 
-def _depth_camera(calibration: CalibrationFile) -> dict[str, str]:
+def _depth_camera(calibration: Calibration) -> dict[str, str]:
     """Return scale error and noise of the depth camera."""
     if (check := calibration.depth_check) is None:
         return {}
@@ -90,7 +90,7 @@ def _depth_camera(calibration: CalibrationFile) -> dict[str, str]:
     }
 
 
-def _lengths(calibration: CalibrationFile) -> dict[str, str]:
+def _lengths(calibration: Calibration) -> dict[str, str]:
     """Return the difference between each known length and the robot's positions."""
     return {
         LENGTHS[one.name]: (
@@ -101,7 +101,7 @@ def _lengths(calibration: CalibrationFile) -> dict[str, str]:
     }
 
 
-def _robot(calibration: CalibrationFile) -> dict[str, str]:
+def _robot(calibration: Calibration) -> dict[str, str]:
     """Return systematic robot errors, joint offsets and the ratio of angles."""
     items = {}
     if (errors := calibration.robot_errors) is not None:
@@ -130,7 +130,7 @@ def _features(reconstruction: Reconstruction) -> dict[str, str]:
     }
 
 
-def _board(calibration: CalibrationFile) -> dict[str, str]:
+def _board(calibration: Calibration) -> dict[str, str]:
     """Return size, place and flatness of a board that took part beside features."""
     if (board := calibration.board) is None:
         return {}

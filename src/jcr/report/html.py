@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 
-from jcr.calibration.calibration_json import CalibrationFile
+from jcr.calibration.record import Calibration
 from jcr.capture.formats.capture_json import origin
 from jcr.capture.formats.table import TABLES
 from jcr.errors import printable
@@ -102,7 +102,7 @@ def poses_report_html(result: PosesResult, options: Options | None = None) -> st
     return _page("poses given, no images", result.pairs.source, calibration, sections)
 
 
-def failed_report_html(capture: Capture, calibration: CalibrationFile, options: Options | None = None) -> str:
+def failed_report_html(capture: Capture, calibration: Calibration, options: Options | None = None) -> str:
     """Return the report of a run that found no camera poses: reason, remedy and images."""
     sections = [
         failure_section(calibration),
@@ -121,7 +121,7 @@ def _about_capture(capture: Capture, options: Options) -> str:
     return f"{arm} · {capture.camera_name} camera, {width} × {height} px, intrinsics {given}"
 
 
-def _about_intrinsics(calibration: CalibrationFile) -> list[str]:
+def _about_intrinsics(calibration: Calibration) -> list[str]:
     """Return a line with the intrinsics that belong to the transform; none where they are unknown."""
     if (found := calibration.intrinsics) is None:
         return []
@@ -132,7 +132,7 @@ def _about_intrinsics(calibration: CalibrationFile) -> list[str]:
     ]
 
 
-def _page(about: str, source: Path, calibration: CalibrationFile, sections: Iterable[Section | None]) -> str:
+def _page(about: str, source: Path, calibration: Calibration, sections: Iterable[Section | None]) -> str:
     """Return the whole page; `source` is the capture as the user named it."""
     # The table or the bag's metadata are called alike in every capture: their folder has the name.
     named = source.parent if source.stem in UNNAMED else source

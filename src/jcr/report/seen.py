@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.seen import within_95
+from jcr.calibration.record import as_estimate
+from jcr.calibration.seen import seen_uncertainty, within_95
 from jcr.calibration.words import given_in_words, seen_in_words
 from jcr.capture.images import read_image
 from jcr.report.figures import Figure, Shape
@@ -63,12 +64,15 @@ def _figure(result: RunResult, distance_m: float) -> Figure:
 
 def _field_mm(result: RunResult, distance_m: float) -> Float[ndarray, "h w"]:
     """Return the 95 % bound (mm) of the error of points on a grid over the image."""
-    intrinsics = result.intrinsics
+    estimate = as_estimate(result.calibration)
+    intrinsics = estimate.intrinsics
+    assert intrinsics is not None
     rows = max(round(GRID * intrinsics.height / intrinsics.width), 2)
     u, v = np.meshgrid(
         np.linspace(0, intrinsics.width - 1, GRID), np.linspace(0, intrinsics.height - 1, rows)
     )
-    covariance = result.seen_uncertainty(np.stack([u, v], axis=-1), distance_m)
+    x_px = np.stack([u, v], axis=-1)
+    covariance = seen_uncertainty(estimate, intrinsics, x_px, distance_m)
     return 1e3 * np.array([[within_95(one) for one in row] for row in covariance])
 
 

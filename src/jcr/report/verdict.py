@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from jcr.calibration.calibration_json import CalibrationFile
+from jcr.calibration.record import Calibration
 from jcr.calibration.words import leave_one_out_text
 from jcr.findings import FindingKind, remedy, sentence, text, verdict_of
 from jcr.findings.sentences import SHORT, reached_in_words
@@ -13,7 +13,7 @@ Tile = tuple[str, str, str, bool]
 """Name, number, remark, and whether it is one of the main numbers."""
 
 
-def head(calibration: CalibrationFile) -> list[Section]:
+def head(calibration: Calibration) -> list[Section]:
     """Return the sections of verdict, main numbers and warnings."""
     sections = [
         Section("verdict", _verdict(calibration)),
@@ -22,12 +22,12 @@ def head(calibration: CalibrationFile) -> list[Section]:
     return sections + [Section("warnings", {"remarks": calibration.remarks})] * bool(calibration.remarks)
 
 
-def notes_section(calibration: CalibrationFile) -> list[Section]:
+def notes_section(calibration: Calibration) -> list[Section]:
     """Return the section of the notes; none where there are none."""
     return [Section("notes", {"remarks": calibration.notes})] * bool(calibration.notes)
 
 
-def failure_section(calibration: CalibrationFile) -> Section:
+def failure_section(calibration: Calibration) -> Section:
     """Return the fault, its remedies, and the reason why each back end failed."""
     failed, *others = calibration.findings
     remedies = [sentence(one) for one in others if one.kind is FindingKind.BOARD_IN_VIEW]
@@ -48,7 +48,7 @@ def failure_section(calibration: CalibrationFile) -> Section:
     return Section("failure", content)
 
 
-def _verdict(calibration: CalibrationFile) -> dict[str, str]:
+def _verdict(calibration: Calibration) -> dict[str, str]:
     """Return the verdict, its reason and colour, and a sentence on the leave-one-out error."""
     required, short = calibration.requirement, calibration.short
     if calibration.doubt is not None:
@@ -66,7 +66,7 @@ def _verdict(calibration: CalibrationFile) -> dict[str, str]:
     return {"kind": kind, "verdict": verdict, "reason": reason, "evidence": evidence}
 
 
-def _leave_one_out(calibration: CalibrationFile) -> str:
+def _leave_one_out(calibration: Calibration) -> str:
     """Return a sentence on the leave-one-out error and its limits."""
     if (held_out := calibration.held_out) is None:
         return "There were too few images for a leave-one-out error."
@@ -81,7 +81,7 @@ def _leave_one_out(calibration: CalibrationFile) -> str:
     )
 
 
-def _tiles(calibration: CalibrationFile) -> Iterator[Tile]:
+def _tiles(calibration: Calibration) -> Iterator[Tile]:
     """Yield four tiles: accuracy of a point at the image centre and in a corner, images used, scale."""
     uncertainty, required = calibration.uncertainty, calibration.requirement
     if required is not None:

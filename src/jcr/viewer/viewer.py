@@ -64,7 +64,7 @@ class Viewer:
         if folder.has_map():
             self.cloud, self.scene = folder.cloud(), folder.scene()
         assert self.calibration.scale is not None  # wherever there is a transform
-        base_from_recon, scale = np.array(self.calibration.base_from_recon), self.calibration.scale
+        base_from_recon, scale = self.calibration.base_from_recon.rigid, self.calibration.scale
         self.image_index = self.reconstruction.image_index
         self.base_from_camera = base_from_recon @ scale_translation(
             self.reconstruction.recon_from_camera, scale

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jcr.calibration.calibration_json import calibration_file
+from jcr.calibration.record import calibration_of
 from jcr.calibration.stage import calibrate
 from jcr.findings.sentences import network_scale
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
@@ -140,7 +140,7 @@ def test_a_metric_network_is_fixed_against_the_robot(factor: float, off_percent:
     check = found.scale_evidence.network
     assert abs(check.off_percent - off_percent) < 4 * check.std_percent * factor
     assert check.std_percent < 0.2 * factor
-    content = calibration_file(made.capture, reconstruction, found, {}, "0")
+    content = calibration_of(made.capture, reconstruction, found, {}, "0")
     assert content.scale_check.off_percent == check.off_percent
     assert any("check the unit of the gripper poses" in text for text in content.warnings) == (factor > 10)
     assert ("agrees with the robot's" in network_scale(check.off_percent, check.std_percent)) == (factor == 1)
