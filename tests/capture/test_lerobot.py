@@ -232,7 +232,7 @@ def test_damaged_sets_are_one_line(tmp_path: Path, small: Path, tabletop: Path):
         (video, b"nonsense", "not a readable video"),
         (video, (small / video).read_bytes()[:3000], "not a readable video"),
         (data, b"nonsense", "not a readable table"),
-        ("meta/info.json", b"{}", "no LeRobot data set"),
+        ("meta/info.json", b"{}", "features: Field required"),
     ):
         copy = tmp_path / "copy"
         shutil.rmtree(copy, ignore_errors=True)

@@ -405,7 +405,7 @@ ROW_FAULTS = {
     "quaternion not of unit length": (
         lambda f: edit_line(f, 1, lambda line: ",".join([*line.split(",")[:4], "1", "1", "0", "0"])),
         {},
-        r"quaternion of pose 1 has length 1\.414",
+        r"pose 1: its quaternion has length 1\.414",
     ),
 }
 ROW_FAULTS |= {

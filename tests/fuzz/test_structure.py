@@ -14,7 +14,6 @@ from PIL import Image
 
 import jcr
 from fuzz_targets import SIZE
-from jcr.capture.formats.lerobot import Info
 from jcr.capture.read import read_source
 from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError
@@ -119,23 +118,6 @@ def test_what_further_values_found_stays_closed(
         assert tried(readers[name], place, value)[0] == "status 2"
     finally:
         readers[name].write(readers[name].content)
-
-
-@pytest.mark.parametrize(
-    "path",
-    [
-        "{episode_index:01000000000d}",
-        "{episode_index.__class__}",
-        "{0}",
-        "{}",
-        "{video_key!r}",
-        "{x",
-        "{video_key:>9999}",
-    ],
-)
-def test_a_path_in_info_json_is_no_program(path: str):
-    with pytest.raises(ValueError, match="data_path"):
-        Info.model_validate({"features": {}, "fps": 10, "data_path": path}, strict=True)
 
 
 def test_joints_that_lead_back_are_refused(tmp_path: Path):

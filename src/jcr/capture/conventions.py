@@ -1,6 +1,5 @@
 """Conventions in which robots and their controllers write poses: rows of numbers to transforms and back."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,45 +116,65 @@ def numbers_from_poses(
 
 
 def poses_from_numbers(
-    numbers: Float[ndarray, "n k"],
-    convention: str,
-    units: UnitsName,
-    where: str,
-    faults: dict[int, str] | None = None,
+    numbers: Float[ndarray, "n k"], convention: str, units: UnitsName, where: str
 ) -> Float[ndarray, "n 4 4"]:
-    """Return base_from_gripper (n,4,4) of rows in a convention's columns; `units` other than auto override its own.
+    """Return base_from_gripper (n,4,4) of rows as `checked_rows`; raise InputError where a row is no pose."""
+    poses, faults = checked_rows(numbers, convention, units, where)
+    if faults:
+        raise InputError(faults[min(faults)])
+    return poses
 
-    Raises InputError on units that cannot be meant. A row that is no pose raises InputError too; where `faults` are
-    given, a few such rows are NaN and their messages are added.
+
+def checked_rows(
+    numbers: Float[ndarray, "n k"], convention: str, units: UnitsName, where: str
+) -> tuple[Float[ndarray, "n 4 4"], dict[int, str]]:
+    """Return base_from_gripper (n,4,4) of rows in a convention's columns, and the messages of rows that are no pose.
+
+    The pose of such a row is NaN. `units` other than auto override the convention's own. Raises InputError on units
+    that cannot be meant, and on matrices by columns in place of rows.
     """
     form = CONVENTIONS[convention]
-    unit_m, _ = _in_metres_and_radians(form, units)
-    found = dict(faults or {})
-    for row in np.flatnonzero(~(np.abs(numbers) < HUGE).all(1)).tolist():
-        text = f"holds NaN or infinity (or beyond {HUGE:.0e}); record it again or drop the row"
-        found.setdefault(row, f"{where}: pose {row + 1} {text}")
-    rows = [row for row in range(len(numbers)) if row not in found]
-    poses, position = np.full((len(numbers), 4, 4), np.nan), np.full((len(numbers), 3), np.nan)
-    matrices = None
+    per_m, per_rad = _in_metres_and_radians(form, units)
+    finite = (np.abs(numbers) < HUGE).all(1)
+    if form.rotation == "rows":
+        _require_rows(numbers[finite].reshape(-1, 4, 4), where)
+    at = {"rows": [3, 7, 11], "columns": [12, 13, 14]}.get(form.rotation, [0, 1, 2])
+    faults = _check_units(np.where(finite[:, None], numbers, 0.0), at, form, units, where)
+    poses = np.full((len(numbers), 4, 4), np.nan)
+    for row in range(len(numbers)):
+        if not finite[row]:
+            text = f"holds NaN or infinity (or beyond {HUGE:.0e}); record it again or drop the row"
+            faults[row] = f"{where}: pose {row + 1} {text}"
+        if row not in faults:
+            try:
+                poses[row] = _pose(numbers[row], form, per_m, per_rad, f"{where}: pose {row + 1}")
+            except InputError as error:
+                faults[row] = str(error)
+    return poses, faults
+
+
+def _pose(
+    numbers: Float[ndarray, " k"], form: Convention, per_m: float, per_rad: float, where: str
+) -> Float[ndarray, "4 4"]:
+    """Return base_from_gripper of the numbers of one pose; raise InputError where they are none."""
     if form.rotation in ("rows", "columns"):
-        matrices = _matrices(numbers[rows].reshape(-1, 4, 4), form, where)
-        matrices[:, :3, 3] *= unit_m
-    position[rows] = numbers[rows, :3] * unit_m if matrices is None else matrices[:, :3, 3]
-    _check_position(position, unit_m, units, where, found)
-    if matrices is None:
-        rotation = _rotations(numbers[rows, 3:], form, units, where, rows, found)
-        poses[rows] = transform(rotation.as_matrix(), position[rows])
-    for row, matrix in zip(rows, () if matrices is None else matrices, strict=matrices is not None):
-        try:
-            poses[row] = require_rigid(matrix, f"{where}: pose {row + 1}")
-        except InputError as error:
-            found[row] = str(error)
-    if found and (faults is None or len(found) > tolerated(len(numbers))):
-        raise InputError(found[min(found)])
-    if faults is not None:
-        faults |= found
-    poses[list(found)] = np.nan
-    return poses
+        rows = numbers.reshape(4, 4) if form.rotation == "rows" else numbers.reshape(4, 4).T
+        matrix = transform(rows[:3, :3], rows[:3, 3] * per_m)
+        matrix[3] = rows[3]
+        return require_rigid(matrix, where)
+    if form.rotation in QUATERNIONS:
+        quaternion = numbers[3:][QUATERNIONS[form.rotation]]
+        if abs((length := float(np.linalg.norm(quaternion))) - 1) > QUATERNION_TOLERANCE:
+            raise InputError(
+                f"{where}: its quaternion has length {length:.4g}, not 1; check which columns are the quaternion, and "
+                "say how it is written (--pose-convention quat-xyzw or quat-wxyz)"
+            )
+        rotation = Rotation.from_quat(quaternion)
+    elif form.rotation == "rotvec":
+        rotation = Rotation.from_rotvec(numbers[3:] * per_rad)
+    else:
+        rotation = Rotation.from_euler(form.rotation, numbers[3:] * per_rad)
+    return transform(rotation.as_matrix(), numbers[:3] * per_m)
 
 
 def tolerated(count: int) -> int:
@@ -175,43 +194,14 @@ def far_rows(position: Float[ndarray, "n 3"]) -> tuple[list[int], float, bool]:
     return rows, float(distance.max(initial=0.0)), len(rows) > tolerated(len(distance))
 
 
-def _matrices(numbers: Float[ndarray, "n 4 4"], form: Convention, where: str) -> Float[ndarray, "n 4 4"]:
-    """Return a copy by rows; InputError where numbers that should be rows are columns."""
-    if form.rotation == "columns":
-        return np.swapaxes(numbers, 1, 2).copy()
+def _require_rows(matrices: Float[ndarray, "n 4 4"], where: str) -> None:
+    """Raise InputError where numbers that should be matrices by rows are by columns."""
     last = [0, 0, 0, 1]
-    if np.allclose(numbers[:, :, 3], last, atol=1e-9) and not np.allclose(numbers[:, 3], last, atol=1e-9):
+    if np.allclose(matrices[:, :, 3], last, atol=1e-9) and not np.allclose(matrices[:, 3], last, atol=1e-9):
         raise InputError(
             f"{where}: the 16 numbers of a pose are a matrix by columns, as a Franka gives them: add "
             "--pose-convention franka"
         )
-    return numbers.copy()
-
-
-def _rotations(
-    numbers: Float[ndarray, "n r"],
-    form: Convention,
-    units: UnitsName,
-    where: str,
-    row_of: Sequence[int],
-    found: dict[int, str],
-) -> Rotation:
-    """Return the rotations of quaternions, vectors or angles; rows whose quaternion has no unit length go to `found`."""
-    if form.rotation not in QUATERNIONS:
-        unit = _in_metres_and_radians(form, units)[1]
-        _check_angles(numbers, unit, units, where)
-        if form.rotation == "rotvec":
-            return Rotation.from_rotvec(numbers * unit)
-        return Rotation.from_euler(form.rotation, numbers * unit)
-    quaternion = numbers[:, QUATERNIONS[form.rotation]]
-    length = np.linalg.norm(quaternion, axis=1)
-    wrong = np.abs(length - 1) > QUATERNION_TOLERANCE
-    for k in np.flatnonzero(wrong).tolist():
-        found[row_of[k]] = (
-            f"{where}: the quaternion of pose {row_of[k] + 1} has length {length[k]:.4g}, not 1; check which columns "
-            "are the quaternion, and say how it is written (--pose-convention quat-xyzw or quat-wxyz)"
-        )
-    return Rotation.from_quat(np.where(wrong[:, None], [0.0, 0.0, 0.0, 1.0], quaternion))
 
 
 def _in_metres_and_radians(form: Convention, units: UnitsName) -> tuple[float, float]:
@@ -220,38 +210,38 @@ def _in_metres_and_radians(form: Convention, units: UnitsName) -> tuple[float, f
     return METRES[length], np.radians(1.0) if angle == "deg" else 1.0
 
 
-def _check_position(
-    position: Float[ndarray, "n 3"], unit: float, units: UnitsName, where: str, found: dict[int, str]
-) -> None:
-    """Raise InputError where most positions cannot be in the unit; a single one that is too far goes to `found`."""
+def _check_units(
+    numbers: Float[ndarray, "n k"], at: list[int], form: Convention, units: UnitsName, where: str
+) -> dict[int, str]:
+    """Return messages of single rows that are too far away; raise InputError on units that cannot be meant.
+
+    `at` are the columns of the position.
+    """
+    per_m, per_rad = _in_metres_and_radians(form, units)
+    position = numbers[:, at] * per_m
     far, farthest, many = far_rows(position)
     if many or len(position) == 1 and far:
         name, short, _ = likely_unit(farthest)
         raise InputError(
-            f"{where}: the gripper is up to {farthest / unit:.4g} from the base; these look like {name}: "
+            f"{where}: the gripper is up to {farthest / per_m:.4g} from the base; these look like {name}: "
             f"add --pose-units {short}-rad (or {short}-deg where angles are in degrees)"
         )
-    for row in far:
-        distance = float(np.linalg.norm(position[row]))
-        text = f"pose {row + 1} is {distance:.4g} m from the base, the others are nearer; record it again"
-        found.setdefault(row, f"{where}: {text}")
-    if units == "auto" and unit < 1 and 0 < farthest < METRES_LIMIT * unit:
+    if units == "auto" and per_m < 1 and 0 < farthest < METRES_LIMIT * per_m:
         raise InputError(
-            f"{where}: the gripper is at most {farthest / unit:.4g} from the base, too near for this convention's "
+            f"{where}: the gripper is at most {farthest / per_m:.4g} from the base, too near for this convention's "
             "millimetres; for metres add --pose-units m-deg (or m-rad)"
         )
-
-
-def _check_angles(angles: Float[ndarray, "n 3"], unit: float, units: UnitsName, where: str) -> None:
-    """Raise InputError where angles cannot be in the unit."""
-    largest = float(np.abs(angles).max(initial=0.0))
-    if unit == 1.0 and largest > RADIANS_LIMIT:
+    largest = float(np.abs(numbers[:, 3:]).max(initial=0.0)) if form.has_angles else 0.0
+    if per_rad == 1.0 and largest > RADIANS_LIMIT:
         raise InputError(
             f"{where}: angles go up to {largest:.4g}; these look like degrees: add --pose-units m-deg "
             "(or mm-deg where positions are in millimetres)"
         )
-    if units == "auto" and unit < 1.0 and 0 < largest < RADIANS_LIMIT:
+    if units == "auto" and per_rad < 1.0 and 0 < largest < RADIANS_LIMIT:
         raise InputError(
             f"{where}: angles are at most {largest:.3g}, too small for this convention's degrees; "
             "for radians add --pose-units mm-rad (or m-rad)"
         )
+    text = "pose {} is {:.4g} m from the base, the others are nearer; record it again"
+    distance = np.linalg.norm(position, axis=1)
+    return {row: f"{where}: {text.format(row + 1, distance[row])}" for row in far}

@@ -18,10 +18,8 @@ from jcr.files import write_bytes
 from jcr.progress import Progress
 from jcr.records import Capture, Intrinsics
 
-ImagesOfRows = Callable[[Int[ndarray, " k"]], Iterator[tuple[int, bytes | UInt8[ndarray, "h w 3"], str]]]
-"""Frames of ascending rows, one by one: row, an encoded file's bytes or RGB pixels, and the file's ending."""
-IntrinsicsOfSize = Callable[[tuple[int, int]], Intrinsics | None]
-"""Intrinsics of images of a size (width, height)."""
+Picture = tuple[int, bytes | UInt8[ndarray, "h w 3"], str]
+"""Row of a frame, its encoded file's bytes or RGB pixels, and the file's ending."""
 BESIDE_ALL_POSES_NS = 1e15
 """Gap (ns) beyond which the frame is before the first pose or after the last."""
 
@@ -39,8 +37,10 @@ class Recording:
     """Speed of the gripper, m/s, rotation counted as in jcr.geometry.motion_length."""
     gap_ns: Int[ndarray, " n"]
     """Time between the two poses around each frame; 0 where none is interpolated."""
-    images_of_rows: ImagesOfRows
-    intrinsics_of_size: IntrinsicsOfSize
+    images_of_rows: Callable[[Int[ndarray, " k"]], Iterator[Picture]]
+    """Images of ascending rows, one by one."""
+    intrinsics_of_size: Callable[[tuple[int, int]], Intrinsics | None]
+    """Intrinsics of images of a size (width, height)."""
     joints: Float[ndarray, "n j"] | None = None
     """Joint angles (rad) of the arm in `options.urdf`, where they are known."""
     depth_at: Callable[[int], UInt16[ndarray, "h w"] | None] | None = None

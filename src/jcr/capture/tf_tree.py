@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
+from scipy.spatial.transform import Rotation
 
-from jcr.capture.conventions import poses_from_numbers
 from jcr.capture.pose_track import PosesAt, PoseTrack, Stamps, pose_track
 from jcr.errors import InputError
-from jcr.geometry import inverse
+from jcr.geometry import inverse, transform
 
 
 class TfTree:
@@ -78,7 +78,9 @@ class TfTree:
         """Return the samples of parent_from_child of a frame, and whether it is static."""
         numbers = np.frombuffer(self._numbers[child]).reshape(-1, 7)
         where = f"{source}: tf from {self.parent[child]} to {child}"
-        poses = poses_from_numbers(numbers, "quat-xyzw", "m-rad", where)
+        if not np.isfinite(numbers).all() or (np.linalg.norm(numbers[:, 3:], axis=1) < 0.5).any():
+            raise InputError(f"{where}: holds a transform that is none; record again")
+        poses = transform(Rotation.from_quat(numbers[:, 3:]).as_matrix(), numbers[:, :3])
         return pose_track(np.frombuffer(self._stamps[child], np.int64), poses), child in self.static
 
 

@@ -1,26 +1,24 @@
 """LeRobot data sets v2.1 and v3.0: videos or images of a wrist camera, with poses or joint angles frame by frame."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from string import Formatter
 from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from jcr.capture.camera_info import read_camera_info
-from jcr.capture.conventions import CONVENTIONS
+from jcr.capture.conventions import CONVENTIONS, poses_from_numbers
 from jcr.capture.formats import Format
-from jcr.capture.formats.table import PoseColumns, poses_of_columns
 from jcr.capture.joints import read_arm
 from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import contained, first_fault, read_json
+from jcr.capture.plain_files import contained, read_json, validated
 from jcr.capture.pose_track import pose_track, speed
-from jcr.capture.recording import Recording, capture_of_recording
+from jcr.capture.recording import Picture, Recording, capture_of_recording
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.progress import Progress
@@ -30,21 +28,6 @@ INFO = "meta/info.json"
 CARTESIAN = "observation.state.cartesian_position"
 """Key of DROID: x, y, z (m), roll, pitch, yaw (rad) of the gripper in the robot's base."""
 STATE = "observation.state"
-FIELDS = ("video_key", "episode_chunk", "episode_index", "chunk_index", "file_index")
-"""Fields of the templates of paths."""
-
-
-def _template(text: str) -> str:
-    """Return a path template with plain fields and digits at most two wide: format() takes attributes, and any width."""
-    for _, name, form, conversion in Formatter().parse(text):
-        if name is None:
-            continue
-        if name not in FIELDS or conversion or not re.fullmatch(r"(0?\d?\d?d)?", form or ""):
-            raise ValueError(f"no path of the fields {', '.join(FIELDS)}")
-    return text
-
-
-Template = Annotated[str, Field(max_length=1000), AfterValidator(_template)]
 
 
 class Feature(BaseModel):
@@ -67,13 +50,13 @@ class Feature(BaseModel):
 class Info(BaseModel):
     """Content of meta/info.json."""
 
-    model_config = ConfigDict(allow_inf_nan=False)
+    model_config = ConfigDict(allow_inf_nan=False, strict=True)
     features: dict[str, Feature]
     fps: Annotated[float, Field(gt=0, le=1e6)]
     codebase_version: str = ""
     chunks_size: Annotated[int, Field(ge=1)] = 1000
-    data_path: Template
-    video_path: Template | None = None
+    data_path: Annotated[str, Field(max_length=1000)]
+    video_path: Annotated[str, Field(max_length=1000)] = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,13 +80,12 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
 
     Raises InputError that lists the existing cameras, states or episodes where the options name others.
     """
-    info = read_info(path)
+    info: Info = validated(Info, read_json(path / INFO), str(path / INFO))
     camera, key = _camera(info.features, options, path), _state_key(info.features, options, path)
     episodes = [read_episode(path, info, camera, key, index) for index in options.episode]
-    try:
-        state = np.concatenate([episode.state for episode in episodes])
-    except ValueError:
-        raise InputError(f"{path}: {key} has another length in another episode; read one episode") from None
+    if len({episode.state.shape[1] for episode in episodes}) > 1:
+        raise InputError(f"{path}: {key} has another length in another episode; read one episode")
+    state = np.concatenate([episode.state for episode in episodes])
     poses, joints = _poses(state, key, info.features[key], options, path)
     ends = np.cumsum([len(episode.time_s) for episode in episodes])
     rows = np.split(np.arange(ends[-1]), ends[:-1])
@@ -123,20 +105,8 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     return capture_of_recording(recording, into, report)
 
 
-def read_info(path: Path) -> Info:
-    """Read meta/info.json of the set in the folder `path`; InputError where it is none."""
-    file = path / INFO
-    content = read_json(file)
-    if not isinstance(content, dict) or not {"features", "fps"} <= content.keys():
-        raise InputError(f"{file}: no LeRobot data set; it has no features or fps")
-    try:
-        return Info.model_validate(content, strict=True)
-    except ValidationError as error:
-        raise InputError(f"{file}: {first_fault(error)}; correct it there or download it again") from None
-
-
 def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> Episode:
-    """Read episode `index` with the state of `key`; InputError when it is not there or damaged."""
+    """Read episode `index` with the state of `key`; raise InputError when it is not there or damaged."""
     has_video = info.features[camera].dtype == "video"
     fields: dict[str, Any] = {"episode_chunk": index // info.chunks_size, "episode_index": index}
     video_fields, start_s = fields, 0.0
@@ -154,38 +124,28 @@ def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> E
     table = _file(path, info.data_path, fields)
     if not table.is_file():
         raise InputError(f"{table}: not there, so there is no episode {index}; they are counted from 0")
-    video_file = _file(path, info.video_path, video_fields | {"video_key": camera}) if has_video else None
     rows = _read_table(table, ["frame_index", "timestamp", key], index)
-    time_s, state = (_numbers(rows[name], f"{table}: {name}") for name in ("timestamp", key))
+    try:
+        time_s, state = (np.array(rows[name], np.float64) for name in ("timestamp", key))
+    except (TypeError, ValueError):
+        raise InputError(f"{table}: {key} has rows of different lengths; choose another episode") from None
     if len(time_s) == 0 or time_s.ndim != 1 or state.ndim != 2:
         raise InputError(f"{table}: {key} of episode {index} is empty or no list; choose another episode")
-    frame = np.array(rows["frame_index"])
+    if not (np.isfinite(time_s).all() and np.isfinite(state).all()):
+        raise InputError(f"{table}: {key} holds NaN or infinity; choose another episode")
     return Episode(
         index=index,
-        frame=frame,
+        frame=np.array(rows["frame_index"]),
         time_s=time_s,
         state=state,
         table=table,
-        video=video_file,
+        video=_file(path, info.video_path, video_fields | {"video_key": camera}) if has_video else None,
         video_start_s=start_s,
     )
 
 
-def _numbers(values: list[Any], where: str) -> Float[ndarray, "n *k"]:
-    """Return a column as finite numbers; InputError where rows have different lengths or no numbers."""
-    try:
-        numbers = np.array(values, np.float64)
-    except (TypeError, ValueError):
-        raise InputError(
-            f"{where}: rows of different lengths, or no numbers; choose another episode"
-        ) from None
-    if not np.isfinite(numbers).all():
-        raise InputError(f"{where}: holds NaN or infinity; choose another episode")
-    return numbers
-
-
 def _read_table(
-    path: Path, columns: list[str], episode: int, rows: list[int] | None = None
+    path: Path, columns: list[str], episode: int, rows: Sequence[int] | None = None
 ) -> dict[str, list]:
     """Return columns of one episode, of some of its frames where `rows` are given; other rows are never loaded."""
     parquet = extra("pyarrow.parquet", "lerobot", "a LeRobot data set")
@@ -193,30 +153,27 @@ def _read_table(
     if rows is not None:
         filters.append(("frame_index", "in", rows))
     try:
-        table = parquet.read_table(path, columns=columns, filters=filters, partitioning=None)
-        return dict(zip(columns, (table[name].to_pylist() for name in columns), strict=True))
+        return parquet.read_table(path, columns=columns, filters=filters, partitioning=None).to_pydict()
     except Exception as error:  # Arrow's own errors have no common base
         reason = str(error).splitlines()[0]
         raise InputError(f"{path}: not a readable table of the set ({reason}); download it again") from None
 
 
-def _file(path: Path, template: str | None, fields: dict[str, Any]) -> Path:
-    """Return the file of a path template; InputError where the fields do not fit."""
-    if template is None:
-        raise InputError(f"{path / INFO}: has videos and no video_path; download it again")
-    try:
-        name = template.format(**fields)
-    except (KeyError, ValueError) as error:
-        raise InputError(
-            f"{path / INFO}: {template} cannot be filled in ({error}); download it again"
-        ) from None
+def _file(path: Path, template: str, fields: dict[str, Any]) -> Path:
+    """Return the file of a path template such as data/chunk-{episode_chunk:03d}/file.parquet."""
+
+    def filled(field: re.Match[str]) -> str:
+        """Return the value of a field, with zeros in front where its width says so."""
+        return str(fields.get(field[1], field[0])).zfill(int(field[2] or 0))
+
+    name = re.sub(r"\{(\w+)(?::0?(\d?\d)d)?\}", filled, template)
     return contained(path, name, str(path / INFO))
 
 
 def _images(
     episodes: list[Episode], rows: list[Int[ndarray, " _"]], wanted: Int[ndarray, " k"], key: str, fps: float
-) -> Iterator[tuple[int, bytes | UInt8[ndarray, "h w 3"], str]]:
-    """Yield row, image and file ending of the wanted rows among the frames of all episodes."""
+) -> Iterator[Picture]:
+    """Yield the images of the wanted rows among the frames of all episodes."""
     for episode, part in zip(episodes, rows, strict=True):
         mine = wanted[np.isin(wanted, part)]
         if len(mine) == 0:
@@ -250,35 +207,30 @@ def _embedded(episode: Episode, camera: str, rows: Int[ndarray, " k"]) -> Iterat
 def _video_frames(
     file: Path, time_s: Float[ndarray, " n"], tolerance_s: float
 ) -> Iterator[UInt8[ndarray, "h w 3"]]:
-    """Yield RGB frames nearest to ascending times; InputError beyond the tolerance, or where the video is damaged."""
+    """Yield the RGB frames at ascending times; raise InputError where there is none within the tolerance."""
     av = extra("av", "lerobot", "a video")
+    due = time_s.tolist()
     try:
         with av.open(str(file)) as container:
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
-            container.seek(max(int((time_s[0] - tolerance_s) / stream.time_base), 0), stream=stream)
-            wanted = iter(time_s.tolist())
-            due = next(wanted, None)
+            container.seek(max(int((due[0] - tolerance_s) / stream.time_base), 0), stream=stream)
             for frame in container.decode(stream):
-                if due is None:
-                    return
-                if frame.time is None or frame.time < due - tolerance_s:
-                    continue
-                while due is not None and abs(frame.time - due) <= tolerance_s:
+                while due and frame.time is not None and abs(frame.time - due[0]) <= tolerance_s:
                     yield np.asarray(frame.to_ndarray(format="rgb24"))
-                    due = next(wanted, None)
-                if due is not None and frame.time > due + tolerance_s:
-                    raise InputError(
-                        f"{file}: no frame at {due:.3f} s, the next is at {frame.time:.3f} s; damaged"
-                    )
-            if due is not None:
-                raise InputError(f"{file}: ends before {due:.3f} s; it is shorter than the data set says")
+                    due.pop(0)
+                if not due or (frame.time is not None and frame.time > due[0] + tolerance_s):
+                    break
     except (av.FFmpegError, IndexError) as error:
         raise InputError(f"{file}: not a readable video ({error}); download it again") from None
+    if due:
+        raise InputError(
+            f"{file}: has no frame at {due[0]:.3f} s, which the data set lists; download it again"
+        )
 
 
 def _camera(features: dict[str, Feature], options: ReadOptions, path: Path) -> str:
-    """Return the key of the wrist camera; InputError with the keys that there are."""
+    """Return the key of the wrist camera; raise InputError with the keys that there are."""
     cameras = [key for key, feature in features.items() if feature.dtype in ("video", "image")]
     if options.camera_topic in cameras:
         return str(options.camera_topic)
@@ -290,7 +242,7 @@ def _camera(features: dict[str, Feature], options: ReadOptions, path: Path) -> s
 
 
 def _state_key(features: dict[str, Feature], options: ReadOptions, path: Path) -> str:
-    """Return the key of the robot's state; InputError with the keys that there are."""
+    """Return the key of the robot's state; raise InputError with the keys that there are."""
     key = options.joint_topic or (CARTESIAN if CARTESIAN in features and options.urdf is None else STATE)
     if key not in features:
         states = [name for name, feature in features.items() if feature.dtype.startswith("float")]
@@ -304,8 +256,7 @@ def _poses(
     state: Float[ndarray, "n k"], key: str, feature: Feature, options: ReadOptions, path: Path
 ) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, "n j"] | None]:
     """Return gripper poses from poses or joint angles, and the joint angles (rad) of a chain of rotating joints."""
-    where = f"{path}: {key}"
-    names = feature.numbers()
+    where, names = f"{path}: {key}", feature.numbers()
     if options.urdf is not None:
         arm = read_arm(options)
         columns = arm.columns(names, where)
@@ -313,7 +264,8 @@ def _poses(
             raise InputError(f"{where}: {len(names)} names for {state.shape[1]} numbers; correct {INFO}")
         recorded = state[:, columns]
         return arm.poses(recorded), arm.angles(recorded)
-    wanted = CONVENTIONS["rpy" if options.pose_convention == "auto" else options.pose_convention].columns
+    convention = "rpy" if options.pose_convention == "auto" else options.pose_convention
+    wanted = CONVENTIONS[convention].columns
     if key == CARTESIAN or options.pose_convention != "auto":
         names = list(wanted)
     elif not set(wanted) <= set(names):
@@ -323,8 +275,8 @@ def _poses(
         )
     if state.shape[1] < len(names):
         raise InputError(f"{where}: {state.shape[1]} numbers, a pose of this convention has {len(names)}")
-    texts = {name: tuple(repr(float(value)) for value in state[:, k]) for k, name in enumerate(names)}
-    return poses_of_columns(PoseColumns(cells=texts), options, where), None
+    numbers = state[:, [names.index(name) for name in wanted]]
+    return poses_from_numbers(numbers, convention, options.pose_units, where), None
 
 
 def _speed(episode: Episode, poses: Float[ndarray, "n 4 4"]) -> Float[ndarray, " n"]:

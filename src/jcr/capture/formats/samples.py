@@ -32,7 +32,9 @@ def read(path: Path, options: ReadOptions) -> PosePairs:
     for key in keys:
         where = f"{path}: {key}"
         columns = columns_of_entries(read_entries(content, where, key), options, where)
-        poses.append(poses_of_columns(columns, options, where, faults))
+        found, wrong = poses_of_columns(columns, options, where)
+        poses.append(found)
+        faults |= wrong | faults
     sound = [row for row in range(len(poses[0])) if row not in faults]
     require_frames(len(sound), str(path))
     return PosePairs(

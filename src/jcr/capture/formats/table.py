@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from jcr.capture.camera_info import FILE, read_camera_info
 from jcr.capture.checks import checked_capture, require_frames
-from jcr.capture.conventions import CONVENTIONS, poses_from_numbers
+from jcr.capture.conventions import CONVENTIONS, checked_rows, tolerated
 from jcr.capture.depth_images import depth_beside
 from jcr.capture.formats import Format, pose_lists
 from jcr.capture.options import ConventionName, ReadOptions, UnitsName
@@ -129,9 +129,8 @@ def read_pose_table(file: Path, options: ReadOptions) -> PoseTable:
     image = next((columns.cells[name] for name in _IMAGE if name in columns.cells), None)
     stamp = next((columns.cells[name] for name in _STAMP if name in columns.cells), None)
     require_frames(0 if image is None else len(image), str(file), 0)
-    faults = dict[int, str]()
     convention = convention_of(columns, options, str(file))
-    poses = poses_of_columns(columns, replace(options, pose_convention=convention), str(file), faults)
+    poses, faults = poses_of_columns(columns, replace(options, pose_convention=convention), str(file))
     stamps = None if stamp is None else np.array([stamp_ns(text, str(file)) for text in stamp])
     return PoseTable(
         base_from_gripper=poses, images=image, stamp_ns=stamps, convention=convention, faults=faults
@@ -157,33 +156,33 @@ def convention_of(columns: PoseColumns, options: ReadOptions, where: str) -> Con
 
 
 def poses_of_columns(
-    columns: PoseColumns, options: ReadOptions, where: str, faults: dict[int, str] | None = None
-) -> Float[ndarray, "n 4 4"]:
-    """Return base_from_gripper (n,4,4); rows that hold no pose raise InputError, or are NaN and named in `faults`."""
+    columns: PoseColumns, options: ReadOptions, where: str
+) -> tuple[Float[ndarray, "n 4 4"], dict[int, str]]:
+    """Return base_from_gripper (n,4,4), NaN for a few rows that hold no pose, and the messages of these rows."""
     convention = convention_of(columns, options, where)
     wanted = CONVENTIONS[convention].columns
     cells, rows = columns.cells, len(next(iter(columns.cells.values())))
     if set(_LAST_ROW) <= set(wanted) and not set(_LAST_ROW) & set(cells):
         cells = cells | {name: (cell,) * rows for name, cell in _LAST_ROW.items()}
-    missing = [name for name in wanted if name not in cells]
-    if missing:
+    if missing := [name for name in wanted if name not in cells]:
         raise InputError(
             f"{where}: no column {', '.join(missing)}, which --pose-convention {convention} needs; "
             f"it has {', '.join(cells)}"
         )
-    numbers = np.full((rows, len(wanted)), np.nan)
+    numbers, faults = np.full((rows, len(wanted)), np.nan), dict[int, str]()
     for k, name in enumerate(wanted):
         for row, cell in enumerate(cells[name]):
             if is_number(cell):
                 numbers[row, k] = float(cell)
             else:
-                fault = (
-                    f"row {row + 1}, column {name}: {shown(cell)} is not a number; correct or drop the row"
-                )
-                if faults is None:
-                    raise InputError(f"{where}: {fault}")
-                faults.setdefault(row, fault)
-    return poses_from_numbers(numbers, convention, _units(convention, columns.units, options), where, faults)
+                text = f"{shown(cell)} is not a number; correct or drop the row"
+                faults.setdefault(row, f"{where}: row {row + 1}, column {name}: {text}")
+    units = _units(convention, columns.units, options)
+    poses, wrong = checked_rows(numbers, convention, units, where)
+    faults = wrong | faults
+    if len(faults) > tolerated(rows):
+        raise InputError(faults[min(faults)])
+    return poses, faults
 
 
 def is_number(cell: str) -> bool:
@@ -282,7 +281,7 @@ def _named(where: str, columns: list[tuple[str, ...]], options: ReadOptions) -> 
 def _read_rows(file: Path) -> tuple[Sequence[str] | None, list[list[str]]]:
     """Read the header, None where there is none, and the cells of every row."""
     if file.suffix == ".npy":
-        return _rows_of_array(file)
+        return None, _rows_of_array(file)
     lines = [line.strip() for line in read_text(file).splitlines() if line.strip()]
     comments = [line.lstrip("# ") for line in lines if line.startswith("#")]
     lines = [line for line in lines if not line.startswith("#")]
@@ -318,12 +317,9 @@ def _rows_of_ur(file: Path, lines: list[str]) -> tuple[Sequence[str], list[list[
         match = _UR_POSE.search(line)
         if match is None and not rows:
             continue  # a header
-        numbers = [] if match is None else [cell.strip() for cell in match[1].split(",")]
-        before = (
-            [] if match is None else re.split(r"[,;\t\s]+", line[: match.start()].strip(" \t,;\"'=:"))[:1]
-        )
-        rows.append([cell for cell in before if cell] + numbers)
-        if len(numbers) != 6 or len(rows[-1]) != len(rows[0]):
+        before = re.findall(r"[^,;\t\s\"'=]+", line[: match.start()])[:1] if match else []
+        rows.append([*before, *(cell.strip() for cell in match[1].split(","))] if match else [])
+        if len(rows[-1]) not in (6, 7) or len(rows[-1]) != len(rows[0]):
             raise InputError(
                 f"{file}: line {number} holds no p[x, y, z, rx, ry, rz] as the others: {shown(line)}; correct or drop it"
             )
@@ -331,14 +327,12 @@ def _rows_of_ur(file: Path, lines: list[str]) -> tuple[Sequence[str], list[list[
     return (*first, "x", "y", "z", "ur_x", "ur_y", "ur_z"), rows
 
 
-def _rows_of_array(file: Path) -> tuple[Sequence[str] | None, list[list[str]]]:
-    """Return the cells of a NumPy array: a structured one has a header, matrices are rows of their numbers."""
+def _rows_of_array(file: Path) -> list[list[str]]:
+    """Return the cells of a NumPy array of matrices or rows of numbers."""
     array = read_npy(file)
-    if array.dtype.names is not None and array.ndim == 1:
-        return array.dtype.names, [[str(value) for value in row] for row in array.tolist()]
     if array.dtype.kind not in "fiu" or array.ndim not in (2, 3) or not array.size:
         raise InputError(f"{file}: no table of numbers; save (n,4,4) matrices or (n,k) rows with numpy.save")
-    return None, [[repr(value) for value in row] for row in array.reshape(len(array), -1).tolist()]
+    return [[repr(value) for value in row] for row in array.reshape(len(array), -1).tolist()]
 
 
 def _name_and_unit(cell: str) -> tuple[str, str]:
