@@ -8,9 +8,10 @@ the selection of a back end take part.
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -28,7 +29,7 @@ from jcr.records import HandEye
 from simulation import image_faults as make
 from simulation.faults import Faults, FaultyCapture, faulty_capture, reconstructed
 from simulation.image_faults import IMAGES as FEW_IMAGES
-from simulation.image_faults import Fault
+from simulation.image_faults import ImageFault
 from simulation.rendered import Rendered, rendered
 
 IMAGES, SCENES = 12, 5
@@ -54,11 +55,21 @@ class Case:
     """Row of a table: a fault, and the kinds of finding that name it."""
 
     what: str
-    fault: Faults | Fault
+    fault: Faults | ImageFault
     named_by: frozenset[FindingKind] = frozenset()
-    """Any of these; images left out name their own fault, too."""
+    """Kinds of which any names the fault; images left out name their own fault, too."""
     given: bool = True
     """Whether intrinsics are given."""
+
+
+def _off(name: str, **sizes: float) -> tuple[str, Faults, frozenset[FindingKind]]:
+    """Return a row of intrinsics that are given wrong by these differences."""
+    return name, Faults(intrinsics=tuple(sizes.items())), INTRINSICS
+
+
+def _case(name: str, named_by: frozenset[FindingKind] = frozenset(), **fault: Any) -> Case:
+    """Return a row of images with a fault of the stored images or of single poses."""
+    return Case(name, ImageFault(**fault), named_by)
 
 
 SLIP = (3.6e-3, float(np.radians(1.1)))
@@ -72,9 +83,9 @@ OBSERVED = (
     Case("by 2 %, intrinsics estimated", Faults(focal_by_distance=0.02), FOCUS, given=False),
     Case("focal length scatters by 2 %", Faults(focal_scatter=0.02), FOCUS),
     Case("zoom by 3 % in the second half", Faults(zoom=0.03), ZOOM),
-    Case("principal point 12 px off in x", Faults(intrinsics=(("cx", 12.0),)), INTRINSICS),
-    Case("k1 of -0.03 ignored", Faults(intrinsics=(("k1", -0.03),)), INTRINSICS),
-    Case("fx alone 3 % off", Faults(intrinsics=(("fx", -18.6),)), INTRINSICS),
+    Case(*_off("principal point 12 px off in x", cx=12.0)),
+    Case(*_off("k1 of -0.03 ignored", k1=-0.03)),
+    Case(*_off("fx alone 3 % off", fx=-18.6)),
     Case("rolling shutter, 15 px in x", Faults(rolling_px=15.0), SHUTTER),
     Case("mount slips by 1 mm 0.3° midway", Faults(slip=(1e-3, float(np.radians(0.3)))), MOVED),
     Case("by 3.6 mm 1.1° midway", Faults(slip=SLIP), MOVED),
@@ -85,35 +96,43 @@ OBSERVED = (
     Case("the tool sags by 1.1° where it is level", Faults(sag=0.02), ROBOT),
     Case(SCALE_ALONE, Faults(pose_scale=1.01)),
 )
+"""Faults of captures of observations."""
+SEEN = (
+    Case(
+        "focal length grows by 2 % from the nearest view to the farthest",
+        Faults(focal_by_distance=0.02),
+        FOCUS,
+    ),
+    Case("by 8 %", Faults(focal_by_distance=0.08), FOCUS),
+    Case("zoom by 3 % midway", Faults(zoom=0.03), ZOOM),
+    Case(*_off("digital zoom of 1.11, intrinsics unchanged", fx=69.0, fy=69.0)),
+    Case(*_off("k1 of -0.1 missing", k1=-0.1)),
+    Case(*_off("principal point 40 px off", cx=32.0, cy=-24.0)),
+    Case(*_off("focal length given 3 % too long", fx=-19.0, fy=-19.0)),
+    Case("rolling shutter, 24 px", Faults(rolling_px=24.0), SHUTTER),
+    Case("stabiliser moves the image by 3 px", Faults(centre_scatter_px=3.0), kinds_of("camera")),
+    Case("thin prism, 0.04", Faults(prism=(0.04, 0.0, 0.02, 0.0)), kinds_of("camera")),
+    Case("mount slips by 3.6 mm 1.1°", Faults(slip=SLIP), MOVED),
+    Case("base pushed by 20 mm 2° midway", Faults(base_moved=(0.02, float(np.radians(2.0)))), MOVED),
+    Case("poses read 400 ms late", Faults(delay_s=0.4, view_s=6.0), ORDER),
+    Case("tool sags by 1.1° where it is level", Faults(sag=0.02), ROBOT),
+    Case(SCALE_ALONE, Faults(pose_scale=1.01), ROBOT),
+)
+"""Faults of camera and robot in captures of images."""
 EXCHANGED = np.r_[0:3, 6, 4:6, 3, 7:FEW_IMAGES]
 RENDERED = (
-    Case(
-        "focal length grows by 2 % from the nearest view to the farthest", Fault(make.breathing(0.02)), FOCUS
-    ),
-    Case("by 8 %", Fault(make.breathing(0.08)), FOCUS),
-    Case("zoom by 3 % midway", Fault(make.zoomed_midway(0.03)), ZOOM),
-    Case("digital zoom of 1.11, intrinsics unchanged", Fault(make.zoomed(1.11)), INTRINSICS),
-    Case("k1 of -0.1 missing", Fault(make.distorted(-0.1)), INTRINSICS),
-    Case("principal point 40 px off", Fault(make.off_centre(32.0, -24.0)), INTRINSICS),
-    Case("rolling shutter, 24 px", Fault(make.rolling(24.0)), SHUTTER),
-    Case("stabiliser moves the image by 3 px", Fault(make.stabilised(3.0)), kinds_of("camera")),
-    Case("thin prism, 0.04", Fault(make.thin_prism(0.04)), kinds_of("camera")),
-    Case("focal length given 3 % too long", Fault(change=make.given(fx=1.03, fy=1.03)), INTRINSICS),
-    Case("images of half the resolution", Fault(change=make.halved), INTRINSICS),
-    Case("mirrored images", Fault(make.mirrored), ORDER),
-    Case("mount slips by 3.6 mm 1.1°", Fault(change=make.slipped(3.6, 1.1)), MOVED),
-    Case("base pushed by 20 mm 2° midway", Fault(change=make.bumped(20.0, 2.0)), MOVED),
-    Case("poses read 400 ms late", Fault(change=make.delayed(0.4, 6.0)), ORDER),
-    Case("images sorted by name as text", Fault(change=make.sorted_as_text), ORDER),
-    Case("one pose 5 mm 1° off", Fault(change=make.one_off(5.0, 1.0, 4), wrong=(4,)), ONE_POSE),
-    Case("two poses exchanged", Fault(change=make.reordered(EXCHANGED), wrong=(3, 6)), ONE_POSE),
-    Case("a frame that is repeated", Fault(change=make.repeated(4, (5,)), wrong=(5,)), ONE_POSE),
-    Case("objects pushed by 6 cm midway", Fault(pushed=True)),
-    Case("exposure and white balance differ by 30 %", Fault(change=make.exposed(0.3))),
-    Case("two images blurred by 9 px", Fault(change=make.blurred(9, (2, 6)))),
-    Case("tool sags by 4 mm 1°", Fault(change=make.sagging(4.0, 1.0)), ROBOT),
-    Case(SCALE_ALONE, Fault(change=make.stretched(1.01, 1.01, 1.01)), ROBOT),
+    *(replace(case, fault=ImageFault(faults=case.fault)) for case in SEEN if isinstance(case.fault, Faults)),
+    _case("images of half the resolution", INTRINSICS, change=make.halved),
+    _case("mirrored images", ORDER, change=make.mirrored),
+    _case("images sorted by name as text", ORDER, change=make.sorted_as_text),
+    _case("one pose 5 mm 1° off", ONE_POSE, change=make.one_off(5.0, 1.0, 4), wrong=(4,)),
+    _case("two poses exchanged", ONE_POSE, change=make.reordered(EXCHANGED), wrong=(3, 6)),
+    _case("a frame that is repeated", ONE_POSE, change=make.repeated(4, (5,)), wrong=(5,)),
+    _case("objects pushed by 6 cm midway", pushed=True),
+    _case("exposure and white balance differ by 30 %", change=make.exposed(0.3)),
+    _case("two images blurred by 9 px", change=make.blurred(9, (2, 6))),
 )
+"""Faults of captures of images through all of `jcr calibrate`."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +170,7 @@ class Outcome:
 
     def is_named(self, case: Case) -> bool:
         """Return whether the answer names the fault, or leaves the wrong images out."""
-        wrong = case.fault.wrong if isinstance(case.fault, Fault) else ()
+        wrong = case.fault.wrong if isinstance(case.fault, ImageFault) else ()
         return (
             self.refused or bool(self.kinds & case.named_by) or (bool(wrong) and self.left_out >= set(wrong))
         )
@@ -164,10 +183,10 @@ def run() -> str:
     images = {
         case: [through_images(1, case.fault, case.given)]
         for case in RENDERED
-        if isinstance(case.fault, Fault)
+        if isinstance(case.fault, ImageFault)
     }
     clean = [_clean(seed) for seed in range(CLEAN)]
-    clean_images = [through_images(1000 + k, Fault(), k % 2 == 0) for k in range(CLEAN_IMAGES)]
+    clean_images = [through_images(1000 + k, ImageFault(), k % 2 == 0) for k in range(CLEAN_IMAGES)]
     return page(observed, images, clean, clean_images)
 
 
@@ -201,7 +220,7 @@ def _scene(number: int) -> Rendered:
     return rendered(number)
 
 
-def through_images(seed: int, fault: Fault, given: bool) -> Outcome:
+def through_images(seed: int, fault: ImageFault, given: bool) -> Outcome:
     """Draw a capture of images with a fault and run `jcr calibrate` on it."""
     capture = make.draw(_scene(seed % SCENES), seed, fault, given=given)
     with tempfile.TemporaryDirectory() as folder:
@@ -212,9 +231,8 @@ def through_images(seed: int, fault: Fault, given: bool) -> Outcome:
         except RejectedError:
             return Outcome(False, frozenset({FindingKind.NO_RECONSTRUCTION}))
     used = result.reconstruction.image_index[result.hand_eye.inliers].tolist()
-    return _judged(
-        result.hand_eye, capture.gripper_from_camera, frozenset(range(len(capture.images))) - set(used)
-    )
+    left_out = frozenset(range(len(capture.images))) - set(used)
+    return _judged(result.hand_eye, capture.gripper_from_camera, left_out)
 
 
 def _judged(hand_eye: HandEye, truths: Iterable[Float[ndarray, "4 4"]], left_out: frozenset[int]) -> Outcome:
@@ -279,7 +297,7 @@ def _claim(what: str, rows: Rows, clean: Sequence[Outcome]) -> str:
 
 def _cells(case: Case, row: Sequence[Outcome]) -> list[object]:
     kinds = Counter(str(kind) for one in row for kind in one.kinds).most_common(3)
-    has_name = case.named_by or (isinstance(case.fault, Fault) and case.fault.wrong)
+    has_name = case.named_by or (isinstance(case.fault, ImageFault) and case.fault.wrong)
     silent = sum(one.is_silent for one in row)
     kept = [(one.mm, one.deg, one.sigmas) for one in row if np.isfinite(one.mm)]
     mm, deg, sigmas = np.median(kept, axis=0) if kept else (np.nan,) * 3

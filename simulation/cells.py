@@ -12,13 +12,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.camera import project
 from jcr.estimation.arms import arm_named
 from jcr.estimation.observations import Observations
 from jcr.estimation.problem import Arm
 from jcr.estimation.systematic import smooth_errors
 from jcr.geometry import (
-    apply,
     apply_similarity,
     inverse,
     rotation_exp,
@@ -35,7 +33,7 @@ from simulation.motion import (
     motion_over_table,
     second_on_wrist,
 )
-from simulation.problems import INTRINSICS, disturbed
+from simulation.problems import INTRINSICS, disturbed, shown_points
 
 Kind = Literal["fixed", "wrists", "arms", "carried"]
 FIXED_CAMERA = Intrinsics(905.0, 903.0, 645.0, 355.0, 1280, 720, (0.06, -0.1, 5e-4, 3e-4, 0.02))
@@ -190,31 +188,23 @@ def _seen(
     rng: np.random.Generator,
 ) -> CellProblem:
     """The problem in a frame and unit of its own, every point seen with noise by all cameras that have it in view."""
-    image, x_px, point = [], [], []
     rigs = np.concatenate(cell.rigs)
-    for k, (rig, row) in enumerate(cell.images):
-        camera, place = cell.cameras[row], rigs[rig] @ cell.mounts[row]
-        x = apply(inverse(place), x_in_base)
-        pixels = project(camera, x)
-        shown = (x[:, 2] > 0) & ((pixels > 0) & (pixels < [camera.width, camera.height])).all(1)
-        if normal is not None:
-            shown &= ((place[:3, 3] - x_in_base) * normal).sum(1) > 0
-        point.append(np.flatnonzero(shown))
-        image.append(np.full(shown.sum(), k))
-        x_px.append(pixels[shown] + noise_px * rng.normal(size=(int(shown.sum()), 2)))
+    rig_of, camera_of = np.array(cell.images).T
+    places = rigs[rig_of] @ np.stack(cell.mounts)[camera_of]
+    cameras = [cell.cameras[row] for row in camera_of]
+    image, point, x_px = shown_points(x_in_base, places, cameras, noise_px, rng, normal)
     world_from_base = transform(rotation_exp(rng.normal(size=3)), rng.normal(size=3))
     scale = float(np.exp(rng.uniform(-2, 2)))
-    rig_of, camera_of = np.array(cell.images).T
     return CellProblem(
         kind=cell.kind,
         reported=tuple(cell.reported),
         observations=Observations(
             rig=rig_of,
             camera=camera_of,
-            image=np.concatenate(image),
-            x_px=np.concatenate(x_px),
-            point=np.concatenate(point),
-            std_px=np.ones(sum(map(len, point))),
+            image=image,
+            x_px=x_px,
+            point=point,
+            std_px=np.ones(len(point)),
         ),
         world_from_rig=scale_translation(world_from_base @ rigs, 1 / scale),
         rig_from_camera=scale_translation(np.stack(cell.mounts), 1 / scale),

@@ -1,9 +1,10 @@
 """Hand-eye problems with a known answer, and image observations of them, without rendering."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.camera import project
@@ -135,25 +136,47 @@ def observed(
     noise_px: float,
     camera: Intrinsics = INTRINSICS,
 ) -> Tracks:
-    """Points scattered over the table, seen with noise (px) by every camera that has them in its image."""
+    """Scatter points over the table, and observe each with noise (px) in all cameras that have it in their images."""
     low, high = np.array([0.25, -0.25, 0.0]), np.array([0.75, 0.25, 0.12])
     x_in_base = rng.uniform(low, high, (points, 3))
     base_from_camera = problem.base_from_camera
-    image, point, pixels = [], [], []
-    for i, pose in enumerate(base_from_camera):
-        x_in_camera = apply(inverse(pose), x_in_base)
-        x_px = project(camera, x_in_camera)
-        inside = (x_px > 0).all(1) & (x_px < [camera.width, camera.height]).all(1)
-        seen = np.flatnonzero(inside & (x_in_camera[:, 2] > 0))
-        image.append(np.full(len(seen), i))
-        point.append(seen)
-        pixels.append(x_px[seen] + noise_px * rng.normal(size=(len(seen), 2)))
+    image, point, x_px = shown_points(
+        x_in_base, base_from_camera, [camera] * len(base_from_camera), noise_px, rng
+    )
     # The reconstruction's frame follows from its first camera.
     recon_from_base = problem.recon_from_camera[0, :3, :3] @ base_from_camera[0, :3, :3].T
     about_camera = (x_in_base - base_from_camera[0, :3, 3]) / problem.scale
     return Tracks(
-        image=np.concatenate(image),
-        x_px=np.concatenate(pixels),
-        point=np.concatenate(point),
+        image=image,
+        x_px=x_px,
+        point=point,
         points_in_recon=about_camera @ recon_from_base.T + problem.recon_from_camera[0, :3, 3],
     )
+
+
+def shown_points(
+    x_in_base: Float[ndarray, "p 3"],
+    base_from_camera: Float[ndarray, "n 4 4"],
+    cameras: Sequence[Intrinsics],
+    noise_px: float,
+    rng: np.random.Generator,
+    normal: Float[ndarray, "p 3"] | None = None,
+    pixels: Callable[[int, Float[ndarray, "p 3"]], Float[ndarray, "p 2"]] | None = None,
+) -> tuple[Int[ndarray, " k"], Int[ndarray, " k"], Float[ndarray, "k 2"]]:
+    """Return image, point and noisy pixel of each observation of points that cameras have in their images.
+
+    With `normal`, points are seen from that side of their surface alone. `pixels` replaces the projection of points in
+    the frame of a camera by another one, given the image's number.
+    """
+    image, point, x_px = [], [], []
+    for k, (place, camera) in enumerate(zip(base_from_camera, cameras, strict=True)):
+        at = apply(inverse(place), x_in_base)
+        there = project(camera, at) if pixels is None else pixels(k, at)
+        inside = (at[:, 2] > 0) & ((there > 0) & (there < [camera.width, camera.height])).all(1)
+        if normal is not None:
+            inside &= ((place[:3, 3] - x_in_base) * normal).sum(1) > 0
+        seen = np.flatnonzero(inside)
+        image.append(np.full(len(seen), k))
+        point.append(seen)
+        x_px.append(there[seen] + noise_px * rng.normal(size=(len(seen), 2)))
+    return np.concatenate(image), np.concatenate(point), np.concatenate(x_px)
