@@ -1,11 +1,11 @@
 """`benchmarks real DIR`: real captures against references, their halves, and boards that took no part.
 
-A transform belongs to its intrinsics, so pairs are compared: the places of a point seen at the centre of the image and
-the working distance. Halves of a capture, calibrated apart, need no reference. Corners of a board that took no part
-show whether points seen in single images are where the calibration says, as exactly as it says.
+A transform belongs to its intrinsics, so pairs are compared: the places of points seen over the image at the working
+distance. References come from the board in the images (benchmarks.references). Halves of a capture, calibrated apart,
+need no reference. Corners of a board that took no part show whether points seen in single images are where the
+calibration says, as exactly as it says.
 """
 
-import json
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -14,21 +14,25 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from numpy import ndarray
-from PIL import Image
 
-from benchmarks.page import apart, boards_of, folders_with, number, table
+from benchmarks.page import boards_of, folders_with, mm_deg, number, table
 from benchmarks.peers import opencv
-from jcr.boards.detection import Sighting, boards, most_seen
-from jcr.calibration.known_transform import read_hand_eye
-from jcr.calibration.seen import joint_covariance
+from benchmarks.real_captures.fetch import recipes
+from benchmarks.references import (
+    Corners,
+    Reference,
+    find_corners,
+    placed,
+    placed_covariance,
+    reference,
+)
+from jcr.calibration.seen import joint_covariance, seen_uncertainty, within_95
 from jcr.camera import parameters, project, unproject, with_parameters
-from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, RejectedError
 from jcr.geometry import (
-    apply,
     inverse,
     nearest_to_lines,
     retract,
@@ -39,41 +43,50 @@ from jcr.geometry import (
 )
 from jcr.pipeline.run import RunOptions, calibrate
 from jcr.reconstruct import ReconstructOptions
-from jcr.records import Capture, HandEye, Intrinsics, coefficients_of
+from jcr.records import Capture, HandEye, Intrinsics
 from jcr.results import RunResult
 
-FEWEST_IMAGES, FEWEST_CORNERS, WORST_PX = 3, 4, 2.0
-"""Fewest images of a corner and corners of an image; rms misfit above which an image shows another thing."""
+WORST_PX = 2.0
+"""rms misfit above which an image shows another thing than the board."""
 DRAWS = 100
 """Draws of the errors that a calibration states."""
-LENGTHS_M = {"SIDE": "0.1", "MARKER": "0.07"}
-"""Lengths of a board whose size nobody states; the ratio of its sides is what counts."""
+SHARES = np.array([0.1, 0.5, 0.9])
+"""Shares of width and height at which points are placed."""
 
 
 def run(captures: Path, boards: Sequence[str] = ()) -> str:
     """Return the page in Markdown: every capture below `captures`, from its images alone and with its board.
 
-    A board is named as CAPTURE=BOARD, in the words of `--board`, its side SIDE where nobody states it. Raises
-    InputError where there is no capture, or a board is of a capture that is not there.
+    Boards are those of the recipes, or named as CAPTURE=BOARD. Raises InputError where there is no capture, or a board
+    is of a capture that is not there.
     """
     folders = folders_with(captures, "capture.json")
-    named = boards_of(boards, folders, captures)
-    rows, halves, corners, absent = [], [], [], []
+    known = {name: recipe.board for name, recipe in recipes().items() if recipe.board}
+    named = known | boards_of(boards, folders, captures)
+    references, rows, halves, corners, absent = {}, [], [], [], []
     for folder in folders:
         capture, board = read_capture(folder), named.get(folder.name)
+        found = None
+        if board is not None:
+            try:
+                seen = find_corners(capture, board)
+                found = reference(capture.base_from_gripper, seen, capture.image_size, capture.intrinsics)
+            except (RejectedError, cv2.error) as refusal:
+                absent.append(f"- {folder.name}, reference: {str(refusal).splitlines()[0]}")
         alone = _calibrated(capture, None)
-        rows.append(_row(folder, capture, None, *alone))
+        rows.append(_row(capture, None, *alone, found))
         if board is not None and "SIDE" not in board:
-            found = _calibrated(capture, board)
-            rows.append(_row(folder, capture, board, *found))
-            rows += _park(folder, board, found[0])
+            marker = _calibrated(capture, board)
+            rows += [_row(capture, board, *marker, found), *_park(capture, board, marker[0], found)]
+        if found is not None:
+            references[folder.name] = found
         halves += _halves(capture)
         if isinstance(alone[0], RunResult) and board is not None:
             try:
                 corners.append(check_points(folder.name, alone[0], board))
             except (InputError, RejectedError) as refusal:
-                absent.append(f"- {folder.name}: {refusal}")
-    return page(rows, halves, corners, absent)
+                absent.append(f"- {folder.name}, check points: {refusal}")
+    return page(references, rows, halves, corners, absent)
 
 
 def _calibrated(capture: Capture, board: str | None) -> tuple[RunResult | RejectedError, float]:
@@ -92,6 +105,50 @@ def _calibrated(capture: Capture, board: str | None) -> tuple[RunResult | Reject
 # References.
 
 
+@dataclass(frozen=True)
+class Apart:
+    """Places of points by two pairs of transform and intrinsics, at nine pixels and the working distance."""
+
+    mm: float
+    """rms distance over the image."""
+    sigmas: float
+    """rms distance over the image in standard deviations of both, per axis; 1 is expected."""
+    stated_mm: float
+    """Distance that 95 % of both errors are stated to stay below, at the centre."""
+
+
+def _pixels(camera: Intrinsics) -> Float[ndarray, "9 2"]:
+    """Return the pixels at which points are placed, the centre in the middle."""
+    return np.stack(np.meshgrid(SHARES * camera.width, SHARES * camera.height), -1).reshape(-1, 2)
+
+
+def _stated(found: HandEye, camera: Intrinsics, distance_m: float) -> Float[ndarray, "9 3 3"]:
+    """Return the stated covariances of the points in gripper axes."""
+    turn = found.gripper_from_camera[:3, :3]
+    return turn @ seen_uncertainty(found.estimate, camera, _pixels(camera), distance_m) @ turn.T
+
+
+def _apart(found: HandEye, other: HandEye | Reference) -> Apart | None:
+    """Compare a calibration with another one or a reference; None where one has no intrinsics."""
+    if found.in_use is None or found.intrinsics is None or other.intrinsics is None:
+        return None
+    camera, distance = found.intrinsics, 1e-3 * found.in_use.seen.distance_mm
+    x_px = _pixels(camera)
+    off = placed(found.gripper_from_camera, camera, x_px, distance)
+    off = off - placed(other.gripper_from_camera, other.intrinsics, x_px, distance)
+    covariance = _stated(found, camera, distance)
+    if isinstance(other, Reference):
+        covariance = covariance + placed_covariance(other, x_px, distance)
+    else:
+        covariance = covariance + _stated(other, other.intrinsics, distance)
+    squared = np.einsum("ki,ki->k", off, np.linalg.solve(covariance, off[..., None])[..., 0])
+    return Apart(
+        mm=1e3 * float(np.sqrt((off**2).sum(1).mean())),
+        sigmas=float(np.sqrt(squared.mean() / 3)),
+        stated_mm=1e3 * within_95(covariance[4]),
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class Row:
     """One calibration beside its reference."""
@@ -101,15 +158,12 @@ class Row:
     alone: bool
     """Whether it is from images alone, without a board."""
     images: str
-    verdict: str
+    verdict: str = ""
     off: tuple[float, float] | None = None
-    """mm and degrees from the reference."""
-    point_mm: float | None = None
-    """Distance of the places that the two pairs of intrinsics and transform give a point."""
+    """mm and degrees from the transform of the reference, whatever the intrinsics."""
+    apart: Apart | None = None
     stated_mm: float | None = None
-    """Stated bound on 95 % of the errors of that point."""
-    sigmas: float | None = None
-    """Largest distance on an axis in standard deviations of both, where the reference states its own."""
+    """Stated bound on 95 % of the errors of a seen point."""
     std: tuple[float, float] | None = None
     """Largest stated standard deviation, mm and degrees."""
     leave_one_out_mm: float | None = None
@@ -118,108 +172,55 @@ class Row:
     def cells(self) -> list[str]:
         """Return the row of the table."""
         off, std = self.off or (None, None), self.std or (None, None)
-        values = (*off, self.point_mm, self.stated_mm, self.sigmas, *std, self.leave_one_out_mm, self.seconds)
+        apart = (None, None) if self.apart is None else (self.apart.mm, self.apart.sigmas)
+        values = (*apart, self.stated_mm, *off, *std, self.leave_one_out_mm, self.seconds)
         return [self.capture, self.how, self.images, self.verdict, *(number(value, 2) for value in values)]
 
 
 def _row(
-    folder: Path, capture: Capture, board: str | None, result: RunResult | RejectedError, seconds: float
+    capture: Capture,
+    board: str | None,
+    result: RunResult | RejectedError,
+    seconds: float,
+    known: Reference | None,
 ) -> Row:
-    """Compare a calibration with the reference stored beside its capture, if any."""
-    how, alone = ("images alone" if board is None else f"`{board}`"), board is None
+    """Compare a calibration with the reference of its capture, if any."""
+    name, how, alone = capture.folder.name, "images alone" if board is None else f"`{board}`", board is None
     if isinstance(result, RejectedError):
         images = f"0 of {len(capture)}"
-        return Row(
-            capture=folder.name, how=how, alone=alone, images=images, verdict="rejected", seconds=seconds
-        )
-    found, known = result.hand_eye, None
+        return Row(capture=name, how=how, alone=alone, images=images, verdict="rejected", seconds=seconds)
+    found, held_out = result.hand_eye, result.calibration.held_out
     std = np.sqrt(np.diag(found.covariance)[:6])
-    off, sigmas, point = None, None, None
-    if (folder / "reference.json").is_file():
-        known = read_hand_eye(folder / "reference.json")
-        off, point = (
-            apart(found.gripper_from_camera, known.gripper_from_camera),
-            _point_off(folder, capture, found),
-        )
-        if known.covariance is not None:
-            joint = np.hypot(std, np.sqrt(np.diag(known.covariance)[:6]))
-            step = step_between(found.gripper_from_camera, known.gripper_from_camera)
-            sigmas = float(np.abs(step / joint).max())
-    held_out = result.calibration.held_out
     return Row(
-        capture=folder.name,
+        capture=name,
         how=how if board else f"{how} ({result.calibration.backend})",
         alone=alone,
         images=f"{sum(image.used for image in result.calibration.images)} of {len(capture)}",
         verdict=result.calibration.verdict or "",
-        off=off,
-        point_mm=point,
+        off=None
+        if known is None
+        else mm_deg(step_between(found.gripper_from_camera, known.gripper_from_camera)),
+        apart=None if known is None else _apart(found, known),
         stated_mm=None if found.in_use is None else found.in_use.seen.within_95_mm,
-        sigmas=sigmas,
         std=(1e3 * float(std[:3].max()), float(np.degrees(std[3:].max()))),
         leave_one_out_mm=None if held_out is None else held_out.translation_mm,
         seconds=seconds,
     )
 
 
-def _park(folder: Path, board: str, result: RunResult | RejectedError) -> Iterator[Row]:
+def _park(
+    capture: Capture, board: str, result: RunResult | RejectedError, known: Reference | None
+) -> Iterator[Row]:
     """Compare OpenCV's Park method on the same poses of the board with the reference."""
-    if isinstance(result, RejectedError) or not (folder / "reference.json").is_file():
+    if isinstance(result, RejectedError) or known is None:
         return
-    rows = result.reconstruction.image_index
-    x, _ = opencv(
-        "Park", result.capture.base_from_gripper[rows], result.reconstruction.recon_from_camera, 1.0
-    )
-    off = apart(x, read_hand_eye(folder / "reference.json").gripper_from_camera)
-    images = f"{len(rows)} of {len(result.capture)}"
-    yield Row(
-        capture=folder.name, how=f"`{board}`, OpenCV Park", alone=False, images=images, verdict="", off=off
-    )
+    rows, made = result.reconstruction.image_index, result.reconstruction
+    x, _ = opencv("Park", result.capture.base_from_gripper[rows], made.recon_from_camera, 1.0)
+    off, images = mm_deg(step_between(x, known.gripper_from_camera)), f"{len(rows)} of {len(capture)}"
+    yield Row(capture=capture.folder.name, how=f"`{board}`, OpenCV Park", alone=False, images=images, off=off)
 
 
-def _point_off(folder: Path, capture: Capture, found: HandEye) -> float | None:
-    """Return the distance (mm) of a point's places by our pair and by that of the reference; None without intrinsics."""
-    reference = read_hand_eye(folder / "reference.json").gripper_from_camera
-    camera = json.loads((folder / "reference.json").read_text()).get("camera")
-    theirs = capture.intrinsics
-    if camera is not None:
-        (fx, _, cx), (_, fy, cy), _ = camera["K"]
-        with Image.open(folder / capture.images[0]) as image:
-            theirs = Intrinsics(fx, fy, cx, cy, *image.size, coefficients_of(camera["d"]))
-    return None if theirs is None else _pair_apart(found, reference, theirs)
-
-
-def _pair_apart(found: HandEye, x: Float[ndarray, "4 4"], intrinsics: Intrinsics) -> float | None:
-    """Return the distance (mm) of the places of a point at the image's centre and the working distance by two pairs."""
-    own = found.intrinsics
-    if own is None or found.in_use is None:
-        return None
-    x_px = np.array([own.width - 1.0, own.height - 1.0]) / 2
-    distance = 1e-3 * found.in_use.seen.distance_mm
-    first, second = (
-        apply(x_of, distance * (ray := unproject(camera, x_px)) / np.linalg.norm(ray))
-        for x_of, camera in ((found.gripper_from_camera, own), (x, intrinsics))
-    )
-    return 1e3 * float(np.linalg.norm(first - second))
-
-
-# Halves.
-
-
-@dataclass(frozen=True)
-class Halves:
-    """Two halves of one capture, calibrated apart."""
-
-    capture: str
-    point_mm: float
-    """Distance of a seen point's places by the two pairs."""
-    stated_mm: float
-    """Bound on 95 % of that distance by what both state."""
-    sigmas: float
-    """Largest difference of the transforms on an axis in standard deviations of both."""
-
-
-def _halves(capture: Capture) -> Iterator[Halves]:
+def _halves(capture: Capture) -> Iterator[tuple[str, Apart]]:
     """Calibrate the even and the odd images apart; nothing where a half is rejected."""
     results = []
     for first in (0, 1):
@@ -235,39 +236,11 @@ def _halves(capture: Capture) -> Iterator[Halves]:
         if isinstance(result, RejectedError) or not result.converged:
             return
         results.append(result.hand_eye)
-    one, other = results
-    if one.in_use is None or other.in_use is None or other.intrinsics is None:
-        return
-    point = _pair_apart(one, other.gripper_from_camera, other.intrinsics)
-    std = np.sqrt(np.diag(one.covariance)[:6] + np.diag(other.covariance)[:6])
-    step = step_between(one.gripper_from_camera, other.gripper_from_camera)
-    stated = float(np.hypot(one.in_use.seen.within_95_mm, other.in_use.seen.within_95_mm))
-    yield Halves(capture.folder.name, point or 0.0, stated, float(np.abs(step / std).max()))
+    if (apart := _apart(*results)) is not None:
+        yield capture.folder.name, apart
 
 
 # Boards that took no part.
-
-
-@dataclass(frozen=True)
-class Corners:
-    """Observations of the corners of one board, an element each."""
-
-    image: Int[ndarray, " k"]
-    corner: Int[ndarray, " k"]
-    x_px: Float[ndarray, "k 2"]
-    x_in_board: Float[ndarray, "c 3"]
-    """Metres as stated, z = 0."""
-
-    def of(self, chosen: Bool[ndarray, " k"]) -> "Corners":
-        """Return some of the observations, of corners and images that have enough of each other."""
-        kept = replace(self, image=self.image[chosen], corner=self.corner[chosen], x_px=self.x_px[chosen])
-        images, shown = np.unique(kept.image, return_counts=True)
-        own, seen = np.unique(kept.corner, return_counts=True)
-        good = np.isin(kept.image, images[shown >= FEWEST_CORNERS])
-        good &= np.isin(kept.corner, own[seen >= FEWEST_IMAGES])
-        if not good.all():
-            return kept.of(good)
-        return replace(kept, corner=np.searchsorted(own, kept.corner), x_in_board=self.x_in_board[own])
 
 
 @dataclass(frozen=True)
@@ -317,17 +290,13 @@ class CheckPoints:
 
 def check_points(name: str, result: RunResult, board: str) -> CheckPoints:
     """Measure the corners of a board by a calibration in which it took no part."""
-    rows = result.reconstruction.image_index[result.hand_eye.inliers]
+    rows = result.reconstruction.image_index[result.hand_eye.inliers].tolist()
     camera = WristCamera(
         result.hand_eye.intrinsics or result.reconstruction.intrinsics,
         result.hand_eye.gripper_from_camera,
         result.capture.base_from_gripper[rows],
     )
-    images = [read_image(result.capture.folder / result.capture.images[row]) for row in rows]
-    spec = board
-    for word, length in LENGTHS_M.items():
-        spec = spec.replace(word, length)
-    corners = _plausible(camera, corners_of(most_seen(boards(spec), images)[1]))
+    corners = _plausible(camera, find_corners(result.capture, board, rows))
     noise_px = float(np.sqrt((_misfit(camera, corners) ** 2).sum(1).mean() / 2))
     return replace(
         measure(camera, corners),
@@ -336,22 +305,6 @@ def check_points(name: str, result: RunResult, board: str) -> CheckPoints:
         corners=len(corners.x_in_board),
         predicted=predicted(camera, result.hand_eye, corners, noise_px),
     )
-
-
-def corners_of(sightings: Sequence[Sequence[Sighting]]) -> Corners:
-    """Return the observations of the body seen most often; `sightings` of each image."""
-    bodies = [s.body for shown in sightings for s in shown]
-    body = max(sorted(set(bodies)), key=bodies.count, default=0)
-    seen = [(k, s) for k, shown in enumerate(sightings) for s in shown if s.body == body]
-    x_in_board = {index: x for _, s in seen for index, x in zip(s.index, s.x_in_body, strict=True)}
-    place = {index: c for c, index in enumerate(sorted(x_in_board))}
-    corners = Corners(
-        np.array([k for k, s in seen for _ in s.index], dtype=int),
-        np.array([place[index] for _, s in seen for index in s.index], dtype=int),
-        np.concatenate([s.x_px for _, s in seen] or [np.zeros((0, 2))]),
-        np.reshape([x_in_board[index] for index in place], (-1, 3)),
-    )
-    return corners.of(np.ones(len(corners.image), bool))
 
 
 def _plausible(camera: WristCamera, corners: Corners) -> Corners:
@@ -475,16 +428,33 @@ def predicted(camera: WristCamera, hand_eye: HandEye, corners: Corners, noise_px
 
 
 def page(
-    rows: Sequence[Row], halves: Sequence[Halves], corners: Sequence[CheckPoints], absent: Sequence[str]
+    references: dict[str, Reference],
+    rows: Sequence[Row],
+    halves: Sequence[tuple[str, Apart]],
+    corners: Sequence[CheckPoints],
+    absent: Sequence[str],
 ) -> str:
     """Return the page of measured captures in Markdown."""
-    lines = [*_claims(rows, halves, corners), "", "## References", ""]
-    lines += [
-        "Distance from the reference stored with a capture, which has an error of its own and is made with the stored "
-        "intrinsics. Point: distance of a point's places by the two pairs of intrinsics and transform.",
+    lines = [
+        *_claims(rows, halves, corners),
+        "",
+        "## References",
+        "",
+        "From the corners of the board in the images (benchmarks/references.py): intrinsics, pose errors, size and "
+        "shape of the sheet are estimated with the transform.",
         "",
         *table(
-            "capture | from | images | verdict | off: mm | ° | point: mm | 95 % stated below | σ of both | ±σ: mm | ° | "
+            "capture | images | corners | rms, px | ±σ: mm | ° | noise: mm | ° | size over stated",
+            ([name, one.images, one.corners, *_numbers(one)] for name, one in references.items()),
+        ),
+        "",
+        "## Captures",
+        "",
+        "Point: rms distance of the places that both pairs of transform and intrinsics give nine points over the "
+        "image, at the working distance; in σ of what both state, per axis.",
+        "",
+        *table(
+            "capture | from | images | verdict | point: mm | σ | 95 % stated below | off: mm | ° | ±σ: mm | ° | "
             "leave-one-out, mm | s",
             (row.cells() for row in rows),
         ),
@@ -492,11 +462,8 @@ def page(
         "## Halves, calibrated apart",
         "",
         *table(
-            "capture | point apart, mm | 95 % stated below | transform apart, σ of both",
-            (
-                [one.capture, f"{one.point_mm:.2f}", f"{one.stated_mm:.2f}", f"{one.sigmas:.1f}"]
-                for one in halves
-            ),
+            "capture | point apart: mm | σ | centre: 95 % stated below, mm",
+            ([name, *(f"{x:.2f}" for x in (one.mm, one.sigmas, one.stated_mm))] for name, one in halves),
         ),
         "",
         "## Boards that took no part",
@@ -511,27 +478,35 @@ def page(
     return "\n".join(lines).rstrip() + "\n"
 
 
-def _claims(rows: Sequence[Row], halves: Sequence[Halves], corners: Sequence[CheckPoints]) -> Iterator[str]:
+def _numbers(one: Reference) -> list[str]:
+    """Return the cells of a reference."""
+    noise = (1e3 * one.noise[0], float(np.degrees(one.noise[1])))
+    return [*(f"{x:.2f}" for x in (one.rms_px, *one.std, *noise)), f"{100 * (one.size - 1):+.2f} %"]
+
+
+def _claims(
+    rows: Sequence[Row], halves: Sequence[tuple[str, Apart]], corners: Sequence[CheckPoints]
+) -> Iterator[str]:
+    """Yield the results of the page in sentences."""
     for what, some in (
         ("images alone", [row for row in rows if row.alone]),
         ("a board", [row for row in rows if not row.alone and row.verdict]),
     ):
         accepted = [row for row in some if row.verdict.startswith("accepted")]
-        off = [row.off for row in accepted if row.off is not None]
-        if off:
-            mm, deg = np.median(off, axis=0)
+        apart = [row.apart for row in accepted if row.apart is not None]
+        if apart:
+            mm = [one.mm for one in apart]
             yield (
-                f"> From {what}: {len(accepted)} of {len(some)} real captures are accepted, {mm:.1f} mm and {deg:.2f}° "
-                f"from the references (median; worst {max(off)[0]:.1f} mm)."
+                f"> From {what}: {len(accepted)} of {len(some)} real captures are accepted; a seen point is "
+                f"{np.median(mm):.1f} mm from its place by the reference (median of {len(mm)}, worst {max(mm):.1f} mm), "
+                f"within 2 σ of both in {sum(one.sigmas < 2 for one in apart)}."
             )
     if halves:
-        agree, within = (
-            sum(one.sigmas < 2 for one in halves),
-            sum(one.point_mm < one.stated_mm for one in halves),
-        )
+        agree = sum(one.sigmas < 2 for _, one in halves)
+        within = sum(one.mm < one.stated_mm for _, one in halves)
         yield (
-            f"> Of {len(halves)} captures cut in halves {agree} agree within 2 σ on every axis, a seen point within "
-            f"what both state for 95 % in {within}."
+            f"> Of {len(halves)} captures cut in halves {agree} agree within 2 σ, a seen point within what both state "
+            f"for 95 % in {within}."
         )
     if corners:
         ratios = [one.scatter / np.sqrt((np.array(one.predicted) ** 2).mean()) for one in corners]

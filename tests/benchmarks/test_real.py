@@ -1,4 +1,4 @@
-"""Corners in the base: of an exact calibration they scatter by the pixels' noise, and wrong intrinsics show."""
+"""Measures of the bench of real captures: scatter of corners in the base frame, and references from boards."""
 
 from dataclasses import replace
 
@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from benchmarks import real
-from benchmarks.real import Corners, WristCamera, measure, pixels_of, predicted
+from benchmarks.real import WristCamera, measure, pixels_of, predicted
+from benchmarks.references import Corners, reference
+from jcr.camera import parameters
 from jcr.estimation.hand_eye import solve_hand_eye
+from jcr.geometry import step_between
 from jcr.records import Intrinsics
 from simulation.problems import TARGET_IN_BASE, HandEyeProblem, hand_eye_problem
 
@@ -16,39 +19,63 @@ NOISE_PX = 0.1
 X_IN_BOARD = np.stack([*np.meshgrid(np.arange(8), np.arange(5)), np.zeros((5, 8))], -1).reshape(-1, 3) * 0.025
 
 
-def seen(problem: HandEyeProblem, bend: float = 0.0) -> tuple[WristCamera, Corners]:
-    """The true camera, and a board about the target, its edges raised by `bend` (m), in its images."""
+def seen(
+    problem: HandEyeProblem, bend: float = 0.0, noise_px: float = NOISE_PX
+) -> tuple[WristCamera, Corners]:
+    """Return the true camera, and a board about the target, its edges raised by `bend` (m), in its images."""
     camera = WristCamera(CAMERA, problem.gripper_from_camera, problem.true_base_from_gripper)
     x_in_base = X_IN_BOARD - X_IN_BOARD.mean(0)
     x_in_base[:, 2] = bend * (x_in_base[:, 0] / x_in_base[:, 0].max()) ** 2
     image, corner = (index.ravel() for index in np.indices((len(problem.base_from_gripper), len(X_IN_BOARD))))
     corners = Corners(image, corner, np.zeros((len(image), 2)), X_IN_BOARD)
     x_px = pixels_of(camera, corners, x_in_base + TARGET_IN_BASE)
-    noise = np.random.default_rng(1).normal(scale=NOISE_PX, size=x_px.shape)
-    return camera, replace(corners, x_px=x_px + noise)
+    return camera, replace(corners, x_px=x_px + noise_px * np.random.default_rng(1).normal(size=x_px.shape))
 
 
-def test_an_exact_calibration_scatters_by_the_noise_of_pixels_and_a_wrong_focal_length_shows():
-    camera, corners = seen(hand_eye_problem(np.random.default_rng(3), 10))
-    exact = measure(camera, corners)
-    depth = np.linalg.norm(camera.base_from_camera[:, :3, 3] - TARGET_IN_BASE, axis=1)
-    lateral = np.sqrt(2) * NOISE_PX * np.sqrt((depth**2).mean()) / CAMERA.fx
-    # The noise of the distance along the ray comes in addition.
-    assert lateral < exact.scatter < 2 * lateral
-    assert exact.side == pytest.approx(1.0, abs=5e-4)
-    assert exact.flat < 1e-4
-    wrong = replace(camera, intrinsics=replace(CAMERA, fx=1.01 * CAMERA.fx, fy=1.01 * CAMERA.fy))
-    off = measure(wrong, corners)
-    # Lengths across the ray are wrong by it, distances are not: the robot's metre gives those.
-    assert off.side == pytest.approx(0.99, abs=5e-4)
-    assert off.scatter > 1.5 * exact.scatter
+def scaled(camera: WristCamera, factor: float) -> WristCamera:
+    """Return the camera with a focal length that is wrong by a factor."""
+    return replace(camera, intrinsics=replace(CAMERA, fx=factor * CAMERA.fx, fy=factor * CAMERA.fy))
 
 
-def test_a_sheet_that_bends_is_not_flat_and_scatters_no_more():
+def test_corners_of_an_exact_calibration_scatter_in_proportion_to_the_noise_of_pixels_whatever_the_sheet():
     problem = hand_eye_problem(np.random.default_rng(3), 10)
-    flat, bent = (measure(*seen(problem, bend)) for bend in (0.0, 0.003))
-    assert bent.flat > 8e-4 > 4 * flat.flat
-    assert bent.scatter < 1.1 * flat.scatter
+    for bend in (0.0, 0.003):
+        exact = measure(*seen(problem, bend, 0.0))
+        assert exact.scatter < 1e-7
+        once, twice = (measure(*seen(problem, bend, noise)).scatter for noise in (NOISE_PX, 2 * NOISE_PX))
+        assert twice / once == pytest.approx(2.0, rel=0.01)
+    # The rms height of the sheet about its best plane: the parabola less its mean.
+    height = 0.003 * (np.linspace(-1, 1, 8) ** 2)
+    assert measure(*seen(problem, 0.003, 0.0)).flat == pytest.approx(height.std(), rel=1e-3)
+
+
+def test_a_wrong_focal_length_shows_in_lengths_and_in_proportion_in_the_scatter():
+    camera, corners = seen(hand_eye_problem(np.random.default_rng(3), 10), 0.0, 0.0)
+    assert measure(camera, corners).side == pytest.approx(1.0, abs=1e-6)
+    one, two = (measure(scaled(camera, factor), corners) for factor in (1.01, 1.02))
+    # Lengths across the ray are wrong by it, distances are not: the robot's metre gives those.
+    assert one.side == pytest.approx(1 / 1.01, abs=1e-3)
+    assert two.scatter / one.scatter == pytest.approx(2.0, rel=0.05) and one.scatter > 1e-4
+
+
+@pytest.mark.slow
+def test_references_state_their_own_error():
+    """Errors over σ of X and intrinsics of boards that are bent and of another size than stated: χ² per parameter."""
+    squared = []
+    for seed in range(2):
+        problem = hand_eye_problem(np.random.default_rng(seed), 10, robot_noise=(4e-4, 1e-3))
+        camera, corners = seen(problem, 0.001)
+        stated = replace(corners, x_in_board=X_IN_BOARD / 1.02)
+        found = reference(problem.base_from_gripper, stated, (CAMERA.width, CAMERA.height))
+        off = np.r_[
+            step_between(found.gripper_from_camera, camera.gripper_from_camera),
+            parameters(CAMERA) - parameters(found.intrinsics),
+        ]
+        squared.append(off @ np.linalg.solve(found.covariance, off) / len(off))
+        assert found.size == pytest.approx(1.02, abs=0.005)
+        assert found.noise[0] == pytest.approx(4e-4, rel=0.5) and found.rms_px < 2 * NOISE_PX
+    # The mean square of 30 parameters is 1 ± 0.26.
+    assert 0.22 < np.mean(squared) < 1.78
 
 
 @pytest.mark.slow
