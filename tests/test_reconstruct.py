@@ -20,6 +20,7 @@ from jcr.reconstruct import (
     Backend,
     ReconstructOptions,
     candidates,
+    tries,
     with_cameras_of,
 )
 from jcr.records import Capture
@@ -85,16 +86,17 @@ def test_another_package_adds_a_row_by_an_entry_point(tmp_path: Path) -> None:
     assert "back end broken (mine:NO_ROW) cannot be loaded" in done.stderr
 
 
-def test_the_best_whose_weights_are_here_comes_first(
+def test_colmap_comes_first_then_networks_whose_weights_are_here_then_direct_alignment(
     present: set[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert candidates(ReconstructOptions()) == ("colmap", "direct")
     present |= {"dust3r", "da3"}
-    assert candidates(ReconstructOptions()) == ("dust3r", "colmap", "da3", "direct")
-    present.add("mast3r")
-    assert candidates(ReconstructOptions())[0] == "mast3r"
+    assert candidates(ReconstructOptions()) == ("colmap", "dust3r", "da3", "direct")
+    present |= {"mast3r", "da3-small"}
+    tried = [one.backend for one in tries(ReconstructOptions(features="auto"))]
+    assert list(dict.fromkeys(tried)) == ["colmap", "mast3r", "da3", "direct"], "one network of each kind"
     monkeypatch.setattr(Backend, "is_installed", lambda self: self.name != "da3")
-    assert candidates(ReconstructOptions()) == ("mast3r", "dust3r", "colmap", "direct")
+    assert candidates(ReconstructOptions())[3:] == ("da3-small", "direct")
     assert candidates(ReconstructOptions(backend="colmap")) == ("colmap",)
 
 

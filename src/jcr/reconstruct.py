@@ -163,6 +163,15 @@ class Backend:
 
 _FIRST = (
     Backend(
+        name="colmap",
+        reconstruct=_colmap,
+        licence="BSD-3-Clause; XFeat and LightGlue Apache-2.0",
+        auto=True,
+        options=("features", "board"),
+        selected_by="features",
+        accuracy="0.02 mm and 0.002° on the bundled capture (jcr docs results/speed)",
+    ),
+    Backend(
         name="mast3r",
         reconstruct=_dust3r,
         licence=f"{CC_BY_NC_SA}, and the licences of its training data (its CHECKPOINTS_NOTICE)",
@@ -195,15 +204,6 @@ _FIRST = (
         parameters=571,
         download_gb=2.3,
         commercial=False,
-    ),
-    Backend(
-        name="colmap",
-        reconstruct=_colmap,
-        licence="BSD-3-Clause; XFeat and LightGlue Apache-2.0",
-        auto=True,
-        options=("features", "board"),
-        selected_by="features",
-        accuracy="0.02 mm and 0.002° on the bundled capture (jcr docs results/speed)",
     ),
     Backend(
         name="da3",
@@ -442,14 +442,16 @@ def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
 def tries(options: ReconstructOptions) -> list[ReconstructOptions]:
     """Return the options of every attempt that `auto` may make, the best first.
 
-    Of the candidates the two best, where one network that sees all views does not count, and no second such one; COLMAP
-    with SIFT, then with learned features where their weights are installed. Raises as `candidates` does.
+    COLMAP with SIFT, then with learned features where these are installed; then the best network that sees pairs, the
+    best that sees all views, and direct alignment. Raises as `candidates` does.
     """
     names = candidates(options)
-    networks = [name for name in names if BACKENDS[name].sees_all_views]
-    asked = [name for name in names if name not in networks[1:]]
+    all_views, pairs = (
+        [name for name in names if BACKENDS[name].hub_id and BACKENDS[name].sees_all_views is kind]
+        for kind in (True, False)
+    )
     made = []
-    for one in (for_backend(options, name) for name in asked[: 3 if networks else 2]):
+    for one in (for_backend(options, name) for name in names if name not in (*all_views[1:], *pairs[1:])):
         made.append(one)
         if (
             one.backend == "colmap"
@@ -552,9 +554,8 @@ def _third_party() -> list[Backend]:
 
 
 BACKENDS: dict[str, Backend] = {row.name: row for row in (*_FIRST, *_third_party(), *_LAST)}
-"""Rows by name; `auto` takes the first that it may.
+"""Rows by name, in the order in which `auto` tries them.
 
-Networks that see pairs, whose uncertainty is known, come first, metric ones before others. COLMAP needs no weights and
-sees what networks do not. Networks that see all views come after it and before direct alignment: with simulated
-predictions, refined by matches, they are more accurate on plain tables, for more time.
+COLMAP comes first: it needs no weights, and its points test the camera. Networks follow, those that see pairs, whose
+uncertainty is known, before those that see all views. Direct alignment needs the most time, and comes last.
 """

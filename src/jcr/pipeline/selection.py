@@ -1,7 +1,7 @@
-"""Which back end a run keeps: each that is tried is reconstructed, calibrated and timed, one after the other."""
+"""Selection of the reconstruction: back ends are tried in turn, each reconstructed, calibrated and timed."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from jcr.allocator import give_back
@@ -25,11 +25,19 @@ from jcr.findings import (
 )
 from jcr.progress import Progress, silent
 from jcr.reconstruct import BACKENDS, ReconstructOptions, reconstruct, tries
-from jcr.records import Attempt, Capture, HandEye, LeaveOneOut, Reconstruction
+from jcr.records import Attempt, Capture, HandEye, Reconstruction
+
+HELPS: tuple[Concerns, ...] = ("reconstruction", "images")
+"""Concerns of a rejection against which another reconstruction of the same images may help."""
+TEXTURED = 50
+"""Observations per image of the capture. SIFT finds 600 to 850 in simulated tabletops of 640x480, 220 in those of half
+the size, and 90 where all are blurred by 9 px."""
+NEARLY_ALL = 0.9
+"""Share of the capture's images."""
 
 
 class NothingFoundError(RejectedError):
-    """No back end that was tried came to a calibration; `findings` say why, strongest first."""
+    """Error that no back end that was tried came to a calibration; `findings` are the reasons, strongest first."""
 
     def __init__(
         self, failure: RejectedError, attempts: tuple[Attempt, ...], causes: tuple[Finding, ...] = ()
@@ -44,149 +52,82 @@ class NothingFoundError(RejectedError):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tried:
-    """One back end's reconstruction and calibration, or why there is none, among the others that were tried."""
+class Selection:
+    """Reconstruction that is kept, its calibration, and the record of all attempts."""
+
+    reconstruction: Reconstruction
+    hand_eye: HandEye
+    attempts: tuple[Attempt, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BackendTrial:
+    """Reconstruction and calibration by one back end, or the error that prevented one."""
 
     account: Attempt
-    """For the files."""
-    made: Reconstruction | None = None
-    calibrated: HandEye | None = None
+    """Record for the files."""
+    reconstruction: Reconstruction | None = None
+    hand_eye: HandEye | None = None
     failure: InputError | RejectedError | None = None
-    """Why there is no calibration."""
-    before: tuple[Attempt, ...] = ()
-    after: tuple[Attempt, ...] = ()
-    """The accounts of the others, in the order in which they were made."""
-
-    @property
-    def attempts(self) -> tuple[Attempt, ...]:
-        """The accounts of all, in the order in which they were made."""
-        return (*self.before, self.account, *self.after)
-
-    @property
-    def timings_s(self) -> dict[str, float]:
-        """Seconds that the stages took, all attempts together."""
-        return timings_of(self.attempts)
-
-    @property
-    def reconstruction(self) -> Reconstruction:
-        """Of an attempt that `require_found` passed."""
-        assert self.made is not None
-        return self.made
-
-    @property
-    def hand_eye(self) -> HandEye:
-        """Of an attempt that `require_found` passed."""
-        assert self.calibrated is not None
-        return self.calibrated
-
-    @property
-    def leave_one_out(self) -> LeaveOneOut | None:
-        """The leave-one-out error; None where there were too few images, or nothing was found."""
-        return None if self.calibrated is None else self.calibrated.leave_one_out
-
-    @property
-    def leave_one_out_m(self) -> float:
-        """The leave-one-out error as one length; infinite where there is none."""
-        return float("inf") if self.leave_one_out is None else self.leave_one_out.length_m
 
     @property
     def name(self) -> str:
-        """The back end and its features."""
+        """Name of the back end, with its features."""
         features = self.account.features
         return self.account.backend + (f" with {features}" if features else "")
 
     @property
-    def title(self) -> str:
-        """The name for the beginning of a note."""
-        best = ", the best whose weights are on this machine" if BACKENDS[self.account.backend].hub_id else ""
-        return f"back end {self.name}{best}"
+    def with_error(self) -> str:
+        """Name of the back end, with the leave-one-out error."""
+        if self.hand_eye is None or self.hand_eye.leave_one_out is None:
+            return f"{self.name} (too few images to leave one out)"
+        return f"{self.name} (leave-one-out error {leave_one_out_text(self.hand_eye.leave_one_out)})"
 
     @property
-    def with_error(self) -> str:
-        """The name with the leave-one-out error."""
-        if self.leave_one_out is None:
-            return f"{self.name} (too few images to leave one out)"
-        return f"{self.name} (leave-one-out error {leave_one_out_text(self.leave_one_out)})"
+    def rejection(self) -> Finding | None:
+        """Strongest finding that rejects the calibration; None of one that is sound, or was not made."""
+        if self.hand_eye is None or self.hand_eye.is_sound:
+            return None
+        return next(finding for finding in self.hand_eye.findings if finding.severity == "rejects")
 
-    def noted(self, note: str) -> "Tried":
-        """The same with one more note."""
-        made = self.reconstruction
-        return replace(self, made=replace(made, notes=(note, *made.notes)))
-
-    def kept_after(self, other: "Tried", why_not: str | None = None) -> "Tried":
-        """This one kept, which was tried after another; `why_not` is why that is not, where it did not fail."""
-        return replace(self, before=(*other.before, other.rejected_attempts(why_not), *other.after))
-
-    def kept_before(self, other: "Tried", why_not: str | None = None) -> "Tried":
-        """This one kept, which was tried before another; `why_not` is why that is not, where it did not fail."""
-        return replace(self, after=(*self.after, other.rejected_attempts(why_not)))
-
-    def rejected_attempts(self, why_not: str | None) -> Attempt:
-        """The account of one that is not kept; what failed has its own reason."""
-        return self.account if why_not is None else replace(self.account, why_not=why_not)
-
-    def require_found(self, of_images: tuple[Finding, ...]) -> "Tried":
-        """Itself, with what the images alone say of the capture; raises InputError or NothingFoundError where there is
-        nothing to keep."""
-        if isinstance(self.failure, InputError):
-            raise self.failure
-        if self.failure is not None:
-            raise NothingFoundError(self.failure, self.attempts, as_causes(of_images))
-        found = of_images if self.hand_eye.is_sound else as_causes(of_images)
-        return replace(self, calibrated=self.hand_eye.with_findings(*found)) if found else self
+    @property
+    def why_not(self) -> str:
+        """Reason why the attempt is not kept, in words."""
+        return f"failed ({self.failure})" if self.hand_eye is None else f"is rejected ({self.hand_eye.doubt})"
 
 
-HELPS: tuple[Concerns, ...] = ("reconstruction", "images")
-"""What another reconstruction of the same images may help against: one that is wrong, or of too few of them."""
+def rank(trial: BackendTrial) -> tuple[bool, bool, float]:
+    """Return the key by which calibrations are compared: accepted, explained, minus the leave-one-out error (m).
 
-
-def rejection(tried: Tried) -> Finding | None:
-    """The strongest finding that rejects a calibration; None of one that is sound, or was not made."""
-    if tried.calibrated is None or tried.calibrated.is_sound:
-        return None
-    return next(finding for finding in tried.calibrated.findings if finding.severity == "rejects")
-
-
-def needs_another(tried: Tried) -> bool:
-    """Whether another back end is tried: this one failed, or is rejected for what another may not have.
-
-    What was found about camera, robot, mount or motion holds for every reconstruction of the same images.
+    A rejection is explained where a cause rejects it that holds for every reconstruction of the same images.
     """
-    if tried.calibrated is None:
+    assert trial.hand_eye is not None
+    rejection, error = trial.rejection, trial.hand_eye.leave_one_out
+    is_explained = rejection is not None and is_lasting(rejection)
+    return rejection is None, is_explained, -float("inf") if error is None else -error.length_m
+
+
+def needs_another(trial: BackendTrial) -> bool:
+    """Test whether a back end failed, or is rejected for a reason that another back end may not have.
+
+    Findings about camera, robot, mount or motion hold for every reconstruction of the same images.
+    """
+    if trial.hand_eye is None:
         return True
-    rejected = rejection(tried)
-    return rejected is not None and not is_lasting(rejected) and rejected.concerns in HELPS
+    rejection = trial.rejection
+    return rejection is not None and not is_lasting(rejection) and rejection.concerns in HELPS
 
 
-TEXTURED = 50
-"""Observations per image of the capture. SIFT finds 600 to 850 in simulated tabletops of 640x480, 220 in those of half
-the size, and 90 where all are blurred by 9 px."""
-
-
-def is_textured(tried: Tried, images: int) -> bool:
-    """Whether SIFT found features in plenty in that number of images, so that a rejection is not for lack of them.
+def is_textured(trial: BackendTrial, images: int) -> bool:
+    """Test whether SIFT found plenty of features in that number of images, so that their lack rejects nothing.
 
     Learned features find as many on plain surfaces.
     """
-    if tried.account.backend != "colmap" or tried.account.features not in (None, "sift"):
+    if trial.account.backend != "colmap" or trial.account.features not in (None, "sift"):
         return False
-    if tried.made is None:
-        return isinstance(tried.failure, RejectedError) and tried.failure.despite_texture
-    return len(tried.made.tracks.image) >= TEXTURED * images
-
-
-NEARLY_ALL = 0.9
-"""Share of the capture's images."""
-
-
-def is_well_seen(tried: Tried, images: int) -> bool:
-    """Whether SIFT found features in plenty and registered nearly all of that number of images, so that a rejection is
-    not for lack of either: other features show the same scene to the same robot, for three times the seconds."""
-    return (
-        is_textured(tried, images)
-        and tried.made is not None
-        and len(tried.made.image_index) >= NEARLY_ALL * images
-    )
+    if trial.reconstruction is None:
+        return isinstance(trial.failure, RejectedError) and trial.failure.despite_texture
+    return len(trial.reconstruction.tracks.image) >= TEXTURED * images
 
 
 def choose(
@@ -196,82 +137,130 @@ def choose(
     progress: Progress | None = None,
     chosen: Callable[[Reconstruction], None] = lambda reconstruction: None,
     depth_options: DepthOptions | None = None,
-) -> Tried:
-    """The capture reconstructed and calibrated; where `auto` had a choice, the notes say what it chose and why.
+) -> Selection:
+    """Reconstruct and calibrate a capture by the back ends of `reconstruct.tries`, and keep the one of highest rank.
 
-    `auto` runs the best back end whose weights are on this machine, and the next attempt of `backends.tries` as long
-    as one `needs_another`; where SIFT finds features in plenty, none that does not test the camera as these do, for
-    what they reject it would accept unseen, and where these register nearly all images no other features. Of two
-    results an accepted one is kept, else the one with the smaller leave-one-out error. `chosen` gets the
-    reconstruction as soon as it is sure that the run keeps it. `depth_options` are for a known length. Raises
+    Another is tried as long as the best one `needs_another`; a note says which was kept and why. `chosen` gets the
+    reconstruction as soon as it is certain that the run keeps it. `depth_options` are for a known length. Raises
     InputError as the back end does, and where gripper poses and joint angles contradict each other; NothingFoundError
     where no back end gave anything.
     """
     robot_errors(capture, calibrate_options)  # refuses before the images cost time
-    depth_options = depth_options or DepthOptions()
-    first, *others = tries(options)
-    if not others:
-        kept = _tried(capture, first, calibrate_options, depth_options, progress, chosen)
-        return kept.require_found(_of_images(capture, kept))
-    kept = _tried(capture, first, calibrate_options, depth_options, progress)
-    if isinstance(kept.failure, InputError) and options.weights is not None:
-        raise kept.failure
-    if not needs_another(kept) and BACKENDS[kept.account.backend].hub_id:
-        kept = kept.noted(kept.title)
-    of_images = _of_images(capture, kept)
-    # A camera at rest shows every back end the same one view.
-    untried = [] if any(one.severity == "rejects" for one in of_images) else others
-    textured, seen = is_textured(kept, len(capture)), is_well_seen(kept, len(capture))
-    for one in untried:
-        if not needs_another(kept):
-            kept = _alone(kept)
-            break
-        if seen and one.backend == "colmap":
-            kept = kept.noted(
-                f"no features but SIFT's were tried: there are plenty, and they register "
-                f"{len(kept.reconstruction.image_index)} of {len(capture)} images"
-            )
-            continue
-        if textured and not BACKENDS[one.backend].tests_camera:
-            kept = _not_overruled(kept, one.backend)
-            break
-        tried = _tried(capture, one, calibrate_options, depth_options, progress)
-        textured = textured or is_textured(tried, len(capture))
-        seen = seen or is_well_seen(tried, len(capture))
-        kept = _better(kept, tried)
-    kept = kept.require_found(of_images)
-    chosen(kept.reconstruction)
-    return kept
+    stages = (calibrate_options, depth_options or DepthOptions(), progress)
+    plan = tries(options)
+    trials, notes = list[BackendTrial](), list[str]()
+    of_images: tuple[Finding, ...] | None = None
+    for one in plan:
+        if trials:
+            of_images = _of_images(capture, trials[-1]) if of_images is None else of_images
+            reason, goes_on = _why_untried(one, trials, len(capture), of_images)
+            if reason is not None:
+                notes += filter(None, [reason])
+                if goes_on:
+                    continue
+                break
+        trial = _try(capture, one, stages, chosen if len(plan) == 1 else None)
+        is_own = not BACKENDS[one.backend].hub_id or options.weights is not None
+        if isinstance(trial.failure, InputError) and is_own:
+            raise trial.failure
+        trials.append(trial)
+    selection = _select(trials, notes, of_images or _of_images(capture, trials[-1]))
+    if len(plan) > 1:
+        chosen(selection.reconstruction)
+    return selection
 
 
-def _of_images(capture: Capture, tried: Tried) -> tuple[Finding, ...]:
-    """What the images alone say of a capture that failed, is not accepted as it is, or has images without a use."""
-    if isinstance(tried.failure, InputError):
+def _why_untried(
+    options: ReconstructOptions,
+    trials: Sequence[BackendTrial],
+    images: int,
+    of_images: tuple[Finding, ...],
+) -> tuple[str | None, bool]:
+    """Return why a back end is not tried after others, None where it is; and whether the next one may be.
+
+    A camera at rest shows every back end the same view. Where SIFT registers nearly all images, other features show
+    the same scene to the same robot. Where SIFT finds plenty of features, a back end that does not test the camera as
+    features do would accept unseen what these reject.
+    """
+    best = max((one for one in trials if one.hand_eye is not None), key=rank, default=trials[-1])
+    if not needs_another(best):
+        rejection = best.rejection
+        no_help = "no other back end was tried, for none can help: "
+        return "" if rejection is None else no_help + text(rejection), False
+    if any(one.severity == "rejects" for one in of_images):
+        return "", False
+    textured = [one for one in trials if is_textured(one, images)]
+    if options.backend == "colmap":
+        seen = [0 if one.reconstruction is None else len(one.reconstruction.image_index) for one in textured]
+        if max(seen, default=0) >= NEARLY_ALL * images:
+            plenty = "no features but SIFT's were tried: there are plenty, and they register"
+            return f"{plenty} {max(seen)} of {images} images", True
+    if textured and not BACKENDS[options.backend].tests_camera:
+        reason = (
+            "it is for scenes without features, which these images have in plenty, and does not test the camera as they "
+            "do"
+        )
+        return f"{options.backend} was not tried: {reason}", False
+    return None, True
+
+
+def _select(trials: Sequence[BackendTrial], notes: list[str], of_images: tuple[Finding, ...]) -> Selection:
+    """Return the trial of highest rank with the notes, and with the findings of the images alone.
+
+    Raises InputError or NothingFoundError where there is none.
+    """
+    kept = max((one for one in trials if one.hand_eye is not None), key=rank, default=None)
+    if kept is None:
+        *earlier, last = trials
+        if isinstance(last.failure, InputError) and not earlier:
+            raise last.failure
+        failure = (
+            last.failure if isinstance(last.failure, RejectedError) else RejectedError(str(last.failure))
+        )
+        # The licence of weights that were used belongs to this answer, too.
+        also = [*notes, *(f"back end {one.name} {one.why_not}" for one in earlier)]
+        raise NothingFoundError(
+            failure.with_more(*also), tuple(one.account for one in trials), as_causes(of_images)
+        )
+    assert kept.hand_eye is not None and kept.reconstruction is not None
+    others = [one for one in trials if one is not kept]
+    if others:
+        notes.insert(0, _why_kept(kept, others))
+    hand_eye = kept.hand_eye
+    found = of_images if hand_eye.is_sound else as_causes(of_images)
+    return Selection(
+        reconstruction=replace(kept.reconstruction, notes=(*notes, *kept.reconstruction.notes)),
+        hand_eye=hand_eye.with_findings(*found) if found else hand_eye,
+        attempts=tuple(
+            one.account
+            if one is kept or one.hand_eye is None
+            else replace(one.account, why_not=f"rejected: {one.hand_eye.doubt}")
+            for one in trials
+        ),
+    )
+
+
+def _why_kept(kept: BackendTrial, others: Sequence[BackendTrial]) -> str:
+    """Return why one back end is kept and not the others, in words."""
+    parts = [f"{one.name if one.hand_eye is None else one.with_error} {one.why_not}" for one in others]
+    accepted, explained, _ = rank(kept)
+    if accepted or not any(one.hand_eye is not None for one in others):
+        how = f"{kept.with_error} was used"
+    elif explained:
+        how = f"{kept.with_error} is rejected, too, and was used: it shows the cause"
+    else:
+        how = f"{kept.with_error} is rejected, too, and was used: its leave-one-out error is the smaller one"
+    return f"back end {'; '.join([*parts, how])}"
+
+
+def _of_images(capture: Capture, trial: BackendTrial) -> tuple[Finding, ...]:
+    """Return the findings of the images alone where a calibration failed, is not accepted, or leaves images out."""
+    if isinstance(trial.failure, InputError):
         return ()
-    found = tried.calibrated
+    found = trial.hand_eye
     if found is not None and found.verdict == "accepted" and found.inliers.sum() == len(capture):
         return ()
     return view_findings(capture)
-
-
-def _alone(kept: Tried) -> Tried:
-    """With why no other back end was tried, where a rejected one is kept."""
-    rejected = rejection(kept)
-    if rejected is None:
-        return kept
-    return kept.noted(f"no other back end was tried, for none can help: {text(rejected)}")
-
-
-def _not_overruled(kept: Tried, backend: str) -> Tried:
-    """With why a back end that tests less was not tried."""
-    note = (
-        f"{backend} was not tried: it is for scenes without features, which these images have in plenty, and does not "
-        "test the camera as they do"
-    )
-    if kept.calibrated is not None:
-        return kept.noted(note)
-    assert isinstance(kept.failure, RejectedError)
-    return replace(kept, failure=kept.failure.with_more(note))
 
 
 def again(
@@ -281,142 +270,93 @@ def again(
     options: CalibrateOptions,
     progress: Progress | None = None,
     depth_options: DepthOptions | None = None,
-) -> Tried:
-    """A reconstruction that was chosen before, and read in `read_s` seconds, calibrated again; raises as `choose`."""
-    tried = _reconstructed(reconstruction, read_s, None)
-    surfaces = _with_surface(capture, tried, options, depth_options or DepthOptions(), progress)
-    kept = _calibrated(capture, surfaces, options, progress)
-    return kept.require_found(_of_images(capture, kept))
+) -> Selection:
+    """Calibrate again a reconstruction that was chosen before, and read in `read_s` seconds; raise as `choose`."""
+    trial = _reconstructed(reconstruction, read_s, None)
+    trial = _calibrated(capture, trial, (options, depth_options or DepthOptions(), progress))
+    return _select([trial], [], _of_images(capture, trial))
 
 
-def timings_of(attempts: tuple[Attempt, ...]) -> dict[str, float]:
-    """Seconds that the stages took, all attempts together."""
+def timings_of(attempts: Sequence[Attempt]) -> dict[str, float]:
+    """Return the seconds that the stages took, all attempts together."""
     return {
         "reconstruct": round(sum(attempt.reconstruct_s for attempt in attempts), 3),
         "calibrate": round(sum(attempt.calibrate_s for attempt in attempts), 3),
     }
 
 
-def _tried(
+Stages = tuple[CalibrateOptions, DepthOptions, Progress | None]
+
+
+def _try(
     capture: Capture,
     options: ReconstructOptions,
-    calibrate_options: CalibrateOptions,
-    depth_options: DepthOptions,
-    progress: Progress | None,
-    reconstructed: Callable[[Reconstruction], None] = lambda reconstruction: None,
-) -> Tried:
-    """One back end's reconstruction, and what `calibrate` makes of it."""
+    stages: Stages,
+    reconstructed: Callable[[Reconstruction], None] | None,
+) -> BackendTrial:
+    """Reconstruct by one back end and calibrate; `reconstructed` gets the reconstruction before it is calibrated."""
     start = time.perf_counter()
     features = None if options.features == "auto" else options.features
     try:
-        reconstruction = reconstruct(capture, options, progress)
+        reconstruction = reconstruct(capture, options, stages[2])
     except (InputError, RejectedError) as error:
-        seconds = round(time.perf_counter() - start, 3)
         account = Attempt(
             backend=options.backend,
             images_registered=None,
-            reconstruct_s=seconds,
+            reconstruct_s=round(time.perf_counter() - start, 3),
             calibrate_s=0.0,
             why_not=str(error),
             features=features,
         )
-        return Tried(account=account, failure=error.with_traceback(None))
-    tried = _reconstructed(reconstruction, time.perf_counter() - start, features, options.backend)
+        return BackendTrial(account=account, failure=error.with_traceback(None))
+    trial = _reconstructed(reconstruction, time.perf_counter() - start, features, options.backend)
     give_back()  # what the back end worked with
-    tried = _with_surface(capture, tried, calibrate_options, depth_options, progress)
-    reconstructed(tried.reconstruction)
-    return _calibrated(capture, tried, calibrate_options, progress)
+    return _calibrated(capture, trial, stages, reconstructed)
 
 
 def _reconstructed(
     reconstruction: Reconstruction, seconds: float, features: str | None, backend: str | None = None
-) -> Tried:
-    count = len(reconstruction.image_index)
+) -> BackendTrial:
+    """Return the trial of a reconstruction that is not calibrated yet."""
     account = Attempt(
         backend=backend or reconstruction.backend,
-        images_registered=count,
+        images_registered=len(reconstruction.image_index),
         reconstruct_s=round(seconds, 3),
         calibrate_s=0.0,
         why_not=None,
         features=features,
     )
-    return Tried(account=account, made=reconstruction)
-
-
-def _with_surface(
-    capture: Capture,
-    tried: Tried,
-    options: CalibrateOptions,
-    depth_options: DepthOptions,
-    progress: Progress | None,
-) -> Tried:
-    """The attempt as the calibration can take it: a known length ends on surfaces, so here densify comes before it.
-
-    It may, for it uses cameras and tracks alone; everywhere else it follows the calibration, of the attempt that is
-    kept.
-    """
-    if options.known_length is None:
-        return tried
-    start = time.perf_counter()
-    made = densify(capture, tried.reconstruction, depth_options, progress)
-    seconds = tried.account.reconstruct_s + time.perf_counter() - start
-    return replace(tried, made=made, account=replace(tried.account, reconstruct_s=round(seconds, 3)))
+    return BackendTrial(account=account, reconstruction=reconstruction)
 
 
 def _calibrated(
-    capture: Capture, tried: Tried, options: CalibrateOptions, progress: Progress | None
-) -> Tried:
-    """Input that calibration cannot use, no other back end fixes: its InputError is the caller's."""
-    report = progress or silent
-    report("calibrate", 0.0)
+    capture: Capture,
+    trial: BackendTrial,
+    stages: Stages,
+    reconstructed: Callable[[Reconstruction], None] | None = None,
+) -> BackendTrial:
+    """Return the trial with its calibration; InputError of the calibration no other back end avoids.
+
+    A known length ends on surfaces: with one, dense depth comes first, from cameras and tracks alone.
+    """
+    options, depth_options, progress = stages
+    report, reconstruction, account = progress or silent, trial.reconstruction, trial.account
+    assert reconstruction is not None
     start = time.perf_counter()
-
-    def account(why_not: str | None) -> Attempt:
-        seconds = round(time.perf_counter() - start, 3)
-        return replace(tried.account, calibrate_s=seconds, why_not=why_not)
-
+    if options.known_length is not None:
+        reconstruction = densify(capture, reconstruction, depth_options, progress)
+        seconds = round(account.reconstruct_s + time.perf_counter() - start, 3)
+        account = replace(account, reconstruct_s=seconds)
+    if reconstructed is not None:
+        reconstructed(reconstruction)
+    report("calibrate", 0.0)
+    start, failure, hand_eye = time.perf_counter(), None, None
     try:
-        hand_eye = calibrate(capture, tried.reconstruction, options)
+        hand_eye = calibrate(capture, reconstruction, options)
     except RejectedError as error:
-        return replace(tried, account=account(str(error)), failure=error.with_traceback(None))
-    calibrated = replace(tried, account=account(None), calibrated=hand_eye)
+        failure = error.with_traceback(None)
+    seconds = round(time.perf_counter() - start, 3)
+    account = replace(account, calibrate_s=seconds, why_not=None if failure is None else str(failure))
     give_back()
     report("calibrate", 1.0)
-    return calibrated
-
-
-def _is_explained(tried: Tried) -> bool:
-    """Whether what rejects it is a cause, which holds for every reconstruction of the same images."""
-    rejected = rejection(tried)
-    return rejected is not None and is_lasting(rejected)
-
-
-def _better(one: Tried, other: Tried) -> Tried:
-    """Which of two is kept, noting why; `one` is known to be doubtful, and was tried first."""
-    if isinstance(other.failure, InputError) and not BACKENDS[other.account.backend].hub_id:
-        raise other.failure
-    about = one.title + "," * ("," in one.title)
-    if one.calibrated is None:
-        nothing = f"{about} failed ({one.failure})"
-        if other.calibrated is None:
-            # The licence of weights that were used belongs to this answer, too.
-            why = other.failure
-            failure = why if isinstance(why, RejectedError) else RejectedError(str(why))
-            return replace(other, failure=failure.with_more(nothing)).kept_after(one)
-        return other.noted(f"{nothing}; {other.with_error} was used instead").kept_after(one)
-    untrusted = f"rejected: {one.hand_eye.doubt}"
-    doubt = f"{about} is rejected ({one.hand_eye.doubt})"
-    if other.calibrated is None:
-        return one.noted(f"{doubt}, and {other.name} failed ({other.failure})").kept_before(other)
-    if other.hand_eye.is_sound:
-        note = f"{doubt}; {other.with_error} is {other.hand_eye.verdict}, and was used instead of {one.with_error}"
-        return other.noted(note).kept_after(one, untrusted)
-    farther = "rejected, and its leave-one-out error is the larger one: "
-    note = f"{doubt}, and so is {other.name}; "
-    if _is_explained(other) and not _is_explained(one):
-        return other.noted(f"{note}{other.name} shows why").kept_after(one, untrusted)
-    if other.leave_one_out_m < one.leave_one_out_m:
-        note += f"{other.with_error} was used and not {one.with_error}"
-        return other.noted(note).kept_after(one, farther + one.with_error)
-    note += f"{one.with_error} was used and not {other.with_error}"
-    return one.noted(note).kept_before(other, farther + other.with_error)
+    return BackendTrial(account=account, reconstruction=reconstruction, hand_eye=hand_eye, failure=failure)

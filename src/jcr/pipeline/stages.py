@@ -14,7 +14,7 @@ from jcr.cell.carried import carried_scene, refined
 from jcr.cell.placement import CamerasFile
 from jcr.depth.densify import densify
 from jcr.findings import sentence
-from jcr.pipeline.selection import NothingFoundError, Tried, again, choose, timings_of
+from jcr.pipeline.selection import NothingFoundError, Selection, again, choose, timings_of
 from jcr.progress import Progress
 from jcr.records import Attempt, Capture, CellCamera
 from jcr.results import RunOptions, RunResult
@@ -32,18 +32,20 @@ def calibrated(capture: Capture, folder: RunFolder, options: RunOptions, progres
     # The arm's kinematics are those of the reported poses, and not of their inverses.
     own = replace(options, calibrate=replace(options.calibrate, robot=None)) if watches else options
     try:
-        tried, attempts = _reused(seen, folder, own, state, progress) or _chosen(
+        selected, attempts = _reused(seen, folder, own, state, progress) or _chosen(
             seen, folder, own, state, progress
         )
     except NothingFoundError as error:
         raise _failed(capture, folder, options, state, error) from None
     state = state.model_copy(update={"attempts": attempts})
     folder.keep_state(state)
-    folder.keep_depth(tried.reconstruction, state)
-    hand_eye = tried.hand_eye
+    folder.keep_depth(selected.reconstruction, state)
+    hand_eye = selected.hand_eye
     if watches:
-        hand_eye = refined(capture, tried.reconstruction, hand_eye, options.calibrate)
-    content = calibration_of(capture, tried.reconstruction, hand_eye, tried.timings_s, __version__, attempts)
+        hand_eye = refined(capture, selected.reconstruction, hand_eye, options.calibrate)
+    content = calibration_of(
+        capture, selected.reconstruction, hand_eye, timings_of(selected.attempts), __version__, attempts
+    )
     if content.verdict == "rejected" or content.short is not None:
         board = proposed_for(capture, options.reconstruct.board)
         content = content if board is None else content.with_findings(board)
@@ -53,7 +55,7 @@ def calibrated(capture: Capture, folder: RunFolder, options: RunOptions, progres
         capture=capture,
         calibration=content,
         hand_eye=hand_eye,
-        reconstruction=tried.reconstruction,
+        reconstruction=selected.reconstruction,
     )
 
 
@@ -134,7 +136,7 @@ def reported(result: RunResult, folder: RunFolder, options: RunOptions, progress
 
 def _reused(
     capture: Capture, folder: RunFolder, options: RunOptions, state: State, progress: Progress
-) -> tuple[Tried, tuple[Attempt, ...]] | None:
+) -> tuple[Selection, tuple[Attempt, ...]] | None:
     """What an earlier run, or `jcr capture`, chose from the same input, calibrated, and how it was chosen; None where it
     is to be made."""
     start = time.perf_counter()
@@ -143,7 +145,7 @@ def _reused(
         return None
     reconstruction, earlier = reused
     read_s = time.perf_counter() - start
-    tried = again(
+    selected = again(
         capture,
         reconstruction,
         read_s,
@@ -151,14 +153,14 @@ def _reused(
         progress,
         options.depth,
     )
-    return tried, earlier.attempts or tried.attempts
+    return selected, earlier.attempts or selected.attempts
 
 
 def _chosen(
     capture: Capture, folder: RunFolder, options: RunOptions, state: State, progress: Progress
-) -> tuple[Tried, tuple[Attempt, ...]]:
+) -> tuple[Selection, tuple[Attempt, ...]]:
     """What is chosen now, and how; its reconstruction is kept as soon as it is sure."""
-    tried = choose(
+    selected = choose(
         capture,
         options.reconstruct,
         options.calibrate,
@@ -166,7 +168,7 @@ def _chosen(
         lambda made: folder.keep_reconstruction(made, state),
         options.depth,
     )
-    return tried, tried.attempts
+    return selected, selected.attempts
 
 
 def _failed(
