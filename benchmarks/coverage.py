@@ -15,19 +15,20 @@ from numpy import ndarray
 
 from benchmarks.page import table
 from benchmarks.peers import opencv
-from jcr.calibration.adjust import adjusted, estimate_of
+from jcr.calibration.adjust import adjusted
 from jcr.calibration.case import of_images
-from jcr.calibration.expected import assumed_of, expected
 from jcr.calibration.fit import fitted
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.requirement import assumptions_of, reached
 from jcr.calibration.robot_errors import robot_errors
-from jcr.calibration.seen import seen_uncertainty, within_95
 from jcr.calibration.stage import calibrate
 from jcr.camera import parameters, unproject, with_parameters
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.estimation.intrinsics_prior import ESTIMATED, Camera, camera_with_prior
-from jcr.estimation.wrist import adjust_wrist
+from jcr.estimation.point_uncertainty import point_covariance, within_95
+from jcr.estimation.prediction import predict
+from jcr.estimation.wrist import adjust_wrist, estimate_of
 from jcr.geometry import apply, step_between
 from jcr.pipeline.check import spread_rows
 from jcr.records import Capture, Estimate, HandEye, Intrinsics, Reconstruction
@@ -242,7 +243,7 @@ def _point_errors(
         estimate.gripper_from_camera, estimate.intrinsics, DISTANCE_M * estimate.scale / problem.scale
     )
     off = placed(problem.gripper_from_camera, camera, DISTANCE_M) - found
-    stated = seen_uncertainty(estimate, estimate.intrinsics, x_px, DISTANCE_M)
+    stated = point_covariance(estimate, estimate.intrinsics, x_px, DISTANCE_M)
     return off @ estimate.gripper_from_camera[:3, :3], stated
 
 
@@ -267,13 +268,12 @@ def _ratios(draws: int) -> Iterator[list[float]]:
         hand_eye = calibrate(capture, reconstruction, options)
         if not (hand_eye.converged and case.hand_eye.converged) or hand_eye.in_use is None:
             continue
-        ahead = expected(assumed_of(case), capture.base_from_gripper, robot.systematic)
-        reported = (
-            hand_eye.in_use.seen.within_95_mm,
-            1e3 * within_95(hand_eye.covariance[:3, :3]),
-            float(np.degrees(within_95(hand_eye.covariance[3:6, 3:6]))),
+        prediction = predict(assumptions_of(case), capture.base_from_gripper, robot.systematic)
+        foretold, reported = (
+            (reached(one.estimate, one.in_use, "seen")[0], *reached(one.estimate, one.in_use, "camera"))
+            for one in (prediction, hand_eye)
         )
-        yield np.divide((ahead.reached("seen")[0], *ahead.reached("camera")), reported).tolist()
+        yield np.divide(foretold, reported).tolist()
 
 
 def _made(seed: int) -> tuple[Capture, Reconstruction]:

@@ -28,10 +28,10 @@ from benchmarks.references import (
     placed_covariance,
     reference,
 )
-from jcr.calibration.seen import joint_covariance, seen_uncertainty, within_95
 from jcr.camera import parameters, project, unproject, with_parameters
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, RejectedError
+from jcr.estimation.point_uncertainty import joint_covariance, point_covariance, within_95
 from jcr.geometry import (
     inverse,
     nearest_to_lines,
@@ -125,7 +125,7 @@ def _pixels(camera: Intrinsics) -> Float[ndarray, "9 2"]:
 def _stated(found: HandEye, camera: Intrinsics, distance_m: float) -> Float[ndarray, "9 3 3"]:
     """Return the stated covariances of the points in gripper axes."""
     turn = found.gripper_from_camera[:3, :3]
-    return turn @ seen_uncertainty(found.estimate, camera, _pixels(camera), distance_m) @ turn.T
+    return turn @ point_covariance(found.estimate, camera, _pixels(camera), distance_m) @ turn.T
 
 
 def _apart(found: HandEye, other: HandEye | Reference) -> Apart | None:

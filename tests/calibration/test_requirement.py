@@ -6,19 +6,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jcr.calibration.expected import assumed_of_poses
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_poses
 from jcr.calibration.record import Calibration, calibration_of, write_calibration
-from jcr.calibration.requirement import GRASPING, advised
+from jcr.calibration.requirement import GRASPING, advised, assumptions_of_poses
 from jcr.calibration.robot_errors import errors_of
-from jcr.calibration.seen import within_95
 from jcr.calibration.words import summary
 from jcr.capture.read import read_capture
 from jcr.cli import dispatch
 from jcr.cli.output import VerboseOutput
 from jcr.cli.result import show, show_calibration
 from jcr.errors import InputError
+from jcr.estimation.point_uncertainty import within_95
 from jcr.findings import Finding, FindingKind, sentence
 from jcr.geometry import inverse, scale_translation, step_between
 from jcr.pipeline import run, stages
@@ -147,7 +146,7 @@ def test_a_scale_that_was_known_is_not_promised_again():
     asked = CalibrateOptions(next_poses=2)
     known = calibrate_poses(given, asked)
     gripper = given.base_from_gripper
-    assumptions = assumed_of_poses(known, gripper)
+    assumptions = assumptions_of_poses(known, gripper)
     free = advised(known, gripper, asked, errors_of(gripper), assumptions)
     first, other = (found.next_poses[0].expected_std for found in (known, free))
     assert 1.02 * other[6] < first[6] and first[6] > 0.95 * np.sqrt(known.covariance[6, 6])

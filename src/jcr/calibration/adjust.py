@@ -19,7 +19,7 @@ from jcr.estimation.projection import view_of
 from jcr.estimation.residuals import paper_residuals
 from jcr.estimation.score_test import focal_lengths
 from jcr.estimation.solve import START_NOISE, Solution
-from jcr.estimation.wrist import adjust_wrist, recon_frame, wrist_arm
+from jcr.estimation.wrist import adjust_wrist, estimate_of, wrist_arm
 from jcr.geometry import inverse, retract, scale_translation, step_between
 from jcr.records import (
     Estimate,
@@ -29,7 +29,6 @@ from jcr.records import (
     LeaveOneOut,
     PaperResiduals,
     RobotExamined,
-    Tracks,
 )
 
 
@@ -96,26 +95,6 @@ def _start_noise(fit: HandEye) -> tuple[float, float]:
 def focal_of_each(case: Case) -> Float[ndarray, "e p"]:
     """The combinations that give every used image a focal length of its own."""
     return focal_lengths(case.reconstruction.intrinsics, len(case.used))
-
-
-def estimate_of(found: Solution, tracks: Tracks) -> Estimate:
-    """What an adjustment came to, in the reconstruction whose tracks were adjusted."""
-    return estimate_in(found, *recon_frame(found, tracks))
-
-
-def estimate_in(found: Solution, scale: float, base_from_recon: Float[ndarray, "4 4"]) -> Estimate:
-    """The same in a reconstruction that is scaled and placed like this."""
-    return Estimate(
-        gripper_from_camera=found.state.x[0],
-        scale=scale,
-        base_from_recon=base_from_recon,
-        covariance=found.covariance[:7, :7],
-        budget=found.budget,
-        intrinsics=found.problem.intrinsics(found.state)[0],
-        intrinsics_covariance=found.intrinsics_covariance(0),
-        intrinsics_cross=found.intrinsics_cross(0),
-        model_error=found.model_error(),
-    )
 
 
 def with_decentring(estimate: Estimate, camera: Intrinsics) -> Estimate:

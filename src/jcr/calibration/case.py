@@ -10,7 +10,6 @@ from numpy import ndarray
 
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import RobotErrors, of_poses
-from jcr.calibration.seen import Scene, scene_uncertainty
 from jcr.estimation.intrinsics_prior import (
     ESTIMATED,
     MEASURED,
@@ -19,11 +18,11 @@ from jcr.estimation.intrinsics_prior import (
     camera_about,
     camera_with_prior,
 )
-from jcr.estimation.points import points_in_base
+from jcr.estimation.point_uncertainty import scene_points, scene_uncertainty
 from jcr.estimation.problem import LinearPrior
 from jcr.estimation.solve import Solution
 from jcr.findings import Finding
-from jcr.records import Capture, HandEye, Reconstruction, Tracks
+from jcr.records import Capture, HandEye, Reconstruction, SceneUncertainty, Tracks
 
 MIN_OBSERVATIONS = 200
 """Fewer correspondences than this do not refine what the poses show."""
@@ -101,11 +100,11 @@ class Case:
         return float(np.median(self.adjusted.images.view.depth)) * self.adjusted.state.scale
 
     @property
-    def scene_in_base(self) -> Scene | None:
-        """What the camera sees, and how well its points are known; None where the images were not adjusted."""
-        if self.adjusted is None or (distance := self.scene_distance_m) is None:
+    def scene_uncertainty(self) -> SceneUncertainty | None:
+        """Uncertainty of the scene in the base frame; None where the calibration is not made of images."""
+        if self.adjusted is None or self.scene_distance_m is None:
             return None
-        return Scene(distance, scene_uncertainty(points_in_base(self.adjusted)))
+        return scene_uncertainty(scene_points(self.adjusted))
 
     @property
     def is_adjustable(self) -> bool:

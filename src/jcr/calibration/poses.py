@@ -7,9 +7,8 @@ import numpy as np
 from jcr.calibration.checks.effects import effects_of_fit, with_rejected_runs
 from jcr.calibration.conventions import better_reading, convention_finding
 from jcr.calibration.cues import height_cue
-from jcr.calibration.expected import assumed_of_poses
 from jcr.calibration.options import CalibrateOptions, check_options
-from jcr.calibration.requirement import advised
+from jcr.calibration.requirement import advised, assumptions_of_poses
 from jcr.calibration.robot_errors import RobotErrors, errors_of
 from jcr.calibration.verdict import with_findings
 from jcr.errors import InputError
@@ -45,7 +44,7 @@ def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -
         hand_eye = with_findings(hand_eye, effects_of_fit(problem, state, hand_eye, pairs.images))
     is_known = options.scale is not None or (pairs.is_metric and is_one(hand_eye))
     gripper = pairs.base_from_gripper
-    assumptions = assumed_of_poses(hand_eye, gripper[hand_eye.inliers], SCALE_STD if is_known else None)
+    assumptions = assumptions_of_poses(hand_eye, gripper[hand_eye.inliers], SCALE_STD if is_known else None)
     return advised(hand_eye, gripper, options, robot, assumptions)
 
 

@@ -24,10 +24,10 @@ from jcr.arrays_json import (
     Square,
 )
 from jcr.calibration.findings_json import FindingJson, derived, require_one_verdict
-from jcr.calibration.seen import joint_covariance, point_in_base
 from jcr.camera import parameter_names
 from jcr.capture.plain_files import first_fault, read_json, shown
 from jcr.errors import InputError, RejectedError
+from jcr.estimation.point_uncertainty import joint_covariance, point_in_base
 from jcr.files import write_text
 from jcr.findings import (
     Finding,

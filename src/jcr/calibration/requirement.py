@@ -1,26 +1,159 @@
-"""What a calibration is needed for: how exact it must be, how exact it is, and how many more images reach that."""
+"""Required accuracy of a calibration, its accuracy in use, and the gripper poses to add until it is reached."""
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from jcr.calibration.expected import Ahead, Assumptions, typical_noise, worse_of
+from jcr.calibration.case import Case
 from jcr.calibration.options import MOST_POSES, CalibrateOptions
-from jcr.calibration.robot_errors import RobotErrors
-from jcr.calibration.seen import Scene, in_use, within_95
-from jcr.estimation.next_poses import assumed_camera
+from jcr.calibration.robot_errors import RobotErrors, of_poses
+from jcr.estimation.equation import Poses
+from jcr.estimation.next_poses import (
+    assumed_camera,
+    candidates,
+    choose,
+    median_distance,
+    nearest,
+    total_uncertainty,
+)
 from jcr.estimation.observability import excitation
+from jcr.estimation.point_uncertainty import in_use, within_95
+from jcr.estimation.prediction import (
+    Assumptions,
+    PredictedCamera,
+    Prediction,
+    predict,
+    predict_covariance,
+    typical_noise,
+)
 from jcr.findings import Concerns, Finding, FindingKind
-from jcr.records import HandEye, NextPose, Plan, Requirement, Where
+from jcr.geometry import inverse, rotation_angle
+from jcr.records import (
+    Estimate,
+    HandEye,
+    InUse,
+    NextPose,
+    Plan,
+    Requirement,
+    RobotNoise,
+    SceneUncertainty,
+    Where,
+)
 
 GRASPING = (5.0, 1.0)
-"""mm, degrees: a parallel gripper that opens 10 mm wider than its object has 5 mm to either side, and a degree moves the
-tip of a finger of 100 mm by 2 mm."""
+"""Default requirement, mm and degrees: a parallel gripper that opens 10 mm wider than its object has 5 mm to either
+side, and a degree moves the tip of a finger of 100 mm by 2 mm."""
 PROPOSED = 2
-"""Gripper poses proposed after a calibration, if that is enough."""
+"""Number of gripper poses proposed after a calibration, if these are enough."""
+COMPARED, EXISTING = 80, 40
+"""Number of candidate poses that are compared, and of poses of the capture by which they are compared."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Proposals:
+    """Poses to add to those of a capture, best first."""
+
+    assumptions: Assumptions
+    base_from_gripper: Float[ndarray, "n 4 4"]
+    robot: RobotErrors
+    """Errors of the poses of the capture."""
+    added: Float[ndarray, "c 4 4"]
+
+    @staticmethod
+    def of(
+        assumptions: Assumptions,
+        base_from_gripper: Poses,
+        robot: RobotErrors,
+        count: int,
+        reach: Float[ndarray, "2 3"] | None = None,
+        seed: int = 0,
+        is_likely: Callable[[Poses], Bool[ndarray, " k"]] | None = None,
+    ) -> "Proposals":
+        """Return the `count` poses that reduce the predicted uncertainty most.
+
+        `robot` is of the poses of the capture, `reach` is that of `candidates`, drawn with `seed`. `is_likely` tells at
+        which poses an image is likely to register; other poses are taken only where there are none of these.
+        """
+        now, x = base_from_gripper, assumptions.gripper_from_camera
+        found = Proposals(assumptions=assumptions, base_from_gripper=now, robot=robot, added=now[:0])
+        if count == 0:
+            return found
+        possible = candidates(now, x, reach, np.random.default_rng(seed))
+        if is_likely is not None and (likely := is_likely(possible)).any():
+            possible = possible[likely]
+        possible, existing = possible[:COMPARED], _spread(len(now))
+        systematic, poses = robot.with_poses(now, possible), np.concatenate([now, possible])
+
+        def uncertainty_of(rows: Int[ndarray, " c"]) -> float:
+            together = np.r_[existing, len(now) + rows]
+            errors = of_poses(systematic, together)
+            covariance = predict_covariance(assumptions, poses[together], errors, averaged=False)
+            return total_uncertainty(covariance, assumptions.distance_m * x[:3, 2])
+
+        return replace(found, added=possible[choose(count, len(possible), uncertainty_of)])
+
+    def predict(self, count: int) -> Prediction:
+        """Return the predicted result with the first `count` of the added poses."""
+        now, added = self.base_from_gripper, self.added[:count]
+        return predict(self.assumptions, np.concatenate([now, added]), self.robot.with_poses(now, added))
+
+    def next_pose(self, count: int, prediction: Prediction) -> NextPose:
+        """Return the last of the first `count` added poses with the prediction for these."""
+        pose, seen = self.added[count - 1], prediction.in_use.seen
+        like = int(nearest(pose[None], self.base_from_gripper)[0])
+        motion = inverse(self.base_from_gripper[like]) @ pose
+        return NextPose(
+            base_from_gripper=pose,
+            expected_std=prediction.std,
+            within_95_mm=seen.within_95_mm,
+            rotation_95_deg=seen.rotation_95_deg,
+            like=like,
+            moved_m=float(np.linalg.norm(motion[:3, 3])),
+            rotation_rad=float(rotation_angle(motion[:3, :3])),
+        )
+
+    def next_poses(self, count: int) -> list[NextPose]:
+        """Return the first `count` added poses, each with the prediction for all up to it."""
+        return [self.next_pose(k, self.predict(k)) for k in range(1, count + 1)]
+
+
+def assumptions_of(case: Case) -> Assumptions:
+    """Return the assumption that further images and gripper poses are like those of an accepted calibration."""
+    used, metric_std = case.base_from_gripper[case.used], case.reconstruction.metric_std
+    assumptions = assumptions_of_poses(case.hand_eye, used, metric_std)
+    if case.adjusted is None or (distance := case.scene_distance_m) is None:
+        return assumptions
+    return replace(assumptions, distance_m=distance, camera=PredictedCamera.of(case.adjusted))
+
+
+def assumptions_of_poses(
+    hand_eye: HandEye, used: Float[ndarray, "n 4 4"], scale_std: float | None = None
+) -> Assumptions:
+    """Return the same assumption for a calibration from given camera poses; `used` are its gripper poses."""
+    return Assumptions(
+        gripper_from_camera=hand_eye.gripper_from_camera,
+        distance_m=median_distance(used @ hand_eye.gripper_from_camera),
+        noise=hand_eye.robot_noise,
+        scale_std=scale_std,
+    )
+
+
+def reached(estimate: Estimate, found: InUse, at: Where) -> tuple[float, float]:
+    """Return the bounds (mm, degrees) of 95 % of the errors at one place; without a scene at a seen point."""
+    translation, rotation = slice(0, 3), slice(3, 6)
+    if at == "camera":
+        covariance = estimate.covariance
+        metres = within_95(covariance[translation, translation])
+    elif at == "scene" and found.scene is not None:
+        covariance = found.scene.covariance
+        metres = found.scene.within_95_m
+    else:
+        return found.seen.within_95_mm, found.seen.rotation_95_deg
+    return 1e3 * metres, float(np.degrees(within_95(covariance[rotation, rotation])))
 
 
 def advised(
@@ -29,18 +162,18 @@ def advised(
     options: CalibrateOptions,
     robot: RobotErrors,
     assumptions: Assumptions,
-    scene: Scene | None = None,
+    scene: SceneUncertainty | None = None,
 ) -> HandEye:
     """Return the calibration with its excitation, its accuracy in use, the requirement, and the poses to add.
 
     Poses are proposed where the requirement is not met or the user asks: the prediction takes a third of a calibration.
     `gripper` are the poses that the solver was given, in its order, `robot` is of these; `assumptions` are those of the
-    calibration, `scene` is what the camera sees, where images were adjusted.
+    calibration, `scene` is the uncertainty of the scene, where images were adjusted.
     """
     used, robot = gripper[hand_eye.inliers], robot.of(np.flatnonzero(hand_eye.inliers))
-    hand_eye = replace(hand_eye, in_use=in_use(hand_eye.estimate, scene or Scene(assumptions.distance_m)))
+    hand_eye = replace(hand_eye, in_use=in_use(hand_eye.estimate, assumptions.distance_m, scene))
     required = _required(hand_eye, options)
-    # Wrong intrinsics and a bent robot stay what they are with further images.
+    # Wrong intrinsics and a strained robot stay the same with further images.
     lasting = [
         one.covariance
         for one in hand_eye.findings
@@ -52,14 +185,13 @@ def advised(
         required = replace(required, more_images=0)
     elif hand_eye.converged:
         count = options.next_poses if required.met else max(PROPOSED, options.next_poses)
-        reach, proposed = _worthwhile(hand_eye, used, required, assumptions, robot, count)
-        required = replace(required, more_images=reach)
+        more, proposed = _worthwhile(hand_eye, used, required, assumptions, robot, count)
+        required = replace(required, more_images=more)
     else:
         # A rejected X is not used, and a robot that is worse than usual is not expected to improve.
-        noise = worse_of(hand_eye.robot_noise, typical_noise())
+        noise = _worse_of(hand_eye.robot_noise, typical_noise())
         assumptions = replace(assumptions, gripper_from_camera=assumed_camera(used), noise=noise, camera=None)
-        ahead = Ahead.of(assumptions, used, robot, PROPOSED)
-        proposed = [ahead.next_pose(count, ahead.expected(count)) for count in range(1, PROPOSED + 1)]
+        proposed = Proposals.of(assumptions, used, robot, PROPOSED).next_poses(PROPOSED)
     seen = excitation(used, hand_eye.gripper_from_camera) if len(used) > 1 else None
     earlier = tuple(one for one in hand_eye.findings if one.kind is not FindingKind.NOT_EXACT_ENOUGH)
     hand_eye = replace(hand_eye, plan=Plan(seen, tuple(proposed), required), findings=earlier)
@@ -68,9 +200,9 @@ def advised(
 
 
 def not_exact_enough(required: Requirement, systematic: bool) -> Finding | None:
-    """That a calibration is not as exact as is required, which rejects it where a user asked for it.
+    """Report that a calibration is not as exact as is required; it rejects where a user asked for the accuracy.
 
-    `systematic`: mostly by systematic errors of the robot.
+    `systematic`: the uncertainty comes mostly from systematic errors of the robot.
     """
     if required.met:
         return None
@@ -84,26 +216,32 @@ def not_exact_enough(required: Requirement, systematic: bool) -> Finding | None:
     return replace(finding, value=1e-3 * required.reached_mm, details=numbers)
 
 
+def _spread(count: int) -> Int[ndarray, " k"]:
+    """Return the rows of at most EXISTING poses, evenly along the capture."""
+    return np.linspace(0, count - 1, min(count, EXISTING)).round().astype(int)
+
+
+def _worse_of(noise: RobotNoise, other: RobotNoise) -> RobotNoise:
+    """Return the larger errors of two robots, with the given noise of the first."""
+    return replace(
+        noise,
+        translation=max(noise.translation, other.translation),
+        rotation=max(noise.rotation, other.rotation),
+        systematic=max(noise.systematic, other.systematic),
+    )
+
+
 def _required(hand_eye: HandEye, options: CalibrateOptions) -> Requirement:
+    """Return the requirement beside the accuracy in use of a calibration."""
     found, at = hand_eye.in_use, options.require_at
     assert found is not None
-    seen = found.seen
-    if at == "camera":
-        covariance = hand_eye.covariance
-        distance_mm, reached_mm = 0.0, 1e3 * within_95(covariance[:3, :3])
-        reached_deg = float(np.degrees(within_95(covariance[3:6, 3:6])))
-    else:
-        distance_mm, reached_mm, reached_deg = seen.distance_mm, seen.within_95_mm, seen.rotation_95_deg
-    # Of camera poses that were given there is no scene but the point ahead.
-    if at == "scene" and found.scene is not None:
-        reached_mm = 1e3 * found.scene.within_95_m
-        reached_deg = float(np.degrees(within_95(found.scene.covariance[3:6, 3:6])))
+    reached_mm, reached_deg = reached(hand_eye.estimate, found, at)
     translation_mm, rotation_deg = options.require or GRASPING
     return Requirement(
         translation_mm=translation_mm,
         rotation_deg=rotation_deg,
         asked=options.require is not None,
-        distance_mm=distance_mm,
+        distance_mm=0.0 if at == "camera" else found.seen.distance_mm,
         reached_mm=reached_mm,
         reached_deg=reached_deg,
         at=at,
@@ -123,32 +261,33 @@ def _worthwhile(
     The reported uncertainty shrinks by the ratio by which the predicted one does: images and robot may be better or
     worse than predicted.
     """
-    ahead = Ahead.of(assumptions, used, robot, least if required.met else MOST_POSES)
-    now, expected = ahead.expected(0), cache(ahead.expected)
+    proposals = Proposals.of(assumptions, used, robot, least if required.met else MOST_POSES)
+    predicted = cache(proposals.predict)
 
     def shrunk(count: int, at: Where, mm: float, deg: float) -> tuple[float, float]:
-        (now_mm, now_deg), (then_mm, then_deg) = now.reached(at), expected(count).reached(at)
+        (now_mm, now_deg), (then_mm, then_deg) = (
+            reached(one.estimate, one.in_use, at) for one in (predicted(0), predicted(count))
+        )
         return mm * then_mm / now_mm, deg * then_deg / now_deg
 
     def is_met(count: int) -> bool:
         mm, deg = shrunk(count, required.at, required.reached_mm, required.reached_deg)
         return replace(required, reached_mm=mm, reached_deg=deg).met
 
-    reach = 0 if required.met else None
+    more = 0 if required.met else None
     if not required.met and is_met(MOST_POSES):
-        reach = next(count for count in range(1, MOST_POSES + 1) if is_met(count))
+        more = next(count for count in range(1, MOST_POSES + 1) if is_met(count))
     found, std = hand_eye.in_use, np.sqrt(np.diag(hand_eye.covariance))
     assert found is not None
     proposed = []
-    for count in range(1, max(least, reach or 0) + 1):
-        then = expected(count)
+    for count in range(1, max(least, more or 0) + 1):
         mm, deg = shrunk(count, "seen", found.seen.within_95_mm, found.seen.rotation_95_deg)
         proposed.append(
             replace(
-                ahead.next_pose(count, then),
-                expected_std=std * then.std / now.std,
+                proposals.next_pose(count, predicted(count)),
+                expected_std=std * predicted(count).std / predicted(0).std,
                 within_95_mm=mm,
                 rotation_95_deg=deg,
             )
         )
-    return reach, proposed
+    return more, proposed

@@ -7,13 +7,12 @@ import numpy as np
 from jcr.calibration.adjust import adjusted
 from jcr.calibration.case import Case
 from jcr.calibration.checks.table import CHECKS
-from jcr.calibration.expected import assumed_of
 from jcr.calibration.fit import fitted
 from jcr.calibration.options import CalibrateOptions, check_options
-from jcr.calibration.requirement import advised
+from jcr.calibration.requirement import advised, assumptions_of
 from jcr.calibration.robot_errors import RobotErrors, robot_errors
-from jcr.calibration.seen import with_given_intrinsics
 from jcr.calibration.verdict import with_checked
+from jcr.estimation.point_uncertainty import with_given_intrinsics
 from jcr.least_squares import one_blas_thread
 from jcr.records import Capture, HandEye, Reconstruction
 
@@ -32,11 +31,12 @@ def calibrate(
     check_options(options := options or CalibrateOptions())
     robot = robot_errors(capture, options).of(reconstruction.image_index)
     case = checked(capture, reconstruction, options, robot)
-    scene = case.scene_in_base
-    hand_eye = advised(case.hand_eye, case.base_from_gripper, options, robot, assumed_of(case), scene)
-    if capture.intrinsics is None or scene is None:
+    hand_eye = advised(
+        case.hand_eye, case.base_from_gripper, options, robot, assumptions_of(case), case.scene_uncertainty
+    )
+    if capture.intrinsics is None or (distance_m := case.scene_distance_m) is None:
         return hand_eye
-    pair = with_given_intrinsics(hand_eye.estimate, reconstruction.intrinsics, scene.distance_m)
+    pair = with_given_intrinsics(hand_eye.estimate, reconstruction.intrinsics, distance_m)
     return replace(hand_eye, with_given_intrinsics=pair)
 
 

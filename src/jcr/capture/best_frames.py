@@ -9,7 +9,8 @@ from numpy import ndarray
 from jcr.capture.images import BLURRED
 from jcr.capture.options import MIN_FRAMES
 from jcr.errors import InputError
-from jcr.estimation.equation import ASSUMED_NOISE, most_informative, pose_information
+from jcr.estimation.equation import ASSUMED_NOISE, expected_covariance
+from jcr.estimation.next_poses import choose, pose_information, total_uncertainty
 from jcr.geometry import inverse, motion_length
 
 STILL = 0.005
@@ -18,6 +19,8 @@ LOOKS = 5
 """Number of frames of one stop that are compared for sharpness."""
 SAME_VIEW = 0.005
 """Smallest distance between two views, m, rotation counted at ARM; the sharpest of nearer frames is kept."""
+WEAK = 1e-6
+"""Information (1/m², 1/rad²) about each unknown before any view, which keeps its covariance finite."""
 
 Rows = Int[ndarray, " _"]
 Poses = Float[ndarray, "n 4 4"]
@@ -56,11 +59,21 @@ def best_frames(
         )
     information = pose_information(base_from_gripper[views], np.eye(4), ASSUMED_NOISE)
     at_rest = speed[views] < STILL
-    chosen = most_informative(np.zeros((13, 13)), information[at_rest], count)
-    known = information[at_rest].sum(0) if at_rest.any() else np.zeros((13, 13))
-    more = most_informative(known, information[~at_rest], count - len(chosen))
+    chosen = _most_informative(WEAK * np.eye(13), information[at_rest], count)
+    more = _most_informative(
+        WEAK * np.eye(13) + information[at_rest].sum(0), information[~at_rest], count - len(chosen)
+    )
     frames = np.sort(np.concatenate([views[at_rest][chosen], views[~at_rest][more]]))
     return frames, tuple(_remarks(frames, speed, len(sharpest) - len(sharp), int(at_rest.sum()), count))
+
+
+def _most_informative(known: Float[ndarray, "13 13"], gain: Float[ndarray, "k 13 13"], count: int) -> Rows:
+    """Return the rows of the `count` views that leave the least uncertainty beside what is known."""
+
+    def uncertainty_of(rows: Rows) -> float:
+        return total_uncertainty(expected_covariance(known + gain[rows].sum(0)))
+
+    return np.array(choose(count, len(gain), uncertainty_of), dtype=int)
 
 
 def _remarks(frames: Rows, speed: Float[ndarray, " n"], blurred: int, at_rest: int, count: int):

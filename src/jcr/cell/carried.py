@@ -9,7 +9,7 @@ errors where they are (estimation/pose_equations.py).
 from dataclasses import replace
 from pathlib import Path
 
-from jcr.calibration.adjust import adjust_case, estimate_of
+from jcr.calibration.adjust import adjust_case
 from jcr.calibration.case import MIN_OBSERVATIONS, Case
 from jcr.calibration.checks.camera import of_fewer_points
 from jcr.calibration.checks.effects import EFFECTS, effects, with_effects
@@ -19,6 +19,7 @@ from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.verdict import with_findings
 from jcr.cell.background import write_moving_parts
 from jcr.estimation.hand_eye import judged, solve_hand_eye
+from jcr.estimation.wrist import estimate_of
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import inverse
 from jcr.records import Capture, HandEye, Reconstruction

@@ -140,7 +140,7 @@ def _expected(images: int, found: "Examination") -> list[str]:
 
     lines = []
     if found.expected is not None:
-        seen, std = found.expected.seen, found.expected.std
+        seen, std = found.expected.in_use.seen, found.expected.std
         offset = " ".join(significant(1e3 * value) for value in std[:3])
         rotation = " ".join(significant(float(np.degrees(value))) for value in std[3:6])
         errors = "found in the images" if found.hand_eye is not None else "usual"
@@ -179,7 +179,7 @@ def _as_json(capture: "Capture | PosePairs", found: "Examination") -> dict[str, 
             "advice": list(found.observability.advice),
         },
         "expected_std": None if found.expected_std is None else found.expected_std.tolist(),
-        "expected_seen": None if found.expected is None else vars(found.expected.seen),
+        "expected_seen": None if found.expected is None else vars(found.expected.in_use.seen),
         "expected_images": [capture.images[row] for row in found.counted],
         "robot_noise": None
         if noise is None

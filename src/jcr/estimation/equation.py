@@ -14,7 +14,6 @@ from jcr.geometry import (
     Transform,
     Transforms,
     by_inverse,
-    by_similarity,
     inverse,
     scale_translation,
     skew,
@@ -31,8 +30,6 @@ PRIOR_STD = np.array([1.0] * 3 + [np.pi] * 3 + [5.0])
 LARGEST_ROTATION = 0.5
 """rad, and of the logarithm of scale, in one step: a poor start on nearly unobservable motions must not throw rotations
 around the circle."""
-UNIT = np.array([1e-3] * 3 + [np.radians(0.1)] * 3 + [2e-3])
-"""What counts alike: 1 mm, 0.1°, 0.2 % of scale."""
 ASSUMED_NOISE = (5e-4, np.radians(0.1))
 """m, rad; of a robot that has not been measured yet."""
 
@@ -117,52 +114,6 @@ def share_within_limits(step: Float[ndarray, " u"]) -> float:
     return min(1.0, LARGEST_ROTATION / max(float(np.abs(step[rotations]).max()), 1e-300))
 
 
-def pose_information(
-    base_from_gripper: Poses, gripper_from_camera: Transform, noise: tuple[float, float]
-) -> Float[ndarray, "n 13 13"]:
-    """What each gripper pose shows of the 13 unknowns (Fisher information), whatever its image shows."""
-    # Any frame and unit of the reconstruction will do: the base's, in metres.
-    camera = base_from_gripper @ gripper_from_camera
-    _, j = residuals(gripper_from_camera, 1.0, np.eye(4), base_from_gripper, camera)
-    j /= np.repeat(noise, 3)[:, None]
-    return np.swapaxes(j, 1, 2) @ j
-
-
 def expected_covariance(hessian: Float[ndarray, "*batch 13 13"]) -> Float[ndarray, "*batch 7 7"]:
-    """Covariance that information leaves, in records.COVARIANCE_ORDER; the prior is added here."""
+    """Return the covariance of X and scale that information and the weak prior leave, in COVARIANCE_ORDER."""
     return np.linalg.inv(hessian + weak_prior())[..., :7, :7]
-
-
-def point_ahead(x: Transform, distance_m: float) -> Float[ndarray, "3 7"]:
-    """By how much a point on the optical axis moves on the gripper, in gripper axes, with X and scale."""
-    return by_similarity(distance_m * x[:3, 2])
-
-
-def uncertainty(
-    covariance: Float[ndarray, "*batch 7 7"], point: Float[ndarray, "3 7"] | None = None
-) -> Float[ndarray, "*batch"] | np.floating:
-    """One number for it: variances over what counts alike, of the camera, the rotation and the scale, or of the place
-    of a `point_ahead`, which the scale moves, and the rotation."""
-    counted = np.eye(7) / UNIT[:, None]
-    if point is not None:
-        counted = np.concatenate([point / UNIT[TRANSLATION, None], counted[ROTATION]])
-    return np.einsum("ri,...ij,rj->...", counted, covariance, counted)
-
-
-def most_informative(
-    known: Float[ndarray, "13 13"],
-    gain: Float[ndarray, "k 13 13"],
-    count: int,
-    point: Float[ndarray, "3 7"] | None = None,
-) -> Int[ndarray, " c"]:
-    """The rows of the `count` candidates that leave the least uncertainty, chosen one by one (A-optimal design).
-
-    What counts is what `uncertainty` counts.
-    """
-    rows, left = list[int](), np.arange(len(gain))
-    for _ in range(min(count, len(gain))):
-        best = int(np.argmin(uncertainty(expected_covariance(known + gain[left]), point)))
-        known = known + gain[left[best]]
-        rows.append(int(left[best]))
-        left = np.delete(left, best)
-    return np.array(rows, dtype=int)

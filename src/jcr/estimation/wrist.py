@@ -20,7 +20,7 @@ from jcr.estimation.score_test import freed
 from jcr.estimation.solve import START_NOISE, Solution, solve
 from jcr.estimation.systematic import smooth_errors
 from jcr.geometry import Poses, Transform, apply, fit_similarity, scale_translation
-from jcr.records import Intrinsics, Tracks
+from jcr.records import Estimate, Intrinsics, Tracks
 
 Start = tuple[Transform, float, Transform]
 """gripper_from_camera, scale and base_from_recon."""
@@ -72,6 +72,44 @@ def image_problem(
     return with_observations(problem, state, observations)
 
 
+def wrist_problem(
+    arm: Arm,
+    start: Start,
+    recon_from_camera: Poses,
+    camera: Camera,
+    tracks: Tracks,
+    *,
+    noise: tuple[float, float] | None = None,
+    combinations: Float[ndarray, "e p"] | None = None,
+) -> tuple[Problem, State]:
+    """Return the problem of images and reported poses together, and its initial state; the world is in metres.
+
+    `arm` moves rig i at image i. `noise` is a lower bound on the random errors of the poses (m, rad), and
+    `combinations` of the columns of score_test.Alternatives are free.
+    """
+    x, scale, z = start
+    points_in_world = scale * tracks.points_in_recon.astype(float)
+    twice = np.bincount(tracks.point, minlength=len(points_in_world)) >= 2
+    boards, world_from_board = shapes_of(tracks.boards, points_in_world, twice, len(arm.rigs))
+    problem = Problem(
+        arms=(arm,),
+        n_rigs=len(arm.rigs) + len(world_from_board),
+        cameras=(camera,),
+        boards=boards,
+        robot_noise_floor=noise,
+    )
+    state = State(
+        x=x[None],
+        scale=1.0,
+        z=z[None],
+        world_from_rig=np.concatenate([scale_translation(recon_from_camera, scale), world_from_board]),
+        points_in_world=points_in_world,
+    )
+    if combinations is not None:
+        problem = freed(problem, combinations, arm.rigs, len(arm.rigs))
+    return with_observations(problem, state, Observations.of_one_camera(tracks, len(arm.rigs)))
+
+
 def adjust_wrist(  # noqa: PLR0913 (each is a fact about the capture)
     arm: Arm | Poses,
     start: Start,
@@ -86,40 +124,39 @@ def adjust_wrist(  # noqa: PLR0913 (each is a fact about the capture)
 ) -> Solution:
     """Adjust images and reported poses together, from a result of a fit to poses.
 
-    `arm` moves rig i at image i; of poses alone the systematic errors are smooth over the poses. `camera` given as
-    intrinsics is exact. `noise` is a lower bound on the random errors of the poses (m, rad), and `start_noise` their
-    initial size. `combinations` of the columns of score_test.Alternatives are free, too. `near` is a solution of the
-    same poses and of the same points or more, from which the adjustment starts.
+    The arguments are those of `wrist_problem`; the systematic errors of poses without an arm are smooth over the poses,
+    and intrinsics without a prior are exact. `start_noise` is the initial size of the random errors of the poses
+    (m, rad). `near` is a solution of the same poses and of the same points or more, from which the adjustment starts.
     """
-    x, scale, z = start
     arm = arm if isinstance(arm, Arm) else wrist_arm(arm)
-    each = arm.rigs
     if isinstance(camera, Intrinsics):
         camera = camera_with_prior(camera, FIXED)
-    points_in_world = scale * tracks.points_in_recon.astype(float)
-    twice = np.bincount(tracks.point, minlength=len(points_in_world)) >= 2
-    boards, world_from_board = shapes_of(tracks.boards, points_in_world, twice, len(each))
-    problem = Problem(
-        arms=(arm,),
-        n_rigs=len(each) + len(world_from_board),
-        cameras=(camera,),
-        boards=boards,
-        robot_noise_floor=noise,
+    problem, state = wrist_problem(
+        arm, start, recon_from_camera, camera, tracks, noise=noise, combinations=combinations
     )
-    state = State(
-        x=x[None],
-        scale=1.0,
-        z=z[None],
-        world_from_rig=np.concatenate([scale_translation(recon_from_camera, scale), world_from_board]),
-        points_in_world=points_in_world,
-    )
-    observations = Observations.of_one_camera(tracks, len(each))
-    if combinations is not None:
-        problem = freed(problem, combinations, each, len(each))
-    problem, state = with_observations(problem, state, observations)
     if near is not None:
         state = transferred(near.problem, near.state, problem)
     return solve(problem, state, start_noise=start_noise)
+
+
+def estimate_of(found: Solution, tracks: Tracks) -> Estimate:
+    """Return the estimate of an adjustment in the frame of the reconstruction whose tracks were adjusted."""
+    return estimate_in(found, *recon_frame(found, tracks))
+
+
+def estimate_in(found: Solution, scale: float, base_from_recon: Transform) -> Estimate:
+    """Return the estimate of an adjustment in a reconstruction with this scale and base_from_recon."""
+    return Estimate(
+        gripper_from_camera=found.state.x[0],
+        scale=scale,
+        base_from_recon=base_from_recon,
+        covariance=found.covariance[:7, :7],
+        budget=found.budget,
+        intrinsics=found.problem.intrinsics(found.state)[0],
+        intrinsics_covariance=found.intrinsics_covariance(0),
+        intrinsics_cross=found.intrinsics_cross(0),
+        model_error=found.model_error(),
+    )
 
 
 def recon_frame(solution: Solution, tracks: Tracks) -> tuple[float, Transform]:

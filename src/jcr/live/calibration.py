@@ -16,9 +16,8 @@ from numpy.typing import ArrayLike
 from jcr.calibration.case import Case, of_points
 from jcr.calibration.checks.left_out import SAME
 from jcr.calibration.checks.views import STILL as MOVED
-from jcr.calibration.expected import FEWEST, assumed_of
 from jcr.calibration.options import CalibrateOptions, check_options
-from jcr.calibration.requirement import advised
+from jcr.calibration.requirement import advised, assumptions_of
 from jcr.calibration.robot_errors import RobotErrors, robot_errors
 from jcr.calibration.stage import checked
 from jcr.capture.camera_info import IntrinsicsEntry
@@ -28,6 +27,7 @@ from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import Arm
+from jcr.estimation.prediction import FEWEST
 from jcr.files import read_bytes, write_text
 from jcr.findings import Finding, FindingKind, strongest_first
 from jcr.geometry import apply, largest_motion
@@ -292,7 +292,7 @@ class LiveCalibration:
             return replace(state, findings=findings, **self._next_pose())
         case, hand_eye = calibrated
         self._remember(len(names), hand_eye)
-        of_rows, assumptions = robot.of(rows), assumed_of(case)
+        of_rows, assumptions = robot.of(rows), assumptions_of(case)
         self._next_pose = lambda: propose(case, hand_eye, of_rows, assumptions, reach, attempts())
         return replace(
             state,
@@ -318,8 +318,8 @@ class LiveCalibration:
             case.base_from_gripper,
             self._options,
             robot,
-            assumed_of(case),
-            case.scene_in_base,
+            assumptions_of(case),
+            case.scene_uncertainty,
         )
 
     def _not_registered(self, names: tuple[str, ...]) -> list[Finding]:

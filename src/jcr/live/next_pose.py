@@ -8,9 +8,11 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.calibration.case import Case
-from jcr.calibration.expected import Ahead, Assumptions, assumed, scene_distance, typical_camera
+from jcr.calibration.requirement import Proposals
 from jcr.calibration.robot_errors import RobotErrors, errors_of
 from jcr.estimation.kinematics import Arm
+from jcr.estimation.next_poses import median_distance
+from jcr.estimation.prediction import Assumptions, assumed, typical_camera
 from jcr.geometry import rotation_angle
 from jcr.live.notation import joints_at
 from jcr.records import Capture, HandEye
@@ -89,7 +91,7 @@ def propose_before_calibration(
     assumptions = assumed(poses, camera)
     if hand_eye is not None and _is_aimed(hand_eye):
         x = hand_eye.gripper_from_camera
-        assumptions = replace(assumptions, gripper_from_camera=x, distance_m=scene_distance(poses @ x))
+        assumptions = replace(assumptions, gripper_from_camera=x, distance_m=median_distance(poses @ x))
     return _best(assumptions, poses, errors_of(poses), attempts, there, reach, is_limited_by_rotation=True)
 
 
@@ -152,11 +154,11 @@ def _best(
         return wanted if wanted.any() else likely
 
     count = 1 if reach.arm is None else PROPOSALS
-    ahead = Ahead.of(assumptions, poses, robot, count, reach.box, is_likely=is_wanted)
+    proposals = Proposals.of(assumptions, poses, robot, count, reach.box, is_likely=is_wanted)
     recorded = None if capture.joints is None else capture.joints[rows]
-    for k, pose in enumerate(ahead.added if reach.arm is not None else ()):
+    for k, pose in enumerate(proposals.added if reach.arm is not None else ()):
         if reach.arm is not None and (joints := joints_at(reach.arm, poses, recorded, pose)) is not None:
-            ahead = replace(ahead, added=ahead.added[k : k + 1])
+            proposals = replace(proposals, added=proposals.added[k : k + 1])
             break
-    best = ahead.next_pose(1, ahead.expected(1))
+    best = proposals.next_poses(1)[0]
     return {"next_pose": best, "next_joints": joints, "next_like": capture.images[rows[best.like]]}

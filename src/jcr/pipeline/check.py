@@ -13,18 +13,9 @@ from jcr.boards.proposal import proposed
 from jcr.calibration.case import Case
 from jcr.calibration.checks.left_out import left_out_poses
 from jcr.calibration.checks.views import as_causes, view_findings
-from jcr.calibration.expected import (
-    FEWEST,
-    Ahead,
-    Assumptions,
-    Expectation,
-    assumed,
-    assumed_of,
-    assumed_of_poses,
-    typical_camera,
-)
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_poses, is_one
+from jcr.calibration.requirement import Proposals, assumptions_of, assumptions_of_poses
 from jcr.calibration.robot_errors import RobotErrors, errors_of, robot_errors
 from jcr.calibration.stage import checked
 from jcr.camera import fold_distance_px
@@ -33,9 +24,16 @@ from jcr.capture.images import brightness_and_sharpness, exposure_fault, read_im
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture, read_source
 from jcr.errors import InputError, RejectedError
-from jcr.estimation.foreseen import ForeseenCamera
 from jcr.estimation.hand_eye import SCALE_STD, solve_hand_eye
 from jcr.estimation.observability import observability
+from jcr.estimation.prediction import (
+    FEWEST,
+    Assumptions,
+    PredictedCamera,
+    Prediction,
+    assumed,
+    typical_camera,
+)
 from jcr.findings import (
     Finding,
     FindingKind,
@@ -67,7 +65,7 @@ class Examination:
     largest_rotation_rad: float
     """Largest angle between two gripper poses."""
     observability: Observability
-    expected: Expectation | None
+    expected: Prediction | None
     """Accuracy that a calibration of the counted images would report; None of fewer than three."""
     counted: Int[ndarray, " c"]
     """Rows of the images that are expected to register: those that did; of images not tried, those that are clear."""
@@ -126,16 +124,15 @@ def check_capture(
     found = [*shown.findings, *(() if shown.hand_eye is not None else seen.findings), *alone.unused]
     is_rejected = verdict_of(found) == "rejected"
     found += as_causes(alone.views) if is_rejected else alone.views
-    ahead = Ahead.of(assumptions, gripper, alone.robot.of(rows), suggest, reach, seed)
-    suggestions = [ahead.next_pose(count, ahead.expected(count)) for count in range(1, suggest + 1)]
+    proposals = Proposals.of(assumptions, gripper, alone.robot.of(rows), suggest, reach, seed)
     return Examination(
         sharpness=alone.sharpness,
         largest_move_m=alone.move_m,
         largest_rotation_rad=alone.rotation_rad,
         observability=seen,
-        expected=ahead.expected(0) if len(counted) >= FEWEST else None,
+        expected=proposals.predict(0) if len(counted) >= FEWEST else None,
         counted=counted,
-        suggestions=tuple(replace(one, like=int(rows[one.like])) for one in suggestions),
+        suggestions=tuple(replace(one, like=int(rows[one.like])) for one in proposals.next_poses(suggest)),
         hand_eye=shown.hand_eye,
         findings=strongest_first({sentence(one): one for one in found}.values()),
         notes=(*alone.notes, *shown.notes),
@@ -200,7 +197,7 @@ def _with_images(alone: _Alone, capture: Capture) -> _Alone:
     )
 
 
-def _camera(capture: Capture | PosePairs) -> ForeseenCamera | None:
+def _camera(capture: Capture | PosePairs) -> PredictedCamera | None:
     """Return the camera as it is assumed before its images are matched."""
     if isinstance(capture, PosePairs):
         return None
@@ -344,7 +341,7 @@ def _compare_registered(
         shown,
         notes=found.notes,
         registered=rows[case.hand_eye.inliers],
-        assumptions=assumed_of(case) if case.hand_eye.converged else None,
+        assumptions=assumptions_of(case) if case.hand_eye.converged else None,
     )
 
 
@@ -362,7 +359,7 @@ def _compare_pairs(pairs: PosePairs, noise: tuple[float, float] | None) -> _Comp
     used, assumptions = hand_eye.inliers, None
     if hand_eye.converged:
         scale_std = SCALE_STD if pairs.is_metric and is_one(hand_eye) else None
-        assumptions = assumed_of_poses(hand_eye, pairs.base_from_gripper[used], scale_std)
+        assumptions = assumptions_of_poses(hand_eye, pairs.base_from_gripper[used], scale_std)
     return _Compared(
         hand_eye=hand_eye,
         findings=hand_eye.findings,

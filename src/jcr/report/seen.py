@@ -8,9 +8,9 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.record import as_estimate
-from jcr.calibration.seen import seen_uncertainty, within_95
 from jcr.calibration.words import given_in_words, seen_in_words
 from jcr.capture.images import read_image
+from jcr.estimation.point_uncertainty import point_covariance, within_95
 from jcr.report.figures import Figure, Shape
 from jcr.report.raster import image_url
 from jcr.report.render import Section
@@ -72,7 +72,7 @@ def _field_mm(result: RunResult, distance_m: float) -> Float[ndarray, "h w"]:
         np.linspace(0, intrinsics.width - 1, GRID), np.linspace(0, intrinsics.height - 1, rows)
     )
     x_px = np.stack([u, v], axis=-1)
-    covariance = seen_uncertainty(estimate, intrinsics, x_px, distance_m)
+    covariance = point_covariance(estimate, intrinsics, x_px, distance_m)
     return 1e3 * np.array([[within_95(one) for one in row] for row in covariance])
 
 

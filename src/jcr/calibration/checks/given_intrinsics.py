@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jcr.calibration.adjust import adjust_case, estimate_of, refined_by
+from jcr.calibration.adjust import adjust_case, refined_by
 from jcr.calibration.case import Case, Checked
 from jcr.calibration.checks.imaged import Imaged, of_case
 from jcr.camera import PARAMETERS, by_parameters, parameters, unproject
@@ -17,6 +17,7 @@ from jcr.estimation.hand_eye import judged
 from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, camera_with_prior
 from jcr.estimation.score_test import freed_intrinsics
 from jcr.estimation.solve import Solution
+from jcr.estimation.wrist import estimate_of
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import ARM, step_between
 

@@ -7,12 +7,13 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.calibration.adjust import adjust_case, estimate_of, focal_of_each
+from jcr.calibration.adjust import adjust_case, focal_of_each
 from jcr.calibration.case import Case
 from jcr.estimation.intrinsics_prior import Camera
 from jcr.estimation.problem import State
 from jcr.estimation.score_test import first_x
 from jcr.estimation.solve import Solution
+from jcr.estimation.wrist import estimate_of
 from jcr.records import Intrinsics
 
 Combinations = Float[ndarray, "e p"]

@@ -1,4 +1,4 @@
-"""What is expected of a calibration before it is made, against what it then reports; and the poses to add."""
+"""Predicted uncertainty of a calibration against its report, and the poses to add."""
 
 import json
 import shutil
@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from benchmarks.coverage import FACTOR, predicted
-from jcr.calibration.expected import Ahead, assumed, expected, typical_camera
 from jcr.calibration.poses import calibrate_poses
 from jcr.calibration.record import Calibration, calibration_of
+from jcr.calibration.requirement import Proposals
 from jcr.calibration.robot_errors import errors_of
+from jcr.estimation.prediction import assumed, predict, typical_camera
 from jcr.pipeline.check import check_capture
 from jcr.records import Intrinsics, NextPose, PosePairs
 from simulation.problems import HandEyeProblem, hand_eye_problem
@@ -34,8 +35,8 @@ def test_check_expects_of_the_bundled_capture_what_its_run_reports(tabletop: Pat
     uncertainty = Calibration.model_validate_json((done / "calibration.json").read_text()).uncertainty
     found = check_capture(tabletop).expected
     assert uncertainty is not None and uncertainty.seen is not None and found is not None
-    assert abs(np.log(found.seen.within_95_mm / uncertainty.seen.within_95_mm)) < WITHIN
-    assert abs(np.log(found.seen.rotation_95_deg / uncertainty.seen.rotation_95_deg)) < WITHIN
+    assert abs(np.log(found.in_use.seen.within_95_mm / uncertainty.seen.within_95_mm)) < WITHIN
+    assert abs(np.log(found.in_use.seen.rotation_95_deg / uncertainty.seen.rotation_95_deg)) < WITHIN
     assert (np.abs(np.log(found.std[:3] / (1e-3 * np.array(uncertainty.translation_std_mm)))) < WITHIN).all()
     assert (np.abs(np.log(np.degrees(found.std[3:6]) / uncertainty.rotation_std_deg)) < WITHIN).all()
 
@@ -60,7 +61,7 @@ def test_what_is_not_known_of_the_camera_is_in_the_expectation():
     exact = typical_camera(given, (640, 480), np.zeros(9))
     systematic = errors_of(gripper).systematic
     known, measured, unknown = (
-        expected(assumed(gripper, camera), gripper, systematic)
+        predict(assumed(gripper, camera), gripper, systematic)
         for camera in (exact, typical_camera(given, (640, 480)), typical_camera(None, (640, 480)))
     )
     assert 1.5 * known.std[3] < measured.std[3] < unknown.std[3]
@@ -72,9 +73,8 @@ def expected_with(
     """Standard deviations expected of a problem's poses, and the poses to add to them."""
     gripper, x = problem.base_from_gripper, problem.gripper_from_camera
     assumptions = replace(assumed(gripper, None, noise), gripper_from_camera=x)
-    ahead = Ahead.of(assumptions, gripper, errors_of(gripper), count, reach)
-    added = [ahead.next_pose(k, ahead.expected(k)) for k in range(1, count + 1)]
-    return ahead.expected(0).std, added
+    proposals = Proposals.of(assumptions, gripper, errors_of(gripper), count, reach)
+    return proposals.predict(0).std, proposals.next_poses(count)
 
 
 def test_proposed_poses_keep_their_promise_and_stay_in_reach():

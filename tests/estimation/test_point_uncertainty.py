@@ -1,4 +1,4 @@
-"""What a calibration is used for: where it places a point that the camera sees."""
+"""Uncertainty of points that the camera sees, against draws and against simulated truth."""
 
 from dataclasses import replace
 from functools import cache
@@ -7,23 +7,21 @@ import numpy as np
 import pytest
 
 from benchmarks.coverage import BENT, WAYS, measure_seen
-from jcr.calibration.adjust import estimate_of
-from jcr.calibration.seen import (
-    Scene,
-    in_use,
-    joint_covariance,
-    point_in_base,
-    scene_uncertainty,
-    seen_uncertainty,
-    with_given_intrinsics,
-    within_95,
-)
 from jcr.camera import parameters, unproject, with_parameters
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.estimation.intrinsics_prior import ESTIMATED, camera_with_prior
-from jcr.estimation.points import points_in_base
+from jcr.estimation.point_uncertainty import (
+    in_use,
+    joint_covariance,
+    point_covariance,
+    point_in_base,
+    scene_points,
+    scene_uncertainty,
+    with_given_intrinsics,
+    within_95,
+)
 from jcr.estimation.solve import Solution
-from jcr.estimation.wrist import adjust_wrist
+from jcr.estimation.wrist import adjust_wrist, estimate_of
 from jcr.geometry import apply, inverse, retract
 from jcr.records import Estimate, HandEye, Intrinsics, Tracks
 from simulation.problems import INTRINSICS, HandEyeProblem, hand_eye_problem, observed
@@ -75,19 +73,19 @@ def test_covariance_of_a_seen_point_is_that_of_draws_of_all_that_places_it():
         ]
     )
     in_camera = drawn @ estimate.gripper_from_camera[:3, :3]
-    for k, covariance in enumerate(seen_uncertainty(estimate, estimate.intrinsics, X_PX, DISTANCE_M)):
+    for k, covariance in enumerate(point_covariance(estimate, estimate.intrinsics, X_PX, DISTANCE_M)):
         assert np.cov(in_camera[:, k].T) == pytest.approx(covariance, abs=0.06 * np.trace(covariance))
 
 
 def test_intrinsics_and_transform_together_place_a_point_better_than_each_is_known():
     estimate, _ = estimated()
     assert estimate.intrinsics is not None
-    together = seen_uncertainty(estimate, estimate.intrinsics, X_PX[0], DISTANCE_M)
+    together = point_covariance(estimate, estimate.intrinsics, X_PX[0], DISTANCE_M)
     apart = replace(estimate, intrinsics_cross=np.zeros_like(estimate.intrinsics_cross))
     assert np.trace(together) < 0.7 * np.trace(
-        seen_uncertainty(apart, estimate.intrinsics, X_PX[0], DISTANCE_M)
+        point_covariance(apart, estimate.intrinsics, X_PX[0], DISTANCE_M)
     )
-    found = in_use(estimate, Scene(DISTANCE_M))
+    found = in_use(estimate, DISTANCE_M)
     assert found.seen.within_95_mm == pytest.approx(1e3 * within_95(together))
     assert found.seen.lateral_95_mm < found.seen.within_95_mm < found.corners.within_95_mm
 
@@ -100,7 +98,7 @@ def test_errors_of_the_gripper_pose_stand_beside_those_of_the_calibration():
     depth_m = DISTANCE_M * ray[:, 2] / np.linalg.norm(ray, axis=1)
     x_in_base, found = point_in_base(estimate, start.robot_noise, X_PX, depth_m, pose)
     assert x_in_base == pytest.approx(apply(pose, placed(estimate.gripper_from_camera, estimate.intrinsics)))
-    here = seen_uncertainty(estimate, estimate.intrinsics, X_PX, DISTANCE_M)
+    here = point_covariance(estimate, estimate.intrinsics, X_PX, DISTANCE_M)
     assert np.trace(found.calibration, axis1=1, axis2=2) == pytest.approx(np.trace(here, axis1=1, axis2=2))
     noise, rng = start.robot_noise, np.random.default_rng(0)
     steps = rng.normal(size=(4000, 6)) * np.repeat((noise.translation, noise.rotation), 3)
@@ -140,7 +138,7 @@ def test_points_of_the_scene_are_where_they_are_said_to_be():
         rng = np.random.default_rng(seed)
         problem = hand_eye_problem(rng, 10, robot_noise=(5e-4, np.radians(0.05)))
         found, _, _ = adjusted(problem, seed)
-        points = points_in_base(found)
+        points = scene_points(found)
         # The tracks are of points that the problem drew first, in the base.
         true = np.random.default_rng([seed, 1]).uniform([0.25, -0.25, 0.0], [0.75, 0.25, 0.12], (300, 3))
         nearest = np.linalg.norm(points.in_base[:, None] - true, axis=2).min(1)

@@ -1,0 +1,315 @@
+"""Uncertainty of points in the frames of gripper and base: of pixels at a distance, and of reconstructed points.
+
+A pixel x at a distance d is the point p = d·u(K, x) in the camera, with unit ray u, and X·p in the gripper. Its error
+comes from the intrinsics K, from X and, where the distance is one of the reconstruction, from the scale. The three were
+estimated together: an error of the principal point that a rotation of the camera compensates has no effect where both
+are used. Their joint covariance is therefore propagated (Kogan, mrcal, "Projection uncertainty").
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from jcr.camera import NORMALIZED, by_parameters, by_point, parameters, unproject, with_thin_prism
+from jcr.distributions import chi2
+from jcr.estimation.cholesky import cholesky, over
+from jcr.estimation.elimination import point_blocks
+from jcr.estimation.equation import BASE_ROTATION, BASE_TRANSLATION, SCALE, pose_by_pose
+from jcr.estimation.model_error import second_moment_px2
+from jcr.estimation.pose_equations import reported_poses
+from jcr.estimation.projection import derivatives
+from jcr.estimation.solve import Solution
+from jcr.geometry import apply, by_similarity, retract, skew
+from jcr.records import Estimate, Intrinsics, InUse, RobotNoise, SceneUncertainty, Seen, WithGivenIntrinsics
+
+Pixels = Float[ndarray, "*points 2"]
+Distances = Float[ndarray, "*#points"] | float
+Covariances = Float[ndarray, "*points 3 3"]
+SCENE_POINTS = 300
+"""Number of points, drawn at random, that represent a scene."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointUncertainty:
+    """Covariances (m²) of points in the robot's base frame, by cause."""
+
+    calibration: Covariances
+    """Covariance by intrinsics, X and scale together: common to all points observed from one gripper pose."""
+    robot_random: Covariances
+    """Covariance by the random error of the gripper pose of the observation."""
+    robot_systematic: Covariances
+    """Covariance by the systematic error of that pose, beside its part in the effective X; for poses in the region of
+    the capture."""
+
+    @property
+    def together(self) -> Covariances:
+        """Sum of the covariances."""
+        return self.calibration + self.robot_random + self.robot_systematic
+
+
+class ScenePoints(NamedTuple):
+    """Some reconstructed points in the frame of the first arm's poses, and their covariance (m²)."""
+
+    in_base: Float[ndarray, "p 3"]
+    together: Float[ndarray, "p 3 p 3"]
+    """Covariance by rigs, cameras and arms, which the points share."""
+    own: Float[ndarray, "p 3 3"]
+    """Covariance by the triangulation of each point."""
+
+
+def point_covariance(
+    estimate: Estimate, intrinsics: Intrinsics, x_px: Pixels, distance_m: Distances
+) -> Covariances:
+    """Return the covariance (m²) of points on the gripper, in camera axes, without the robot's pose errors.
+
+    `intrinsics` belong to the estimate, `x_px` (...,2) are pixels of the distorted image, `distance_m` (...) is along
+    the ray, in the metres of the reconstruction.
+    """
+    by_unknown, by_pixel = _derivatives(estimate, intrinsics, x_px, distance_m)
+    model_error = by_pixel @ _model_error_px2(estimate, intrinsics, x_px) @ np.swapaxes(by_pixel, -1, -2)
+    return by_unknown @ joint_covariance(estimate) @ np.swapaxes(by_unknown, -1, -2) + model_error
+
+
+def point_in_base(
+    estimate: Estimate,
+    noise: RobotNoise,
+    x_px: Pixels,
+    depth_m: Distances,
+    base_from_gripper: Float[ndarray, "4 4"],
+) -> tuple[Float[ndarray, "*points 3"], PointUncertainty]:
+    """Return the base-frame coordinates (m) of points at pixels, z = `depth_m` in the camera, and their covariances.
+
+    `noise` is that of the reported gripper pose, whose errors add to those of the calibration.
+    """
+    intrinsics, x = estimate.intrinsics, estimate.gripper_from_camera
+    assert intrinsics is not None
+    ray = unproject(intrinsics, x_px)
+    distance_m = np.asarray(depth_m) * np.linalg.norm(ray, axis=-1) / ray[..., 2]
+    p_in_gripper = apply(x, np.asarray(depth_m)[..., None] * ray / ray[..., 2:])
+    base_from_camera_axes = base_from_gripper[:3, :3] @ x[:3, :3]
+    in_camera = point_covariance(estimate, intrinsics, x_px, distance_m)
+    lever = skew(p_in_gripper @ base_from_gripper[:3, :3].T)
+    square = lever @ np.swapaxes(lever, -1, -2)
+    random, systematic = (
+        metres**2 * np.eye(3) + radians**2 * square
+        for metres, radians in ((noise.translation, noise.rotation), noise.systematic_left)
+    )
+    return apply(base_from_gripper, p_in_gripper), PointUncertainty(
+        calibration=base_from_camera_axes @ in_camera @ base_from_camera_axes.T,
+        robot_random=random,
+        robot_systematic=systematic,
+    )
+
+
+def bounds_at(
+    estimate: Estimate, intrinsics: Intrinsics, x_px: Float[ndarray, "2"], distance_m: float
+) -> Seen:
+    """Return the bounds of 95 % of the errors of a point: across the ray, along it, and in direction."""
+    by_unknown, by_pixel = _derivatives(estimate, intrinsics, x_px, distance_m)
+    ray = unproject(intrinsics, x_px)
+    # Two directions across the ray, and the ray: rows.
+    axes = np.linalg.svd(ray[None] / np.linalg.norm(ray))[2][[1, 2, 0]]
+    moved = axes @ point_covariance(estimate, intrinsics, x_px, distance_m) @ axes.T
+    # The direction is not changed by a translation; the rotation about the ray takes the place of the distance.
+    by_direction = axes @ by_unknown / distance_m
+    by_direction[:, :3] = by_direction[2] = 0.0
+    by_direction[2, 3:6] = axes[2] @ estimate.gripper_from_camera[:3, :3].T
+    by_pixel = axes @ by_pixel / distance_m
+    rotated = by_direction @ joint_covariance(estimate) @ by_direction.T
+    rotated += by_pixel @ _model_error_px2(estimate, intrinsics, x_px) @ by_pixel.T
+    return Seen(
+        distance_mm=1e3 * distance_m,
+        within_95_mm=1e3 * within_95(moved),
+        lateral_95_mm=1e3 * within_95(moved[:2, :2]),
+        along_95_mm=1e3 * within_95(moved[2:, 2:]),
+        ray_95_deg=float(np.degrees(within_95(rotated[:2, :2]))),
+        rotation_95_deg=float(np.degrees(within_95(rotated))),
+    )
+
+
+def in_use(estimate: Estimate, distance_m: float, scene: SceneUncertainty | None = None) -> InUse:
+    """Return the accuracy of an estimate at the centre and the worst corner of the image, and in the scene.
+
+    Camera poses that were given have no intrinsics; the ray along the optical axis is then exact.
+    """
+    camera = estimate.intrinsics
+    if camera is None:
+        at_centre = bounds_at(estimate, NORMALIZED, np.zeros(2), distance_m)
+        return InUse(seen=at_centre, corners=at_centre)
+    right, bottom = camera.width - 1.0, camera.height - 1.0
+    centre, *corners = (
+        bounds_at(estimate, camera, np.array(x_px), distance_m)
+        for x_px in ((right / 2, bottom / 2), (0.0, 0.0), (0.0, bottom), (right, 0.0), (right, bottom))
+    )
+    return InUse(seen=centre, corners=max(corners, key=lambda one: one.within_95_mm), scene=scene)
+
+
+def with_given_intrinsics(
+    estimate: Estimate, given: Intrinsics, distance_m: float
+) -> WithGivenIntrinsics | None:
+    """Return the transform that belongs to given intrinsics, compared with the estimate at the centre of the image.
+
+    The transform is the mean of the joint distribution where the intrinsics are `given`, with a thin prism of 0 where
+    they have none. Its difference from the estimate counts as uncertainty. None where no intrinsics were estimated.
+    """
+    camera, cross = estimate.intrinsics, estimate.intrinsics_cross
+    if camera is None or cross is None or estimate.intrinsics_covariance is None:
+        return None
+    same_model = with_thin_prism(given) if camera.model == "thin_prism" else given
+    off = parameters(same_model) - parameters(camera)
+    step = cross @ np.linalg.pinv(estimate.intrinsics_covariance, rcond=1e-12, hermitian=True) @ off
+    # A user of the pair has other distances, and no scale.
+    step[6] = 0.0
+    pair = replace(
+        estimate,
+        covariance=estimate.covariance + np.outer(step, step),
+        intrinsics_cross=cross + np.outer(step, off),
+        intrinsics_covariance=estimate.intrinsics_covariance + np.outer(off, off),
+    )
+    x_px = np.array([camera.width - 1.0, camera.height - 1.0]) / 2
+    apart = _derivatives(estimate, camera, x_px, distance_m)[0] @ np.r_[step, off]
+    return WithGivenIntrinsics(
+        gripper_from_camera=retract(estimate.gripper_from_camera, step[:6]),
+        covariance=pair.covariance,
+        intrinsics=given,
+        seen=bounds_at(pair, camera, x_px, distance_m),
+        differs_mm=1e3 * float(np.linalg.norm(apart)),
+    )
+
+
+def joint_covariance(estimate: Estimate) -> Float[ndarray, "j j"]:
+    """Return the covariance of COVARIANCE_ORDER and, where they were estimated, of the intrinsics."""
+    if estimate.intrinsics_covariance is None or estimate.intrinsics_cross is None:
+        return estimate.covariance
+    cross = estimate.intrinsics_cross
+    return np.block([[estimate.covariance, cross], [cross.T, estimate.intrinsics_covariance]])
+
+
+def within_95(covariance: Float[ndarray, "n n"]) -> float:
+    """Return the bound of the length of 95 % of normal errors, to 1 % (Imhof 1961, Pearson's moments)."""
+    spread = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
+    mean, second, third = (float((spread**power).sum()) for power in (1, 2, 3))
+    if third <= 0:
+        return 0.0
+    freedom = second**3 / third**2
+    return float(np.sqrt(mean + (chi2.ppf(0.95, freedom) - freedom) * np.sqrt(second / freedom)))
+
+
+def scene_uncertainty(points: ScenePoints) -> SceneUncertainty:
+    """Return the uncertainty of a scene as a whole, and of its shape, by some of its points."""
+    middle, count = np.median(points.in_base, axis=0), len(points.in_base)
+    by_step = by_similarity(points.in_base - middle).reshape(3 * count, 7)
+    together = points.together.reshape(3 * count, 3 * count)
+    fit = np.linalg.pinv(by_step)
+    as_whole = fit @ together @ fit.T
+    left = np.trace(together) - 2 * np.sum((fit @ together) * by_step.T)
+    left += np.sum((as_whole @ by_step.T) * by_step.T)
+    each = points.together[np.arange(count), :, np.arange(count)] + points.own
+    return SceneUncertainty(
+        middle_in_base=middle,
+        covariance=as_whole,
+        shape_m=float(np.sqrt(max(left, 0.0) / (3 * count))),
+        within_95_m=float(np.median([within_95(one) for one in each])),
+    )
+
+
+def scene_points(solution: Solution) -> ScenePoints:
+    """Return some of the points of a solution with their covariance.
+
+    The mixed model has eliminated the rigs and the points. Their covariance follows by back substitution: of the rigs
+    given the unknowns of the mixed model, then of the points given rigs and cameras.
+    """
+    likely, images = solution.most_likely, solution.images
+    count = len(images.state.points_in_world)
+    some = np.sort(np.random.default_rng(0).permutation(count)[:SCENE_POINTS])
+    base_from_world, scale = likely.z[0][:3, :3], likely.scale
+    in_base_axes = scale * images.state.points_in_world[some] @ base_from_world.T
+    by_column, own = _triangulation(solution, some)
+    by_column = scale * base_from_world @ by_column
+    by_unknown, column_covariance = _rigs_given_unknowns(solution)
+    j = by_column @ by_unknown
+    by_frame = by_similarity(in_base_axes)
+    j[:, :, BASE_TRANSLATION] += by_frame[:, :, :3]
+    j[:, :, BASE_ROTATION] += by_frame[:, :, 3:6]
+    j[:, :, SCALE] += by_frame[:, :, 6:]
+    j, by_column = j.reshape(3 * len(some), -1), by_column.reshape(3 * len(some), -1)
+    together = j @ solution.covariance @ j.T + by_column @ column_covariance @ by_column.T
+    return ScenePoints(
+        in_base_axes + likely.z[0][:3, 3],
+        together.reshape(len(some), 3, len(some), 3),
+        scale**2 * base_from_world @ own @ base_from_world.T,
+    )
+
+
+def _triangulation(
+    solution: Solution, some: Int[ndarray, " n"]
+) -> tuple[Float[ndarray, "n 3 d"], Float[ndarray, "n 3 3"]]:
+    """Return the derivative of points by the columns of the images, and their covariance where these are fixed."""
+    images, problem = solution.images, solution.problem
+    _, rows_point, rows_rig, _ = problem.rows
+    rows = np.flatnonzero(np.isin(rows_point, some))
+    point = np.searchsorted(some, rows_point[rows])
+    by = derivatives(problem, images.state, images.view, images.weight)
+    by_point = by.by_point[rows]
+    starts = np.flatnonzero(np.diff(point, prepend=-1))
+    blocks = point_blocks(by_point, starts)
+    first = problem.columns.first_rig
+    columns = np.zeros((len(rows), 2, len(images.gradient)))
+    columns[:, :, :first] = by.shared[rows]
+    own = first + 6 * rows_rig[rows][:, None] + np.arange(6)
+    columns[np.arange(len(rows))[:, None, None], np.arange(2)[:, None], own[:, None]] = by.own[rows]
+    coupling = np.add.reduceat(np.swapaxes(by_point, 1, 2) @ columns, starts)
+    return -np.linalg.solve(blocks, coupling), np.linalg.inv(blocks)
+
+
+def _rigs_given_unknowns(solution: Solution) -> tuple[Float[ndarray, "d p"], Float[ndarray, "d d"]]:
+    """Return the derivative of the columns of the images by the unknowns, and their covariance where these are fixed.
+
+    That covariance is what images and reported poses leave of the rigs.
+    """
+    problem, equations, rigs = solution.problem, solution.equations, solution.images.rigs
+    by_rig = reported_poses(problem, solution.most_likely)[2]
+    shown = pose_by_pose(by_rig, rigs.covariance)
+    gain = over(cholesky(equations.covariance(solution.log_sizes)), shown).T
+    robots, columns, free, by_arm = problem.arm_unknowns, problem.columns.count, problem.free, problem.by_arm
+    by_unknown = np.zeros((columns, len(solution.covariance)))
+    by_unknown[free, robots + np.arange(len(free))] = 1.0
+    by_unknown[by_arm] = -gain @ equations.jacobian
+    by_unknown[by_arm, robots:] -= rigs.follow
+    left = np.zeros((columns, columns))
+    left[np.ix_(by_arm, by_arm)] = rigs.covariance - gain @ shown
+    return by_unknown, left
+
+
+def _model_error_px2(
+    estimate: Estimate, intrinsics: Intrinsics, x_px: Pixels
+) -> Float[ndarray, "*points 2 2"]:
+    """Return the covariance of pixels by the remaining error of the camera model."""
+    x_px = np.asarray(x_px, float)
+    if estimate.model_error is None:
+        return np.zeros((*x_px.shape, 2))
+    return second_moment_px2(estimate.model_error, intrinsics, x_px)
+
+
+def _derivatives(
+    estimate: Estimate, intrinsics: Intrinsics, x_px: Pixels, distance_m: Distances
+) -> tuple[Float[ndarray, "*points 3 j"], Float[ndarray, "*points 3 2"]]:
+    """Return derivatives of points on the gripper, in camera axes, by the joint unknowns and by their pixels."""
+    ray = unproject(intrinsics, np.asarray(x_px, float))
+    length = np.linalg.norm(ray, axis=-1)[..., None, None]
+    unit, distance = ray / length[..., 0], np.asarray(distance_m)[..., None]
+    across = np.eye(3) - unit[..., :, None] * unit[..., None, :]
+    by_ray = np.linalg.inv(by_point(intrinsics, ray)[..., :2])
+    by_pixel = distance[..., None] * across[..., :2] @ by_ray / length
+    camera_from_gripper_axes = estimate.gripper_from_camera[:3, :3].T
+    by_unknown = by_similarity(distance * unit)
+    by_unknown[..., :3] = camera_from_gripper_axes
+    by_unknown[..., 3:6] = by_unknown[..., 3:6] @ camera_from_gripper_axes
+    if estimate.intrinsics_cross is None:
+        return by_unknown, by_pixel
+    # The pixel is fixed: the ray compensates a change of the projection by the parameters.
+    by_intrinsics = -by_pixel @ by_parameters(intrinsics, ray)
+    return np.concatenate([by_unknown, by_intrinsics], axis=-1), by_pixel
