@@ -90,6 +90,10 @@ class Scripted:
         )
         return self.progress
 
+    def keep(self, image, pose, joints, time_s, depth_mm, *, replaces: int | None = None) -> str:
+        old = None if replaces is None else self.live.names[replaces]
+        return self.live.add(image, pose, joints, depth_mm, time_s, old)
+
     def propose_elsewhere(self, base_from_gripper: ndarray) -> Progress:
         self.progress = replace(self.progress, next_joints=base_from_gripper[:3, 3])
         return self.progress

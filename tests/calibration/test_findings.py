@@ -115,10 +115,6 @@ EXAMPLES: dict[FindingKind, dict] = {
     FindingKind.POSES_SWAPPED: {"images": ("a.png", "b.png")},
     FindingKind.POSE_CONTRADICTS_IMAGE: {"value": 0.1, "images": ("a.png",), "details": SIZE},
     FindingKind.NOT_REGISTERED: {"images": ("a.png",), "details": {"text": "matches no other image"}},
-    FindingKind.SAMPLE_REPEATED: {"images": ("a.png",)},
-    FindingKind.POSE_UNIT: {"value": 431.0, "details": {"unit": "millimetres", "a_metre": 1000.0}},
-    FindingKind.FRAME_REPEATED: {"images": ("a.png",), "details": {"mm": 30.0, "deg": 5.0}},
-    FindingKind.SIZE_DIFFERS: {"images": ("a.png",), "details": {"size": "640x480", "before": "320x240"}},
     FindingKind.CLOCK_JUMPS: {"value": 0.5, "images": ("a.png",)},
 }
 """What a kind needs to be said; the others a value with its sigma and chance, or words of their own."""

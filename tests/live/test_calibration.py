@@ -18,7 +18,7 @@ import jcr
 from jcr.capture.images import read_image
 from jcr.findings import FindingKind, sentence
 from jcr.geometry import inverse, rotation_exp, step_between, transform
-from jcr.live.calibration import LiveCalibration, checked_image
+from jcr.live.calibration import LiveCalibration
 from jcr.live.notation import Notation
 from jcr.live.page import page_content
 from jcr.live.progress import Progress, next_lines
@@ -57,7 +57,7 @@ def resumed(grown: tuple[Path, list[Progress]], tmp_path: Path) -> Iterator[Live
 @pytest.mark.slow
 def test_every_image_from_the_fifth_on_gives_a_calibration_and_it_becomes_more_exact(grown):
     _, states = grown
-    assert all(state.added == state.images[-1] and state.refused is None for state in states)
+    assert all(state.added == state.images[-1] for state in states)
     assert all(state.hand_eye is None and state.findings for state in states[:2])
     assert all(state.hand_eye is not None and state.hand_eye.converged for state in states[4:])
     assert [one.images for one in states[-1].history] == list(range(3, 13))
@@ -138,8 +138,9 @@ def test_a_place_that_shows_what_another_does_is_not_proposed_again(resumed: Liv
         assert pose is not None
         x = resumed.progress.hand_eye.gripper_from_camera  # pyright: ignore[reportOptionalMemberAccess]
         places.append((pose.base_from_gripper @ x)[:3, 3])
-        state = resumed.add(still(tabletop, 0), pose.base_from_gripper)
-        assert state.refused is not None and state.refused.kind is FindingKind.FRAME_REPEATED
+        with pytest.raises(jcr.InputError, match="image 12: is the same as images/000.png, though"):
+            resumed.add(still(tabletop, 0), pose.base_from_gripper)
+        resumed.propose_elsewhere(pose.base_from_gripper)
     assert all(np.linalg.norm(places[k] - places[j]) > 0.05 for k in range(3) for j in range(k))
 
 
@@ -174,14 +175,6 @@ def test_a_capture_that_is_resumed_stands_where_it_stood_and_a_retake_replaces(
 @pytest.mark.slow
 def test_each_fault_is_named_at_the_image_where_it_happens(resumed: LiveCalibration, tabletop: Path):
     pose, image = jcr.read_capture(tabletop).base_from_gripper[11], still(tabletop, 11)
-    count = len(resumed.live.names)
-
-    repeated = resumed.add(still(tabletop, 3), pose)
-    assert repeated.refused is not None and repeated.refused.kind is FindingKind.FRAME_REPEATED
-    assert repeated.refused.images == ("images/003.png",)
-    small = resumed.add(image[::2, ::2], pose)
-    assert small.refused is not None and small.refused.kind is FindingKind.SIZE_DIFFERS
-    assert len(resumed.live.names) == count and repeated.registered == resumed.progress.registered
 
     def against(state: Progress) -> dict[FindingKind, Any]:
         return {one.kind: one for one in state.findings if one.images == (state.added,)}
@@ -229,27 +222,53 @@ def test_a_robot_whose_model_is_refused_gives_no_joint_targets_and_is_named_once
     assert [page["headline"], *page["lines"]].count(warning[:1].upper() + warning[1:]) == 1
 
 
-def test_what_is_no_image_or_no_pose_is_named_with_its_remedy(tmp_path: Path, tabletop: Path):
-    image, pose = still(tabletop, 0), jcr.read_capture(tabletop).base_from_gripper[0]
+def test_what_cannot_be_kept_is_named_and_nothing_is_written(tmp_path: Path, tabletop: Path):
+    image, poses = still(tabletop, 0), jcr.read_capture(tabletop).base_from_gripper
+    in_mm, mirrored, not_finite = poses[1].copy(), poses[1] @ np.diag([1.0, 1, -1, 1]), poses[1].copy()
+    in_mm[:3, 3] *= 1e3
+    not_finite[0, 3] = np.nan
+    other = still(tabletop, 1)
+    path = tabletop / "images" / "00.jpg"
     with closing(LiveCalibration(tmp_path / "capture")) as live:
-        for wrong, words in (
-            (str(tabletop / "images" / "00.jpg"), "is a path; give the pixels"),
-            (tabletop / "images" / "00.jpg", "is a path; give the pixels"),
-            (image / 255.0, "float64 values; give uint8"),
-            (np.dstack([image, image[..., :1]]), r"image\[..., :3\]"),
+        live.add(image, poses[0])
+        before = (live.live.folder / "capture.json").read_bytes()
+        for wrong, pose, words in (
+            (str(path), poses[1], "is a path; give the pixels"),
+            (other / 255.0, poses[1], "float64 values; give uint8"),
+            (np.dstack([other, other[..., :1]]), poses[1], r"image\[..., :3\]"),
+            (other[::2, ::2], poses[1], "set its old resolution"),
+            (other, poses[1][:3, :3], "a rotation .3x3. has no translation"),
+            (other, poses[1][:3], "four rows"),
+            (other, 2 * poses[1], "last row"),
+            (other, poses[1] @ np.diag([2.0, 2, 2, 1]), "scaled by 2"),
+            (other, mirrored, "a reflection"),
+            (other, not_finite, "NaN"),
+            (other, in_mm, "looks like millimetres: divide the translation by 1000"),
+            (image, poses[1], "image 2: is the same as images/000.png, though the gripper moved by"),
+            (image, poses[0], "image 2: repeats images/000.png, image and pose"),
         ):
             with pytest.raises(jcr.InputError, match=words):
                 live.add(wrong, pose)
-        for wrong, words in (
-            (pose[:3, :3], "a rotation .3x3. has no translation"),
-            (pose[:3], "four rows"),
-            (2 * pose, "last row"),
-        ):
-            with pytest.raises(jcr.InputError, match=words):
-                live.add(image, wrong)
         with pytest.raises(jcr.InputError, match="bgr"):
-            checked_image(image, "grb")
-        assert live.live.names == []
+            live.add(other, poses[1], color="grb")  # pyright: ignore[reportArgumentType]
+        with pytest.raises(jcr.InputError, match="image 2: joints: up to 90 rad; these look like degrees"):
+            live.add(other, poses[1], joints=[90.0] * 6)
+        assert (live.live.folder / "capture.json").read_bytes() == before
+        assert [file.name for file in (live.live.folder / "images").iterdir()] == ["000.png"]
+        # In place of the first it is no second one.
+        assert live.add(image, poses[0], replaces=0).images == ("images/001.png",)
+
+
+def test_all_images_may_be_removed_and_others_added(tmp_path: Path, tabletop: Path):
+    poses = jcr.read_capture(tabletop).base_from_gripper
+    with closing(LiveCalibration(tmp_path / "capture")) as live:
+        with pytest.raises(jcr.InputError, match="no image at index 0; the capture has 0"):
+            live.remove(0)
+        for _ in range(2):
+            live.add(still(tabletop, 0), poses[0])
+            assert len(live.add(still(tabletop, 1), poses[1]).images) == 2
+            live.remove(1)
+            assert live.remove(0).images == ()
 
 
 def test_grey_and_bgr_images_are_converted_and_lists_are_poses(tmp_path: Path, tabletop: Path):
@@ -277,22 +296,6 @@ def test_two_threads_may_add_images(tmp_path: Path, tabletop: Path):
         # Each state is that after one more image, and all are kept.
         assert sorted(len(state.images) for state in states) == [1, 2, 3]
         assert live.progress.images == tuple(live.live.names) == tuple(f"images/00{k}.png" for k in range(3))
-
-
-def test_a_pose_in_millimetres_and_a_sample_that_is_given_twice_are_not_kept(tmp_path: Path, tabletop: Path):
-    image, poses = still(tabletop, 0), jcr.read_capture(tabletop).base_from_gripper
-    with closing(LiveCalibration(tmp_path / "capture")) as live:
-        live.add(image, poses[0])
-        in_mm = poses[1].copy()
-        in_mm[:3, 3] *= 1e3
-        state = live.add(still(tabletop, 1), in_mm)
-        assert state.refused is not None and state.refused.kind is FindingKind.POSE_UNIT
-        assert "divide the translation by 1000" in str(state) and len(str(state).splitlines()) == 2
-        state = live.add(image, poses[0])
-        assert state.refused is not None and state.refused.kind is FindingKind.SAMPLE_REPEATED
-        assert state.refused.images == state.images == ("images/000.png",)
-        # In place of the first it is no second one.
-        assert live.add(image, poses[0], replaces=0).images == ("images/001.png",)
 
 
 @pytest.mark.slow

@@ -283,18 +283,6 @@ class FindingKind(StrEnum):
         "take such a view again, nearer to a pose that registered, with textured things in view",
         means="while a capture is taken (`jcr capture`): its camera is not in the reconstruction",
         evidence="other images that match it")
-    SAMPLE_REPEATED = "image and pose repeat others", Row("single",
-        "the image and the gripper pose are those of {images[0]}: not kept",
-        "move the gripper, or press retake", evidence="m, the motion between both")
-    POSE_UNIT = "gripper pose in another unit", Row("single",
-        "the gripper would be {value:.4g} m from the base, as of a pose in {unit}: not kept",
-        "divide the translation by {a_metre:.0f}", evidence="largest coordinate of the position, as given")
-    FRAME_REPEATED = "image repeats another", Row("single",
-        "the image is the same as {images[0]}, though the gripper moved by {mm:.0f} mm and {deg:.0f}°: not "
-        "kept", "check that the camera's stream is live", evidence="m between the gripper poses")
-    SIZE_DIFFERS = "image size differs", Row("single",
-        "the image has {size} pixels, the others {before}: not kept",
-        "set the camera's old resolution, or name a new folder")
     CLOCK_JUMPS = "clock jumps back", Row("single",
         "the time of {images[0]} is {value:.3g} s before that of the image before it",
         "check that images and poses are stamped by one clock", evidence="s")

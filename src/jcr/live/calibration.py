@@ -1,10 +1,9 @@
 """Calibration that is updated after each image of a capture, with its accuracy, findings and the next gripper pose."""
 
-import json
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -28,7 +27,6 @@ from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import Arm
 from jcr.estimation.prediction import FEWEST
-from jcr.files import read_bytes, write_text
 from jcr.findings import Finding, FindingKind, strongest_first
 from jcr.geometry import apply, largest_motion
 from jcr.least_squares import one_blas_thread
@@ -43,8 +41,6 @@ from jcr.sfm.growing import Growing
 if TYPE_CHECKING:
     from jcr.results import RunResult
 
-HISTORY = "live/history.json"
-"""File in the folder of the capture with the accuracy after each image."""
 OBSERVATIONS = 300, 8000
 """Observations per image and in all that are used while images are taken; the calibration at the end uses all."""
 FEW = 5
@@ -94,7 +90,7 @@ class LiveCalibration:
         self._map: Growing | None = None
         self._mapped: list[str] = []
         self._of_image: dict[str, tuple[Finding, ...]] = {}
-        self._history = _read_history(folder.folder / HISTORY)
+        self._history: tuple[Accuracy, ...] = ()
         self._refused: list[Float[ndarray, "4 4"]] = []
         self._next_pose: Callable[[], dict[str, Any]] = dict
         """Fields of Progress for the capture as it was calibrated last and the gripper poses refused since."""
@@ -120,23 +116,40 @@ class LiveCalibration:
 
         `joints` are the angles of the arm (rad), `time_s` is the time of the image, `depth_mm` (h,w) the image of a
         depth camera, `color` the order of channels ("bgr" for OpenCV), `replaces` the index of an image that is removed
-        for this one. An image of another size, one that repeats an earlier one, or a pose in another unit is not kept:
-        `refused` says why, and the capture is unchanged. Raises InputError for arrays that are no image or no pose.
+        for this one; grey images are converted. Raises InputError that names the image, and leaves the capture as it
+        was, for arrays that are no image or no rigid pose, a pose in another unit than metres, another size than that
+        of the others, and an image that repeats another. Threads may add at once: one of them waits for the other.
         """
-        pixels, pose = checked_image(image, color), checked_pose(base_from_gripper)
-        angles = None if joints is None else np.asarray(joints, np.float64)
         with self._lock:
-            old = None if replaces is None else self.live.names[replaces]
-            refused = self._refusal(pixels, pose, without=old)
-            if refused is not None:
-                return self._refuse(refused, pose)
-            self.live.add(pixels, pose, angles, depth_mm, time_s, replaces=old)
+            self.keep(image, base_from_gripper, joints, time_s, depth_mm, color=color, replaces=replaces)
             return self.update()
+
+    def keep(
+        self,
+        image: ArrayLike | Path,
+        base_from_gripper: ArrayLike,
+        joints: ArrayLike | None = None,
+        time_s: float | None = None,
+        depth_mm: UInt16[ndarray, "h w"] | None = None,
+        *,
+        color: Literal["rgb", "bgr"] = "rgb",
+        replaces: int | None = None,
+    ) -> str:
+        """Write an image into the capture as `add`, without calibrating, and return its name; `update` calibrates."""
+        with self.live.lock:
+            number = f"image {len(self.live.names) + 1}"
+            pixels = checked_image(image, color, number)
+            pose = checked_pose(base_from_gripper, f"{number}: base_from_gripper")
+            old = None if replaces is None else self._name(replaces)
+            if self.live.size == (pixels.shape[1], pixels.shape[0]):
+                self._refuse_repeated(pixels, pose, old, number)
+            angles = None if joints is None else np.asarray(joints, np.float64)
+            return self.live.add(pixels, pose, angles, depth_mm, time_s, replaces=old)
 
     def remove(self, index: int) -> Progress:
         """Remove the image at `index` from the capture, and calibrate without it."""
         with self._lock:
-            self.live.remove(self.live.names[index])
+            self.live.remove(self._name(index))
             return self.update()
 
     def undo(self) -> Progress:
@@ -174,6 +187,9 @@ class LiveCalibration:
             new = [name for name in names if name not in self._mapped]
             if capture is not None:
                 self._extend(capture)
+            elif self._map is not None:
+                self._map.close()
+                self._map = None
             added = new[-1] if new and before <= len(names) else None
             self._refused.clear()
             self.progress = self._calibrated(capture, added)
@@ -195,36 +211,34 @@ class LiveCalibration:
             self.live.close()
             self._opened.close()
 
-    def _refusal(
-        self, image: UInt8[ndarray, "h w 3"], base_from_gripper: Float[ndarray, "4 4"], without: str | None
-    ) -> Finding | None:
-        """Return the reason why an image is not kept, or None; `without` names an image that does not count."""
-        size = (image.shape[1], image.shape[0])
-        if self.live.size not in (None, size):
-            now, before = ("{}x{}".format(*one) for one in (size, self.live.size))
-            return Finding.of(FindingKind.SIZE_DIFFERS, "rejects", "images", size=now, before=before)
-        far, farthest, _ = far_rows(base_from_gripper[None, :3, 3])
-        if far:
-            unit, _, a_metre = likely_unit(farthest)
-            return Finding.of(
-                FindingKind.POSE_UNIT, "rejects", "poses", value=farthest, unit=unit, a_metre=float(a_metre)
-            )
+    def _name(self, index: int) -> str:
+        """Return the name of an image; raise InputError where the capture has no such image."""
+        names = self.live.names
+        if not -len(names) <= index < len(names):
+            raise InputError(f"there is no image at index {index}; the capture has {len(names)}")
+        return names[index]
+
+    def _refuse_repeated(
+        self,
+        image: UInt8[ndarray, "h w 3"],
+        base_from_gripper: Float[ndarray, "4 4"],
+        without: str | None,
+        number: str,
+    ) -> None:
+        """Raise InputError where an image repeats another than the one named `without`."""
         new = ImageSummary.of(image)
         for one in self.live.images:
             if one.image == without or not new.is_like(self.live.summary(one.image)):
                 continue
             metres, radians = largest_motion(np.stack([one.base_from_gripper, base_from_gripper]))
-            moved = metres >= MOVED[0] or radians >= MOVED[1]
-            kind = FindingKind.FRAME_REPEATED if moved else FindingKind.SAMPLE_REPEATED
-            return Finding.of(kind, "rejects", "images", one.image, value=metres, rotation=radians)
-        return None
-
-    def _refuse(self, refused: Finding, base_from_gripper: Float[ndarray, "4 4"]) -> Progress:
-        """Return the state after an image that is not kept."""
-        if refused.kind is FindingKind.FRAME_REPEATED:
-            self.propose_elsewhere(base_from_gripper)
-        self.progress = replace(self.progress, added=None, refused=refused)
-        return self.progress
+            if metres < MOVED[0] and radians < MOVED[1]:
+                raise InputError(
+                    f"{number}: repeats {one.image}, image and pose; move the arm and take another"
+                )
+            raise InputError(
+                f"{number}: is the same as {one.image}, though the gripper moved by {1e3 * metres:.0f} mm and "
+                f"{np.degrees(radians):.0f}°; check that the camera's stream is live"
+            )
 
     def _forget(self, name: str) -> None:
         """Remove an image from the map."""
@@ -336,7 +350,7 @@ class LiveCalibration:
         ]
 
     def _remember(self, images: int, hand_eye: HandEye) -> None:
-        """Write the accuracy with this number of images; entries of more images belong to other images."""
+        """Note the accuracy with this number of images; entries of more images belong to other images."""
         required = hand_eye.requirement
         assert required is not None
         reached = Accuracy(
@@ -346,37 +360,46 @@ class LiveCalibration:
             accepted=hand_eye.converged,
         )
         self._history = (*(one for one in self._history if one.images < images), reached)
-        write_text(self.live.folder / HISTORY, json.dumps([asdict(one) for one in self._history]) + "\n")
 
 
-def checked_image(image: ArrayLike | Path, color: str = "rgb") -> UInt8[ndarray, "h w 3"]:
+def checked_image(
+    image: ArrayLike | Path, color: str = "rgb", number: str = "image"
+) -> UInt8[ndarray, "h w 3"]:
     """Return an image as RGB (h,w,3) uint8, grey ones converted; raise InputError for anything else."""
     if isinstance(image, str | Path):
         raise InputError(
-            f"image {image}: is a path; give the pixels, numpy.array(PIL.Image.open(path).convert('RGB'))"
+            f"{number}: {image} is a path; give the pixels, numpy.array(PIL.Image.open(path).convert('RGB'))"
         )
     if color not in ("rgb", "bgr"):
         raise InputError(f'color={color!r}: give "rgb", or "bgr" for images of OpenCV')
     pixels = np.asarray(image)
     if pixels.dtype != np.uint8:
         raise InputError(
-            f"image: {pixels.dtype} values; give uint8 from 0 to 255 "
+            f"{number}: {pixels.dtype} values; give uint8 from 0 to 255 "
             "(of floats from 0 to 1: (255 * image).round().astype(numpy.uint8))"
         )
     if pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 1):
         pixels = np.repeat(pixels.reshape(*pixels.shape[:2], 1), 3, axis=2)
     if pixels.ndim != 3 or pixels.shape[2] != 3:
-        raise InputError(f"image: shape {pixels.shape}; give (height, width, 3), of RGBA image[..., :3]")
+        raise InputError(f"{number}: shape {pixels.shape}; give (height, width, 3), of RGBA image[..., :3]")
     return np.ascontiguousarray(pixels[..., ::-1] if color == "bgr" else pixels)
 
 
-def checked_pose(base_from_gripper: ArrayLike) -> Float[ndarray, "4 4"]:
-    """Return a rigid transform (4,4); raise InputError for anything else."""
+def checked_pose(base_from_gripper: ArrayLike, where: str) -> Float[ndarray, "4 4"]:
+    """Return a rigid transform (4,4) in metres; raise InputError, begun with `where`, for anything else."""
     if np.shape(base_from_gripper) == (3, 3):
         raise InputError(
-            "base_from_gripper: a rotation (3x3) has no translation; give 4x4 with the position in metres"
+            f"{where}: a rotation (3x3) has no translation; give 4x4 with the position in metres"
         )
-    return read_rigid(base_from_gripper, "base_from_gripper")
+    pose = read_rigid(base_from_gripper, where)
+    far, farthest, _ = far_rows(pose[None, :3, 3])
+    if far:
+        name, _, a_metre = likely_unit(farthest)
+        raise InputError(
+            f"{where}: the gripper is {farthest:.4g} from the base; that looks like {name}: divide the translation by "
+            f"{a_metre}"
+        )
+    return pose
 
 
 def _first(capture: Capture, count: int) -> Capture:
@@ -434,11 +457,3 @@ def _points(case: Case, hand_eye: HandEye) -> Float[ndarray, "p 3"]:
     seen = np.flatnonzero(np.bincount(tracks.point, minlength=len(tracks.points_in_recon)) >= 3)
     some = seen[:: max(1, len(seen) // MOST_POINTS)]
     return apply(hand_eye.base_from_recon, hand_eye.scale * tracks.points_in_recon[some])
-
-
-def _read_history(file: Path) -> tuple[Accuracy, ...]:
-    """Return the accuracies as they were written; none of a file that cannot be read, for it decides nothing."""
-    try:
-        return tuple(Accuracy(**one) for one in json.loads(read_bytes(file)))
-    except (OSError, ValueError, TypeError):
-        return ()

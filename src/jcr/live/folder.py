@@ -1,6 +1,7 @@
 """Capture folder that grows image by image and is complete after every change, so that stopping loses nothing."""
 
 import re
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -30,8 +31,8 @@ IMAGES = "images"
 class LiveFolder:
     """Capture folder whose images are added, replaced and removed; images that it holds already are kept.
 
-    One thread at a time makes changes; others may read at any time. The files of removed images stay until `close`, so
-    that a change can be undone.
+    Changes are made by one thread at a time, which holds `lock`; others may read at any time. The files of removed
+    images stay until `close`, so that a change can be undone.
     """
 
     def __init__(
@@ -39,6 +40,7 @@ class LiveFolder:
     ) -> None:
         """Open or begin a capture; raise InputError where the folder or its capture.json cannot be used."""
         self.folder, file = folder, folder / FILE
+        self.lock = threading.RLock()
         if folder.exists() and not folder.is_dir():
             raise InputError(f"{folder}: is a file; name a folder for the capture")
         self._content = CaptureFile(frames=[], intrinsics=None, source={"program": "jcr capture"})  # pyright: ignore[reportCallIssue]
@@ -97,7 +99,7 @@ class LiveFolder:
         entry = {"image": f"{IMAGES}/{stem}.png", "base_from_gripper": base_from_gripper, "time_s": time_s}
         entry |= {"joints": None if joints is None else joints.tolist()}
         entry |= {"depth": None if depth_mm is None else f"depth/{stem}.png"}
-        new: FrameEntry = validated(FrameEntry, entry, f"image {len(self.images)}")
+        new: FrameEntry = validated(FrameEntry, entry, f"image {len(self.images) + 1}")
         images = (*(one for one in self.images if one.image != replaces), new)
         if len({len(one.joints) for one in images if one.joints is not None}) > 1:
             raise InputError(f"joints of {new.image}: not as many angles as the other images have; give all")
@@ -118,7 +120,8 @@ class LiveFolder:
 
     def remove(self, name: str) -> None:
         """Remove an image from the capture."""
-        self._change(tuple(one for one in self.images if one.image != name))
+        with self.lock:
+            self._change(tuple(one for one in self.images if one.image != name))
 
     @property
     def can_undo(self) -> bool:
@@ -127,11 +130,12 @@ class LiveFolder:
 
     def undo(self) -> bool:
         """Take back the last change of this session; return whether there was one."""
-        if not self._earlier:
-            return False
-        self._write(self._earlier[-1])
-        self.images = self._earlier.pop()
-        return True
+        with self.lock:
+            if not self._earlier:
+                return False
+            self._write(self._earlier[-1])
+            self.images = self._earlier.pop()
+            return True
 
     def close(self) -> None:
         """Delete the files of images that this session removed; no change can be undone after that."""
@@ -144,9 +148,12 @@ class LiveFolder:
 
         Images of an earlier session may have had another clock.
         """
-        row = self.names.index(name)
-        before, now = self.images[max(row - 1, 0)], self.images[row]
-        if row == 0 or now.time_s is None or before.time_s is None:
+        images = self.images
+        row = next((k for k, one in enumerate(images) if one.image == name), 0)
+        if row == 0:
+            return None
+        before, now = images[row - 1], images[row]
+        if now.time_s is None or before.time_s is None:
             return None
         if (before.image in self._before_session) != (name in self._before_session):
             return None

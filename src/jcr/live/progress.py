@@ -42,8 +42,6 @@ class Progress:
     """Names of all images that are kept, in the order in which they were taken."""
     added: str | None = None
     """Image whose addition led to this state; None where none was added."""
-    refused: Finding | None = None
-    """Reason why the image that was given is not kept."""
     registered: tuple[str, ...] = ()
     """Images whose cameras are known."""
     findings: tuple[Finding, ...] = ()
@@ -198,8 +196,6 @@ def _accuracy(state: Progress) -> str:
 
 def _advice(state: Progress) -> str:
     """Return what to do next, in one line."""
-    if state.refused is not None:
-        return f"refused: {sentence(state.refused)}"
     if found := faults(state):
         return sentence(found[0])
     if state.requirement_met:

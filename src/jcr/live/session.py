@@ -5,6 +5,8 @@ Requests and commands may come from any thread (HTTP server, terminal, arm) and 
 
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -122,16 +124,14 @@ class LiveSession:
         self._lock = threading.RLock()
         """Held while an image is taken or a command is obeyed."""
         self._changed = threading.Condition()
-        """Notified when the state or the counters below change."""
+        """Notified when the state changes."""
         self.state = SessionState(images=self.folder.images)
-        self._wanted = self._done = 0
-        """Number of changes that the calibration must follow, and of those that it has followed."""
-        self._refused: list[Float[ndarray, "4 4"]] = []
-        """Gripper poses at which no image was kept and for which no other pose is proposed yet."""
         self._calibrated: tuple[str, ...] | None = None
-        self._is_abandoned = False
         self._error: Exception | None = None
-        self._worker = threading.Thread(target=self._follow_changes, daemon=True)
+        self._worker = ThreadPoolExecutor(1)
+        """Thread of the calibration, which follows each change."""
+        self._following: Future[None] = Future()
+        """Last calibration that was asked for."""
 
     def run(self, source: Callable[[], None] | None = None) -> None:
         """Take images until there are enough, the source or the video ends, or the requirement ends the capture.
@@ -139,11 +139,10 @@ class LiveSession:
         `source` calls `take` in a thread of its own; None where requests come from elsewhere. Raises the error of the
         source or the camera.
         """
-        self._want_calibration()
+        self._follow()
         self._show(is_over=len(self.folder.names) >= self.options.most)
-        self._worker.start()
         if source is not None:
-            threading.Thread(target=self._follow, args=(source,), daemon=True).start()
+            threading.Thread(target=self._request, args=(source,), daemon=True).start()
         try:
             with self._changed:
                 self._changed.wait_for(lambda: self.state.is_over)
@@ -178,21 +177,12 @@ class LiveSession:
         with self._lock:
             if self.state.is_over:
                 return {"accepted": False, "reason": "the capture has ended", "done": True}
-            name, why = self._take(state, current)
-            is_over = self.state.is_over
-            if name is None:
-                answer: Answer = {"accepted": False, "reason": why, "done": is_over}
-                self._refuse(f"refused: {why}", answer)
-                self._want_calibration(state.base_from_gripper)
-            else:
-                answer = {"accepted": True, "image": name, "done": is_over}
-                self._tell(answer, [f"kept {name}"])
-            ticket = self._wanted
+            answer = self._take(state, current)
+            following = self._following
         if not waits:
             return answer
-        with self._changed:
-            self._changed.wait_for(lambda: self._done >= ticket)
-            return self.state.progress.as_json() | answer | {"done": self.state.is_over}
+        wait([following])
+        return self.state.progress.as_json() | answer | {"done": self.state.is_over}
 
     def press(self, action: Action, number: int | None = None) -> None:
         """Obey a command; `number` counts images from 1, None: the last one."""
@@ -226,50 +216,59 @@ class LiveSession:
         self._show(self.state.event, is_refusal=self.state.is_refusal, is_over=True, is_done=True)
         return self.state.result
 
-    def _take(self, state: RobotState, current: Callable[[], RobotState] | None) -> tuple[str | None, str]:
-        """Return the name of a new image and "", or None and the reason why none is kept."""
+    def _take(self, state: RobotState, current: Callable[[], RobotState] | None) -> Answer:
+        """Take an image, let its calibration follow, and return the answer."""
+        names, replaced = self.folder.names, self.state.replaces
         try:
             frame = self._frame(state, current)
-        except StopIteration:
-            self._show(is_over=True)
-            return None, "the video has ended"
-        except InputError as error:  # The camera is lost.
-            self._fail(error)
-            return None, str(error)
-        if isinstance(frame, str):
-            return None, frame
-        try:
-            name = self.folder.add(
+            name = self.calibration.keep(
                 frame.image,
                 state.base_from_gripper,
                 state.joints,
-                frame.depth_mm,
                 frame.time_s,
-                replaces=self.state.replaces,
+                frame.depth_mm,
+                replaces=names.index(replaced) if replaced in names else None,
             )
+        except StopIteration:
+            self.end()
+            why = "the video has ended"
         except InputError as error:
-            return None, str(error)
+            why = str(error)
         except OSError as error:
-            return None, f"the image cannot be written ({error.strerror}); free the disk and take it again"
-        self._show(f"kept {name}", replaces=None, is_over=len(self.folder.names) >= self.options.most)
-        self._want_calibration()
-        return name, ""
+            why = f"the image cannot be written ({error.strerror}); free the disk and take it again"
+        else:
+            self._follow()
+            self._show(f"kept {name}", replaces=None, is_over=len(self.folder.names) >= self.options.most)
+            answer: Answer = {"accepted": True, "image": name, "done": self.state.is_over}
+            self._tell(answer, [f"kept {name}"])
+            return answer
+        answer = {"accepted": False, "reason": why, "done": self.state.is_over}
+        self._refuse(f"refused: {why}", answer)
+        self._follow(state.base_from_gripper)
+        return answer
 
-    def _frame(self, state: RobotState, current: Callable[[], RobotState] | None) -> Frame | str:
-        """Return a frame at rest, or the reason why none is kept."""
+    def _frame(self, state: RobotState, current: Callable[[], RobotState] | None) -> Frame:
+        """Return a frame at rest; raise InputError with the reason why none is kept, StopIteration at a video's end."""
         others = [one for one in self.folder.images if one.image != self.state.replaces]
         pose = state.base_from_gripper
         for one in others:
             if not is_farther(one.base_from_gripper, pose, SAME_PLACE):
-                return f"the gripper is where {one.image} was taken; move to another pose"
+                raise InputError(f"the gripper is where {one.image} was taken; move to another pose")
         kept = [self.folder.summary(one.image) for one in others]
-        found = frame_at_rest(self._frames, kept, self.options.patience)
-        if isinstance(found, Frame) and current is not None:
+        try:
+            found = frame_at_rest(self._frames, kept, self.options.patience)
+        except InputError as error:
+            self._fail(error)
+            raise
+        if isinstance(found, str):
+            raise InputError(found)
+        if current is not None:
             try:
-                if is_farther(pose, current().base_from_gripper, REST):
-                    return "the arm moved while the image was taken; let it rest"
+                has_moved = is_farther(pose, current().base_from_gripper, REST)
             except (InputError, StopIteration) as error:
-                return f"the pose cannot be read after the image: {error}"
+                raise InputError(f"the pose cannot be read after the image: {error}") from None
+            if has_moved:
+                raise InputError("the arm moved while the image was taken; let it rest")
         return found
 
     def _take_now(self) -> None:
@@ -312,7 +311,7 @@ class LiveSession:
     def _follow_removal(self, event: str) -> None:
         """Calibrate the images that are left."""
         self._show(event, replaces=None)
-        self._want_calibration()
+        self._follow()
         self._tell({"images": self.folder.names}, [event])
 
     def _refuse(self, why: str, answer: Answer | None = None) -> None:
@@ -320,7 +319,7 @@ class LiveSession:
         self._show(why, is_refusal=True)
         self._tell(answer or {"accepted": False, "reason": why.removeprefix("refused: ")}, [why])
 
-    def _follow(self, source: Callable[[], None]) -> None:
+    def _request(self, source: Callable[[], None]) -> None:
         """Run the source of requests; its end is the end of the capture."""
         try:
             source()
@@ -335,56 +334,41 @@ class LiveSession:
             self._error = error
         self.end()
 
-    def _want_calibration(self, refused: Float[ndarray, "4 4"] | None = None) -> None:
-        """Let the worker calibrate the images, and propose a pose away from a refused one."""
-        with self._changed:
-            self._wanted += 1
-            if refused is not None:
-                self._refused.append(refused)
-            self._changed.notify_all()
+    def _follow(self, refused: Float[ndarray, "4 4"] | None = None) -> None:
+        """Let the worker calibrate the images where they changed, and propose a pose away from a refused one."""
+        with suppress(RuntimeError):  # The worker has ended, with the session.
+            self._following = self._worker.submit(self._calibrate, refused)
 
     def _stop_worker(self, longest_s: float, abandon: bool) -> None:
         """Wait until the worker has calibrated all images, or with `abandon` the present ones."""
-        self._is_abandoned = abandon
         self.end()
-        self._worker.join(longest_s)
-        with self._changed:
-            self._done = self._wanted
-            self._changed.notify_all()
+        self._worker.shutdown(wait=False, cancel_futures=abandon)
+        wait([self._following], longest_s)
 
-    def _follow_changes(self) -> None:
-        """Calibrate after each change of the capture, in the worker's thread."""
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._wanted > self._done or self.state.is_over)
-                if self._is_abandoned or self._wanted == self._done:
-                    return
-                ticket, refused, self._refused = self._wanted, self._refused, []
-            try:
-                self._calibrate(refused)
-            except (InputError, RejectedError) as error:
-                self._refuse(f"no calibration: {error}")
-            except OSError as error:
-                self._refuse(f"no calibration: {error.filename or self.folder.folder}: {error.strerror}")
-            except Exception as error:
-                self._fail(error)
-            with self._changed:
-                self._done = max(self._done, ticket)
-                self._changed.notify_all()
+    def _calibrate(self, refused: Float[ndarray, "4 4"] | None) -> None:
+        """Calibrate the images where they changed, and propose another pose, in the worker's thread."""
+        try:
+            if tuple(self.folder.names) != self._calibrated:
+                self._update()
+            if refused is not None:
+                self._report(self.calibration.propose_elsewhere(refused))
+        except (InputError, RejectedError) as error:
+            self._refuse(f"no calibration: {error}")
+        except OSError as error:
+            self._refuse(f"no calibration: {error.filename or self.folder.folder}: {error.strerror}")
+        except Exception as error:
+            self._fail(error)
 
-    def _calibrate(self, refused: list[Float[ndarray, "4 4"]]) -> None:
-        """Calibrate the images where they changed, finish an accurate calibration, and propose other poses."""
-        if tuple(self.folder.names) != self._calibrated:
-            progress = self.calibration.update()
-            self._calibrated = progress.images
-            self._report(progress)
-            if self.options.until_accurate and progress.requirement_met:
-                result = self.calibration.finish()
-                required = result.hand_eye.requirement
-                if result.converged and required is not None and required.met:
-                    self._show(is_over=True, result=result)
-        for pose in refused:
-            self._report(self.calibration.propose_elsewhere(pose))
+    def _update(self) -> None:
+        """Calibrate the images, and end the capture where that is accurate enough."""
+        progress = self.calibration.update()
+        self._calibrated = progress.images
+        self._report(progress)
+        if self.options.until_accurate and progress.requirement_met:
+            result = self.calibration.finish()
+            required = result.hand_eye.requirement
+            if result.converged and required is not None and required.met:
+                self._show(is_over=True, result=result)
 
     def _report(self, progress: Progress) -> None:
         """Show and tell a state of the calibration."""
