@@ -130,7 +130,7 @@ def run_by_command(capture: Path, out: Path) -> None:
     command = [sys.executable, "-m", "jcr", "run", str(capture), str(out), "--quiet"]
     finished = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
     assert finished.returncode == 0, finished.stderr
-    assert "report:" in finished.stdout
+    assert "\nReport  " in finished.stdout
 
 
 @pytest.fixture(scope="session")
