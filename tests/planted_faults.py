@@ -94,6 +94,27 @@ FAULTS = (
         ("tests/estimation/test_closed_form.py",),
     ),
     PlantedFault(
+        "boards",
+        "src/jcr/boards/detection.py",
+        "return bool(shade[like_first].mean() < shade[~like_first].mean())",
+        "return bool(shade[like_first].mean() > shade[~like_first].mean())",
+        ("tests/boards/test_detection.py",),
+    ),
+    PlantedFault(
+        "findings",
+        "src/jcr/findings/finding.py",
+        'finding.kind.row.group != "images", not is_cause(finding)',
+        'finding.kind.row.group != "images", is_cause(finding)',
+        ("tests/calibration/test_findings.py",),
+    ),
+    PlantedFault(
+        "pipeline",
+        "src/jcr/pipeline/selection.py",
+        "if other.leave_one_out_m < one.leave_one_out_m:",
+        "if other.leave_one_out_m > one.leave_one_out_m:",
+        ("tests/test_attempts.py",),
+    ),
+    PlantedFault(
         "calibration",
         "src/jcr/calibration/verdict.py",
         "if not accepted or not judged(hand_eye).converged:",
@@ -176,26 +197,38 @@ def copy_source(into: Path) -> None:
             shutil.copy(source, into / name)
 
 
-def is_caught(fault: PlantedFault, copy: Path) -> bool:
-    """Return whether a test fails while the error is in the copy; raise ValueError where the edit does not apply."""
+def failed_test(fault: PlantedFault, copy: Path) -> str:
+    """Return the test that fails while the error is in the copy, and passes without; empty where none does.
+
+    Raises ValueError where the edit does not apply.
+    """
     file = copy / fault.file
     text = file.read_text()
     if text.count(fault.before) != 1:
-        raise ValueError(f"{fault.stage}: {fault.file} does not contain the line once: {fault.before}")
+        raise ValueError(f"{fault.file} does not contain the line once: {fault.before}")
+    file.write_text(text.replace(fault.before, fault.after))
+    try:
+        failed = _first_failure(copy, fault.tests)
+    finally:
+        file.write_text(text)
+    if failed and _first_failure(copy, (failed,)):
+        raise ValueError(f"{failed} fails without the error, too")
+    return failed
+
+
+def _first_failure(copy: Path, tests: tuple[str, ...]) -> str:
+    """Return the first test that fails, or an empty text."""
     environment = os.environ | {
         "PYTHONPATH": f"{copy / 'src'}{os.pathsep}{copy}",
         "PYTHONDONTWRITEBYTECODE": "1",
     }
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *fault.tests]
-    file.write_text(text.replace(fault.before, fault.after))
-    try:
-        done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True)
-    finally:
-        file.write_text(text)
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
+    done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True)
     # 1: tests failed. Others: nothing was collected, or pytest itself failed.
     if done.returncode not in (0, 1):
-        raise ValueError(f"{fault.stage}: pytest ended with status {done.returncode}: {done.stdout[-500:]}")
-    return done.returncode == 1
+        raise ValueError(f"pytest ended with status {done.returncode}: {done.stdout[-500:]}")
+    failures = [line for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+    return failures[0].split(" - ")[0].split(" ", 1)[1] if done.returncode else ""
 
 
 def main(names: list[str]) -> int:
@@ -207,13 +240,13 @@ def main(names: list[str]) -> int:
             if names and fault.stage not in names:
                 continue
             try:
-                caught = is_caught(fault, Path(folder))
+                failed = failed_test(fault, Path(folder))
             except ValueError as error:
-                sys.stdout.write(f"{error}\n")
+                sys.stdout.write(f"{fault.stage}: {error}\n")
                 missed += 1
                 continue
-            missed += not caught
-            sys.stdout.write(f"{fault.stage}: {'caught' if caught else 'NOT CAUGHT'}\n")
+            missed += not failed
+            sys.stdout.write(f"{fault.stage}: {failed or 'NOT CAUGHT'}\n")
             sys.stdout.flush()
     return int(missed > 0)
 
