@@ -144,9 +144,9 @@ FAULTS = (
     ),
     PlantedFault(
         "cell",
-        "src/jcr/cell/localise.py",
-        "recon_from_camera = inverse(transform(motion.rotation.matrix(), motion.translation))",
-        "recon_from_camera = transform(motion.rotation.matrix(), motion.translation)",
+        "src/jcr/cell/stage.py",
+        "lambda p, k=k: p.z[0] @ inverse(p.z[k])",
+        "lambda p, k=k: p.z[k] @ inverse(p.z[0])",
         ("tests/cell/test_cell.py",),
     ),
     PlantedFault(
