@@ -3,7 +3,7 @@
 import shutil
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -12,16 +12,15 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float
 from numpy import ndarray
-from PIL import Image
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
 from benchmarks.page import table
 from benchmarks.peers import WEBCAM
 from jcr.calibration.stage import calibrate
-from jcr.camera import project, rays
+from jcr.camera import project
 from jcr.capture.read import read_capture
 from jcr.depth.densify import densify
 from jcr.errors import InputError
@@ -29,7 +28,7 @@ from jcr.export.provenance import Provenance
 from jcr.export.volume import write_octomap
 from jcr.geometry import apply, inverse
 from jcr.reconstruct import ReconstructOptions, reconstruct
-from jcr.records import HandEye, Intrinsics, PointCloud, Reconstruction
+from jcr.records import HandEye, PointCloud, Reconstruction
 from jcr.scene.build import build_scene
 from jcr.scene.cloud import point_cloud
 from jcr.scene.options import MapOptions
@@ -39,7 +38,7 @@ from jcr.segments.measure import ObjectSize, measure
 from jcr.segments.tabletop import label_tabletop
 from simulation.capture import SimulateOptions, simulate
 from simulation.scenes import make_scene
-from simulation.surface import solid_labels
+from simulation.surface import Surface, solid_labels, true_surface
 from simulation.truth import TrueObject, Truth, read_truth, true_depth, true_labels
 
 VIEWS, POINTS = 12, 200_000
@@ -76,16 +75,6 @@ class MapScore:
     color_psnr: float
     label_iou: float
     """Mean over the labels; as `color_psnr`, on the surface where the map knows it."""
-
-
-@dataclass(frozen=True)
-class Surface:
-    """All pixels of a simulated capture as points, with the truth about each."""
-
-    x_in_base: Float[ndarray, "n 3"]
-    color: UInt8[ndarray, "n 3"]
-    label: Int[ndarray, " n"]
-    image: Int[ndarray, " n"]
 
 
 @dataclass(frozen=True)
@@ -237,19 +226,6 @@ def _fcl(
     return seconds, float((np.array(hits) == scene.check_spheres(centers, radii, "free")).mean())
 
 
-def true_surface(truth: Truth) -> Surface:
-    """What the images show, one point a pixel."""
-    parts = []
-    for k, base_from_camera in enumerate(truth.base_from_camera):
-        depth = true_depth(truth, k)
-        shown = depth > 0
-        with Image.open(truth.folder / truth.images[k]) as image:
-            color = np.asarray(image)[shown]
-        x_in_base = apply(base_from_camera, depth[shown][:, None] * rays(truth.intrinsics)[shown])
-        parts.append((x_in_base, color, true_labels(truth, k)[shown].astype(int), np.full(shown.sum(), k)))
-    return Surface(*map(np.concatenate, zip(*parts, strict=True)))
-
-
 def true_cloud(truth: Truth) -> PointCloud:
     """The cloud that perfect poses and depth would give."""
     surface, draw = true_surface(truth), np.random.default_rng(0)
@@ -342,17 +318,24 @@ def mean_iou(found: ndarray, true: ndarray, labels: tuple = ()) -> float:
 
 
 def _seen(truth: Truth, x_in_base: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
-    """Which free places lie before what a camera's pixel shows."""
-    seen, camera = np.zeros(len(x_in_base), bool), truth.intrinsics
+    """Test which free places lie before what a camera's pixel shows."""
+    return np.any([z < depth for z, depth in _depths(truth, x_in_base)], axis=0)
+
+
+def _depths(
+    truth: Truth, x_in_base: Float[ndarray, "n 3"]
+) -> Iterator[tuple[Float[ndarray, " n"], Float[ndarray, " n"]]]:
+    """Yield depths of places and of the pixels that show them, for each image; infinite and 0 outside of it."""
+    camera = truth.intrinsics
     for k, camera_from_base in enumerate(inverse(truth.base_from_camera)):
         x_in_camera = apply(camera_from_base, x_in_base)
         z = x_in_camera[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             column, row = np.round(project(camera, x_in_camera)).T
-        ahead = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        depth = true_depth(truth, k)[row[ahead].astype(int), column[ahead].astype(int)]
-        seen[np.flatnonzero(ahead)[z[ahead] < depth]] = True
-    return seen
+        shown = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        there, depth = np.where(shown, z, np.inf), np.zeros(len(z))
+        depth[shown] = true_depth(truth, k)[row[shown].astype(int), column[shown].astype(int)]
+        yield there, depth
 
 
 def _distance(tree: KDTree, x: Float[ndarray, "n 3"]) -> Float[ndarray, " n"]:
@@ -366,20 +349,11 @@ DEPTH_SCENES = {
     "everything plain": ("direct", SimulateOptions(seed=1, texture=False)),
 }
 LIMITS_MM = (2, 5, 10)
+Shares = Float[ndarray, " k"]
+"""Percentages within each of LIMITS_MM."""
 PLACES = 20_000
 SEES = 0.003
-"""m: distance behind an image's surface up to which the image still sees a place."""
-
-
-@dataclass(frozen=True)
-class Shown:
-    """What the pixels of a pointmap truly show."""
-
-    depth: Float[ndarray, "m h w"]
-    x_in_base: Float[ndarray, "m h w 3"]
-    asked: Bool[ndarray, "m h w"]
-    """Table or object within the workspace, which another image shows as well."""
-    table: Bool[ndarray, "m h w"]
+"""m: difference of depth up to which an image shows a place."""
 
 
 def _depth(folder: Path) -> list[str]:
@@ -391,7 +365,7 @@ def _depth(folder: Path) -> list[str]:
         begun = time.process_time()
         found = densify(capture, reconstruct(capture, ReconstructOptions(backend=backend)))
         seconds = time.process_time() - begun
-        table_mm, objects_mm = covered(found, calibrate(capture, found), shown_by(made, found))
+        table_mm, objects_mm = covered(found, calibrate(capture, found), read_truth(made))
         shares[name] = table_mm[1], objects_mm[1]
         pixels = f"{100 * (found.dense.confidence > 0).mean():.1f}"
         rows.append(
@@ -410,57 +384,18 @@ def _depth(folder: Path) -> list[str]:
     ]
 
 
-def shown_by(folder: Path, found: Reconstruction) -> Shown:
-    """The truth of a simulated capture at the pixels of its pointmaps."""
-    truth, grid = read_truth(folder), found.dense.intrinsics
-    direction = rays(grid)
-    place = project(truth.intrinsics, direction).astype(np.float32)
-    nearest = np.rint(place).astype(int).clip(0, [truth.intrinsics.width - 1, truth.intrinsics.height - 1])
-    depth, label = [], []
-    for k in found.image_index.tolist():
-        at_pixel = true_depth(truth, k)[nearest[..., 1], nearest[..., 0]]
-        between = cv2.remap(
-            true_depth(truth, k).astype(np.float32), place[..., 0], place[..., 1], cv2.INTER_LINEAR
-        )
-        depth.append(np.where(np.abs(between - at_pixel) < SEES, between, at_pixel))
-        label.append(true_labels(truth, k)[nearest[..., 1], nearest[..., 0]])
-    base_from_camera = truth.base_from_camera[found.image_index]
-    x = np.stack(
-        [apply(pose, z[..., None] * direction) for pose, z in zip(base_from_camera, depth, strict=True)]
-    )
+def covered(found: Reconstruction, hand_eye: HandEye, truth: Truth) -> tuple[Shares, Shares]:
+    """Return the percentages of table and objects, where two images show them, near a point of all pointmaps."""
+    surface = true_surface(truth)
     low, high = truth.workspace_in_base
-    labels = np.stack(label)
-    asked = (labels > 0) & ((x >= low) & (x <= high)).all(-1)
-    others = np.zeros(asked.shape, int)
-    for i in range(len(x)):
-        for j in range(len(x)):
-            if i != j:
-                others[i] += _sees(apply(inverse(base_from_camera[j]), x[i]), depth[j], grid)
-    return Shown(np.stack(depth), x, asked & (others > 0), labels == 1)
-
-
-def _sees(x: Float[ndarray, "h w 3"], depth: Float[ndarray, "h w"], grid: Intrinsics) -> Bool[ndarray, "h w"]:
-    """Whether points in a camera's frame are what its depth image shows, give or take a pixel."""
-    ahead = np.where(x[..., 2:] > 0, x, [0.0, 0.0, 1.0])
-    u, v = np.moveaxis(np.rint(project(grid, ahead)), -1, 0)
-    inside = (x[..., 2] > 0) & (u >= 0) & (v >= 0) & (u < grid.width) & (v < grid.height)
-    u, v = np.where(inside, u, 0).astype(int), np.where(inside, v, 0).astype(int)
-    near, far = cv2.erode(depth, np.ones((3, 3))), cv2.dilate(depth, np.ones((3, 3)))
-    return inside & (x[..., 2] > near[v, u] - SEES) & (x[..., 2] < far[v, u] + SEES)
-
-
-def covered(
-    found: Reconstruction, hand_eye: HandEye, shown: Shown
-) -> tuple[Float[ndarray, " k"], Float[ndarray, " k"]]:
-    """Percent of the table's and the objects' places with a point of all pointmaps within each limit."""
-    has = found.dense.confidence > 0
-    x = hand_eye.scale * found.dense.points_in_recon[has].astype(np.float64)
-    tree = KDTree(apply(hand_eye.base_from_recon, x))
-    drawn = np.random.default_rng(0).choice(int(shown.asked.sum()), PLACES, replace=False)
-    distance = tree.query(shown.x_in_base[shown.asked][drawn], distance_upper_bound=0.011)[0]
-    table = shown.table[shown.asked][drawn]
-    shares = [(1e3 * distance[:, None] <= LIMITS_MM)[rows].mean(0) for rows in (table, ~table)]
-    return 100 * shares[0], 100 * shares[1]
+    there = (surface.label > 0) & ((surface.x_in_base >= low) & (surface.x_in_base <= high)).all(1)
+    drawn = np.random.default_rng(0).choice(np.flatnonzero(there), PLACES, replace=False)
+    x, on_table = surface.x_in_base[drawn], surface.label[drawn] == 1
+    asked = np.sum([np.abs(z - depth) < SEES for z, depth in _depths(truth, x)], axis=0) > 1
+    points = hand_eye.scale * found.dense.points_in_recon[found.dense.confidence > 0].astype(np.float64)
+    tree = KDTree(apply(hand_eye.base_from_recon, points))
+    near = 1e3 * tree.query(x, distance_upper_bound=0.011)[0][:, None] <= LIMITS_MM
+    return 100 * near[asked & on_table].mean(0), 100 * near[asked & ~on_table].mean(0)
 
 
 HEIGHT_SEEDS, HEIGHT_COUNTS = (6, 7, 8), (8, 10)

@@ -1,17 +1,19 @@
 """What is solid in a simulated scene, and the surface that its images show."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
+from PIL import Image
 from scipy.spatial.distance import cdist
 
 from jcr.camera import rays
 from jcr.geometry import apply, inverse, transform
 from simulation.meshes import Mesh
 from simulation.scenes import Scene
-from simulation.truth import read_truth, true_depth, true_labels
+from simulation.truth import Truth, read_truth, true_depth, true_labels
 
 
 def solid_labels(scene: Scene, x_in_base: Float[ndarray, "n 3"]) -> Int[ndarray, "n"]:
@@ -53,20 +55,33 @@ def winding_number(mesh: Mesh, points: Float[ndarray, "n 3"]) -> Float[ndarray, 
     return windings
 
 
-def truth_points(folder: Path) -> tuple[Float[ndarray, "n 3"], Int[ndarray, "n"]]:
-    """The surface that the images show: points in the base frame (n,3) m, one a pixel, and their labels (n,).
+@dataclass(frozen=True)
+class Surface:
+    """Points at all pixels of a simulated capture, and the truth about each."""
 
-    Table and objects within the workspace box. InputError where the depth was not written (`--truth scene`).
-    """
-    truth = read_truth(folder)
-    camera = truth.intrinsics
-    rays_in_camera = rays(camera)
-    low, high = truth.workspace_in_base
-    points, labels = [], []
+    x_in_base: Float[ndarray, "n 3"]
+    color: UInt8[ndarray, "n 3"]
+    label: Int[ndarray, " n"]
+    image: Int[ndarray, " n"]
+
+
+def true_surface(truth: Truth) -> Surface:
+    """Return the surface that the images show; it needs the depth that `--truth scene` leaves out."""
+    parts = []
     for k, base_from_camera in enumerate(truth.base_from_camera):
-        depth, label = true_depth(truth, k), true_labels(truth, k)
-        x_in_base = apply(base_from_camera, depth[..., None] * rays_in_camera)
-        shown = (label > 0) & ((x_in_base >= low) & (x_in_base <= high)).all(-1)
-        points.append(x_in_base[shown])
-        labels.append(label[shown].astype(np.int64))
-    return np.concatenate(points), np.concatenate(labels)
+        depth = true_depth(truth, k)
+        shown = depth > 0
+        with Image.open(truth.folder / truth.images[k]) as image:
+            color = np.asarray(image)[shown]
+        x_in_base = apply(base_from_camera, depth[shown][:, None] * rays(truth.intrinsics)[shown])
+        label = true_labels(truth, k)[shown].astype(np.int64)
+        parts.append((x_in_base, color, label, np.full(len(label), k)))
+    return Surface(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def truth_points(folder: Path) -> tuple[Float[ndarray, "n 3"], Int[ndarray, "n"]]:
+    """Return points of table and objects in the workspace (m, base frame) and their labels, from all images."""
+    truth = read_truth(folder)
+    surface, (low, high) = true_surface(truth), truth.workspace_in_base
+    there = (surface.label > 0) & ((surface.x_in_base >= low) & (surface.x_in_base <= high)).all(1)
+    return surface.x_in_base[there], surface.label[there]
