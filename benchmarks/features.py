@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from benchmarks.page import apart, folders_with, table
-from jcr.calibration.known_transform import read_hand_eye
+from benchmarks.page import folders_with, number, table
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
@@ -40,8 +39,7 @@ class Row:
     images: str
     seconds: float
     accepted: bool = False
-    off: tuple[float, float] | None = None
-    """mm and degrees from the reference; None without a calibration."""
+    leave_one_out_mm: float | None = None
     std: tuple[float, float] | None = None
     """Largest stated standard deviation, mm and degrees."""
 
@@ -52,14 +50,14 @@ class Row:
 
     def cells(self) -> list[str]:
         """Return the row of the table."""
-        numbers = [f"{value:.2f}" for pair in (self.off, self.std) if pair is not None for value in pair]
+        numbers = [number(value, 2) for value in (self.leave_one_out_mm, *(self.std or (None, None)))]
         accepted = "yes" if self.accepted else "no"
-        return [self.capture, self.way, self.images, *(numbers or ["–"] * 4), accepted, f"{self.seconds:.0f}"]
+        return [self.capture, self.way, self.images, *numbers, accepted, f"{self.seconds:.0f}"]
 
 
 def run(captures: Path) -> str:
-    """Return the page in Markdown: captures below `captures` that have a reference, matched in each way."""
-    folders = folders_with(captures, "reference.json")[::EVERY]
+    """Return the page in Markdown: some of the captures below `captures`, matched in each way."""
+    folders = folders_with(captures, "capture.json")[::EVERY]
     return page([_row(folder, features, gate) for folder in folders for features, gate in WAYS])
 
 
@@ -70,11 +68,10 @@ def page(rows: Sequence[Row]) -> str:
     lines = [
         f"> Calibrations from images alone that are accepted: {', '.join(counts)}.",
         "",
-        "Distance from the reference stored with each capture, which has an error of its own. Seconds: reconstruction "
-        "without dense depth and calibration.",
+        "Leave-one-out error of the gripper poses. Seconds: reconstruction without dense depth and calibration.",
         "",
         *table(
-            "capture | features | images registered | off: mm | ° | ±σ: mm | ° | accepted | s",
+            "capture | features | images registered | leave-one-out, mm | ±σ: mm | ° | accepted | s",
             (row.cells() for row in rows),
         ),
     ]
@@ -100,7 +97,7 @@ def _row(folder: Path, features: FeatureName, gate: bool) -> Row:
         f"{count} of {len(capture)}",
         seconds,
         hand_eye.converged,
-        apart(hand_eye.gripper_from_camera, read_hand_eye(folder / "reference.json").gripper_from_camera),
+        None if hand_eye.leave_one_out is None else 1e3 * hand_eye.leave_one_out.length_m,
         (1e3 * float(std[:3].max()), float(np.degrees(std[3:6].max()))),
     )
 

@@ -53,8 +53,9 @@ BENCHES = {
     ),
     "speed": Bench("Speed", TIME, "Processor time and memory of jobs and stages, beside COLMAP alone.", True),
     "peers": Bench(
-        "Peers", OTHERS, "Hand-eye solvers, few images and global alignment beside other methods.", True
+        "Peers", OTHERS, "Hand-eye solvers, images and global alignment beside other methods.", True
     ),
+    "kinhec": Bench("KinHEC", OTHERS, "Hand-eye solvers on KinHEC's tier small by its own protocol."),
     "pointmaps": Bench("Pointmaps", OTHERS, "The whole job from pairwise pointmaps with a network's errors."),
 }
 """Benches in the order of the index."""
