@@ -272,6 +272,7 @@ def _ratios(draws: int) -> Iterator[list[float]]:
         foretold, reported = (
             (reached(one.estimate, one.in_use, "seen")[0], *reached(one.estimate, one.in_use, "camera"))
             for one in (prediction, hand_eye)
+            if one.in_use is not None
         )
         yield np.divide(foretold, reported).tolist()
 
