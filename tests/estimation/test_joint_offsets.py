@@ -5,8 +5,10 @@ import pytest
 
 from jcr.estimation.arms import arm_named
 from jcr.estimation.hand_eye import solve_hand_eye
-from jcr.estimation.joint_offsets import joint_offsets
+from jcr.estimation.pose_effects import joint_offsets
+from jcr.estimation.pose_equations import pose_equations
 from jcr.estimation.systematic import arm_errors, posed
+from jcr.estimation.wrist import pose_problem
 from simulation.arms import PresetName
 from simulation.problems import bent_problem
 
@@ -17,8 +19,9 @@ def examined(preset: PresetName, seed: int):
     arm, joints = posed(problem.bent.arm, problem.joints, gripper)
     systematic = arm_errors(arm, joints)
     solved = solve_hand_eye(gripper, camera, systematic=systematic)
-    offsets = joint_offsets(solved, gripper, camera, systematic, arm, joints)
-    return problem.bent.errors[:6], offsets
+    start = solved.gripper_from_camera, solved.scale, solved.base_from_recon
+    poses = pose_equations(*pose_problem(gripper, camera, start, error_covariance=systematic), None)
+    return problem.bent.errors[:6], joint_offsets(poses, arm, joints)
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """The marker back end: metric camera poses from a board or tags of known size, for those who have one.
 
-Pose of a plane from its points: IPPE (Collins and Bartoli, IJCV 2014), then least squares in pixels.
+Poses of planes come from estimation/absolute_pose.py.
 """
 
 from collections import Counter
@@ -13,10 +13,11 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.boards.detection import PRINTED, Board, Sighting, boards, is_of_unknown_size, most_seen
-from jcr.camera import WITHIN_FOLD, by_point, fold_distance_px, project, unproject, without_distortion
+from jcr.camera import WITHIN_FOLD, by_point, fold_distance_px, project
 from jcr.capture.images import read_image
 from jcr.errors import RejectedError
-from jcr.geometry import apply, inverse, retract, rotation_between_deg, rotation_exp, skew, transform
+from jcr.estimation.absolute_pose import absolute_pose
+from jcr.geometry import apply, inverse, retract, skew
 from jcr.least_squares import minimise
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
@@ -24,8 +25,8 @@ from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 FEWEST_POINTS = 4
 WORST_PX = 3.0
 """A board whose points miss by more (rms) is bent, or no such board."""
-AMBIGUOUS = 1.5
-"""A small or distant plane may be tilted either way: two poses whose errors differ by less than this factor."""
+GATE_PX = 10.0
+"""Distance within which corners take part in a pose; those of a bent board are all near."""
 FEWEST_FOR_INTRINSICS = 4
 """Fewest images of a board that determine intrinsics."""
 
@@ -123,34 +124,16 @@ def _intrinsics(
 
 def pose_of_body(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:
     """Return the body's pose; None where its points lie on a line, miss, or fit two poses."""
-    x, x_px = sighting.x_in_body, sighting.x_px
-    seen, camera = x_px, (intrinsics.matrix, np.array(intrinsics.distortion))
-    if intrinsics.model == "fisheye":
-        # OpenCV's solvers know the other two: they get a pinhole's image of the same rays.
-        straight = without_distortion(intrinsics)
-        seen, camera = (
-            project(straight, unproject(intrinsics, x_px)),
-            (straight.matrix, np.array(straight.distortion)),
-        )
+    x = sighting.x_in_body
     if np.linalg.svd(x - x.mean(0), compute_uv=False)[1] < 1e-6:
         return None
-    count, rotations, translations, _ = cv2.solvePnPGeneric(x, seen, *camera, flags=cv2.SOLVEPNP_IPPE)
-    found = []
-    for k in range(count):
-        rotation, shift = cv2.solvePnPRefineLM(x, seen, *camera, rotations[k], translations[k])
-        pose = transform(rotation_exp(rotation.ravel()), shift.ravel())
-        residual_px = project(intrinsics, apply(pose, x)) - x_px
-        found.append(Pose(pose, float(np.sqrt((residual_px**2).sum(1).mean()))))
-    found.sort(key=lambda pose: pose.rms_px)
-    if not found or found[0].rms_px > WORST_PX:
+    found = absolute_pose(sighting.x_px, x, intrinsics, gate_px=GATE_PX, planar=True)
+    if found is None or found.rival is not None:
         return None
-    for other in found[1:]:
-        apart_deg = float(
-            rotation_between_deg(found[0].camera_from_body[:3, :3], other.camera_from_body[:3, :3])
-        )
-        if apart_deg > 5 and other.rms_px < AMBIGUOUS * found[0].rms_px + 0.05:
-            return None
-    return found[0]
+    pose = inverse(found.a_from_camera)
+    residual_px = project(intrinsics, apply(pose, x)) - sighting.x_px
+    rms_px = float(np.sqrt((residual_px**2).sum(1).mean()))
+    return Pose(pose, rms_px) if rms_px < WORST_PX else None
 
 
 def locate_cameras_and_bodies(

@@ -3,6 +3,7 @@
 Where images add nothing to the poses, what the errors of given intrinsics would do is added to the fit instead.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from jcr.estimation.residuals import paper_residuals
 from jcr.estimation.score_test import focal_lengths
 from jcr.estimation.solve import START_NOISE, Solution
 from jcr.estimation.wrist import adjust_wrist, estimate_of, wrist_arm
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import inverse, retract, scale_translation, step_between
 from jcr.records import (
     Estimate,
@@ -30,6 +32,10 @@ from jcr.records import (
     PaperResiduals,
     RobotExamined,
 )
+
+SETTLED_ENOUGH = 0.5
+"""Standard deviations of the last step below which an adjustment that did not settle is only noted: smaller effects
+are not reported either (checks/effects.py)."""
 
 
 def adjusted(case: Case) -> Case:
@@ -50,11 +56,21 @@ def adjusted(case: Case) -> Case:
     case = replace(case, adjusted=found)
     if not case.hand_eye.observability.observable:
         return case
-    refined = judged(refined_by(case, found))
+    refined = judged(refined_by(case, found)).with_findings(*_not_settled(found))
     nearer, than = refined.leave_one_out, case.hand_eye.leave_one_out
     if case.tracks.from_pointmaps and (nearer is None or than is None or nearer.length_m >= than.length_m):
         return case
     return replace(case, hand_eye=refined)
+
+
+def _not_settled(found: Solution) -> Iterator[Finding]:
+    """Yield a finding where the rounds of the adjustment ended before sizes and steps settled."""
+    if not found.settled:
+        severity = "warns" if found.last_step > SETTLED_ENOUGH else "informs"
+        details = {"rounds": float(found.iterations)}
+        yield Finding.of(
+            FindingKind.NOT_SETTLED, severity, "reconstruction", value=found.last_step, **details
+        )
 
 
 def adjust_case(

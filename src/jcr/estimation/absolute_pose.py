@@ -84,7 +84,7 @@ def absolute_pose(
         one
         for start in starts
         if start[2].sum() == most >= least
-        and (one := _refined(x_px, points, spread, start, gate_px, 7 if focal == "free" else 6))
+        and (one := _refined(x_px, points, spread, start, gate_px, 7 if focal == "free" else 6, least))
     ]
     if not found:
         return None
@@ -113,22 +113,31 @@ def _initial_poses(
     planar: bool,
 ) -> list[_Start]:
     """Return the two poses of a plane, with all points, or the one on which RANSAC finds that most points agree."""
+    if not planar:
+        found = ransac_pose(camera.fx * unproject(camera, x_px)[:, :2], points, camera.fx, gate_px)
+        return [] if found is None else [(found[0], camera, found[1])]
     pixels, matrix = camera.fx * unproject(camera, x_px)[:, :2], np.diag([camera.fx, camera.fx, 1.0])
-    if planar:
-        _, rotations, shifts, _ = cv2.solvePnPGeneric(points, pixels, matrix, None, flags=cv2.SOLVEPNP_IPPE)
-        every = np.ones(len(points), bool)
-        poses = [
-            transform(rotation_exp(r.ravel()), s.ravel()) for r, s in zip(rotations, shifts, strict=True)
-        ]
-        return [(inverse(pose), camera, every) for pose in poses if (apply(pose, points)[:, 2] > 0).all()]
+    _, rotations, shifts, _ = cv2.solvePnPGeneric(points, pixels, matrix, None, flags=cv2.SOLVEPNP_IPPE)
+    poses = [transform(rotation_exp(r.ravel()), s.ravel()) for r, s in zip(rotations, shifts, strict=True)]
+    every = np.ones(len(points), bool)
+    return [(inverse(pose), camera, every) for pose in poses if (apply(pose, points)[:, 2] > 0).all()]
+
+
+def ransac_pose(
+    x_px: Float[ndarray, "k 2"], points: Float[ndarray, "k 3"], focal_px: float, gate_px: float
+) -> tuple[Float[ndarray, "4 4"], Bool[ndarray, " k"]] | None:
+    """Return a_from_camera by SQPNP in RANSAC, and the points that agree; None where none is found.
+
+    `x_px` are pixels from the principal point of a camera without distortion.
+    """
     done, rotation, shift, rows = cv2.solvePnPRansac(
-        points, pixels, matrix, None,
+        points, x_px, np.diag([focal_px, focal_px, 1.0]), None,
         iterationsCount=2000, reprojectionError=gate_px, confidence=0.9999, flags=cv2.SOLVEPNP_SQPNP,
     )  # fmt: skip
     if not done or rows is None:
-        return []
-    inlier = np.isin(np.arange(len(points)), np.ravel(rows))
-    return [(inverse(transform(rotation_exp(rotation.ravel()), shift.ravel())), camera, inlier)]
+        return None
+    pose = inverse(transform(rotation_exp(rotation.ravel()), shift.ravel()))
+    return pose, np.isin(np.arange(len(points)), np.ravel(rows))
 
 
 def _refined(
@@ -138,6 +147,7 @@ def _refined(
     start: _Start,
     gate_px: float,
     p: int,
+    least: int,
 ) -> CameraPose | None:
     """Return the pose of least reprojection error under a Cauchy loss; noise and inliers are estimated in turn."""
     (pose, camera, inlier), found = start, None
@@ -148,7 +158,7 @@ def _refined(
         std_px = _noise(residual[inlier], added[inlier], p)
         root = np.linalg.inv(np.linalg.cholesky(std_px**2 * np.eye(2) + added))
         agreed, inlier = inlier, std_px * np.linalg.norm(root @ residual[..., None], axis=(1, 2)) < gate_px
-        if inlier.sum() < p:
+        if inlier.sum() < max(least, (p + 1) // 2):
             return None
         white, seen = root[inlier], (x_px[inlier], points[inlier])
 

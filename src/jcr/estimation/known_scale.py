@@ -1,25 +1,23 @@
-"""Two stacks of poses in the same unit: the two constant transforms between them."""
+"""Least-squares fit of the two constant transforms between two stacks of poses in one unit."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.estimation.equation import UNKNOWNS, Poses, columns_of_arm, residuals, share_within_limits
+from jcr.estimation.equation import Poses, columns_of_arm, residuals
 from jcr.geometry import Transform, retract
+from jcr.least_squares import minimise
 
-STEPS, SETTLED = 30, 1e-12
 
-
-@dataclass(frozen=True)
-class Fit:
-    """base_from_gripper · `gripper_from_camera` ≈ `base_from_recon` · recon_from_camera."""
+class Fit(NamedTuple):
+    """Transforms with base_from_gripper · `gripper_from_camera` ≈ `base_from_recon` · recon_from_camera."""
 
     gripper_from_camera: Transform
     base_from_recon: Transform
     residual: Float[ndarray, "n 6"]
-    """As in `equation.residuals`: m and rad."""
+    """Steps of `equation.residuals` (m, rad)."""
 
 
 def fit_known_scale(
@@ -29,19 +27,19 @@ def fit_known_scale(
     noise: tuple[float, float],
     exchanged: bool = False,
 ) -> Fit:
-    """Weighted least squares (Gauss-Newton) from `start` (gripper_from_camera, base_from_recon); `noise` in m, rad.
+    """Return the weighted least-squares fit from `start` (gripper_from_camera, base_from_recon); `noise` in m, rad.
 
-    Where the motions do not determine both, the solution nearest the start. `exchanged` is that of `equation.residuals`.
+    Directions that the motions do not determine stay as they are in `start`. `exchanged` is that of
+    `equation.residuals`.
     """
-    (x, z), free = start, columns_of_arm(0)
-    weight = 1 / np.repeat(noise, 3)
-    for _ in range(STEPS):
-        residual, jacobian = residuals(x, 1.0, z, base_from_gripper, recon_from_camera, exchanged)
-        step = np.zeros(UNKNOWNS)
-        rows = (weight[:, None] * jacobian[:, :, free]).reshape(-1, len(free))
-        step[free] = -np.linalg.lstsq(rows, (weight * residual).ravel(), rcond=1e-9)[0]
-        step *= share_within_limits(step)
-        x, z = retract(x, step[:6]), retract(z, step[7:])
-        if np.abs(step).max() < SETTLED:
-            break
+    weight, columns = 1 / np.repeat(noise, 3), columns_of_arm(0)
+
+    def linearised(at: tuple[Transform, Transform]) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 12"]]:
+        residual, jacobian = residuals(at[0], 1.0, at[1], base_from_gripper, recon_from_camera, exchanged)
+        return weight * residual, weight[:, None] * jacobian[:, :, columns]
+
+    def moved(at: tuple[Transform, Transform], step: Float[ndarray, "12"]) -> tuple[Transform, Transform]:
+        return retract(at[0], step[:6]), retract(at[1], step[6:])
+
+    x, z = minimise(linearised, start, moved).unknowns
     return Fit(x, z, residuals(x, 1.0, z, base_from_gripper, recon_from_camera, exchanged)[0])

@@ -1,4 +1,4 @@
-"""Effects on the gripper poses as columns of the equations: slip, drift, delay, moved base, and strains of the arm."""
+"""Columns of the equations for effects on the gripper poses: slip, drift, delay, moved base, strains, joint offsets."""
 
 from collections.abc import Iterator
 
@@ -6,9 +6,14 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.estimation.components import most_likely
 from jcr.estimation.hypotheses import Row
+from jcr.estimation.kinematics import Arm, Joints, error_jacobian
+from jcr.estimation.mixed_model import solve_equations
+from jcr.estimation.pose_equations import PoseEquations
 from jcr.findings import FindingKind
 from jcr.geometry import Poses, skew
+from jcr.records import JointOffsets
 
 LEAST_PART = 3
 """Images on either side of a change: fewer are single wrong poses."""
@@ -104,3 +109,19 @@ def velocity(base_from_gripper: Poses) -> Float[ndarray, "n 6"]:
 def _flat(columns: Float[ndarray, "n 6 d"]) -> Float[ndarray, "s d"]:
     """Return columns with one row per residual, s = 6n."""
     return columns.reshape(-1, columns.shape[2])
+
+
+def joint_offsets(poses: PoseEquations, arm: Arm, joints: Joints) -> JointOffsets:
+    """Return the offset of each joint (rad), true angle less reported one, and its standard deviation.
+
+    Best linear unbiased prediction (Searle, Casella and McCulloch 1992, chapter 7) at the most likely sizes of the
+    errors of the poses. An offset that no pose shows, as of the first joint, keeps the standard deviation of any joint.
+    """
+    sizes = most_likely(poses.equations)[0]
+    solution = solve_equations(poses.equations, sizes)
+    size = float(np.sqrt(poses.equations.variances(sizes)[2]))
+    columns = _flat(error_jacobian(arm, joints)[:, :, : arm.dof])
+    columns = columns - poses.region.by_unknown @ (poses.region.fit @ columns)
+    offset = size**2 * columns.T @ solution.weighed_left
+    known = np.diag(columns.T @ solution.projection @ columns)
+    return JointOffsets(offset, size * np.sqrt(np.maximum(1 - size**2 * known, 0.0)), size)

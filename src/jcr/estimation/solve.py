@@ -82,7 +82,10 @@ class Solution:
     """Expected information of the log sizes of the robot's errors."""
     evidence: ImageEvidence | None
     settled: bool
+    """Whether sizes and steps settled before the largest number of rounds."""
     iterations: int
+    last_step: float = 0.0
+    """Largest step of an arm's unknown in the last round, in standard deviations; 0 without observations."""
     smooth: SmoothSolution | None = None
     """Solution of many poses in the eigenvectors of their systematic errors; None: of the equations themselves."""
 
@@ -207,8 +210,9 @@ def solve(
         )
     if start.pixel_noise is None:
         start = _adjusted_to_poses(problem, start, problem.robot_noise_floor or start_noise)
-    state, images, settled, rounds = _rounds(problem, start)
-    return replace(_with_covariance(problem, state, images, averaged), settled=settled, iterations=rounds)
+    state, images, settled, rounds, last_step = _rounds(problem, start)
+    found = _with_covariance(problem, state, images, averaged)
+    return replace(found, settled=settled, iterations=rounds, last_step=last_step)
 
 
 def with_priors(solution: Solution, priors: Sequence[LinearPrior]) -> Solution:
@@ -249,9 +253,13 @@ def expected_solution(
     )
 
 
-def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool, int]:
-    """Estimate the sizes of errors and step all unknowns, in turn until both settle."""
-    state, acceleration, log_sizes = start, Acceleration(), start.robot_log_sizes
+def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool, int, float]:
+    """Estimate the sizes of errors and step all unknowns, in turn until both settle.
+
+    Return also whether they settled, the number of rounds, and the largest last step of an arm's unknown in standard
+    deviations.
+    """
+    state, acceleration, log_sizes, last_step = start, Acceleration(), start.robot_log_sizes, np.inf
     for count in range(1, ROUNDS + 1):
         before, view = state.pixel_noise, view_of(problem, state)
         state = with_pixel_noise(problem, state, view)
@@ -264,8 +272,8 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
         assert before is not None and state.pixel_noise is not None
         repixeled = state.pixel_noise.change(before)
         if max(change, resized, repixeled) < SIZES_SETTLED and together.size < STEP_SETTLED:
-            return replace(state, robot_log_sizes=log_sizes), images, True, count
-        moved = together.after(state, normal)
+            return replace(state, robot_log_sizes=log_sizes), images, True, count, together.size
+        moved, last_step = together.after(state, normal), together.size
         if together.cost(moved) <= together.cost(state) * (1 + ROUNDING):
             begun, ended = _coordinates(problem, start, unresized), _coordinates(problem, start, moved)
             state = _state_at(
@@ -275,7 +283,7 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
             state = together.damped(replace(state, robot_log_sizes=log_sizes))
             acceleration.forget()
     state = replace(state, robot_log_sizes=log_sizes)
-    return state, evidence(problem, state), False, ROUNDS
+    return state, evidence(problem, state), False, ROUNDS, last_step
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

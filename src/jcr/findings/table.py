@@ -220,6 +220,9 @@ class FindingKind(StrEnum):
         means="what a back end says to act on, in words", help="in its words")
     NO_RECONSTRUCTION = "no reconstruction", Row("reconstruction", "{text}", sentences.given_remedy,
         means="no back end found camera poses", help="in its words")
+    NOT_SETTLED = "adjustment not settled", Row("reconstruction",
+        "the adjustment has not settled: its last round moved the result by {value:.2g} standard deviations",
+        "add images of textured, still things", evidence="the last step, in standard deviations")
     OWN_REJECTED = "the capture's own camera is rejected", Row("cell",
         "the {camera} camera's own calibration is rejected", help="correct that first")
     FEW_POINTS_SHARED = "few points shared with the scene", Row("cell",

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from jcr.calibration.case import Case, Checked
-from jcr.calibration.robot_errors import of_poses
-from jcr.estimation.joint_offsets import joint_offsets
+from jcr.estimation.pose_effects import joint_offsets
+from jcr.estimation.pose_equations import pose_equations
+from jcr.estimation.wrist import pose_problem
 from jcr.findings import Finding, FindingKind
 from jcr.records import JointOffsets, RobotExamined
 
@@ -25,9 +26,15 @@ def check_robot(case: Case) -> Checked:
     if len(used) < MIN_EXAMINED or arm is None or joints is None:
         return Checked()
     hand_eye = case.hand_eye
-    gripper, camera = case.base_from_gripper[used], case.recon_from_camera[used]
-    systematic = of_poses(case.robot.systematic, used)
-    offsets = joint_offsets(hand_eye.before or hand_eye, gripper, camera, systematic, arm, joints[used])
+    fit = hand_eye.before or hand_eye
+    problem, state = pose_problem(
+        case.base_from_gripper[used],
+        case.recon_from_camera[used],
+        (fit.gripper_from_camera, fit.scale, fit.base_from_recon),
+        error_covariance=case.systematic,
+        noise_floor=fit.robot_noise.given,
+    )
+    offsets = joint_offsets(pose_equations(problem, state, None), arm, joints[used])
     examined = RobotExamined(hand_eye.robot_noise, offsets)
     of_camera = any(finding.kind.row.group == "camera" for finding in hand_eye.findings)
     found = None if of_camera else _joint_finding(offsets)

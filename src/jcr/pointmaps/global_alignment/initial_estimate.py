@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.geometry import fit_similarity, inverse
+from jcr.estimation.absolute_pose import ransac_pose
+from jcr.geometry import apply, fit_similarity, inverse
 from jcr.pointmaps.global_alignment.alignment import Pinhole
 from jcr.pointmaps.global_alignment.observations import ImageObservations
 from jcr.pointmaps.global_alignment.pointmap_residuals import State
@@ -98,12 +98,10 @@ def _depth_by_resection(o: ImageObservations, focal: float) -> Float[ndarray, " 
         use = weight > 0
         if use.sum() < 6:
             continue
-        found, rotation, shift, inliers = cv2.solvePnPRansac(
-            points[use], x_px[use], np.eye(3), None, reprojectionError=0.02, flags=cv2.SOLVEPNP_SQPNP
-        )
-        if found and len(inliers) > best_inliers:
-            depth = points @ cv2.Rodrigues(rotation)[0][2] + shift[2]
-            best_depth, best_inliers = np.maximum(depth, 0.01 * np.median(np.abs(depth))), len(inliers)
+        found = ransac_pose(x_px[use], points[use], 1.0, 0.02)
+        if found is not None and found[1].sum() > best_inliers:
+            depth = apply(inverse(found[0]), points)[:, 2]
+            best_depth, best_inliers = np.maximum(depth, 0.01 * np.median(np.abs(depth))), int(found[1].sum())
     return best_depth
 
 
