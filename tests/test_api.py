@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 import jcr
-from fuzz_targets import sound_run
+from corpus import sound_run
 from jcr.capture.images import encode_png
 from jcr.capture.options import ReadOptions
 from jcr.options import checked_options

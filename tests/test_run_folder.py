@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fuzz_targets import sound_run
+from corpus import sound_run
 from jcr.calibration.options import CalibrateOptions
 from jcr.cli import call, dispatch
 from jcr.errors import InputError

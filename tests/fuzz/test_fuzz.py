@@ -1,6 +1,6 @@
 """Hostile bytes and hostile numbers: a right reading, an InputError or an honest doubt, and nothing else.
 
-JCR_TEST_FUZZ=20 looks twenty times as long; tests/fuzz has the harness of a coverage-guided fuzzer.
+JCR_TEST_FUZZ=20 looks twenty times as long.
 """
 
 import os
@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import jcr
-from fuzz_targets import Target, targets
+from corpus import Target, corpus
 from jcr.errors import InputError
 from jcr.geometry import rotation_exp, transform
 from simulation.poses import Pattern
@@ -64,16 +64,17 @@ def changed(data: bytes, edits: list[tuple[float, str, int, bytes]]) -> bytes:
 
 @pytest.fixture(scope="module")
 def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
-    return targets(tmp_path_factory.mktemp("fuzz") / "targets")
+    return corpus(tmp_path_factory.mktemp("fuzz") / "targets")
 
 
 NAMES = [
-    "calibration.json", "camera_info.yaml", "cameras.bin", "capture.json", "cloud.ply",
-    "depth.npz", "episode.parquet", "images.bin", "map.safetensors", "pairs.npz", "picture.bmp", "picture.gif",
-    "picture.jpg", "picture.png", "picture.tif", "picture.webp", "points.csv", "points.npy", "points.ply", 
-    "poses.csv", "poses.json",
-    "poses.npy", "poses.tsv", "poses.txt", "reconstruction.npz", "reference.json", "samples.yaml", "scan.bag",
-    "scan.mcap", "weights.pth", "wrist.samples",
+    "about.json", "added/capture.json", "arm.urdf", "calibration.json", "camera_info.yaml", "cameras.bin",
+    "capture.json", "cloud.ply", "compared calibration.json", "depth.npz", "episode.parquet", "images.bin",
+    "info.json v2.1", "info.json v3.0", "map.safetensors", "metadata.yaml", "names.json", "pairs.npz", "picture.bmp",
+    "picture.gif", "picture.jpg", "picture.png", "picture.tif", "picture.webp", "points.csv", "points.npy",
+    "points.ply", "poses.csv", "poses.json", "poses.npy", "poses.tsv", "poses.txt", "reconstruction.npz",
+    "reference.json", "resumed capture.json", "run.json", "sample.json", "samples.yaml", "scan.bag", "scan.mcap",
+    "weights.pth", "wrist.samples",
 ]  # fmt: skip
 
 
@@ -101,19 +102,6 @@ def test_changed_bytes_are_read_or_refused(name: str, readers: dict[str, Target]
 
     try:
         feed()
-    finally:
-        target.file.write_bytes(valid)
-
-
-@pytest.mark.parametrize("shape", [(4, 0, 4), (0, 0, 4), (0, 16)])
-def test_a_table_without_numbers_is_refused(shape: tuple[int, ...], readers: dict[str, Target]):
-    """The coverage-guided fuzzer found the first of these."""
-    target = readers["poses.npy"]
-    valid = target.file.read_bytes()
-    np.save(target.file, np.zeros(shape))
-    try:
-        with pytest.raises(InputError, match="no table of numbers"):
-            target.read(target.file)
     finally:
         target.file.write_bytes(valid)
 

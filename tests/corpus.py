@@ -1,0 +1,378 @@
+"""Valid files of every kind that jcr reads, with their readers: the corpus of the fuzz tests."""
+
+import csv
+import io
+import json
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from PIL import Image
+
+import capture_writers as writers
+from jcr.calibration.known_transform import read_hand_eye
+from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.poses import calibrate_poses
+from jcr.calibration.record import calibration_of, read_calibration, write_calibration
+from jcr.capture.added import read_added
+from jcr.capture.camera_info import read_camera_info
+from jcr.capture.formats import capture_json
+from jcr.capture.formats.lerobot import Info, read_episode
+from jcr.capture.images import read_image
+from jcr.capture.options import ReadOptions
+from jcr.capture.read import read_source
+from jcr.capture.urdf_chain import read_chain
+from jcr.cli.query import read_points
+from jcr.depth.dense import pointmaps_of
+from jcr.depth.depth_npz import read_depth, write_depth
+from jcr.geometry import inverse
+from jcr.live.folder import LiveFolder
+from jcr.live.server import sample_pose
+from jcr.pointmaps.pairs import pairs_from_arrays, read_arrays
+from jcr.reconstruct import ReconstructOptions
+from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
+from jcr.records import (
+    Attempt,
+    Capture,
+    Intrinsics,
+    PointCloud,
+    Pointmaps,
+    PosePairs,
+    Reconstruction,
+    Tracks,
+)
+from jcr.run_folder import RunFolder
+from jcr.scene.cloud_ply import read_cloud, write_cloud
+from jcr.scene.map_file import load_map
+from jcr.scene.options import MapOptions
+from jcr.segments.labels import _read_names
+from simulation.problems import hand_eye_problem
+from simulation.ros_bag import write_bag
+
+SIZE = (16, 12)
+COUNT = 4
+RUN_IMAGES = 6
+FRAMES = ReadOptions(base_frame="base_link", gripper_frame="tool0", frames=3)
+Read = Callable[[Path], object]
+
+
+def to_json(content: Any) -> str:
+    """Return JSON; infinity as a number that is too large for any."""
+    return json.dumps(content).replace("Infinity", "1e309")
+
+
+def to_yaml(content: Any) -> str:
+    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+    return yaml.dump(content, Dumper=dumper, width=10_000_000)
+
+
+def to_csv(rows: Any) -> str:
+    lines = rows if isinstance(rows, list) else [rows]
+    return "\n".join(",".join(map(str, line)) if isinstance(line, list) else str(line) for line in lines)
+
+
+STRUCTURES: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
+    ".json": (json.loads, to_json),
+    ".yaml": (yaml.safe_load, to_yaml),
+    ".samples": (yaml.safe_load, to_yaml),
+    ".csv": (lambda text: list(csv.reader(io.StringIO(text))), to_csv),
+}
+"""Parser and writer of the files whose values are exchanged, by their endings."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """Valid file that is changed, and its reader."""
+
+    file: Path
+    read: Read
+
+    def feed(self, data: bytes) -> object:
+        """Return the content that the reader finds in these bytes."""
+        self.file.write_bytes(data)
+        return self.read(self.file)
+
+
+def small_capture(folder: Path) -> Capture:
+    """Write four tiny images, and poses of a hand-eye problem."""
+    (folder / "images").mkdir(parents=True)
+    draw = np.random.default_rng(0)
+    images = tuple(f"images/{k}.png" for k in range(COUNT))
+    for name in images:
+        Image.fromarray(draw.integers(0, 255, (SIZE[1], SIZE[0], 3), dtype=np.uint8)).save(folder / name)
+    poses = hand_eye_problem(draw, COUNT).base_from_gripper
+    intrinsics = Intrinsics(15.0, 15.0, 7.5, 5.5, *SIZE, (0.01, 0.0, 0.0, 0.0, 0.0))
+    capture = Capture(
+        folder=folder, images=images, base_from_gripper=poses, image_size=SIZE, intrinsics=intrinsics
+    )
+    capture_json.write(folder, capture)
+    return capture
+
+
+def corpus(folder: Path) -> dict[str, Target]:
+    """Return every reader's target, its valid file in a folder of its own below `folder`."""
+    capture = small_capture(folder / "images")
+    cameras = capture.base_from_gripper @ hand_eye_problem(np.random.default_rng(1), 3).gripper_from_camera
+    found = captures(folder, capture, cameras) | recordings(folder / "recordings", capture)
+    found |= pictures(folder / "pictures") | results(folder / "results", capture, cameras)
+    return found | networks(folder / "networks") | runs(folder, capture)
+
+
+def source(path: Path, options: ReadOptions = FRAMES) -> Read:
+    """Return a function that reads the capture at a path, a recording into a new folder."""
+
+    def read(file: Path) -> object:
+        with tempfile.TemporaryDirectory(dir=path.parent) as into:
+            return read_source(path, options, into=into)
+
+    return read
+
+
+def captures(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Target]:
+    """Return captures and samples in every format that is no recording."""
+    own = small_capture(folder / "capture").folder / "capture.json"
+    (own.parent / "arm.urdf").write_text(writers.URDF)
+    content = json.loads(own.read_text()) | {"robot": "ur5e", "urdf": "arm.urdf"}
+    content["frames"] = [frame | {"joints": [0.1] * 6} for frame in content["frames"]]
+    own.write_text(json.dumps(content))
+    found = {
+        "capture.json": Target(own, capture_json.read),
+        "resumed capture.json": Target(own, lambda file: resumed(file.parent)),
+        "arm.urdf": Target(own.parent / "arm.urdf", lambda file: read_chain(file, 3)),
+    }
+    for name, write in writers.CORPUS.items():
+        place = folder / name.replace(".", "-")
+        write(place, capture)
+        found[name] = Target(place / name, source(place))
+    table = folder / "poses-csv"
+    found["camera_info.yaml"] = Target(table / "camera_info.yaml", lambda file: read_camera_info(file, SIZE))
+    samples = {"samples.yaml": writers.write_moveit, "wrist.samples": writers.write_easy_handeye2}
+    for name, write in samples.items():
+        file = write(folder / name.replace(".", "-"), capture.base_from_gripper, cameras)
+        found[name] = Target(file, source(file))
+    place = folder / "colmap"
+    writers.write_colmap(place, capture, cameras)
+    for name in ("cameras.bin", "images.bin"):
+        found[name] = Target(place / "sparse" / "0" / name, source(place))
+    (folder / "sample.json").write_text(json.dumps({"base_from_gripper": np.eye(4).tolist()}))
+    found["sample.json"] = Target(folder / "sample.json", lambda file: sample_pose(file.read_bytes()))
+    return found
+
+
+def resumed(folder: Path) -> object:
+    """Resume a live capture and add an image."""
+    return LiveFolder(folder).add(np.full((SIZE[1], SIZE[0], 3), 7, np.uint8), np.eye(4))
+
+
+def pictures(folder: Path) -> dict[str, Target]:
+    """Return an image in each format that cameras write."""
+    folder.mkdir()
+    pixels = np.random.default_rng(2).integers(0, 255, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
+    names = [f"picture.{ending}" for ending in ("png", "jpg", "tif", "bmp", "webp", "gif")]
+    for name in names:
+        Image.fromarray(pixels).save(folder / name)
+    return {name: Target(folder / name, read_image) for name in names}
+
+
+def recordings(folder: Path, capture: Capture) -> dict[str, Target]:
+    """Return data that robots record."""
+    pixels = [np.asarray(Image.open(capture.folder / name).convert("RGB")) for name in capture.images]
+    states = np.repeat(writers.rows_as("rpy", capture.base_from_gripper), 3, axis=0)
+    episode = [image for image in pixels for _ in range(3)], states
+    names, found = ["x", "y", "z", "roll", "pitch", "yaw"], dict[str, Target]()
+    for version in ("v2.1", "v3.0"):
+        place = writers.write_lerobot(
+            folder / version, [episode], version, "observation.state", names, codec=None
+        )
+        found[f"info.json {version}"] = Target(place / "meta/info.json", source(place))
+    place = folder / "v2.1"
+    info = Info.model_validate_json((place / "meta/info.json").read_text())
+    camera = "observation.images.wrist"
+    found["episode.parquet"] = Target(
+        place / "data/chunk-000/episode_000000.parquet",
+        lambda file: read_episode(place, info, camera, "observation.state", 0),
+    )
+    kinds = (
+        ("mcap", "scan.mcap", "scan"),
+        ("ros1", "scan.bag", "scan.bag"),
+        ("sqlite3", "metadata.yaml", "s"),
+    )
+    for kind, name, bag in kinds:
+        file = write_bag(folder / bag, capture, kind, 2.0, fps=4.0, tf_hz=10.0)
+        inside = next(file.glob(f"*{Path(name).suffix}")) if file.is_dir() else file
+        found[name] = Target(inside, source(file if kind == "sqlite3" else inside))
+    return found
+
+
+def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Target]:
+    """Return the files of a run folder that are read again."""
+    from jcr.scene.build import build_scene
+
+    folder.mkdir()
+    draw = np.random.default_rng(3)
+    height, width = SIZE[1], SIZE[0]
+    assert capture.intrinsics is not None
+    reconstruction = Reconstruction(
+        image_index=np.arange(COUNT),
+        recon_from_camera=cameras,
+        intrinsics=capture.intrinsics,
+        pointmaps=Pointmaps(
+            intrinsics=capture.intrinsics,
+            points_in_recon=draw.random((COUNT, height, width, 3)).astype(np.float32),
+            confidence=np.ones((COUNT, height, width), np.float32),
+            colors=np.zeros((COUNT, height, width, 3), np.uint8),
+        ),
+        tracks=Tracks(
+            image=np.zeros(2, int),
+            x_px=draw.random((2, 2)),
+            point=np.arange(2),
+            points_in_recon=draw.random((2, 3)),
+        ),
+        backend="colmap",
+    )
+    write_reconstruction(folder / "reconstruction.npz", reconstruction)
+    dense = pointmaps_of(
+        draw.uniform(0.5, 1.0, (COUNT, height, width)).astype(np.float32),
+        np.full((COUNT, height, width), 0.01, np.float16),
+        np.ones((COUNT, height, width), np.float16),
+        np.ones((COUNT, height, width), np.uint8),
+        np.zeros((COUNT, height, width, 3), np.uint8),
+        cameras,
+        capture.intrinsics,
+    )
+    write_depth(folder / "depth.npz", replace(reconstruction, pointmaps=dense), "y")
+    ones = np.ones(200)
+    cloud = PointCloud(
+        points_in_base=draw.random((200, 3)),
+        color=np.zeros((200, 3), np.uint8),
+        confidence=ones,
+        margin=ones,
+        label=ones.astype(int),
+        image=np.zeros(200, int),
+        camera_centers_in_base=inverse(cameras)[:, :3, 3],
+        label_names=("none", "cup"),
+    )
+    write_cloud(folder / "cloud.ply", cloud)
+    write_cloud(folder / "points.ply", cloud)
+    (folder / "points.csv").write_text("x,y,z\n0.1,0.2,0.3\n")
+    np.save(folder / "points.npy", draw.random((4, 3)))
+    build_scene(cloud, MapOptions(cell=0.2, max_seconds=0.1)).save(folder / "map.safetensors")
+    readers: dict[str, Read] = {
+        "reconstruction.npz": read_reconstruction,
+        "depth.npz": lambda path: read_depth(path, reconstruction, None),
+        "cloud.ply": read_cloud,
+        "map.safetensors": load_map,
+        "points.csv": read_points,
+        "points.npy": read_points,
+        "points.ply": read_points,
+    }
+    with np.load(folder / "reconstruction.npz") as stored:
+        arrays = dict(stored)
+    (folder / "about.json").write_text(str(arrays.pop("about")))
+
+    def read_about(file: Path) -> object:
+        """Read a reconstruction whose JSON is that of a file."""
+        np.savez(
+            folder / "about.npz",
+            about=np.array(file.read_text(errors="replace")),
+            allow_pickle=False,
+            **arrays,
+        )
+        return read_reconstruction(folder / "about.npz")
+
+    return {
+        name: Target(folder / name, read) for name, read in (readers | {"about.json": read_about}).items()
+    }
+
+
+def networks(folder: Path) -> dict[str, Target]:
+    """Return predictions and weights of networks."""
+    import torch
+
+    from jcr.hub import Weights
+    from jcr.pointmaps.dust3r.weights import load_weights
+
+    folder.mkdir()
+    shape = (2, 4, 4)
+    arrays = {name: np.zeros((*shape, 3), np.float32) for name in ("pts3d", "pts3d_in_other_view")}
+    arrays |= {name: np.ones(shape, np.float32) for name in ("conf", "conf2")}
+    np.savez(folder / "pairs.npz", edges=np.array([[0, 1], [1, 0]]), allow_pickle=False, **arrays)
+    torch.save({"model": {"weight": torch.zeros(4)}}, folder / "weights.pth")
+    readers: dict[str, Read] = {
+        "pairs.npz": lambda file: pairs_from_arrays(read_arrays(file), file.name),
+        "weights.pth": lambda file: load_weights(Weights(file, file.name, "unknown")),
+    }
+    return {name: Target(folder / name, read) for name, read in readers.items()}
+
+
+def runs(folder: Path, capture: Capture) -> dict[str, Target]:
+    """Return the JSON files of runs."""
+    run = sound_run(folder / "run")
+    added = folder / "with_added" / "added"
+    added.mkdir(parents=True)
+    (added / "000.png").write_bytes((capture.folder / capture.images[0]).read_bytes())
+    frames = [{"image": "000.png", "base_from_gripper": np.eye(4).tolist()}]
+    owner = {"added_to": str(capture.folder.resolve()), "frames": frames}
+    (added / "capture.json").write_text(json.dumps(owner))
+    reference = {"gripper_from_camera": np.eye(4).tolist(), "uncertainty": {"covariance": np.eye(7).tolist()}}
+    (folder / "reference.json").write_text(json.dumps(reference))
+    (folder / "names.json").write_text(json.dumps({"1": "mug", "2": "box"}))
+    readers: dict[str, tuple[Path, Read]] = {
+        "calibration.json": (run / "calibration.json", lambda file: RunFolder(run).calibration()),
+        "compared calibration.json": (run / "calibration.json", lambda file: read_hand_eye(run)),
+        "run.json": (run / "run.json", lambda file: (RunFolder(run).capture(), RunFolder(run).options())),
+        "reference.json": (folder / "reference.json", read_hand_eye),
+        "added/capture.json": (added / "capture.json", lambda file: read_added(added.parent, capture)),
+        "names.json": (folder / "names.json", _read_names),
+    }
+    return {name: Target(file, read) for name, (file, read) in readers.items()}
+
+
+def sound_run(out: Path) -> Path:
+    """Write a run folder with calibration.json and run.json, of poses without noise; its capture lies in it."""
+    (out / "capture").mkdir(parents=True)
+    problem = hand_eye_problem(np.random.default_rng(0), RUN_IMAGES)
+    names = tuple(f"{k}.png" for k in range(RUN_IMAGES))
+    frames = []
+    for name, pose in zip(names, problem.base_from_gripper, strict=True):
+        Image.fromarray(np.random.default_rng(len(frames)).integers(0, 255, (72, 96, 3), np.uint8)).save(
+            out / "capture" / name
+        )
+        frames.append({"image": name, "base_from_gripper": pose.tolist()})
+    (out / "capture" / "capture.json").write_text(json.dumps({"frames": frames}))
+    pairs = PosePairs(
+        source=out,
+        images=names,
+        base_from_gripper=problem.base_from_gripper,
+        recon_from_camera=problem.recon_from_camera,
+        is_metric=False,
+    )
+    attempt = Attempt(
+        backend="colmap", images_registered=RUN_IMAGES, reconstruct_s=1.0, calibrate_s=0.5, why_not=None
+    )
+    content = calibration_of(pairs, pairs, calibrate_poses(pairs), {}, "0", [attempt]).as_json()
+    intrinsics = {
+        "fx": 90.0,
+        "fy": 90.0,
+        "cx": 47.5,
+        "cy": 35.5,
+        "distortion": [0.0] * 5,
+        "width": 96,
+        "height": 72,
+    }
+    (out / "calibration.json").write_text(json.dumps(content | {"intrinsics": intrinsics}))
+    write_calibration(out / "calibration.json", read_calibration(out))
+    options = {"reconstruct": asdict(ReconstructOptions()), "calibrate": asdict(CalibrateOptions())}
+    options["calibrate"] |= {"robot_noise": [0.1, 0.05], "known_length": ["0.png", 1.0, 2.0, 30.0, 4.0, 50.0]}
+    state = {
+        "capture": str(out / "capture"),
+        "reconstruct": "0",
+        "options": options,
+        "attempts": [asdict(attempt)],
+    }
+    (out / "run.json").write_text(json.dumps(state))
+    return out
