@@ -2,6 +2,7 @@
 
 import inspect
 import re
+import shutil
 import subprocess
 import sys
 from io import BytesIO
@@ -15,10 +16,13 @@ from PIL import Image
 
 import jcr
 from corpus import sound_run
+from jcr.camera import project
 from jcr.capture.images import encode_png
 from jcr.capture.options import ReadOptions
+from jcr.geometry import apply, rotation_exp, transform
 from jcr.options import checked_options
 from jcr.results import RunOptions
+from places import ROOT
 
 
 def python(code: str) -> subprocess.CompletedProcess[str]:
@@ -123,12 +127,34 @@ def test_options_take_text_for_paths_and_lists_for_tuples():
     assert checked_options(None, RunOptions) == RunOptions()
 
 
-def test_a_run_is_loaded_and_compared_by_text_and_by_path(tmp_path: Path):
+def test_a_run_is_loaded_and_compared_by_path_record_and_matrix(tmp_path: Path):
     out = sound_run(tmp_path)
     loaded = jcr.load_run(str(out))
     assert loaded.verdict == loaded.calibration.verdict and loaded.converged == loaded.calibration.converged
-    assert loaded.covariance is not None and loaded.covariance.shape == (7, 7)
-    assert np.allclose(loaded.gripper_from_camera, jcr.load_run(out).calibration.gripper_from_camera)
-    assert jcr.compare(str(out), out).chi2 == 0
+    assert loaded.covariance.shape == (7, 7) and loaded.capture.images == loaded.capture.images
+    with pytest.raises(jcr.InputError, match="the camera's mount is gripper: read gripper_from_camera and"):
+        _ = loaded.base_from_camera
+    matrix = loaded.gripper_from_camera.tolist()
+    for other in (str(out), out, loaded, loaded.calibration, matrix):
+        assert jcr.compare(loaded, other).chi2 == pytest.approx(0, abs=1e-9)
+    matrix[0][3] += 0.01
+    assert np.abs(jcr.compare(loaded, matrix).translation_m) == pytest.approx([0.01, 0, 0])
+    with pytest.raises(jcr.InputError, match=r"shape \(2,\); give a 4×4"):
+        jcr.compare(loaded, [1.0, 2.0])
     with pytest.raises(jcr.InputError, match=r"reconstruction.npz: no such file"):
         jcr.touch(str(out), "touched.csv")
+
+
+def test_a_pixel_and_its_depth_give_a_point_in_the_base_from_lists_and_arrays(tmp_path: Path):
+    shutil.copy(ROOT / "tests" / "calibrations" / "accepted.json", tmp_path / "calibration.json")
+    run = jcr.load_run(tmp_path)
+    camera, x = run.intrinsics, run.gripper_from_camera
+    assert camera is not None
+    gripper = transform(rotation_exp(np.array([0.1, -0.2, 0.3])), np.array([0.4, 0.1, 0.5]))
+    x_in_camera = np.array([[0.05, -0.04, 0.5], [-0.1, 0.02, 0.7]])
+    pixels = project(camera, x_in_camera)
+    found, covariance = run.point_in_base(pixels.tolist(), [0.5, 0.7], gripper.tolist())
+    assert found == pytest.approx(apply(gripper @ x, x_in_camera), abs=1e-9)
+    single, of_single = run.point_in_base(pixels[1], 0.7, gripper)
+    assert single == pytest.approx(found[1]) and of_single == pytest.approx(covariance[1])
+    assert np.linalg.eigvalsh(covariance).min() > 0

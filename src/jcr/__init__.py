@@ -1,8 +1,22 @@
 """Joint calibration and representation: a wrist camera's images to a calibrated camera and a map.
 
-capture = jcr.read_capture("captures/table")
-result = jcr.run(capture, "out/table")
-scene = jcr.load_map("out/table")
+    capture = jcr.read_capture("captures/table")
+    result = jcr.run(capture, "out/table")                  # or jcr.load_run("out/table")
+    result.verdict, result.gripper_from_camera, result.covariance, result.intrinsics
+    x_in_base, covariance = result.point_in_base([320, 240], 0.45, base_from_gripper)
+    scene = jcr.load_map("out/table")
+    scene.query(x_in_base)
+
+Captures      read_capture, check_capture, LiveCalibration
+Calibration   run, calibrate, solve_hand_eye, load_run, compare, verify_run, touch, add_camera
+Map           build_map, load_map, measure, load_robot
+Files         export_run
+Networks      global_align
+Options       RunOptions (reconstruct, calibrate, cloud, map, segment, depth), ReadOptions, ExportOptions
+Errors        InputError (the input cannot be used), RejectedError (no calibration exists)
+
+Transforms are 4×4 and named a_from_b, points x_in_a; metres and radians, pixels from the centre of the first one.
+Lists are taken for arrays, and dicts for options. help(jcr.run) describes one name; `jcr docs` lists the manual.
 """
 
 from importlib.util import find_spec

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from jaxtyping import Float, Int
 from numpy import ndarray
+from numpy.typing import ArrayLike
 
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
@@ -139,9 +140,9 @@ class CalibrationResult:
 
     def point_in_base(
         self,
-        pixel: Float[ndarray, "*points 2"],
-        depth_m: Float[ndarray, "*points"] | float,
-        base_from_gripper: Float[ndarray, "4 4"],
+        pixel: ArrayLike,
+        depth_m: ArrayLike | float,
+        base_from_gripper: ArrayLike,
     ) -> tuple[Float[ndarray, "*points 3"], Float[ndarray, "*points 3 3"]]:
         """Return the base-frame coordinates (m) of points that the camera shows, and their covariances (m²).
 

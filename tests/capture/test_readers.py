@@ -548,7 +548,7 @@ def test_the_command_line_calibrates_samples(tmp_path: Path, problem: HandEyePro
     path = writers.write_easy_handeye2(tmp_path, problem.base_from_gripper, cameras)
     done = run_jcr("calibrate", path, tmp_path / "out")
     assert done.returncode == 0, done.stderr
-    assert "the scale is 1, as the marker's size says" in done.stdout
+    assert "\nScale       1, as the marker's size says\n" in done.stdout
     content = json.loads((tmp_path / "out" / "calibration.json").read_text())
     assert np.abs(content["gripper_from_camera"] - problem.gripper_from_camera).max() < 1e-6
     checked = run_jcr("check", path, "--json")

@@ -7,7 +7,9 @@ from typing import Any
 import pytest
 
 from jcr.calibration.record import read_calibration
+from jcr.cli import dispatch
 from jcr.cli.capture import Arguments, _conclude
+from jcr.estimation.arms import ROBOT_NAMES
 from jcr.live.session import SessionOptions
 from jcr.records import Requirement
 from places import ROOT
@@ -60,3 +62,10 @@ def test_a_rejected_result_exits_with_three_and_the_last_line_is_a_command_that_
     assert printed[-1] == f"Next        {last}" and len(printed) <= 14
     if found is not None:
         assert printed[0].startswith("ACCEPTED" if found.converged else "REJECTED")
+
+
+def test_the_arms_are_listed(capsys: pytest.CaptureFixture[str]):
+    assert dispatch(["capture", "--robot", "list"]) == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(ROBOT_NAMES)
+    assert dispatch(["capture"]) == 2
+    assert capsys.readouterr().err == "error: OUT: required, and not given (jcr capture --help)\n"

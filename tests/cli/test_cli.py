@@ -217,7 +217,7 @@ def test_images_without_features_are_rejected_and_show_what_to_do(tmp_path: Path
     finished = run_jcr("run", tmp_path / "plain", tmp_path / "out", "--quiet")
     assert finished.returncode == 3
     assert finished.stdout.startswith("REJECTED") and not finished.stderr
-    assert "\nCause       the images show one colour and no edges" in finished.stdout
+    assert "\nCause       direct alignment: the images show one colour and no edges" in finished.stdout
     content = json.loads((tmp_path / "out" / "calibration.json").read_text())
     assert content["converged"] is False and content["gripper_from_camera"] is None
     report = (tmp_path / "out" / "report.html").read_text()

@@ -543,7 +543,7 @@ def test_a_failed_run_leaves_no_map_of_an_earlier_one(tmp_path: Path, sound: Pat
     out = tmp_path / "out"
     shutil.copytree(done, out)
     assert dispatch(["calibrate", str(sound), str(out), "--backend", "colmap", "--quiet"]) == 3
-    assert read_calibration(out).gripper_from_camera is None
+    assert read_calibration(out).parent_from_camera is None
     kept = {path.name for path in out.iterdir()}
     assert kept == {".lock", "calibration.json", "log.txt", "report.html", "run.json"}
     capsys.readouterr()

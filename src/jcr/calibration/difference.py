@@ -1,15 +1,26 @@
-"""How far apart two calibrations are, whether what both report explains it, and which of its causes would."""
+"""Difference of two calibrations, tested against the covariances of both, with the causes that would explain it."""
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+from numpy.typing import ArrayLike
 
-from jcr.calibration.known_transform import Known, read_hand_eye
+from jcr.calibration.known_transform import Known, known_calibration, read_hand_eye
+from jcr.calibration.record import Calibration
 from jcr.distributions import chi2
-from jcr.geometry import step_between
+from jcr.errors import InputError
+from jcr.geometry import require_rigid, step_between
+
+if TYPE_CHECKING:
+    from jcr.results import CalibrationResult
+
+    Comparable = CalibrationResult | Calibration | str | Path | ArrayLike
+else:
+    Comparable = object
 
 OTHER = "reference"
 """Name of the covariance of a calibration whose file has no budget."""
@@ -19,7 +30,7 @@ NOTHING = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """From one gripper_from_camera to another, in gripper axes."""
+    """Difference of one gripper_from_camera from another, in gripper axes."""
 
     translation_m: Float[ndarray, "3"]
     rotation_vector: Float[ndarray, "3"]
@@ -30,19 +41,34 @@ class Difference:
     """Squared Mahalanobis distance, of 6 degrees of freedom where errors of the two are independent."""
     p_value: float | None
     explained_by: dict[str, float]
-    """Shares of it, by cause, largest first; their sum is 1. Empty where there is no difference."""
+    """Share of χ² by cause, largest first; the sum is 1. Empty where there is no difference."""
 
 
-def compare(calibration: str | Path, reference: str | Path) -> Difference:
-    """The difference of two calibrations, each a run folder, a calibration.json or a JSON file with gripper_from_camera.
+def compare(calibration: Comparable, other: Comparable) -> Difference:
+    """Return the difference of two calibrations and whether their errors explain it.
 
-    Raises InputError where one of them has no transform.
+    Each is a result, a Calibration, a path (run folder, calibration.json, or a JSON file with gripper_from_camera), or
+    a 4×4 gripper_from_camera. Raises InputError where one of them has no transform of a camera on the gripper,
+    RejectedError where nothing was found.
     """
-    return difference(read_hand_eye(Path(calibration)), read_hand_eye(Path(reference)))
+    return difference(_known(calibration), _known(other))
+
+
+def _known(one: Comparable) -> Known:
+    """Return transform and covariance of what `compare` takes."""
+    if isinstance(one, str | Path):
+        return read_hand_eye(Path(one))
+    record = getattr(one, "calibration", one)
+    if isinstance(record, Calibration):
+        return known_calibration(record)
+    matrix = np.asarray(one, float)
+    if matrix.shape != (4, 4):
+        raise InputError(f"a transform of shape {matrix.shape}; give a 4×4 gripper_from_camera")
+    return Known(require_rigid(matrix, "gripper_from_camera"), None, {})
 
 
 def difference(ours: Known, other: Known) -> Difference:
-    """The difference of one calibration from another, compared with the covariances that they state.
+    """Return the difference of one calibration from another, compared with the covariances that they state.
 
     A cause of covariance Pₖ explains ΔᵀV⁻¹PₖV⁻¹Δ of ΔᵀV⁻¹Δ, V = ΣPₖ: the squared size of its best linear prediction.
     """

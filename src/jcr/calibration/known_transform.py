@@ -1,4 +1,4 @@
-"""gripper_from_camera as a file of anybody's states it: a calibration, or the reference of a data set."""
+"""gripper_from_camera of a calibration, or of the reference of a data set."""
 
 import json
 from dataclasses import dataclass
@@ -9,28 +9,27 @@ from jaxtyping import Float
 from numpy import ndarray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from jcr.arrays_json import Covariance7, Matrix, Spread3
-from jcr.calibration.record import UncertaintyBudget, read_content, validated
+from jcr.arrays_json import Matrix, Spread3
+from jcr.calibration.record import Calibration, read_content, validated
 from jcr.capture.plain_files import first_fault
 from jcr.errors import InputError
-from jcr.geometry import require_rigid
 
 
 @dataclass(frozen=True)
 class Known:
-    """A calibration as a file of anybody's states it."""
+    """Transform and covariance of a calibration, or of a reference."""
 
     gripper_from_camera: Float[ndarray, "4 4"]
     covariance: Float[ndarray, "6 6"] | None
-    """Of the first six of COVARIANCE_ORDER; None where the file has none."""
+    """Covariance of the first six of COVARIANCE_ORDER; None where none is stated."""
     parts: dict[str, Float[ndarray, "6 6"]]
-    """Of the covariance, by cause; empty where the file names none."""
+    """Parts of the covariance, by cause; empty where none are stated."""
     doubt: str | None = None
-    """Why it is rejected, by its own file; None where it is accepted, or the file has no verdict."""
+    """Reason of the rejection; None where it is accepted, or has no verdict."""
 
 
 def read_hand_eye(path: Path) -> Known:
-    """gripper_from_camera, and its covariance where the file has one; InputError where there is no transform.
+    """Read gripper_from_camera, and its covariance where the file has one; raise InputError without a transform.
 
     A reference.json may state `std_mm` and `std_deg`, along the axes of the gripper.
     """
@@ -41,40 +40,39 @@ def read_hand_eye(path: Path) -> Known:
     if not file.is_file():
         raise InputError(f"{path}: no calibration.json or reference.json there; name a run folder or a file")
     content = read_content(file)
-    doubt = validated(content, file).doubt if "format" in content else None
+    if "format" in content:
+        return known_calibration(validated(content, file), str(file))
     try:
         found = _Transform.model_validate_json(json.dumps(content))
     except ValidationError as error:
         raise InputError(f"{file}: {first_fault(error)}; correct it there") from None
     if found.gripper_from_camera is None:
         raise InputError(f"{file}: has no gripper_from_camera; that calibration failed")
-    transform = require_rigid(np.array(found.gripper_from_camera), f"{file}: gripper_from_camera")
-    if (uncertainty := found.uncertainty) is not None:
-        budget = {} if uncertainty.budget is None else vars(uncertainty.budget)
-        parts = {name: share.covariance for name, share in budget.items() if share is not None}
-        return Known(
-            transform,
-            np.array(uncertainty.covariance)[:6, :6],
-            {name: np.array(part)[:6, :6] for name, part in parts.items() if part is not None},
-            doubt,
-        )
+    transform = found.gripper_from_camera
     if found.std_mm is not None and found.std_deg is not None:
         std = np.r_[np.array(found.std_mm) / 1e3, np.radians(found.std_deg)]
         return Known(transform, np.diag(std**2), {})
     return Known(transform, None, {})
 
 
-class _Known(BaseModel):
-    model_config = ConfigDict(allow_inf_nan=False)
-    covariance: Covariance7
-    budget: UncertaintyBudget | None = None
+def known_calibration(calibration: Calibration, name: str = "the calibration") -> Known:
+    """Return the transform of a calibration with its covariance and the parts of it; raise InputError without one."""
+    if calibration.parent_from_camera is None or calibration.uncertainty is None:
+        raise InputError(f"{name}: has no {calibration.mount}_from_camera; that calibration failed")
+    budget = calibration.uncertainty.budget
+    shares = {} if budget is None else {name: share for name, share in budget if share is not None}
+    return Known(
+        calibration.gripper_from_camera,
+        calibration.covariance[:6, :6],
+        {name: share.covariance[:6, :6] for name, share in shares.items() if share.covariance is not None},
+        calibration.doubt,
+    )
 
 
 class _Transform(BaseModel):
-    """What is asked of a file that somebody else wrote."""
+    """Fields of a file that somebody else wrote."""
 
     model_config = ConfigDict(allow_inf_nan=False)
     gripper_from_camera: Matrix | None = None
-    uncertainty: _Known | None = None
     std_mm: Spread3 | None = None
     std_deg: Spread3 | None = None

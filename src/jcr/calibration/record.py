@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+from numpy.typing import ArrayLike
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from jcr.arrays_json import (
@@ -217,8 +218,8 @@ class Uncertainty(Part):
         """Return the uncertainty of an estimate, in general and at the working distance."""
         std = np.sqrt(np.diag(estimate.covariance))
         return cls(
-            translation_std_mm=(1e3 * std[:3]),
-            rotation_std_deg=np.degrees(std[3:6]),
+            translation_std_mm=(1e3 * std[:3]).tolist(),
+            rotation_std_deg=np.degrees(std[3:6]).tolist(),
             scale_std_percent=float(100 * std[6]),
             covariance=estimate.covariance,
             order=list(COVARIANCE_ORDER),
@@ -462,9 +463,9 @@ class Calibration(Part):
 
     def point_in_base(
         self,
-        pixel: Float[ndarray, "*points 2"],
-        depth_m: Float[ndarray, "*points"] | float,
-        base_from_gripper: Float[ndarray, "4 4"],
+        pixel: ArrayLike,
+        depth_m: ArrayLike | float,
+        base_from_gripper: ArrayLike,
     ) -> tuple[Float[ndarray, "*points 3"], Float[ndarray, "*points 3 3"]]:
         """Return the base-frame coordinates (m) of points that the camera shows, and their covariances (m²).
 

@@ -6,14 +6,14 @@ import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from jcr.capture.options import ConventionName, UnitsName
 from jcr.cli.output import Output
 from jcr.errors import InputError
-from jcr.estimation.arms import CHOICES, RobotName
+from jcr.estimation.arms import CHOICES, ROBOT_NAMES, RobotName, arm_named
 from jcr.live.cameras import CameraOptions
 from jcr.live.session import LEAST_IMAGES, SessionOptions
 
@@ -40,6 +40,7 @@ class Arguments:
 
     examples:
       jcr capture captures/table --camera 0 --poses ur:192.168.0.2 --robot ur5e
+      jcr capture --robot list
       jcr capture captures/table --camera 0 --poses ur:192.168.0.2 --require 2 0.3 --until-accurate
       jcr capture captures/table --camera realsense --poses franka:172.16.0.2
       jcr capture captures/table --camera 2 --camera-size 1920 1080 --focus 30 --poses xarm:192.168.1.203
@@ -48,7 +49,7 @@ class Arguments:
       JCR_TOKEN=secret jcr capture captures/table --camera 0 --listen 192.168.0.5:7464
     """
 
-    out: Annotated[Path, tyro.conf.Positional]
+    out: Annotated[Path | None, tyro.conf.Positional] = None
     """Folder of the capture; an unfinished capture is continued."""
     camera: Annotated[str, tyro.conf.arg(metavar="DEVICE")] = "0"
     """V4L2 device number, realsense[:SERIAL], URL of a stream (rtsp://…), or a recording (video file, .bag)."""
@@ -60,8 +61,10 @@ class Arguments:
     """Notation of typed poses and of the printed next pose; auto: the arm's own."""
     pose_units: UnitsName = "auto"
     """Units of typed and printed poses; auto: those of the convention."""
-    robot: Annotated[RobotName | None, tyro.conf.arg(metavar=CHOICES)] = None
-    """The arm: the next pose is then also printed as joint angles, within the arm's limits."""
+    robot: Annotated[RobotName | Literal["list"] | None, tyro.conf.arg(metavar=f"{{list,{CHOICES[1:]}")] = (
+        None
+    )
+    """The arm: the next pose is then also printed as joint angles, within the arm's limits; list prints the arms."""
     page_port: Annotated[int, tyro.conf.arg(metavar="PORT")] = 0
     """Port of the live page and of samples on this machine alone; 0: any free one."""
     listen: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
@@ -78,6 +81,19 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> int:
+    """Take a capture, or list the arms."""
+    if arguments.robot == "list":
+        arms = [arm_named(name) for name in ROBOT_NAMES]
+        lines = [f"{arm.name:<8}{arm.dof} joints, reach {arm.reach:.2f} m" for arm in arms]
+        facts = {"robots": [{"name": arm.name, "joints": arm.dof, "reach_m": arm.reach} for arm in arms]}
+        arguments.output.result("\n".join(lines) + "\n", facts)
+        return 0
+    if arguments.out is None:
+        raise InputError("OUT: required, and not given (jcr capture --help)")
+    return _take(arguments, arguments.out, arguments.robot)
+
+
+def _take(arguments: Arguments, out: Path, robot: RobotName | None) -> int:
     """Take images until there are enough, or the calibration is as accurate as required; calibrate all of them."""
     from jcr.live.arms import states_of
     from jcr.live.calibration import LiveCalibration
@@ -104,14 +120,14 @@ def main(arguments: Arguments) -> int:
         answers.append(answer)
         _print("\n".join(lines))
 
-    with locked(arguments.out), open_camera(arguments.camera, arguments.settings) as camera:
-        folder = LiveFolder(arguments.out, given or camera.intrinsics, arguments.robot)
+    with locked(out), open_camera(arguments.camera, arguments.settings) as camera:
+        folder = LiveFolder(out, given or camera.intrinsics, robot)
         calibration = LiveCalibration(folder, options={"require": options.require}, reach=options.reach_m)
         gripper = None if states is None else lambda: next(states())
         session = LiveSession(calibration, camera, options, tell, _notation(arguments, folder), gripper)
         try:
             with LiveServer(session, listen, arguments.poses == "http") as server:
-                _print(f"{len(folder.names)} images in {arguments.out}; open {server.address} in a browser")
+                _print(f"{len(folder.names)} images in {out}; open {server.address} in a browser")
                 session.run(_source(arguments, session, states, server))
                 result = session.finish()
         finally:
@@ -130,6 +146,7 @@ def _conclude(
     from jcr.calibration.words import labelled, summary
 
     out, images = arguments.out, len(folder.names)
+    assert out is not None
     required = None if result is None else result.hand_eye.requirement
     is_accepted = result is not None and result.converged
     lines = [] if result is None else summary(result.calibration).splitlines()
@@ -196,7 +213,6 @@ def _listen(arguments: Arguments) -> "Listen":
 
 def _notation(arguments: Arguments, folder: "LiveFolder") -> "Notation":
     """Return the notation of printed poses: that of the options, else that of the arm."""
-    from jcr.estimation.arms import arm_named
     from jcr.live.arms import NOTATIONS
     from jcr.live.notation import Notation
 

@@ -32,8 +32,8 @@ def show_calibration(result: "Result", output: VerboseOutput) -> None:
 
     if not output.json:
         cameras = getattr(result, "cameras", None)
-        placed = 0 if cameras is None else len(cameras.cameras)
-        sys.stdout.write(summary(result.calibration, MOST_LINES - placed))
+        others = 1 if cameras is None else 1 + len(cameras.cameras)  # a line of the caller, and the cameras
+        sys.stdout.write(summary(result.calibration, MOST_LINES - others))
         sys.stdout.flush()
 
 

@@ -1,5 +1,6 @@
 """`jcr run`: everything, from a capture to a calibrated camera and a map."""
 
+import shlex
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,7 @@ from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
 if TYPE_CHECKING:
+    from jcr.cli.result import Result
     from jcr.results import RunResult
 
 
@@ -69,7 +71,7 @@ def main(arguments: Arguments) -> int:
         if (before := finished(capture, out, options)) is not None:
             sys.stderr.write(f"unchanged: {out} is the run of this capture with these options\n")
             show_calibration(before, arguments.output)
-            return show(before, arguments.output)
+            return show(before, arguments.output, *_map_lines(before, out, map_options is not None))
         shown = list[object]()
 
         def show_early(result: "RunResult") -> None:
@@ -80,4 +82,15 @@ def main(arguments: Arguments) -> int:
         result = calibrated(lambda: run(capture, out, options, progress=progress, calibrated=show_early), out)
     if not shown:
         show_calibration(result, arguments.output)
-    return show(result, arguments.output)
+    return show(result, arguments.output, *_map_lines(result, out, map_options is not None))
+
+
+def _map_lines(result: "Result", out: Path, is_wanted: bool) -> list[str]:
+    """Return the line on the map: how to look at it, or why there is none where one was wanted."""
+    from jcr.calibration.words import labelled
+    from jcr.run_folder import RunFolder
+
+    if RunFolder(out).has_map():
+        return labelled("Map", f"jcr view {shlex.quote(str(out))}")
+    missing = [note for note in result.calibration.notes if note.startswith("no map was made")]
+    return labelled("Map", *missing) if is_wanted else []

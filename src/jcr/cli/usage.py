@@ -3,8 +3,12 @@
 The hook of tyro for parse errors is in its module `_errors`, which pyproject.toml bounds by the minor version.
 """
 
+import io
+import shutil
+import sys
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import fields, is_dataclass
 from itertools import takewhile
 from pathlib import Path
@@ -23,6 +27,8 @@ CONFIGURATION = (
     tyro.conf.DisallowNone,
 )
 """Conversion of the fields of a command's `Arguments` to options."""
+WIDEST = 120
+"""Columns of the paragraphs of the help, on a wider terminal too."""
 SHELLS = ("bash", "zsh", "tcsh", "fish")
 """Shells that tyro writes a completion script for."""
 VALUES = {float: "number", int: "whole number", str: "text", Path: "path"}
@@ -35,8 +41,33 @@ def parsed(record: Any, program: str, arguments: Sequence[str]) -> Any:
     def refuse(event: _errors.ParseErrorEvent) -> None:
         raise InputError(f"{_complaint(event, record, program, arguments)} ({program} --help)")
 
-    with _errors.on_parse_error(refuse):
+    with _errors.on_parse_error(refuse), _wrapped_paragraphs():
         return tyro.cli(record, prog=program, args=list(arguments), config=CONFIGURATION)
+
+
+class _Help(io.StringIO):
+    """Text that is printed later; it counts as a terminal where the output is one, for its colours."""
+
+    def __init__(self, output: Any) -> None:
+        super().__init__()
+        self.output = output
+
+    def isatty(self) -> bool:
+        """Test whether the output is a terminal."""
+        return self.output.isatty()
+
+
+@contextmanager
+def _wrapped_paragraphs() -> Iterator[None]:
+    """Wrap the paragraphs of the help at words; tyro 1.0 prints each as one line."""
+    width, printed = min(shutil.get_terminal_size().columns, WIDEST), _Help(sys.stdout)
+    try:
+        with redirect_stdout(printed):
+            yield
+    finally:
+        lines = printed.getvalue().split("\n")
+        wrapped = (textwrap.fill(line, width) if line[:1].isalpha() else line for line in lines)
+        sys.stdout.write("\n".join(wrapped))
 
 
 def write_completion(records: Mapping[str, type], arguments: Sequence[str]) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
+from numpy.typing import ArrayLike
 
 from jcr.boards.proposal import proposed
 from jcr.calibration.case import Case
@@ -93,7 +94,7 @@ def check_capture(
     suggest: int = 0,
     look: bool = True,
     robot_noise: tuple[float, float] | None = None,
-    reach: Float[ndarray, "2 3"] | None = None,
+    reach: ArrayLike | None = None,
     seed: int = 0,
     progress: Progress | None = None,
     thorough: bool = False,
@@ -124,7 +125,8 @@ def check_capture(
     found = [*shown.findings, *(() if shown.hand_eye is not None else seen.findings), *alone.unused]
     is_rejected = verdict_of(found) == "rejected"
     found += as_causes(alone.views) if is_rejected else alone.views
-    proposals = Proposals.of(assumptions, gripper, alone.robot.of(rows), suggest, reach, seed)
+    box = None if reach is None else np.asarray(reach, float)
+    proposals = Proposals.of(assumptions, gripper, alone.robot.of(rows), suggest, box, seed)
     return Examination(
         sharpness=alone.sharpness,
         largest_move_m=alone.move_m,

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
+from numpy.typing import ArrayLike
 from safetensors.torch import save
 from torch import Tensor
 
@@ -94,9 +95,7 @@ class SceneMap:
             answers = tuple(answer.cpu().numpy() for answer in answers)
         return dict(zip(self.properties, answers, strict=True))
 
-    def query(
-        self, x_in_base: Float[ndarray, "n 3"] | Float[Tensor, "n 3"], unknown: Unknown = "report"
-    ) -> Sample:
+    def query(self, x_in_base: ArrayLike | Float[Tensor, "n 3"], unknown: Unknown = "report") -> Sample:
         """Query the map at points (n,3) m; tensors are answered with (differentiable) tensors.
 
         `unknown` is how unseen places count in `occupancy` and `distance`: as solid, as empty,
@@ -109,8 +108,8 @@ class SceneMap:
 
     def check_spheres(
         self,
-        centers_in_base: Float[ndarray, "*batch 3"],
-        radii: Float[ndarray, "..."] | float,
+        centers_in_base: ArrayLike,
+        radii: ArrayLike | float,
         unknown: Unknown = "occupied",
     ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
         """Test whether spheres at (…,3) with radii (broadcast to …) in metres touch something.
@@ -140,9 +139,9 @@ class SceneMap:
 
     def check_segments(
         self,
-        starts_in_base: Float[ndarray, "*batch 3"],
-        ends_in_base: Float[ndarray, "*batch 3"],
-        radii: Float[ndarray, "..."] | float,
+        starts_in_base: ArrayLike,
+        ends_in_base: ArrayLike,
+        radii: ArrayLike | float,
         unknown: Unknown = "occupied",
     ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
         """Test whether spheres swept from starts to ends (…,3) touch something; answers and raises as `check_spheres`.
@@ -169,7 +168,7 @@ class SceneMap:
         robot: str | Path | RobotSpheres,
         joint_values: JointValues,
         unknown: Unknown = "occupied",
-        base_from_robot: Float[ndarray, "4 4"] | None = None,
+        base_from_robot: ArrayLike | None = None,
         ignore_links: tuple[str, ...] = (),
     ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
         """Test whether a robot touches something at joint values (…,dof); answers as `check_spheres`.
@@ -236,9 +235,10 @@ class SceneMap:
             closed=unknown == "occupied",
         )
 
-    def _points(self, x: ndarray | Tensor, what: str) -> Float[Tensor, "n 3"]:
+    def _points(self, x: ArrayLike | Tensor, what: str) -> Float[Tensor, "n 3"]:
         """Return points on the map's device; raise InputError for a wrong shape or numbers that are not finite."""
-        if np.ndim(x) != 2 or x.shape[1] != 3:
+        x = x if isinstance(x, Tensor) else np.asarray(x)
+        if x.ndim != 2 or x.shape[1] != 3:
             raise InputError(f"{what}: expected an array of shape (n, 3) in metres, got {tuple(np.shape(x))}")
         tensor = torch.as_tensor(x, dtype=torch.float32, device=self.seen.lower.device)
         if not torch.isfinite(tensor).all():
