@@ -6,7 +6,7 @@ import pytest
 from numpy import ndarray
 
 from jcr.boards.proposal import board_in_view, proposed
-from jcr.export.board_sheet import PAPERS_MM, board_sheet
+from jcr.boards.sheet import PAPERS_MM, board_sheet
 from jcr.findings import sentence
 
 PX_PER_MM = 5

@@ -303,6 +303,7 @@ def views(tmp_path: Path) -> "PosedImages":
         folder=folder,
         images=images,
         base_from_camera=poses,
+        base_from_gripper=poses,
         intrinsics=INTRINSICS,
         tracks=tracks,
         points_in_base=points,

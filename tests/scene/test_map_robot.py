@@ -194,7 +194,7 @@ def test_robots_and_joints_that_make_no_sense_are_refused(scene: "SceneMap", urd
         scene.check_robot(robot, np.zeros(3), base_from_robot=np.diag([2.0, 2, 2, 1]))
     broken = tmp_path / "broken.urdf"
     broken.write_text("<robot><link")
-    with pytest.raises(InputError, match="cannot be read as URDF"):
+    with pytest.raises(InputError, match="not a readable URDF"):
         load_robot(broken)
     broken.write_text(URDF)  # its mesh is not beside it
     with pytest.raises(InputError, match="mesh of link slide"):

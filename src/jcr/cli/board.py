@@ -32,8 +32,8 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Write the sheet and print the option that it is used with."""
+    from jcr.boards.sheet import board_sheet
     from jcr.errors import InputError
-    from jcr.export.board_sheet import board_sheet
     from jcr.files import write_bytes
 
     if arguments.out.suffix.lower() != ".pdf":

@@ -3,6 +3,8 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -24,7 +26,8 @@ if TYPE_CHECKING:
     from jcr.calibration.record import Calibration
     from jcr.cell.placement import CameraPlacement
     from jcr.export.views import PosedImages
-    from jcr.records import Capture, Intrinsics, Reconstruction
+    from jcr.records import Intrinsics, PointCloud
+    from jcr.scene.scene_map import SceneMap
 
 
 @dataclass(frozen=True)
@@ -205,15 +208,15 @@ class Run:
             intrinsics=intrinsics,
         )
 
-    @cached_property
-    def capture(self) -> "Capture":
-        """Images and poses of the run."""
-        return self.folder.capture()
+    @property
+    def cloud(self) -> "PointCloud":
+        """cloud.ply."""
+        return self.folder.cloud()
 
-    @cached_property
-    def reconstruction(self) -> "Reconstruction":
-        """reconstruction.npz."""
-        return self.folder.reconstruction()
+    @property
+    def scene(self) -> "SceneMap":
+        """map.safetensors."""
+        return self.folder.scene()
 
     @property
     def views(self) -> "PosedImages":
@@ -227,117 +230,104 @@ class Run:
                 f"{self.folder.path}: a fixed camera watched the gripper: its images show no scene in the base frame"
             )
         base_from_recon = self.calibration.base_from_recon.rigid
-        return posed_images(self.capture, self.reconstruction, base_from_recon, scale)
+        return posed_images(self.folder.capture(), self.folder.reconstruction(), base_from_recon, scale)
 
 
-def _of_mount(text: Callable[[ros.CameraMount], str]) -> Callable[[Run, Path], None]:
-    """Return the writer of a text about the exported camera."""
-    return lambda run, path: write_text(path, text(run.mount))
+def _written(name: str, *contents: str) -> Callable[[Run, Path], None]:
+    """Return the writer `name` (module.function of this package), given these contents and options of a run.
+
+    The module is imported when the writer is called, because torch and pycolmap take seconds.
+    """
+    module, function = name.split(".")
+
+    def write(run: Run, path: Path) -> None:
+        """Write a file or folder."""
+        values = [attrgetter(content)(run) for content in contents]
+        getattr(import_module(f"jcr.export.{module}"), function)(path, *values)
+
+    return write
 
 
-def _ros2(run: Run, path: Path) -> None:
-    """Write a launch file of all cameras and arms."""
-    write_text(path, ros.ros2_launch(run.mount, *run.others))
-
-
-def _urdf(run: Run, path: Path) -> None:
-    """Write a URDF of all cameras and arms."""
-    write_text(path, ros.urdf(run.mount, *run.others))
-
-
-def _easy_handeye2(run: Run, path: Path) -> None:
-    """Write a .calib file that has the name of its calibration."""
-    write_text(path, ros.easy_handeye2(run.mount, path.stem))
-
-
-def _ply(run: Run, path: Path) -> None:
-    """Write the cloud."""
-    from jcr.scene.cloud_ply import write_cloud
-
-    write_cloud(path, run.folder.cloud(), run.provenance.notes)
-
-
-def _glb(run: Run, path: Path) -> None:
-    """Write the mesh of the surface."""
-    scene = run.folder.scene()
-    from jcr.export.volume import write_glb
-
-    write_glb(path, scene, run.provenance)
-
-
-def _octomap(run: Run, path: Path) -> None:
-    """Write an OctoMap."""
-    scene = run.folder.scene()
-    from jcr.export.volume import write_octomap
-
-    write_octomap(path, scene, run.provenance, run.options.voxel_size)
-
-
-def _esdf(run: Run, path: Path) -> None:
-    """Write voxels of signed distance."""
-    scene = run.folder.scene()
-    from jcr.export.volume import write_esdf
-
-    write_esdf(path, scene, run.provenance, run.options.unknown or "occupied", run.options.voxel_size)
-
-
-def _spheres(run: Run, path: Path) -> None:
-    """Write spheres that cover solid space."""
-    scene = run.folder.scene()
-    from jcr.export.volume import write_spheres
-
-    write_spheres(path, scene, run.provenance, run.options.unknown or "free", run.options.excess)
-
-
-def _nerfstudio(run: Run, path: Path) -> None:
-    """Write transforms.json with images and initial points."""
-    from jcr.export.views import write_nerfstudio
-
-    images = run.options.undistort, run.options.link_images
-    write_nerfstudio(path, run.views, run.folder.cloud(), run.provenance, *images)
-
-
-def _colmap(run: Run, path: Path) -> None:
-    """Write a COLMAP model with images."""
-    from jcr.export.views import write_colmap
-
-    images = run.options.undistort, run.options.link_images
-    write_colmap(path, run.views, run.provenance, *images)
-
-
-def _rerun(run: Run, path: Path) -> None:
-    """Write a Rerun recording."""
-    scene = run.folder.scene()
-    from jcr.export.rrd import write_rrd
-
-    base_from_gripper = run.capture.base_from_gripper[run.reconstruction.image_index]
-    write_rrd(path, run.views, base_from_gripper, run.folder.cloud(), scene, run.provenance)
+def _text(text: Callable[[Run, Path], str]) -> Callable[[Run, Path], None]:
+    """Return the writer of a text."""
+    return lambda run, path: write_text(path, text(run, path))
 
 
 FORMATS = (
-    Format("ros2", "hand_eye.launch.xml", "static_transform_publisher line and launch file", _ros2),
+    Format(
+        "ros2",
+        "hand_eye.launch.xml",
+        "static_transform_publisher line and launch file",
+        _text(lambda run, path: ros.ros2_launch(run.mount, *run.others)),
+    ),
     Format(
         "moveit",
         "hand_eye.launch.py",
         "launch file as MoveIt Calibration saves it",
-        _of_mount(ros.moveit_launch),
+        _text(lambda run, path: ros.moveit_launch(run.mount)),
     ),
-    Format("urdf", "hand_eye.urdf", "camera link and fixed joint", _urdf),
-    Format("easy_handeye2", "hand_eye.calib", ".calib for its publisher", _easy_handeye2),
     Format(
-        "camera_info", "camera_info.yaml", "intrinsics for camera_info_manager", _of_mount(ros.camera_info)
+        "urdf",
+        "hand_eye.urdf",
+        "camera link and fixed joint",
+        _text(lambda run, path: ros.urdf(run.mount, *run.others)),
     ),
-    Format("ply", "cloud.ply", "points, colours, labels", _ply),
-    Format("glb", "map.glb", "mesh of the seen surface with colours", _glb),
-    Format("octomap", "map.bt", "occupied, free and unknown voxels", _octomap),
-    Format("esdf", "esdf.npz", "voxels of signed distance", _esdf),
-    Format("spheres", "spheres.npz", "spheres that cover what is solid", _spheres),
+    Format(
+        "easy_handeye2",
+        "hand_eye.calib",
+        ".calib for its publisher",
+        _text(lambda run, path: ros.easy_handeye2(run.mount, path.stem)),
+    ),
+    Format(
+        "camera_info",
+        "camera_info.yaml",
+        "intrinsics for camera_info_manager",
+        _text(lambda run, path: ros.camera_info(run.mount)),
+    ),
+    Format("ply", "cloud.ply", "points, colours, labels", _written("views.write_ply", "cloud", "provenance")),
+    Format(
+        "glb",
+        "map.glb",
+        "mesh of the seen surface with colours",
+        _written("volume.write_glb", "scene", "provenance"),
+    ),
+    Format(
+        "octomap",
+        "map.bt",
+        "occupied, free and unknown voxels",
+        _written("volume.write_octomap", "scene", "provenance", "options.voxel_size"),
+    ),
+    Format(
+        "esdf",
+        "esdf.npz",
+        "voxels of signed distance",
+        _written("volume.write_esdf", "scene", "provenance", "options.unknown", "options.voxel_size"),
+    ),
+    Format(
+        "spheres",
+        "spheres.npz",
+        "spheres that cover what is solid",
+        _written("volume.write_spheres", "scene", "provenance", "options.unknown", "options.excess"),
+    ),
     Format(
         "nerfstudio",
         "nerfstudio/",
         "transforms.json, images and first points for a splat or NeRF",
-        _nerfstudio,
+        _written(
+            "views.write_nerfstudio",
+            *("views", "cloud", "provenance", "options.undistort", "options.link_images"),
+        ),
     ),
-    Format("colmap", "colmap/", "COLMAP model in the base frame, binary and text", _colmap),
-    Format("rerun", "run.rrd", "recording for the Rerun viewer", _rerun),
+    Format(
+        "colmap",
+        "colmap/",
+        "COLMAP model in the base frame, binary and text",
+        _written("views.write_colmap", "views", "provenance", "options.undistort", "options.link_images"),
+    ),
+    Format(
+        "rerun",
+        "run.rrd",
+        "recording for the Rerun viewer",
+        _written("rrd.write_rrd", "views", "cloud", "scene", "provenance"),
+    ),
 )

@@ -1,4 +1,4 @@
-"""Export formats and options, in a module of their own so that the command line's help imports no writer."""
+"""Export formats and options, apart from the writers, for the help of the command line."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -33,12 +33,12 @@ class ExportOptions:
     """Pose of the optical frame in that link: x y z (m) qx qy qz qw, as `ros2 run tf2_ros tf2_echo LINK OPTICAL`
     prints it; by default the same origin, with axes as in REP-103."""
     intrinsics: Literal["estimated", "given"] = "estimated"
-    """Which intrinsics the camera is used with: those that the run estimated, or those that the capture gave; each has
-    a transform of its own, and files name the pair."""
+    """Intrinsics that the camera is used with: estimated by the run, or given by the capture. Each pair has a transform
+    of its own, and files name the pair."""
     voxel_size: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
     """Voxel size (m) for octomap and esdf; by default the map's cell."""
     unknown: Literal["occupied", "free"] | None = None
-    """How unseen space counts: by default as occupied in esdf, as free (left out) in spheres."""
+    """State of unseen space: by default occupied in esdf, free (left out) in spheres."""
     excess: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
     """Metres by which spheres may extend into free space; by default two cells of the map."""
     undistort: bool = False

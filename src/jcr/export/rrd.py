@@ -1,10 +1,7 @@
-"""A recording for the Rerun viewer: cloud, surface, cameras with their images, grippers."""
+"""Recording for the Rerun viewer: cloud, surface, cameras with their images, grippers."""
 
 from pathlib import Path
 from typing import Any
-
-from jaxtyping import Float
-from numpy import ndarray
 
 from jcr.export.provenance import Provenance
 from jcr.export.views import PosedImages
@@ -20,15 +17,11 @@ _GRIPPER_AXES_M = 0.05
 def write_rrd(
     path: Path,
     views: PosedImages,
-    base_from_gripper: Float[ndarray, "m 4 4"],
     cloud: PointCloud,
     scene: SceneMap,
     provenance: Provenance,
 ) -> None:
-    """Write a .rrd; `base_from_gripper` are the gripper poses of the `views`.
-
-    Raises InputError without rerun-sdk, which is 500 MB and therefore an extra of its own.
-    """
+    """Write a .rrd; raise InputError without rerun-sdk, which is 500 MB and therefore an extra of its own."""
     rr: Any = extra("rerun", "rerun", "a .rrd file")
     vertices, faces, colors = surface_mesh(scene)
     intrinsics = views.intrinsics
@@ -41,7 +34,7 @@ def write_rrd(
         recording.log("base/cloud", rr.Points3D(cloud.points_in_base, colors=cloud.color), static=True)
         surface = rr.Mesh3D(vertex_positions=vertices, triangle_indices=faces, vertex_colors=colors)
         recording.log("base/surface", surface, static=True)
-        poses = zip(views.images, views.base_from_camera, base_from_gripper, strict=True)
+        poses = zip(views.images, views.base_from_camera, views.base_from_gripper, strict=True)
         for image, base_from_camera, gripper in poses:
             at = rr.Transform3D(translation=gripper[:3, 3], mat3x3=gripper[:3, :3])
             recording.log(f"base/grippers/{image}", at, rr.TransformAxes3D(_GRIPPER_AXES_M), static=True)

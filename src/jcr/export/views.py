@@ -37,6 +37,8 @@ class PosedImages:
     images: tuple[str, ...]
     """Paths relative to that folder."""
     base_from_camera: Float[ndarray, "m 4 4"]
+    base_from_gripper: Float[ndarray, "m 4 4"]
+    """Reported gripper poses."""
     intrinsics: Intrinsics
     tracks: Tracks
     points_in_base: Float[ndarray, "p 3"]
@@ -55,10 +57,16 @@ def posed_images(
         folder=capture.folder,
         images=tuple(capture.images[row] for row in reconstruction.image_index),
         base_from_camera=base_from_recon @ scale_translation(reconstruction.recon_from_camera, scale),
+        base_from_gripper=capture.base_from_gripper[reconstruction.image_index],
         intrinsics=reconstruction.intrinsics,
         tracks=reconstruction.tracks,
         points_in_base=apply_similarity(base_from_recon, scale, reconstruction.tracks.points_in_recon),
     )
+
+
+def write_ply(path: Path, cloud: PointCloud, provenance: Provenance) -> None:
+    """Write the cloud as PLY with its provenance in the header."""
+    write_cloud(path, cloud, provenance.notes)
 
 
 def write_nerfstudio(

@@ -49,16 +49,17 @@ def write_esdf(
     path: Path,
     scene: SceneMap,
     provenance: Provenance,
-    unknown: Literal["occupied", "free"],
+    unknown: Literal["occupied", "free"] | None = None,
     voxel: float | None = None,
 ) -> None:
     """Write the signed distance at the centres of voxels of side `voxel` m, by default the map's cell, as .npz.
 
+    Unseen space counts as occupied by default.
     `values` (nx,ny,nz) with x slowest, as cuRobo lays out its voxel tensor; `origin` (3,) the centre of the
     first voxel; `voxel_size`; `dims` (3,) the sides of the grid; `pose` (7,) its centre and quaternion w x y z,
     as cuRobo wants them; and as text `frame`, `unit`, `sign`, `unknown`.
     """
-    voxel = _voxel(scene, voxel)
+    voxel, unknown = _voxel(scene, voxel), unknown or "occupied"
     count = np.floor((scene.box[1] - scene.box[0]) / voxel + 1e-6).astype(int)
     centers = _centers(scene.box[0], count, voxel)
     values = scene.query(centers.reshape(-1, 3), unknown).distance.reshape(count)
@@ -88,28 +89,22 @@ def write_spheres(
     path: Path,
     scene: SceneMap,
     provenance: Provenance,
-    unknown: Literal["occupied", "free"],
+    unknown: Literal["occupied", "free"] | None = None,
     excess: float | None = None,
 ) -> None:
-    """Write the spheres of `spheres_of_map` as .npz: `centers` (n,3) and `radii` (n,) m."""
-    centers, radii = spheres_of_map(scene, unknown, excess)
-    _write_npz(path, provenance, centers=centers, radii=radii, unknown=unknown)
+    """Write spheres that hold solid space and reach at most `excess` m beyond it as .npz: `centers` (n,3), `radii` (n,).
 
-
-def spheres_of_map(
-    scene: SceneMap, unknown: Literal["occupied", "free"], excess: float | None = None
-) -> tuple[Float[ndarray, "n 3"], Float[ndarray, " n"]]:
-    """Return centres (n,3) and radii (n,) m of spheres that hold solid space and reach at most `excess` m beyond it.
-
-    By default the excess is two of the map's cells; space is sampled in steps of a quarter of it.
+    Unseen space counts as free by default. The default excess is two of the map's cells; space is sampled in steps of
+    a quarter of it.
     """
+    unknown = unknown or "free"
     excess = 2 * scene.cell if excess is None else excess
     step = _voxel(scene, excess / 4)
     count = np.ceil((scene.box[1] - scene.box[0]) / step - 1e-6).astype(int)
     points = _centers(scene.box[0], count, step)
     distance = scene.query(points.reshape(-1, 3), unknown).distance.reshape(count)
     index, radii = cover_with_spheres(distance, step, excess)
-    return points[tuple(index.T)], radii
+    _write_npz(path, provenance, centers=points[tuple(index.T)], radii=radii, unknown=unknown)
 
 
 def write_glb(path: Path, scene: SceneMap, provenance: Provenance) -> None:

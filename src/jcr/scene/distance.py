@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
-from torch.nn import functional as F
+
+from jcr.scene.fields import interpolate_grid
 
 BISECTIONS = 5
 """Halvings of a grid edge in search of the surface: 0.3 mm at cells of 1 cm."""
@@ -30,18 +31,11 @@ class DistanceGrid:
 
     def at(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
         """Return distance and gradient (n,4), interpolated trilinearly at points (n,3) of the box."""
-        return self._interpolate(self.gradients, x_in_base).T
+        return interpolate_grid(self.gradients, self.lower, self.cell, x_in_base).T
 
     def distance(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """Return the distance (n,) alone, at points (n,3) of the box."""
-        return self._interpolate(self.nodes[None], x_in_base)[0]
-
-    def _interpolate(
-        self, table: Float[Tensor, "k nz ny nx"], x_in_base: Float[Tensor, "n 3"]
-    ) -> Float[Tensor, "k n"]:
-        cells = torch.tensor(table.shape[:0:-1], device=x_in_base.device) - 1
-        at = ((x_in_base - self.lower) * (2.0 / (self.cell * cells)) - 1.0).view(1, 1, 1, -1, 3)
-        return F.grid_sample(table[None], at, padding_mode="border", align_corners=True).view(len(table), -1)
+        return interpolate_grid(self.nodes[None], self.lower, self.cell, x_in_base)[0]
 
 
 def distance_grid(

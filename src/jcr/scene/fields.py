@@ -133,35 +133,36 @@ class GridEncoding(nn.Module):
             for lattice, n in zip(lattices, features, strict=True)
         )
         self.features = sum(features)
+        self._dense: list[Tensor] | None = None
 
     def forward(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "f n"]:
         """Return the features (f,n) of points (n,3)."""
+        if self._dense is not None:
+            parts = zip(self._dense, self.lattices, strict=True)
+            return torch.cat(
+                [interpolate_grid(t, lattice.lower, lattice.cell, x_in_base) for t, lattice in parts]
+            )
         parts = zip(self.tables, self.lattices, strict=True)
         return torch.cat([Interpolate.apply(t, *lattice.corners(x_in_base)) for t, lattice in parts])
 
-
-class SpreadEncoding:
-    """A trained `GridEncoding` with features at every node: more memory, and answers three times as fast."""
-
-    def __init__(self, encoding: GridEncoding) -> None:
-        self.tables = [
-            table.detach()[lattice.row.long()].T.reshape(1, -1, *lattice.shape)
-            for table, lattice in zip(encoding.tables, encoding.lattices, strict=True)
-        ]
-        self.lower = [lattice.lower for lattice in encoding.lattices]
-        self.scale = [
-            2.0 / (lattice.cell * (torch.tensor(lattice.shape[::-1], device=lattice.lower.device) - 1))
-            for lattice in encoding.lattices
+    def expand(self) -> None:
+        """Keep the trained features at every node: more memory, and answers three times as fast."""
+        self._dense = [
+            table.detach()[lattice.row.long()].T.unflatten(1, lattice.shape)
+            for table, lattice in zip(self.tables, self.lattices, strict=True)
         ]
 
-    def __call__(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "f n"]:
-        """Return the features (f,n) of points (n,3)."""
-        parts = []
-        for table, lower, scale in zip(self.tables, self.lower, self.scale, strict=True):
-            at = ((x_in_base - lower) * scale - 1.0).view(1, 1, 1, -1, 3)
-            sampled = F.grid_sample(table, at, padding_mode="border", align_corners=True)
-            parts.append(sampled.view(table.shape[1], -1))
-        return torch.cat(parts)
+
+def interpolate_grid(
+    table: Float[Tensor, "k nz ny nx"],
+    lower: Float[Tensor, "3"],
+    cell: float,
+    x_in_base: Float[Tensor, "n 3"],
+) -> Float[Tensor, "k n"]:
+    """Return values at the nodes of a regular grid, interpolated trilinearly at points (n,3) of its box."""
+    cells = torch.tensor(table.shape[:0:-1], device=x_in_base.device) - 1
+    at = ((x_in_base - lower) * (2.0 / (cell * cells)) - 1.0).view(1, 1, 1, -1, 3)
+    return F.grid_sample(table[None], at, padding_mode="border", align_corners=True).view(len(table), -1)
 
 
 def linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Linear:
@@ -189,7 +190,6 @@ class Field(nn.Module):
             if shape.frequencies
             else GridEncoding([lattices[k] for k, _ in shape.grids], [n for _, n in shape.grids])
         )
-        self.spread: SpreadEncoding | None = None
         self.hidden = linear(self.encoding.features, shape.hidden, generator)
         self.heads = nn.ModuleDict(
             {name: linear(shape.hidden, n, generator) for name, n in shape.heads.items()}
@@ -210,15 +210,10 @@ class Field(nn.Module):
             target = targets[name]
             standard.copy_(torch.stack([target.mean(0), target.std(0).clamp(min=1e-6)]))
 
-    def before_relu(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "hidden n"]:
-        """Return the inputs of the hidden units at points (n,3)."""
-        # Features first: with so few of them, this product and its gradients take half the time.
-        features = (self.spread or self.encoding)(x_in_base)
-        return torch.addmm(self.hidden.bias[:, None], self.hidden.weight, features)
-
     def forward(self, x_in_base: Float[Tensor, "n 3"]) -> dict[str, Tensor]:
         """Return the outputs (n, outputs) of every head at points (n,3)."""
-        hidden = F.relu(self.before_relu(x_in_base))
+        # Features first: with so few of them, this product and its gradients take half the time.
+        hidden = F.relu(torch.addmm(self.hidden.bias[:, None], self.hidden.weight, self.encoding(x_in_base)))
         outputs = {}
         for name, head in self.heads.items():
             outputs[name] = torch.addmm(head.bias[:, None], head.weight, hidden).T  # pyright: ignore[reportArgumentType, reportIndexIssue]
@@ -252,12 +247,8 @@ class Fields(nn.Module):
                 out |= field(x_in_base)
         return {name: out[name] for name in names}
 
-    def field_of(self, name: str) -> Field:
-        """Return the field that has the head."""
-        return next(f for shape, f in zip(self.shapes, self.of, strict=True) if name in shape.heads)  # pyright: ignore[reportReturnType]
-
-    def spread(self, name: str) -> None:
-        """Make the field of that head answer faster, at the cost of memory; for maps that are trained."""
+    def expand(self, name: str) -> None:
+        """Make the field with that head answer faster, at the cost of memory; for maps that are trained."""
         for shape, field in zip(self.shapes, self.of, strict=True):
             if name in shape.heads and isinstance(field.encoding, GridEncoding):
-                field.spread = SpreadEncoding(field.encoding)  # pyright: ignore[reportArgumentType]
+                field.encoding.expand()

@@ -1,4 +1,4 @@
-"""Options of cloud and map, in a module of their own so that the command line's help imports no torch."""
+"""Options of cloud and map, apart from the code that imports torch, for the help of the command line."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -8,7 +8,7 @@ import tyro
 
 @dataclass(frozen=True)
 class CloudOptions:
-    """Which points of the pointmaps enter the map."""
+    """Selection of the points of the pointmaps that enter the map."""
 
     confidence_percentile: Annotated[float, tyro.conf.arg(metavar="PERCENT")] = 20.0
     """Drop this share (%) of the points that have only matching or a prediction as support, least confident first."""
@@ -22,7 +22,7 @@ class CloudOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class MapOptions:
-    """How the map is trained."""
+    """Workspace, resolution and training of the map."""
 
     preset: Literal["default", "paper"] = "default"
     """default: feature grids, free space learnt along the rays; paper: the paper's sinusoidal network with uniform

@@ -38,15 +38,10 @@ class Rays:
     """Properties of each point: color (n,3), label (n,), further values (n,d)."""
 
     def __getitem__(self, rows: Tensor | slice) -> "Rays":
+        """Return some of the rays."""
         targets = {name: target[rows] for name, target in self.targets.items()}
-        return Rays(
-            x=self.x[rows],
-            ahead=self.ahead[rows],
-            reach=self.reach[rows],
-            weight=self.weight[rows],
-            measured=self.measured[rows],
-            targets=targets,
-        )
+        columns = ("x", "ahead", "reach", "weight", "measured")
+        return Rays(targets=targets, **{name: getattr(self, name)[rows] for name in columns})
 
 
 @dataclass(frozen=True)

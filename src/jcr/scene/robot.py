@@ -12,12 +12,14 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.ndimage import distance_transform_edt
 
+from jcr.capture.urdf_chain import joints_to, load_urdf, source_of
 from jcr.errors import InputError
 from jcr.geometry import apply, rotation_exp, transform
 from jcr.scene.spheres import cover_with_spheres
 
 if TYPE_CHECKING:
     import trimesh
+    import yourdfpy
 
 VOXELS = 100_000
 """Largest number of voxels in the bounding box of a shape."""
@@ -27,20 +29,18 @@ JointValues = Float[ndarray, "*batch dof"] | Mapping[str, Float[ndarray, "*batch
 
 @dataclass(frozen=True, kw_only=True)
 class RobotJoint:
-    """Joint between two links."""
+    """Joint between two links, which are rows of `RobotSpheres.links`."""
 
     parent: int
     child: int
-    """Rows of `RobotSpheres.links`."""
     parent_from_joint: Float[ndarray, "4 4"]
     axis: Float[ndarray, "3"]
-    kind: str
-    """revolute, continuous, prismatic or fixed."""
+    slides: bool
     column: int | None
     """Column of the joint values; None for a fixed joint."""
-    multiplier: float = 1.0
-    offset: float = 0.0
-    """Offset of a joint that mimics another: value = multiplier · other + offset."""
+    factor: float
+    offset: float
+    """Value of the joint = factor · column + offset, for joints that mimic another one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,14 +76,14 @@ class RobotSpheres:
         batch = values.shape[:-1]
         root_from_link = np.broadcast_to(np.eye(4), (len(self.links), *batch, 4, 4)).copy()
         for joint in self.joints:
-            motion = np.broadcast_to(np.eye(4), (*batch, 4, 4))
+            pose = root_from_link[joint.parent] @ joint.parent_from_joint
             if joint.column is not None:
-                along = (joint.multiplier * values[..., joint.column] + joint.offset)[..., None] * joint.axis
-                slides = joint.kind == "prismatic"
-                motion = (
-                    transform(np.eye(3), along) if slides else transform(rotation_exp(along), np.zeros(3))
+                along = (joint.factor * values[..., joint.column] + joint.offset)[..., None] * joint.axis
+                still = np.zeros(3)
+                pose = pose @ (
+                    transform(np.eye(3), along) if joint.slides else transform(rotation_exp(along), still)
                 )
-            root_from_link[joint.child] = root_from_link[joint.parent] @ joint.parent_from_joint @ motion
+            root_from_link[joint.child] = pose
         pose = np.moveaxis(root_from_link[self.link], 0, -3)
         return (pose[..., :3, :3] @ self.centers_in_link[:, :, None])[..., 0] + pose[..., :3, 3]
 
@@ -132,43 +132,41 @@ def _times_ns(path: Path) -> tuple[int, ...]:
 
 @lru_cache(maxsize=8)
 def _load(path: Path, times_ns: tuple[int, ...], excess: float) -> RobotSpheres:
+    """Return the spheres of the robot in an existing file; `times_ns` tells changed files apart."""
     import yourdfpy
 
-    try:
-        robot: Any = yourdfpy.URDF.load(
-            str(path),
-            build_scene_graph=False,
-            build_collision_scene_graph=True,
-            load_meshes=False,
-            load_collision_meshes=True,
-            force_collision_mesh=False,
-        )
-    except Exception as error:
-        raise InputError(f"{path}: cannot be read as URDF ({error})") from error
-    links = tuple(link.name for link in robot.robot.links)
-    joints = _joints(robot, links, path)
-    scene = robot.collision_scene
+    tree = load_urdf(path)
+    links = tuple(link.name for link in tree.robot.links)
+    joints = _joints(tree, links, path)
+    robot: Any = yourdfpy.URDF.load(
+        str(path),
+        build_scene_graph=False,
+        build_collision_scene_graph=True,
+        load_meshes=False,
+        load_collision_meshes=True,
+        force_collision_mesh=False,
+    )
+    graph, shapes = robot.collision_scene.graph, robot.collision_scene.geometry
     link, centers, radii = [], [], []
     found = dict.fromkeys(links, 0)
-    for node in scene.graph.nodes_geometry:
-        on = scene.graph.transforms.parents[node]
-        link_from_shape, name = scene.graph.get(frame_to=node, frame_from=on)
+    for node in graph.nodes_geometry:
+        on = node
         while on not in found:  # a mesh file may be a tree of its own
-            on = scene.graph.transforms.parents[on]
-            link_from_shape, name = scene.graph.get(frame_to=node, frame_from=on)
+            on = graph.transforms.parents[on]
+        link_from_shape, name = graph.get(frame_to=node, frame_from=on)
         found[on] += 1
-        center, radius = spheres_of_shape(scene.geometry[name], np.asarray(link_from_shape), excess)
+        center, radius = spheres_of_shape(shapes[name], np.asarray(link_from_shape), excess)
         link.append(np.full(len(radius), links.index(on)))
         centers.append(center)
         radii.append(radius)
-    for each in robot.robot.links:
+    for each in tree.robot.links:
         if found[each.name] < len(each.collisions):
             raise InputError(f"{path}: a collision mesh of link {each.name} cannot be found; fix its path")
     if not radii:
         raise InputError(f"{path}: no link has a <collision> shape, so nothing can collide")
     return RobotSpheres(
         links=links,
-        joint_names=tuple(robot.actuated_joint_names),
+        joint_names=tuple(tree.actuated_joint_names),
         joints=joints,
         link=np.concatenate(link),
         centers_in_link=np.concatenate(centers),
@@ -176,39 +174,26 @@ def _load(path: Path, times_ns: tuple[int, ...], excess: float) -> RobotSpheres:
     )
 
 
-def _joints(robot: Any, links: tuple[str, ...], path: Path) -> tuple[RobotJoint, ...]:
-    """Return the joints of a yourdfpy.URDF, parents before children."""
-    columns = {name: k for k, name in enumerate(robot.actuated_joint_names)}
-    waiting, reached, joints = list(robot.robot.joints), {robot.base_link}, []
-    while waiting:
-        ready = [joint for joint in waiting if joint.parent in reached]
-        if not ready:
-            raise InputError(
-                f"{path}: joint {waiting[0].name} hangs on no link that reaches {robot.base_link}"
+def _joints(robot: "yourdfpy.URDF", links: tuple[str, ...], path: Path) -> tuple[RobotJoint, ...]:
+    """Return the joints of a robot, parents before children."""
+    joints = []
+    for joint in sorted(robot.robot.joints, key=lambda joint: len(joints_to(robot, joint.child))):
+        if joint.type not in ("revolute", "continuous", "prismatic", "fixed"):
+            raise InputError(f"{path}: joint {joint.name} is {joint.type}, which is not supported")
+        leader, factor, offset = source_of(robot, joint)
+        axis = np.array([1.0, 0.0, 0.0] if joint.axis is None else joint.axis, float)
+        joints.append(
+            RobotJoint(
+                parent=links.index(joint.parent),
+                child=links.index(joint.child),
+                parent_from_joint=np.eye(4) if joint.origin is None else np.asarray(joint.origin, float),
+                axis=axis / np.linalg.norm(axis),
+                slides=joint.type == "prismatic",
+                column=None if joint.type == "fixed" else robot.actuated_joint_names.index(leader),
+                factor=factor,
+                offset=offset,
             )
-        for joint in ready:
-            if joint.type not in ("revolute", "continuous", "prismatic", "fixed"):
-                raise InputError(f"{path}: joint {joint.name} is {joint.type}, which is not supported")
-            leader, multiplier, offset = joint.name, 1.0, 0.0
-            if joint.mimic is not None:
-                leader = joint.mimic.joint
-                multiplier = 1.0 if joint.mimic.multiplier is None else float(joint.mimic.multiplier)
-                offset = float(joint.mimic.offset or 0.0)
-            axis = np.array([1.0, 0.0, 0.0] if joint.axis is None else joint.axis, float)
-            joints.append(
-                RobotJoint(
-                    parent=links.index(joint.parent),
-                    child=links.index(joint.child),
-                    parent_from_joint=np.eye(4) if joint.origin is None else np.asarray(joint.origin, float),
-                    axis=axis / np.linalg.norm(axis),
-                    kind=joint.type,
-                    column=None if joint.type == "fixed" else columns[leader],
-                    multiplier=multiplier,
-                    offset=offset,
-                )
-            )
-            reached.add(joint.child)
-            waiting.remove(joint)
+        )
     return tuple(joints)
 
 

@@ -53,7 +53,7 @@ class SceneMap:
         """Preset, steps and seconds of the training."""
         self.properties = tuple(name for shape in fields.shapes for name in shape.heads)
         """Properties of the fields: occupancy, color, and label or further values where they were given."""
-        self.fields.spread("occupancy")
+        self.fields.expand("occupancy")
         self._distance: dict[str, DistanceGrid] = {}
         self._lock = threading.Lock()
 
@@ -104,7 +104,7 @@ class SceneMap:
         """
         _check_choice(unknown)
         x, tensors = self._points(x_in_base, "points"), isinstance(x_in_base, Tensor)
-        return Sample(self.fields, self.seen, self.distance_grid, x, unknown=unknown, tensors=tensors)
+        return Sample(self, x, unknown=unknown, tensors=tensors)
 
     def check_spheres(
         self,

@@ -8,7 +8,7 @@ import tyro
 
 @dataclass(frozen=True)
 class TabletopOptions:
-    """What counts as an object on the table."""
+    """Limits of an object on the table."""
 
     object_lowest: Annotated[float, tyro.conf.arg(metavar="M")] = 0.008
     """Height (m) above the plane that an object must reach; its lower points may then belong to it."""
@@ -22,7 +22,7 @@ class TabletopOptions:
 
 @dataclass(frozen=True)
 class SegmentOptions:
-    """How the scene is divided into objects."""
+    """Method that divides the scene into objects."""
 
     segments: Literal["auto", "labels", "tabletop", "sam", "none"] = "auto"
     """labels: labels/NAME.png in the capture's folder; tabletop: the support plane and what stands on it; sam: Segment

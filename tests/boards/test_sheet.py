@@ -11,7 +11,7 @@ from numpy import ndarray
 import jcr
 from in_process import run_jcr
 from jcr.boards.detection import boards
-from jcr.export.board_sheet import board_sheet
+from jcr.boards.sheet import board_sheet
 
 
 def mm_of_page(data: bytes) -> tuple[ndarray, ndarray]:
