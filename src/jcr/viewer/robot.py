@@ -23,22 +23,19 @@ def read_robot(urdf: Path, capture: Capture) -> "tuple[yourdfpy.URDF, Float[ndar
     """
     import yourdfpy
 
-    if not urdf.is_file():
-        raise InputError(f"{urdf}: no such URDF file")
-    load_urdf(urdf)
+    moving = load_urdf(urdf).actuated_joint_names
     if (joints := capture.joints) is None:
         raise InputError(
             f"{capture.folder}: has no joint values, so the robot's pose is unknown; add `joints` (rad) to each frame "
             "of its capture.json, or leave out --urdf"
         )
-    try:
-        robot = yourdfpy.URDF.load(str(urdf))
-    except Exception as error:  # whatever XML and mesh readers raise
-        raise InputError(f"{urdf}: cannot be read as URDF ({error})") from error
-    moving = robot.actuated_joint_names
     if len(moving) < joints.shape[1]:
         raise InputError(
             f"{urdf}: moves {len(moving)} joints, but the capture has {joints.shape[1]} values for each image; give "
             "the URDF of the whole arm"
         )
+    try:
+        robot = yourdfpy.URDF.load(str(urdf))
+    except Exception as error:  # whatever the readers of meshes raise
+        raise InputError(f"{urdf}: a mesh cannot be read ({error})") from error
     return robot, np.pad(joints, ((0, 0), (0, len(moving) - joints.shape[1])))

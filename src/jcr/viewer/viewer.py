@@ -1,7 +1,6 @@
 """3D view of a run in the browser: points, cameras, robot, slices of the map, a sphere to test."""
 
 import threading
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -16,12 +15,11 @@ from viser.extras import ViserUrdf
 
 from jcr.camera import pinhole_inside, undistortion
 from jcr.capture.images import read_image
-from jcr.findings import sentence, verdict_of
-from jcr.findings.sentences import reached_in_words
 from jcr.geometry import apply, apply_similarity, scale_translation
 from jcr.progress import Progress, silent
 from jcr.report.raster import TRACK_COLOR, label_colors
 from jcr.report.render import render
+from jcr.report.verdict import head
 from jcr.run_folder import RunFolder
 from jcr.scene.samples import Slice, level_slice, sample_surface
 from jcr.scene.scene_map import SceneMap, Unknown
@@ -43,7 +41,7 @@ CLICK_RAD = 0.006
 FAR_M = 0.2
 """Distance at which the colours of a slice end."""
 Value = Float[ndarray, "3"]
-SliceOf = Literal["distance", "occupancy", "unknown"]
+SliceOf = Literal["distance", "occupancy"]
 
 
 class Viewer:
@@ -96,20 +94,9 @@ class Viewer:
         report("view", 1.0)
 
     def _verdict(self, folder: RunFolder) -> str:
-        """Return the verdict with its reason, the leave-one-out error, and the remedy for a missing map."""
-        calibration, held_out = self.calibration, self.calibration.held_out
-        verdict, lines = verdict_of(calibration.findings).capitalize(), []
-        if not calibration.converged:
-            lines.append(f"**{verdict}:** {calibration.doubt}")
-        elif (short := calibration.short) is not None:
-            lines.append(f"**{verdict}:** {sentence(short)}")
-        elif calibration.requirement is not None:
-            lines.append(f"**{verdict}:** {reached_in_words(calibration.requirement)}")
-        if calibration.converged and held_out is not None:
-            lines.append(
-                f"Leave-one-out error {held_out.translation_mm:.2f} mm, {held_out.rotation_deg:.3f}°; "
-                f"{len(self.image_index)} cameras."
-            )
+        """Return the headline of the report, and the remedy for a missing map."""
+        headline = head(self.calibration)[0].content
+        lines = [f"**{headline['verdict']}:** {headline['reason']}", headline["evidence"]]
         if self.scene is None:
             lines.append(f"No map yet: make one with `jcr map {folder.path}`.")
         return "\n\n".join(lines)
@@ -196,7 +183,7 @@ class Viewer:
             self.slice_of = gui.add_dropdown("slice", ("none", *get_args(SliceOf)), initial_value="none")
             bottom, top = float(low[2].round(3)), float(high[2].round(3))
             self.slice_at = gui.add_slider("height (m)", bottom, top, 0.005, round(self._support() + 0.02, 3))
-            self._slice_legend = gui.add_html("")
+            self._slice_legend = gui.add_markdown("")
         vertices, faces = unknown_border(scene)
         self._unknown = None
         if len(faces):
@@ -419,38 +406,24 @@ def unknown_border(scene: SceneMap) -> tuple[Float[ndarray, "v 3"], Integer[ndar
     return low + pitch * (vertices + 0.5), faces
 
 
-def plasma(share: Float[ndarray, "*shape"]) -> UInt8[ndarray, "*shape 3"]:
-    """Return RGB colours from violet (0) to yellow (1)."""
-    levels = (255 * share.reshape(-1, 1)).clip(0, 255).astype(np.uint8)
-    return cv2.applyColorMap(levels, cv2.COLORMAP_PLASMA)[..., ::-1].reshape(*share.shape, 3)
-
-
 def slice_colors(cut: Slice, of: SliceOf) -> UInt8[ndarray, "h w 4"]:
     """Return RGBA of a slice in the colours of SLICE_LEGENDS."""
     rgba = np.zeros((*cut.occupancy.shape, 4), np.uint8)
-    if of == "distance":
-        known = np.isfinite(cut.distance)
-        rgba[known, :3] = plasma(1 - (cut.distance[known] / FAR_M).clip(0, 1))
-        rgba[known, 3] = 217
-        rgba[known & (cut.distance <= 0)] = (200, 30, 30, 230)
-        return rgba
     if of == "occupancy":
         rgba[..., :3], rgba[..., 3] = OCCUPIED, 255 * (0.1 + 0.9 * cut.occupancy.clip(0, 1))
-    rgba[cut.unknown] = (*GREY, 160)
+        rgba[cut.unknown] = (*GREY, 160)
+        return rgba
+    known = np.isfinite(cut.distance)
+    share = (255 * (1 - (cut.distance[known] / FAR_M).clip(0, 1))).astype(np.uint8)
+    rgba[known, :3] = cv2.applyColorMap(share[:, None], cv2.COLORMAP_PLASMA)[:, 0, ::-1]
+    rgba[known, 3] = 217
+    rgba[known & (cut.distance <= 0)] = (200, 30, 30, 230)
     return rgba
 
 
-def _legend(colors: Sequence[Sequence[int]], low: str, high: str) -> str:
-    """Return a bar of RGB colours from left to right, with a label at both ends, as HTML."""
-    return render("bar.html", {"colors": colors, "low": low, "high": high}, "jcr.viewer")
-
-
 SLICE_LEGENDS: dict[str, str] = {
-    "distance": _legend(
-        plasma(np.linspace(1, 0, 9)).tolist(), "surface (solid: red)", f"{100 * FAR_M:.0f} cm and more"
-    ),
-    "occupancy": _legend([(255, 255, 255), OCCUPIED], "free", "occupied (unknown: grey)"),
-    "unknown": _legend([GREY] * 2, "grey: unseen space", ""),
+    "distance": f"yellow: at a surface; violet: {100 * FAR_M:.0f} cm and more; red: solid",
+    "occupancy": "white: free; blue: occupied; grey: unknown",
 }
 """Legends of the slices."""
 
