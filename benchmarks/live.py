@@ -119,7 +119,7 @@ WAYS: dict[str, Callable[[Cell, Progress, int], Float[ndarray, "4 4"]]] = {
     "varied": _varied,
     "random": _random,
 }
-"""What gives the next base_from_gripper, from the state and the number of images so far."""
+"""Functions that give the next base_from_gripper from the state and the number of images so far."""
 
 
 @dataclass(frozen=True)

@@ -61,17 +61,17 @@ class MapScore:
     recall_5mm: float
     recall_10mm: float
     false_free_inside: float
-    """Of the inside of objects, what is called free with unknown="occupied"."""
+    """Share of the inside of objects that is called free with unknown="occupied"."""
     false_free_deep: float
-    """The same more than 5 mm from the surface that the images show."""
+    """Share of the inside more than 5 mm from the surface that the images show."""
     false_occupied: float
-    """Of the free space that a camera saw, what is called occupied."""
+    """Share of the free space that a camera saw that is called occupied."""
     false_occupied_far: float
-    """The same more than 10 mm from any surface."""
+    """Share of that space more than 10 mm from any surface."""
     unknown_free: float
-    """Of the free space that a camera saw, what is called unknown."""
+    """Share of the free space that a camera saw that is called unknown."""
     unknown: float
-    """Of the workspace."""
+    """Share of the workspace that is unknown."""
     color_psnr: float
     label_iou: float
     """Mean over the labels; as `color_psnr`, on the surface where the map knows it."""
@@ -79,7 +79,7 @@ class MapScore:
 
 @dataclass(frozen=True)
 class Places:
-    """Where a map is asked, and the truth there."""
+    """Points at which a map is queried, and the truth there."""
 
     x: Float[ndarray, "n 3"]
     """One in each cell of a grid over the truth's workspace."""
@@ -190,7 +190,7 @@ def _speed(scene: SceneMap, folder: Path) -> list[str]:
 
 
 def _median_seconds(what: Callable[[], object]) -> float:
-    """Of `REPEATS` calls after one that warms up."""
+    """Return the median of `REPEATS` calls after one that warms up."""
     what()
     seconds = []
     for _ in range(REPEATS):
@@ -261,7 +261,7 @@ def calibrated_cloud(truth: Truth) -> PointCloud:
 
 
 def places_to_ask(truth: Truth) -> Places:
-    """The same for every map."""
+    """Return the points at which every map is queried."""
     draw = np.random.default_rng(0)
     low, high = truth.workspace_in_base
     surface = true_surface(truth)

@@ -1,4 +1,4 @@
-"""What the pages of several benches share: tables, distances in mm and degrees, and the captures a bench is given."""
+"""Tables, distances in mm and degrees, and captures that several benches share."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path

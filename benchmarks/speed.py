@@ -35,7 +35,7 @@ class Spent:
     """Resources of one process."""
 
     processor_s: float
-    """Of all threads, in the program and in the system."""
+    """Processor time of all threads, in the program and in the system."""
     wall_s: float
     peak_mib: float
     """Resident set."""

@@ -59,7 +59,7 @@ def _files_beside(app: Sphinx, name: str, source: list[str]) -> None:
 
 
 def _formula(translator: Any, node: nodes.Element) -> None:
-    """As MathML, which browsers draw without a script from elsewhere."""
+    """Write a formula as MathML, which browsers draw without a script from elsewhere."""
     display = "block" if isinstance(node, nodes.math_block) else "inline"
     translator.body.append(convert(node.astext(), display=display))
     raise nodes.SkipNode

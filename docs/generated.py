@@ -143,14 +143,14 @@ def _entry(name: str, value: Any) -> list[str]:
 
 
 def _default(field: Field[Any]) -> str:
-    """Of a field of a record; empty where it must be given."""
+    """Return the default of a field of a record; empty where it must be given."""
     if field.default is not MISSING:
         return f"`{_cell(repr(field.default))}`"
     return "" if field.default_factory is MISSING else "those of its fields"
 
 
 def _signature(name: str, function: Any) -> str:
-    """As it is in the source, where annotations are short."""
+    """Return the signature as it is in the source, where annotations are short."""
     node = ast.parse(textwrap.dedent(inspect.getsource(function))).body[0]
     assert isinstance(node, ast.FunctionDef)
     arguments = ast.unparse(node.args)
@@ -173,7 +173,7 @@ def _signature(name: str, function: Any) -> str:
 
 
 def described(record: type) -> dict[str, str]:
-    """What the string below each field of a class says, of the class itself and those it is made of."""
+    """Return the docstring of each field of a class and of the classes it derives from."""
     return {
         field.target.id: " ".join(below.value.value.split())
         for field, below in _fields(record)
@@ -277,7 +277,7 @@ def _table(part: dict[str, Any]) -> list[str]:
 
 
 def _said(value: dict[str, Any]) -> str:
-    """Of a value that may be null, what is said of the other."""
+    """Return the description of a value, or of the other type of a value that may be null."""
     parts = [value, *value.get("anyOf", [])]
     return next((part["description"] for part in parts if "description" in part), "")
 
@@ -400,7 +400,7 @@ PAGES = {
     "findings.md": findings_page,
     "formats.md": formats_page,
 }
-"""What writes each page."""
+"""Functions that write each page."""
 
 if __name__ == "__main__":
     write_pages()

@@ -21,9 +21,9 @@ HERE = Path(__file__).parent
 CAPTURE = HERE.parent / "examples" / "tabletop"
 WIDTH, HEIGHT = 900, 300
 PHOTO = (320, 240)
-"""Of an image as it is drawn, in pixels."""
+"""Size of a drawn image, pixels."""
 LEFT, RIGHT, TOP, BOTTOM = 430, 870, 40, 240
-"""Of the chart."""
+"""Borders of the chart, pixels."""
 STEP_S, STAY_S = 0.9, 3.0
 """An image is shown for a step, the last one for longer."""
 STYLE = """
@@ -34,7 +34,7 @@ text{font:15px system-ui,sans-serif;fill:#444}.big{font-size:22px;font-weight:60
 
 
 def states() -> list[tuple[str, float, float]]:
-    """Of each image from which on there is a calibration: its file, the error in mm and in degrees."""
+    """Return for each image with a calibration: its file, the error in mm and in degrees."""
     content = json.loads((CAPTURE / "capture.json").read_text())
     intrinsics, found = jcr.read_capture(CAPTURE).intrinsics, []
     with tempfile.TemporaryDirectory() as folder:

@@ -62,7 +62,7 @@ NAMES = (
     ("joint {} sag",),
     ("joint {} gear sine", "joint {} gear cosine"),
 )
-"""Of the errors of each joint, counted from 1: those of all joints of the first kind, then of the second."""
+"""Names of the errors of each joint, counted from 1: all of the first kind, then all of the second."""
 
 
 @dataclass(frozen=True)

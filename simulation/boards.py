@@ -13,7 +13,7 @@ from jcr.records import Boards, Body, Intrinsics
 from simulation.faults import INTRINSICS, FaultyCapture
 
 SQUARE_PX, SAMPLES = 40, 3
-"""Of the printed pattern, and of the drawn image a pixel's samples to a side."""
+"""Pixels of a square of the printed pattern, and samples along the side of a pixel of the drawn image."""
 PAPER, INK = 240, 25
 
 
@@ -34,7 +34,7 @@ class Sheet:
 
 
 def with_sheet(found: FaultyCapture, rng: np.random.Generator, sheet: Sheet) -> FaultyCapture:
-    """The same capture with the corners of a sheet among its points, in the images that show all of it."""
+    """Return the capture with the corners of a sheet among its points, in the images that show all of it."""
     grid = np.stack(np.meshgrid(*map(np.arange, sheet.corners)), axis=-1).reshape(-1, 2).astype(float)
     grid = np.column_stack([grid - grid.mean(0), np.zeros(len(grid))])
     printed = sheet.side_m * (1 + sheet.size_error) * grid

@@ -46,7 +46,7 @@ BOX_AHEAD = 0.12
 
 @dataclass(frozen=True, kw_only=True)
 class CellProblem:
-    """What is reported and seen, and the truth."""
+    """Reported poses and observations of a cell, and the truth."""
 
     kind: Kind
     reported: tuple[Float[ndarray, "n 4 4"], ...]
@@ -54,9 +54,9 @@ class CellProblem:
     observations: Observations
     """Rigs are those of the first arm in order, then of the second, then fixed cameras."""
     world_from_rig: Float[ndarray, "m 4 4"]
-    """In a frame and unit of their own, as a reconstruction has them."""
+    """Rig poses in a frame and unit of their own, as a reconstruction has them."""
     rig_from_camera: Float[ndarray, "c 4 4"]
-    """In that unit."""
+    """Camera poses in the unit of `world_from_rig`."""
     points_in_world: Float[ndarray, "p 3"]
     cameras: tuple[Intrinsics, ...]
     scale: float

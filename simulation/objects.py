@@ -56,7 +56,7 @@ class TableObject:
 
     @property
     def radius(self) -> float:
-        """Of the smallest circle about its origin that holds its footprint, in metres."""
+        """Radius (m) of the smallest circle about the origin that holds the footprint."""
         return float(np.linalg.norm(self._vertices[:, :2], axis=1).max())
 
     def measured(self, label: int) -> TrueObject:

@@ -1,4 +1,4 @@
-"""What to simulate."""
+"""Options of a simulated capture."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -12,13 +12,13 @@ from simulation.scenes import SceneName, TableName
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateOptions:
-    """What to simulate."""
+    """Scene, motion, camera and errors of a simulated capture."""
 
     scene: SceneName = "tabletop"
     """Objects and table: a mix on wood; 8 or 7 items on a plain light table; 7 on a plain dark one; tape,
     box, mug and toolbox for measuring."""
     images: int = 12
-    """How many images; of the pattern `varied` fewer are the first ones of more (`two` has 2)."""
+    """Number of images; fewer images of the pattern `varied` are the first ones of more (`two` has 2)."""
     pattern: Pattern = "varied"
     """Path of the wrist. All but `varied` leave part of the calibration unobservable: an orbit at one radius,
     pure translation, a turntable, xyz + yaw (SCARA), rotating about a tool point or about the camera's centre,
@@ -61,7 +61,7 @@ class SimulateOptions:
     jpeg_quality: int | Literal["lossless"] = 90
     """1 to 100, or lossless: PNG."""
     fixed_cameras: int = 0
-    """How many cameras stand beside the table and see the scene, an image each."""
+    """Number of cameras that stand beside the table and see the scene, an image each."""
     wrist_cameras: int = 1
     """1 or 2: a second camera on the gripper, beside the first and with intrinsics of its own."""
     arms: int = 1

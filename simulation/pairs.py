@@ -52,7 +52,7 @@ class PairErrors:
 
 @dataclass(frozen=True)
 class PairTruth:
-    """What the predictions were made from."""
+    """Truth that the predictions were made from."""
 
     base_from_camera: Float[ndarray, "n 4 4"]
     depth: Float[ndarray, "n h w"]
@@ -96,7 +96,7 @@ def predicted_pairs(
     rng: np.random.Generator,
     carries_intrinsics: bool,
 ) -> tuple[PairPredictions, PairTruth]:
-    """What a network would predict of views of known depth (0: nothing there), each pair in a unit of its own."""
+    """Return predictions of a network for views of known depth (0: nothing there), each pair in a unit of its own."""
     height, width = depth.shape[1:]
     x_in_camera = depth[..., None] * rays(k)
     count = len(edges)
@@ -156,7 +156,7 @@ def _with_errors(
 def pairs_of_capture(
     folder: Path, size: tuple[int, int] = (128, 96), errors: PairErrors | None = None, seed: int = 0
 ) -> tuple[PairPredictions, PairTruth]:
-    """What a network would predict of all pairs of a simulated capture, from its true depth.
+    """Return predictions of a network for all pairs of a simulated capture, from its true depth.
 
     The images' size must be an odd multiple of `size`, so that the grid's pixels are pixels of the images.
     """

@@ -1,4 +1,4 @@
-"""Where the wrist goes: hand-eye transforms and patterns of gripper poses over a table.
+"""Hand-eye transforms and patterns of gripper poses over a table.
 
 A pattern is made of camera poses, since what must be in view is the table; the gripper follows from them.
 """

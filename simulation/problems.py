@@ -20,10 +20,10 @@ TARGET_IN_BASE = np.array([0.5, 0.0, 0.0])
 
 @dataclass(frozen=True)
 class HandEyeProblem:
-    """What a robot and a reconstruction would report, and the truth."""
+    """Reports of a robot and a reconstruction, and the truth."""
 
     base_from_gripper: Float[ndarray, "n 4 4"]
-    """As reported, with the robot pose noise."""
+    """Reported gripper poses, with the robot pose noise."""
     recon_from_camera: Float[ndarray, "n 4 4"]
     gripper_from_camera: Float[ndarray, "4 4"]
     scale: float
@@ -31,7 +31,7 @@ class HandEyeProblem:
 
     @property
     def base_from_camera(self) -> Float[ndarray, "n 4 4"]:
-        """Where the cameras were."""
+        """True camera poses."""
         return self.true_base_from_gripper @ self.gripper_from_camera
 
 
@@ -92,7 +92,7 @@ class BentProblem(HandEyeProblem):
 
     @property
     def base_from_camera(self) -> Float[ndarray, "n 4 4"]:
-        """Where the cameras were."""
+        """True camera poses."""
         return self.true_base_from_gripper @ self.physical_gripper_from_camera
 
 

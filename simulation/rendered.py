@@ -21,12 +21,12 @@ SIZE, WIDE = (640, 480), (960, 720)
 FOCAL_PX = (600.0, 660.0)
 POSES = 14
 PUSHED, BY_M = 3, (0.04, 0.045, 0.0)
-"""How many objects are pushed, and by how much."""
+"""Number of pushed objects, and their displacement (m)."""
 ARMS: tuple[RobotName | None, ...] = (None, "ur5e", None, "panda", None)
-"""Of the scenes one after the other; None: a gripper whose poses have no systematic errors."""
+"""Arm of each scene; None: a gripper whose poses have no systematic errors."""
 
 PxFromPx = Callable[[Float[ndarray, "h w 2"]], Float[ndarray, "h w 2"]]
-"""Where the pinhole camera that the user believes in has what the real camera shows at a pixel."""
+"""Map from the pixels of the real camera to those of the assumed pinhole camera."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,11 +36,11 @@ class Rendered:
     images: tuple[UInt8[ndarray, "h w 3"], ...]
     """RGB, of size WIDE."""
     images_pushed: tuple[UInt8[ndarray, "h w 3"], ...]
-    """The same after somebody pushed objects aside."""
+    """Images after somebody pushed objects aside."""
     camera: Intrinsics
-    """Of size SIZE."""
+    """Intrinsics of an image of size SIZE."""
     base_from_gripper: Float[ndarray, "n 4 4"]
-    """As nominal kinematics report them, without random errors."""
+    """Gripper poses of nominal kinematics, without random errors."""
     distance: Float[ndarray, " n"]
     """m, from the camera to the middle of the objects."""
     gripper_from_camera: Float[ndarray, "4 4"]

@@ -98,7 +98,7 @@ def _messages(
     compressed: bool,
     kind: str,
 ) -> Iterator[tuple[int, str, Any]]:
-    """What is recorded, in order of time."""
+    """Yield the recorded messages in order of time."""
 
     def header(at: int, frame: str) -> Any:
         stamp = types["builtin_interfaces/msg/Time"](at // 10**9, at % 10**9)

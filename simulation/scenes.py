@@ -21,7 +21,7 @@ TableName = Literal["light", "dark"]
 
 @dataclass(frozen=True)
 class Recipe:
-    """What stands on which table."""
+    """Objects of a scene and the table that carries them."""
 
     objects: tuple[str, ...]
     table: TableName
@@ -54,7 +54,7 @@ class Scene:
     """The middle of the group of objects, on the table top, in metres."""
     objects: tuple[TableObject, ...]
     light_in_base: Float[ndarray, "3"]
-    """Where the lamp hangs, in metres."""
+    """Position of the lamp (m)."""
 
     @property
     def table_height(self) -> float:
@@ -68,7 +68,7 @@ class Scene:
 
     @property
     def true_objects(self) -> tuple[TrueObject, ...]:
-        """What there is to measure on the table."""
+        """Measurable objects on the table."""
         return tuple(thing.measured(label) for label, thing in enumerate(self.objects, start=2))
 
     @property

@@ -1,4 +1,4 @@
-"""What is solid in a simulated scene, and the surface that its images show."""
+"""Solid space of a simulated scene, and the surface that its images show."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +33,7 @@ def solid_labels(scene: Scene, x_in_base: Float[ndarray, "n 3"]) -> Int[ndarray,
 
 
 def winding_number(mesh: Mesh, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
-    """How often the surface winds around each point: 1 within a closed one, 0 outside; parts add up.
+    """Return how often the surface winds around each point: 1 within a closed one, 0 outside; parts add up.
 
     The triangles' solid angles (van Oosterom and Strackee 1983, eq. 8) over 4π, as in Jacobson et al. 2013.
     """

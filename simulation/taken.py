@@ -1,4 +1,4 @@
-"""What a camera and a robot make of the truth: intrinsics, the errors of cheaper cameras, poses as they are reported."""
+"""Simulated intrinsics, errors of cheaper cameras, and reported poses of a true capture."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -55,7 +55,7 @@ def with_robot_noise(
     rotation_deg: float,
     rng: np.random.Generator,
 ) -> Float[ndarray, "n 4 4"]:
-    """What a robot of that accuracy reports: each pose after a step of independent Gaussians in every axis."""
+    """Return the reported poses: each pose after a step of independent Gaussians in every axis."""
     sizes = np.repeat([1e-3 * translation_mm, np.radians(rotation_deg)], 3)
     return retract(base_from_gripper, sizes * rng.normal(size=(len(base_from_gripper), 6)))
 

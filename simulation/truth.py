@@ -37,7 +37,7 @@ class TrueObject:
 
 @dataclass(frozen=True, kw_only=True)
 class Truth:
-    """What a simulated capture should be found to show."""
+    """True values of a simulated capture."""
 
     folder: Path
     """Folder of the capture."""
@@ -48,7 +48,7 @@ class Truth:
     """Names of the images in capture.json."""
     gripper_from_camera: Float[ndarray, "4 4"]
     base_from_gripper: Float[ndarray, "n 4 4"]
-    """Where the gripper was, whatever the robot reported."""
+    """True gripper poses; the robot may report others."""
     base_from_camera: Float[ndarray, "n 4 4"]
     intrinsics: Intrinsics
     labels: tuple[str, ...]

@@ -1,15 +1,15 @@
-"""What accuracy is required of a calibration, and what it reaches."""
+"""Required accuracy of a calibration, and the accuracy that it reaches."""
 
 from dataclasses import dataclass
 from typing import Literal
 
 Where = Literal["seen", "camera", "scene"]
-"""What an accuracy is of: a point that the camera sees, the camera on the gripper, the mapped scene."""
+"""Quantity that an accuracy refers to: a point that the camera sees, the camera on the gripper, or the mapped scene."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Requirement:
-    """How exact a calibration must be, and how exact it is; 95 % of errors are smaller."""
+    """Required and reached accuracy of a calibration; 95 % of errors are smaller."""
 
     translation_mm: float
     rotation_deg: float
@@ -22,7 +22,7 @@ class Requirement:
     more_images: int | None = None
     """At the poses proposed, that would reach it; 0 where it is, None where no reasonable number does."""
     at: Where = "camera"
-    """What the millimetres and degrees are of."""
+    """Quantity that the millimetres and degrees refer to."""
 
     @property
     def met(self) -> bool:
