@@ -34,7 +34,7 @@ from jcr.scene.cloud import point_cloud
 from jcr.scene.options import MapOptions
 from jcr.scene.scene_map import SceneMap
 from jcr.segments.labels import read_labels
-from jcr.segments.measure import ObjectSize, measure
+from jcr.segments.measure import ObjectSize, measure_objects
 from jcr.segments.tabletop import label_tabletop
 from simulation.capture import SimulateOptions, simulate
 from simulation.scenes import make_scene
@@ -449,7 +449,9 @@ def _measured_heights(place: Path, seed: int, images: int) -> list[tuple[TrueObj
     assert given is not None  # copied above
     masked = point_cloud(capture, reconstruction, hand_eye, given.labels)
     cloud = label_tabletop(masked)
-    sizes = {size.label: size for size in measure(cloud, float(np.sqrt(hand_eye.covariance[6, 6]))).objects}
+    sizes = {
+        size.label: size for size in measure_objects(cloud, float(np.sqrt(hand_eye.covariance[6, 6]))).objects
+    }
     # Each true object and the segment with which it overlaps most.
     count = np.zeros((cloud.label.max() + 1, len(truth.labels)))
     np.add.at(count, (cloud.label, masked.label), 1)

@@ -74,7 +74,7 @@ from .scene.robot import RobotSpheres as RobotSpheres
 from .scene.robot import load_robot as load_robot
 from .scene.sample import Sample as Sample
 from .scene.scene_map import SceneMap as SceneMap
-from .segments.measure import Measured as Measured
+from .segments.measure import Measurement as Measurement
 from .segments.options import SegmentOptions as SegmentOptions
 from .segments.options import TabletopOptions as TabletopOptions
 

@@ -24,7 +24,7 @@ from jcr.segments.options import SegmentOptions
 
 if TYPE_CHECKING:
     from jcr.scene.scene_map import SceneMap
-    from jcr.segments.measure import Measured
+    from jcr.segments.measure import Measurement
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,7 +165,7 @@ class RunResult(CalibrationResult):
     reconstruction: Reconstruction
     cloud: PointCloud | None = None
     scene: "SceneMap | None" = None
-    measured: "Measured | None" = None
+    measured: "Measurement | None" = None
     """Support plane and objects; None without a map, and where no plane carries the scene."""
     cameras: CamerasFile | None = None
     """Further cameras of the cell; None where there are none."""

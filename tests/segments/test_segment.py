@@ -30,10 +30,10 @@ from jcr.records import (
     Tracks,
 )
 from jcr.segments.labels import read_labels
-from jcr.segments.measure import measure
+from jcr.segments.measure import measure_objects
 from jcr.segments.options import SegmentOptions
 from jcr.segments.segments import image_labels, label_cloud
-from jcr.segments.tabletop import label_tabletop, support_plane
+from jcr.segments.tabletop import fit_support, label_tabletop
 
 NOISE = 5e-4
 UPRIGHT = np.eye(4)
@@ -100,7 +100,7 @@ def cloud_of(
 
 
 def sizes_of(cloud: PointCloud) -> list[ndarray]:
-    return [size.box_size for size in measure(label_tabletop(cloud)).objects]
+    return [size.box_size for size in measure_objects(label_tabletop(cloud)).objects]
 
 
 @pytest.fixture
@@ -113,7 +113,7 @@ def test_sizes_are_recovered_on_a_tilted_table(rng: np.random.Generator):
     things = box(rng, (0.12, 0.07, 0.05), (0.1, 0.05), 0.6), ring(rng, 0.02, 0.04, 0.11, (-0.1, -0.1))
     cloud = label_tabletop(cloud_of(rng, table(rng), *things, base_from_table=base_from_table))
     assert cloud.label_names == ("none", "table", "object 1", "object 2")
-    measured = measure(cloud)
+    measured = measure_objects(cloud)
     up = measured.support.base_from_support[:3, 2]
     np.testing.assert_allclose(up, base_from_table[:3, 2], atol=2e-4)
     lying, standing = measured.objects
@@ -142,7 +142,7 @@ def test_a_wall_behind_with_more_points_is_no_table_and_no_object(rng: np.random
     wall = rectangle(rng, (-0.6, 0.31, -0.2), (0.6, 0.31, 0.6), density=1e5)
     cloud = cloud_of(rng, table(rng), wall, box(rng, (0.1, 0.1, 0.05)))
     assert len(wall) > 2 * len(table(rng))
-    measured = measure(label_tabletop(cloud))
+    measured = measure_objects(label_tabletop(cloud))
     assert measured.support.base_from_support[2, 2] > 0.999
     assert len(measured.objects) == 1 and abs(measured.objects[0].height - 0.05) < 2e-4
 
@@ -164,7 +164,7 @@ def test_points_that_stray_above_a_narrow_top_do_not_lift_it(rng: np.random.Gene
 
 def test_a_board_on_the_table_does_not_lift_the_plane(rng: np.random.Generator):
     board = rectangle(rng, (-0.1, -0.1, 0.006), (0.1, 0.1, 0.006))
-    measured = measure(
+    measured = measure_objects(
         label_tabletop(cloud_of(rng, table(rng), board, box(rng, (0.05, 0.05, 0.05), (0.2, 0.2))))
     )
     (size,) = measured.objects
@@ -174,7 +174,7 @@ def test_a_board_on_the_table_does_not_lift_the_plane(rng: np.random.Generator):
 def test_an_empty_table_has_no_object_and_reports_it(rng: np.random.Generator):
     cloud, notes = label_cloud(cloud_of(rng, table(rng)), SegmentOptions())
     assert cloud.label_names == ("none", "table") and "no object" in notes[0]
-    assert measure(cloud).objects == ()
+    assert measure_objects(cloud).objects == ()
 
 
 def test_without_a_plane_there_are_no_segments_and_it_reports_it(rng: np.random.Generator):
@@ -185,7 +185,7 @@ def test_without_a_plane_there_are_no_segments_and_it_reports_it(rng: np.random.
     with pytest.raises(InputError, match="no plane carries the scene"):
         label_cloud(scatter, SegmentOptions(segments="tabletop"))
     with pytest.raises(InputError, match="10 points"):
-        support_plane(cloud_of(rng, ball[:10]))
+        fit_support(cloud_of(rng, ball[:10]))
 
 
 def test_a_tray_full_of_parts_without_a_bare_plane_gives_a_note(rng: np.random.Generator):
@@ -193,7 +193,7 @@ def test_a_tray_full_of_parts_without_a_bare_plane_gives_a_note(rng: np.random.G
     parts = [box(rng, (0.05, 0.05, 0.03 + 0.001 * k), (0.055 * (k % 5), 0.055 * (k // 5))) for k in range(25)]
     tray = rng.uniform((-0.03, -0.0275, 0.0), (0.25, -0.0273, 0.0), (600, 3))
     full = cloud_of(rng, tray, *parts)
-    plane = support_plane(cloud_of(rng, table(rng), *parts))
+    plane = fit_support(cloud_of(rng, table(rng), *parts))
     plane = replace(plane, on_plane=np.abs(full.points_in_base[:, 2]) < 1e-3)
     cloud, notes = label_cloud(full, SegmentOptions(), plane)
     assert cloud.label_names == ("none",) and "no bare part of the support plane" in notes[0]
@@ -208,7 +208,7 @@ def test_labels_that_came_with_the_images_are_kept_and_measured(rng: np.random.G
     cloud = replace(cloud_of(rng, *things), label=label, label_names=names)
     kept, notes = label_cloud(cloud, SegmentOptions())
     assert kept is cloud and notes == ()
-    assert [(size.name, round(size.height, 3)) for size in measure(cloud).objects] == [
+    assert [(size.name, round(size.height, 3)) for size in measure_objects(cloud).objects] == [
         ("book", 0.05),
         ("block", 0.08),
     ]
@@ -223,13 +223,13 @@ def test_the_stated_sigma_of_a_height_covers_its_error(rng: np.random.Generator)
         x = cloud.points_in_base.copy()
         shift = rng.normal(0, 2e-3, (2, IMAGES))
         x[:, 2] += np.where(x[:, 2] > 0.03, shift[1][cloud.image], shift[0][cloud.image])
-        (size,) = measure(label_tabletop(replace(cloud, points_in_base=x))).objects
+        (size,) = measure_objects(label_tabletop(replace(cloud, points_in_base=x))).objects
         misses.append(size.height - 0.06)
         stated.append(size.height_std)
     sigmas = np.abs(misses) / stated
     assert (sigmas < 1).mean() > 0.6 and (sigmas < 2).mean() > 0.93
     assert np.mean(stated) < 3 * np.std(misses)
-    scaled = measure(label_tabletop(cloud), scale_std=0.05).objects[0].height_std
+    scaled = measure_objects(label_tabletop(cloud), scale_std=0.05).objects[0].height_std
     assert scaled == pytest.approx(0.05 * 0.06, rel=0.1)
 
 
@@ -241,12 +241,14 @@ def test_a_top_that_one_image_alone_shows_is_no_more_than_a_lower_bound(rng: np.
     x = cloud.points_in_base
     top = (x[:, 0] < 0) & (x[:, 2] > 0.05)
     seen, hidden = (
-        {size.height > 0.07: size for size in measure(label_tabletop(cloud)).objects}
+        {size.height > 0.07: size for size in measure_objects(label_tabletop(cloud)).objects}
         for cloud in (cloud, replace(cloud, image=np.where(top, 0, np.maximum(cloud.image, 1))))
     )
     assert seen[True].top_seen and seen[False].top_seen
     assert not hidden[True].top_seen and hidden[False].top_seen
-    measured = measure(label_tabletop(replace(cloud, image=np.where(top, 0, np.maximum(cloud.image, 1)))))
+    measured = measure_objects(
+        label_tabletop(replace(cloud, image=np.where(top, 0, np.maximum(cloud.image, 1))))
+    )
     assert sizes_table(measured).count("≥") == 1
 
 

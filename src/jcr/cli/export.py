@@ -8,7 +8,7 @@ from typing import Annotated, get_args
 import tyro
 
 from jcr.cli.output import Output, warn
-from jcr.export.options import ExportOptions, FormatName
+from jcr.export.options import ExportName, ExportOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,10 +28,10 @@ class Arguments:
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of a run."""
     format: Annotated[
-        FormatName | None,
+        ExportName | None,
         tyro.conf.Positional,
         tyro.conf.arg(
-            help=f"{', '.join(get_args(FormatName))}; without it, all are listed with their contents."
+            help=f"{', '.join(get_args(ExportName))}; without it, all are listed with their contents."
         ),
     ] = None
     path: Annotated[Path | None, tyro.conf.Positional] = None

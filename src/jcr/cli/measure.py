@@ -9,7 +9,7 @@ import tyro
 from jcr.cli.output import Output, plain
 
 if TYPE_CHECKING:
-    from jcr.segments.measure import Measured
+    from jcr.segments.measure import Measurement
 
 
 @dataclass(frozen=True)
@@ -41,14 +41,14 @@ def main(arguments: Arguments) -> int:
     return 0
 
 
-def content(measured: "Measured") -> dict[str, object]:
+def content(measured: "Measurement") -> dict[str, object]:
     """The result as JSON has it: metres, base frame, standard deviations of one sigma."""
     support = plain(measured.support)
     del support["on_plane"]  # a flag for each point of the cloud
     return {"support": support, "objects": [plain(size) for size in measured.objects]}
 
 
-def table(measured: "Measured") -> str:
+def table(measured: "Measurement") -> str:
     """A line for the plane and a line an object, in millimetres."""
     support = measured.support
     x, y, z = support.base_from_support[:3, 2]

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from jcr.errors import InputError, RejectedError, did_you_mean
 from jcr.export import ros
-from jcr.export.options import ExportOptions, FormatName
+from jcr.export.options import ExportName, ExportOptions
 from jcr.export.provenance import Provenance
 from jcr.files import write_text
 from jcr.geometry import transform
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Format:
+class ExportFormat:
     """Row of the table."""
 
-    name: FormatName
+    name: ExportName
     file: str
     """Default name in OUT/export; ends with / for a folder."""
     about: str
@@ -43,7 +43,7 @@ class Format:
 
 def export_run(
     out: str | Path,
-    format: FormatName,
+    format: ExportName,
     path: str | Path | None = None,
     options: ExportOptions | Mapping[str, Any] | None = None,
 ) -> Path:
@@ -57,8 +57,8 @@ def export_run(
 
 
 def write_run(
-    out: Path, format: FormatName, path: Path | None, options: ExportOptions
-) -> "tuple[Run, Format, Path, bool]":
+    out: Path, format: ExportName, path: Path | None, options: ExportOptions
+) -> "tuple[Run, ExportFormat, Path, bool]":
     """Write a run folder in a format; return run, row of the table, path, and whether other content was replaced.
 
     Raises InputError for a format that does not exist, options that it cannot serve, and a run that lacks what it
@@ -66,7 +66,7 @@ def write_run(
     """
     row = next((row for row in FORMATS if row.name == format), None)
     if row is None:
-        names = get_args(FormatName)
+        names = get_args(ExportName)
         raise InputError(
             f"{format}: no such format{did_you_mean(format, names)}; choose one of {', '.join(names)}"
         )
@@ -254,62 +254,64 @@ def _text(text: Callable[[Run, Path], str]) -> Callable[[Run, Path], None]:
 
 
 FORMATS = (
-    Format(
+    ExportFormat(
         "ros2",
         "hand_eye.launch.xml",
         "static_transform_publisher line and launch file",
         _text(lambda run, path: ros.ros2_launch(run.mount, *run.others)),
     ),
-    Format(
+    ExportFormat(
         "moveit",
         "hand_eye.launch.py",
         "launch file as MoveIt Calibration saves it",
         _text(lambda run, path: ros.moveit_launch(run.mount)),
     ),
-    Format(
+    ExportFormat(
         "urdf",
         "hand_eye.urdf",
         "camera link and fixed joint",
         _text(lambda run, path: ros.urdf(run.mount, *run.others)),
     ),
-    Format(
+    ExportFormat(
         "easy_handeye2",
         "hand_eye.calib",
         ".calib for its publisher",
         _text(lambda run, path: ros.easy_handeye2(run.mount, path.stem)),
     ),
-    Format(
+    ExportFormat(
         "camera_info",
         "camera_info.yaml",
         "intrinsics for camera_info_manager",
         _text(lambda run, path: ros.camera_info(run.mount)),
     ),
-    Format("ply", "cloud.ply", "points, colours, labels", _written("views.write_ply", "cloud", "provenance")),
-    Format(
+    ExportFormat(
+        "ply", "cloud.ply", "points, colours, labels", _written("views.write_ply", "cloud", "provenance")
+    ),
+    ExportFormat(
         "glb",
         "map.glb",
         "mesh of the seen surface with colours",
         _written("volume.write_glb", "scene", "provenance"),
     ),
-    Format(
+    ExportFormat(
         "octomap",
         "map.bt",
         "occupied, free and unknown voxels",
         _written("volume.write_octomap", "scene", "provenance", "options.voxel_size"),
     ),
-    Format(
+    ExportFormat(
         "esdf",
         "esdf.npz",
         "voxels of signed distance",
         _written("volume.write_esdf", "scene", "provenance", "options.unknown", "options.voxel_size"),
     ),
-    Format(
+    ExportFormat(
         "spheres",
         "spheres.npz",
         "spheres that cover what is solid",
         _written("volume.write_spheres", "scene", "provenance", "options.unknown", "options.excess"),
     ),
-    Format(
+    ExportFormat(
         "nerfstudio",
         "nerfstudio/",
         "transforms.json, images and first points for a splat or NeRF",
@@ -318,13 +320,13 @@ FORMATS = (
             *("views", "cloud", "provenance", "options.undistort", "options.link_images"),
         ),
     ),
-    Format(
+    ExportFormat(
         "colmap",
         "colmap/",
         "COLMAP model in the base frame, binary and text",
         _written("views.write_colmap", "views", "provenance", "options.undistort", "options.link_images"),
     ),
-    Format(
+    ExportFormat(
         "rerun",
         "run.rrd",
         "recording for the Rerun viewer",

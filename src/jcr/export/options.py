@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-FormatName = Literal[
+ExportName = Literal[
     "ros2", "moveit", "urdf", "easy_handeye2", "camera_info", "ply", "glb", "octomap", "esdf", "spheres",
     "nerfstudio", "colmap", "rerun",
 ]  # fmt: skip

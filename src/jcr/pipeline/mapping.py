@@ -15,9 +15,9 @@ from jcr.records import Capture, PointCloud
 from jcr.results import RunOptions, RunResult
 from jcr.scene.cloud import point_cloud
 from jcr.scene.map_file import require_packages
-from jcr.segments.measure import Measured, measure
+from jcr.segments.measure import Measurement, measure_objects
 from jcr.segments.segments import image_labels, label_cloud
-from jcr.segments.tabletop import Support, support_plane
+from jcr.segments.tabletop import Support, fit_support
 
 if TYPE_CHECKING:
     from jcr.scene.scene_map import SceneMap
@@ -29,7 +29,7 @@ class Mapped:
 
     cloud: PointCloud
     scene: "SceneMap"
-    measured: Measured | None
+    measured: Measurement | None
     """None where no plane carries the scene."""
     notes: tuple[str, ...]
     """What the user should know of the labels."""
@@ -66,10 +66,12 @@ def make_map(result: RunResult, added: Capture, options: RunOptions, progress: P
         return Mapped(cloud, scene, sizes and sizes.result(), (*remarks, *notes))
 
 
-def measured(cloud: PointCloud, calibration: Calibration, support: Support | None = None) -> Measured:
+def measured(cloud: PointCloud, calibration: Calibration, support: Support | None = None) -> Measurement:
     """The support plane, found where it is not given, and what stands on it; InputError when none carries the scene."""
     uncertainty = calibration.uncertainty
-    return measure(cloud, 0.0 if uncertainty is None else uncertainty.scale_std_percent / 100, support)
+    return measure_objects(
+        cloud, 0.0 if uncertainty is None else uncertainty.scale_std_percent / 100, support
+    )
 
 
 def _extended(result: RunResult, added: Capture, options: RunOptions, progress: Progress) -> RunResult:
@@ -92,7 +94,7 @@ def _cloud(
     labels, names = (None, ("none",)) if given is None else (given.labels, given.names)
     cloud = point_cloud(capture, reconstruction, hand_eye, labels, options.cloud, names)
     try:
-        support = support_plane(cloud)
+        support = fit_support(cloud)
     except InputError:
         support = None
     cloud, notes = label_cloud(cloud, options.segment, support)

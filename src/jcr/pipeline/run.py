@@ -34,7 +34,7 @@ from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
 if TYPE_CHECKING:
-    from jcr.segments.measure import Measured
+    from jcr.segments.measure import Measurement
 
 
 def run(
@@ -239,7 +239,7 @@ def add_camera(
         return stages.reported(result, folder, options, report)
 
 
-def measure(out: str | Path) -> "Measured":
+def measure(out: str | Path) -> "Measurement":
     """Measure the support plane of a run and the objects on it, from its cloud and its calibration.
 
     Raises InputError if there is no map, or if there is no support plane.

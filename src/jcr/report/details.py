@@ -16,7 +16,7 @@ from jcr.report.images import reprojections_px
 from jcr.report.render import Section
 from jcr.rounding import significant, with_std
 
-Options = Mapping[str, Mapping[str, Any]]
+StageOptions = Mapping[str, Mapping[str, Any]]
 """Options by name, by the name of their stage."""
 CELLS = 16
 """Cells across the image in which coverage is counted."""
@@ -25,7 +25,7 @@ PACKAGES = ("numpy", "scipy", "torch", "pycolmap")
 
 def details_section(
     calibration: Calibration,
-    options: Options,
+    options: StageOptions,
     reconstruction: Reconstruction | None = None,
     map_history: Mapping[str, str] | None = None,
 ) -> Section:

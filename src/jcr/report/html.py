@@ -11,7 +11,7 @@ from jcr.errors import printable
 from jcr.geometry import scale_translation
 from jcr.records import Capture
 from jcr.report.cell_cameras import cameras_section
-from jcr.report.details import Options, details_section
+from jcr.report.details import StageOptions, details_section
 from jcr.report.images import images_alone_section, images_section
 from jcr.report.motion import motion_section
 from jcr.report.objects import objects_section
@@ -47,7 +47,7 @@ OPEN = {"verdict", "failure", "tiles", "warnings", "transform", "view", "images"
 """Sections that are not collapsed."""
 
 
-def report_html(result: RunResult, options: Options | None = None) -> str:
+def report_html(result: RunResult, options: StageOptions | None = None) -> str:
     """Return the report of a run, made with these options, as one HTML page that loads nothing else.
 
     Sections whose record a run does not have are left out. Raises InputError when an image of the capture has
@@ -88,7 +88,7 @@ def report_html(result: RunResult, options: Options | None = None) -> str:
     return _page(about, origin(capture.folder), calibration, sections)
 
 
-def poses_report_html(result: PosesResult, options: Options | None = None) -> str:
+def poses_report_html(result: PosesResult, options: StageOptions | None = None) -> str:
     """Return the report of a calibration from given camera poses, without images."""
     calibration = result.calibration
     sections = [
@@ -102,7 +102,9 @@ def poses_report_html(result: PosesResult, options: Options | None = None) -> st
     return _page("poses given, no images", result.pairs.source, calibration, sections)
 
 
-def failed_report_html(capture: Capture, calibration: Calibration, options: Options | None = None) -> str:
+def failed_report_html(
+    capture: Capture, calibration: Calibration, options: StageOptions | None = None
+) -> str:
     """Return the report of a run that found no camera poses: reason, remedy and images."""
     sections = [
         failure_section(calibration),
@@ -112,7 +114,7 @@ def failed_report_html(capture: Capture, calibration: Calibration, options: Opti
     return _page(_about_capture(capture, options or {}), origin(capture.folder), calibration, sections)
 
 
-def _about_capture(capture: Capture, options: Options) -> str:
+def _about_capture(capture: Capture, options: StageOptions) -> str:
     """Return arm and camera of a capture as text."""
     width, height = capture.image_size
     given = "given" if capture.intrinsics is not None else "estimated"

@@ -2,10 +2,10 @@
 
 from jcr.report.raster import label_colors
 from jcr.report.render import Section
-from jcr.segments.measure import Measured
+from jcr.segments.measure import Measurement
 
 
-def objects_section(measured: Measured, label_names: tuple[str, ...]) -> Section:
+def objects_section(measured: Measurement, label_names: tuple[str, ...]) -> Section:
     """Return height and box of every object with one standard deviation, beside the colour of its label."""
     colors = label_colors(len(label_names)).tolist()
     rows = []

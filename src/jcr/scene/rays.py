@@ -45,7 +45,7 @@ class Rays:
 
 
 @dataclass(frozen=True)
-class Samples:
+class TrainingSamples:
     """Places of known occupancy; the first are the surface points themselves, which carry the other properties."""
 
     x: Float[Tensor, "k 3"]
@@ -54,12 +54,12 @@ class Samples:
     surface: Rays
 
 
-def on_surface(rays: Rays) -> Samples:
+def on_surface(rays: Rays) -> TrainingSamples:
     """Return the surface points alone as samples."""
-    return Samples(rays.x, torch.ones_like(rays.weight), rays.weight, rays)
+    return TrainingSamples(rays.x, torch.ones_like(rays.weight), rays.weight, rays)
 
 
-def draw_samples(rays: Rays, seen: SeenGrid, along_rays: bool, generator: torch.Generator) -> Samples:
+def draw_samples(rays: Rays, seen: SeenGrid, along_rays: bool, generator: torch.Generator) -> TrainingSamples:
     """Return positives and negatives of occupancy for a batch of rays.
 
     The paper's: the points, and as many places drawn uniformly in the box (noise-contrastive estimation). Along
@@ -100,7 +100,7 @@ def draw_samples(rays: Rays, seen: SeenGrid, along_rays: bool, generator: torch.
     x = torch.cat(positives + negatives)
     occupied = torch.zeros(len(x), device=device)
     occupied[: sum(map(len, positives))] = 1.0
-    return Samples(x, occupied, torch.cat(weights), rays)
+    return TrainingSamples(x, occupied, torch.cat(weights), rays)
 
 
 def workspace_box(

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.ndimage import distance_transform_edt
 
-from jcr.capture.urdf_chain import joints_to, load_urdf, source_of
+from jcr.capture.urdf_chain import joints_to, load_urdf
 from jcr.errors import InputError
 from jcr.geometry import apply, rotation_exp, transform
 from jcr.scene.spheres import cover_with_spheres
@@ -180,7 +180,13 @@ def _joints(robot: "yourdfpy.URDF", links: tuple[str, ...], path: Path) -> tuple
     for joint in sorted(robot.robot.joints, key=lambda joint: len(joints_to(robot, joint.child))):
         if joint.type not in ("revolute", "continuous", "prismatic", "fixed"):
             raise InputError(f"{path}: joint {joint.name} is {joint.type}, which is not supported")
-        leader, factor, offset = source_of(robot, joint)
+        leader, factor, offset = joint.name, 1.0, 0.0
+        if (mimic := joint.mimic) is not None:
+            leader, offset = mimic.joint, mimic.offset or 0.0
+            factor = 1.0 if mimic.multiplier is None else mimic.multiplier
+        moves = joint.type != "fixed"
+        if moves and leader not in robot.actuated_joint_names:
+            raise InputError(f"{path}: joint {joint.name} mimics {leader}, which is not an independent joint")
         axis = np.array([1.0, 0.0, 0.0] if joint.axis is None else joint.axis, float)
         joints.append(
             RobotJoint(
@@ -189,7 +195,7 @@ def _joints(robot: "yourdfpy.URDF", links: tuple[str, ...], path: Path) -> tuple
                 parent_from_joint=np.eye(4) if joint.origin is None else np.asarray(joint.origin, float),
                 axis=axis / np.linalg.norm(axis),
                 slides=joint.type == "prismatic",
-                column=None if joint.type == "fixed" else robot.actuated_joint_names.index(leader),
+                column=robot.actuated_joint_names.index(leader) if moves else None,
                 factor=factor,
                 offset=offset,
             )

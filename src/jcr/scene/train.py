@@ -10,7 +10,7 @@ from torch.nn import functional as F
 from torch.optim.adam import adam
 
 from jcr.scene.fields import Field
-from jcr.scene.rays import Rays, Samples, draw_samples, on_surface
+from jcr.scene.rays import Rays, TrainingSamples, draw_samples, on_surface
 from jcr.scene.seen import SeenGrid
 
 
@@ -30,7 +30,7 @@ class Recipe:
     surface_grids: tuple[tuple[int, int], ...]
     """(lattice, features) of the properties of surfaces."""
     rays: bool
-    """Samples along the rays, instead of uniform negatives alone."""
+    """TrainingSamples along the rays, instead of uniform negatives alone."""
     layer_rate: float
     grid_rate: float
     """Learning rates of Adam."""
@@ -91,7 +91,7 @@ def train(
 
     off_surface = "occupancy" in field.heads  # all else is known on surfaces only
 
-    def draw(batch: Rays) -> Samples:
+    def draw(batch: Rays) -> TrainingSamples:
         return draw_samples(batch, seen, recipe.rays, generator) if off_surface else on_surface(batch)
 
     # Shuffled once, so that batches are slices and nothing is gathered again.
@@ -120,7 +120,7 @@ def train(
     return step
 
 
-def total_loss(field: Field, samples: Samples) -> Tensor:
+def total_loss(field: Field, samples: TrainingSamples) -> Tensor:
     """Return the weighted loss: binary cross-entropy of occupancy, cross-entropy of labels, squared error of others.
 
     Squared errors are in units of the value's variance, so that neither metres nor kelvins drown the rest.

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import PointCloud
-from jcr.segments.tabletop import FEWEST, Support, support_plane
+from jcr.segments.tabletop import FEWEST, Support, fit_support
 
 SHARPEST = 0.0005
 """Metres; heights are separated no finer than this, nor than twice the roughness of the plane."""
@@ -48,7 +48,7 @@ class ObjectSize:
 
 
 @dataclass(frozen=True)
-class Measured:
+class Measurement:
     """The support plane and what stands on it."""
 
     support: Support
@@ -70,7 +70,7 @@ class _Shape:
     outline: Float[ndarray, "k 2"]
 
 
-def measure(cloud: PointCloud, scale_std: float = 0.0, support: Support | None = None) -> Measured:
+def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support | None = None) -> Measurement:
     """Measure all labelled objects above the support plane.
 
     The support plane's own label, and label 0, are no objects. `scale_std` is the relative uncertainty (one
@@ -79,7 +79,7 @@ def measure(cloud: PointCloud, scale_std: float = 0.0, support: Support | None =
     the spread of the top over the root of the number of images and how bent the table is, and at the sides half a
     cell. Raises InputError when no plane carries the scene.
     """
-    support = support or support_plane(cloud)
+    support = support or fit_support(cloud)
     x_in_support = apply(inverse(support.base_from_support), cloud.points_in_base)
     plane_label = np.bincount(cloud.label[support.on_plane]).argmax()
     # Seen from the others alone, the plane lies a little higher or lower.
@@ -101,7 +101,7 @@ def measure(cloud: PointCloud, scale_std: float = 0.0, support: Support | None =
         sizes.append(
             _size(int(label), cloud.label_names[label], len(x), whole, np.array(parts), support, scale_std)
         )
-    return Measured(support, tuple(sorted(sizes, key=lambda size: -size.box_size[0] * size.box_size[1])))
+    return Measurement(support, tuple(sorted(sizes, key=lambda size: -size.box_size[0] * size.box_size[1])))
 
 
 def _size(

@@ -51,7 +51,7 @@ PLANES, SAMPLE = 400, 20_000
 """Planes through three random points that are tried, and points each is tried on."""
 
 
-def support_plane(cloud: PointCloud) -> Support:
+def fit_support(cloud: PointCloud) -> Support:
     """Fit the plane with most points on it that has the cameras on one side (RANSAC, then robust least squares).
 
     What was filled in by planes is left out of the fit and its noise: it lies on planes by construction.
@@ -126,7 +126,7 @@ def label_tabletop(
     that touch. Raises InputError when no plane carries the scene.
     """
     options = options or TabletopOptions()
-    support = support or support_plane(cloud)
+    support = support or fit_support(cloud)
     x_in_support = apply(inverse(support.base_from_support), cloud.points_in_base)
     height = x_in_support[:, 2]
     noise = NOISE_REACH * support.noise
