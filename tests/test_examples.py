@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 import jcr
-from jcr.geometry import rotation_between_deg
+from jcr.camera import unproject
+from jcr.geometry import apply, rotation_between_deg
 from places import ROOT
 
 if TYPE_CHECKING:
@@ -146,6 +147,22 @@ def test_the_splat_s_cameras_are_where_the_robot_fixed_them(done: Path, tmp_path
     lowest_and_highest = numbers(r"hang (.+) to (.+) m above", text)
     np.testing.assert_allclose(lowest_and_highest, [heights.min(), heights.max()], atol=2e-3)
     assert (tmp_path / "run/splat/points.ply").is_file()
+
+
+def test_a_result_places_a_point_compares_exports_and_answers(done: Path, tmp_path: Path):
+    out = shutil.copytree(done, tmp_path / "run")
+    text = printed("07_use_a_result", tmp_path, "run")
+    capture = jcr.read_capture(EXAMPLES / "tabletop")
+    assert capture.intrinsics is not None
+    *found, sigma_x, sigma_y, sigma_z = numbers(
+        r"point: \[ *(\S+) +(\S+) +(\S+)\] m ± \[ *(\S+) +(\S+) +(\S+)\] mm", text.replace("]", " ]")
+    )
+    ray = unproject(capture.intrinsics, np.array([320.0, 240.0]))
+    true = apply(capture.base_from_gripper[0] @ true_hand_eye(), 0.45 * ray)
+    assert np.linalg.norm(found - true) < 1e-3 and 0 < max(sigma_x, sigma_y, sigma_z) < 1
+    off_mm = numbers(r"transform: \[ *(\S+) +(\S+) +(\S+) *\] mm apart", text.replace("]", " ]"))
+    assert np.linalg.norm(off_mm) < 0.5
+    assert (out / "export" / "hand_eye.urdf").is_file() and "map at the point: occupancy" in text
 
 
 def test_the_api_is_called_as_it_is_shown(done: Path, tmp_path: Path):

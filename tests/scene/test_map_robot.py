@@ -71,10 +71,6 @@ def shape_named(name: str) -> "trimesh.Trimesh":
     from trimesh.util import concatenate
 
     match name:
-        case "box":
-            return box((0.2, 0.06, 0.03))
-        case "rod":
-            return cylinder(0.04, 0.3)
         case "disc":
             return cylinder(0.15, 0.02)
         case "ball":
@@ -83,7 +79,7 @@ def shape_named(name: str) -> "trimesh.Trimesh":
     return concatenate([box((0.3, 0.03, 0.03)), box((0.03, 0.03, 0.3), across)])
 
 
-@pytest.mark.parametrize("name", ["box", "rod", "disc", "ball", "elbow"])
+@pytest.mark.parametrize("name", ["disc", "ball", "elbow"])
 def test_spheres_hold_the_shape_and_little_else(name: str):
     import trimesh
 
@@ -105,22 +101,23 @@ def test_spheres_hold_the_shape_and_little_else(name: str):
     assert len(radii) < 450
 
 
-def test_joints_move_the_spheres_as_the_urdf_shows(urdf: Path):
+def test_joints_move_the_spheres_as_in_yourdfpy(urdf: Path):
+    import yourdfpy
+
     from jcr.scene.robot import load_robot
 
-    robot = load_robot(urdf)
-    assert robot.joint_names == ("turn", "bend", "push")
-    assert len(robot.links) == 6
-    at = {name: np.flatnonzero(robot.link == robot.links.index(name)) for name in robot.links}
-    q = np.array([[0.0, 0.0, 0.0], [np.pi / 2, 0.0, 0.0], [0.0, np.pi / 2, 0.0], [0.0, 0.0, 0.04]])
-    tip = robot.centers(q)[:, at["tip"][0]]
-    assert np.allclose(tip, [[0.25, 0, 0.16], [0, 0.25, 0.16], [0, 0, -0.09], [0.29, 0, 0.16]], atol=1e-9)
-    finger = robot.centers(q)[:, at["finger"][0]] - tip
-    assert np.allclose(finger[[0, 3]], [[0, 0.01, 0], [0, 0.03, 0]], atol=1e-9)
+    peer, robot = yourdfpy.URDF.load(str(urdf), load_meshes=False), load_robot(urdf)
+    assert robot.joint_names == ("turn", "bend", "push") and len(robot.links) == 6
+    q = np.array([[0.0, 0.0, 0.0], [np.pi / 2, 0.0, 0.0], [0.7, -1.1, 0.03], [0.0, 0.0, 0.04]])
+    for values, centers in zip(q, robot.centers(q), strict=True):
+        peer.update_cfg(values)
+        for name in robot.links:
+            mine = robot.link == robot.links.index(name)
+            expected = apply(peer.get_transform(name), robot.centers_in_link[mine])
+            np.testing.assert_allclose(centers[mine], expected, atol=1e-9)
     by_name = robot.centers({"push": q[:, 2], "turn": q[:, 0], "bend": q[:, 1]})
     assert np.array_equal(by_name, robot.centers(q))
     assert robot.centers(q.reshape(2, 2, 3)).shape == (2, 2, len(robot.radii), 3)
-    assert np.allclose(robot.radii[at["tip"]], 0.02)
 
 
 def test_a_changed_mesh_is_loaded_again(urdf: Path, tmp_path: Path):
@@ -135,20 +132,6 @@ def test_a_changed_mesh_is_loaded_again(urdf: Path, tmp_path: Path):
     trimesh.creation.icosphere(radius=30.0).export(copy.parent / "wedge.stl")
     after = load_robot(copy)
     assert after.radii.max() > 1.5 * before.radii[before.link == before.links.index("slide")].max()
-
-
-def test_yourdfpy_puts_the_links_at_the_same_places(urdf: Path):
-    import yourdfpy
-
-    from jcr.scene.robot import load_robot
-
-    peer, robot = yourdfpy.URDF.load(str(urdf), load_meshes=False), load_robot(urdf)
-    q = np.array([0.7, -1.1, 0.03])
-    peer.update_cfg(q)
-    for name in ("upper", "fore", "slide", "tip", "finger"):
-        mine = robot.link == robot.links.index(name)
-        expected = apply(peer.get_transform(name), robot.centers_in_link[mine])
-        assert np.allclose(robot.centers(q)[mine], expected, atol=1e-9)
 
 
 def test_the_arm_touches_the_ball_where_it_bends_into_it(scene: "SceneMap", urdf: Path):
