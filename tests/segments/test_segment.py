@@ -346,7 +346,9 @@ def hand_eye() -> HandEye:
     none = np.zeros(2)
     return HandEye(
         estimate=estimate,
-        images=ImageResiduals(np.ones(2, bool), none, none),
+        images=ImageResiduals(
+            inliers=np.ones(2, bool), translation_residual_m=none, rotation_residual_rad=none
+        ),
         residuals=PaperResiduals(0.0, 0.0),
         robot=RobotExamined(RobotNoise(translation=0.0, rotation=0.0, estimated=False)),
     )

@@ -96,7 +96,7 @@ class Viewer:
     def _verdict(self, folder: RunFolder) -> str:
         """Return the headline of the report, and the remedy for a missing map."""
         headline = head(self.calibration)[0].content
-        lines = [f"**{headline['verdict']}:** {headline['reason']}", headline["evidence"]]
+        lines = [f"**{headline['verdict']}:** {headline['reason']}."]
         if self.scene is None:
             lines.append(f"No map yet: make one with `jcr map {folder.path}`.")
         return "\n\n".join(lines)
