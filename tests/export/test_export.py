@@ -128,15 +128,11 @@ def test_ros_files_hold_the_transform_and_name_frames_and_units(name: str, doubt
     path = tmp_path / name
     path.write_text(write(mount(doubt)))
     np.testing.assert_allclose(read(path), PARENT_FROM_CHILD, atol=1e-9)
+    line = ros.static_transform_publisher("tool0", "optical", PARENT_FROM_CHILD)
+    np.testing.assert_allclose(of_publisher(line.split()[4:]), PARENT_FROM_CHILD, atol=1e-9)
     first = path.read_text()[:300]
     assert "optical in tool0" in first and "metres, radians" in first
     assert ("REJECTED: scale: every view" in first) == (doubt is not None)
-
-
-def test_static_transform_publisher_line_holds_the_transform():
-    line = ros.static_transform_publisher("tool0", "optical", PARENT_FROM_CHILD)
-    assert line.startswith("ros2 run tf2_ros static_transform_publisher ")
-    np.testing.assert_allclose(of_publisher(line.split()[4:]), PARENT_FROM_CHILD, atol=1e-9)
 
 
 def test_root_link_has_the_axes_of_rep_103():
@@ -244,20 +240,26 @@ def test_urdf_of_wrist_and_fixed_cameras_of_two_arms_is_one_tree(tmp_path: Path)
         np.testing.assert_allclose(robot.get_transform(child, parent), PARENT_FROM_CHILD, atol=1e-9)
 
 
-def test_easy_handeye2_of_a_fixed_camera_names_its_base_and_effector():
-    fixed = replace(mount(), parent="arm_base", base="arm_base", effector="flange")
-    named = yaml.safe_load(ros.easy_handeye2(fixed, "x"))["parameters"]
+def test_easy_handeye2_of_a_fixed_camera_names_its_base_and_effector(done: Path, tmp_path: Path):
+    content = json.loads((done / "calibration.json").read_text())
+    moved = {"base_from_camera": "gripper_from_camera", "gripper_from_object": "base_from_recon"}
+    fixed = {"mount": "base", "with_given_intrinsics": None} | {
+        new: content.pop(old) for new, old in moved.items()
+    }
+    (tmp_path / "calibration.json").write_text(json.dumps(content | fixed))
+    frames = {"parent_frame": "flange", "base_frame": "arm_base"}
+    written = yaml.safe_load(export_run(tmp_path, "easy_handeye2", options=frames).read_text())
+    named = written["parameters"]
     assert named["calibration_type"] == "eye_on_base"
     assert (named["robot_base_frame"], named["robot_effector_frame"]) == ("arm_base", "flange")
+    position = [written["transform"]["translation"][axis] for axis in "xyz"]
+    assert position == [row[3] for row in fixed["base_from_camera"][:3]]
 
 
 @pytest.mark.parametrize("name", ["", "/tool0", "tool 0", 'a"b', "<x>", "ü", "a--b"])
 def test_names_that_are_no_frames_are_refused(name: str):
     with pytest.raises(InputError, match="frame"):
         ros.CameraMount(parent="tool0", child=name, parent_from_child=PARENT_FROM_CHILD)
-
-
-def test_a_frame_cannot_be_its_own_parent():
     with pytest.raises(InputError, match="different"):
         ros.CameraMount(parent="tool0", child="tool0", parent_from_child=PARENT_FROM_CHILD)
     with pytest.raises(InputError, match="root"):
@@ -649,18 +651,16 @@ def test_wrong_sizes_and_places_are_refused(
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
-def test_rerun_recording_is_read_by_rerun(done: Path, tmp_path: Path):
+def test_rerun_recording_is_read_by_rerun_and_a_missing_package_is_named(
+    done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "rerun", None)
+        assert dispatch(["export", str(done), "rerun", str(tmp_path / "none.rrd")]) == 2
+        assert "jcr-handeye[rerun]" in capsys.readouterr().err and not (tmp_path / "none.rrd").exists()
     pytest.importorskip("rerun", reason="rerun-sdk is an extra of its own: pip install 'jcr-handeye[rerun]'")
     path = export(done, "rerun", tmp_path / "run.rrd")
     verified = subprocess.run(
         [sys.executable, "-m", "rerun", "rrd", "verify", path], capture_output=True, text=True, check=False
     )
     assert verified.returncode == 0, verified.stderr
-
-
-def test_rerun_that_is_not_installed_is_named(
-    done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    assert dispatch(["export", str(done), "rerun", str(tmp_path / "run.rrd")]) == 2
-    assert "jcr-handeye[rerun]" in capsys.readouterr().err and not (tmp_path / "run.rrd").exists()

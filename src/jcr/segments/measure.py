@@ -203,18 +203,14 @@ def _top(height: Float[ndarray, " n"], roughness: float) -> tuple[float, float]:
     return middle, spread
 
 
-def _counted(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "c r"]:
-    """Return the number of points in each cell seen from above, with an empty cell all around."""
-    cell = np.floor((xy - xy.min(0)) / CELL).astype(int) + 1
-    shape = cell.max(0) + 2
-    flat = np.ravel_multi_index(tuple(cell.T), shape)
-    return np.bincount(flat, minlength=shape.prod()).reshape(shape).astype(float)
-
-
 def _dense(xy: Float[ndarray, "n 2"]) -> tuple[Float[ndarray, "k 2"], Float[ndarray, " k"]]:
-    """Return the points without the thin fringe around them, and the share of a cell that each represents."""
-    count = _counted(xy)
+    """Return the points without the thin fringe around them, and the share of a cell that each represents.
+
+    Points are counted in the cells seen from above, with an empty cell all around.
+    """
     cell = tuple((np.floor((xy - xy.min(0)) / CELL).astype(int) + 1).T)
+    count = np.zeros([rows.max() + 2 for rows in cell])
+    np.add.at(count, cell, 1.0)
     smooth = gaussian_filter(count, 0.5, mode="constant")
     kept = smooth[cell] >= EDGE_SHARE * np.median(count[count > 0])
     if kept.sum() < 3:
@@ -224,6 +220,4 @@ def _dense(xy: Float[ndarray, "n 2"]) -> tuple[Float[ndarray, "k 2"], Float[ndar
 
 def _axes(rotation_rad: float) -> Float[ndarray, "2 2"]:
     """Return the rows of axes rotated from x and y."""
-    return np.array(
-        [[np.cos(rotation_rad), np.sin(rotation_rad)], [-np.sin(rotation_rad), np.cos(rotation_rad)]]
-    )
+    return rotation_exp(np.array([0.0, 0.0, -rotation_rad]))[:2, :2]

@@ -28,10 +28,6 @@ class Support:
     on_plane: Bool[ndarray, " n"]
     """Points of the cloud that lie on it."""
 
-    def height(self, x_in_base: Float[ndarray, "n 3"]) -> Float[ndarray, " n"]:
-        """Return the height (m) of points (n,3) above the plane."""
-        return apply(inverse(self.base_from_support), x_in_base)[:, 2]
-
 
 FEWEST, LEAST_SHARE = 30, 1e-3
 """Points of an object, and share of all points."""
