@@ -54,9 +54,9 @@ FAULTS = (
     PlantedFault(
         "capture",
         "src/jcr/capture/conventions.py",
-        '"cm": 1e-2',
-        '"cm": 1e-3',
-        ("tests/capture/test_first_day.py", "tests/capture/test_readers.py"),
+        '"kuka": Convention((*_XYZ, "a", "b", "c"), "ZYX"',
+        '"kuka": Convention((*_XYZ, "a", "b", "c"), "zyx"',
+        ("tests/capture/test_readers.py",),
     ),
     PlantedFault(
         "features",
@@ -75,8 +75,8 @@ FAULTS = (
     PlantedFault(
         "photometric",
         "src/jcr/photometric/residuals.py",
-        "misfit = np.sort(np.where(seen, misfit / (misfit + np.float32(sigma**2)), 2.0), axis=0)",
-        "misfit = np.sort(np.where(seen, misfit / (misfit + np.float32(sigma)), 2.0), axis=0)",
+        "weight = (seen & some.agreed) / (1 + _squared(residual) / np.float32(sigma**2)) ** 2",
+        "weight = (seen & some.agreed) / (1 + _squared(residual) / np.float32(sigma**2))",
         ("tests/photometric/test_direct.py",),
     ),
     PlantedFault(
@@ -96,8 +96,8 @@ FAULTS = (
     PlantedFault(
         "boards",
         "src/jcr/boards/detection.py",
-        "return bool(shade[like_first].mean() < shade[~like_first].mean())",
-        "return bool(shade[like_first].mean() > shade[~like_first].mean())",
+        "true = margin + square * corners - HALF_PIXEL",
+        "true = margin + square * corners",
         ("tests/boards/test_detection.py",),
     ),
     PlantedFault(
@@ -110,8 +110,8 @@ FAULTS = (
     PlantedFault(
         "pipeline",
         "src/jcr/pipeline/selection.py",
-        "if other.leave_one_out_m < one.leave_one_out_m:",
-        "if other.leave_one_out_m > one.leave_one_out_m:",
+        'return rejection is None, is_explained, -float("inf") if error is None else -error.length_m',
+        'return rejection is None, is_explained, -float("inf") if error is None else error.length_m',
         ("tests/test_attempts.py",),
     ),
     PlantedFault(
