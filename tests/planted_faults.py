@@ -131,9 +131,9 @@ FAULTS = (
     PlantedFault(
         "map",
         "src/jcr/scene/scene_map.py",
-        "return ((distance < radius) | (beyond > 0),)",
-        "return (distance < radius,)",
-        ("tests/scene/test_map.py",),
+        'apply(require_rigid(np.asarray(base_from_robot, float), "base_from_robot"), centers)',
+        'apply(np.linalg.inv(require_rigid(np.asarray(base_from_robot, float), "base_from_robot")), centers)',
+        ("tests/scene/test_map_robot.py",),
     ),
     PlantedFault(
         "segments",
