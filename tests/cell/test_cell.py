@@ -277,6 +277,27 @@ def test_a_second_camera_on_the_gripper_is_placed_by_images_of_two_gripper_poses
 
 
 @pytest.mark.slow
+def test_the_base_of_a_second_arm_is_found_from_its_wrist_camera(tabletop: Path, calibrated):
+    old, reconstruction, hand_eye = calibrated
+    capture = jcr.read_capture(tabletop)
+    base_from_other = transform(rotation_exp(np.array([0.1, -0.2, 2.8])), np.array([0.9, 0.3, 0.1]))
+    rows = [2, 5, *range(OLD, len(capture))]
+    camera = CellCamera(
+        name="other_wrist",
+        mount="gripper",
+        arm="other",
+        images=tuple(capture.images[row] for row in rows),
+        image_size=capture.image_size,
+        intrinsics=capture.intrinsics,
+        base_from_gripper=inverse(base_from_other) @ capture.base_from_gripper[rows],
+    )
+    found = place_cameras(old, [camera], reconstruction, hand_eye)
+    assert found.cameras[0].converged and found.arms[0].name == "other"
+    off = step_between(np.array(found.arms[0].base_from_other_base), base_from_other)
+    assert np.linalg.norm(off[:3]) < 0.01 and np.degrees(np.linalg.norm(off[3:])) < 1.0
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("zoom", [1.0, 1.03])
 def test_a_zoom_of_a_second_camera_is_named_with_its_size_and_none_where_there_is_none(zoom: float):
     problem = cell_problem("wrists", "white", COUNT, seed=1, points=150)
