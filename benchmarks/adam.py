@@ -186,7 +186,7 @@ def _quat_xyzw(recon_from_camera: Float[ndarray, "k 4 4"]) -> Float[ndarray, "k 
 
 
 def _mean_confidence(predictions: PairPredictions, log_weight: bool) -> Float[ndarray, "n h w"]:
-    """The network's confidence averaged over the pairs that show an image, logs of it where they are weights."""
+    """Return the network's confidence averaged over the pairs that show an image; logs where these are the weights."""
     total = np.zeros((predictions.image_count, *predictions.conf.shape[1:]), np.float32)
     for edge, *confs in zip(predictions.edges, predictions.conf, predictions.conf2, strict=True):
         for image, conf in zip(edge, confs, strict=True):

@@ -52,7 +52,7 @@ GRID = 0.004
 
 @dataclass(frozen=True)
 class MapScore:
-    """Shares, not percent."""
+    """Scores of a map, as shares."""
 
     f_5mm: float
     f_10mm: float
@@ -227,7 +227,7 @@ def _fcl(
 
 
 def true_cloud(truth: Truth) -> PointCloud:
-    """The cloud that perfect poses and depth would give."""
+    """Return the cloud of perfect poses and depth."""
     surface, draw = true_surface(truth), np.random.default_rng(0)
     chosen = draw.choice(len(surface.image), min(POINTS, len(surface.image)), replace=False)
     return PointCloud(
@@ -243,7 +243,7 @@ def true_cloud(truth: Truth) -> PointCloud:
 
 
 def calibrated_cloud(truth: Truth) -> PointCloud:
-    """The cloud that COLMAP and the calibration of the capture give, labelled by the true masks."""
+    """Return the cloud of COLMAP and the calibration of the capture, labelled by the true masks."""
     capture = read_capture(truth.folder)
     reconstruction = densify(capture, reconstruct(capture, ReconstructOptions(backend="colmap")))
     size = reconstruction.dense.confidence.shape[:0:-1]
@@ -282,7 +282,7 @@ def places_to_ask(truth: Truth) -> Places:
 
 
 def score(scene: SceneMap, places: Places) -> MapScore:
-    """The map of a simulated capture against its truth."""
+    """Score the map of a simulated capture against its truth."""
     x, surface = places.x, places.surface
     sample = scene.query(x)
     occupied = (sample.occupancy >= 0.5) & ~sample.unknown

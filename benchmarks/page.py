@@ -12,29 +12,29 @@ from jcr.geometry import rotation_between_deg
 
 
 def table(head: str, rows: Iterable[Iterable[object]]) -> list[str]:
-    """Lines of a Markdown table; `head` names the columns, with bars between them."""
+    """Return the lines of a Markdown table; `head` names the columns, with bars between them."""
     lines = [f"| {head} |", "|---" * (head.count("|") + 1) + "|"]
     return lines + [f"| {' | '.join(map(str, row))} |" for row in rows]
 
 
 def number(value: float | None, digits: int) -> str:
-    """A cell; empty where there is no value."""
+    """Return a cell of a table, empty where there is no value."""
     return "" if value is None or np.isnan(value) else f"{value:.{digits}f}"
 
 
 def mm_deg(step: Float[ndarray, " p"]) -> tuple[float, float]:
-    """Length in mm and angle in degrees of a step whose first six are a translation (m) and a rotation vector (rad)."""
+    """Return length (mm) and angle (degrees) of a step: translation (m), rotation vector (rad)."""
     return 1e3 * float(np.linalg.norm(step[:3])), float(np.degrees(np.linalg.norm(step[3:6])))
 
 
 def apart(x: Float[ndarray, "4 4"], reference: Float[ndarray, "4 4"]) -> tuple[float, float]:
-    """Distance of two hand-eye transforms in mm and degrees."""
+    """Return the distance of two hand-eye transforms in mm and degrees."""
     mm = 1e3 * float(np.linalg.norm(x[:3, 3] - reference[:3, 3]))
     return mm, float(rotation_between_deg(x[:3, :3], reference[:3, :3]))
 
 
 def folders_with(captures: Path, file: str) -> list[Path]:
-    """The folders below `captures` that hold a file of this name; InputError where there is none."""
+    """Return the folders below `captures` that hold a file of this name; raise InputError where there is none."""
     folders = sorted(path.parent for path in captures.glob(f"*/{file}"))
     if not folders:
         raise InputError(f"{captures}: no folder below it holds a {file}")
@@ -42,7 +42,7 @@ def folders_with(captures: Path, file: str) -> list[Path]:
 
 
 def boards_of(boards: Sequence[str], folders: Sequence[Path], captures: Path) -> dict[str, str]:
-    """The boards given as CAPTURE=BOARD, by capture; InputError for one of a capture that is not there."""
+    """Return boards given as CAPTURE=BOARD by capture; raise InputError for a capture that is not there."""
     named = {name: board for name, _, board in (text.partition("=") for text in boards)}
     if unknown := named.keys() - {folder.name for folder in folders}:
         raise InputError(f"--boards {', '.join(sorted(unknown))}: no such capture in {captures}")

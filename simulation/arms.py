@@ -88,11 +88,11 @@ class BentArm:
     """The errors in the order of `error_names`; m and rad."""
 
     def reported(self, joints: Joints) -> Float[ndarray, "n 4 4"]:
-        """base_from_gripper (n,4,4) as the controller computes it."""
+        """Return base_from_gripper (n,4,4) as the controller computes it."""
         return forward_kinematics(self.arm, joints)
 
     def true(self, joints: Joints) -> Float[ndarray, "n 4 4"]:
-        """base_from_gripper (n,4,4) of the bent arm; exact, except that the lever of sag is that of the nominal arm."""
+        """Return the true base_from_gripper (n,4,4), exact except that the lever of sag is that of the nominal arm."""
         dof, arm = self.arm.dof, self.arm
         offset, link, sag, gear = np.split(self.errors, dof * np.cumsum([1, LINK_ERRORS, 1]))
         sine, cosine = gear.reshape(dof, 2).T
@@ -104,18 +104,18 @@ class BentArm:
         return forward_kinematics(replace(arm, parent_from_joint=arm.parent_from_joint @ moved), angles)
 
     def named_errors(self) -> dict[str, float]:
-        """The errors that are not zero, by name (m, rad)."""
+        """Return the errors that are not zero by name (m, rad)."""
         names = error_names(self.arm)
         return {name: float(value) for name, value in zip(names, self.errors, strict=True) if value}
 
 
 def error_names(arm: Arm) -> tuple[str, ...]:
-    """Names of an arm's errors in their order: "joint 3", "link 2 tilt 1"."""
+    """Return the names of an arm's errors in their order: "joint 3", "link 2 tilt 1"."""
     return tuple(text.format(i + 1) for texts in NAMES for i in range(arm.dof) for text in texts)
 
 
 def bend(arm: Arm, sizes: ErrorSizes, rng: np.random.Generator) -> BentArm:
-    """The arm with random errors of the given sizes."""
+    """Draw an arm with random errors of the given sizes."""
     std = np.r_[
         error_std(arm, sizes.joint_offset, sizes.link),
         np.repeat([sizes.sag, sizes.gear], [arm.dof, 2 * arm.dof]),
@@ -151,7 +151,7 @@ PRESETS: dict[PresetName, ArmErrors] = {
 
 
 def hand_eye_on(arm: Arm, rng: np.random.Generator) -> Float[ndarray, "4 4"]:
-    """A plausible gripper_from_camera (4,4) that looks where the gripper points."""
+    """Draw a plausible gripper_from_camera (4,4) that looks where the gripper points."""
     normal = np.cross([0.0, 0.0, 1.0], arm.forward)
     angle = np.arctan2(np.linalg.norm(normal), arm.forward[2])
     axis = normal / max(float(np.linalg.norm(normal)), 1e-12)
@@ -159,12 +159,12 @@ def hand_eye_on(arm: Arm, rng: np.random.Generator) -> Float[ndarray, "4 4"]:
 
 
 def view_size(arm: Arm) -> float:
-    """Size of the arm, 1 for a UR5e."""
+    """Return the size of the arm, 1 for a UR5e."""
     return (arm.reach - float(np.linalg.norm(arm.last_from_gripper[:3, 3]))) / WRIST_OF_VIEWS
 
 
 def table_center(arm: Arm) -> Float[ndarray, "3"]:
-    """The middle of a table that suits the arm (m): where its rest posture points, or farther ahead."""
+    """Return the middle of a table that suits the arm (m): where its rest posture points, or farther ahead."""
     at_rest = forward_kinematics(arm, arm.rest[None])[0]
     ahead = at_rest[:3, :3] @ arm.forward
     meets = at_rest[:3, 3] - ahead * at_rest[2, 3] / ahead[2]

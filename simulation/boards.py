@@ -19,18 +19,18 @@ PAPER, INK = 240, 25
 
 @dataclass(frozen=True, kw_only=True)
 class Sheet:
-    """A chessboard that lies among the other things, and what its user states of it."""
+    """Chessboard that lies among other things, with the size that its user states."""
 
     corners: tuple[int, int] = (9, 6)
     side_m: float = 0.025
     stated_m: float | None = 0.025
-    """None: unknown."""
+    """Stated side; None where it is unknown."""
     bend_m: float = 0.0
-    """By how much its short edges are above its middle."""
+    """Height of its short edges over its middle."""
     size_error: float = 0.0
-    """Relative, of the printed size over `side_m`."""
+    """Relative excess of the printed size over `side_m`."""
     noise_px: float = 0.1
-    """One sigma of a coordinate of a corner."""
+    """Standard deviation of a coordinate of a corner."""
 
 
 def with_sheet(found: FaultyCapture, rng: np.random.Generator, sheet: Sheet) -> FaultyCapture:
@@ -76,7 +76,7 @@ def with_chessboard(
     corners: tuple[int, int],
     side_m: float,
 ) -> UInt8[ndarray, "h w 3"]:
-    """The image with a chessboard in front of all else, its first inner corner at the origin of its frame."""
+    """Draw a chessboard in front of all else, its first inner corner at the origin of its frame."""
     across, down = np.array(corners) + 1
     is_black = np.add.outer(np.arange(down), np.arange(across)) % 2 == 0
     squares = np.where(is_black, INK, PAPER).astype(np.uint8).repeat(SQUARE_PX, 0).repeat(SQUARE_PX, 1)

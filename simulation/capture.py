@@ -132,7 +132,7 @@ def _write_images(
 
 
 def _reference(motion: Motion) -> dict[str, object]:
-    """The hand-eye transform of reference.json, and how it was found."""
+    """Return the hand-eye transform of reference.json, and how it was found."""
     if motion.bent is None:
         return {"gripper_from_camera": motion.physical.tolist(), "how": "simulated, exact"}
     return {
@@ -145,7 +145,7 @@ def _reference(motion: Motion) -> dict[str, object]:
 def _measured(
     depth: Float[ndarray, "h w"], wrong: tuple[float, float], draw: np.random.Generator
 ) -> UInt16[ndarray, "h w"]:
-    """Depth (mm) as a depth camera of that scale error and noise measures it; 0 where it sees none."""
+    """Return depth (mm) as a depth camera of that scale error and noise measures it; 0 where it sees none."""
     percent, noise_mm = wrong
     edge = np.ptp([np.roll(depth, step, axis) for step in (-1, 1) for axis in (0, 1)], axis=0) > 0.03 * depth
     noisy = (1 + percent / 100) * depth + 1e-3 * noise_mm * depth**2 * draw.normal(size=depth.shape)

@@ -1,4 +1,4 @@
-"""Cells with several cameras as numbers, without images: what robots report and images show, and the truth.
+"""Cells with several cameras as numbers, without images: reported poses, observations, and the truth.
 
 Four kinds: `fixed`, a camera beside the table that a wrist camera maps; `wrists`, two cameras on one wrist; `arms`, two
 arms with a wrist camera each before one table; `carried`, a fixed camera that watches a box in the gripper. Poses are
@@ -38,9 +38,9 @@ from simulation.problems import INTRINSICS, disturbed, shown_points
 Kind = Literal["fixed", "wrists", "arms", "carried"]
 FIXED_CAMERA = Intrinsics(905.0, 903.0, 645.0, 355.0, 1280, 720, (0.06, -0.1, 5e-4, 3e-4, 0.02))
 TABLE = np.array([[-0.25, -0.25, 0.0], [0.25, 0.25, 0.12]])
-"""m about the middle of the table: where points lie."""
+"""Box about the middle of the table (m) in which points lie."""
 BOX = np.array([0.16, 0.12, 0.1])
-"""m: the thing in the gripper, its middle this far ahead of the gripper's frame."""
+"""Sides (m) of the object in the gripper, whose middle is BOX_AHEAD before the gripper's frame."""
 BOX_AHEAD = 0.12
 
 
@@ -63,7 +63,7 @@ class CellProblem:
     truth: dict[str, Float[ndarray, "4 4"]]
     """gripper_from_camera, and of a second one or arm; base_from_camera, base1_from_base2, gripper_from_object."""
     starts: tuple[tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]], ...]
-    """True X and base_from_world of each arm, where a search may start."""
+    """True X and base_from_world of each arm, as initial estimates."""
 
     @property
     def arms(self) -> list[Arm]:
@@ -173,7 +173,7 @@ class _Cell:
 
 
 def _box(points: int, rng: np.random.Generator) -> tuple[Float[ndarray, "p 3"], Float[ndarray, "p 3"]]:
-    """Points on the faces of the box, and the faces' normals."""
+    """Draw points on the faces of the box; return them with the faces' normals."""
     axis, side = rng.integers(0, 3, points), rng.choice([-1.0, 1.0], points)
     x = rng.uniform(-0.5, 0.5, (points, 3))
     x[np.arange(points), axis] = 0.5 * side
@@ -187,7 +187,7 @@ def _seen(
     noise_px: float,
     rng: np.random.Generator,
 ) -> CellProblem:
-    """The problem in a frame and unit of its own, every point seen with noise by all cameras that have it in view."""
+    """Return the problem in a frame and unit of its own, with noisy observations of all points in view."""
     rigs = np.concatenate(cell.rigs)
     rig_of, camera_of = np.array(cell.images).T
     places = rigs[rig_of] @ np.stack(cell.mounts)[camera_of]

@@ -20,7 +20,7 @@ class Mesh:
     faces: Int[ndarray, "f 3"]
 
     def moved(self, offset: Triple) -> "Mesh":
-        """The mesh shifted by `offset` (3,) m."""
+        """Return the mesh shifted by `offset` (3,) m."""
         return Mesh(self.vertices + np.asarray(offset), self.uv, self.faces)
 
 
@@ -34,7 +34,7 @@ def _joined(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def _grid(vertices: Float[ndarray, "r c 3"], uv: Float[ndarray, "r c 2"]) -> Mesh:
-    """A sheet of vertices, rows by columns; outside is where columns × rows points."""
+    """Return a sheet of vertices, rows by columns; outside is where columns × rows points."""
     rows, columns = vertices.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
@@ -54,7 +54,7 @@ _SIDES = {
 
 
 def box(size: Triple, sides: Sequence[str] = tuple(_SIDES)) -> Mesh:
-    """Sides of a box of `size` (x, y, z) m standing on z = 0; each shows the whole texture."""
+    """Return sides of a box of `size` (x, y, z) m standing on z = 0; each shows the whole texture."""
     half = np.asarray(size) / 2
     square = np.array([[[0.0, 0.0], [1.0, 0.0]], [[0.0, 1.0], [1.0, 1.0]]])
     meshes = []
@@ -66,7 +66,7 @@ def box(size: Triple, sides: Sequence[str] = tuple(_SIDES)) -> Mesh:
 
 
 def revolved(*profiles: Sequence[tuple[float, float]], segments: int = 48) -> Mesh:
-    """Solid of revolution about z of profiles [(radius, z), …] m, outside on the right hand going along them.
+    """Return the solid of revolution about z of profiles [(radius, z), …] m, outside on the right hand along them.
 
     Within a profile the surface is shaded smooth; between profiles there is an edge.
     """
@@ -85,7 +85,7 @@ def revolved(*profiles: Sequence[tuple[float, float]], segments: int = 48) -> Me
 
 
 def tube(path: Float[ndarray, "n 3"], radius: float, segments: int = 12) -> Mesh:
-    """Round tube of `radius` m about a path (n,3) m in a vertical plane: the handle of a mug or a case."""
+    """Return a round tube of `radius` m about a path (n,3) m in a vertical plane: the handle of a mug or a case."""
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     # The path stays in one plane, whose normal no tangent is parallel to.

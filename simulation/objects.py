@@ -60,7 +60,7 @@ class TableObject:
         return float(np.linalg.norm(self._vertices[:, :2], axis=1).max())
 
     def measured(self, label: int) -> TrueObject:
-        """Its height, footprint and the smallest upright box around it."""
+        """Return its height, footprint and the smallest upright box around it."""
         x_in_base = apply(self.base_from_object, self._vertices)
         height = float(self._vertices[:, 2].max())
         # OpenCV's planar geometry takes single precision: about the object's origin that is exact to 1e-8 m.
@@ -83,22 +83,22 @@ class TableObject:
 
 
 def carton(rng: np.random.Generator) -> Parts:
-    """A printed package, upright."""
+    """Make a printed package, upright."""
     return _package(rng, rng.uniform((0.08, 0.045, 0.10), (0.13, 0.065, 0.17)))
 
 
 def package(rng: np.random.Generator) -> Parts:
-    """A flat printed package, lying."""
+    """Make a flat printed package, lying."""
     return _package(rng, rng.uniform((0.12, 0.09, 0.05), (0.17, 0.13, 0.08)))
 
 
 def carried_package(rng: np.random.Generator) -> TableObject:
-    """A larger printed package, which a gripper carries before a fixed camera."""
+    """Make a larger printed package, which a gripper carries before a fixed camera."""
     return TableObject("carried", _package(rng, rng.uniform((0.16, 0.11, 0.19), (0.2, 0.14, 0.23))))
 
 
 def book(rng: np.random.Generator) -> Parts:
-    """A closed book, lying, whose pages show on three sides."""
+    """Make a closed book, lying, whose pages show on three sides."""
     x, y, z = rng.uniform((0.12, 0.17, 0.018), (0.15, 0.21, 0.035))
     color = _paint(rng)
     cover = Part(box((x, y, z), ("+z",)), color, textures.printed(rng, 720, 512, color))
@@ -107,7 +107,7 @@ def book(rng: np.random.Generator) -> Parts:
 
 
 def block(rng: np.random.Generator) -> Parts:
-    """A wooden toy block with painted sides."""
+    """Make a wooden toy block with painted sides."""
     edge = rng.uniform(0.04, 0.055)
     sides = ("+x", "-x", "+y", "-y", "+z", "-z")
     parts = []
@@ -118,7 +118,7 @@ def block(rng: np.random.Generator) -> Parts:
 
 
 def can(rng: np.random.Generator) -> Parts:
-    """A tin with a printed label."""
+    """Make a tin with a printed label."""
     radius, height = rng.uniform((0.031, 0.09), (0.039, 0.12))
     color = _paint(rng)
     rim, lid = 0.94 * radius, height - 0.004
@@ -134,7 +134,7 @@ def can(rng: np.random.Generator) -> Parts:
 
 
 def bottle(rng: np.random.Generator) -> Parts:
-    """A bottle with a label and a screw cap."""
+    """Make a bottle with a label and a screw cap."""
     radius, height = rng.uniform((0.028, 0.15), (0.035, 0.19))
     color, glass = _paint(rng), _paint(rng)
     low, high = 0.18 * height, 0.56 * height
@@ -158,7 +158,7 @@ def bottle(rng: np.random.Generator) -> Parts:
 
 
 def mug(rng: np.random.Generator) -> Parts:
-    """A mug with a handle and an image around it."""
+    """Make a mug with a handle and an image around it."""
     radius, height = rng.uniform((0.038, 0.085), (0.043, 0.105))
     color = _WHITE if rng.random() < 0.5 else _paint(rng)
     inner = radius - 0.004
@@ -182,7 +182,7 @@ def mug(rng: np.random.Generator) -> Parts:
 
 
 def tape(rng: np.random.Generator) -> Parts:
-    """A roll of tape, lying."""
+    """Make a roll of tape, lying."""
     # Packing tape: a 76 mm core, about 48 mm wide.
     inner, thickness, height = rng.uniform((0.0378, 0.008, 0.046), (0.0382, 0.018, 0.05))
     outer, color = inner + thickness, _paint(rng)
@@ -201,7 +201,7 @@ def tape(rng: np.random.Generator) -> Parts:
 
 
 def bowl(rng: np.random.Generator) -> Parts:
-    """A painted bowl on a foot."""
+    """Make a painted bowl on a foot."""
     radius, height = rng.uniform((0.06, 0.045), (0.075, 0.06))
     color, foot, wall = _paint(rng), 0.45 * radius, 0.004
     outside = revolved([(foot, 0.006)] + _quarter(foot, radius, 0.006, height))
@@ -220,7 +220,7 @@ def bowl(rng: np.random.Generator) -> Parts:
 
 
 def fruit(rng: np.random.Generator) -> Parts:
-    """An apple: a ball with a dimple and a stalk."""
+    """Make an apple: a ball with a dimple and a stalk."""
     radius = rng.uniform(0.033, 0.04)
     angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 25)
     r = radius * np.cos(angle) * (1 + 0.08 * np.sin(angle))
@@ -237,7 +237,7 @@ def fruit(rng: np.random.Generator) -> Parts:
 
 
 def toolbox(rng: np.random.Generator) -> Parts:
-    """A toolbox: body, lid with a sticker and a grip, latches."""
+    """Make a toolbox: body, lid with a sticker and a grip, latches."""
     x, y, z = rng.uniform((0.24, 0.12, 0.08), (0.28, 0.14, 0.10))
     color, sticker = _paint(rng), _paint(rng)
     lid = (x + 0.008, y + 0.008, 0.03)
@@ -288,24 +288,24 @@ def _package(rng: np.random.Generator, size: Float[ndarray, "3"]) -> Parts:
 
 
 def _paint(rng: np.random.Generator) -> Color:
-    """One of a few paints, a little lighter or darker."""
+    """Draw one of a few paints, a little lighter or darker."""
     r, g, b = np.clip(np.array(_PAINTS[rng.integers(len(_PAINTS))]) * rng.uniform(0.85, 1.15), 0, 1)
     return float(r), float(g), float(b)
 
 
 def _wrap(label: Image) -> Image:
-    """A label twice around a round thing, so that it reads from most sides."""
+    """Put a label twice around a round object, so that it reads from most sides."""
     return np.concatenate([label, label], axis=1)
 
 
 def _arc(r0: float, r1: float, z0: float, z1: float) -> list[tuple[float, float]]:
-    """Shoulder of a bottle: an S from (r0, z0) to (r1, z1)."""
+    """Return the shoulder of a bottle: an S from (r0, z0) to (r1, z1)."""
     t = np.linspace(0, 1, 12)[1:]
     blend = 0.5 - 0.5 * np.cos(np.pi * t)
     return [(float(r0 + (r1 - r0) * b), float(z0 + (z1 - z0) * s)) for b, s in zip(blend, t, strict=True)]
 
 
 def _quarter(r0: float, r1: float, z0: float, z1: float) -> list[tuple[float, float]]:
-    """Wall of a bowl: a quarter of an ellipse from (r0, z0), flat there, to (r1, z1), steep there."""
+    """Return the wall of a bowl: a quarter of an ellipse from (r0, z0), flat there, to (r1, z1), steep there."""
     angle = np.linspace(0, 0.5 * np.pi, 14)
     return [(float(r0 + (r1 - r0) * np.sin(a)), float(z0 + (z1 - z0) * (1 - np.cos(a)))) for a in angle]

@@ -70,7 +70,7 @@ def synthetic_pairs(
     seed: int = 0,
     intrinsics: Intrinsics | None = None,
 ) -> tuple[PairPredictions, PairTruth]:
-    """Predictions for `edges` at `size` (width, height), each pair in a unit between half and twice a metre.
+    """Predict `edges` at `size` (width, height), each pair in a unit between half and twice a metre.
 
     Without `intrinsics` the focal length is 0.95 widths and the principal point the middle, and the
     predictions carry none.
@@ -145,7 +145,7 @@ def _with_errors(
     errors: PairErrors,
     rng: np.random.Generator,
 ) -> Float[ndarray, "h w 3"]:
-    """Points with smooth errors along and across the sight and white ones in all directions."""
+    """Add smooth errors along and across the sight, and white ones in all directions, to points."""
     height, width = depth.shape
     white = errors.pixel * growth * np.where(outlier, 20, 1) * depth
     stretched = exact * (1 + errors.warp * growth * _smooth(rng, height, width))[..., None]
@@ -179,7 +179,7 @@ def pairs_of_capture(
 
 
 def _cameras(count: int, rng: np.random.Generator) -> Float[ndarray, "n 4 4"]:
-    """base_from_camera of views round a part of the table, at varied height, distance and roll."""
+    """Draw base_from_camera of views round a part of the table, at varied height, distance and roll."""
     azimuth = 1.2 * np.pi * np.arange(count) / count + rng.uniform(-0.1, 0.1, count)
     elevation, radius = rng.uniform(np.pi / 6, np.pi / 3, count), rng.uniform(0.55, 0.85, count)
     eye = radius * np.stack(
@@ -195,7 +195,7 @@ def _cameras(count: int, rng: np.random.Generator) -> Float[ndarray, "n 4 4"]:
 
 
 def _depth(base_from_camera: Float[ndarray, "4 4"], ray: Float[ndarray, "h w 3"]) -> Float[ndarray, "h w"]:
-    """Depth of the nearest surface along rays of unit depth."""
+    """Return the depth of the nearest surface along rays of unit depth."""
     origin, direction = base_from_camera[:3, 3], ray @ base_from_camera[:3, :3].T
     nearest = np.maximum(*((ROWS_ABOVE[:, None, None] - origin) / direction)).min(axis=-1)
     for *center, radius in SPHERES:
@@ -212,7 +212,7 @@ def _depth(base_from_camera: Float[ndarray, "4 4"], ray: Float[ndarray, "h w 3"]
 
 
 def _smooth(rng: np.random.Generator, height: int, width: int) -> Float[ndarray, "h w"]:
-    """Unit normals on a 4x5 grid, interpolated."""
+    """Draw unit normals on a 4x5 grid and interpolate them."""
     return cv2.resize(rng.normal(size=(4, 5)), (width, height), interpolation=cv2.INTER_LINEAR)
 
 

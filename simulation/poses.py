@@ -38,7 +38,7 @@ _VIEWS = np.array(
 
 
 def random_hand_eye(rng: np.random.Generator) -> Float[ndarray, "4 4"]:
-    """A plausible gripper_from_camera (4,4): 3 to 12 cm away, tilted by up to 25°, any roll."""
+    """Draw a plausible gripper_from_camera (4,4): 3 to 12 cm away, tilted by up to 25°, any roll."""
     side, roll, toward = rng.uniform(0, 2 * np.pi, 3)
     aside, ahead = rng.uniform(0.03, 0.1), rng.uniform(-0.05, 0.06)
     tilt = np.radians(rng.uniform(5, 25)) * np.array([np.cos(toward), np.sin(toward), 0.0])
@@ -49,7 +49,7 @@ def random_hand_eye(rng: np.random.Generator) -> Float[ndarray, "4 4"]:
 def looking_at(
     place: Float[ndarray, "3"], target: Float[ndarray, "3"], rng: np.random.Generator
 ) -> Float[ndarray, "4 4"]:
-    """base_from_camera at a place, the target nearly in the middle of its image, rolled at random."""
+    """Draw base_from_camera at a place, the target nearly in the middle of its image, rolled at random."""
     z = target - place + 0.03 * rng.normal(size=3)
     z /= np.linalg.norm(z)
     x = np.cross(z, rng.normal(size=3))
@@ -64,7 +64,7 @@ def gripper_poses(
     gripper_from_camera: Float[ndarray, "4 4"],
     rng: np.random.Generator,
 ) -> Cameras:
-    """True base_from_gripper (n,4,4) of the pattern about a target; `two` has 2 poses whatever `count`."""
+    """Draw base_from_gripper (n,4,4) of the pattern about a target; `two` has 2 poses whatever `count`."""
     base_from_camera = _PATTERNS[pattern](count, target_in_base, gripper_from_camera, rng)
     return base_from_camera @ inverse(gripper_from_camera)
 
@@ -76,7 +76,7 @@ def _look_at(
     distance: Float[ndarray, "n"],
     roll_deg: Float[ndarray, "n"],
 ) -> Cameras:
-    """base_from_camera (n,4,4) of cameras that see `target` in the middle of the image."""
+    """Return base_from_camera (n,4,4) of cameras that see `target` in the middle of the image."""
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
     away = np.stack(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], -1
@@ -92,14 +92,14 @@ def _look_at(
 def _facing(
     target: Float[ndarray, "n 3"], rotation: Float[ndarray, "n 3 3"], distance: Float[ndarray, "n"]
 ) -> Cameras:
-    """base_from_camera (n,4,4) with given rotations, put where their optical axes meet the targets."""
+    """Return base_from_camera (n,4,4) with given rotations, whose optical axes meet the targets."""
     return transform(rotation, target - distance[:, None] * rotation[..., 2])
 
 
 def _aims(
     count: int, target: Float[ndarray, "3"], spread: float, rng: np.random.Generator
 ) -> Float[ndarray, "n 3"]:
-    """Points on the table about `target` to look at."""
+    """Draw points on the table about `target` to look at."""
     return target + np.column_stack([rng.uniform(-spread, spread, (count, 2)), rng.uniform(0, 0.05, count)])
 
 
@@ -158,7 +158,7 @@ def _camera_centre(
 
 
 def _tilts(count: int, tilt_deg: float, yaw_deg: float, rng: np.random.Generator) -> Float[ndarray, "n 3 3"]:
-    """Rotations about level axes all around by up to `tilt_deg`, after yaw by up to `yaw_deg`."""
+    """Draw rotations about level axes all around by up to `tilt_deg`, after yaw by up to `yaw_deg`."""
     toward = 2 * np.pi * (np.arange(count) + rng.uniform(0, 1)) / count
     tilt = np.radians(rng.uniform(0.5, 1.0, count) * tilt_deg)
     yaw = np.radians(rng.uniform(-yaw_deg, yaw_deg, count))

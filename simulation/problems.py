@@ -43,7 +43,7 @@ def hand_eye_problem(
     camera_noise: tuple[float, float] = (0.0, 0.0),
     deviation: float = 0.0,
 ) -> HandEyeProblem:
-    """A random hand-eye transform, scale and reconstruction frame, and wrist views in the given pattern.
+    """Draw a hand-eye transform, scale and reconstruction frame, and wrist views in the given pattern.
 
     Noises are one sigma per axis (m, rad) of the reported gripper poses and of the reconstructed cameras;
     `deviation` (rad) rotates every view by so much about a random axis, off a degenerate pattern.
@@ -68,7 +68,7 @@ def hand_eye_problem(
 def disturbed(
     a_from_b: Float[ndarray, "n 4 4"], noise: tuple[float, float], rng: np.random.Generator
 ) -> Float[ndarray, "n 4 4"]:
-    """Transforms with Gaussian errors, one sigma per axis: position in a's axes (m), rotation in b's (rad)."""
+    """Add Gaussian errors to transforms, one sigma per axis: position in a's axes (m), rotation in b's (rad)."""
     rotation = a_from_b[:, :3, :3] @ rotation_exp(noise[1] * rng.normal(size=(len(a_from_b), 3)))
     return transform(rotation, a_from_b[:, :3, 3] + noise[0] * rng.normal(size=(len(a_from_b), 3)))
 
@@ -76,7 +76,7 @@ def disturbed(
 def error(
     problem: HandEyeProblem, gripper_from_camera: Float[ndarray, "4 4"], scale: float
 ) -> Float[ndarray, "7"]:
-    """True minus found, in records.COVARIANCE_ORDER."""
+    """Return true minus found, in records.COVARIANCE_ORDER."""
     return np.r_[
         step_between(gripper_from_camera, problem.gripper_from_camera), np.log(problem.scale / scale)
     ]
@@ -84,7 +84,7 @@ def error(
 
 @dataclass(frozen=True)
 class BentProblem(HandEyeProblem):
-    """A hand-eye problem of a bent arm; `gripper_from_camera` is the effective one."""
+    """Hand-eye problem of a bent arm; `gripper_from_camera` is the effective one."""
 
     bent: BentArm
     joints: Float[ndarray, "n dof"]
@@ -103,7 +103,7 @@ def bent_problem(
     seed: int,
     camera_noise: tuple[float, float] = (5e-5, np.radians(0.005)),
 ) -> BentProblem:
-    """A random bent arm, hand-eye transform, reconstruction frame and scale, and `count` views of a table.
+    """Draw a bent arm, hand-eye transform, reconstruction frame and scale, and `count` views of a table.
 
     `camera_noise` is one sigma (m, rad) per axis of the reconstructed cameras.
     """

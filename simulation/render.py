@@ -43,7 +43,7 @@ def render(
     textured: bool = True,
     with_truth: bool = True,
 ) -> Iterator[View]:
-    """The views of pinhole cameras with fx = fy and a central principal point, which is what MuJoCo has.
+    """Render the views of pinhole cameras with fx = fy and a central principal point, which is what MuJoCo has.
 
     Poses are taken one at a time, each when the view before it was taken.
     Raises InputError where MuJoCo or an OpenGL library is missing.
@@ -76,7 +76,7 @@ def render(
 
 @contextmanager
 def _renderers(mjcf: str, files: dict[str, bytes], *sizes: tuple[int, int]) -> Iterator[Any]:
-    """MuJoCo's model, data and a renderer for each size (width, height), closed at the end."""
+    """Open MuJoCo's model, data and a renderer for each size (width, height), and close them at the end."""
     # MuJoCo reads the variable when it is imported; its own default on Linux needs a display.
     if platform.system() == "Linux":
         egl = ctypes.util.find_library("EGL") or not ctypes.util.find_library("OSMesa")
@@ -113,7 +113,7 @@ _LAMPS = 4
 def to_mjcf(
     scene: Scene, textured: bool, fovy: float, buffer: tuple[int, int]
 ) -> tuple[str, dict[str, bytes]]:
-    """MJCF text and its PNG files by name.
+    """Return MJCF text and its PNG files by name.
 
     Untextured: every part in its one colour. The camera, of vertical field of view `fovy` rad, is rendered
     into a `buffer` of width by height pixels.
@@ -153,7 +153,7 @@ def to_mjcf(
 
 
 def _add_lamps(world: xml.Element, scene: Scene) -> None:
-    """One lamp as a ring of weak ones: MuJoCo's shadows are hard, their sum is soft."""
+    """Add one lamp as a ring of weak ones: MuJoCo's shadows are hard, their sum is soft."""
     for angle in 2 * np.pi * np.arange(_LAMPS) / _LAMPS:
         at = scene.light_in_base + 0.12 * np.array([np.cos(angle), np.sin(angle), 0.0])
         xml.SubElement(

@@ -27,7 +27,7 @@ BLUR_PX_PER_M = 30.0
 def nearest_view(
     poses: Float[ndarray, "n 4 4"], views: Float[ndarray, "m 4 4"]
 ) -> tuple[Float[ndarray, " n"], Float[ndarray, " n"], ndarray]:
-    """Distance (mm) and angle (deg) of each pose from the nearest view, and which view that is."""
+    """Return distance (mm) and angle (deg) of each pose from the nearest view, and the number of that view."""
     distance = np.linalg.norm(poses[:, None, :3, 3] - views[None, :, :3, 3], axis=-1)
     nearest = distance.argmin(1)
     angle = rotation_between_deg(poses[:, :3, :3], views[nearest, :3, :3])
@@ -43,7 +43,7 @@ def write_bag(
     tf_hz: float = TF_HZ,
     compressed: bool = True,
 ) -> Path:
-    """A bag in which the arm stops at every view of a capture and moves smoothly between them.
+    """Write a bag in which the arm stops at every view of a capture and moves smoothly between them.
 
     Depth images of the capture, those of the nearest view, are on /camera/aligned_depth_to_color/image_raw. Topics:
     /camera/image_raw or /camera/image_raw/compressed, /camera/camera_info, /tf (base_link to tool0) and
@@ -76,7 +76,7 @@ def write_bag(
 
 
 def pose_at(views: Float[ndarray, "m 4 4"], seconds: float, time_s: Float[ndarray, " n"]):
-    """Gripper poses (n,4,4) of an arm that halts at each view for half of its share of the time, and speeds (m/s)."""
+    """Return poses (n,4,4) of an arm that halts at each view for half of its share of the time, and speeds (m/s)."""
     share = seconds / len(views)
     # 10u³ − 15u⁴ + 6u⁵ starts and ends at rest (Flash and Hogan 1985, minimum jerk).
     u = np.clip((time_s % share) / share * 2 - 1, 0, 1)
@@ -141,7 +141,7 @@ def _messages(
 def _depth_images(
     types: dict[str, Any], header: Callable[[int, str], Any], capture: Capture, at: int, row: float
 ) -> Iterator[tuple[int, str, Any]]:
-    """Depth, a little later than the image at `row` of the capture."""
+    """Yield depth, a little later than the image at `row` of the capture."""
     if capture.depths is not None and (name := capture.depths[round(row)]) is not None:
         depth = (1000 * read_depth(capture.folder / name, capture.image_size)).round().astype("<u2")
         fields = (*depth.shape, "16UC1", 0, 2 * depth.shape[1], depth.view(np.uint8).ravel())
@@ -152,7 +152,7 @@ def _depth_images(
 def _blurred(
     image: UInt8[ndarray, "h w 3"], speed: float, rng: np.random.Generator
 ) -> UInt8[ndarray, "h w 3"]:
-    """The image as a moving camera sees it, with one grey level of noise in places: no two frames are alike."""
+    """Blur an image by the camera's speed, with one grey level of noise in places: no two frames are alike."""
     length = 1 + round(BLUR_PX_PER_M * speed)
     noisy = image ^ (rng.random(image.shape[:2]) < 0.02)[..., None].astype(np.uint8)
     return np.asarray(cv2.blur(noisy, (length, 1)), dtype=np.uint8) if length > 1 else noisy

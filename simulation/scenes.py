@@ -26,7 +26,7 @@ class Recipe:
     objects: tuple[str, ...]
     table: TableName
     plain_table: bool
-    """A low-texture table top; otherwise wood."""
+    """Whether the table top has little texture; otherwise it is of wood."""
 
 
 RECIPES: dict[SceneName, Recipe] = {
@@ -78,7 +78,7 @@ class Scene:
 
 
 def make_scene(name: SceneName, seed: int, table: TableName | None = None) -> Scene:
-    """The scene of that name and seed; `table` overrides the recipe's light or dark table top."""
+    """Make the scene of that name and seed; `table` overrides the recipe's light or dark table top."""
     # One stream a matter: a change in the textures must not move the objects.
     layout, looks, lamp = (np.random.default_rng([seed, stream]) for stream in (1, 2, 3))
     recipe = RECIPES[name]
@@ -98,7 +98,7 @@ def make_scene(name: SceneName, seed: int, table: TableName | None = None) -> Sc
 
 
 def moved(scene: Scene, center_in_base: Float[ndarray, "3"]) -> Scene:
-    """The scene with the middle of its objects, on the table top, somewhere else in the base frame (m)."""
+    """Return the scene with the middle of its objects, on the table top, at another place in the base frame (m)."""
     shift = center_in_base - scene.table_center_in_base
     by = transform(np.eye(3), shift)
     objects = tuple(replace(thing, base_from_object=by @ thing.base_from_object) for thing in scene.objects)
@@ -124,7 +124,7 @@ def _table_top(rng: np.random.Generator, table: TableName, plain: bool) -> Part:
 def _arranged(
     rng: np.random.Generator, things: Sequence[TableObject], center_in_base: Float[ndarray, "3"]
 ) -> tuple[TableObject, ...]:
-    """The objects, each rotated at random, where the bounding circles of none overlap."""
+    """Place the objects, each rotated at random, where no bounding circles overlap."""
     radii = np.array([thing.radius for thing in things])
     spots = np.zeros((len(things), 2))
     order = rng.permutation(len(things))

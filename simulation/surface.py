@@ -17,7 +17,7 @@ from simulation.truth import Truth, read_truth, true_depth, true_labels
 
 
 def solid_labels(scene: Scene, x_in_base: Float[ndarray, "n 3"]) -> Int[ndarray, "n"]:
-    """Label of the solid that each point (n,3) m lies within: the table, an object, or 0 for none."""
+    """Return the label of the solid that each point (n,3) m lies within: the table, an object, or 0 for none."""
     table_frame = transform(np.eye(3), scene.table_center_in_base)
     solids = [(table_frame, scene.table), *((thing.base_from_object, thing.parts) for thing in scene.objects)]
     labels = np.zeros(len(x_in_base), np.int64)

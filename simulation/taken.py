@@ -20,7 +20,7 @@ _WIDTH, _HEIGHT = 640, 480
 
 
 def pinhole(rng: np.random.Generator) -> Intrinsics:
-    """Intrinsics of 40° to 48° vertical field of view, as webcams and the colour side of depth cameras have.
+    """Draw intrinsics of 40° to 48° vertical field of view, as webcams and the colour side of depth cameras have.
 
     MuJoCo's image spans [-½, W-½] when pixel (0, 0) is the centre of a pixel, so its middle is (W-1)/2.
     """
@@ -29,7 +29,7 @@ def pinhole(rng: np.random.Generator) -> Intrinsics:
 
 
 def with_intrinsics_error(camera: Intrinsics, percent: float, rng: np.random.Generator) -> Intrinsics:
-    """Intrinsics that are off by Gaussian errors: fx and fy by one of `percent`, cx and cy each of that of the width."""
+    """Add Gaussian errors to intrinsics: fx and fy by one of `percent`, cx and cy each by that share of the width."""
     focal, x, y = 0.01 * percent * rng.normal(size=3)
     return replace(
         camera,
@@ -43,7 +43,7 @@ def with_intrinsics_error(camera: Intrinsics, percent: float, rng: np.random.Gen
 def stated_intrinsics(
     camera: Intrinsics, options: SimulateOptions, rng: np.random.Generator
 ) -> Intrinsics | None:
-    """The intrinsics that capture.json gives: with the errors that the options ask for, or None where it gives none."""
+    """Return the intrinsics of capture.json with the errors of the options, or None where it gives none."""
     if options.unknown_intrinsics:
         return None
     return with_intrinsics_error(camera, options.intrinsics_error, rng)
@@ -63,7 +63,7 @@ def with_robot_noise(
 def degraded(
     image: UInt8[ndarray, "h w 3"], options: SimulateOptions, rng: np.random.Generator
 ) -> UInt8[ndarray, "h w 3"]:
-    """The image of a cheaper camera: blurred, darker towards the corners, noisy."""
+    """Return the image of a cheaper camera: blurred, darker towards the corners, noisy."""
     light = image.astype(np.float32)
     if options.blur:
         light = cv2.GaussianBlur(light, (0, 0), options.blur)
@@ -77,20 +77,20 @@ def degraded(
 
 
 def image_suffix(options: SimulateOptions) -> str:
-    """The ending of the images' names, without dot."""
+    """Return the ending of the images' names, without dot."""
     return "png" if options.jpeg_quality == "lossless" else "jpg"
 
 
 def write_image(
     path: Path, pixels: UInt8[ndarray, "h w 3"], options: SimulateOptions, stream: Sequence[int]
 ) -> None:
-    """Write what the camera of the options takes of `pixels`; its noise is the stream's of the options' seed."""
+    """Write the image that the camera of the options takes of `pixels`; its noise is drawn from `stream`."""
     rng = np.random.default_rng([options.seed, *stream])
     write_bytes(path, encoded(degraded(pixels, options, rng), options.jpeg_quality))
 
 
 def encoded(image: UInt8[ndarray, "h w 3"], jpeg_quality: int | Literal["lossless"]) -> bytes:
-    """RGB as JPEG of that quality, or as PNG."""
+    """Encode RGB as JPEG of that quality, or as PNG."""
     if jpeg_quality == "lossless":
         return encode_png(image)
     return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])[1].tobytes()

@@ -19,7 +19,7 @@ _FONTS = (cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX, cv2.FONT_HERSHEY_SI
 
 
 def wood(rng: np.random.Generator, height: int, width: int, light: Color, dark: Color) -> Image:
-    """Planks along the rows with year rings, fibres and pores between two colours (h,w,3)."""
+    """Draw planks along the rows with year rings, fibres and pores between two colours (h,w,3)."""
     planks = []
     for plank in np.array_split(np.arange(height), 8):
         rows = len(plank)
@@ -39,13 +39,13 @@ def wood(rng: np.random.Generator, height: int, width: int, light: Color, dark: 
 
 
 def laminate(rng: np.random.Generator, height: int, width: int, color: Color, contrast: float) -> Image:
-    """A plain table top with faint specks and clouds of that contrast (h,w,3)."""
+    """Draw a plain table top with faint specks and clouds of that contrast (h,w,3)."""
     specks, clouds = (_smooth_noise(rng, height, width, (cell, cell)) for cell in (4.0, 150.0))
     return _to_image(_rgb(color) * (1 + np.float32(contrast) * (0.5 * specks + 0.5 * clouds)[..., None]))
 
 
 def printed(rng: np.random.Generator, height: int, width: int, color: Color) -> Image:
-    """A printed package: a ground colour, a name, an image of overlapping shapes, small print (h,w,3)."""
+    """Draw a printed package: a ground colour, a name, an image of overlapping shapes, small print (h,w,3)."""
     image = np.full((height, width, 3), _ink(color), np.uint8)
     inks = [_ink(colorsys.hsv_to_rgb(*rng.uniform((0, 0.25, 0.35), (1, 0.85, 0.95)))) for _ in range(4)]
     bright = np.mean(color) > 0.45
@@ -70,7 +70,7 @@ def printed(rng: np.random.Generator, height: int, width: int, color: Color) -> 
 
 
 def glaze(rng: np.random.Generator, height: int, width: int, color: Color) -> Image:
-    """Painted ceramics or fruit: a ground colour with soft clouds and small dark flecks (h,w,3).
+    """Draw painted ceramics or fruit: a ground colour with soft clouds and small dark flecks (h,w,3).
 
     Its right half mirrors the left, so that it closes around a round thing.
     """
@@ -84,7 +84,7 @@ def glaze(rng: np.random.Generator, height: int, width: int, color: Color) -> Im
 def _smooth_noise(
     rng: np.random.Generator, height: int, width: int, cell: tuple[float, float]
 ) -> Float[ndarray, "h w"]:
-    """Noise in about [-1, 1] whose blobs are `cell` (rows, columns) pixels large: a coarse grid, enlarged."""
+    """Draw noise in about [-1, 1] whose blobs are `cell` (rows, columns) pixels large: a coarse grid, enlarged."""
     grid = rng.uniform(-1, 1, (max(2, round(height / cell[0])), max(2, round(width / cell[1]))))
     return cv2.resize(grid.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
 

@@ -21,7 +21,7 @@ DEPTH_UNIT_M = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class TrueObject:
-    """One object of the scene as it is."""
+    """Object of a scene as it is."""
 
     name: str
     label: int
@@ -93,7 +93,7 @@ def write_pixels(
 
 
 def read_truth(folder: Path) -> Truth:
-    """The truth of a capture folder that `python -m simulation` made; FileNotFoundError where there is none."""
+    """Read the truth of a capture that `python -m simulation` made; raise FileNotFoundError where there is none."""
     content = json.loads((folder / "truth" / "scene.json").read_text())
     del content["format"], content["depth_unit_m"]
     for name in ("gripper_from_camera", "base_from_gripper", "base_from_camera", "workspace_in_base"):
@@ -108,12 +108,12 @@ def read_truth(folder: Path) -> Truth:
 
 
 def true_depth(truth: Truth, image: int) -> Float[ndarray, "h w"]:
-    """Depth (m) along the optical axis at the pixels of one image; 0 where there is nothing."""
+    """Read depth (m) along the optical axis at the pixels of one image; 0 where there is nothing."""
     return _pixels(truth, "depth", image) * DEPTH_UNIT_M
 
 
 def true_labels(truth: Truth, image: int) -> UInt8[ndarray, "h w"]:
-    """Labels of the pixels of one image."""
+    """Read the labels of the pixels of one image."""
     return _pixels(truth, "labels", image)
 
 
