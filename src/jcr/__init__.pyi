@@ -6,6 +6,9 @@ from .calibration.options import CalibrateOptions as CalibrateOptions
 from .calibration.record import Calibration as Calibration
 from .capture.options import ReadOptions as ReadOptions
 from .capture.read import read_capture as read_capture
+from .capture.ros_image import read_ros_camera_info as read_ros_camera_info
+from .capture.ros_image import read_ros_depth as read_ros_depth
+from .capture.ros_image import read_ros_image as read_ros_image
 from .cell.placement import CamerasFile as CamerasFile
 from .depth.options import DepthOptions as DepthOptions
 from .errors import InputError as InputError
@@ -23,9 +26,6 @@ from .live.cameras import Frame as Frame
 from .live.progress import Accuracy as Accuracy
 from .live.progress import Progress as Progress
 from .live.robot import RobotState as RobotState
-from .live.ros import read_ros_camera_info as read_ros_camera_info
-from .live.ros import read_ros_depth as read_ros_depth
-from .live.ros import read_ros_image as read_ros_image
 from .live.server import Listen as Listen
 from .live.server import LiveServer as LiveServer
 from .live.session import LiveSession as LiveSession

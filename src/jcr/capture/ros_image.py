@@ -1,4 +1,4 @@
-"""Conversion of sensor_msgs/Image and CompressedImage to images and depth."""
+"""Images, depth and intrinsics of ROS messages, from bags (rosbags) and nodes (rclpy); ROS itself is not imported."""
 
 from typing import Any
 
@@ -7,7 +7,9 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 from numpy import ndarray
 
+from jcr.capture.camera_info import intrinsics_of_ros
 from jcr.errors import InputError
+from jcr.records import Intrinsics
 
 _CHANNELS = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "8UC3": 3, "mono8": 1, "8UC1": 1}
 _TO_RGB = {
@@ -29,13 +31,35 @@ _TO_RGB = {
 }
 
 
+def read_ros_image(message: Any) -> UInt8[ndarray, "h w 3"]:
+    """Return the RGB image of a sensor_msgs/Image or CompressedImage; raise InputError for what is no colour image."""
+    pixels, _ = image_of(message, "image")
+    if isinstance(pixels, bytes):
+        decoded = cv2.imdecode(np.frombuffer(pixels, np.uint8), cv2.IMREAD_COLOR_RGB)
+        return np.asarray(decoded, np.uint8)
+    return pixels
+
+
+def read_ros_depth(message: Any) -> UInt16[ndarray, "h w"]:
+    """Return the depth (mm) of a sensor_msgs/Image or CompressedImage, 0 where there is none."""
+    return depth_of(message, "depth")
+
+
+def read_ros_camera_info(message: Any) -> Intrinsics | None:
+    """Return the intrinsics of a sensor_msgs/CameraInfo; None of a camera that was never calibrated."""
+    size = (message.width, message.height)
+    return intrinsics_of_ros(
+        list(message.k), message.distortion_model, list(message.d), size, size, "camera_info"
+    )
+
+
 def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"], str]:
     """Return the bytes of an encoded file, or RGB pixels, and the ending of the file.
 
     Raises InputError for encodings that are no image (depth) or that jcr does not know.
     """
     if hasattr(message, "format"):
-        data = message.data.tobytes()
+        data = bytes(message.data)
         for magic, ending in ((b"\xff\xd8\xff", ".jpg"), (b"\x89PNG\r\n", ".png")):
             if data.startswith(magic):
                 return data, ending
@@ -56,10 +80,10 @@ def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"],
 
 
 def depth_of(message: Any, where: str) -> UInt16[ndarray, "h w"]:
-    """Return depth in mm, 0 where there is none; InputError for a message that is no depth image."""
+    """Return depth in mm, 0 where there is none; raise InputError for a message that is no depth image."""
     if hasattr(message, "format"):
         # compressed_depth_image_transport writes its quantisation before the PNG.
-        data = message.data.tobytes()
+        data = bytes(message.data)
         begin = data.find(b"\x89PNG\r\n")
         depth = cv2.imdecode(np.frombuffer(data[max(begin, 0) :], np.uint8), cv2.IMREAD_UNCHANGED)
         if begin < 0 or depth is None or depth.dtype != np.uint16 or "32FC1" in message.format:
@@ -80,8 +104,9 @@ def depth_of(message: Any, where: str) -> UInt16[ndarray, "h w"]:
 
 
 def _rows(message: Any, used: int, what: str, where: str) -> UInt8[ndarray, "h used"]:
-    """Return the `used` bytes of each row, which may be padded to `step`; InputError where some are missing."""
-    if message.step < used or message.data.size < message.height * message.step:
+    """Return the `used` bytes of each row, which may be padded to `step`; raise InputError where some are missing."""
+    data = np.frombuffer(message.data, np.uint8)  # rclpy gives an array.array
+    if message.step < used or data.size < message.height * message.step:
         raise InputError(f"{where}: {what} is cut short; record again")
-    rows = message.data[: message.height * message.step].reshape(message.height, message.step)
+    rows = data[: message.height * message.step].reshape(message.height, message.step)
     return np.ascontiguousarray(rows[:, :used])

@@ -18,11 +18,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from jcr.errors import InputError
 from jcr.live.page import camera_image, image_card, page_parts, whole_page
@@ -72,6 +73,14 @@ class Listen:
             raise InputError(
                 f"{self.option} {self.host}:{self.port}: others can reach that address; set a token (JCR_TOKEN)"
             )
+
+
+class _Command(BaseModel):
+    """Command of the page."""
+
+    model_config = ConfigDict(strict=True)
+    action: Action
+    number: int | None = None
 
 
 class LiveServer:
@@ -282,14 +291,10 @@ class _Handler(BaseHTTPRequestHandler):
     def _command(self) -> tuple[Action, int | None] | None:
         """Return the command in the body; None where there is no valid one."""
         try:
-            found = json.loads(self._body(MAX_COMMAND) or b"")
-        except (ValueError, RecursionError):
+            command = _Command.model_validate_json(self._body(MAX_COMMAND) or b"")
+        except ValidationError:
             return None
-        if not isinstance(found, dict) or found.get("action") not in get_args(Action):
-            return None
-        number = found.get("number")
-        is_number = number is None or (isinstance(number, int) and not isinstance(number, bool))
-        return (found["action"], number) if is_number else None
+        return command.action, command.number
 
     def _send_state(self, version: str) -> None:
         """Send the state; only its version where the page has it."""
