@@ -127,6 +127,15 @@ class RunFolder:
         except OSError as error:  # a path that no file system takes
             raise InputError(f"{self.path / STATE}: capture: {error.strerror}; run `jcr run` again") from None
 
+    def capture_of(self, calibration: Calibration) -> Capture:
+        """Return the capture that a calibration was made from; InputError where it has other images now."""
+        capture = self.capture()
+        if [image.image for image in calibration.images] != list(capture.images):
+            raise InputError(
+                f"{capture.folder}: has changed since {self.path} was made; run `jcr calibrate` again"
+            )
+        return capture
+
     def options(self) -> MadeWith:
         """What the calibration was made with; raises as `state` does."""
         return self.state().options

@@ -230,7 +230,8 @@ class Run:
                 f"{self.folder.path}: a fixed camera watched the gripper: its images show no scene in the base frame"
             )
         base_from_recon = self.calibration.base_from_recon.rigid
-        return posed_images(self.folder.capture(), self.folder.reconstruction(), base_from_recon, scale)
+        capture = self.folder.capture_of(self.calibration)
+        return posed_images(capture, self.folder.reconstruction(), base_from_recon, scale)
 
 
 def _written(name: str, *contents: str) -> Callable[[Run, Path], None]:

@@ -59,7 +59,7 @@ def touch(out: str | Path, points: str | Path) -> Touched:
     """
     folder, points = RunFolder(Path(out)), Path(points)
     calibration, reconstruction = folder.calibrated()
-    capture = folder.capture()
+    capture = folder.capture_of(calibration)
     rows = _rows(points)
     x, base_from_recon = calibration.gripper_from_camera, calibration.base_from_recon
     scale = base_from_recon.scale

@@ -171,11 +171,7 @@ def _calibrated_on(folder: RunFolder, calibration: Calibration, new: Capture) ->
         raise InputError(
             f"{folder.path}: its calibration is rejected and cannot be tested; calibrate again (jcr run)"
         )
-    capture = folder.capture()
-    if [image.image for image in calibration.images] != list(capture.images):
-        raise InputError(
-            f"{capture.folder}: has changed since {folder.path} was made; run `jcr calibrate` again"
-        )
+    capture = folder.capture_of(calibration)
     _require_size(new.folder, new.image_size, capture.image_size)
     return capture
 

@@ -58,7 +58,7 @@ class Viewer:
         report = progress or silent
         self.server, self._lock = server, threading.Lock()
         self.calibration, self.reconstruction = folder.calibrated()
-        self.capture, self.cloud, self.scene = folder.capture(), None, None
+        self.capture, self.cloud, self.scene = folder.capture_of(self.calibration), None, None
         if folder.has_map():
             self.cloud, self.scene = folder.cloud(), folder.scene()
         assert self.calibration.scale is not None  # wherever there is a transform

@@ -18,7 +18,7 @@ from jcr.capture.options import MAX_FRAMES, ReadOptions
 from jcr.capture.plain_files import contained, read_json, shown, validated
 from jcr.errors import InputError
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
-from jcr.files import write_bytes, write_new, write_text
+from jcr.files import write_new
 from jcr.records import Capture
 
 FILE, URDF = "capture.json", "robot.urdf"
@@ -180,11 +180,11 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
     if capture.urdf is not None:
         # Beside the images, whatever it was called: a capture is complete in its folder.
         if capture.urdf.resolve() != (folder / URDF).resolve():
-            write_bytes(folder / URDF, capture.urdf.read_bytes())
+            write_new(folder / URDF, capture.urdf.read_bytes())
         stated["urdf"] = URDF
     if cameras := cameras_as_json(capture):
         stated["cameras"] = cameras
-    write_text(folder / FILE, CaptureFile(**stated, **remarks).as_text())
+    write_new(folder / FILE, CaptureFile(**stated, **remarks).as_text().encode())
 
 
 def origin(folder: Path) -> Path:

@@ -1,0 +1,127 @@
+"""A second run of unchanged input makes nothing, whatever its format; changed input is read and run again."""
+
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import capture_writers as writers
+import jcr
+from conftest import shrunk_capture
+from jcr.capture.images import read_image
+from jcr.cli import dispatch
+from jcr.pipeline import selection
+from jcr.reconstruct import ReconstructOptions
+from jcr.records import Capture, Reconstruction, Tracks
+from simulation.problems import INTRINSICS, hand_eye_problem
+from simulation.ros_bag import write_bag
+
+pytestmark = pytest.mark.slow
+
+COUNT, SECONDS = 8, 2.0
+PROBLEM = hand_eye_problem(np.random.default_rng(0), COUNT, robot_noise=(2e-4, 5e-4))
+
+
+@pytest.fixture(scope="module")
+def capture(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    """Eight small images, with gripper poses of a problem whose camera poses are known."""
+    folder = shrunk_capture(tabletop, tmp_path_factory.mktemp("small") / "capture", COUNT, 160)
+    file = folder / "capture.json"
+    content = json.loads(file.read_text())
+    for frame, pose in zip(content["frames"], PROBLEM.base_from_gripper, strict=True):
+        frame["base_from_gripper"] = pose.tolist()
+    file.write_text(json.dumps(content))
+    return jcr.read_capture(folder)
+
+
+@pytest.fixture(autouse=True)
+def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The back end of each reconstruction that is made; it gives the camera poses of the problem."""
+    made = []
+
+    def reconstruct(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
+        made.append(options.backend)
+        tracks = Tracks(
+            image=np.zeros(0, int),
+            x_px=np.zeros((0, 2)),
+            point=np.zeros(0, int),
+            points_in_recon=np.zeros((0, 3)),
+        )
+        return Reconstruction(
+            image_index=np.arange(len(capture)),
+            recon_from_camera=PROBLEM.recon_from_camera[: len(capture)],
+            intrinsics=INTRINSICS,
+            tracks=tracks,
+            backend=options.backend,
+        )
+
+    monkeypatch.setattr(selection, "reconstruct", reconstruct)
+    monkeypatch.setattr(selection, "view_findings", lambda _: ())
+    return made
+
+
+def lerobot(folder: Path, capture: Capture) -> Path:
+    images = [read_image(capture.folder / name) for name in capture.images]
+    states = writers.rows_as("rpy", capture.base_from_gripper)
+    names = ["x", "y", "z", "roll", "pitch", "yaw"]
+    key = "observation.state"
+    return writers.write_lerobot(folder / "set", [(images, states)], "v3.0", key, names, codec=None)
+
+
+FORMATS: dict[str, Callable[[Path, Capture], Path]] = {
+    "capture.json": lambda folder, capture: capture.folder,
+    **writers.CORPUS,
+    "COLMAP model": lambda folder, capture: writers.write_colmap(folder, capture, PROBLEM.recon_from_camera),
+    "bag": lambda folder, capture: write_bag(
+        folder / "scan", capture, "mcap", seconds=8.0, fps=10.0, tf_hz=50.0
+    ),
+    "LeRobot": lerobot,
+}
+OPTIONS = {"bag": ["--base-frame", "base_link", "--gripper-frame", "tool0", "--frames", str(COUNT)]}
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_the_second_run_makes_nothing(
+    format: str, capture: Capture, tmp_path: Path, made: list[str], capsys: pytest.CaptureFixture[str]
+):
+    path = FORMATS[format](tmp_path / "input", capture)
+    path = path.parent if path.is_file() else path
+    out = tmp_path / "out"
+    command = ["run", str(path), str(out), "--no-map", "--backend", "colmap", *OPTIONS.get(format, [])]
+    first = dispatch(command)
+    said = capsys.readouterr()
+    assert first in (0, 3), said.err
+    stamps = {file: file.stat().st_mtime_ns for file in out.rglob("*") if file.name != ".lock"}
+    start = time.perf_counter()
+    assert dispatch(command) == first
+    seconds, again = time.perf_counter() - start, capsys.readouterr()
+    assert made == ["colmap"] and "unchanged: " in again.err
+    assert again.out.splitlines()[1:] == said.out.splitlines()[1:]
+    now = {file: file.stat().st_mtime_ns for file in out.rglob("*") if file.name != ".lock"}
+    assert {file for file in now if not file.is_dir()} == {file for file in stamps if not file.is_dir()}
+    assert all(now[file] == stamps[file] for file in stamps if not file.is_dir())
+    assert seconds < SECONDS
+
+
+@pytest.mark.parametrize("format", ["poses.csv", "bag", "LeRobot"])
+def test_edited_input_is_read_and_run_again(
+    format: str, capture: Capture, tmp_path: Path, made: list[str], capsys: pytest.CaptureFixture[str]
+):
+    path, out = tmp_path / "input", tmp_path / "out"
+    moved = capture.base_from_gripper.copy()
+    moved[:, 0, 3] += 0.1
+    command = ["run", "", str(out), "--no-map", "--backend", "colmap", *OPTIONS.get(format, [])]
+    for poses in (capture.base_from_gripper, moved):
+        written = FORMATS[format](path, replace(capture, base_from_gripper=poses))
+        command[1] = str(written.parent if written.is_file() else written)
+        dispatch(command)
+        os.rename(path, tmp_path / f"{len(made)}")
+        assert "unchanged" not in capsys.readouterr().err
+    assert made == ["colmap", "colmap"]
+    found = jcr.read_capture(out / "capture").base_from_gripper
+    assert found[:, 0, 3].mean() == pytest.approx(moved[:, 0, 3].mean(), abs=0.02)
