@@ -23,7 +23,7 @@ from jcr.calibration.record import Calibration, calibration_of, failed_calibrati
 from jcr.calibration.stage import calibrate
 from jcr.calibration.words import log
 from jcr.capture.conventions import numbers_from_poses, poses_from_numbers
-from jcr.capture.formats.capture_json import kept
+from jcr.capture.formats.capture_json import kept, origin
 from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
 from jcr.cell.placement import ArmPlacement, CameraPlacement, CellPlacement, ImageUse, TransformUncertainty
@@ -470,7 +470,10 @@ def test_poses_to_add_are_in_the_notation_of_the_robot(
 
 def test_a_capture_that_was_copied_keeps_its_name_and_path(tmp_path: Path, tabletop: Path, run: RunResult):
     scan = shrunk_capture(tabletop, tmp_path / "bin_picking", 3, 160)
-    frames = json.loads((scan / "capture.json").read_text())["frames"]
+    content = json.loads((scan / "capture.json").read_text())
+    (scan / "capture.json").write_text(json.dumps(content | {"source": "a key of the user's own"}))
+    assert origin(scan) == scan.resolve()
+    frames = content["frames"]
     (scan / "capture.json").unlink()
     rows = numbers_from_poses(np.array([frame["base_from_gripper"] for frame in frames]), "ur")
     lines = [f"{frame['image']},{','.join(map(str, row))}" for frame, row in zip(frames, rows, strict=True)]

@@ -192,7 +192,7 @@ def origin(folder: Path) -> Path:
     content = read_json(folder / FILE) if (folder / FILE).is_file() else {}
     content = content if isinstance(content, dict) else {}
     made_from = content.get("made_from")
-    source = made_from[0] if isinstance(made_from, list) and made_from else content.get("source")
+    source = made_from[0] if isinstance(made_from, list) and made_from else None
     return Path(source) if isinstance(source, str) and source else folder.resolve()
 
 
@@ -206,7 +206,7 @@ def kept(capture: Capture, folder: Path) -> Capture:
     others = (name for camera in capture.others for name in camera.images)
     for name in filter(None, (*capture.images, *(capture.depths or ()), *others)):
         write_new(folder / name, (capture.folder / name).read_bytes())
-    write(folder, capture, source=str(capture.source))
+    write(folder, capture, made_from=[str(capture.source)])
     return replace(read(folder), cameras=capture.cameras, notes=capture.notes)
 
 
