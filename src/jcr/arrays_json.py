@@ -35,7 +35,7 @@ def _rigid(rows: list[list[float]]) -> Float[ndarray, "4 4"]:
 
 
 LEAST_EIGENVALUE = 1e-14
-"""Of errors in units of their standard deviations: below it they are not independent, but for digits that were lost."""
+"""Least eigenvalue of a correlation matrix: below it the errors depend on each other, or digits were lost."""
 LOST_DIGITS = 1e-3
 """By which an eigenvalue of a part may be below 0: of motions that show little, the last digits are not exact."""
 

@@ -39,7 +39,7 @@ _WIDEST_PINHOLE = 1.7
 
 
 def parameter_names(camera: Intrinsics) -> tuple[str, ...]:
-    """Of `parameters`, in their order."""
+    """Return the names of `parameters`, in their order."""
     return ("fx", "fy", "cx", "cy", *COEFFICIENTS[camera.model])
 
 
@@ -121,7 +121,7 @@ def by_parameters(
 
 
 def _distorted(camera: Intrinsics, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
-    """Where rays (x, y, 1) go before focal lengths and principal point."""
+    """Return the distorted coordinates of rays (x, y, 1), before focal lengths and principal point."""
     r2 = x * x + y * y
     radial, _ = _radial(camera, r2)
     if camera.model == "fisheye":
@@ -218,7 +218,7 @@ def _fisheye_rays(camera: Intrinsics, target: Float[ndarray, "*batch 2"]) -> Flo
 
 @lru_cache(maxsize=64)  # every stage asks for the same camera
 def fold_distance_px(camera: Intrinsics) -> float | None:
-    """How far from the principal point the distortion folds over inside the frame; None when it never does.
+    """Return the distance (px) from the principal point at which the distortion folds over; None if it never does.
 
     Rays are followed outwards until they leave the frame. Where the Jacobian's determinant reaches zero
     before, two rays share one pixel and the pixels beyond have no ray at all.
@@ -260,7 +260,7 @@ def usable_intrinsics(camera: Intrinsics | None) -> tuple[Intrinsics | None, tup
 
 
 def resized(camera: Intrinsics, width: int, height: int) -> Intrinsics:
-    """The same camera with its image resized to `width` x `height` pixels."""
+    """Return the camera with its image resized to `width` x `height` pixels."""
     sx, sy = width / camera.width, height / camera.height
     return replace(
         camera,
@@ -274,12 +274,12 @@ def resized(camera: Intrinsics, width: int, height: int) -> Intrinsics:
 
 
 def cropped(camera: Intrinsics, left: int, top: int, width: int, height: int) -> Intrinsics:
-    """The same camera with `width` x `height` pixels cut out of its image, from column `left` and row `top` on."""
+    """Return the camera with `width` x `height` pixels cut out of its image, from column `left` and row `top` on."""
     return replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=width, height=height)
 
 
 def zoomed(camera: Intrinsics, factor: float) -> Intrinsics:
-    """The same camera with both focal lengths multiplied."""
+    """Return the camera with both focal lengths multiplied."""
     return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
 
 

@@ -27,12 +27,12 @@ class chi2:  # noqa: N801
 
     @staticmethod
     def ppf(share: Number, freedom: Number) -> Any:
-        """What is exceeded with a probability of 1 - share."""
+        """Return the value that is exceeded with a probability of 1 - share."""
         return 2 * gammaincinv(np.asarray(freedom) / 2, share)
 
     @staticmethod
     def isf(share: Number, freedom: Number) -> Any:
-        """What is exceeded with a probability of share."""
+        """Return the value that is exceeded with a probability of share."""
         return chdtri(freedom, share)
 
 

@@ -34,7 +34,7 @@ class RejectedError(RuntimeError):
         self.despite_texture = despite_texture
 
     def with_more(self, *also: str) -> "RejectedError":
-        """The same with more to say."""
+        """Return the error with further sentences."""
         return RejectedError(
             self.what, *self.remedies, also=(*self.also, *also), despite_texture=self.despite_texture
         )

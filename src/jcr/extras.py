@@ -7,7 +7,7 @@ from types import ModuleType
 from jcr.errors import InputError
 
 DISTRIBUTION = "jcr-handeye"
-"""What pip calls it; the package that is imported, and the command, are `jcr`."""
+"""Name of the distribution for pip; the package that is imported, and the command, are `jcr`."""
 
 
 def extra(module: str, name: str, what: str, otherwise: str = "") -> ModuleType:

@@ -26,7 +26,7 @@ def written_whole(path: Path) -> Iterator[Path]:
 
 
 def read_bytes(path: Path) -> bytes:
-    """What a file holds; raises as `require_file`, and OSError where there is nothing that can be read."""
+    """Read a file; raise as `require_file`, and OSError where nothing can be read."""
     require_file(path)
     return path.read_bytes()
 

@@ -65,7 +65,7 @@ def skew(v: Vectors) -> Rotations:
 
 
 def by_similarity(v: Vectors) -> Float[ndarray, "*batch 3 7"]:
-    """How points v from an origin move with a step (v, w) of it and the logarithm of a scale about it."""
+    """Return the derivatives of points v from an origin by a step (v, w) of it and the logarithm of a scale about it."""
     identity = np.broadcast_to(np.eye(3), (*v.shape, 3))
     return np.concatenate([identity, -skew(v), v[..., None]], axis=-1)
 
@@ -222,7 +222,7 @@ def nearest_to_lines(
 
 
 def motion_length(motion: Transforms) -> Float[ndarray, "*batch"] | np.floating:
-    """How far motions (...,4,4) go (m): the way of the origin, and the angle at ARM."""
+    """Return the length of motions (...,4,4) (m): the way of the origin, and the angle times ARM."""
     return np.linalg.norm(motion[..., :3, 3], axis=-1) + ARM * rotation_angle(motion[..., :3, :3])
 
 

@@ -43,7 +43,7 @@ class IntrinsicsJson(Part):
 
 
 class IntrinsicsAndStd(IntrinsicsJson):
-    """With what is known of their errors."""
+    """Intrinsics with their standard deviations."""
 
     std: Spreads | None = None
     """Standard deviations of fx, fy, cx, cy and the distortion; null where the intrinsics were not refined."""
@@ -61,7 +61,7 @@ class IntrinsicsAndStd(IntrinsicsJson):
     def of(
         cls, intrinsics: Intrinsics | None, std: Float[ndarray, " q"] | None = None
     ) -> "IntrinsicsAndStd | None":
-        """Those of a record, None where there are none."""
+        """Return the intrinsics of a record; None where there are none."""
         if intrinsics is None:
             return None
         return cls.model_validate(vars(intrinsics) | {"std": std})

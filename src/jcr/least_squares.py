@@ -18,7 +18,7 @@ machine has other work: of 15 images with the other core taken, `solve_hand_eye`
 
 Unknowns = TypeVar("Unknowns")
 Loss = Literal["linear", "soft_l1", "cauchy"]
-"""Of the squared length s of a residual: s, 2(√(1 + s) − 1) or log(1 + s), as scipy.optimize.least_squares has them."""
+"""Loss of a squared length s: s, 2(√(1 + s) − 1) or log(1 + s), as in scipy.optimize.least_squares."""
 START_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e12
 TINY = 1e-300
 """Cost of exact data, below which nothing can be gained."""

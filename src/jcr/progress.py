@@ -1,4 +1,4 @@
-"""What a user sees while something runs: one bar a stage on stderr, with the time left."""
+"""Progress on stderr: one bar a stage, with the time left."""
 
 import sys
 from collections.abc import Callable, Iterator, Sequence

@@ -25,7 +25,7 @@ OF_POINTMAPS = ("points_in_recon", "confidence", "colors", "reason", "depth_std"
 
 
 class BoardsJson(BaseModel):
-    """What is no array of records.Boards."""
+    """Fields of records.Boards that are no arrays."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
     spec: str
@@ -38,7 +38,7 @@ class BoardsJson(BaseModel):
 
 
 class About(BaseModel):
-    """What is no array."""
+    """Fields of a reconstruction that are no arrays."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
     format: str

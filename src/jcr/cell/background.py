@@ -17,14 +17,14 @@ from jcr.capture.images import encode_png, read_image
 from jcr.files import write_bytes
 
 LEVELS = 14.0
-"""Of 255, by which colours differ that are not the same; noise and JPEG are less, after averaging."""
+"""Least difference (of 255) of two colours that are not the same; noise and JPEG are less, after averaging."""
 REDUCED = 320
 """px across, at which images are compared."""
 LEAST_SHARE, LEAST = 0.3, 3
-"""Of the images, and how many at least, that must agree on a pixel for it to be background."""
+"""Share and number of the images that must agree on a pixel of the background."""
 GREY = 128
 GROWN, SOFT = 0.012, 0.008
-"""Of the width: by how much what moves is grown, and sigma of the fading around it."""
+"""Growth of the moving part, and sigma of the fading around it, as shares of the width."""
 
 
 def moving_parts(images: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndarray, "h w 3"]]:

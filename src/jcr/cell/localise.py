@@ -20,9 +20,9 @@ from jcr.records import Intrinsics
 from jcr.sfm.register import GATE_PX, MIN_POINTS, Features, features, triangulated
 
 FOCAL_OF_WIDTH = 0.9
-"""Of a camera without known intrinsics: where the search for its focal length starts."""
+"""Initial focal length of a camera without known intrinsics, as a share of the width."""
 LEAST_SPREAD = 0.05
-"""Of the image's area that the points must span; crowded ones determine the place badly."""
+"""Least share of the image's area that the points span; crowded points determine the pose badly."""
 CLEARLY_MORE = 1.1
 """Times the points that agree with given intrinsics: more are no chance of RANSAC."""
 

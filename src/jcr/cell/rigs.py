@@ -25,7 +25,7 @@ from jcr.records import Capture, CellCamera, HandEye
 SAME_PLACE = (0.02, np.radians(2.0))
 """m, rad: images of one fixed camera, or places of a camera on its gripper, differ by no more."""
 SAME_PLACE_OF_UNKNOWN = (0.2, np.radians(6.0))
-"""Of the distance of the scene, rad: the same where a focal length estimated from one image is in it."""
+"""Share of the distance of the scene, rad: this limit for a focal length that one image determines."""
 AT_A_FRAME = (0.01, np.radians(1.0))
 """m, rad: nearer than this to where the wrist camera was, a fixed camera is likely to be that camera."""
 LEAST_POSES = 3
@@ -40,7 +40,7 @@ class Member:
     rig: Int[ndarray, " k"]
     """The rig of each image; -1 where it is not used."""
     rig_from_camera: Float[ndarray, "4 4"] | None
-    """Where it is not the rig's first camera."""
+    """Pose in the rig; None for its first camera."""
     arm: int | None
     """Place of its arm among the ties; None: fixed."""
     findings: tuple[Finding, ...] = ()

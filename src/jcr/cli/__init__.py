@@ -83,7 +83,7 @@ _DISK = {
     errno.ELOOP: "a link leads back to itself; put a file or a folder there",
     errno.ENAMETOOLONG: "choose a shorter name",
 }
-"""What the machine, not the program, has wrong, and the remedy."""
+"""Remedies of faults of the machine, by the number of the error."""
 
 
 LONGEST_LINE = 2000

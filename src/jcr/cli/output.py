@@ -1,4 +1,4 @@
-"""What every command prints and where: its result on stdout, all else on stderr."""
+"""Output of every command: its result on stdout, all else on stderr."""
 
 import io
 import json
@@ -10,7 +10,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Output:
-    """What the command prints: its result on stdout, everything else on stderr."""
+    """Options of the output."""
 
     json: bool = False
     """Print the result as one JSON object."""

@@ -38,7 +38,7 @@ class Arguments:
     """File to write, .csv or .npy (a structured array); by default points.answers.csv beside the points, or none with
     --json, which prints the answers."""
     unknown: Literal["occupied", "free", "report"] = "report"
-    """How unseen space counts: as solid, as empty, or with occupancy 0.5."""
+    """State of unseen space: solid, empty, or occupancy 0.5."""
     output: Output = field(default_factory=Output)
 
 
@@ -68,7 +68,7 @@ def main(arguments: Arguments) -> int:
 
 
 def labelled(label: Int[ndarray, " n"], names: tuple[str, ...]) -> str:
-    """How many points lie on what; nothing where the map has no labels but that of none."""
+    """Return the number of points on each label as text; empty where the map has no labels."""
     count = np.bincount(label, minlength=len(names))
     parts = [f"{names[k]} {count[k]}" for k in range(1, len(names)) if count[k]]
     return f"; by label: {', '.join(parts)}" if parts else ""

@@ -1,4 +1,4 @@
-"""How commands come by their capture: read for a run's folder, or only to be looked at."""
+"""Reading of the capture of a command, into the folder of a run or for a look."""
 
 import sys
 import tempfile
@@ -24,7 +24,7 @@ def _announce(path: Path) -> None:
 
 
 def source(path: Path, options: ReadOptions, out: Path, progress: "Progress") -> "Capture | PosePairs":
-    """What lies at a path, a recording's frames put in the run folder `out`."""
+    """Read the capture at a path; the frames of a recording are put in the run folder `out`."""
     _announce(path)
     from jcr.capture.read import read_source
     from jcr.run_folder import CAPTURE, locked
