@@ -1,11 +1,9 @@
 """Camera poses whose errors add up along the sequence: found, weighed, and not found where errors are independent."""
 
 import numpy as np
-import pytest
 
-from jcr.estimation.camera_drift import random_walks
 from jcr.estimation.hand_eye import solve_hand_eye
-from jcr.geometry import retract, rotation_exp, step_between, transform
+from jcr.geometry import rotation_exp, transform
 from simulation.problems import HandEyeProblem, error, hand_eye_problem
 
 GROWTH = (3e-3, 3e-3)
@@ -47,20 +45,3 @@ def test_independent_errors_do_not_grow():
         poses = problem.base_from_gripper, problem.recon_from_camera
         plain, either = (solve_hand_eye(*poses, in_sequence=flag) for flag in (False, True))
         assert np.array_equal(plain.covariance, either.covariance)
-
-
-def test_random_walks_are_the_covariances_of_drawn_sequences():
-    problem, _ = drifting(0, 6)
-    true, scale = problem.recon_from_camera, problem.scale
-    rng, steps = np.random.default_rng(1), []
-    for _ in range(4000):
-        camera, growth = [true[0]], 1e-4 * rng.normal(size=(6, 6))
-        growth[:, :3] /= scale
-        for k in range(1, 6):
-            motion = np.linalg.inv(true[k - 1]) @ true[k]
-            camera.append(camera[-1] @ motion @ retract(np.eye(4), growth[k]))
-        steps.append(step_between(true, np.stack(camera)).ravel() / 1e-4)
-    by_position, by_rotation, _ = random_walks(true, scale)
-    size = np.sqrt(np.diag(by_position + by_rotation)) + 1e-9
-    difference = (np.cov(np.array(steps).T) - by_position - by_rotation) / np.outer(size, size)
-    assert np.abs(difference).max() == pytest.approx(0.0, abs=0.1)

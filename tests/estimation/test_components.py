@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
 import jcr
-from jcr.estimation.components import most_likely, over_sizes
+from jcr.estimation.components import most_likely
 from jcr.estimation.covariance import expected_posterior, posterior
 from jcr.estimation.equation import residuals
 from jcr.estimation.mixed_model import Equations
@@ -62,32 +61,6 @@ def test_the_sizes_are_found_from_many_poses():
     middle = np.median(found, axis=0)
     np.testing.assert_allclose(middle[:2], WHITE, rtol=0.15)
     assert middle[2] == pytest.approx(np.radians(0.3), rel=0.4)
-
-
-def test_the_ellipsoid_of_99_percent_holds_99_percent_of_the_mixture():
-    model = equations(np.random.default_rng(4), 4, np.radians(0.1))
-    sizes, information = most_likely(model)
-    found = posterior(model, sizes, information, None)
-    rng = np.random.default_rng(5)
-    drawn = np.concatenate(
-        [
-            rng.multivariate_normal(step, covariance, round(40_000 * share))
-            for weight, _, solution in over_sizes(model, sizes, information)
-            for share, step, covariance in zip(weight, solution.step, solution.covariance, strict=True)
-        ]
-    )
-    off = drawn - found.step
-    squared = np.einsum("ki,ki->k", off, np.linalg.solve(found.covariance, off.T).T)
-    assert (squared < chi2.ppf(0.99, 7)).mean() == pytest.approx(0.99, abs=0.004)
-
-
-def test_the_budget_sums_to_the_covariance():
-    model = equations(np.random.default_rng(6), 8, np.radians(0.1))
-    sizes, information = most_likely(model)
-    found = posterior(model, sizes, information, None)
-    std = np.sqrt(np.diag(found.covariance)[:7])
-    parts = sum(part / np.outer(std, std) for part in vars(found.budget).values())
-    np.testing.assert_allclose(parts, found.covariance[:7, :7] / np.outer(std, std), atol=1e-9)
 
 
 def test_constant_errors_of_base_and_gripper_are_part_of_the_answer():

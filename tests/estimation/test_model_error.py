@@ -6,10 +6,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from jcr.camera import by_parameters, unproject
 from jcr.estimation.hand_eye import solve_hand_eye
-from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, camera_with_prior
-from jcr.estimation.model_error import TYPICAL, displacements, polynomials_of
+from jcr.estimation.intrinsics_prior import ESTIMATED, camera_with_prior
+from jcr.estimation.model_error import TYPICAL
 from jcr.estimation.solve import Solution
 from jcr.estimation.wrist import adjust_wrist
 from jcr.records import Intrinsics
@@ -33,19 +32,6 @@ def adjusted(warp_px: float) -> Solution:
         camera_with_prior(guess, ESTIMATED),
         tracks,
     )
-
-
-def test_displacements_are_beside_what_the_intrinsics_express():
-    rng = np.random.default_rng(0)
-    x_px, prior = rng.uniform([0, 0], [640, 480], (500, 2)), camera_with_prior(INTRINSICS, ESTIMATED)
-    by = displacements((prior,), [polynomials_of(prior)], x_px, np.zeros(500, int)).reshape(1000, -1)
-    of_intrinsics = (by_parameters(INTRINSICS, unproject(INTRINSICS, x_px)) @ prior.directions).reshape(
-        1000, -1
-    )
-    size = np.linalg.norm(by, axis=0).max() * np.linalg.norm(of_intrinsics, axis=0)
-    assert np.abs(by.T @ of_intrinsics / size).max() < 1e-9
-    exact = camera_with_prior(INTRINSICS, FIXED)
-    assert displacements((exact,), [polynomials_of(exact)], x_px, np.zeros(500, int)).shape == (500, 2, 0)
 
 
 @pytest.mark.slow

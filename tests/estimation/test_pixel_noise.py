@@ -62,15 +62,3 @@ def test_covariance_is_that_of_the_errors():
         squares.append(errors.ravel() ** 2 / np.diag(of_rotations))
     assert np.mean(squares) == pytest.approx(1.0, abs=0.4)
     assert adjusted(0, "size")[0].state.pixel_noise.sigma_px[0] == pytest.approx(np.sqrt(0.05 * 0.5), rel=0.2)
-
-
-def test_stated_sizes_follow_their_observations():
-    tracks = Tracks(
-        image=np.array([0, 1, 1]),
-        x_px=np.arange(6.0).reshape(3, 2),
-        point=np.array([0, 0, 1]),
-        points_in_recon=np.zeros((2, 3)),
-        std_px=np.arange(3.0),
-    )
-    kept = tracks.only(tracks.image == 1)
-    assert kept.std_px is not None and kept.std_px.tolist() == [1, 2] and kept.point.tolist() == [0, 1]

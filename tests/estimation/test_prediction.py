@@ -1,11 +1,8 @@
 """Predicted uncertainty of a calibration against its report, and the poses to add."""
 
-import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -39,20 +36,6 @@ def test_check_expects_of_the_bundled_capture_what_its_run_reports(tabletop: Pat
     assert abs(np.log(found.in_use.seen.rotation_95_deg / uncertainty.seen.rotation_95_deg)) < WITHIN
     assert (np.abs(np.log(found.std[:3] / (1e-3 * np.array(uncertainty.translation_std_mm)))) < WITHIN).all()
     assert (np.abs(np.log(np.degrees(found.std[3:6]) / uncertainty.rotation_std_deg)) < WITHIN).all()
-
-
-def views(tabletop: Path, folder: Path, rows: list[int], blurred: list[int]) -> Path:
-    """Some images of the bundled capture, some of them blurred."""
-    content = json.loads((tabletop / "capture.json").read_text())
-    content["frames"] = [content["frames"][row] for row in rows]
-    (folder / "images").mkdir(parents=True)
-    for row, frame in zip(rows, content["frames"], strict=True):
-        shutil.copy(tabletop / frame["image"], folder / frame["image"])
-        if row in blurred:
-            image = cv2.imread(str(folder / frame["image"]))
-            cv2.imwrite(str(folder / frame["image"]), cv2.GaussianBlur(image, (0, 0), 8))
-    (folder / "capture.json").write_text(json.dumps(content))
-    return folder
 
 
 def test_what_is_not_known_of_the_camera_is_in_the_expectation():

@@ -45,26 +45,6 @@ def test_camera_noise_is_beaten_by_the_images():
     assert np.nanmax(median_reprojection_px(evidence.problem, evidence.view)) < 0.6
 
 
-def test_a_focal_length_off_by_five_percent_is_found():
-    rng = np.random.default_rng(2)
-    problem = hand_eye_problem(rng, 10, robot_noise=(1e-4, np.radians(0.01)), camera_noise=(5e-3, 0.01))
-    tracks = observed(problem, rng, 600, 0.3)
-    guess = Intrinsics(INTRINSICS.fx * 1.05, INTRINSICS.fy * 1.05, 319.5, 239.5, 640, 480)
-    adjusted = solved(problem, tracks, camera_with_prior(guess, ESTIMATED))
-    assert adjusted.problem.intrinsics(adjusted.state)[0].fx == pytest.approx(INTRINSICS.fx, rel=2e-3)
-    assert np.linalg.norm(error(problem, adjusted.state.x[0], problem.scale)[:3]) < 1e-3
-
-
-def test_wrong_matches_do_not_pull():
-    rng = np.random.default_rng(3)
-    problem = hand_eye_problem(rng, 8, robot_noise=(1e-4, np.radians(0.01)))
-    tracks = observed(problem, rng, 300, 0.3)
-    wrong = rng.random(len(tracks.image)) < 0.1
-    tracks.x_px[wrong] += rng.normal(size=(wrong.sum(), 2)) * 40
-    adjusted = solved(problem, tracks)
-    assert np.linalg.norm(error(problem, adjusted.state.x[0], problem.scale)[:3]) < 1e-3
-
-
 @pytest.mark.parametrize("views", [2, 3, 8])
 def test_noise_of_the_images_is_found_from_short_tracks_too(views: int):
     # A point seen twice takes up three of its four errors.

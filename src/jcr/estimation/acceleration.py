@@ -1,9 +1,8 @@
-"""A fixed point in fewer rounds: Anderson's acceleration.
+"""Anderson's acceleration of a fixed-point iteration.
 
-Weights of observations and sizes of errors are estimated from where everything is, and everything moves to where they
-put it: each round leaves much of what the last one left, up to 0.8 of it. The rounds before show along what, and the
-next begins where a combination of them would stand still (Anderson, J. ACM 12, 1965; Walker and Ni, SIAM J. Numer.
-Anal. 49, 2011).
+Weights of observations and sizes of errors are estimated from a state, and the state follows from them: each round
+leaves up to 0.8 of the distance of the last one. The next round begins at the combination of the last rounds whose
+step would be smallest (Anderson, J. ACM 12, 1965; Walker and Ni, SIAM J. Numer. Anal. 49, 2011).
 """
 
 import numpy as np
@@ -11,11 +10,11 @@ from jaxtyping import Float
 from numpy import ndarray
 
 ROUNDS_BEFORE = 3
-"""That the next one makes use of."""
+"""Number of earlier rounds that the next one uses."""
 PARALLEL = 1e-2
 """Rounds whose steps differ by less than this share of what others differ by add nothing."""
 FARTHEST = 5.0
-"""Times a round's own step that the combination may go beyond it."""
+"""Largest distance of the combination from the end of a round, in lengths of the round's own step."""
 
 
 class Acceleration:
@@ -28,9 +27,9 @@ class Acceleration:
     def next(
         self, begin: Float[ndarray, " n"], end: Float[ndarray, " n"], weight: Float[ndarray, " n"]
     ) -> Float[ndarray, " n"]:
-        """Where the next round begins, from where this one began and ended.
+        """Return the begin of the next round, from the begin and the end of this one.
 
-        `weight` makes unknowns comparable, as one over their standard deviations does; those of no weight follow.
+        `weight` is one over the standard deviation of each unknown; unknowns of weight 0 follow the others.
         """
         self._ends = [*self._ends[-ROUNDS_BEFORE:], end]
         self._steps = [*self._steps[-ROUNDS_BEFORE:], end - begin]
@@ -47,5 +46,5 @@ class Acceleration:
         return end - beyond * (most / far if far > most else 1.0)
 
     def forget(self) -> None:
-        """Begin again, for what the rounds before showed is no longer so."""
+        """Drop the earlier rounds, which no longer show how the iteration proceeds."""
         self._ends, self._steps = [], []

@@ -23,13 +23,13 @@ def _shifted(x: float, y: float, z: float) -> Transform:
 
 
 def _dh(a: Numbers, d: Numbers, alpha_deg: Numbers) -> list[tuple[float, float, float, float]]:
-    """Rows of `from_dh`, without offsets of the joints' zeros."""
+    """Return rows of `from_dh`, without offsets of the joints' zeros."""
     columns = zip(a, d, np.radians(alpha_deg), strict=True)
     return [(float(a), float(d), float(alpha), 0.0) for a, d, alpha in columns]
 
 
 def _ur(name: str, d1: float, a2: float, a3: float, d4: float, d5: float, d6: float) -> Arm:
-    """Universal Robots e-Series, standard parameters.
+    """Return an arm of the Universal Robots e-Series, by standard parameters.
 
     Source: Universal Robots, "DH Parameters for calculations of kinematics and dynamics"; the same numbers are in
     ur_description/config/*/default_kinematics.yaml of ros-industrial/universal_robot. The base is that of the
@@ -42,10 +42,10 @@ def _ur(name: str, d1: float, a2: float, a3: float, d4: float, d5: float, d6: fl
 
 
 def _franka(name: str, limits: Limits) -> Arm:
-    """Franka Emika Panda (FER) and Research 3, modified parameters; the gripper is the flange.
+    """Return a Franka Emika Panda (FER) or Research 3, by modified parameters; the gripper is the flange.
 
-    Source: Franka Control Interface documentation, "Robot and interface specifications"; robots/fer/kinematics.yaml and
-    robots/fr3/joint_limits.yaml of frankaemika/franka_description.
+    Source: Franka Control Interface documentation, "Robot and interface specifications"; robots/fer/kinematics.yaml
+    and robots/fr3/joint_limits.yaml of frankaemika/franka_description.
     """
     a, d = (0, 0, 0, 0.0825, -0.0825, 0, 0.088), (0.333, 0, 0.316, 0, 0.384, 0, 0)
     rows = _dh(a, d, (0, -90, 90, 90, -90, 90, 90))
@@ -55,7 +55,7 @@ def _franka(name: str, limits: Limits) -> Arm:
 
 
 def _iiwa(name: str, base: float, upper: float, forearm: float) -> Arm:
-    """KUKA LBR iiwa 7 R800 and 14 R820, standard parameters; the gripper is the media flange "basic".
+    """Return a KUKA LBR iiwa 7 R800 or 14 R820, by standard parameters; the gripper is the media flange "basic".
 
     Source: KUKA, "LBR iiwa: Specification" (lengths and limits); iiwa_description/urdf/iiwa7.xacro and iiwa14.xacro of
     IFL-CAMP/iiwa_stack (signs and the 126 mm from wrist to flange).
@@ -83,7 +83,7 @@ XARM7 = """
 
 
 def _xarm(name: str, origins: str, limits: Limits, rest: Sequence[float]) -> Arm:
-    """UFACTORY xArm; the gripper is link_eef, the flange.
+    """Return a UFACTORY xArm; the gripper is link_eef, the flange.
 
     Source: xarm_description/config/kinematics/default/*.yaml and urdf/*/*.urdf.xacro of xArm-Developer/xarm_ros.
     """
@@ -100,7 +100,7 @@ Z1 = """
 
 
 def _z1() -> Arm:
-    """Unitree Z1; the gripper is where its own is mounted (gripperStator), x forward.
+    """Return a Unitree Z1; the gripper is where its own is mounted (gripperStator), x forward.
 
     Source: robots/z1_description/xacro of unitreerobotics/unitree_ros, link dimensions of its z1.urdf.
     """
@@ -119,7 +119,7 @@ SO101 = """
 
 
 def _so101() -> Arm:
-    """SO-101 follower, five joints without the jaw; the gripper is gripper_frame_link, at the jaw's tip.
+    """Return an SO-101 follower, five joints without the jaw; the gripper is gripper_frame_link, at the jaw's tip.
 
     Source: Simulation/SO101/so101_new_calib.urdf of TheRobotStudio/SO-ARM100 (zero in the middle of each range).
     """
@@ -131,8 +131,10 @@ def _so101() -> Arm:
 def _from_origins(
     name: str, origins: str, last_from_gripper: Transform, limits: Limits, rest: Sequence[float]
 ) -> Arm:
-    """An arm whose joints rotate about z, from the `origin` of each joint of its URDF: x, y, z (m), roll, pitch, yaw
-    (degrees)."""
+    """Return an arm whose joints rotate about z, from the `origin` of each joint of its URDF.
+
+    Each row is x, y, z (m), roll, pitch, yaw (degrees).
+    """
     rows = np.array(origins.split(), float).reshape(-1, 6)
     rotation = Rotation.from_euler("xyz", rows[:, 3:], degrees=True).as_matrix()
     return Arm(
@@ -172,11 +174,11 @@ _ARMS: dict[RobotName, Callable[[], Arm]] = {
 }
 ROBOT_NAMES: tuple[RobotName, ...] = get_args(RobotName)
 CHOICES = f"{{{','.join(ROBOT_NAMES)}}}"
-"""Of an option that may be left out, as help shows it: the parser would list them in any order, and None."""
+"""Type of an option that names an arm, as the help shows it."""
 
 
 def arm_named(name: str) -> Arm:
-    """The arm of that name; InputError listing the names there are."""
+    """Return the arm of a name; raise InputError with the known names where it is unknown."""
     for known, make in _ARMS.items():
         if known == name:
             return make()

@@ -24,17 +24,17 @@ from jcr.geometry import apply, fit_similarity, skew
 from jcr.records import Boards
 
 CORNER_STD_M = np.array([5e-5, 5e-5, 1e-4])
-"""Of a corner by itself, along the axes of its body."""
+"""Standard deviation of a single corner along each axis of its body."""
 STRETCH_STD = 1e-3
 """Relative: by how much more a printer stretches one side than the other."""
 BEND_STD_M = {2: 3e-4, 3: 1e-4}
 """Rms height of each polynomial of this degree over the corners."""
 SIZE_STD = 10.0
-"""Of the logarithm of the size in the world: nothing is known of it, for nothing is known of the world's own."""
+"""Standard deviation of the logarithm of the size in units of the world, whose own unit is unknown."""
 FEWEST_TO_BEND = 9
 """Corners of a body with fewer show no bend beside its tilt."""
 FEWEST_CORNERS = 4
-"""Of a body whose pose its corners determine."""
+"""Smallest number of corners that determine the pose of a body."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,22 +46,22 @@ class BoardShapes:
     body: Int[ndarray, " c"]
     """Row of the bodies."""
     first_rig: int
-    """The rig that the first body is."""
+    """Rig of the first body."""
     x_in_body: Float[ndarray, "c 3"]
-    """In the unit of the world where the adjustment starts."""
+    """Coordinates in the unit of the world where the adjustment starts."""
     by_shape: Float[ndarray, "c 3 s"]
     """Displacement by each column of what is free of the shape; 0 for the first, the logarithm of the size."""
     shape_std: Float[ndarray, " s"]
     unit: float
-    """Of the world, where the adjustment starts, that a unit of the stated size is."""
+    """Length, in units of the world where the adjustment starts, of a unit of the stated size."""
 
     @property
     def rig(self) -> Int[ndarray, " c"]:
-        """Of each corner's body."""
+        """Rig of each corner's body."""
         return self.first_rig + self.body
 
     def of_points(self, kept: Int[ndarray, " p"]) -> "BoardShapes":
-        """Of a scene whose points are these rows, ascending, of the present one."""
+        """Return the shapes in a scene whose points are these rows, ascending, of the present one."""
         rows = np.flatnonzero(np.isin(self.point, kept))
         return replace(
             self,
@@ -72,7 +72,7 @@ class BoardShapes:
         )
 
     def is_corner(self, points: int) -> Bool[ndarray, " p"]:
-        """Which of this many points are corners."""
+        """Return a mask of the corners among `count` points."""
         out = np.zeros(points, bool)
         out[self.point] = True
         return out
@@ -83,7 +83,7 @@ class BoardShapes:
         points_in_world: Float[ndarray, "p 3"],
         shape: Float[ndarray, " s"],
     ) -> Float[ndarray, "c 3"]:
-        """Of each corner along the axes of its body, in standard deviations."""
+        """Return the residual of each corner along the axes of its body, in standard deviations."""
         in_body = self._in_body(world_from_rig, points_in_world, shape)
         return (in_body - self.x_in_body - self.by_shape @ shape) / CORNER_STD_M
 
@@ -95,8 +95,10 @@ class BoardShapes:
         columns: slice,
         shared: int,
     ) -> Derivatives:
-        """Two rows a corner, across and above its body; the second is half empty. `columns` are those of the shape among
-        the `shared` ones."""
+        """Return two rows for each corner, across and above its body; the second is half empty.
+
+        `columns` are those of the shape among the `shared` ones.
+        """
         c = len(self.point)
         residual, by = np.zeros((c, 4)), np.zeros((c, 4, shared + 9))
         residual[:, :3] = self.residual(world_from_rig, points_in_world, shape)
@@ -120,7 +122,7 @@ class BoardShapes:
     def point_information(
         self, world_from_rig: Float[ndarray, "m 4 4"], shape: Float[ndarray, " s"], points: int
     ) -> Float[ndarray, "p 3 3"]:
-        """What the shape alone shows of each point where its body is known; 0 of those that are no corners."""
+        """Return the information of the shape about each point where its body is known; 0 for other points."""
         whitened = np.exp(-shape[0]) * np.swapaxes(world_from_rig[self.rig, :3, :3], 1, 2)
         whitened /= CORNER_STD_M[:, None]
         out = np.zeros((points, 3, 3))
@@ -128,7 +130,7 @@ class BoardShapes:
         return out
 
     def bend(self, shape: Float[ndarray, " s"]) -> Float[ndarray, " c"]:
-        """Height of each corner above the plane of its body, in the unit of the world."""
+        """Return the height of each corner above the plane of its body, in the unit of the world."""
         return self.by_shape[:, 2] @ shape
 
     def _in_body(
@@ -151,15 +153,15 @@ class _SeenBody:
     x_in_body: Float[ndarray, "c 3"]
     world_from_body: Float[ndarray, "4 4"]
     size: float
-    """In the world over the stated one."""
+    """Size in the world over the stated size."""
 
 
 def shapes_of(
     boards: Boards | None, points_in_world: Float[ndarray, "p 3"], seen: Bool[ndarray, " p"], first_rig: int
 ) -> tuple[BoardShapes | None, Float[ndarray, "b 4 4"]]:
-    """The shapes of boards whose corners are among triangulated points, and where their bodies are about.
+    """Return the shapes of boards whose corners are among triangulated points, and initial poses of their bodies.
 
-    Corners that are not `seen` take no part, nor do bodies with fewer than four that are; None where there is none.
+    Corners that are not `seen` take no part, nor do bodies with fewer than four such corners; None without bodies.
     """
     bodies = [] if boards is None else list(_seen_bodies(boards, points_in_world, seen))
     if not bodies:
@@ -189,7 +191,7 @@ def shapes_of(
 def _seen_bodies(
     boards: Boards, points_in_world: Float[ndarray, "p 3"], seen: Bool[ndarray, " p"]
 ) -> Iterator[_SeenBody]:
-    """The bodies whose seen corners determine where they are."""
+    """Return the bodies whose observed corners determine their pose."""
     for body in boards.bodies:
         rows = np.flatnonzero(seen[body.point])
         x, there = body.x_in_body[rows], points_in_world[body.point[rows]]
@@ -201,7 +203,7 @@ def _seen_bodies(
 
 
 def _deformations(x: Float[ndarray, "c 3"]) -> tuple[Float[ndarray, "c 3 w"], Sequence[float]]:
-    """The ways in which a body may deform, and their standard deviations."""
+    """Return the directions in which a body may deform, and their standard deviations."""
     if len(x) < FEWEST_TO_BEND:
         return np.zeros((len(x), 3, 0)), ()
     across = x[:, :2] - x[:, :2].mean(0)

@@ -18,7 +18,7 @@ _solve_triangular, _invert = get_lapack_funcs(("trtrs", "potri"), dtype=np.float
 
 
 def cholesky(matrix: Matrices) -> Matrices:
-    """L of a matrix that is positive definite but for rounding: of motions that show nothing it is not."""
+    """Return L of a matrix that is positive definite but for rounding, which that of degenerate motions is not."""
     size = np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 1e-300))
     scaled = matrix / size[..., :, None] / size[..., None, :]
     for rounding in JITTER:
@@ -33,28 +33,28 @@ def cholesky(matrix: Matrices) -> Matrices:
 
 
 def lower(root: Matrices, right: Columns) -> Float[ndarray, "*k n r"]:
-    """L⁻¹ times matrices."""
+    """Return L⁻¹ times matrices."""
     return _triangular(root, right, transposed=False)
 
 
 def upper(root: Matrices, right: Columns) -> Float[ndarray, "*k n r"]:
-    """L⁻ᵀ times matrices."""
+    """Return L⁻ᵀ times matrices."""
     return _triangular(root, right, transposed=True)
 
 
 def over(root: Matrices, right: Columns) -> Float[ndarray, "*k n r"]:
-    """V⁻¹ times matrices."""
+    """Return V⁻¹ times matrices."""
     return upper(root, lower(root, right))
 
 
 def inverse_of(root: Float[ndarray, "n n"]) -> Float[ndarray, "n n"]:
-    """V⁻¹ itself."""
+    """Return V⁻¹."""
     half = np.tril(_invert(root, lower=1)[0])
     return half + np.tril(half, -1).T
 
 
 def log_root_determinant(root: Matrices) -> Float[ndarray, "*k"] | np.floating:
-    """log √det V."""
+    """Return log √det V."""
     return np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1)
 
 

@@ -15,21 +15,21 @@ from jcr.geometry import Rotations, Transform, inverse, nearest_rotation, transf
 Poses = Float[ndarray, "*#batch n 4 4"]
 Weights = Float[ndarray, "*#batch n"]
 ROUNDS = 5
-"""Of polishing the rotations; a likelihood fit finishes the work."""
+"""Largest number of rounds that refine the rotations; a likelihood fit follows."""
 NEAR_HALF_ROTATION = -0.73
 """Trace of a rotation by 150°, beyond which the sine of the angle shows little of the axis."""
 RELATIVE_CUT = 1e-10
-"""Of the largest singular value: what is smaller is rounding, and of a direction unseen."""
+"""Share of the largest singular value below which a value is rounding, and its direction unobservable."""
 
 
 def closed_form(
     base_from_gripper: Poses, recon_from_camera: Poses, weights: Weights | None = None, rounds: int = ROUNDS
 ) -> tuple[Float[ndarray, "... 4 4"], Float[ndarray, "..."] | np.floating, Float[ndarray, "... 4 4"]]:
-    """Closed-form `gripper_from_camera` (...,4,4), scale (...) and `base_from_recon` (...,4,4).
+    """Return `gripper_from_camera` (...,4,4), scale (...) and `base_from_recon` (...,4,4) in closed form.
 
-    Rotation first, then translation and scale by one linear least squares (the paper's scale recovery
-    problem, eq. 8 to 10, whose grid search over λ it makes needless); of motions that leave them open, the smallest
-    translation. The scale comes out 0 or less where the motions do not show it.
+    The rotation comes first, then translation and scale by one linear least-squares problem (the paper's scale
+    recovery problem, eq. 8 to 10, without its grid search over λ). Of motions that leave them open, the smallest
+    translation is returned. The scale is 0 or less where the motions do not determine it.
     """
     weights = np.ones(base_from_gripper.shape[:-2]) if weights is None else weights
     of_gripper, of_camera = base_from_gripper[..., :3, :3], recon_from_camera[..., :3, :3]
@@ -44,7 +44,7 @@ def initial_estimate(
     recon_from_camera: Float[ndarray, "n 4 4"],
     weights: Float[ndarray, " n"] | None = None,
 ) -> tuple[Transform, float, Transform]:
-    """`closed_form` with a scale that a reconstruction can have: where motions do not show it, that of their extents."""
+    """Return `closed_form` with a positive scale, that of the extents where the motions do not determine it."""
     x, scale, z = closed_form(base_from_gripper, recon_from_camera, weights)
     if scale <= 0:
         w = np.ones(len(base_from_gripper)) if weights is None else weights
@@ -56,12 +56,12 @@ def initial_estimate(
 
 
 def motions(a_from_b: Poses) -> Float[ndarray, "... n n 4 4"]:
-    """All relative motions: entry (i, j) is a_from_b[i]⁻¹ · a_from_b[j]."""
+    """Return all relative motions: entry (i, j) is a_from_b[i]⁻¹ · a_from_b[j]."""
     return inverse(a_from_b)[..., :, None, :, :] @ a_from_b[..., None, :, :, :]
 
 
 def sine_axis(rotation: Rotations) -> Float[ndarray, "*batch 3"]:
-    """Rotation axis times the sine of the angle (...,3): smooth at 0 and, unlike the logarithm, at π."""
+    """Return the rotation axis times the sine of the angle (...,3), smooth at 0 and, unlike the logarithm, at π."""
     antisymmetric = (rotation - np.swapaxes(rotation, -1, -2)) / 2
     return np.stack([antisymmetric[..., 2, 1], antisymmetric[..., 0, 2], antisymmetric[..., 1, 0]], axis=-1)
 
@@ -72,12 +72,12 @@ def rotations(
     weights: Weights,
     rounds: int = ROUNDS,
 ) -> tuple[Rotations, Rotations]:
-    """R_X and the rotation of base_from_recon (...,3,3) from R_G · R_X = R_Z · R_C.
+    """Return R_X and the rotation of base_from_recon (...,3,3) from R_G · R_X = R_Z · R_C.
 
-    Park and Martin's sum over pairs (1994), on sine-weighted axes instead of logarithms. Where a motion is near a
-    rotation by
-    180°, and its sine small, another solution competes: the equation is linear in R_X and R_Z, and the leading singular
-    pair of Σ w R_C ⊗ R_G solves it (Shah 2013); alone it is ambiguous where all motions are rotations by 180°.
+    The solution is Park and Martin's sum over pairs (1994), with sine-weighted axes instead of logarithms. Where a
+    motion is nearly a rotation by 180°, whose sine is small, another solution competes: the equation is linear in R_X
+    and R_Z, and the leading singular pair of Σ w R_C ⊗ R_G solves it (Shah 2013). That one alone is ambiguous where
+    all motions are rotations by 180°.
     """
     batch, n = weights.shape[:-1], weights.shape[-1]
     gripper, camera = gripper.reshape(-1, n, 3, 3), camera.reshape(-1, n, 3, 3)
@@ -108,7 +108,7 @@ def _polished(
     weights: Float[ndarray, "h n"],
     rounds: int,
 ) -> tuple[Float[ndarray, "h 3 3"], Float[ndarray, "h 3 3"], Float[ndarray, " h"]]:
-    """R_X and R_Z, each the best given the other, in turn (monotone), and the squared gap that they leave."""
+    """Return R_X and R_Z, each optimal given the other in turn (monotone), and the squared residual."""
     from_gripper, from_camera = np.swapaxes(gripper, -1, -2), np.swapaxes(camera, -1, -2)
     weighed = weights[:, :, None, None] * gripper
     base = nearest_rotation((weighed @ rotation[:, None] @ from_camera).sum(1))
@@ -125,7 +125,7 @@ def _polished(
 
 
 def _centred(x: Float[ndarray, "*#batch n k"], weights: Weights) -> Float[ndarray, "... n k"]:
-    """Without the weighted mean over the images."""
+    """Return values without their weighted mean over the images."""
     w = weights / weights.sum(-1, keepdims=True)
     return x - w[..., None, :] @ x
 
@@ -133,7 +133,7 @@ def _centred(x: Float[ndarray, "*#batch n k"], weights: Weights) -> Float[ndarra
 def _translations(
     base_from_gripper: Poses, recon_from_camera: Poses, base_rotation: Rotations, weights: Weights
 ) -> tuple[Float[ndarray, "... 3"], Float[ndarray, "..."] | np.floating, Float[ndarray, "... 3"]]:
-    """t_X, λ and t_Z (of base_from_recon) from R_G t_X + t_G = λ R_Z t_C + t_Z, linear in all three.
+    """Return t_X, λ and t_Z (of base_from_recon) from R_G t_X + t_G = λ R_Z t_C + t_Z, linear in all three.
 
     t_Z is eliminated: it makes the weighted means equal. The paper prints t_c^e for the camera's translation in its
     d_i(λ); t_C is meant.

@@ -1,8 +1,8 @@
-"""How large the errors of gripper poses are, random and systematic: variance components of a mixed linear model.
+"""Variance components of the errors of gripper poses, random and systematic, in a mixed linear model.
 
-Restricted maximum likelihood shows the three sizes (Searle, Casella and McCulloch, "Variance components", 1992, section
-6.6), but few images show them badly. An answer is therefore not taken at the best sizes: it is averaged over them with
-their posterior weights, on a grid about the mode (Rue, Martino and Chopin, J. R. Statist. Soc. B 71, 2009, section 3).
+Restricted maximum likelihood estimates the three sizes (Searle, Casella and McCulloch, "Variance components", 1992,
+section 6.6), but few images determine them badly. A result is therefore averaged over the sizes with their posterior
+weights, on a grid about the mode (Rue, Martino and Chopin, J. R. Statist. Soc. B 71, 2009, section 3).
 """
 
 from collections.abc import Callable, Sequence
@@ -15,20 +15,20 @@ from numpy import ndarray
 from jcr.estimation.mixed_model import Each, Equations, LinearSolution, LogSizes, solve_equations
 
 LEVELS = tuple(1.5 * np.arange(-4, 5))
-"""Standard deviations of the log sizes at which the posterior is evaluated; for a normal one, the error of so coarse a
-sum is 3e-4."""
+"""Distances from the mode at which the posterior is evaluated, in standard deviations of the log sizes; for a normal
+posterior the error of this sum is 3e-4."""
 FARTHEST, LESS_FAR = 21.0, 10.0
-"""Squared distance from the mode up to which. Rare errors come from rare sizes: up to 7, three images covered 81 %
-instead of 95 %, and two of 120 images that had not moved were called moved at p < 0.001."""
+"""Largest squared distance from the mode. Rare errors come from rare sizes: with 7 as the limit, three images covered
+81 % instead of 95 %, and two of 120 images that had not moved were called moved at p < 0.001."""
 MANY, TOO_MANY = 15, 80
-"""Poses from which the sizes are known well enough to go less far, and for the mode alone."""
+"""Numbers of poses from which the smaller limit is enough, and from which the mode alone is used."""
 AT_ONCE = 4e6
-"""Numbers of one array of the solutions that are found together."""
+"""Largest number of elements of an array of solutions that are computed together."""
 SETTLED = 1e-4
 """Change of log sizes that no longer matters."""
 
 Information = Float[ndarray, "c c"]
-"""Expected, of the log sizes at their mode."""
+"""Expected information of the log sizes at their mode."""
 Weighed = list[tuple[Float[ndarray, " g"], Float[ndarray, "g c"], LinearSolution]]
 """Posterior weights (their sum is 1) of log sizes about their mode, and the solutions at these, in groups."""
 
@@ -39,10 +39,10 @@ def most_likely(
     settled: float = SETTLED,
     score: Callable[[LogSizes], tuple[float, LogSizes, Information]] | None = None,
 ) -> tuple[LogSizes, Information]:
-    """Log sizes at the mode of their posterior, and the expected information there, to a last step `settled`.
+    """Return the log sizes at the mode of their posterior, to a last step `settled`, and their expected information.
 
-    By Fisher scoring, with the curvature that the last step showed (BFGS, Nocedal and Wright, "Numerical optimization",
-    2006, eq. 6.19): where the expected information is half of it, steps swing about the mode.
+    Fisher scoring uses the curvature that the last step showed (BFGS, Nocedal and Wright, "Numerical optimization",
+    2006, eq. 6.19): where the expected information is half of the curvature, steps swing about the mode.
     """
     score = score or (lambda at: _score(equations, at))
     at = np.log(equations.typical) if start is None else start
@@ -69,10 +69,10 @@ def most_likely(
 
 
 def log_evidence(equations: Equations, log_posterior: float, information: Information) -> float:
-    """Log density of the residuals, averaged over unknowns and sizes: of s residuals but for (2π)^(−s/2), and up to a
-    constant that all sets of residuals share.
+    """Return the log density of the residuals, averaged over unknowns and sizes, up to a common constant.
 
-    By Laplace's method about the mode of the sizes, at which `log_posterior` and `information` are.
+    Laplace's method is used about the mode of the sizes, at which `log_posterior` and `information` are. The factor
+    (2π)^(−s/2) of s residuals is left out.
     """
     gradient = equations.prior_gradient
     against_prior = gradient @ np.linalg.lstsq(equations.prior_information, gradient, rcond=None)[0]
@@ -96,7 +96,7 @@ def over_sizes(
     information: Information,
     density: Callable[[LinearSolution], Each] = lambda solution: solution.log_posterior,
 ) -> Weighed:
-    """The log sizes about their mode that stand for all.
+    """Return a grid of log sizes about their mode with posterior weights and solutions.
 
     `density` is the logarithm of the sizes' posterior, up to a constant.
     """
@@ -113,12 +113,12 @@ def over_sizes(
 
 
 def expected_information(equations: Equations, log_sizes: LogSizes) -> Information:
-    """Of the log sizes, their prior included."""
+    """Return the expected information of the log sizes, including their prior."""
     return _score(equations, log_sizes)[2]
 
 
 def _score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, Information]:
-    """Log posterior of the sizes, its gradient, and the expected information."""
+    """Return the log posterior of the sizes, its gradient, and the expected information."""
     solution = solve_equations(equations, log_sizes)
     projection, left = solution.projection, solution.weighed_left
     masks = np.stack([equations.of_position, 1 - equations.of_position])
@@ -143,10 +143,10 @@ def _score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, 
 def _grid(
     equations: Equations, mode: LogSizes, information: Information, log_density: Callable[[LogSizes], Each]
 ) -> tuple[Float[ndarray, "k c"], Float[ndarray, " k"]]:
-    """Log sizes about their mode, and the log of the volume that each stands for.
+    """Return log sizes about their mode, and the log volume of each.
 
-    Along each axis of the information, either way, in steps of the standard deviation that the posterior has there,
-    which is skew: what few images show is rather what the sizes are not above than what they are not below.
+    The steps along both directions of each axis of the information are the standard deviation of the posterior there,
+    which is skew: few images bound the sizes from above rather than from below.
     """
     poses = len(equations.residual) // 6
     if poses > TOO_MANY:

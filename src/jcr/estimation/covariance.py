@@ -1,8 +1,8 @@
-"""The unknowns averaged over the sizes of the errors, with a calibrated covariance, and its causes.
+"""Unknowns averaged over the sizes of the errors, with a calibrated covariance and its causes.
 
 Cov = E[C] + Var[θ̂] over the sizes (components.py). A mixture has longer tails than a normal distribution of its
-covariance: the covariance is scaled until its 99 % ellipsoid holds 99 %, for an accepted answer that is many standard
-deviations off is the worst fault.
+covariance. The covariance is therefore scaled until its 99 % ellipsoid holds 99 %: an accepted result that is many
+standard deviations off is the worst fault.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,10 +21,10 @@ from jcr.estimation.systematic import Region
 from jcr.records import Budget, RobotNoise
 
 COVERED = 0.99
-"""By the ellipsoid that holds what it states."""
+"""Probability of the ellipsoid that is made to hold it."""
 HALVINGS = 40
-"""Of the interval in which the size of that ellipsoid lies, to 1e-11 of it: scipy.optimize takes longer to import than
-a calibration of a few images."""
+"""Number of halvings of the interval that contains the size of that ellipsoid, to 1e-11 of it; scipy.optimize takes
+longer to import than a calibration of a few images."""
 
 Square = Float[ndarray, "p p"]
 Stack = Float[ndarray, "*k p p"]
@@ -39,22 +39,26 @@ class Posterior:
     """Scaled so that its 99 % ellipsoid holds 99 %."""
     budget: Budget
     log_sizes: LogSizes
-    """At the mode."""
+    """Log sizes at the mode."""
 
 
 def posterior(
     equations: Equations, log_sizes: LogSizes, information: Information, region: Region | None
 ) -> Posterior:
-    """The unknowns averaged over the sizes about their mode; `region` adds what other poses of it would change."""
+    """Return the unknowns averaged over the sizes about their mode.
+
+    `region` adds the change that other poses of the region would make.
+    """
     found = over_sizes(equations, log_sizes, information)
     return _averaged(equations, log_sizes, found, lambda one, at: _elsewhere(equations, one, at, region))
 
 
 def expected_posterior(equations: Equations, noise: RobotNoise, region: Region | None) -> Posterior:
-    """The posterior to expect of a robot with this noise, before there are any residuals: those of `equations` are 0.
+    """Return the posterior to expect for a robot with this noise, before there are residuals: those of `equations` are
+    0.
 
-    In the density of the sizes the squares of residuals are replaced by their expectations, tr(P V) for the covariance V
-    that the noise gives them.
+    In the density of the sizes the squares of residuals are replaced by their expectations, tr(P V) for the covariance
+    V of the noise.
     """
     mode = equations.log_sizes_of(noise)
     root = cholesky(equations.covariance(mode))
@@ -68,7 +72,7 @@ def expected_posterior(equations: Equations, noise: RobotNoise, region: Region |
 
 
 def expected_covariance_at(equations: Equations, noise: RobotNoise, region: Region | None) -> Square:
-    """The covariance of the same at the sizes themselves, as if these were known exactly: for comparisons."""
+    """Return the expected covariance where the sizes are known exactly, for comparisons."""
     mode = equations.log_sizes_of(noise)
     return solve_equations(equations, mode).covariance + _expected_elsewhere(equations, mode, region)
 
@@ -79,7 +83,7 @@ def _averaged(
     found: Weighed,
     elsewhere: Callable[[LinearSolution, LogSizes], Stack],
 ) -> Posterior:
-    """The mixture of the solutions that were `found` with their weights, each wider by `elsewhere`."""
+    """Return the mixture of the solutions `found` with their weights, each widened by `elsewhere`."""
     groups = [(share, one.step, one.covariance + elsewhere(one, sizes)) for share, sizes, one in found]
     weight, steps, each = (np.concatenate(part) for part in zip(*groups, strict=True))
     step = weight @ steps
@@ -94,7 +98,7 @@ def _averaged(
 def _elsewhere(
     equations: Equations, solution: LinearSolution, log_sizes: LogSizes, region: Region | None
 ) -> Stack:
-    """Covariance of what the systematic part leaves open because the answer is asked for the region, not its poses."""
+    """Return the covariance that systematic errors add because the result holds for the region, not for its poses."""
     if region is None or equations.systematic is None:
         return np.zeros_like(solution.information_root)
     part = equations.variances(log_sizes)[..., 2, None, None] * equations.systematic
@@ -108,7 +112,7 @@ def _elsewhere(
 
 
 def _expected_elsewhere(equations: Equations, log_sizes: LogSizes, region: Region | None) -> Stack:
-    """`_elsewhere` before there are residuals: what they will show of the systematic part is as large as it is."""
+    """Return `_elsewhere` before there are residuals, with systematic errors as large as expected."""
     if region is None or equations.systematic is None:
         return np.zeros((*log_sizes.shape[:-1], *equations.prior_information.shape))
     size = equations.variances(log_sizes)[..., 2, None, None, None]
@@ -118,13 +122,13 @@ def _expected_elsewhere(equations: Equations, log_sizes: LogSizes, region: Regio
 def _whitened_and_fitted(
     solution: LinearSolution, matrix: Float[ndarray, "*#k s r"]
 ) -> tuple[Float[ndarray, "*k s r"], Float[ndarray, "*k p r"]]:
-    """A and B with AᵀA − BᵀB = MᵀPM, P the projection of the solution."""
+    """Return A and B with AᵀA − BᵀB = MᵀPM, P the projection of the solution."""
     fitted = lower(solution.information_root, np.swapaxes(solution.weighed, -1, -2) @ matrix)
     return lower(solution.root, matrix), fitted
 
 
 def _blocks_of_poses(covariance: Float[ndarray, "*k s s"]) -> Float[ndarray, "*k m 6 6"]:
-    """The block of each pose by itself."""
+    """Return the diagonal block of each pose."""
     m = covariance.shape[-1] // 6
     each = np.arange(m)
     return np.moveaxis(covariance.reshape(*covariance.shape[:-2], m, 6, m, 6)[..., each, :, each, :], 0, -3)
@@ -136,10 +140,11 @@ def _widening(
     each: Float[ndarray, "k p p"],
     covariance: Square,
 ) -> float:
-    """Factor on the covariance of a mixture of normal distributions, after which its 99 % ellipsoid holds 99 %.
+    """Return the factor on the covariance of a mixture of normal distributions that makes its 99 % ellipsoid hold 99
+    %.
 
-    Squared Mahalanobis distances under each are matched by a scaled χ² of the same mean and variance (Satterthwaite,
-    Biometrics Bulletin 2, 1946).
+    Squared Mahalanobis distances under each component are matched by a scaled χ² of the same mean and variance
+    (Satterthwaite, Biometrics Bulletin 2, 1946).
     """
     std = np.sqrt(np.diag(covariance))
     scaled, shift = covariance / np.outer(std, std), off / std
@@ -162,9 +167,10 @@ def _widening(
 
 
 def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covariance: Square) -> Budget:
-    """The covariance of X and scale by its causes, which share what the averaging over sizes added.
+    """Return the covariance of X and scale by its causes, which share the excess from averaging over sizes.
 
-    What intrinsics add is what would go if they were known; the rest is divided as if they were.
+    The part of the intrinsics is the covariance that knowing them would remove; the rest is divided as if they were
+    known.
     """
     exact = replace(
         equations,
@@ -212,9 +218,10 @@ def budget_of(parts: Sequence[Float[ndarray, "_ _"]], covariance: Float[ndarray,
 
 
 def _between(one: Square, other: Square) -> Square:
-    """The linear map of least displacement that takes errors of one covariance to those of the other.
+    """Return the linear map of least displacement that takes errors of one covariance to those of another.
 
-    Symmetric, where lengths are counted in standard deviations (Knott and Smith, J. Optim. Theory Appl. 43, 1984).
+    The map is symmetric where lengths are counted in standard deviations (Knott and Smith, J. Optim. Theory Appl. 43,
+    1984).
     """
     std = np.sqrt(np.diag(one))
     values, vectors = np.linalg.eigh(one / np.outer(std, std))

@@ -20,15 +20,15 @@ class Derivatives:
     """Derivatives of observations, and their residuals, all times the root of their weights."""
 
     shared: Float[ndarray, "k 2 s"]
-    """By what all images share: the first columns of the equations."""
+    """Derivatives by the columns that all images share, which come first."""
     own: Float[ndarray, "k 2 o"]
-    """By what each image has of its own: `o` more columns an image."""
+    """Derivatives by the `o` columns that each image has of its own."""
     by_point: Float[ndarray, "k 2 3"]
     residual: Float[ndarray, "k 2"]
 
 
 def in_order(order: Int[ndarray, " k"], *parts: Derivatives) -> Derivatives:
-    """Rows of several parts, one after the other, in another order."""
+    """Return the rows of several parts, one after the other, in another order."""
     names = ("shared", "own", "by_point", "residual")
     return Derivatives(
         **{name: np.concatenate([getattr(part, name) for part in parts])[order] for name in names}
@@ -37,26 +37,26 @@ def in_order(order: Int[ndarray, " k"], *parts: Derivatives) -> Derivatives:
 
 @dataclass(frozen=True, kw_only=True)
 class _Group:
-    """Points that are eliminated together, for they are seen by few images of many."""
+    """Points that are eliminated together, because few of many images show them."""
 
     points: Int[ndarray, " n"]
     rows: Int[ndarray, " k"]
-    """Of their observations, point by point."""
+    """Row numbers of their observations, point by point."""
     batches: list[tuple[slice, slice]]
-    """Points seen equally often, and their observations."""
+    """Points with equally many observations, and these observations."""
     images: Int[ndarray, " i"]
-    """That see any of them."""
+    """Images that show any of them."""
     pairs: Int[ndarray, " j"]
     """First observation of each point in each image: rigs see a point by several cameras."""
     point: Int[ndarray, " j"]
-    """Of each pair, in `points`."""
+    """Index of each pair's point in `points`."""
     image: Int[ndarray, " j"]
-    """Of each pair, in `images`."""
+    """Index of each pair's image in `images`."""
 
 
 @dataclass(frozen=True)
 class Sightings:
-    """Which points are seen in which images."""
+    """Points and the images that show them."""
 
     rows: list[Int[ndarray, "..."]]
     """Observations of each image."""
@@ -66,7 +66,8 @@ class Sightings:
 
     @staticmethod
     def of(point: Int[ndarray, " k"], image: Int[ndarray, " k"], images: int) -> "Sightings":
-        """Of observations sorted by point and then by image, every point with at least one."""
+        """Return the sightings of observations that are sorted by point and then by image, each point with at least
+        one."""
         starts = np.flatnonzero(np.diff(point, prepend=-1))
         rows = [np.flatnonzero(image == i) for i in range(images)]
         return Sightings(rows, starts, _groups(starts, image))
@@ -83,7 +84,7 @@ class Normal:
     the columns and their gradients."""
 
     def stepped(self, points: Float[ndarray, "p 3"], step: Float[ndarray, " d"]) -> Float[ndarray, "p 3"]:
-        """The points after the Gauss-Newton step that belongs to a step of everything else."""
+        """Return the points after the Gauss-Newton step that belongs to a step of all other unknowns."""
         points = points.copy()
         for chosen, columns, root, half in self._blocks:
             along = half @ np.append(step[columns], 1.0)
@@ -94,7 +95,7 @@ class Normal:
 def with_fixed_points(
     rows: Derivatives, seen: Sightings
 ) -> tuple[Float[ndarray, "d d"], Float[ndarray, " d"]]:
-    """Hessian and right side of everything but the points."""
+    """Return Hessian and right side of all unknowns but the points."""
     s, o = rows.shared.shape[2], rows.own.shape[2]
     size = s + o * len(seen.rows)
     hessian, right = np.zeros((size, size)), np.zeros(size)
@@ -113,7 +114,7 @@ def without_points(
     seen: Sightings,
     damping: float = 0.0,
 ) -> Normal:
-    """The equations of everything but the points, in place, with what the points could take up taken from them."""
+    """Return the equations of all unknowns but the points, in place, with the Schur complement of the points."""
     s, o = rows.shared.shape[2], rows.own.shape[2]
     blocks = []
     for group in seen.groups:
@@ -139,28 +140,30 @@ def without_points(
 def _whitened(
     by_point: Float[ndarray, "k 2 3"], points: int, damping: float
 ) -> tuple[Float[ndarray, "n 3 3"], Float[ndarray, "k 2 3"]]:
-    """The inverse roots of the own blocks of points that are seen equally often, and the derivatives by these points in
-    units of their standard deviations."""
+    """Return the inverse roots of the blocks of points with equally many observations, and whitened derivatives by
+    them."""
     of_point = by_point.reshape(points, -1, 3)
     root = np.linalg.inv(np.linalg.cholesky(_regular(np.swapaxes(of_point, 1, 2) @ of_point, damping)))
     return root, (of_point @ np.swapaxes(root, 1, 2)).reshape(by_point.shape)
 
 
 def point_blocks(by_point: Float[ndarray, "k 2 3"], starts: Int[ndarray, " n"]) -> Float[ndarray, "n 3 3"]:
-    """The points' own blocks of the normal equations."""
+    """Return each point's own block of the normal equations."""
     return _regular(np.add.reduceat(np.swapaxes(by_point, 1, 2) @ by_point, starts), 0.0)
 
 
 def _regular(v: Float[ndarray, "n 3 3"], damping: float) -> Float[ndarray, "n 3 3"]:
-    """Damped, and kept from being singular where the rays of a point are parallel."""
+    """Return blocks that are damped, and regular where the rays of a point are parallel."""
     v[:, range(3), range(3)] *= 1 + damping
     v[:, range(3), range(3)] += 1e-9 * np.trace(v, axis1=1, axis2=2)[:, None] + 1e-12
     return v
 
 
 def _groups(starts: Int[ndarray, " p"], image: Int[ndarray, " k"]) -> list[_Group]:
-    """Points in the order of the first image that sees them: those beside each other are seen by few others. In a group
-    they are in the order of how many see them."""
+    """Return groups of points in the order of the first image that shows them, which few other images share.
+
+    Within a group the points are in the order of the number of their observations.
+    """
     if len(starts) == 0:
         return []
     seen = np.diff(np.r_[starts, len(image)])
@@ -189,7 +192,7 @@ def _groups(starts: Int[ndarray, " p"], image: Int[ndarray, " k"]) -> list[_Grou
 
 
 def _batches(counts: Int[ndarray, " n"]) -> list[tuple[slice, slice]]:
-    """Points of the same count, which are beside each other, and their observations."""
+    """Return ranges of neighbouring points with the same number of observations, and of these observations."""
     edges = np.r_[np.flatnonzero(np.diff(counts, prepend=-1)), len(counts)].tolist()
     ends = np.r_[0, np.cumsum(counts)].tolist()
     return [(slice(a, b), slice(ends[a], ends[b])) for a, b in zip(edges[:-1], edges[1:], strict=True)]

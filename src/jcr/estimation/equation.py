@@ -26,12 +26,12 @@ BASE_TRANSLATION, BASE_ROTATION = slice(7, 10), slice(10, 13)
 UNKNOWNS = 13
 
 PRIOR_STD = np.array([1.0] * 3 + [np.pi] * 3 + [5.0])
-"""So weak that it only keeps what the motions cannot see finite: 1 m, π rad, a factor e⁵."""
+"""Standard deviations (m, rad, log scale) of a prior that only keeps unobservable directions finite."""
 LARGEST_ROTATION = 0.5
-"""rad, and of the logarithm of scale, in one step: a poor start on nearly unobservable motions must not throw rotations
-around the circle."""
+"""Largest step of a rotation (rad) and of the logarithm of scale: a poor initial estimate of nearly unobservable
+motions must not rotate beyond a half turn."""
 ASSUMED_NOISE = (5e-4, np.radians(0.1))
-"""m, rad; of a robot that has not been measured yet."""
+"""Assumed noise (m, rad) of a robot that has not been measured."""
 
 
 def predict(
@@ -40,7 +40,7 @@ def predict(
     z: Transforms,
     recon_from_camera: Poses,
 ) -> Float[ndarray, "*batch n 4 4"]:
-    """Gripper poses in base (...,n,4,4): base_from_recon · S_λ(recon_from_camera) · X⁻¹, for one or many (X, λ, Z)."""
+    """Return gripper poses (...,n,4,4): base_from_recon · S_λ(recon_from_camera) · X⁻¹, for one or many (X, λ, Z)."""
     scaled = scale_translation(recon_from_camera, np.asarray(scale)[..., None])
     return z[..., None, :, :] @ scaled @ inverse(x)[..., None, :, :]
 
@@ -53,9 +53,9 @@ def residuals(
     recon_from_camera: Poses,
     exchanged: bool = False,
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 13"]]:
-    """Steps from the reported gripper poses to the predicted ones (base axes), and their Jacobian.
+    """Return steps from the reported gripper poses to the predicted ones (base axes), and their Jacobian.
 
-    `exchanged`: the camera stands still and the gripper carries what it sees. X is then base_from_camera, Z
+    `exchanged`: the camera is fixed and the gripper carries the scene. X is then base_from_camera, Z
     gripper_from_recon, and they predict gripper_from_base; the residuals are still those of base_from_gripper.
     """
     predicted = predict(x, scale, z, recon_from_camera)
@@ -77,7 +77,7 @@ def residuals(
 def residuals_by_camera(
     x: Transform, scale: float, z: Transform, recon_from_camera: Poses, exchanged: bool = False
 ) -> Float[ndarray, "n 6 6"]:
-    """Derivative of `residuals` by a step of each camera."""
+    """Return the derivative of `residuals` by a step of each camera."""
     base_from_recon = z[:3, :3]
     lever = recon_from_camera[:, :3, :3] @ x[:3, :3].T @ x[:3, 3]
     j = np.zeros((len(lever), 6, 6))
@@ -88,7 +88,7 @@ def residuals_by_camera(
 
 
 def pose_by_pose(blocks: Float[ndarray, "n 6 6"], matrix: Float[ndarray, "r c"]) -> Float[ndarray, "r c"]:
-    """The block diagonal matrix of a block a pose, times a matrix of r = 6n rows."""
+    """Return the product of a block-diagonal matrix, one block a pose, and a matrix of r = 6n rows."""
     return (blocks @ matrix.reshape(len(blocks), 6, -1)).reshape(matrix.shape)
 
 
@@ -99,7 +99,7 @@ def columns_of_arm(arm: int) -> Int[ndarray, "12"]:
 
 
 def weak_prior(arms: int = 1) -> Float[ndarray, "u u"]:
-    """Information that keeps finite what the motions cannot see of the unknowns of that number of arms."""
+    """Return the information that keeps unobservable directions of the unknowns of some arms finite."""
     std = np.full(12 * arms + 1, np.inf)
     for arm in range(arms):
         std[columns_of_arm(arm)[:6]] = PRIOR_STD[:6]
@@ -108,7 +108,7 @@ def weak_prior(arms: int = 1) -> Float[ndarray, "u u"]:
 
 
 def share_within_limits(step: Float[ndarray, " u"]) -> float:
-    """Of a step of the unknowns of one or more arms, how much of it rotates nothing too far."""
+    """Return the share of a step of the arms' unknowns that keeps all rotations within LARGEST_ROTATION."""
     arms = range((len(step) - 1) // 12)
     rotations = np.r_[SCALE, *(columns_of_arm(arm)[[3, 4, 5, 9, 10, 11]] for arm in arms)]
     return min(1.0, LARGEST_ROTATION / max(float(np.abs(step[rotations]).max()), 1e-300))

@@ -1,4 +1,4 @@
-"""From poses to a judged hand-eye calibration: robust fit, uncertainty, observability, leave-one-out error."""
+"""Hand-eye calibration from poses: robust fit, uncertainty, observability, leave-one-out error and findings."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -33,18 +33,18 @@ from jcr.records import (
 )
 
 MAX_NOISE = (0.02, np.radians(3.0))
-"""m, rad: worse than the worst servo arm; poses and images then do not belong together."""
+"""Largest noise (m, rad), beyond that of the worst servo arm; poses and images then do not belong together."""
 MAX_STD = (0.02, np.radians(3.0), 0.05)
-"""m, rad, relative scale: an answer less certain than this is none."""
+"""Largest standard deviations (m, rad, relative scale) of an accepted result."""
 MIN_SHARE_USED = 0.6
 SCALE_STD = 0.002
-"""Relative; of a printed marker's size."""
+"""Relative standard deviation of the size of a printed marker."""
 FEW = 5
-"""Images, below which a wrong one cannot be outvoted and the robot pose noise is hardly known."""
+"""Number of images below which a wrong one cannot be outvoted and the robot pose noise is hardly known."""
 WELL_ABOVE = 2e-3
-"""m: of a smaller leave-one-out error nothing is said."""
+"""Leave-one-out error (m) below which no finding is made."""
 SURPRISE = 1.5
-"""Times the robot noise that was given; more is worth saying."""
+"""Factor on the given robot noise beyond which a finding is made."""
 
 
 Offset = tuple[Float[ndarray, "3"], float, float]
@@ -66,7 +66,7 @@ def solve_hand_eye(  # noqa: PLR0913 (published; each is a fact about the captur
     systematic: Float[ndarray, "r r"] | None = None,
     in_sequence: bool = True,
 ) -> HandEye:
-    """Hand-eye calibration with unknown scale from camera poses of your own.
+    """Return the hand-eye calibration with unknown scale from camera poses of your own.
 
     Takes two stacks (n,4,4), n ≥ 2, taken at the same instants and in the same order: gripper poses in the base frame
     (m) and camera poses in any frame and unit. `robot_noise` is a lower bound on the noise of the gripper poses (1
@@ -82,20 +82,14 @@ def solve_hand_eye(  # noqa: PLR0913 (published; each is a fact about the captur
     the scale is estimated. `offset` is an axis of the gripper frame, the position of the camera along it (m), and its
     standard deviation (m), for motions that do not determine it.
 
-    `in_sequence`: the camera poses may have been found one after the other, as by visual odometry or SLAM; errors that
-    add up along their order are then looked for, and weighed where the poses show them.
+    `in_sequence`: the camera poses may have been found one after the other, as by visual odometry or SLAM. Errors that
+    add up along their order are then tested and included.
 
     Raises InputError for shapes, values or counts that cannot be poses, and for poses or angles that do not fit the
     robot. Degenerate motion raises nothing; it is in the result (`observability`, `converged`).
     """
     gripper, camera = _checked_pairs(base_from_gripper, recon_from_camera)
-    n, priors = len(gripper), () if offset is None else (offset_prior(*offset),)
-    if scale is not None:
-        if not (np.isfinite([scale, scale_std]).all() and scale > 0 and scale_std > 0):
-            raise InputError(
-                f"scale: {scale} ± {scale_std} must be two positive numbers (m per unit, relative)"
-            )
-        priors += (scale_prior(scale, scale_std),)
+    priors, n = _checked_priors(offset, scale, scale_std), len(gripper)
     if robot_noise is not None and not (np.isfinite(robot_noise).all() and min(robot_noise) > 0):
         raise InputError(f"robot_noise: {robot_noise} must be two positive numbers (m, rad)")
     if camera_covariance is not None and camera_covariance.shape != (6 * n, 6 * n):
@@ -113,6 +107,16 @@ def solve_hand_eye(  # noqa: PLR0913 (published; each is a fact about the captur
         if drift is not None:
             fit, distinct = _fit_distinct(gripper, camera, robot_noise, priors, drift, systematic)
     return judged(_with_residuals(gripper, camera, fit, distinct))
+
+
+def _checked_priors(offset: Offset | None, scale: float | None, scale_std: float) -> tuple[LinearPrior, ...]:
+    """Return the priors of the camera's offset and of the scale; raise InputError for numbers that are none."""
+    priors = () if offset is None else (offset_prior(*offset),)
+    if scale is None:
+        return priors
+    if not (np.isfinite([scale, scale_std]).all() and scale > 0 and scale_std > 0):
+        raise InputError(f"scale: {scale} ± {scale_std} must be two positive numbers (m per unit, relative)")
+    return (*priors, scale_prior(scale, scale_std))
 
 
 def _fit_distinct(
@@ -182,7 +186,7 @@ JUDGED = frozenset(
 
 
 def judged(hand_eye: HandEye) -> HandEye:
-    """The calibration with findings of the kinds JUDGED as its numbers are now, after those of other kinds."""
+    """Return the calibration with findings of the kinds JUDGED by its present numbers, after those of other kinds."""
     uncertain = tuple(_of_uncertainty(hand_eye))
     # A direction that is observed weakly explains an uncertainty that rejects, and is named before it.
     weak = "rejects" if uncertain else "warns"
@@ -196,7 +200,7 @@ def judged(hand_eye: HandEye) -> HandEye:
 
 
 def _of_agreement(hand_eye: HandEye) -> Iterator[Finding]:
-    """Too few images, or none, that fit their gripper poses."""
+    """Yield findings that too few images agree, or that poses contradict the images."""
     used, n = float(hand_eye.inliers.sum()), len(hand_eye.inliers)
     if used < max(3, MIN_SHARE_USED * n) and n > 2:
         yield Finding.of(FindingKind.FEW_AGREE, "rejects", "reconstruction", value=used, images=float(n))
@@ -207,7 +211,7 @@ def _of_agreement(hand_eye: HandEye) -> Iterator[Finding]:
 
 
 def _of_uncertainty(hand_eye: HandEye) -> Iterator[Finding]:
-    """Each part of the answer that is too uncertain."""
+    """Yield a finding for each part of the result that is too uncertain."""
     if not hand_eye.observability.observable:
         return
     std = np.sqrt(np.diag(hand_eye.covariance))
@@ -223,7 +227,7 @@ def _of_uncertainty(hand_eye: HandEye) -> Iterator[Finding]:
 
 
 def _of_residuals(hand_eye: HandEye) -> Iterator[Finding]:
-    """What a user should know of an answer that may still be accepted."""
+    """Yield findings that do not reject: noise above the given one, leave-one-out error, few images."""
     noise = hand_eye.robot_noise
     metres, radians = _disagreement(hand_eye)
     if noise.given is not None and (
@@ -242,7 +246,7 @@ def _of_residuals(hand_eye: HandEye) -> Iterator[Finding]:
 
 
 def _disagreement(hand_eye: HandEye) -> tuple[float, float]:
-    """Root mean square residual of the used images per axis (m, rad), made up for the 13 unknowns that were fitted."""
+    """Return the rms residual of the used images per axis (m, rad), corrected for the 13 fitted unknowns."""
     used = hand_eye.inliers
     count = 6 * int(used.sum())
     fitted = count / max(count - 13, 1)
@@ -267,7 +271,7 @@ def _reasons(
 
 
 def _leave_one_out(fit: Solution, used: Bool[ndarray, " n"]) -> LeaveOneOut | None:
-    """Each used image predicted by a fit to the others; None when too few are left to fit."""
+    """Return the error of each used image's prediction by a fit to the others; None where too few are left to fit."""
     if used.sum() < 4:
         return None
     metres, radians = np.linalg.norm(fit.leave_one_out()[0][used].reshape(-1, 2, 3), axis=2).mean(0)
@@ -277,6 +281,7 @@ def _leave_one_out(fit: Solution, used: Bool[ndarray, " n"]) -> LeaveOneOut | No
 
 
 def _checked_pairs(base_from_gripper: ArrayLike, recon_from_camera: ArrayLike) -> tuple[Poses, Poses]:
+    """Return two stacks of rigid poses of equal number; raise InputError for others."""
     gripper = _checked(base_from_gripper, "base_from_gripper")
     camera = _checked(recon_from_camera, "recon_from_camera")
     n = len(gripper)

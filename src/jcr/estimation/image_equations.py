@@ -72,7 +72,8 @@ class ImageEvidence:
     state: State
     view: View
     information: Float[ndarray, "d d"]
-    """With the priors of intrinsics and nuisances; the similarity of the world has a negligible one."""
+    """Information, including that of the priors of intrinsics and nuisances, and a negligible one of the world's
+    similarity."""
     gradient: Float[ndarray, " d"]
     """Gradient of half the squared distance."""
 

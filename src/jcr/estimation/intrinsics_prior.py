@@ -60,7 +60,7 @@ class Camera:
     intrinsics: Intrinsics
     """Middle of the prior."""
     directions: Float[ndarray, "q c"]
-    """In the order of camera.parameters."""
+    """Directions of the parameters, in the order of camera.parameters."""
     std: Float[ndarray, " c"]
     mount_free: bool = False
     """Whether its pose on the rig is estimated."""

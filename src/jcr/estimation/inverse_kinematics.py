@@ -1,9 +1,9 @@
-"""Joint angles from gripper poses: damped least squares from many starts, and one branch for a whole capture.
+"""Joint angles from gripper poses: damped least squares from many initial estimates, and one branch for a capture.
 
 Limits of what poses can show: an arm with six joints reaches a pose in up to eight ways; the branch with the least
 change from image to image and nearest the arm's rest posture is chosen. The angles of a seventh joint are those
-nearest the rest posture. An unknown tool frame changes the angles, and poses of any tool within reach fit an arm
-with six joints or more: a wrong robot is recognised only where its reach or its limits exclude a pose.
+nearest the rest posture. An unknown tool frame changes the angles, and poses of any tool within reach fit an arm with
+six joints or more: a wrong robot is recognised only where its reach or its limits exclude a pose.
 """
 
 from dataclasses import dataclass
@@ -29,18 +29,18 @@ from jcr.geometry import (
 STARTS = 12
 STEPS = 30
 LAST = 8
-"""Last steps, in which a redundant arm no longer moves towards its rest posture."""
+"""Number of last steps in which a redundant arm no longer moves towards its rest posture."""
 FITS = (1e-4, 1e-3)
-"""m, rad: largest misfit of a pose that the arm reaches."""
+"""Largest misfit (m, rad) of a pose that the arm reaches."""
 REFUSED = (0.01, np.radians(1.0))
-"""Of the reach, rad: poses with a larger misfit are not of this arm. Factory calibration and joint limits that were
-widened explain less."""
+"""Misfit, as a share of the reach and in rad, from which poses are not of this arm. Factory calibration and joint
+limits that were widened explain less."""
 TO_REST = 0.5
-"""Share of the way to its rest posture that a redundant arm goes in a step."""
+"""Share of the way to its rest posture that a redundant arm goes in one step."""
 MISFIT_WEIGHT, REST_WEIGHT = 1e10, 0.05
-"""Of the squared misfit (m²) and the squared distance from rest (rad²), beside squared change between poses."""
+"""Weights of the squared misfit (m²) and the squared distance from rest (rad²), beside squared change between poses."""
 TOOL_STD = (0.15, 1.0)
-"""m, rad: weak prior on an unknown tool."""
+"""Standard deviation (m, rad) of a weak prior on an unknown tool."""
 TOOLS = tuple(
     (np.array([0.0, 0.0, ahead]), np.array([0.0, 0.0, yaw]))
     for ahead in (0.1, 0.2)
@@ -68,7 +68,7 @@ class Posture:
 def inverse_kinematics(
     arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"], flange_from_tool: Transform | None = None
 ) -> Posture:
-    """Joint angles (n,dof) within the limits, continuous over the poses, and the misfit of each pose.
+    """Return joint angles (n,dof) within the limits, continuous over the poses, and the misfit of each pose.
 
     `flange_from_tool` is the frame of the poses in the gripper frame of `arm`. None: the identity, or where the poses
     are then out of reach, a constant tool that explains them, estimated together with the angles.
@@ -89,7 +89,7 @@ def inverse_kinematics(
 
 
 def required_posture(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"]) -> Posture:
-    """`inverse_kinematics`; InputError with the misfit where the poses do not fit the arm."""
+    """Return the result of `inverse_kinematics`; raise InputError with the misfit where the poses do not fit the arm."""
     posture = inverse_kinematics(arm, base_from_gripper)
     if posture.misfit_m.max() > REFUSED[0] * arm.reach or posture.misfit_rad.max() > REFUSED[1]:
         raise InputError(
@@ -102,7 +102,7 @@ def required_posture(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"]) -> Po
 def reach_toward(
     arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"], start: Joints, steps: int = STEPS
 ) -> Joints:
-    """Joint angles (n,dof) within the limits that bring the gripper as near each pose as it gets from `start`.
+    """Return joint angles (n,dof) within the limits that bring the gripper as near each pose as it gets from `start`.
 
     Damped least squares, the damping after Sugihara ("Solvability-unconcerned inverse kinematics by the
     Levenberg-Marquardt method", IEEE Trans. Robotics 27, 2011), all poses at once. The free motion of a redundant arm
@@ -132,7 +132,7 @@ def reach_toward(
 def _damped_step(
     error: Float[ndarray, "n 6"], jacobian: Float[ndarray, "n 6 dof"], free: Joints
 ) -> Float[ndarray, "n dof"]:
-    """`free` and the smallest damped change that removes the remaining error."""
+    """Return the sum of `free` and the smallest damped change that removes the remaining error."""
     damping = 0.5 * (error**2).sum(1) + 1e-9
     square = jacobian @ np.swapaxes(jacobian, 1, 2) + damping[:, None, None] * np.eye(6)
     left = error[..., None] - jacobian @ free[..., None]
@@ -142,7 +142,7 @@ def _damped_step(
 def _error(
     arm: Arm, joints: Joints, base_from_gripper: Float[ndarray, "n 4 4"]
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 dof"]]:
-    """Difference to the pose in base axes, rotations times geometry.ARM (m), and the Jacobian of the gripper."""
+    """Return the difference to the pose in base axes, rotations times geometry.ARM (m), and the gripper's Jacobian."""
     now, jacobian = kinematic_jacobian(arm, joints)
     rotation = rotation_log(base_from_gripper[:, :3, :3] @ np.swapaxes(now[:, :3, :3], 1, 2))
     jacobian[:, 3:] *= ARM
@@ -156,7 +156,7 @@ def _posture(
     rng: np.random.Generator,
     known: Joints | None = None,
 ) -> Posture:
-    """The best path through the solutions from many starts, for a known tool."""
+    """Return the best path through the solutions from many initial estimates, for a known tool."""
     base_from_gripper = base_from_tool @ inverse(flange_from_tool)
     # The rest posture, and random angles within the limits (within the middle rotation of wider ones).
     half = np.minimum(np.diff(arm.limits)[:, 0] / 2, np.pi)
@@ -174,13 +174,13 @@ def _posture(
 def _misfit(
     arm: Arm, joints: Joints, base_from_tool: Float[ndarray, "n 4 4"], flange_from_tool: Transform
 ) -> Float[ndarray, "n 2"]:
-    """Distance (m) and angle (rad) from each pose."""
+    """Return the distance (m) and the angle (rad) from each pose."""
     off = inverse(forward_kinematics(arm, joints) @ flange_from_tool) @ base_from_tool
     return np.stack([np.linalg.norm(off[:, :3, 3], axis=1), rotation_angle(off[:, :3, :3])], 1)
 
 
 def _path(arm: Arm, found: Float[ndarray, "n s dof"], misfit: Float[ndarray, "n s"]) -> Joints:
-    """One solution a pose, with the least change between poses (Viterbi), near the rest posture."""
+    """Return one solution for each pose, with the least change between poses (Viterbi), near the rest posture."""
     own = MISFIT_WEIGHT * misfit + REST_WEIGHT * (_change(arm, arm.rest, found) ** 2).sum(-1)
     cost, back = own[0], []
     for k in range(1, len(found)):
@@ -202,14 +202,14 @@ def _path(arm: Arm, found: Float[ndarray, "n s dof"], misfit: Float[ndarray, "n 
 def _change(
     arm: Arm, a: Float[ndarray, "... dof"], b: Float[ndarray, "... dof"]
 ) -> Float[ndarray, "... dof"]:
-    """Change from angles a to b, the shorter way where the joint has a full rotation."""
+    """Return the change from angles a to b, the shorter way where the joint has a full rotation."""
     return np.where(np.diff(arm.limits)[:, 0] >= 2 * np.pi, unwrapped(b - a), b - a)
 
 
 def _with_tool(
     arm: Arm, base_from_tool: Float[ndarray, "n 4 4"], joints: Joints, flange_from_tool: Transform
 ) -> tuple[Joints, Transform]:
-    """Joint angles and one tool together: Gauss-Newton, the angles of each pose eliminated."""
+    """Return joint angles and one tool by Gauss-Newton, with the angles of each pose eliminated."""
     weight = 1e-6 / np.repeat(np.square(TOOL_STD), 3)
     for _ in range(STEPS):
         error, jacobian = _error(arm, joints, base_from_tool @ inverse(flange_from_tool))

@@ -27,7 +27,7 @@ from jcr.geometry import ARM, Poses, Transform, rotation_exp, transform
 
 Joints = Float[ndarray, "n dof"]
 LINK_ERRORS = 4
-"""Of each joint: two translations, two rotations."""
+"""Number of link errors of each joint: two translations, two rotations."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -68,10 +68,11 @@ def from_dh(
     modified: bool,
     last_from_gripper: Transform | None = None,
 ) -> Arm:
-    """An arm from rows (a, d, α, θ₀) in metres and radians, of standard (distal) or modified (Craig) parameters.
+    """Return an arm from rows (a, d, α, θ₀) in metres and radians, of standard (distal) or modified (Craig)
+    parameters.
 
-    Standard: R_z(q+θ₀) T_z(d) T_x(a) R_x(α). Modified: R_x(α) T_x(a) R_z(q+θ₀) T_z(d), α and a being those of
-    the link before.
+    Standard: R_z(q+θ₀) T_z(d) T_x(a) R_x(α). Modified: R_x(α) T_x(a) R_z(q+θ₀) T_z(d), α and a being those of the link
+    before.
     """
     frame, frames = np.eye(4), []
     for a, d, alpha, theta in rows:
@@ -90,12 +91,12 @@ def from_dh(
 
 
 def with_tool(arm: Arm, flange_from_tool: Transform) -> Arm:
-    """The arm with its gripper frame at a tool."""
+    """Return the arm with its gripper frame at a tool."""
     return replace(arm, last_from_gripper=arm.last_from_gripper @ flange_from_tool)
 
 
 def joint_frames(arm: Arm, joints: Joints) -> tuple[Float[ndarray, "n dof 4 4"], Poses]:
-    """base_from_joint of each joint, not yet rotated by it, and base_from_gripper."""
+    """Return base_from_joint of each joint, before its own rotation, and base_from_gripper."""
     rotated = transform(rotation_exp(joints[..., None] * arm.axes), np.zeros(3))
     frames = np.empty((*joints.shape, 4, 4))
     at = np.broadcast_to(np.eye(4), (len(joints), 4, 4))
@@ -106,27 +107,27 @@ def joint_frames(arm: Arm, joints: Joints) -> tuple[Float[ndarray, "n dof 4 4"],
 
 
 def forward_kinematics(arm: Arm, joints: Joints) -> Poses:
-    """base_from_gripper (n,4,4) of the nominal arm at joint angles (n,dof) in rad."""
+    """Return base_from_gripper (n,4,4) of the nominal arm at joint angles (n,dof) in rad."""
     return joint_frames(arm, joints)[1]
 
 
 def kinematic_jacobian(arm: Arm, joints: Joints) -> tuple[Poses, Float[ndarray, "n 6 dof"]]:
-    """base_from_gripper, and its twist (v of the gripper's origin, ω; base axes) per rad of each joint."""
+    """Return base_from_gripper, and its twist (v of the gripper's origin, ω; base axes) per rad of each joint."""
     frames, gripper = joint_frames(arm, joints)
     return gripper, np.swapaxes(axis_twists(arm, frames, gripper), 1, 2)
 
 
 def error_std(arm: Arm, joint_offset: float, link: float) -> Float[ndarray, " p"]:
-    """One standard deviation of each column of `error_jacobian`, from those of a joint's offset (rad) and a link (m).
+    """Return one standard deviation of each column of `error_jacobian`, for a joint's offset (rad) and a link (m).
 
-    A link's rotations have that of its translations divided by geometry.ARM (0.3 m), a typical length of a link: 0.3 mm
-    goes with 0.06°.
+    A link's rotations have that of its translations divided by geometry.ARM (0.3 m), a typical length of a link: 0.3
+    mm goes with 0.06°.
     """
     return np.r_[np.full(arm.dof, joint_offset), np.tile([link, link, link / ARM, link / ARM], arm.dof)]
 
 
 def error_jacobian(arm: Arm, joints: Joints) -> Float[ndarray, "n 6 p"]:
-    """Derivative of the gripper's true pose by the arm's errors, at errors zero; p = 5 dof.
+    """Return the derivative of the gripper's true pose by the arm's errors, at errors zero; p = 5 dof.
 
     Rows are those of `equation.residuals`, steps of geometry.retract from the reported pose (m, rad; base axes), to
     which errors φ add `error_jacobian · φ`. Columns are the offsets of all joints, then the errors of each link.
@@ -142,7 +143,7 @@ def error_jacobian(arm: Arm, joints: Joints) -> Float[ndarray, "n 6 p"]:
 
 
 def axis_twists(arm: Arm, frames: Float[ndarray, "n dof 4 4"], gripper: Poses) -> Float[ndarray, "n dof 6"]:
-    """The gripper's twist (v of its origin, ω; base axes) per rad of each joint, from `joint_frames`."""
+    """Return the gripper's twist (v of its origin, ω; base axes) per rad of each joint, from `joint_frames`."""
     return _twist(frames, gripper, (frames[..., :3, :3] @ arm.axes[..., None])[..., 0])
 
 
@@ -154,7 +155,7 @@ def _twist(
 
 
 def perpendicular(axes: Float[ndarray, "dof 3"]) -> Float[ndarray, "dof 3 2"]:
-    """Two unit vectors perpendicular to each axis: the frame's x and y where the axis is its z."""
+    """Return two unit vectors perpendicular to each axis: the frame's x and y where the axis is its z."""
     order = np.argsort(np.abs(axes), axis=1, kind="stable")
     first = np.eye(3)[order[:, 0]]
     first = first - (first * axes).sum(1, keepdims=True) * axes
@@ -163,5 +164,5 @@ def perpendicular(axes: Float[ndarray, "dof 3"]) -> Float[ndarray, "dof 3 2"]:
 
 
 def unwrapped(angles: Float[ndarray, "*n"]) -> Float[ndarray, "*n"]:
-    """Angles in [-π, π)."""
+    """Return angles in [-π, π)."""
     return (angles + np.pi) % (2 * np.pi) - np.pi

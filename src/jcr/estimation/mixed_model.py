@@ -1,4 +1,4 @@
-"""The mixed linear model of gripper poses at one value of the unknowns, and its solution at given sizes of the errors.
+"""Mixed linear model of gripper poses at one value of the unknowns, and its solution at given sizes of the errors.
 
 The residuals of n poses are r = −J θ + e + ε. The random part ε has σ_t² per axis of position and σ_r² per axis of
 rotation, the systematic part e has covariance σ_s² G (systematic.py), and what the cameras add is known.
@@ -16,28 +16,28 @@ from jcr.estimation.systematic import REACH
 from jcr.records import RobotNoise
 
 NOISE_FLOOR = (2e-5, np.radians(0.002))
-"""m, rad; so that a perfect fit does not claim a perfect robot."""
+"""Least noise (m, rad) beside the estimated one, so that a perfect fit does not claim a perfect robot."""
 TYPICAL = np.array([3e-4, np.radians(0.04), np.radians(0.1)])
-"""σ_t (m), σ_r (rad), σ_s (rad) of an arm: where their weak priors have their middle."""
+"""Middle of the weak priors of σ_t (m), σ_r (rad) and σ_s (rad) of an arm."""
 FACTOR_STD = np.log([10.0, 10.0, 3.0])
-"""By what factor arms differ in these. Data sheets of industrial arms leave 0.03 to 0.1° of systematic error, those of
-servo arms 1 to 2°."""
+"""Logarithms of the factors by which arms differ in these. Data sheets of industrial arms state 0.03 to 0.1° of
+systematic error, those of servo arms 1 to 2°."""
 TYPICAL_WALKS, WALK_FACTOR_STD = np.array([3e-4, 1e-3, 1e-3]), np.log(30.0)
 """Growth of the errors of camera poses from one image to the next (m, rad, relative scale), and the factor by which it
 differs between sequences."""
 _FACTORS = np.r_[FACTOR_STD, np.full(3, WALK_FACTOR_STD)]
 GIVEN_SHARE = 0.3
-"""Of a given noise, that a robot has beside it: the middle of the prior."""
+"""Middle of the prior of a robot's noise beside a given one, as a share of the given one."""
 SHOWN = 1.1
-"""Times the noise that was given: so much more is the residuals' doing."""
+"""Factor on a given noise beyond which the noise counts as estimated from the residuals."""
 LEAST_BESIDE = 0.01
-"""Of what is counted anyway, that errors beside it are at least: the logarithm of no error is not finite."""
+"""Least errors beside the given noise, as a share of it: the logarithm of no error is not finite."""
 RATIO_STD = np.log(4.0)
-"""Of log(σ_t / (REACH · σ_r)) over robots. Tied more closely, by a factor of 2, three images of a robot whose rotations
-are six times better than its positions cover 80 to 90 %."""
+"""Standard deviation of log(σ_t / (REACH · σ_r)) over robots. With log 2 instead, three images of a robot whose
+rotations are six times better than its positions cover 80 to 90 %."""
 
 LogSizes = Float[ndarray, "*k c"]
-"""Of σ_t, σ_r and, where there is a systematic part, σ_s."""
+"""Logarithms of σ_t, σ_r and, where there is a systematic part, σ_s."""
 Each = Float[ndarray, "*k"] | np.floating
 Residuals = Float[ndarray, " s"]
 Covariance = Float[ndarray, "s s"]
@@ -53,11 +53,11 @@ class Equations:
     prior_information: Float[ndarray, "p p"]
     prior_gradient: Float[ndarray, " p"]
     known: Covariance | None = None
-    """That errors of the cameras give the residuals."""
+    """Covariance of the residuals by errors of the cameras."""
     systematic: Covariance | None = None
-    """Of the systematic part where σ_s is 1 rad; None: there is none."""
+    """Covariance of the systematic part where σ_s is 1 rad; None: there is none."""
     given: tuple[float, float] | None = None
-    """σ_t and σ_r as the user gave them (m, rad): no less is counted."""
+    """Lower bounds of σ_t and σ_r that the user gave (m, rad)."""
     walks: tuple[Covariance, ...] = ()
     """Covariances of errors of the camera poses that add up along the sequence, where their sizes are 1."""
     confirmed: Covariance | None = None
@@ -65,7 +65,7 @@ class Equations:
 
     @property
     def least(self) -> Float[ndarray, "2"]:
-        """σ_t and σ_r that are counted beside what is estimated."""
+        """Noise σ_t and σ_r that counts beside the estimated one."""
         return np.array(self.given or NOISE_FLOOR)
 
     @property
@@ -78,7 +78,7 @@ class Equations:
 
     @property
     def count(self) -> int:
-        """Of sizes to be found."""
+        """Number of sizes to be estimated."""
         return len(self.components) + 2
 
     @property
@@ -92,24 +92,24 @@ class Equations:
         return np.tile(np.repeat([1.0, 0.0], 3), len(self.residual) // 6)
 
     def variances(self, log_sizes: LogSizes) -> Float[ndarray, "*k c"]:
-        """σ_t², σ_r², σ_s²."""
+        """Return σ_t², σ_r², σ_s² and the squared growth of the camera errors."""
         variances = np.exp(2 * log_sizes)
         variances[..., :2] += self.least**2
         return variances
 
     def log_sizes_of(self, noise: RobotNoise) -> Float[ndarray, " c"]:
-        """The sizes that this noise is made of; of what is counted anyway they are a hundredth at least."""
+        """Return the log sizes of a noise, at least LEAST_BESIDE of the noise that counts in any case."""
         sizes = np.array([noise.translation, noise.rotation, noise.systematic])[: self.count]
         beside = np.sqrt(np.maximum(sizes[:2] ** 2 - self.least**2, (LEAST_BESIDE * self.least) ** 2))
         return np.log(np.r_[beside, np.maximum(sizes[2:], LEAST_BESIDE * self.least[1])])
 
     def random(self, log_sizes: LogSizes) -> Float[ndarray, "*k s"]:
-        """Variance of each residual's random part."""
+        """Return the variance of each residual's random part."""
         variances = self.variances(log_sizes)
         return variances[..., :1] * self.of_position + variances[..., 1:2] * (1 - self.of_position)
 
     def noise(self, log_sizes: LogSizes) -> RobotNoise:
-        """The errors of the poses, where their sizes are these and there is a systematic part."""
+        """Return the errors of the poses at these sizes, where there is a systematic part."""
         assert self.systematic is not None
         metres, radians, systematic = np.sqrt(self.variances(log_sizes)[:3]).tolist()
         left = systematic * np.sqrt(np.diag(self.systematic).reshape(-1, 2, 3).mean((0, 2)))
@@ -124,7 +124,7 @@ class Equations:
         )
 
     def covariance(self, log_sizes: LogSizes) -> Float[ndarray, "*k s s"]:
-        """V of the residuals."""
+        """Return the covariance V of the residuals."""
         random = self.random(log_sizes)
         covariance = np.zeros((*random.shape, random.shape[-1]))
         variances = self.variances(log_sizes)[..., 2:]
@@ -138,7 +138,7 @@ class Equations:
         return covariance
 
     def log_prior(self, log_sizes: LogSizes) -> Each:
-        """Log density of the weak priors of the sizes, up to a constant."""
+        """Return the log density of the weak priors of the sizes, up to a constant."""
         z = (log_sizes - np.log(self.typical)) / _FACTORS[: self.count]
         ratio = (log_sizes[..., 0] - log_sizes[..., 1] - np.log(REACH)) / RATIO_STD
         return -((z**2).sum(-1) + ratio**2) / 2
@@ -149,7 +149,7 @@ class Equations:
         return float(np.log(_FACTORS[: self.count]).sum())
 
     def log_prior_slope(self, log_sizes: LogSizes) -> tuple[LogSizes, Float[ndarray, "c c"]]:
-        """Its gradient and negative Hessian."""
+        """Return the gradient and the negative Hessian of `log_prior`."""
         std = _FACTORS[: self.count]
         z = (log_sizes - np.log(self.typical)) / std
         ratio = (log_sizes[0] - log_sizes[1] - np.log(REACH)) / RATIO_STD
@@ -160,12 +160,12 @@ class Equations:
 
 @dataclass(frozen=True, kw_only=True)
 class LinearSolution:
-    """The unknowns at one value of the sizes, or at k values."""
+    """Unknowns at one value of the sizes, or at k values."""
 
     log_likelihood: Each
     """Restricted, of the sizes; up to a constant that all sizes and all models of the same residuals share."""
     log_posterior: Each
-    """The same with the prior of the sizes."""
+    """Log likelihood with the prior of the sizes."""
     step: Float[ndarray, "*k p"]
     root: Float[ndarray, "*k s s"]
     """Lower Cholesky factor of V."""
@@ -174,11 +174,11 @@ class LinearSolution:
     weighed: Float[ndarray, "*k s p"]
     """V⁻¹J."""
     weighed_left: Float[ndarray, "*k s"]
-    """V⁻¹(r + Jθ): of what the unknowns leave of the residuals."""
+    """Weighed remaining residuals V⁻¹(r + Jθ)."""
 
     @property
     def gain(self) -> Float[ndarray, "*k p s"]:
-        """By which errors of the residuals pass into the unknowns, with the sign reversed: C JᵀV⁻¹."""
+        """Gain with which errors of the residuals pass into the unknowns, with the sign reversed: C JᵀV⁻¹."""
         return over(self.information_root, np.swapaxes(self.weighed, -1, -2))
 
     @property
@@ -198,7 +198,7 @@ class LinearSolution:
 
 
 def solve_equations(equations: Equations, log_sizes: LogSizes) -> LinearSolution:
-    """Generalised least squares at given sizes."""
+    """Return the generalised least-squares solution at given sizes."""
     root = cholesky(equations.covariance(log_sizes))
     whitened = lower(root, np.column_stack([equations.jacobian, equations.residual]))
     jacobian, residual = whitened[..., :-1], whitened[..., -1:]
@@ -224,7 +224,7 @@ def solve_equations(equations: Equations, log_sizes: LogSizes) -> LinearSolution
 def left_out(
     solution: LinearSolution, noise: tuple[float, float]
 ) -> tuple[Float[ndarray, "m 6"], Float[ndarray, "m 6 6"]]:
-    """Each pose's residual from a fit without it, P_ii⁻¹ (P r)_i, and its covariance P_ii⁻¹.
+    """Return each pose's residual from a fit without it, P_ii⁻¹ (P r)_i, and its covariance P_ii⁻¹.
 
     `noise` (m, rad) sets the units in which the matrices are inverted.
     """

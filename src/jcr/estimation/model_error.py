@@ -1,11 +1,4 @@
-"""What a camera's model leaves of its distortion: a displacement that is smooth over the image, the same in all images.
-
-A few coefficients do not bend every ray as a cheap camera does. What they leave is common to all images: it does not
-average out, it hardly shows in the pixels' noise, and it moves the intrinsics that are fitted with it. It is a random
-effect here as the systematic errors of the robot are: polynomials over the image, of one size that is estimated with
-the rest (MacKay, "Bayesian interpolation", Neural Computation 4, 1992, eq. 4.9). What the intrinsics can express is
-taken out of them, so that the intrinsics are those that fit the image best.
-"""
+"""Remaining error of a camera's model: displacements of pixels that its coefficients do not describe."""
 
 from collections.abc import Sequence
 
@@ -19,9 +12,9 @@ from jcr.estimation.intrinsics_prior import Camera
 from jcr.records import Intrinsics, ModelError
 
 DEGREE = 5
-"""Of the polynomials."""
+"""Total degree of the polynomials."""
 TYPICAL = 1e-4
-"""Of the width, per polynomial: the middle of the prior of their size, a weak one."""
+"""Middle of the weak prior of the size of each polynomial, in widths of the image."""
 UPDATES, SETTLED = 100, 1e-3
 """Most updates of the size, and the relative change of its square that ends them."""
 WORTH = 2.0
@@ -82,8 +75,10 @@ def expressed(camera: Camera, x_px: Float[ndarray, "k 2"]) -> Float[ndarray, "q 
 def second_moment_px2(
     left: ModelError, camera: Intrinsics, x_px: Float[ndarray, "*points 2"]
 ) -> Float[ndarray, "*points 2 2"]:
-    """Of the displacement at pixels (px²): who projects with the camera alone errs by it and by what is unknown of
-    it."""
+    """Return the second moment of the displacement at pixels (px²).
+
+    A projection with the camera alone errs by the displacement and by its uncertainty.
+    """
     flat = x_px.reshape(-1, 2)
     by = camera.width * _polynomials(flat, camera)
     by = by - by_parameters(camera, unproject(camera, flat)) @ left.expressed
@@ -97,7 +92,7 @@ def polynomials_of(camera: Camera) -> int:
 
 
 def _polynomials(x_px: Float[ndarray, "k 2"], camera: Intrinsics) -> Float[ndarray, "k 2 e"]:
-    """Of x, then of y: products of Legendre polynomials, up to a total degree, over a square about the image."""
+    """Return the displacements of x, then of y: products of Legendre polynomials up to a total degree over a square."""
     u, v = ((2 * x_px - [camera.width - 1, camera.height - 1]) / max(camera.width, camera.height)).T
     every = legvander2d(u, v, [DEGREE, DEGREE]).reshape(-1, DEGREE + 1, DEGREE + 1)
     i, j = np.nonzero(np.add.outer(np.arange(DEGREE + 1), np.arange(DEGREE + 1)) <= DEGREE)
@@ -107,7 +102,7 @@ def _polynomials(x_px: Float[ndarray, "k 2"], camera: Intrinsics) -> Float[ndarr
 
 
 def _beside(by: Float[ndarray, "k 2 e"], expressed: Float[ndarray, "k 2 q"]) -> Float[ndarray, "k 2 e"]:
-    """Displacements without what others express, over these observations."""
+    """Return displacements without the part that others express, over these observations."""
     flat, basis = by.reshape(-1, by.shape[2]), expressed.reshape(-1, expressed.shape[2])
     orthonormal = np.linalg.qr(basis)[0]
     return (flat - orthonormal @ (orthonormal.T @ flat)).reshape(by.shape)

@@ -1,7 +1,7 @@
-"""How an arm with known joint angles is mounted: the constant base and tool between its kinematics and reported poses.
+"""Constant base and tool between the kinematics of an arm with known joint angles and its reported poses.
 
-Controllers report poses in a base and of a tool of the user's choice. Both are constant, so joint angles and poses of a
-few images determine them, and what remains shows whether angles and poses belong to this arm at all.
+Controllers report poses in a base and of a tool of the user's choice. Both are constant, so joint angles and poses of
+a few images determine them, and what remains shows whether angles and poses belong to this arm at all.
 """
 
 from dataclasses import replace
@@ -18,24 +18,24 @@ from jcr.estimation.known_scale import fit_known_scale
 from jcr.geometry import ARM, inverse, rotation_exp, transform
 
 NOISE = (1e-3, 1e-3 / ARM)
-"""m, rad: differences of equal weight."""
+"""Differences (m, rad) of equal weight."""
 AGREE = (0.015, np.radians(1.5))
-"""Of the reach, rad; root mean square. Controllers use kinematics calibrated at the factory, which are millimetres
-from the nominal arm."""
+"""Largest rms difference of agreeing angles and poses, as a share of the reach and in rad. Controllers use kinematics
+calibrated at the factory, which are millimetres from the nominal arm."""
 ALIKE, SURE = 0.01, 5.0
-"""Relative, and in standard deviations: further apart, reported positions are of another length than the arm's links. A
-factory's calibration changes them by less."""
+"""Difference of lengths from which reported positions are not of this arm: relative, and in standard deviations. A
+factory's calibration changes lengths by less."""
 
 
 class LengthError(InputError):
-    """Gripper positions are by one factor longer or shorter than the arm's; no image would show it."""
+    """Error that gripper positions are longer or shorter than the arm's by one factor, which no image shows."""
 
 
 def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Poses) -> Arm:
-    """The arm with the base and tool with which its forward kinematics gives the reported poses best.
+    """Return the arm with the base and tool whose forward kinematics fits the reported poses best.
 
-    Where the motions do not determine them, those nearest the arm's own. InputError where angles and poses disagree,
-    LengthError where they do by a factor of all positions.
+    Where the motions do not determine them, they are nearest the arm's own. Raise InputError where angles and poses
+    disagree, and LengthError where they do by a factor of all positions.
     """
     nominal = forward_kinematics(arm, joints)
     weights = np.ones(len(joints))
@@ -59,7 +59,7 @@ def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Poses) -> Arm:
 
 
 def _require_length(arm: Arm, base_from_gripper: Poses, nominal: Poses) -> None:
-    """LengthError where one factor on all positions makes them agree with the nominal arm, and it is not 1."""
+    """Raise LengthError where one factor other than 1 on all positions makes them agree with the nominal arm."""
     tool, scale, base = closed_form(base_from_gripper, nominal)
     factor = float(scale)
     if factor <= 0:  # unobservable
@@ -81,5 +81,5 @@ def _require_length(arm: Arm, base_from_gripper: Poses, nominal: Poses) -> None:
 
 
 def _apart(residual: Float[ndarray, "n 6"]) -> Float[ndarray, "2"]:
-    """m and rad, root mean square."""
+    """Return the rms difference in m and rad."""
     return np.sqrt((residual.reshape(-1, 2, 3) ** 2).sum(2).mean(0))

@@ -1,9 +1,9 @@
-"""Which parts of the calibration the motions can see.
+"""Observability of the hand-eye transform and the scale by the motions of a capture.
 
-The excitation of a direction of (translation, rotation, scale) is by how many metres, root mean square over
-the images, one metre along it moves the reported gripper positions, after base_from_recon has followed as
-well as it can; rotations count at geometry.ARM, scale by the spread of the camera centres. It is about 0.4
-for general motion, and the sine of the deviation for a nearly degenerate one.
+The excitation of a direction of (translation, rotation, scale) is by how many metres, root mean square over the
+images, one metre along it moves the reported gripper positions, after base_from_recon has followed as well as it can;
+rotations count at geometry.ARM, scale by the spread of the camera centres. It is about 0.4 for general motion, and the
+sine of the deviation for a nearly degenerate one.
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ EXACT = 0.005
 def excitation(
     base_from_gripper: Poses, gripper_from_camera: Transform | None, priors: Sequence[LinearPrior] = ()
 ) -> Excitation:
-    """What gripper poses (n,4,4) can see of X and λ; without an X the camera is put at the gripper."""
+    """Return the excitation of X and λ by gripper poses (n,4,4); without an X the camera is assumed at the gripper."""
     n = len(base_from_gripper)
     offset = np.zeros(3) if gripper_from_camera is None else gripper_from_camera[:3, 3]
     # An offset that was never seen may be anything; the excitation hardly depends on a plausible one.
@@ -59,7 +59,7 @@ def observability(
     recon_from_camera: Poses | None = None,
     priors: Sequence[LinearPrior] = (),
 ) -> Observability:
-    """A finding for each unseen direction; camera poses, if given, distinguish an orbit from a fixed tool."""
+    """Return a finding for each unobservable direction; camera poses distinguish an orbit from a fixed tool."""
     n = len(base_from_gripper)
     if n == 2:
         return Observability((_unseen("two images"),))
@@ -79,7 +79,7 @@ def observability(
 
 
 def _unseen(motion: str, at: Float[ndarray, "3"] | None = None, frame: str = "") -> Finding:
-    """A direction that motions like this (words.py lists them) do not show; an axis, or point, of a frame."""
+    """Return a finding of a direction that a kind of motion does not show, with an axis or a point of a frame."""
     where: dict[str, Any] = (
         {} if at is None else dict(zip("xyz", at.tolist(), strict=True)) | {"frame": frame}
     )
@@ -110,7 +110,7 @@ def _explained(
 
 
 def _lost_scale(base_from_gripper: Poses, recon_from_camera: Poses | None) -> Finding:
-    """Scale is lost when a point fixed to the gripper stays where it is: which point it is."""
+    """Return the finding of the point fixed to the gripper whose rest makes the scale unobservable."""
     tool = still_point(base_from_gripper)[0]
     if recon_from_camera is None:
         return _unseen("one point", tool, "gripper")
@@ -124,7 +124,7 @@ def _lost_scale(base_from_gripper: Poses, recon_from_camera: Poses | None) -> Fi
 
 
 def still_point(a_from_b: Poses) -> tuple[Float[ndarray, "3"], float, float]:
-    """The point of frame b that moves least in a, how far it moves, and how far b's origin does (rms)."""
+    """Return the point of frame b that moves least in a, its motion, and that of b's origin (rms)."""
     rotation, position = a_from_b[:, :3, :3], a_from_b[:, :3, 3]
     rows, right = (rotation - rotation.mean(0)).reshape(-1, 3), (position - position.mean(0)).ravel()
     point = np.linalg.lstsq(rows, -right, rcond=1e-9)[0]

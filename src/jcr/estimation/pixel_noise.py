@@ -1,4 +1,4 @@
-"""How large the errors of image observations are: one model for every adjustment.
+"""Estimate of the errors of image observations, one model for every adjustment.
 
 The size comes from the median point, for wrong matches are many; what neighbours share of their errors from sums over
 cells of the images.
@@ -23,18 +23,18 @@ CELLS = 8
 model leaves."""
 MIN_SIGMA_PX = 0.02
 RATIOS = (0.25, 100.0)
-"""Of the variances of other cameras' observations to that of the first's: of few points that only one other sees, a
-camera seems as good as its weight makes it."""
+"""Bounds of the ratio of the variances of other cameras' observations to those of the first camera. A camera whose few
+points only one other camera observes seems as good as its weight makes it."""
 FAR_OFF = 6.0
 """Median residuals; seven sigma."""
 COMMON = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
 """Shares of the variance of the median observation that are tried as what all observations have in common."""
 SCALE_STEPS = 10
 NEAREST = 0.05
-"""Of the median depth: no camera focuses on what is nearer, and a mismatch that two images place in front of both
-fixes them where it lies, the surer the nearer it comes."""
+"""Least depth of an observation as a share of the median depth. No camera focuses on nearer points, and a mismatch
+that lies in front of two cameras fixes them the more, the nearer it lies."""
 LEAST_LEFT = 0.1
-"""Of an observation's variance after its point took its part: below, the residual shows nothing of it."""
+"""Least share of an observation's variance after its point took its part; below, the residual shows nothing of it."""
 
 
 @dataclass(frozen=True)
@@ -42,27 +42,29 @@ class PixelNoise:
     """Errors of image observations."""
 
     sigma_px: Float[ndarray, " g"]
-    """Of one coordinate, by group of observations: the features of each camera, then the corners of boards, which are
-    found in another way."""
+    """Standard deviation of one coordinate by group of observations: the features of each camera, then the corners of
+    boards, which another detector finds."""
     inflation: float = 1.0
-    """Of the variance of what many observations show together, because neighbours share errors; one for all cameras, for
-    where points follow the few observations of one its own residuals do not show it."""
+    """Factor on the variance of sums of many observations, because neighbours share errors. It is one for all cameras:
+    where points follow the few observations of a camera, its own residuals do not show it."""
     common: float = 1.0
     """Share of the variance of a median observation that all have alike; the rest is as its match states it."""
 
     def change(self, before: "PixelNoise") -> float:
-        """Of the sizes, relative; the largest."""
+        """Return the largest relative change of the sizes."""
         return float(np.abs(np.log(self.sigma_px / before.sigma_px)).max())
 
     def variance_px2(self, layout: "Layout") -> Float[ndarray, " k"]:
-        """Of one coordinate of each observation."""
+        """Return the variance of each observation's coordinates, px², shape (n,)."""
         return self.sigma_px[layout.group] ** 2 * layout.relative_variance(self.common)
 
     def weights(
         self, residual_px: Float[ndarray, "k 2"], depth: Float[ndarray, " k"], layout: "Layout"
     ) -> Float[ndarray, " k"]:
-        """Inverse variances of observations under the Cauchy loss; those of points behind a camera, or so near that no
-        camera shows them, are 0."""
+        """Return the inverse variances of observations under the Cauchy loss.
+
+        They are 0 for points behind a camera, or so near that no camera is in focus there.
+        """
         variance = self.variance_px2(layout)
         squared = (residual_px**2).sum(1) / variance
         weight = loss_weight("cauchy", squared / LOSS_SCALE**2) / (variance * self.inflation)
@@ -75,15 +77,16 @@ class Layout:
     """What of the observations the estimate needs and no adjustment changes."""
 
     camera: Int[ndarray, " k"]
-    """Of each observation."""
+    """Camera of each observation."""
     group: Int[ndarray, " k"]
-    """Of each observation, as PixelNoise counts them."""
+    """Group of each observation, as PixelNoise counts them."""
     groups: int
     point: Int[ndarray, " k"]
     cell: Int[ndarray, " k"]
-    """The images of a fixed camera show the same features with the same errors: their cells are one."""
+    """Cell of each observation. The images of a fixed camera show the same features with the same errors: their cells
+    are one."""
     stated_variance: Float[ndarray, " k"]
-    """As matching states it, over the median observation's."""
+    """Variance that matching states, over that of the median observation."""
     median_square: Float[ndarray, " p"]
     """Median of a point's sum of squared residuals where an image coordinate's variance is 1: of the 2n errors of n
     views its position takes up 3, but for a corner of a board, whose place is known."""
@@ -118,11 +121,11 @@ class Layout:
         return bool(np.ptp(self.stated_variance) > 0) if len(self.stated_variance) else False
 
     def relative_variance(self, common: float) -> Float[ndarray, " k"]:
-        """Of each observation over the median one's, where all have this share of that in common."""
+        """Return the variance of each observation over the median one, all having this share in common."""
         return common + (1 - common) * self.stated_variance
 
     def squares_of_cells(self, pull: Float[ndarray, "k 2"]) -> float:
-        """Squared sums over cells of what each observation pulls, added up."""
+        """Return the sum of the squared sums of weighted residuals over cells."""
         return sum(float((np.bincount(self.cell, along) ** 2).sum()) for along in pull.T)
 
 
@@ -133,12 +136,16 @@ def pixel_noise(
     ratio: Float[ndarray, " g"],
     common: float = 1.0,
 ) -> PixelNoise:
-    """From the median point none of whose observations is far off, and from cells of the images.
+    """Return the pixel noise from the median point without outliers and from cells of the images.
+
+    `ratio` is that of the variances of each group's observations to those of the first. With independent errors the
+    squared sum of the weighted residuals over a cell is, on average, the sum of their squares. The factor beyond that
+    is the information that errors shared by neighbours cost the images.
 
     `ratio` is that of the variances of each group's observations to those of the first. Were errors independent, the
-    squared sum over a cell of what each observation pulls would be, on average, the sum of the squares; what it is times
-    that is what the errors that neighbours share cost of the images' information (the variance inflation of cluster
-    sampling; Liang and Zeger, Biometrika 73, 1986).
+    squared sum over a cell of what each observation pulls would be, on average, the sum of the squares; what it is
+    times that is what the errors that neighbours share cost of the images' information (the variance inflation of
+    cluster sampling; Liang and Zeger, Biometrika 73, 1986).
     """
     relative = (residual_px**2).sum(1) / (ratio[layout.group] * layout.relative_variance(common))
     far = relative > FAR_OFF**2 * np.median(relative)
@@ -161,10 +168,10 @@ def left_of_points(
     starts: Int[ndarray, " p"],
     known: Float[ndarray, "p 3 3"] | None = None,
 ) -> Float[ndarray, " k"]:
-    """Share of each observation's variance that its residual has after the points took their part (their leverage).
+    """Return the share of each observation's variance that is left in its residual by the leverage of the points.
 
-    `by_point` are derivatives by the points, `starts` each point's first observation, `known` the information that each
-    point has beside its observations.
+    `by_point` are derivatives by the points, `starts` each point's first observation, `known` the information that
+    each point has beside its observations.
     """
     weight = replace(before, inflation=1.0).weights(residual_px, depth, layout)
     j = np.sqrt(weight)[:, None, None] * by_point
@@ -180,10 +187,10 @@ def variance_ratios(
     depth: Float[ndarray, " k"],
     left: Float[ndarray, " k"],
 ) -> Float[ndarray, " g"]:
-    """Variances of each group's observations over those of the first.
+    """Return the variances of each group's observations over those of the first.
 
-    From their sums of squares over what is left of them, for a group whose residuals are small because points follow
-    it is not the better one.
+    The sums of squares are divided by what the points left of them: a group whose residuals are small because points
+    follow it is not the better one.
     """
     count = len(before.sigma_px)
     ratio = np.ones(count)
@@ -204,9 +211,9 @@ def common_share(
     left: Float[ndarray, " k"],
     ratio: Float[ndarray, " g"],
 ) -> float:
-    """The share of variance that all observations have alike under which the residuals are likeliest.
+    """Return the most likely share of variance that all observations have alike.
 
-    Each at its likeliest size, under the Student's t distribution whose negative logarithm is the loss.
+    Each share has its most likely size, under the Student's t distribution whose negative logarithm is the loss.
     """
     if not layout.states_variances:
         return 1.0

@@ -89,11 +89,11 @@ class State:
     """Estimates of all unknowns of a problem, and of the sizes of its errors."""
 
     x: Float[ndarray, "a 4 4"]
-    """gripper_from_rig of each arm, or base_from_camera where the arm carries the scene."""
+    """Transform gripper_from_rig of each arm, or base_from_camera where the arm carries the scene."""
     scale: float
     """Metres per unit of the world."""
     z: Float[ndarray, "a 4 4"]
-    """base_from_world of each arm, or gripper_from_world; the world in metres."""
+    """Transform base_from_world of each arm, or gripper_from_world; the world in metres."""
     world_from_rig: Float[ndarray, "m 4 4"]
     rig_from_camera: Float[ndarray, "c 4 4"] = field(default_factory=lambda: np.eye(4)[None])
     camera_steps: Float[ndarray, " l"] = field(default_factory=lambda: np.zeros(0))

@@ -34,7 +34,7 @@ class View:
     from_centre_px: Float[ndarray, "k 2"]
     """Projection by the camera alone, from the principal point."""
     own_map: Float[ndarray, "k 2"] | None
-    """e^l and the shear (px/px) of each observation's image; None where images do not differ from their cameras."""
+    """Factor e^l and shear (px/px) of each observation's image; None where images do not differ from their cameras."""
     residual_px: Float[ndarray, "k 2"]
     """Projection minus observation."""
 

@@ -1,4 +1,4 @@
-"""How well a hand-eye calibration explains the motions, as the paper reports it."""
+"""Residuals δ_t and δ_R of the motions, as the paper reports them."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -14,7 +14,7 @@ def paper_residuals(
     scale: float,
     used: Bool[ndarray, " n"],
 ) -> tuple[float, float]:
-    """Mean δ_t (m) and δ_R (Frobenius norm) of A·X − X·B(λ) over consecutive used images (paper, eq. 16)."""
+    """Return the mean δ_t (m) and δ_R (Frobenius norm) of A·X − X·B(λ) over consecutive used images (paper, eq. 16)."""
     a, b = (inverse(of[used][:-1]) @ of[used][1:] for of in (base_from_gripper, recon_from_camera))
     gap = a @ gripper_from_camera - gripper_from_camera @ scale_translation(b, scale)
     translation = np.linalg.norm(gap[:, :3, 3], axis=1).mean()

@@ -1,11 +1,11 @@
-"""Which images to believe: a stale or shuffled gripper pose spoils one image, not one motion.
+"""Selection of the images whose gripper poses agree with the others (stale or shuffled poses do not).
 
-Candidates come from triples of images whose motions are congruent (a rotation and its conjugate rotate by the
-same angle, whatever X is: the screw congruence of Chen 1991). The candidate with the least trimmed squares
-over images (Rousseeuw 1984) starts a maximum-likelihood fit, which images join as long as the evidence grows:
-the density of all residuals, averaged over what is unknown, where those of wrong poses may be of any size
-(Box and Tiao, Biometrika 55, 1968). A bent arm's errors are larger than those of the few images that it bends
-least, and yet none is wrong: it costs less to take the arm for a worse one than many poses for wrong.
+Candidates come from triples of images whose motions are congruent (a rotation and its conjugate rotate by the same
+angle, whatever X is: the screw congruence of Chen 1991). The candidate with the least trimmed squares over images
+(Rousseeuw 1984) starts a maximum-likelihood fit, which images join as long as the evidence grows: the density of all
+residuals, averaged over what is unknown, where those of wrong poses may be of any size (Box and Tiao, Biometrika 55,
+1968). A bent arm's errors are larger than those of the few images that it bends least, and yet none is wrong: it costs
+less to take the arm for a worse one than many poses for wrong.
 """
 
 from collections.abc import Callable
@@ -39,7 +39,8 @@ WRONG = 1e-5
 capture, all sound, 5 % were rejected at 0.02, 2 % at 1e-5, and at 1e-7 still as many; there a wrong pose of doosan_bench
 with its board is kept."""
 LEAST_WRONG, MOST_WRONG = (1e-3, np.radians(0.2)), (1.0, np.pi)
-"""How far off wrong poses are (m, rad). No image is rejected for less: smaller errors are vision's, and harm nobody."""
+"""Least errors of wrong poses (m, rad). No image is rejected for less: smaller errors come from vision, and are
+harmless."""
 
 
 def robust_fit(
@@ -100,8 +101,9 @@ def robust_fit(
 
 
 def _joined(fitted: Callable[[Images], Fit], used: Images) -> tuple[Images, float]:
-    """The images to use, and the log evidence of that: those join `used` that are likelier sound than wrong, or the
-    likeliest of all, as long as the evidence grows.
+    """Return the images to use and their log evidence, after images joined `used` while the evidence grew.
+
+    Those that are likelier right than wrong join, or the likeliest one.
     """
     fit = fitted(used)
     best = _evidence(fit, used)
@@ -123,7 +125,10 @@ def _joined(fitted: Callable[[Images], Fit], used: Images) -> tuple[Images, floa
 
 
 def _left(fitted: Callable[[Images], Fit], used: Images) -> tuple[Images, float]:
-    """The same from the other side: the farthest leaves, as long as the evidence grows and more than four are left."""
+    """Return the images to use and their log evidence, after the farthest left while the evidence grew.
+
+    At least four images stay.
+    """
     fit = fitted(used)
     best = _evidence(fit, used)
     while used.sum() > 4:
@@ -142,15 +147,16 @@ def _evidence(fit: Fit, used: Images) -> float:
 
 
 def _distance(fit: Fit) -> Float[ndarray, " n"]:
-    """Squared, of each pose from a fit without it, in what noise lets expect."""
+    """Return the squared distance of each pose from a fit without it, in the expected covariance."""
     _, left_out, covariance = fit
     gap = np.linalg.solve(covariance, left_out[..., None])[..., 0]
     return np.einsum("ni,ni->n", left_out, gap)
 
 
 def _log_wrong(fit: Fit) -> Float[ndarray, " n"]:
-    """Of each pose, the log density of how far it is off if it is wrong, times (2π)^3: of any size alike, in any
-    direction; and the odds that it is.
+    """Return the log density of the error of each pose if it is wrong, times (2π)^3, and the odds that it is wrong.
+
+    Wrong poses have errors of any size and direction alike.
     """
     off = np.linalg.norm(fit[1].reshape(-1, 2, 3), axis=2)
     least, most = np.array(LEAST_WRONG), np.array(MOST_WRONG)
@@ -160,7 +166,7 @@ def _log_wrong(fit: Fit) -> Float[ndarray, " n"]:
 
 
 def least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> tuple[Images, float]:
-    """The subset of images with the least trimmed squared error over all candidate triples, and its root mean (m)."""
+    """Return the subset of images with the least trimmed squared error over candidate triples, and its root mean (m)."""
     n = len(base_from_gripper)
     keep = max(4, int(np.ceil(SHARE_RIGHT * n)))
     triples = _congruent_triples(motions(base_from_gripper), motions(recon_from_camera))
@@ -193,13 +199,13 @@ def _squared_error(
     base_from_gripper: Poses,
     recon_from_camera: Poses,
 ) -> Float[ndarray, "*batch n"]:
-    """Squared distance (m²) of every reported gripper pose from its prediction, rotation counted by ARM."""
+    """Return the squared distance (m²) of each reported gripper pose from its prediction, rotation counted by ARM."""
     gap = predict(x, scale, z, recon_from_camera) - base_from_gripper
     return (gap[..., :3, 3] ** 2).sum(-1) + ARM**2 * (gap[..., :3, :3] ** 2).sum((-1, -2)) / 2
 
 
 def _congruent_triples(a: Float[ndarray, "n n 4 4"], b: Float[ndarray, "n n 4 4"]) -> Int[ndarray, "h 3"]:
-    """Triples of images whose three motions rotate by the same angle in gripper and camera, best first."""
+    """Return triples of images whose three motions rotate by the same angle in gripper and camera, best first."""
     n = len(a)
     gap = np.abs(rotation_angle(a[..., :3, :3]) - rotation_angle(b[..., :3, :3]))
     if n * (n - 1) * (n - 2) > 6 * MOST_TRIPLES:

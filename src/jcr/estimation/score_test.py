@@ -1,11 +1,10 @@
-"""What else the images could show: parameters beside those that were adjusted, tested where the adjustment ended.
+"""Score tests of additional camera parameters at the converged adjustment.
 
-The mixed model is written once more with columns for what was fixed: every parameter of a camera, a focal length, a
-shear and an offset for each of its images by itself, and a thin prism. A hypothesis is a few combinations of these
-columns. How much freeing them would lower the cost, at one Gauss-Newton step, over the dispersion of the residuals,
-is Rao's score test (Rao, Proc. Cambridge Phil. Soc. 44, 1948), here beside F, for the robot pose noise was estimated
-from few residuals. The same step shows how large they are and how far the camera's place would move; the adjustment
-with them free (`freed`) is what they come to.
+The mixed model is written again with columns for fixed parameters: every parameter of a camera, a focal length, a
+shear and an offset for each of its images, and a thin prism. A hypothesis is a few combinations of these columns. The
+test is Rao's score test (Proc. Cambridge Phil. Soc. 44, 1948): the gain of the cost in one Gauss-Newton step over the
+dispersion of the residuals, by F because few residuals determine the robot pose noise. `freed` makes the problem whose
+adjustment estimates the combinations.
 """
 
 from collections.abc import Callable
@@ -34,47 +33,47 @@ WEAK_DISTORTION, WEAK_SHEAR, WEAK_FOCAL, WEAK_OFFSET, WEAK_PRISM = 1.0, 0.3, 0.0
 
 
 OfImage = Literal["focal", "shear", "x", "y"]
-"""What NuisancePrior has of each image, in its order."""
+"""Nuisance of each image, in the order of the rows of `Problem.nuisance_directions`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Alternatives:
-    """The equations of every column that may be freed; what was adjusted is eliminated.
+    """Equations of every column that may be freed, with the adjusted unknowns eliminated.
 
-    The columns are the parameters of one camera in `units`, then the nuisances of its images in the order of
-    NuisancePrior.
+    The columns are the parameters of one camera in `units`, then the nuisances of its images.
     """
 
     hessian: Float[ndarray, "e e"]
     right: Float[ndarray, " e"]
     place_by_column: Float[ndarray, "6 e"]
-    """How far the camera's place moves with each column."""
+    """Derivative of the camera's pose by each column."""
     images: int
-    """Of the camera."""
+    """Number of images of the camera."""
     freedom: int
-    """Of the robots' residuals, by which their noise was estimated: fewer than the images have by far."""
+    """Degrees of freedom of the robots' residuals, by which their noise was estimated: far fewer than the images have.
+    """
     dispersion: float
-    """Variance of what pulls at a parameter, over what the weights state."""
+    """Variance of the gradient of a parameter over the variance that the weights state."""
     names: tuple[str, ...]
-    """Of the camera's parameters."""
+    """Names of the camera's parameters."""
     units: Float[ndarray, " q"]
-    """What each of them counts in: focal lengths in themselves, the centre in widths."""
+    """Unit of each parameter: focal lengths relative, the centre in widths."""
     distance: Float[ndarray, " m"]
     """Median depth of the points of each image (m)."""
     down_in_camera: Float[ndarray, "m 3"]
-    """Of each image, the direction against the base's z axis."""
+    """Direction against the base's z axis in the camera of each image."""
 
     @property
     def columns(self) -> int:
-        """That may be freed."""
+        """Number of columns that may be freed."""
         return len(self.right)
 
     def of_camera(self, names: tuple[str, ...]) -> Float[ndarray, "e p"]:
-        """Combinations: these parameters of the camera."""
+        """Return the combinations that are these parameters of the camera."""
         return np.eye(self.columns)[:, [self.names.index(name) for name in names]]
 
     def of_images(self, nuisance: OfImage, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
-        """Combinations: this nuisance of each image moves by its share."""
+        """Return the combinations that move a nuisance of each image by its share."""
         out = np.zeros((self.columns, shares.shape[1]))
         first = len(self.names) + get_args(OfImage).index(nuisance) * self.images
         out[first : first + self.images] = shares
@@ -83,14 +82,14 @@ class Alternatives:
 
 @dataclass(frozen=True)
 class Tested:
-    """What freeing some combinations would do."""
+    """Result of a test of some combinations."""
 
     log_p: float
-    """Of a gain like this or larger where there is nothing."""
+    """Logarithm of the probability of this gain or a larger one by chance."""
     covariance: Float[ndarray, "p p"]
-    """Of the combinations."""
+    """Covariance of the combinations."""
     shift: Float[ndarray, "6"]
-    """The step of the camera's place that comes with it, axes of its parent."""
+    """Step of the camera's pose that comes with it, axes of its parent."""
 
 
 def first_x(state: State) -> Transform:
@@ -202,7 +201,7 @@ def _place_by_kept(
 
 
 def _distances(images: ImageEvidence, mine: Int[ndarray, " m"]) -> Float[ndarray, " m"]:
-    """Median depth of the points of each image; of one without points that of the others."""
+    """Return the median depth of the points of each image; that of the other images for one without points."""
     assert images.problem.observations is not None
     depth, image = images.view.depth, images.problem.observations.image
     distance = np.array([np.median(depth[image == k]) if (image == k).any() else np.nan for k in mine])
@@ -248,18 +247,18 @@ def beyond_prior(solution: Solution, prior: Camera, camera: int = 0) -> Float[nd
 
 
 def units_of(camera: Intrinsics) -> Float[ndarray, " q"]:
-    """What its parameters count in: focal lengths in themselves, the centre in widths."""
+    """Return the units of a camera's parameters: focal lengths relative, the centre in widths."""
     distortion = [1.0] * (len(parameter_names(camera)) - 4)
     return np.array([camera.fx, camera.fy, camera.width, camera.width, *distortion])
 
 
 def weak_of(camera: Intrinsics) -> Float[ndarray, " q"]:
-    """Standard deviations of its parameters, in their units, that only keep finite what the images cannot see."""
+    """Return standard deviations of the parameters, in their units, that only keep unobservable ones finite."""
     return np.array([WEAK.get(name, WEAK_DISTORTION) for name in parameter_names(camera)])
 
 
 def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
-    """The combinations of columns of `Alternatives` that give every image a focal length of its own."""
+    """Return the combinations of columns of `Alternatives` that give every image a focal length of its own."""
     q = len(parameter_names(camera))
     out = np.zeros((q + OF_IMAGE * images + PRISM, images))
     out[:2, 0] = 1.0
@@ -268,7 +267,7 @@ def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
 
 
 def differences(count: int) -> Float[ndarray, "n d"]:
-    """An orthonormal basis of what differs between this many, whose sum is 0."""
+    """Return an orthonormal basis of the zero-sum vectors of length n, shape (n, n - 1)."""
     return np.linalg.svd(np.eye(count) - 1 / count)[0][:, : count - 1]
 
 
@@ -298,24 +297,24 @@ def freed(
 
 
 def _weak_nuisances(images: int) -> Float[ndarray, " r"]:
-    """Standard deviations of nuisances that only keep finite what the images cannot see."""
+    """Return standard deviations of nuisances that only keep unobservable ones finite."""
     of_images = np.repeat([WEAK_FOCAL, WEAK_SHEAR, WEAK_OFFSET, WEAK_OFFSET], images)
     return np.r_[of_images, np.full(PRISM, WEAK_PRISM)]
 
 
 def _std(combinations: Float[ndarray, "n p"], of_each: Float[ndarray, " n"]) -> Float[ndarray, " p"]:
-    """Of combinations, where each of what they combine has one."""
+    """Return the standard deviations of combinations of parameters with these standard deviations."""
     return 1 / np.sqrt(((combinations / of_each[:, None]) ** 2).sum(0))
 
 
 def spanned(combinations: Float[ndarray, "e p"]) -> Float[ndarray, "e r"]:
-    """An orthonormal basis of what the combinations free; some may free the same."""
+    """Return an orthonormal basis of the space of the combinations."""
     u, size, _ = np.linalg.svd(combinations, full_matrices=False)
     return u[:, size > 1e-9 * size.max(initial=1e-300)]
 
 
 def tested(equations: Alternatives, free: Float[ndarray, "e p"], beside: Float[ndarray, "e q"]) -> Tested:
-    """The test of freeing the combinations `free`, with those of `beside` free under both hypotheses."""
+    """Return the test of the combinations `free`, with those of `beside` free under both hypotheses."""
     q, both = beside.shape[1], np.concatenate([beside, free], axis=1)
     fewer, more = spanned(beside), spanned(both)
     without, gain_without, _ = _step(equations, fewer)
@@ -332,7 +331,7 @@ def tested(equations: Alternatives, free: Float[ndarray, "e p"], beside: Float[n
 def _step(
     equations: Alternatives, free: Float[ndarray, "e r"]
 ) -> tuple[Float[ndarray, " r"], float, Float[ndarray, "r r"]]:
-    """How far these combinations go where they are free, what it gains, and the covariance."""
+    """Return the step of these combinations where they are free, its gain, and their covariance."""
     covariance = np.linalg.inv(free.T @ equations.hessian @ free)
     right = free.T @ equations.right
     step = covariance @ right
@@ -340,8 +339,10 @@ def _step(
 
 
 def _dispersion(images: ImageEvidence) -> float:
-    """Of the weighted residuals, and no less than that of their sums over cells of the images (cluster sampling;
-    Liang and Zeger, Biometrika 73, 1986)."""
+    """Return the dispersion of the weighted residuals, at least that of their sums over cells of the images.
+
+    Cells are clusters in the sense of Liang and Zeger (Biometrika 73, 1986).
+    """
     problem, weight = images.problem, images.weight
     pull = weight[:, None] * images.view.residual_px
     taken = 3 * len(images.state.points_in_world) + 6 * len(problem.seen.rows)

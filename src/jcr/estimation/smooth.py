@@ -33,7 +33,7 @@ class SmoothModel:
     """Equations of the used poses in the eigenvectors of their systematic errors, s = 6m rows: positions, rotations."""
 
     equations: Equations
-    """Of the physical unknowns, rows in the order of the poses."""
+    """Equations of the physical unknowns, rows in the order of the poses."""
     vectors: Float[ndarray, "h h"]
     """Eigenvectors of the errors of rotations, h = 3m."""
     values: Float[ndarray, " s"]

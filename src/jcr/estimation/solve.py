@@ -76,7 +76,7 @@ class Solution:
     budget: Budget | None
     """Covariance of the first arm's X and scale by its causes; None where it was not averaged."""
     most_likely: State
-    """Before the averaging: the state about which the equations are linear."""
+    """State before the averaging, about which the equations are linear."""
     poses: PoseEquations
     size_information: Information
     """Expected information of the log sizes of the robot's errors."""

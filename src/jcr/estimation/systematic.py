@@ -1,12 +1,11 @@
-"""Errors that an arm makes alike wherever it is near: their covariance over gripper poses, and which X they leave to
-be found.
+"""Systematic errors of an arm: their covariance over gripper poses, and the effective transform that they leave.
 
-Joint offsets and link errors bend every reported pose, by much the same at poses that are near each other. More
-images do not average them away. A constant error of the first joint rotates the base and one of the last joint the
-gripper: no pose shows it, and nobody who uses this arm's reported poses is harmed by it. What is asked is the
-*effective* hand-eye transform: of all (X, base_from_recon) the one that best predicts the camera from the reported
-poses over the workspace of the capture, 1 mm and 2 mrad counting alike. Its systematic residuals e' = (I − J A) e are
-what is left of e after that fit, A = (JᵀWJ)⁻¹JᵀW.
+Joint offsets and link errors change the reported poses, by similar amounts for near poses, and more images do not
+average them away. A constant error of the first joint rotates the base and one of the last joint the gripper: no pose
+shows it, and it does no harm to a user of these reported poses. The result is therefore the *effective* hand-eye
+transform: of all (X, base_from_recon) the one that best predicts the camera from the reported poses over the workspace
+of the capture, where 1 mm and 2 mrad count alike. Its systematic residuals e' = (I − J A) e are what that fit leaves
+of e, A = (JᵀWJ)⁻¹JᵀW.
 """
 
 from dataclasses import dataclass
@@ -23,21 +22,22 @@ from jcr.estimation.mounting import mounted_arm
 from jcr.geometry import Poses, rotation_angle
 
 REACH = 0.45
-"""m. A joint's error shows in the gripper's position as in its rotation (rad) times the reach behind it."""
+"""Typical lever (m) between an arm's joint and its gripper, by which an error of rotation shows in the position."""
 ALIKE = 1.0
-"""rad, with REACH for lengths: gripper poses so far apart share e^(−1/2) of their errors."""
+"""Distance (rad, with REACH for lengths) of gripper poses that share e^(−1/2) of their errors."""
 EFFECTIVE_WEIGHT = np.repeat([1 / 1e-3, 1 / 2e-3], 3)
-"""Of errors of position (1/m) and rotation (1/rad) in the effective transform."""
+"""Weights of errors of position (1/m) and rotation (1/rad) in the effective transform."""
 LINK_PER_JOINT = 3e-3 / np.radians(1.0)
-"""m per rad: arms that are made better are better in both, 0.03° and 0.1 mm, 0.1° and 0.3 mm, 0.3° and 1 mm."""
+"""Error of a link (m) for each rad of a joint offset: more exact arms are so in both, 0.03° and 0.1 mm, 0.1° and 0.3
+mm, 0.3° and 1 mm."""
 LEAST_FREE = 0.4
-"""One less a pose's leverage counts as at least this: of three or four images every pose is nearly fitted by itself."""
+"""Least value of one minus the leverage of a pose: a fit to three or four images nearly follows each of them."""
 
 
 def posed(arm: Arm, joints: Joints | None, base_from_gripper: Poses) -> tuple[Arm, Joints]:
-    """The arm with the tool that it carries, and its joint angles at the poses, which show them where `joints` is None.
+    """Return the arm with its tool, and its joint angles at the poses, computed where `joints` is None.
 
-    InputError where poses, joints and arm do not fit.
+    Raise InputError where poses, joints and arm do not fit.
     """
     if joints is not None:
         return mounted_arm(arm, joints, base_from_gripper), joints
@@ -46,10 +46,10 @@ def posed(arm: Arm, joints: Joints | None, base_from_gripper: Poses) -> tuple[Ar
 
 
 def smooth_errors(base_from_gripper: Poses) -> Float[ndarray, "s s"]:
-    """Covariance (6n,6n) of errors that vary smoothly over gripper poses, where they are 1 rad per axis and REACH m.
+    """Return the covariance (6n,6n) of errors that vary smoothly over gripper poses, of 1 rad per axis and REACH m.
 
-    A Gaussian random field over poses, of steps of geometry.retract: half of an error keeps its direction in the
-    base, half of it rotates with the gripper.
+    They are a Gaussian random field over poses, of steps of geometry.retract: half of an error keeps its direction in
+    the base, half of it rotates with the gripper.
     """
     n = len(base_from_gripper)
     rotation, position = base_from_gripper[:, :3, :3], base_from_gripper[:, :3, 3]
@@ -63,9 +63,9 @@ def smooth_errors(base_from_gripper: Poses) -> Float[ndarray, "s s"]:
 
 
 def arm_errors(arm: Arm, joints: Joints) -> Float[ndarray, "s s"]:
-    """Covariance (6n,6n) of the errors of an arm whose joints are 1 rad off, its links by as much as goes with that.
+    """Return the covariance (6n,6n) of the errors of an arm with joint offsets of 1 rad and link errors in proportion.
 
-    Joint offsets and link errors of size one, at joint angles (n,dof) in rad.
+    `joints` (n,dof) are its angles in rad.
     """
     columns = error_jacobian(arm, joints) * error_std(arm, 1.0, LINK_PER_JOINT)
     stacked = columns.reshape(-1, columns.shape[2])
@@ -74,30 +74,31 @@ def arm_errors(arm: Arm, joints: Joints) -> Float[ndarray, "s s"]:
 
 @dataclass(frozen=True)
 class Region:
-    """The fit of an effective transform to the poses of a capture, s = 6n; the scale is not part of it."""
+    """Fit of an effective transform to the poses of a capture, s = 6n; the scale is not part of it."""
 
     by_unknown: Float[ndarray, "s u"]
     """J, without the scale: 12 unknowns, and of further arms 12 each."""
     fit: Float[ndarray, "u s"]
     """A = (JᵀWJ)⁻¹JᵀW; zero for poses that are not used."""
     unknowns: int = 13
-    """Of the whole problem; they begin as those of equation.py do."""
+    """Number of unknowns of the whole problem, which begin as those of equation.py."""
 
     @staticmethod
     def of_unknowns(by_unknown: Float[ndarray, "s u"], unknowns: int) -> "Region":
-        """That of residuals with this derivative by what the effective transform may choose."""
+        """Return the region of residuals with this derivative by the unknowns of the effective transform."""
         root = np.tile(EFFECTIVE_WEIGHT, len(by_unknown) // 6)
         fit = np.linalg.pinv(root[:, None] * by_unknown, rcond=1e-9) * root
         return Region(by_unknown, fit, unknowns)
 
     def left(self, systematic: Float[ndarray, "s s"]) -> Float[ndarray, "s s"]:
-        """Covariance of what a systematic error leaves after the effective transform took its part."""
+        """Return the covariance of the part of a systematic error that the effective transform leaves."""
         # (I − J A) S (I − J A)ᵀ, without a product of two matrices of the residuals' size.
         half = systematic - self.by_unknown @ (self.fit @ systematic)
         return half - (half @ self.fit.T) @ self.by_unknown.T
 
     def spread(self, second_moment: Float[ndarray, "*k m 6 6"]) -> Float[ndarray, "*k p p"]:
-        """Covariance (p,p) of the unknowns for other poses of the same region, from E[e'e'ᵀ] of each of m used poses.
+        """Return the covariance (p,p) of the unknowns for other poses of the region, from E[e'e'ᵀ] of each of m used
+        poses.
 
         The poses of the capture are a sample of the region: a regression on them differs from one on the region by
         what their residuals show, corrected for each pose's own leverage (MacKinnon and White, J. Econometrics 29,
@@ -112,7 +113,7 @@ class Region:
 
     @cached_property
     def _corrected(self) -> Float[ndarray, "m u 6"]:
-        """By which each pose's residuals pass into the unknowns, as if its own leverage were none."""
+        """Gain with which each pose's residuals pass into the unknowns, without the pose's own leverage."""
         m = len(self.by_unknown) // 6
         u = self.by_unknown.shape[1]
         own = self.fit.reshape(u, m, 6).swapaxes(0, 1)

@@ -23,7 +23,7 @@ from jcr.geometry import Poses, Transform, apply, fit_similarity, scale_translat
 from jcr.records import Estimate, Intrinsics, Tracks
 
 Start = tuple[Transform, float, Transform]
-"""gripper_from_camera, scale and base_from_recon."""
+"""Initial estimate of gripper_from_camera, scale and base_from_recon."""
 
 
 def wrist_arm(base_from_gripper: Poses, error_covariance: Float[ndarray, "s s"] | None = None) -> Arm:
