@@ -17,6 +17,7 @@ from jcr.capture.depth_images import read_depth
 from jcr.capture.images import encode_png
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import NEVER, pose_track
+from jcr.capture.recording import Recording, capture_of_recording
 from jcr.capture.ros_image import depth_of, image_of
 from jcr.files import write_bytes
 from jcr.geometry import rotation_exp, transform
@@ -57,6 +58,12 @@ def test_the_stops_of_the_arm_are_found_in_every_storage(tmp_path: Path, capture
         # What was read is a capture folder itself.
         again = jcr.read_capture(tmp_path / f"{kind}-frames")
         assert (again.base_from_gripper == got.base_from_gripper).all() and again.images == got.images
+        for name, k in zip(got.images, view, strict=True):
+            image = cv2.imread(str(got.folder / name)).astype(int)
+            original = cv2.imread(str(capture.folder / capture.images[k])).astype(int)
+            assert (
+                np.abs(image - original).max() <= 1 or kind != "sqlite3"
+            )  # raw, with noise that the bag adds
 
 
 @pytest.mark.slow
@@ -155,31 +162,6 @@ def test_joint_states_and_a_urdf_stand_in_for_tf(tmp_path: Path, capture: Captur
     for name, pose in zip(got.images, got.base_from_gripper, strict=True):
         assert np.allclose(pose, expected[(got.folder / name).read_bytes()], atol=1e-6)
     writers.assert_joints(got, angles)
-
-
-@pytest.mark.slow
-def test_raw_images_come_out_as_they_went_in(tmp_path: Path, capture: Capture):
-    bag = write_bag(tmp_path / "raw", capture, "mcap", 6.0, fps=4.0, tf_hz=50.0, compressed=False)
-    got = jcr.read_capture(bag, FRAMES, into=tmp_path / "frames")
-    *_, view = nearest_view(got.base_from_gripper, capture.base_from_gripper)
-    for name, k in zip(got.images, view, strict=True):
-        image = cv2.imread(str(got.folder / name)).astype(int)
-        original = cv2.imread(str(capture.folder / capture.images[k])).astype(int)
-        assert np.abs(image - original).max() <= 1  # the noise that the bag adds
-
-
-@pytest.mark.slow
-def test_a_bag_is_read_once(tmp_path: Path, mcap: Path):
-    into = tmp_path / "frames"
-    first = jcr.read_capture(mcap, FRAMES, into=into)
-    stamps = {name: (into / name).stat().st_mtime_ns for name in first.images}
-    again = jcr.read_capture(mcap, FRAMES, into=into)
-    assert {name: (into / name).stat().st_mtime_ns for name in again.images} == stamps
-    assert (again.base_from_gripper == first.base_from_gripper).all()
-    fewer = jcr.read_capture(
-        mcap, ReadOptions(base_frame="base_link", gripper_frame="tool0", frames=5), into=into
-    )
-    assert len(fewer) == 5
 
 
 @pytest.mark.parametrize(
@@ -335,26 +317,20 @@ def test_the_command_line_judges_a_bag(mcap: Path):
 
 
 def test_images_that_are_listed_and_not_there_are_refused_in_one_line(tmp_path: Path):
-    """A bag whose index is damaged: its messages come when read in turn, and not when asked for by their time."""
-    from jcr.capture.options import ReadOptions
-    from jcr.capture.recording import Recording, capture_of_recording
-
+    """The index of a damaged bag: its messages come when read in turn, and not when asked for by their time."""
     poses = np.tile(np.eye(4), (30, 1, 1))
     poses[:, 0, 3] = 0.02 * np.arange(30)
     image = np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8)
+    recording = Recording(
+        source=tmp_path / "scan.mcap",
+        options=ReadOptions(),
+        names=[str(k) for k in range(30)],
+        base_from_gripper=poses,
+        speed=np.zeros(30),
+        gap_ns=np.zeros(30, int),
+        images_of_rows=lambda rows: ((row, image, ".png") for row in rows.tolist()[::2]),
+        intrinsics_of_size=lambda size: None,
+    )
     with pytest.raises(jcr.InputError, match="scan.mcap: .* are not where its index says; it is damaged"):
-        capture_of_recording(
-            Recording(
-                source=tmp_path / "scan.mcap",
-                options=ReadOptions(),
-                names=[str(k) for k in range(30)],
-                base_from_gripper=poses,
-                speed=np.zeros(30),
-                gap_ns=np.zeros(30, int),
-                images_of_rows=lambda rows: ((row, image, ".png") for row in rows.tolist()[::2]),
-                intrinsics_of_size=lambda size: None,
-            ),
-            tmp_path / "out",
-            lambda stage, share: None,
-        )
+        capture_of_recording(recording, tmp_path / "out", lambda stage, share: None)
     assert not (tmp_path / "out").exists()

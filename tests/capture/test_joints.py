@@ -28,6 +28,31 @@ def test_forward_kinematics_agree_with_a_hand_computation(tmp_path: Path):
     np.testing.assert_allclose(arm.poses(angles), arm_poses(angles), atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({}, "--gripper-frame is not given; its links are base_link, upper"),
+        ({"gripper_frame": "base_link"}, "nothing moves between base_link and base_link"),
+        ({"gripper_frame": "tool0", "base_frame": "finger"}, "no joints lead from finger to tool0"),
+    ],
+)
+def test_frames_between_which_there_is_no_arm_are_named(tmp_path: Path, options: dict, words: str):
+    (tmp_path / "arm.urdf").write_text(URDF)
+    with pytest.raises(jcr.InputError, match=words):
+        read_arm(ReadOptions(urdf=tmp_path / "arm.urdf", **options))
+
+
+def test_what_is_no_urdf_is_refused(tmp_path: Path):
+    joints = "".join(
+        f'<joint name="{a}{b}" type="revolute"><parent link="{a}"/><child link="{b}"/><axis xyz="0 0 1"/></joint>'
+        for a, b in ("ab", "bc", "ca")
+    )
+    ring = f'<robot name="ring"><link name="a"/><link name="b"/><link name="c"/>{joints}</robot>'
+    for text, words in (("<robot", "not a readable URDF"), (ring, "lead back")):
+        with pytest.raises(jcr.InputError, match=words):
+            arm_of(tmp_path, text)
+
+
 @pytest.mark.parametrize("units", ["m-rad", "m-deg"])
 def test_an_angle_that_wraps_is_interpolated_the_shorter_way(tmp_path: Path, units: str):
     arm = arm_of(tmp_path, URDF, pose_units=units)

@@ -15,7 +15,6 @@ import pytest
 import capture_writers as writers
 import jcr
 from jcr.capture.images import read_image
-from jcr.capture.joints import read_arm
 from jcr.capture.options import ReadOptions
 from jcr.records import Capture, Intrinsics
 from simulation.problems import HandEyeProblem, hand_eye_problem
@@ -246,21 +245,3 @@ def test_damaged_sets_are_one_line(tmp_path: Path, small: Path, tabletop: Path):
     (tmp_path / "escaped" / "meta" / "info.json").write_text(json.dumps(info))
     with pytest.raises(jcr.InputError, match="leads out of"):
         jcr.read_capture(tmp_path / "escaped", into=tmp_path / "frames")
-
-
-def test_an_arm_is_followed_from_base_to_gripper(tmp_path: Path):
-    (tmp_path / "arm.urdf").write_text(writers.URDF)
-    arm = read_arm(ReadOptions(urdf=tmp_path / "arm.urdf", gripper_frame="tool0"))
-    assert arm.joints == ("pan", "lift", "roll")
-    angles = np.random.default_rng(2).uniform(-2, 2, (5, 3))
-    assert np.allclose(arm.poses(angles), writers.arm_poses(angles), atol=1e-9)
-    for options, words in (
-        ({}, "--gripper-frame is not given; its links are base_link, upper"),
-        ({"gripper_frame": "base_link"}, "nothing moves between base_link and base_link"),
-        ({"gripper_frame": "tool0", "base_frame": "finger"}, "no joints lead from finger to tool0"),
-    ):
-        with pytest.raises(jcr.InputError, match=words):
-            read_arm(ReadOptions(urdf=tmp_path / "arm.urdf", **options))
-    (tmp_path / "arm.urdf").write_text("<robot")
-    with pytest.raises(jcr.InputError, match="not a readable URDF"):
-        read_arm(ReadOptions(urdf=tmp_path / "arm.urdf", gripper_frame="tool0"))

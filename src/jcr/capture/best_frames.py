@@ -40,17 +40,15 @@ def best_frames(
     fewer than three frames are left.
     """
     still = _runs(usable & (speed < STILL))
-    moving = _slowest(_runs(usable & (speed >= STILL)), speed, count) if len(still) < count else []
-    looked_at = [moment[np.linspace(0, len(moment) - 1, LOOKS + 2).astype(int)[1:-1]] for moment in still]
-    rows = np.unique(np.concatenate([*looked_at, *moving, np.zeros(0, int)]))
+    moments = [run[np.linspace(0, len(run) - 1, LOOKS + 2).astype(int)[1:-1]] for run in still]
+    if len(still) < count:
+        moments += _slowest(_runs(usable & (speed >= STILL)), speed, count)
+    rows = np.unique(np.concatenate([*moments, np.zeros(0, int)]))
     sharpness = np.zeros(len(speed))
     sharpness[rows] = sharpness_of(rows)
-    sharpest = np.array([moment[sharpness[moment].argmax()] for moment in looked_at + moving], dtype=int)
-    sharp = (
-        sharpest[sharpness[sharpest] >= BLURRED * np.median(sharpness[sharpest])]
-        if len(sharpest)
-        else sharpest
-    )
+    sharpest = np.array([moment[sharpness[moment].argmax()] for moment in moments], dtype=int)
+    least = BLURRED * np.median(sharpness[sharpest]) if len(sharpest) else 0.0
+    sharp = sharpest[sharpness[sharpest] >= least]
     views = _different(base_from_gripper, sharp[np.argsort(-sharpness[sharp], kind="stable")])
     if len(views) < MIN_FRAMES:
         raise InputError(
@@ -58,13 +56,21 @@ def best_frames(
             "needed: record again with a pause at each of a dozen views"
         )
     information = pose_information(base_from_gripper[views], np.eye(4), ASSUMED_NOISE)
-    at_rest = speed[views] < STILL
-    chosen = _most_informative(WEAK * np.eye(13), information[at_rest], count)
-    more = _most_informative(
-        WEAK * np.eye(13) + information[at_rest].sum(0), information[~at_rest], count - len(chosen)
-    )
-    frames = np.sort(np.concatenate([views[at_rest][chosen], views[~at_rest][more]]))
-    return frames, tuple(_remarks(frames, speed, len(sharpest) - len(sharp), int(at_rest.sum()), count))
+    frames, known = np.zeros(0, int), WEAK * np.eye(13)
+    for of_kind in (speed[views] < STILL, speed[views] >= STILL):  # frames at rest come first
+        chosen = _most_informative(known, information[of_kind], count - len(frames))
+        frames = np.append(frames, views[of_kind][chosen])
+        known = known + information[of_kind].sum(0)
+    notes = []
+    if len(sharp) < len(sharpest):
+        notes.append(f"{len(sharpest) - len(sharp)} moments of the recording are blurred and were left out")
+    at_rest = int((speed[views] < STILL).sum())
+    if at_rest < count and (fastest := float(speed[frames].max())) >= STILL:
+        notes.append(
+            f"the arm stands still at {at_rest} different views where {count} frames are wanted; the others were "
+            f"taken at up to {1e3 * fastest:.0f} mm/s: pause for half a second at each view"
+        )
+    return np.sort(frames), tuple(notes)
 
 
 def _most_informative(known: Float[ndarray, "13 13"], gain: Float[ndarray, "k 13 13"], count: int) -> Rows:
@@ -74,17 +80,6 @@ def _most_informative(known: Float[ndarray, "13 13"], gain: Float[ndarray, "k 13
         return total_uncertainty(expected_covariance(known + gain[rows].sum(0)))
 
     return np.array(choose(count, len(gain), uncertainty_of), dtype=int)
-
-
-def _remarks(frames: Rows, speed: Float[ndarray, " n"], blurred: int, at_rest: int, count: int):
-    """Yield remarks on blurred stops and on frames that were taken in motion."""
-    if blurred:
-        yield f"{blurred} moments of the recording are blurred and were left out"
-    if at_rest < count and (fastest := float(speed[frames].max())) >= STILL:
-        yield (
-            f"the arm stands still at {at_rest} different views where {count} frames are wanted; the others were "
-            f"taken at up to {1e3 * fastest:.0f} mm/s: pause for half a second at each view"
-        )
 
 
 def _runs(mask: Bool[ndarray, " n"]) -> list[Rows]:

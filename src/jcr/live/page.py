@@ -43,7 +43,7 @@ def whole_page(session: LiveSession) -> str:
         ("grippers", "grippers", True),
         ("grid", "base and grid", True),
         ("next", "next pose (green)", True),
-        ("tracks", "points seen (red)", True),
+        ("tracks", "points of the scene (red)", True),
     ]
     view = {"layers": [], "checks": checks, "through": [], "labels": [], "data": _scene(session.state)}
     content = {"folder": str(session.folder.folder), "scene": Section("view", view)}
@@ -185,7 +185,11 @@ def _tiles(state: SessionState, required: tuple[float, float]) -> list[Tile]:
     tiles: list[Tile] = [
         (name, f"± {significant(value)}{unit}", f"required {limit:g}{unit}", True)
         for name, value, limit, unit in zip(
-            ("Point seen, 95 %", "Direction, 95 %"), _reached(state), required, (" mm", "°"), strict=False
+            ("Point uncertainty, 95 %", "Direction, 95 %"),
+            _reached(state),
+            required,
+            (" mm", "°"),
+            strict=False,
         )
     ]
     count = f"{len(state.progress.registered)} of {len(state.images)}"
@@ -211,7 +215,7 @@ def _courses(progress: Progress, required: tuple[float, float]) -> list[Figure]:
         return []
     count = [one.images for one in history]
     curves = [
-        ("Point seen (mm)", [one.translation_mm for one in history], required[0], " mm"),
+        ("Point uncertainty (mm)", [one.translation_mm for one in history], required[0], " mm"),
         ("Direction (°)", [one.rotation_deg for one in history], required[1], "°"),
     ]
     return [course_figure(title, count, values, goal, unit) for title, values, goal, unit in curves]
@@ -242,7 +246,7 @@ def _scene(state: SessionState) -> dict[str, Any]:
     intrinsics = (found.intrinsics if found is not None else None) or ANY_CAMERA
     poses = [*(one.base_from_gripper for one in state.images), *next_poses]
     shown_in_base = np.array([np.zeros(3), *(pose[:3, 3] for pose in poses)])
-    layer = PointLayer("points seen", points, colors, TRACK_SIZE)
+    layer = PointLayer("points of the scene", points, colors, TRACK_SIZE)
     return scene_data([layer], views, next_poses, x, intrinsics, shown_in_base)
 
 

@@ -191,7 +191,7 @@ def _accuracy(state: Progress) -> str:
         met = "met" if state.requirement_met else reached if required.met else "not met"
         limits = f"; required {required.translation_mm:g} mm and {required.rotation_deg:g}°: {met}"
     mm, deg = significant(state.now.translation_mm), significant(state.now.rotation_deg)
-    return f"± {mm} mm and {deg}° (95 % of errors of a seen point){verdict}{limits}"
+    return f"± {mm} mm and {deg}° (95 % of errors of a point at the working distance){verdict}{limits}"
 
 
 def _advice(state: Progress) -> str:
