@@ -175,14 +175,14 @@ FAULTS = (
         "src/jcr/run_folder.py",
         "fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)",
         "fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)",
-        ("tests/test_run_folder.py", "tests/faults/test_faults.py"),
+        ("tests/test_run_folder.py",),
     ),
     PlantedFault(
         "files",
         "src/jcr/files.py",
         "        temporary.unlink(missing_ok=True)",
         "        pass",
-        ("tests/faults/test_faults.py", "tests/test_run_folder.py"),
+        ("tests/test_files.py",),
     ),
 )
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from jcr.files import write_new, write_text
+from jcr.files import write_new, write_text, written_whole
 
 
 @pytest.mark.parametrize("umask", [0o022, 0o077])
@@ -33,3 +33,11 @@ def test_a_file_that_has_the_bytes_already_keeps_its_time(tmp_path: Path):
     assert file.stat().st_mtime == 1
     write_new(file, b"two")
     assert file.read_bytes() == b"two" and file.stat().st_mtime > 1
+
+
+def test_a_file_that_is_not_written_whole_leaves_the_old_one_and_nothing_beside_it(tmp_path: Path):
+    (tmp_path / "map.bin").write_text("old")
+    with pytest.raises(KeyboardInterrupt), written_whole(tmp_path / "map.bin") as temporary:
+        temporary.write_text("new")
+        raise KeyboardInterrupt
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("map.bin", "old")]

@@ -17,7 +17,7 @@ from jcr.errors import InputError
 from jcr.reconstruct import ReconstructOptions
 from jcr.records import Capture, CellCamera
 from jcr.results import RunOptions
-from jcr.run_folder import MadeWith, RunFolder, state_of
+from jcr.run_folder import MadeWith, RunFolder, locked, state_of
 
 
 @pytest.fixture(scope="module")
@@ -179,3 +179,10 @@ def test_memory_that_ends_is_one_line(capsys):
     assert call(load, "jcr run", []) == 2
     said = capsys.readouterr().err
     assert said.startswith("error: out of memory (Unable to allocate 5.62 MiB); ") and said.count("\n") == 1
+
+
+def test_a_second_run_in_the_same_folder_is_refused(tmp_path: Path):
+    with locked(tmp_path / "out"), pytest.raises(InputError, match="another jcr"), locked(tmp_path / "out"):
+        pytest.fail("two runs write the same folder")
+    # The folder, into which nothing came, is gone with its lock.
+    assert not (tmp_path / "out").exists()
