@@ -37,7 +37,7 @@ from .pipeline.run import build_map as build_map
 from .pipeline.run import calibrate as calibrate
 from .pipeline.run import measure as measure
 from .pipeline.run import run as run
-from .pipeline.touch import Touched as Touched
+from .pipeline.touch import TouchTest as TouchTest
 from .pipeline.touch import touch as touch
 from .pipeline.verify import Verification as Verification
 from .pipeline.verify import VerifyOptions as VerifyOptions

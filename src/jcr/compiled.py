@@ -13,7 +13,7 @@ _PART: dict[str, Any] = _OPTIONS | {"forceinline": True, "_nrt": False}
 
 
 def compiled(function: Callable[..., Any]) -> Any:
-    """The function compiled when it is first called, and kept on disk where that can be written.
+    """Compile the function when it is first called, and keep it on disk where that can be written.
 
     Such functions carry no shapes to check and say `@no_type_check`: a checker around them could not be compiled.
     """
@@ -24,7 +24,7 @@ def compiled(function: Callable[..., Any]) -> Any:
 
 
 def inlined(function: Callable[..., Any]) -> Any:
-    """A part of compiled functions, put in where they call it; it must allocate nothing.
+    """Compile a function that is inlined where compiled functions call it; it must allocate nothing.
 
     Then the arrays that it is given need not be counted, which takes as long as the window of a pixel, and longer where
     two threads count one array.
@@ -42,7 +42,7 @@ def random_state(seed):
 @inlined
 @no_type_check
 def uniform(state):
-    """A number from 0 to 1 (Marsaglia, "Xorshift RNGs", 2003)."""
+    """Return a number from 0 to 1 (Marsaglia, "Xorshift RNGs", 2003)."""
     x = state[0]
     x ^= x << np.uint64(13)
     x ^= x >> np.uint64(7)

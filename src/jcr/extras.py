@@ -1,4 +1,4 @@
-"""Packages that not every use needs: each comes with an extra of this distribution, and a missing one is named so."""
+"""Optional packages: each comes with an extra of this distribution, which messages name."""
 
 from importlib import import_module
 from importlib.util import find_spec
@@ -11,7 +11,7 @@ DISTRIBUTION = "jcr-handeye"
 
 
 def extra(module: str, name: str, what: str, otherwise: str = "") -> ModuleType:
-    """The module that `what` needs, or an InputError that names the extra with it, or what to do `otherwise`."""
+    """Import the module that `what` needs; raise InputError that names its extra, or what to do `otherwise`."""
     try:
         return import_module(module)
     except ImportError as error:
@@ -21,12 +21,12 @@ def extra(module: str, name: str, what: str, otherwise: str = "") -> ModuleType:
 
 
 def install(name: str) -> str:
-    """The command that installs an extra."""
+    """Return the command that installs an extra."""
     return f"pip install '{DISTRIBUTION}[{name}]'"
 
 
 def is_installed(module: str) -> bool:
-    """Whether a top-level module is there, without importing it."""
+    """Test whether a top-level module is there, without importing it."""
     return find_spec(module) is not None
 
 

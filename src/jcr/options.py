@@ -11,7 +11,7 @@ Options = TypeVar("Options")
 
 
 def checked_options(options: object, kind: type[Options]) -> Options:
-    """The options as a record of that kind, from such a record, a dict of its fields, or None for the defaults.
+    """Return the options as a record of that kind, from such a record, a dict of its fields, or None for the defaults.
 
     Text stands for a path and a list for a tuple. Raises InputError with the field for anything else.
     """
@@ -45,7 +45,7 @@ def checked_options(options: object, kind: type[Options]) -> Options:
 
 @cache
 def _kinds_of_records(kind: type) -> dict[str, type]:
-    """The fields that are records of options themselves, with their kinds."""
+    """Return the fields that are records of options themselves, with their kinds."""
     hints = get_type_hints(kind)
     found = {name: next(filter(is_dataclass, (hint, *get_args(hint))), None) for name, hint in hints.items()}
     return {name: record for name, record in found.items() if isinstance(record, type)}

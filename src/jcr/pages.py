@@ -12,7 +12,7 @@ SECTIONS = ("tutorials", "how-to", "reference", "explanation", "results")
 
 
 def pages() -> dict[str, Path]:
-    """The file of each page by its name, as `jcr docs` takes it; empty where no page was installed."""
+    """Return the file of each page by its name, as `jcr docs` takes it; empty where no page was installed."""
     if (CHECKOUT / "conf.py").is_file():
         found = sorted(CHECKOUT.rglob("*.md"))
     else:
@@ -34,7 +34,7 @@ def _name(path: Path) -> str:
 
 
 def page(name: str) -> str:
-    """The Markdown of a page by its name (`captures`, `results/speed`); InputError where there is no such page."""
+    """Return the Markdown of a page by its name (`captures`, `results/speed`); raise InputError without such a page."""
     found = pages()
     if name not in found:
         there = ", ".join(other for other in found if "/" not in other) or "none on this machine"
@@ -43,6 +43,6 @@ def page(name: str) -> str:
 
 
 def title(path: Path) -> str:
-    """The first heading of a page."""
+    """Return the first heading of a page."""
     with path.open(encoding="utf-8") as lines:
         return next((line[2:].strip() for line in lines if line.startswith("# ")), path.stem)

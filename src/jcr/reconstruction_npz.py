@@ -90,12 +90,12 @@ def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
 
 
 def arrays_of(pointmaps: Pointmaps) -> dict[str, np.ndarray]:
-    """The arrays of pointmaps by the names that they have in a file; `pointmaps_in` reads them."""
+    """Return the arrays of pointmaps by their names in a file; `pointmaps_in` reads them."""
     return {name: array for name in OF_POINTMAPS if (array := getattr(pointmaps, name)) is not None}
 
 
 def pointmaps_in(file: Mapping[str, np.ndarray], intrinsics: IntrinsicsJson, images: int) -> Pointmaps:
-    """The pointmaps of this many images in a file; KeyError or ValueError where they are not whole."""
+    """Return the pointmaps of this many images in a file; raise KeyError or ValueError where they are not whole."""
     found = Pointmaps(
         intrinsics=intrinsics.record(),
         points_in_recon=file["points_in_recon"],
@@ -147,7 +147,7 @@ def read_npz(path: Path, expected: str) -> Iterator[tuple[str, Mapping[str, np.n
 
 
 def read_reconstruction(path: Path) -> Reconstruction:
-    """The record in a reconstruction.npz; InputError when it is damaged or of a newer format."""
+    """Read a reconstruction.npz; raise InputError where it is damaged or of a newer format."""
     with read_npz(path, FORMAT) as (text, file):
         about = About.model_validate_json(text, strict=True)
         found = Reconstruction(

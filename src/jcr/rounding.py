@@ -1,4 +1,4 @@
-"""Numbers as people read them."""
+"""Rounding of numbers for people."""
 
 import numpy as np
 
@@ -6,20 +6,20 @@ MOST_DECIMALS = 9
 
 
 def decimals_of(std: float) -> int:
-    """Decimals of a number that is known to one standard deviation: none is below a tenth of that."""
+    """Return the decimals of a number with this standard deviation: none is below a tenth of it."""
     if not np.isfinite(std) or std <= 0:
         return MOST_DECIMALS if std == 0 else 0
     return int(np.clip(np.floor(1 - np.log10(std)), 0, MOST_DECIMALS))
 
 
 def with_std(value: float, std: float) -> str:
-    """The number and its standard deviation with as many decimals as that leaves: 25.40 ± 0.05."""
+    """Return the number and its standard deviation with the decimals that these leave: 25.40 ± 0.05."""
     decimals = decimals_of(std)
     return f"{value:.{decimals}f} ± {std:.{decimals}f}"
 
 
 def significant(value: float, digits: int = 2) -> str:
-    """The number with this many significant digits, never in powers of ten; at most six decimals."""
+    """Return the number with this many significant digits, never in powers of ten; at most six decimals."""
     if not np.isfinite(value):
         return "unknown"
     if abs(value) < 0.5e-6:

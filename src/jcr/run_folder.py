@@ -1,7 +1,6 @@
-"""A run folder: what its files are, which stage made each and from what, who may write there, and reading them back.
+"""Files of a run folder: writing under a lock, the fingerprints of what they were made from, and validated reading.
 
-Whatever a command is given as OUT is input like any other: it may have been edited or cut. What is read here has
-been validated; what has not raises InputError in one line.
+A run folder is input like any other: it may have been edited or cut. An invalid file raises InputError of one line.
 """
 
 import fcntl
@@ -52,7 +51,7 @@ MOVING = "moving"
 CAPTURE = "capture"
 """Images and poses that were read from another format than capture.json."""
 LIVE = "result"
-"""In the folder of a capture that was calibrated while it was taken: the run folder of all its images."""
+"""Run folder of all images, in the folder of a capture that was calibrated while it was taken."""
 STATE = "run.json"
 """The capture, the options of its calibration, and what reconstruction.npz was made from."""
 RECONSTRUCTION, CALIBRATION, LOG = "reconstruction.npz", "calibration.json", "log.txt"
@@ -60,13 +59,13 @@ CLOUD, REPORT = "cloud.ply", "report.html"
 OF_RECONSTRUCTION = (STATE, DEPTH, RECONSTRUCTION)
 """A kill between two of them leaves none without what it was made from."""
 OF_CALIBRATION = (CLOUD, MAP, REPORT, CAMERAS)
-"""What holds of one calibration alone."""
+"""Files that belong to one calibration alone."""
 PASSING = {"timings_s", "warnings", "notes", "version", "attempts", "requirement", "next_poses"}
-"""Of calibration.json: what may differ between two of the same calibration."""
+"""Fields of calibration.json that may differ between two files of the same calibration."""
 
 
 class MadeWith(BaseModel):
-    """The options that a calibration was made with."""
+    """Options that a calibration was made with."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     reconstruct: ReconstructOptions
@@ -75,16 +74,16 @@ class MadeWith(BaseModel):
 
 
 class State(BaseModel):
-    """The content of run.json."""
+    """Content of run.json."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     capture: Annotated[str, Field(max_length=4096, pattern=r"^[^\x00]+$")]
-    """Its folder."""
+    """Folder of the capture."""
     reconstruct: str
     """The fingerprint of what reconstruction.npz was made from."""
     options: MadeWith
     attempts: tuple[Attempt, ...] = ()
-    """How that reconstruction was chosen."""
+    """Attempts from which that reconstruction was selected."""
     complete: str | None = None
     """The fingerprint of all that a finished run was made from and of its calibration.json; None of one that was not
     finished."""
@@ -99,12 +98,12 @@ class State(BaseModel):
 
 @dataclass(frozen=True)
 class RunFolder:
-    """What one run left, and where."""
+    """Folder with the files of one run."""
 
     path: Path
 
     def state(self) -> State:
-        """run.json; InputError where there is no run, or its file was damaged."""
+        """Read run.json; raise InputError where there is no run, or its file was damaged."""
         file = self.path / STATE
         try:
             return State.model_validate_json(read_bytes(file), strict=True)
@@ -118,7 +117,7 @@ class RunFolder:
             ) from None
 
     def capture(self) -> Capture:
-        """The capture that the run was made from; InputError where there is no run, or no such capture any more."""
+        """Return the capture that the run was made from; raise InputError without a run, or without the capture."""
         name = self.state().capture
         try:
             return read_capture(name)
@@ -137,15 +136,15 @@ class RunFolder:
         return capture
 
     def options(self) -> MadeWith:
-        """What the calibration was made with; raises as `state` does."""
+        """Return the options that the calibration was made with; raise as `state` does."""
         return self.state().options
 
     def calibration(self) -> Calibration:
-        """calibration.json; InputError where there is none, or it was damaged."""
+        """Read calibration.json; raise InputError where there is none, or it was damaged."""
         return read_calibration(self.path)
 
     def reconstruction(self, depth: str | None = None) -> Reconstruction:
-        """reconstruction.npz, with the pointmaps of depth.npz where there are some (of the fingerprint `depth` alone).
+        """Read reconstruction.npz, with the pointmaps of a depth.npz (of the fingerprint `depth` alone).
 
         InputError where there is no reconstruction, or a file was damaged.
         """
@@ -164,7 +163,7 @@ class RunFolder:
             return None
 
     def calibrated(self) -> tuple[Calibration, Reconstruction]:
-        """A calibration and the reconstruction behind it.
+        """Return a calibration and the reconstruction that it was made from.
 
         Raises InputError where either is missing or damaged, nothing was found, or they are not of the same images.
         """
@@ -186,19 +185,19 @@ class RunFolder:
         return calibration, reconstruction
 
     def cloud(self) -> PointCloud:
-        """cloud.ply; InputError where there is none, or it was damaged."""
+        """Read cloud.ply; raise InputError where there is none, or it was damaged."""
         return read_cloud(self.path / CLOUD)
 
     def scene(self) -> "SceneMap":
-        """map.safetensors; InputError where there is none, it was damaged, or its packages are not installed."""
+        """Read map.safetensors; raise InputError where there is none, it is damaged, or its packages are missing."""
         return load_map(self.path)
 
     def has_map(self) -> bool:
-        """Whether there is a map, sound or not."""
+        """Test whether there is a map, sound or not."""
         return (self.path / MAP).is_file()
 
     def earlier(self, state: State) -> State | None:
-        """The state of an earlier run whose reconstruction was made from the same; else it is to be made again.
+        """Return the state of an earlier run whose reconstruction was made from the same input; None without one.
 
         A state that cannot be read proves nothing: to make every stage again is always right.
         """
@@ -210,12 +209,12 @@ class RunFolder:
         return found if same else None
 
     def reuse_reconstruction(self, state: State) -> tuple[Reconstruction, State] | None:
-        """The reconstruction of an earlier run of the same, with its pointmaps, and that run's state."""
+        """Return the reconstruction of an earlier run of the same input, with its pointmaps, and that run's state."""
         earlier = self.earlier(state)
         return None if earlier is None else (self.reconstruction(state.depth), earlier)
 
     def reuse_live(self, capture: Capture, state: State) -> tuple[Reconstruction, State] | None:
-        """The same of the calibration that `jcr capture` left in the capture's own folder; it is then kept here too."""
+        """Return reconstruction and state that `jcr capture` left in the capture's folder, and keep them here, too."""
         live = RunFolder(capture.folder / LIVE)
         if live.path.resolve() == self.path.resolve():
             return None
@@ -228,11 +227,11 @@ class RunFolder:
         return found
 
     def keep_capture(self, capture: Capture) -> Capture:
-        """The capture as later commands will find it: where it lies, or copied if it is of another format."""
+        """Return the capture as later commands will find it: where it lies, or copied if it is of another format."""
         return kept(capture, self.path / CAPTURE)
 
     def keep_reconstruction(self, reconstruction: Reconstruction, state: State) -> None:
-        """Write it, then what it was made from; pointmaps that were estimated become depth.npz."""
+        """Write a reconstruction, then its fingerprint; pointmaps that were estimated become depth.npz."""
         for name in (STATE, DEPTH):  # of the one before
             (self.path / name).unlink(missing_ok=True)
         pointmaps = reconstruction.pointmaps
@@ -242,7 +241,7 @@ class RunFolder:
         self.keep_depth(reconstruction, state)
 
     def has_depth(self, reconstruction: Reconstruction, state: State) -> bool:
-        """Whether depth.npz was made from this reconstruction with these options."""
+        """Test whether depth.npz was made from this reconstruction with these options."""
         return is_made_from(self.path / DEPTH, state.depth)
 
     def keep_depth(self, reconstruction: Reconstruction, state: State) -> None:
@@ -259,7 +258,7 @@ class RunFolder:
         )
 
     def forget_reconstruction(self) -> None:
-        """Remove what is another capture's, or of other options."""
+        """Remove the reconstruction of another capture, or of other options."""
         for name in OF_RECONSTRUCTION:
             (self.path / name).unlink(missing_ok=True)
 
@@ -285,11 +284,11 @@ class RunFolder:
         scene.save(self.path / MAP)
 
     def cameras(self) -> CamerasFile | None:
-        """cameras.json; None where there is none, InputError where it was damaged."""
+        """Read cameras.json; return None where there is none, raise InputError where it was damaged."""
         return read_cameras(self.path)
 
     def keep_cameras(self, content: CamerasFile | None) -> None:
-        """Write cameras.json, or remove what is of no camera any more."""
+        """Write cameras.json, or remove it where there are no cameras."""
         if content is None:
             (self.path / CAMERAS).unlink(missing_ok=True)
         else:
@@ -300,7 +299,7 @@ class RunFolder:
         self.keep_state(self.state().model_copy(update={"complete": self._completion(capture, options)}))
 
     def is_complete(self, capture: Capture, options: Any) -> bool:
-        """Whether a run of the same is finished, and its files were neither changed nor removed since."""
+        """Test whether a run of the same input is finished, and its files were neither changed nor removed since."""
         try:
             files = [REPORT]
             if self.calibration().parent_from_camera is not None:
@@ -333,7 +332,7 @@ class RunFolder:
 
 @contextmanager
 def locked(path: Path) -> Iterator[RunFolder]:
-    """The folder, made and locked, so that a second run on it writes nothing between the first one's files.
+    """Make and lock the folder, so that a second run on it writes nothing between the first one's files.
 
     What a killed run had begun to write is removed, and so is a new folder into which nothing came.
     """
@@ -361,7 +360,7 @@ def locked(path: Path) -> Iterator[RunFolder]:
 
 
 def state_of(capture: Capture, options: MadeWith) -> State:
-    """The state of a run with these options, before anything was tried; InputError where no file can hold it."""
+    """Return the state of a run with these options, before anything was tried; raise InputError for a name not UTF-8."""
     try:
         str(capture.folder.resolve()).encode()
     except UnicodeEncodeError:
@@ -374,12 +373,12 @@ def state_of(capture: Capture, options: MadeWith) -> State:
 
 
 def _deciding(options: ReconstructOptions) -> dict[str, Any]:
-    """The options as they decide a reconstruction: what auto stands for changes with the weights on this machine."""
+    """Return the options that decide a reconstruction, with the back ends that `auto` means on this machine."""
     return options.as_json() | {"backend": candidates(options)}
 
 
 def fingerprint(capture: Capture, options: dict[str, Any]) -> str:
-    """A hash of all that a stage's result depends on: images, poses, intrinsics, options, version and file format."""
+    """Return a hash of the input of a reconstruction: images, poses, intrinsics, options, version and file format."""
     digest = hashlib.sha256()
     for name in capture.images:
         digest.update(name.encode() + b"\0" + hashlib.sha256((capture.folder / name).read_bytes()).digest())

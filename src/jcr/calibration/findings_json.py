@@ -28,7 +28,7 @@ def _without_words(value: Any) -> Any:
 
 _FINDING = TypeAdapter(Finding)
 FindingJson = Annotated[Finding, BeforeValidator(_without_words), PlainSerializer(as_json)]
-"""With its text and remedy, which are for people and made again when it is read."""
+"""Finding with its text and remedy, which are for people and made again when it is read."""
 
 
 def derived(findings: Sequence[Finding]) -> dict[str, Any]:

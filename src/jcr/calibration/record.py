@@ -97,7 +97,7 @@ class Share(Part):
     translation_mm: Spread
     rotation_deg: Spread
     covariance: PartCovariance7 | None = None
-    """In the order of `uncertainty`; the parts' sum is the whole."""
+    """Covariance in the order of `uncertainty`; the parts' sum is the whole."""
 
     @classmethod
     def of(cls, covariance: Float[ndarray, "7 7"]) -> "Share":
@@ -276,7 +276,7 @@ class RobotErrors(Part):
     systematic_deg: Spread
     """One sigma of the joint offsets where the arm is known, else of the gripper's rotation."""
     translation_mm: Spread
-    """What of them is left in the poses per axis, after the effective hand-eye transform took its part."""
+    """Part that is left in the poses per axis, after the effective hand-eye transform took its own."""
     rotation_deg: Spread
     joints: list[JointOffset] | None = None
     """The joints from the base on; null where the arm is not known."""
@@ -300,7 +300,7 @@ class GivenIntrinsicsKept(Part):
 
     gripper_from_camera: Matrix
     covariance: Covariance7
-    """In the order of `uncertainty`."""
+    """Covariance in the order of `uncertainty`."""
     intrinsics: IntrinsicsJson
     seen: SeenJson
     differs_mm: Spread
@@ -328,7 +328,7 @@ class Calibration(Part):
 
     format: Literal["jcr.calibration/2"] = FORMAT
     mount: Mount = "gripper"
-    """What the camera is mounted on."""
+    """Body that the camera is mounted on."""
     on_gripper: Matrix | None = Field(default=None, alias="gripper_from_camera")
     on_base: Matrix | None = Field(default=None, alias="base_from_camera")
     scene: Matrix | None = Field(default=None, alias="base_from_recon")

@@ -42,14 +42,14 @@ def main(arguments: Arguments) -> int:
 
 
 def content(measured: "Measurement") -> dict[str, object]:
-    """The result as JSON has it: metres, base frame, standard deviations of one sigma."""
+    """Return the result for JSON: metres, base frame, standard deviations of one sigma."""
     support = plain(measured.support)
     del support["on_plane"]  # a flag for each point of the cloud
     return {"support": support, "objects": [plain(size) for size in measured.objects]}
 
 
 def table(measured: "Measurement") -> str:
-    """A line for the plane and a line an object, in millimetres."""
+    """Return a line for the plane and a line for each object, in millimetres."""
     support = measured.support
     x, y, z = support.base_from_support[:3, 2]
     lines = [

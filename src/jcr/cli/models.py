@@ -40,7 +40,7 @@ SCALES = {True: "metres", False: "arbitrary", None: "your file's is_metric"}
 
 
 def models() -> list[dict[str, Any]]:
-    """The back ends, in the order of `auto`: what --json prints of each."""
+    """Return the back ends in the order of `auto`, each as --json prints it."""
     return [
         {
             "backend": row.name,
@@ -65,7 +65,7 @@ def _present(row: Backend) -> str:
 
 
 def as_text(rows: list[dict[str, Any]]) -> str:
-    """The list for a terminal."""
+    """Return the list for a terminal."""
     lines = []
     for row in rows:
         size = f", {row['parameters_m']} M parameters" if row["parameters_m"] else ""
@@ -93,7 +93,7 @@ def main(arguments: Arguments) -> int:
 
 
 def _get(arguments: Arguments) -> int:
-    """The weights of one back end, or of a hub id, downloaded, checked, and put where runs look for them."""
+    """Download the weights of a back end, or of a hub id, check them, and put them where runs look for them."""
     with_weights = [row.name for row in BACKENDS.values() if row.hub_id]
     name = arguments.name
     row = BACKENDS.get(name or "")

@@ -52,6 +52,11 @@ class _Help(io.StringIO):
         super().__init__()
         self.output = output
 
+    @property
+    def encoding(self) -> str | None:
+        """Encoding of the output, which decides how tyro draws boxes."""
+        return self.output.encoding
+
     def isatty(self) -> bool:
         """Test whether the output is a terminal."""
         return self.output.isatty()

@@ -1,4 +1,4 @@
-"""Many captures: each run on its own, over processes of this machine or a Ray cluster, and a table that ranks them."""
+"""Runs of many captures, over processes of this machine or a Ray cluster, and a table that ranks them."""
 
 import csv
 import io
@@ -28,12 +28,12 @@ from jcr.report.render import render
 from jcr.run_folder import CAPTURE, RunFolder, locked
 
 RETRIES = 3
-"""How often a task is started again whose Ray node died."""
+"""Number of times a task is started again whose Ray node died."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BatchOptions:
-    """Where and how much to run."""
+    """Options of the batch."""
 
     processes: int | None = None
     """Captures at a time on this machine (unset: one for every two cores); cores are shared out among them."""
@@ -43,14 +43,14 @@ class BatchOptions:
     """Run on a Ray cluster at this address (auto: the one this machine belongs to). Every node must see the same
     folders. Needs the extra jcr-handeye[cluster]."""
     cpus_per_task: int = 2
-    """With --ray: cores that a capture takes."""
+    """Cores that a capture takes, with --ray."""
     gpus_per_task: float = 0.0
-    """With --ray: GPUs that a capture takes; 0.25 lets four share one."""
+    """GPUs that a capture takes, with --ray; 0.25 lets four share one."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One capture in the table."""
+    """Row of the table: one capture."""
 
     capture: str
     out: str
@@ -71,7 +71,7 @@ class Row:
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """A capture to run, and with what."""
+    """Capture to run, with its options."""
 
     capture: Path
     out: Path
@@ -118,7 +118,7 @@ def batch(
 
 
 def run_one(task: Task) -> Row:
-    """The row of one capture, run unless it was finished before; whatever goes wrong is in the row."""
+    """Run one capture, unless it is finished, and return its row; an error is in the row."""
     start = time.perf_counter()
     try:
         with locked(task.out):
@@ -170,7 +170,7 @@ def _row(task: Task, content: Calibration) -> Row:
 
 
 def is_accepted(row: Row) -> bool:
-    """Whether its calibration is, with warnings or without."""
+    """Test whether the calibration is accepted, with warnings or without."""
     return row.status in ("accepted", "accepted with warnings")
 
 
@@ -180,7 +180,7 @@ def _rank(row: Row) -> tuple[int, float, str]:
 
 
 def _names(captures: Sequence[Path]) -> list[str]:
-    """A folder name a capture: its own, with a number where two are called the same."""
+    """Return a folder name for each capture: its own, with a number where two have the same."""
     names: list[str] = []
     for path in captures:
         own = (path.parent if path.is_file() else path).resolve().name or "capture"
@@ -204,7 +204,7 @@ def _on_this_machine(tasks: list[Task], options: BatchOptions) -> Iterator[Row]:
 
 
 def _over_pool(tasks: list[Task], processes: int):
-    """Rows as they come; returns the tasks that a broken pool left undone."""
+    """Yield rows as they come; return the tasks that a broken pool left undone."""
     left: list[Task] = []
     # Spawned, not forked: libraries with threads of their own do not survive a fork.
     context = multiprocessing.get_context("spawn")
@@ -226,13 +226,13 @@ def _over_pool(tasks: list[Task], processes: int):
 
 
 def _dies_on_interrupt() -> None:
-    """Ctrl-C reaches every process of the terminal; only the first one reports it."""
+    """End at Ctrl-C, which reaches every process of the terminal, without a report."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 @contextmanager
 def _threads_per_process(threads: int) -> Iterator[None]:
-    """Numerical libraries read these when a process starts; one each for all cores would stand in each other's way."""
+    """Set the number of threads that numerical libraries read when a process starts."""
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     before = {name: os.environ.get(name) for name in names}
     os.environ.update(dict.fromkeys(names, str(threads)))

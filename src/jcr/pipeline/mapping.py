@@ -1,4 +1,4 @@
-"""The map stage: a calibrated reconstruction to the labelled cloud, the map, and what stands on the table."""
+"""Stage of the map: from a calibrated reconstruction to the labelled cloud, the map, and the measured objects."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -24,31 +24,31 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Mapped:
-    """What the map stage made."""
+class MapResult:
+    """Result of the stage of the map."""
 
     cloud: PointCloud
     scene: "SceneMap"
     measured: Measurement | None
     """None where no plane carries the scene."""
     notes: tuple[str, ...]
-    """What the user should know of the labels."""
+    """Remarks on the labels."""
 
 
 def require_map(options: DepthOptions) -> None:
-    """InputError, before any work, where no map can be made: no torch, or no dense depth wanted."""
+    """Raise InputError, before any work, where no map can be made: no torch, or no dense depth wanted."""
     require_dense(options)
     require_packages("the map", "; `jcr run` and `jcr calibrate` calibrate without it")
 
 
 def require_dense(options: DepthOptions) -> None:
-    """InputError where a map is wanted, and the dense depth that it needs is not."""
+    """Raise InputError where a map is wanted, and the dense depth that it needs is not."""
     if not options.dense:
         raise InputError("--no-dense: the map needs dense depth; leave it out, or add --no-map")
 
 
-def make_map(result: RunResult, added: Capture, options: RunOptions, progress: Progress) -> Mapped:
-    """The map of a calibrated run and of images that were added to it later.
+def make_map(result: RunResult, added: Capture, options: RunOptions, progress: Progress) -> MapResult:
+    """Build the map of a calibrated run and of images that were added to it later.
 
     Raises InputError where no point is confident enough, or the options leave nothing to map.
     """
@@ -63,11 +63,11 @@ def make_map(result: RunResult, added: Capture, options: RunOptions, progress: P
     with ThreadPoolExecutor(1) as beside:
         sizes = None if support is None else beside.submit(measured, cloud, result.calibration, support)
         scene = build_scene(cloud, options.map, progress, device=device)
-        return Mapped(cloud, scene, sizes and sizes.result(), (*remarks, *notes))
+        return MapResult(cloud, scene, sizes and sizes.result(), (*remarks, *notes))
 
 
 def measured(cloud: PointCloud, calibration: Calibration, support: Support | None = None) -> Measurement:
-    """The support plane, found where it is not given, and what stands on it; InputError when none carries the scene."""
+    """Measure the support plane, found where it is not given, and the objects on it; raise InputError without one."""
     uncertainty = calibration.uncertainty
     return measure_objects(
         cloud, 0.0 if uncertainty is None else uncertainty.scale_std_percent / 100, support
@@ -75,7 +75,7 @@ def measured(cloud: PointCloud, calibration: Calibration, support: Support | Non
 
 
 def _extended(result: RunResult, added: Capture, options: RunOptions, progress: Progress) -> RunResult:
-    """With the added images in the reconstruction."""
+    """Return the result with the added images in the reconstruction."""
     if not len(added):
         return result
     from jcr.depth.added import extend
@@ -88,7 +88,7 @@ def _extended(result: RunResult, added: Capture, options: RunOptions, progress: 
 def _cloud(
     result: RunResult, options: RunOptions, progress: Progress
 ) -> tuple[PointCloud, Support | None, tuple[str, ...]]:
-    """The labelled cloud, its support plane if there is one, and what the user should know of the labels."""
+    """Return the labelled cloud, its support plane if there is one, and remarks on the labels."""
     capture, reconstruction, hand_eye = result.capture, result.reconstruction, result.hand_eye
     given = image_labels(capture, reconstruction, hand_eye, options.segment, progress)
     labels, names = (None, ("none",)) if given is None else (given.labels, given.names)

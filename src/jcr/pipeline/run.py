@@ -80,7 +80,7 @@ def run(
 
 
 def finished(capture: Capture, out: str | Path, options: RunOptions) -> SavedRun | None:
-    """The run in the folder `out`, if it was made from this capture with these options and nothing has changed."""
+    """Return the run in the folder `out` if it was made from this capture with these options and nothing has changed."""
     if not (Path(out) / REPORT).is_file():
         return None
     options, _ = _possible(options.for_capture(capture), capture)
@@ -91,7 +91,7 @@ def finished(capture: Capture, out: str | Path, options: RunOptions) -> SavedRun
 
 
 def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, str | None]:
-    """The options without the map where none can be made, and what to install for it if that is missing."""
+    """Return the options, without the map where none can be made, and the package to install for it."""
     # What a camera on the base sees moves with the gripper, not with the base.
     if options.map is None or capture.mount == "base":
         return replace(options, map=None), None
@@ -105,7 +105,7 @@ def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, str | 
 
 
 def _why_no_map(estimate_depth: bool = False) -> str | None:
-    """What to install before a map can be made; None where all that makes one is imported, its loops compiled."""
+    """Return the package to install before a map can be made; None where all is imported and its loops are compiled."""
     from jcr.scene.map_file import require_packages
 
     if estimate_depth:
@@ -140,7 +140,7 @@ def calibrate(
 def calibrate_poses(
     pairs: PosePairs, out: str | Path, options: CalibrateOptions | None = None
 ) -> PosesResult:
-    """calibration.json and report in the folder `out` from camera poses that were given, without images."""
+    """Write calibration.json and report to the folder `out`, from camera poses that were given, without images."""
     from jcr.report.html import poses_report_html
 
     with locked(Path(out)) as folder:
@@ -251,7 +251,7 @@ def measure(out: str | Path) -> "Measurement":
 
 
 def _capture_of(capture: Capture | str | Path, out: Path) -> Capture:
-    """A capture as it is, or read from a path; images of a recording are put into the run folder."""
+    """Return a capture as it is, or read it from a path; images of a recording are put into the run folder."""
     if isinstance(capture, Capture):
         return capture
     if not isinstance(capture, str | Path):
@@ -263,7 +263,7 @@ def _capture_of(capture: Capture | str | Path, out: Path) -> Capture:
 def _after_calibration(
     result: RunResult, added: Capture | None, folder: RunFolder, options: RunOptions, progress: Progress
 ) -> RunResult:
-    """`added` are the images of the map alone; None: there is no map."""
+    """Run the stages after the calibration; `added` are images of the map alone, None without a map."""
     if result.capture.mount != "base":
         result = stages.located(result, folder, options, progress)
     if added is not None:

@@ -42,6 +42,7 @@ class NothingFoundError(RejectedError):
     def __init__(
         self, failure: RejectedError, attempts: tuple[Attempt, ...], causes: tuple[Finding, ...] = ()
     ) -> None:
+        """Order `causes`, findings of the images alone, before the failure."""
         self.attempts = attempts
         self.findings = strongest_first((*causes, *no_reconstruction(failure)))
         first = self.findings[0]

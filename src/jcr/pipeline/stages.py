@@ -1,4 +1,4 @@
-"""The stages on a run folder: each starts from the files of those before it, and adds its own and its time."""
+"""Stages on a run folder: each starts from the files of those before it, and adds its own and its time."""
 
 import time
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from jcr.run_folder import MOVING, RunFolder, State, state_of
 
 
 def calibrated(capture: Capture, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
-    """The reconstruction that the folder has of the same input, calibrated; else back ends are tried.
+    """Calibrate the reconstruction that the folder has of the same input; without one, try back ends.
 
     Where the camera watches the gripper, what the gripper carries is the scene.
     """
@@ -60,7 +60,7 @@ def calibrated(capture: Capture, folder: RunFolder, options: RunOptions, progres
 
 
 def located(result: RunResult, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
-    """With the other cameras of the cell, those of the capture and those added to the run."""
+    """Return the result with the other cameras of the cell, those of the capture and those added to the run."""
     start = time.perf_counter()
     found = cameras(result, read_added_cameras(folder.path, result.capture), folder, options, progress)
     folder.keep_cameras(found)
@@ -78,7 +78,7 @@ def cameras(
     options: RunOptions,
     progress: Progress,
 ) -> CamerasFile | None:
-    """The other cameras of the cell as cameras.json has them; None where there are none."""
+    """Return the other cameras of the cell as cameras.json has them; None where there are none."""
     others = (*result.capture.others, *added)
     if not others:
         return None
@@ -91,7 +91,7 @@ def cameras(
 
 
 def densified(result: RunResult, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
-    """With the dense depth that the map needs: predicted, in the folder, or estimated now."""
+    """Return the result with the dense depth of the map: predicted, in the folder, or estimated now."""
     start = time.perf_counter()
     reconstruction = densify(
         result.capture,
@@ -107,7 +107,7 @@ def densified(result: RunResult, folder: RunFolder, options: RunOptions, progres
 def mapped(
     result: RunResult, added: Capture, folder: RunFolder, options: RunOptions, progress: Progress
 ) -> RunResult:
-    """With cloud, map, and what stands on the table; `added` are further images for it."""
+    """Return the result with cloud, map and measured objects; `added` are further images for the map."""
     from jcr.pipeline.mapping import make_map  # labels and sizes need half of SciPy, a calibration does not
 
     start = time.perf_counter()
@@ -122,7 +122,7 @@ def mapped(
 
 
 def reported(result: RunResult, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
-    """With the report, and the last of the times."""
+    """Return the result after the report is written, with the last of the times."""
     from jcr.report.html import report_html
 
     start = time.perf_counter()
@@ -137,8 +137,10 @@ def reported(result: RunResult, folder: RunFolder, options: RunOptions, progress
 def _reused(
     capture: Capture, folder: RunFolder, options: RunOptions, state: State, progress: Progress
 ) -> tuple[Selection, tuple[Attempt, ...]] | None:
-    """What an earlier run, or `jcr capture`, chose from the same input, calibrated, and how it was chosen; None where it
-    is to be made."""
+    """Calibrate the reconstruction that an earlier run, or `jcr capture`, selected from the same input.
+
+    Return it with the attempts of that selection; None where there is none.
+    """
     start = time.perf_counter()
     reused = folder.reuse_reconstruction(state) or folder.reuse_live(capture, state)
     if reused is None:
@@ -159,7 +161,7 @@ def _reused(
 def _chosen(
     capture: Capture, folder: RunFolder, options: RunOptions, state: State, progress: Progress
 ) -> tuple[Selection, tuple[Attempt, ...]]:
-    """What is chosen now, and how; its reconstruction is kept as soon as it is sure."""
+    """Select a reconstruction now, and keep it in the folder as soon as the selection is certain."""
     selected = choose(
         capture,
         options.reconstruct,
@@ -174,7 +176,7 @@ def _chosen(
 def _failed(
     capture: Capture, folder: RunFolder, options: RunOptions, state: State, error: NothingFoundError
 ) -> NothingFoundError:
-    """The error, with the --board that would help where the images show one; its reason is left in the folder.
+    """Return the error, with the --board that the images show, after its reason is written to the folder.
 
     Nothing stays there of another capture or of other options.
     """

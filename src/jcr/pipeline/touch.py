@@ -1,4 +1,4 @@
-"""How well the map is where the robot's tip feels it: the error in task space that `jcr touch` reports."""
+"""Touch test: error in task space between points that the robot's tip touched and the map."""
 
 import csv
 from dataclasses import dataclass
@@ -16,20 +16,20 @@ from jcr.run_folder import RunFolder
 
 COLUMNS = ("image", "x_px", "y_px", "x_m", "y_m", "z_m")
 LEAST = 3
-"""Points that tell a wrong calibration from one bad touch."""
+"""Fewest points that distinguish a wrong calibration from one bad touch."""
 UNLIKELY = 1e-3
-"""Chance of such errors where what is reported holds, below which it is said not to."""
+"""Largest p-value of errors that the reported uncertainty does not explain."""
 
 
 @dataclass(frozen=True)
-class Touched:
-    """Touched points against the map."""
+class TouchTest:
+    """Comparison of touched points with the map."""
 
     images: tuple[str, ...]
     error: Float[ndarray, "k 3"]
-    """m, base axes: where the tip was less where the map has the point."""
+    """Position of the tip less that of the point in the map (m, base axes)."""
     std: Float[ndarray, "k 3"]
-    """m: what the calibration and the robot's errors let expect."""
+    """Standard deviations by the calibration and the robot's errors (m)."""
     p_value: float
     """Chance of errors like these or larger, all points together."""
 
@@ -40,16 +40,16 @@ class Touched:
 
     @property
     def expected(self) -> float:
-        """What it should be by the reported uncertainty (m)."""
+        """Root mean square length that the reported uncertainty predicts (m)."""
         return float(np.sqrt((self.std**2).sum(1).mean()))
 
     @property
     def common(self) -> Float[ndarray, "3"]:
-        """m: the mean error, which a wrong tip or tool offset would cause."""
+        """Mean error (m), which a wrong tip or tool offset would cause."""
         return self.error.mean(0)
 
 
-def touch(out: str | Path, points: str | Path) -> Touched:
+def touch(out: str | Path, points: str | Path) -> TouchTest:
     """Compare points that the tip touched with the surface that the images show at their pixels.
 
     `points` is a CSV with the columns image, x_px, y_px (where an image of the run shows the point) and x_m, y_m, z_m
@@ -77,7 +77,7 @@ def touch(out: str | Path, points: str | Path) -> Touched:
     covariance += _touch_variance(calibration) * np.eye(len(covariance))
     error = np.array([tip for _, _, tip in rows]) - mapped
     squared = float(error.ravel() @ np.linalg.solve(covariance, error.ravel()))
-    return Touched(
+    return TouchTest(
         tuple(image for image, _, _ in rows),
         error,
         np.sqrt(np.diag(covariance)).reshape(-1, 3),
@@ -86,7 +86,7 @@ def touch(out: str | Path, points: str | Path) -> Touched:
 
 
 def _touch_variance(calibration) -> float:
-    """m² per axis of a single gripper position, random and systematic."""
+    """Return the variance (m² per axis) of a single gripper position, random and systematic."""
     noise, errors = calibration.robot_noise, calibration.robot_errors
     systematic_mm = 0.0 if errors is None else errors.translation_mm
     return (noise.translation_mm**2 + systematic_mm**2) / 1e6

@@ -1,4 +1,4 @@
-"""Has the camera moved since it was calibrated? What `jcr verify` answers."""
+"""Test whether the camera has moved since it was calibrated, from a few new images."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -39,7 +39,7 @@ MIN_TO_RECALIBRATE = 5
 
 @dataclass(frozen=True)
 class VerifyOptions:
-    """What counts as moved."""
+    """Options of the test for a moved camera."""
 
     alpha: float = 1e-3
     """False-alarm rate: the probability of reporting a movement when nothing has moved."""
@@ -49,11 +49,11 @@ class VerifyOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Verification:
-    """The verdict on a calibration, and what it rests on."""
+    """Verdict on a calibration, with the measured drift."""
 
     moved: bool
     cause: Cause
-    """What has moved, where something has."""
+    """Body that has moved, where one has."""
     offset: Float[ndarray, "6"]
     """Drift: translation (m) and rotation vector (rad) of the camera in gripper axes."""
     std: Float[ndarray, "6"]
@@ -62,7 +62,7 @@ class Verification:
     detectable: tuple[float, float]
     """m, rad: a drift of this size in the worst direction would be found nine times in ten."""
     images: tuple[str, ...]
-    """Those that were used."""
+    """Names of the images that were used."""
     notes: tuple[str, ...]
     how: str
     fixed: str | None = None
@@ -72,24 +72,24 @@ class Verification:
 
     @property
     def drift_m(self) -> float:
-        """How far the camera is from where it was calibrated."""
+        """Distance (m) of the camera from its calibrated place."""
         return float(np.linalg.norm(self.offset[:3]))
 
     @property
     def drift_rad(self) -> float:
-        """By how much it is rotated."""
+        """Angle (rad) of the camera's rotation since the calibration."""
         return float(np.linalg.norm(self.offset[3:]))
 
     @property
     def verdict(self) -> Verdict:
-        """Of the calibration, for the new images."""
+        """Verdict on the calibration by the new images."""
         if self.moved:
             return "rejected"
         return "accepted with warnings" if self.notes else "accepted"
 
     @property
     def finding(self) -> str:
-        """What has moved, in words."""
+        """Body that has moved, in words."""
         if self.fixed is not None:
             return f"{self.fixed} has {'moved' if self.moved else 'not moved'}"
         moved = {"camera": "the camera", "scene": "the scene", "either": "the camera or the scene"}
@@ -97,7 +97,7 @@ class Verification:
 
     @property
     def advice(self) -> str:
-        """What to do, where something has moved."""
+        """Remedy where something has moved."""
         if self.fixed is not None:
             return f"{self.fixed} has moved; fasten it, and calibrate it again (jcr add-camera, under another name)"
         anew = "tighten the mount, then calibrate again from 8 or more images (jcr run)"
@@ -120,7 +120,7 @@ def verify_run(
     options: VerifyOptions | Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> Verification:
-    """Hold the calibration in the run folder `out` against the few images of `new`, a capture or its path.
+    """Test the calibration in the run folder `out` against the few images of `new`, a capture or its path.
 
     Raises InputError for a run that holds no accepted calibration, or images of another camera; RejectedError
     when the images share too few features with the old scene, or too few of another, to tell.
@@ -166,7 +166,7 @@ def _read(new: Capture | str | Path) -> Capture:
 
 
 def _calibrated_on(folder: RunFolder, calibration: Calibration, new: Capture) -> Capture:
-    """The capture of a run; InputError where new images cannot be compared with it."""
+    """Return the capture of a run; raise InputError where new images cannot be compared with it."""
     if not calibration.converged:
         raise InputError(
             f"{folder.path}: its calibration is rejected and cannot be tested; calibrate again (jcr run)"
@@ -191,7 +191,7 @@ def _in_old_scene(
     lost: Sequence[str],
     options: VerifyOptions,
 ) -> Verification:
-    """By the images that show where in the calibrated scene they were taken."""
+    """Test by the images that are located in the calibrated scene."""
     calibration, capture, reconstruction, calibrate_options = then
     shared = [k for k, place in enumerate(located) if isinstance(place, CameraPose)]
     places = [place for place in located if isinstance(place, CameraPose)]
@@ -286,7 +286,7 @@ def _images(folder: Path, names: Sequence[str]) -> dict[str, UInt8[ndarray, "h w
 def _require_new(
     now: Mapping[str, UInt8[ndarray, "_ _ 3"]], then: Mapping[str, UInt8[ndarray, "_ _ 3"]]
 ) -> None:
-    """InputError where an image is one of the calibration, whatever it is called: that would confirm itself."""
+    """Raise InputError where an image is one of the calibration, whatever its name: it would confirm itself."""
     for name, image in now.items():
         for old, other in then.items():
             if np.array_equal(image, other):
@@ -296,7 +296,7 @@ def _require_new(
 
 
 def _same_poses(new: Capture, then: Capture) -> tuple[str, ...]:
-    """A note where gripper poses are to the last digit those of the calibration: commanded ones, or copied."""
+    """Return a note where gripper poses equal those of the calibration to the last digit: commanded, or copied."""
     same = [
         name
         for name, pose in zip(new.images, new.base_from_gripper, strict=True)
@@ -317,7 +317,7 @@ def fitted(
     options: CalibrateOptions,
     systematic: Float[ndarray, "s s"],
 ) -> tuple[Solution, tuple[Poses, Poses]]:
-    """The calibration's poses fitted again, for the joint covariance that its file does not keep; and the poses.
+    """Fit the calibration's poses again, for the joint covariance that its file does not keep; return the poses, too.
 
     Robot and cameras alone, without bundle adjustment: new images are located in the same cameras' frame. `systematic`
     is the covariance of the systematic errors of the poses used, at 1 rad.
@@ -375,7 +375,7 @@ def _by_recalibration(
     options: VerifyOptions,
     progress: Progress | None,
 ) -> Verification:
-    """Another scene: a calibration of its own, and the difference of the two against both covariances."""
+    """Calibrate from the images of another scene, and test the difference against both covariances."""
     if calibration.intrinsics is not None:
         new = replace(new, intrinsics=calibration.intrinsics.record())
     reconstruction = reconstruct(new, options_then.reconstruct, progress)
@@ -399,7 +399,7 @@ def _of_two(
     notes: tuple[str, ...],
     how: str,
 ) -> Verification:
-    """The verdict on two places of the camera that are so far apart."""
+    """Return the verdict on two places of the camera that differ by `offset`."""
     p_value = float(chi2.sf(offset @ np.linalg.solve(covariance, offset), 6))
     return Verification(
         moved=_is_moved(offset, p_value, options),

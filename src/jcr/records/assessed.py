@@ -1,4 +1,4 @@
-"""What findings are about: its verdict and the reasons in words follow from the findings alone."""
+"""Records with findings, from which their verdict and the reasons in words follow."""
 
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -10,18 +10,18 @@ Same = TypeVar("Same", bound="Assessed")
 
 @dataclass(frozen=True, kw_only=True)
 class Assessed:
-    """A calibration, or a camera's place, with what was found against it."""
+    """Calibration with its findings."""
 
     findings: tuple[Finding, ...] = ()
     """Strongest first; of the same severity causes before consequences."""
 
     def with_findings(self: Same, *findings: Finding) -> Same:
-        """The same with more findings, each in its place."""
+        """Return the record with more findings, each in its place."""
         return replace(self, findings=strongest_first((*self.findings, *findings)))
 
     @property
     def verdict(self) -> Verdict:
-        """That of the worst finding."""
+        """Verdict of the worst finding."""
         return verdict_of(self.findings)
 
     @property
@@ -31,7 +31,7 @@ class Assessed:
 
     @property
     def doubt(self) -> str | None:
-        """Why it is rejected, in words; None when it is not."""
+        """Reason of the rejection in words; None where it is accepted."""
         return doubt_of(self.findings)
 
     @property

@@ -1,4 +1,4 @@
-"""Where the camera sits on the gripper, how well that is known, and what was found on the way."""
+"""State of a calibration, with its uncertainty, and the records that it is made of."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -16,7 +16,7 @@ from jcr.records.capture import Intrinsics
 
 @dataclass(frozen=True, kw_only=True)
 class ImageVerdict:
-    """What the calibration thinks of one image of the capture."""
+    """Use and residuals of one image of the capture."""
 
     image: str
     used: bool
@@ -30,7 +30,7 @@ class ImageVerdict:
 
 @dataclass(frozen=True)
 class Observability:
-    """Which directions of (translation, rotation, scale) the motions can see."""
+    """Directions of (translation, rotation, scale) that the motions determine."""
 
     findings: tuple[Finding, ...] = ()
     """One of kind UNOBSERVABLE per direction that is unobservable, or nearly so."""
@@ -42,7 +42,7 @@ class Observability:
 
     @property
     def unobservable(self) -> tuple[str, ...]:
-        """In words, e.g. "scale: every view rotates about one point fixed to the gripper"."""
+        """Unobservable directions in words, e.g. "scale: every view rotates about one point fixed to the gripper"."""
         return tuple(unobservable(finding) for finding in self.findings)
 
     @property
@@ -53,7 +53,7 @@ class Observability:
 
 @dataclass(frozen=True)
 class Excitation:
-    """Principal directions of what the motions see, least seen first (estimation/observability.py)."""
+    """Principal directions of the excitation by the motions, the weakest first (estimation/observability.py)."""
 
     value: Float[ndarray, "7"]
     direction: Float[ndarray, "7 7"]
@@ -64,7 +64,7 @@ class Excitation:
 
 @dataclass(frozen=True, kw_only=True)
 class NextPose:
-    """A gripper pose worth adding, and how exact a calibration with it and those before it is expected to be."""
+    """Gripper pose to add, and the expected accuracy of a calibration with it and those before it."""
 
     base_from_gripper: Float[ndarray, "4 4"]
     expected_std: Float[ndarray, "7"]
@@ -72,7 +72,7 @@ class NextPose:
     within_95_mm: float
     """Distance that 95 % of the errors of a seen point stay below, as Seen has it."""
     rotation_95_deg: float
-    """The same of the directions of things seen there."""
+    """Bound on 95 % of the errors of directions there."""
     like: int
     """Row of the existing pose that it is nearest to."""
     moved_m: float
@@ -104,7 +104,7 @@ class RobotNoise:
 
 @dataclass(frozen=True)
 class JointOffsets:
-    """By how much each joint of the arm seems off."""
+    """Estimated offset of each joint of the arm."""
 
     offset: Float[ndarray, " dof"]
     """rad: true angle less the reported one."""
@@ -115,28 +115,27 @@ class JointOffsets:
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """What the covariance of a calibration comes from; in COVARIANCE_ORDER, and their sum is the covariance."""
+    """Parts of the covariance of a calibration, by cause, in COVARIANCE_ORDER; their sum is the covariance."""
 
     robot_random: Float[ndarray, "7 7"]
     robot_systematic: Float[ndarray, "7 7"]
     intrinsics: Float[ndarray, "7 7"]
-    """What would go if they were known."""
+    """Part that would vanish if the intrinsics were known."""
     images: Float[ndarray, "7 7"]
     """Camera poses and features; and what is unobservable."""
     faults: Float[ndarray, "7 7"]
-    """What findings and their uncertainty add."""
+    """Part that findings and their uncertainty add."""
 
     @property
     def mostly_systematic(self) -> bool:
-        """Whether most of the translation's variance is systematic errors of the robot, which images of the same region
-        leave."""
+        """Whether systematic robot errors, which more images leave, are most of the translation's variance."""
         others = self.robot_random, self.intrinsics, self.images, self.faults
         return bool(np.trace(self.robot_systematic[:3, :3]) >= sum(np.trace(part[:3, :3]) for part in others))
 
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """Error on images left out of the calibration: the number to believe."""
+    """Leave-one-out error: prediction of each image's gripper pose from the others."""
 
     translation_mm: float
     rotation_deg: float
@@ -190,7 +189,7 @@ class DepthCheck:
 
 @dataclass(frozen=True, kw_only=True)
 class Seen:
-    """How exactly a point that the camera sees is placed: 95 % of errors are smaller."""
+    """Point uncertainty: bounds on 95 % of the errors of a point that the camera sees."""
 
     distance_mm: float
     """Distance of the point from the camera along its ray (mm)."""
@@ -203,24 +202,24 @@ class Seen:
     ray_95_deg: float
     """Direction of the ray."""
     rotation_95_deg: float
-    """Of the directions of things seen there, the rotation about the ray included."""
+    """Bound on directions there, the rotation about the ray included."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneUncertainty:
-    """How well the reconstructed scene is placed in the base frame, every point by all images that see it."""
+    """Uncertainty of the reconstructed scene in the base frame, every point by all images that see it."""
 
     middle_in_base: Float[ndarray, "3"]
     covariance: Float[ndarray, "7 7"]
-    """Of steps of the scene as a whole (geometry.retract) about its middle, along axes of the base, and of the logarithm
-    of its size."""
+    """Covariance of steps of the scene as a whole (geometry.retract) about its middle, along axes of the base, and
+    of the logarithm of its size."""
     shape_m: float
     """One sigma per axis of what else moves a point: the scene is bent."""
     within_95_m: float
     """Distance that 95 % of a point's errors stay below, the median point; its own triangulation included."""
 
     def covariance_at(self, x_in_base: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3 3"]:
-        """Of points (m²), without their own triangulation."""
+        """Return the covariances of points (m²), without their own triangulation."""
         from jcr.geometry import by_similarity  # SciPy, which help need not wait for
 
         by = by_similarity(x_in_base - self.middle_in_base)
@@ -229,35 +228,33 @@ class SceneUncertainty:
 
 @dataclass(frozen=True, kw_only=True)
 class InUse:
-    """How exact a calibration is in use, by its intrinsics, X and scale together; without the robot's own pose
-    errors."""
+    """Point uncertainty by intrinsics, transform and scale together, without the robot's own pose errors."""
 
     seen: Seen
     """Uncertainty of a point at the centre of the image, at the median distance of the scene."""
     corners: Seen
-    """The same at the worst corner of the image."""
+    """Uncertainty of a point at the worst corner of the image."""
     scene: SceneUncertainty | None = None
     """None where no image was adjusted."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WithGivenIntrinsics:
-    """The transform for who keeps the intrinsics that were given: the likeliest one where these are exact."""
+    """Transform for the intrinsics that were given: the likeliest one where these are exact."""
 
     gripper_from_camera: Float[ndarray, "4 4"]
     covariance: Float[ndarray, "7 7"]
-    """In COVARIANCE_ORDER; with its distance from the transform that belongs to the estimated intrinsics."""
+    """Covariance in COVARIANCE_ORDER, with the distance from the transform of the estimated intrinsics."""
     intrinsics: Intrinsics
     seen: Seen
     """Uncertainty of a seen point with these intrinsics, what they place wrongly included."""
     differs_mm: float
-    """How far apart the two pairs place a point at the centre of the image, at the same distance."""
+    """Distance between the places of a point at the image centre by the two pairs (mm)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelError:
-    """What the intrinsics leave of the distortion: polynomials over the image (estimation/model_error.py), in widths of
-    it."""
+    """Distortion beyond the model: polynomials over the image, in its widths (estimation/model_error.py)."""
 
     likeliest: Float[ndarray, " e"]
     covariance: Float[ndarray, "e e"]
@@ -267,7 +264,7 @@ class ModelError:
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """What was estimated, and how well it is known."""
+    """Estimated transform, scale and intrinsics, with their covariances."""
 
     gripper_from_camera: Float[ndarray, "4 4"]
     scale: float
@@ -298,7 +295,7 @@ class Estimate:
         covariance: Float[ndarray, "7 7"],
         shifts: tuple[Float[ndarray, "7"], Float[ndarray, " q"]] | None = None,
     ) -> "Estimate":
-        """The same, as uncertain as a fault with this covariance makes it.
+        """Return the estimate, as uncertain as a fault with this covariance makes it.
 
         `shifts` are those of COVARIANCE_ORDER and of camera.parameters together, where the intrinsics move with it.
         """
@@ -342,7 +339,7 @@ class PaperResiduals:
 
 @dataclass(frozen=True)
 class RobotExamined:
-    """What the residuals show of the robot itself."""
+    """Errors of the robot that the residuals show."""
 
     noise: RobotNoise
     joint_offsets: JointOffsets | None = None
@@ -407,19 +404,19 @@ class ScaleEvidence:
 
 @dataclass(frozen=True)
 class Plan:
-    """How exact the calibration must be, and the poses that would make it so."""
+    """Required accuracy, and the poses that would reach it."""
 
     excitation: Excitation | None = None
-    """What the used poses show by themselves."""
+    """Excitation by the used poses."""
     next_poses: tuple[NextPose, ...] = ()
-    """Those that would shrink the reported uncertainty most; `like` counts the used poses."""
+    """Gripper poses that would shrink the reported uncertainty most; `like` counts the used poses."""
     requirement: Requirement | None = None
     """None where the solver was asked and not the calibration stage."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class HandEye(Assessed):
-    """The calibration: where the camera sits on the gripper, the metric scale, and how far to trust both."""
+    """State of a calibration as it passes through fit, bundle adjustment and checks."""
 
     estimate: Estimate
     images: ImageResiduals
@@ -429,7 +426,7 @@ class HandEye(Assessed):
     scale_evidence: ScaleEvidence = ScaleEvidence()
     plan: Plan = Plan()
     in_use: InUse | None = None
-    """How exactly it places points; None where the solver was asked and not the calibration stage."""
+    """Point uncertainty; None of a fit outside the stage calibrate."""
     with_given_intrinsics: WithGivenIntrinsics | None = None
     """None where no intrinsics were given, or they were not estimated beside that."""
     before: "HandEye | None" = None
@@ -437,7 +434,7 @@ class HandEye(Assessed):
 
     @property
     def gripper_from_camera(self) -> Float[ndarray, "4 4"]:
-        """Where the camera sits on the gripper."""
+        """Hand-eye transform; base_from_camera of a fixed camera."""
         return self.estimate.gripper_from_camera
 
     @property
@@ -452,7 +449,7 @@ class HandEye(Assessed):
 
     @property
     def covariance(self) -> Float[ndarray, "7 7"]:
-        """In COVARIANCE_ORDER."""
+        """Covariance in COVARIANCE_ORDER."""
         return self.estimate.covariance
 
     @property
@@ -472,12 +469,12 @@ class HandEye(Assessed):
 
     @property
     def robot_noise(self) -> RobotNoise:
-        """Of the gripper poses."""
+        """Noise of the gripper poses."""
         return self.robot.noise
 
     @property
     def requirement(self) -> Requirement | None:
-        """How exact it must be, and is; None where the solver was asked and not the calibration stage."""
+        """Required and reached accuracy; None of a fit outside the stage calibrate."""
         return self.plan.requirement
 
     @property
@@ -487,7 +484,7 @@ class HandEye(Assessed):
 
     @property
     def observability(self) -> Observability:
-        """Which directions the motions can see."""
+        """Directions that the motions determine."""
         return Observability(tuple(one for one in self.findings if one.kind is FindingKind.UNOBSERVABLE))
 
     @property
@@ -501,7 +498,7 @@ class HandEye(Assessed):
 
 @dataclass(frozen=True, kw_only=True)
 class Attempt:
-    """What came of one back end that was tried."""
+    """Attempt with one back end."""
 
     backend: str
     images_registered: int | None
@@ -510,6 +507,6 @@ class Attempt:
     calibrate_s: float
     """0 where there was nothing to calibrate."""
     why_not: str | None
-    """Why the run does not keep it; None where it does."""
+    """Reason why the run does not keep it; None where it does."""
     features: str | None = None
-    """What was matched between images, where the back end has a choice."""
+    """Features that were matched between images, where the back end has a choice."""

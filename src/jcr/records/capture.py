@@ -1,4 +1,4 @@
-"""What goes in: the camera model's numbers, images with gripper poses, or poses alone."""
+"""Input of a calibration: intrinsics, images with gripper poses, or poses alone."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -44,7 +44,7 @@ class Intrinsics:
     width: int
     height: int
     distortion: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """As many coefficients as COEFFICIENTS has names for the model."""
+    """Coefficients, as many as COEFFICIENTS has names for the model."""
     model: DistortionModel = "pinhole"
 
     @property
@@ -54,7 +54,7 @@ class Intrinsics:
 
 
 Mount = Literal["gripper", "base"]
-"""What a camera is bolted to: the gripper of an arm, or the ground that the arm's base stands on."""
+"""Body that a camera is mounted on: the gripper of an arm, or the ground that the arm's base stands on."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,11 +93,11 @@ class Capture:
     intrinsics_std: Float[ndarray, " q"] | None = None
     """Standard deviations of the given ones, in the order of camera.parameters, not a number where one is not stated."""
     source: Path | None = None
-    """What it was read from, where that is not a capture.json in `folder`."""
+    """Source that it was read from, where that is not a capture.json in `folder`."""
     cameras: Path | None = None
     """A COLMAP model that holds the cameras' poses already."""
     notes: tuple[str, ...] = ()
-    """What reading found that the user should know: how files were paired, frames left out."""
+    """Remarks of the reader: pairing of files, frames left out."""
     joints: Float[ndarray, "n dof"] | None = None
     """Joint angles (rad) at each image, from the base on; None: not recorded."""
     robot: str | None = None
@@ -107,19 +107,20 @@ class Capture:
     orientation: int = 1
     """EXIF's, of all images: 1 as the sensor has them; others were rotated upright, and the camera frame is theirs."""
     pose_convention: str | None = None
-    """How its robot writes poses, a name of capture.conventions.CONVENTIONS; None where its file does not tell."""
+    """Pose convention, a name of capture.conventions.CONVENTIONS; None where the file does not state one."""
     depths: tuple[str | None, ...] | None = None
-    """Of a depth camera, an image each or None: 16-bit PNG in mm, aligned with the images, relative to `folder`."""
+    """Images of a depth camera, one for each image or None: aligned 16-bit PNG in mm, relative to `folder`."""
     camera_name: str = "wrist"
     mount: Mount = "gripper"
     """base: a fixed camera, and the images show what the gripper carries."""
     others: tuple[CellCamera, ...] = ()
 
     def __len__(self) -> int:
+        """Return the number of images."""
         return len(self.images)
 
     def _repr_html_(self) -> str:
-        """A table, for notebooks."""
+        """Return a table for notebooks."""
         width, height = self.image_size
         centres = self.base_from_gripper[:, :3, 3]
         camera = "to be estimated"
@@ -151,6 +152,7 @@ class PosePairs:
     backend: str = "poses given"
 
     def __len__(self) -> int:
+        """Return the number of images."""
         return len(self.images)
 
     @property

@@ -9,7 +9,7 @@ TEMPLATE = """\
 
 
 def table(heading: str, rows: Iterable[Sequence[str]], note: str = "") -> str:
-    """A heading, rows whose first cell names them, and a note below; all of it text."""
+    """Return an HTML table: a heading, rows whose first cell names them, and a note below; all of it text."""
     from jinja2 import Template  # which no command needs for its help
 
     return Template(TEMPLATE, autoescape=True).render(heading=heading, rows=rows, note=note)

@@ -1,4 +1,4 @@
-"""What images alone give: camera poses, points, and pointmaps, up to one similarity."""
+"""Reconstruction from images alone: camera poses, points and pointmaps, up to one similarity."""
 
 from dataclasses import dataclass, replace
 
@@ -28,7 +28,7 @@ class Boards:
     spec: str
     """The boards as `--board` names them."""
     side: float
-    """Of a square or a tag, in the unit of `Body.x_in_body`: metres, or 1 where it is unknown."""
+    """Side of a square or a tag, in the unit of `Body.x_in_body`: metres, or 1 where it is unknown."""
     size_std: float | None
     """Relative standard deviation of the stated size, common to all bodies; None: the size is unknown."""
     bodies: tuple[Body, ...]
@@ -36,7 +36,7 @@ class Boards:
     elsewhere: tuple[int, ...] = ()
     """Rows of the reconstruction whose images show a body at another place than most do: their corners are left out."""
     proposed: str | None = None
-    """Where no body was found, the `--board` that the images seem to show; None where they show none."""
+    """Value for `--board` that the images seem to show where no body was found; None where they show none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,20 +55,20 @@ class Tracks:
     from_board: bool = False
     """All on a board or tags: the scene rises above them."""
     std_px: Float[ndarray, " k"] | None = None
-    """Of one coordinate of each observation, as its match states it, up to a factor; None: all are alike."""
+    """Standard deviation of one coordinate of each observation by its match, up to a factor; None: all are alike."""
     boards: Boards | None = None
     """Boards or tags whose corners are among the points; None: no shape of any point is known."""
 
     @property
     def on_board(self) -> Bool[ndarray, " p"]:
-        """Which points are corners of `boards`."""
+        """Mask of the points that are corners of `boards`."""
         out = np.zeros(len(self.points_in_recon), bool)
         for body in () if self.boards is None else self.boards.bodies:
             out[body.point] = True
         return out
 
     def only(self, rows: Bool[ndarray, " k"] | Int[ndarray, " n"]) -> "Tracks":
-        """These observations; points keep their rows."""
+        """Return these observations; points keep their rows."""
         std = None if self.std_px is None else self.std_px[rows]
         return replace(self, image=self.image[rows], x_px=self.x_px[rows], point=self.point[rows], std_px=std)
 
@@ -79,13 +79,13 @@ class CameraEvidence:
 
     recon_from_camera: Float[ndarray, "m 4 4"]
     covariance: Float[ndarray, "r r"]
-    """Of steps of the cameras (geometry.retract, recon axes), camera by camera; r = 6m. The recon frame is that of one
-    of the cameras, which is therefore exact."""
+    """Covariance of steps of the cameras (geometry.retract, recon axes), camera by camera; r = 6m. The recon frame is
+    that of one of the cameras, which is therefore exact."""
 
 
 NO_DEPTH, MATCHED, PRIOR, BOTH = 0, 1, 2, 3
-"""What a depth rests on: nothing; images that show the same (or a network's prediction); a plane that the colours
-and the matched depths around it speak for; both."""
+"""Evidence of a depth: none; images that show the same, or a network's prediction; a plane that the colours and the
+matched depths around it support; both."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +110,7 @@ class Pointmaps:
         return self.reason is None
 
     def of_rows(self, rows: Int[ndarray, " k"]) -> "Pointmaps":
-        """Those of some images, in the order of `rows`."""
+        """Return the pointmaps of some images, in the order of `rows`."""
         return replace(
             self,
             points_in_recon=self.points_in_recon[rows],
@@ -137,13 +137,13 @@ class Reconstruction:
     is_metric: bool = False
     """Whether the unit is meant to be the metre."""
     metric_std: float | None = None
-    """How well its unit is known to be a metre, relative one sigma; None: no standard deviation is given."""
+    """Relative standard deviation of its unit from a metre; None: not given."""
     notes: tuple[str, ...] = ()
-    """What was done: images not registered, matches left out."""
+    """Remarks: images not registered, matches left out."""
     warnings: tuple[str, ...] = ()
-    """What the user must act on: intrinsics that cannot be used, a gripper pose that the images contradict."""
+    """Warnings: intrinsics that cannot be used, a gripper pose that the images contradict."""
     evidence: CameraEvidence | None = None
-    """In the same frame, where the robot's poses were used for `recon_from_camera` or cameras err beside them."""
+    """Evidence in the same frame, where robot poses were used for `recon_from_camera` or cameras err beside them."""
 
     @property
     def dense(self) -> Pointmaps:
