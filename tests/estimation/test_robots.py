@@ -18,71 +18,45 @@ from jcr.estimation.mounting import LengthError, mounted_arm
 from jcr.geometry import inverse, rotation_exp, step_between, transform
 from simulation.arms import BentArm, error_names
 
-H = np.pi / 2
 Z = (0, 0, 1)
 
-# Joint origins (x, y, z, roll, pitch, yaw) and axis as in the makers' URDF files, where arms.py has DH parameters;
-# last the origin of the gripper frame.
-URDF_FORMS = {
-    "ur3e": [
-        ((0, 0, 0.15185, 0, 0, 0), Z),
-        ((0, 0, 0, H, 0, 0), Z),
-        ((-0.24355, 0, 0, 0, 0, 0), Z),
-        ((-0.2132, 0, 0.13105, 0, 0, 0), Z),
-        ((0, -0.08535, 0, H, 0, 0), Z),
-        ((0, 0.0921, 0, H, np.pi, np.pi), Z),
-        ((0, 0, 0, 0, 0, 0), None),
-    ],
-    "ur5e": [
-        ((0, 0, 0.1625, 0, 0, 0), Z),
-        ((0, 0, 0, H, 0, 0), Z),
-        ((-0.425, 0, 0, 0, 0, 0), Z),
-        ((-0.3922, 0, 0.1333, 0, 0, 0), Z),
-        ((0, -0.0997, 0, H, 0, 0), Z),
-        ((0, 0.0996, 0, H, np.pi, np.pi), Z),
-        ((0, 0, 0, 0, 0, 0), None),
-    ],
-    "panda": [
-        ((0, 0, 0.333, 0, 0, 0), Z),
-        ((0, 0, 0, -H, 0, 0), Z),
-        ((0, -0.316, 0, H, 0, 0), Z),
-        ((0.0825, 0, 0, H, 0, 0), Z),
-        ((-0.0825, 0.384, 0, -H, 0, 0), Z),
-        ((0, 0, 0, H, 0, 0), Z),
-        ((0.088, 0, 0, H, 0, 0), Z),
-        ((0, 0, 0.107, 0, 0, 0), None),
-    ],
-    "iiwa7": [
-        ((0, 0, 0.15, 0, 0, 0), Z),
-        ((0, 0, 0.19, H, 0, np.pi), Z),
-        ((0, 0.21, 0, H, 0, np.pi), Z),
-        ((0, 0, 0.19, H, 0, 0), Z),
-        ((0, 0.21, 0, -H, np.pi, 0), Z),
-        ((0, 0.0607, 0.19, H, 0, 0), Z),
-        ((0, 0.081, 0.0607, -H, np.pi, 0), Z),
-        ((0, 0, 0.045, np.pi, np.pi, np.pi), None),
-    ],
-    "iiwa14": [
-        ((0, 0, 0.1575, 0, 0, 0), Z),
-        ((0, 0, 0.2025, H, 0, np.pi), Z),
-        ((0, 0.2045, 0, H, 0, np.pi), Z),
-        ((0, 0, 0.2155, H, 0, 0), Z),
-        ((0, 0.1845, 0, -H, np.pi, 0), Z),
-        ((0, 0, 0.2155, H, 0, 0), Z),
-        ((0, 0.081, 0, -H, np.pi, 0), Z),
-        ((0, 0, 0.045, np.pi, np.pi, np.pi), None),
-    ],
-    "z1": [
-        ((0, 0, 0.0585, 0, 0, 0), Z),
-        ((0, 0, 0.045, 0, 0, 0), (0, 1, 0)),
-        ((-0.35, 0, 0, 0, 0, 0), (0, 1, 0)),
-        ((0.218, 0, 0.057, 0, 0, 0), (0, 1, 0)),
-        ((0.07, 0, 0, 0, 0, 0), Z),
-        ((0.0492, 0, 0, 0, 0, 0), (1, 0, 0)),
-        ((0.051, 0, 0, 0, 0, 0), None),
-    ],
+# Joint origins (x, y, z in m; roll, pitch, yaw in degrees) and axis (x or y; else z) as in the makers' URDF files, where
+# arms.py has DH parameters; last the origin of the gripper frame.
+URDF_TEXTS = {
+    "ur3e": (
+        "0 0 0.15185 0 0 0; 0 0 0 90 0 0; -0.24355 0 0 0 0 0; -0.2132 0 0.13105 0 0 0; 0 -0.08535 0 90 0 0; "
+        "0 0.0921 0 90 180 180; 0 0 0 0 0 0"
+    ),
+    "ur5e": (
+        "0 0 0.1625 0 0 0; 0 0 0 90 0 0; -0.425 0 0 0 0 0; -0.3922 0 0.1333 0 0 0; 0 -0.0997 0 90 0 0; "
+        "0 0.0996 0 90 180 180; 0 0 0 0 0 0"
+    ),
+    "panda": (
+        "0 0 0.333 0 0 0; 0 0 0 -90 0 0; 0 -0.316 0 90 0 0; 0.0825 0 0 90 0 0; -0.0825 0.384 0 -90 0 0; "
+        "0 0 0 90 0 0; 0.088 0 0 90 0 0; 0 0 0.107 0 0 0"
+    ),
+    "iiwa7": (
+        "0 0 0.15 0 0 0; 0 0 0.19 90 0 180; 0 0.21 0 90 0 180; 0 0 0.19 90 0 0; 0 0.21 0 -90 180 0; "
+        "0 0.0607 0.19 90 0 0; 0 0.081 0.0607 -90 180 0; 0 0 0.045 180 180 180"
+    ),
+    "iiwa14": (
+        "0 0 0.1575 0 0 0; 0 0 0.2025 90 0 180; 0 0.2045 0 90 0 180; 0 0 0.2155 90 0 0; 0 0.1845 0 -90 180 0; "
+        "0 0 0.2155 90 0 0; 0 0.081 0 -90 180 0; 0 0 0.045 180 180 180"
+    ),
+    "z1": (
+        "0 0 0.0585 0 0 0; 0 0 0.045 0 0 0 y; -0.35 0 0 0 0 0 y; 0.218 0 0.057 0 0 0 y; 0.07 0 0 0 0 0; "
+        "0.0492 0 0 0 0 0 x; 0.051 0 0 0 0 0"
+    ),
 }
-URDF_FORMS["fr3"] = URDF_FORMS["panda"]
+URDF_TEXTS["fr3"] = URDF_TEXTS["panda"]
+
+
+def urdf_form(name):
+    """Return the origin of each joint (m, rad) and its axis, None for the gripper frame."""
+    rows = [row.split() for row in URDF_TEXTS[name].split(";")]
+    axes = [dict(x=(1, 0, 0), y=(0, 1, 0)).get(row[-1], Z) for row in rows[:-1]]
+    origins = [(*map(float, row[:3]), *np.radians(np.array(row[3:6], float))) for row in rows]
+    return list(zip(origins, [*axes, None], strict=True))
 
 
 # Body positions, quaternions (w, x, y, z) and joint axes of MuJoCo models: so101_new_calib.xml beside the URDF, and
@@ -131,11 +105,11 @@ def urdf_text(form, limits):
     return "".join(text) + "</robot>"
 
 
-@pytest.mark.parametrize("name", URDF_FORMS)
+@pytest.mark.parametrize("name", URDF_TEXTS)
 def test_arm_agrees_with_its_urdf(name, tmp_path):
     import yourdfpy
 
-    arm, form = arm_named(name), URDF_FORMS[name]
+    arm, form = arm_named(name), urdf_form(name)
     file = tmp_path / "arm.urdf"
     file.write_text(urdf_text(form, arm.limits))
     joints = postures(arm, 5, spread=1.0)
@@ -256,7 +230,7 @@ def test_joint_angles_contradict_positions_that_are_all_too_long(name):
 
 
 def test_urdf_that_is_no_arm_is_refused(tmp_path):
-    form = URDF_FORMS["ur5e"]
+    form = urdf_form("ur5e")
     file = tmp_path / "arm.urdf"
     file.write_text(urdf_text(form, arm_named("ur5e").limits))
     with pytest.raises(InputError, match="no chain with 7 joints"):
