@@ -1,19 +1,15 @@
 """Sizes of random and systematic errors of gripper poses, and what is honest about an answer averaged over them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 import jcr
 from jcr.estimation.components import most_likely
-from jcr.estimation.covariance import expected_posterior, posterior
 from jcr.estimation.equation import residuals
 from jcr.estimation.mixed_model import Equations
 from jcr.estimation.robust import robust_fit
 from jcr.estimation.systematic import Region, arm_errors, smooth_errors
 from jcr.geometry import retract, rotation_exp, step_between, transform
-from jcr.records import RobotNoise
 from simulation.problems import error, hand_eye_problem
 
 WHITE = (2e-4, np.radians(0.03))
@@ -143,21 +139,3 @@ def test_poses_and_angles_that_are_not_of_the_robot_are_an_input_error(joints, r
     problem = hand_eye_problem(np.random.default_rng(2), 8)
     with pytest.raises(jcr.InputError, match=words):
         jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera, joints=joints, robot=robot)
-
-
-@pytest.mark.parametrize(("count", "systematic_rad"), [(6, 2e-3), (16, 2e-3), (8, 5e-4)])
-def test_the_posterior_that_is_expected_is_the_one_that_draws_have(count: int, systematic_rad: float):
-    rng = np.random.default_rng(count)
-    one = equations(rng, count, systematic_rad)
-    reported = []
-    for _ in range(30):
-        part = rng.multivariate_normal(
-            np.zeros(6 * count), systematic_rad**2 * one.systematic, method="cholesky"
-        )
-        white = np.tile(np.repeat(WHITE, 3), count) * rng.normal(size=6 * count)
-        drawn = replace(one, residual=part + white)
-        reported.append(np.diag(posterior(drawn, *most_likely(drawn), None).covariance))
-    noise = RobotNoise(translation=WHITE[0], rotation=WHITE[1], estimated=True, systematic=systematic_rad)
-    silent = replace(one, residual=np.zeros(6 * count))
-    ratio = np.diag(expected_posterior(silent, noise, None).covariance) / np.median(reported, axis=0)
-    assert (np.abs(np.log(ratio)) < np.log(1.6)).all(), ratio

@@ -12,12 +12,11 @@ from numpy import ndarray
 
 from jcr.calibration.case import Case
 from jcr.calibration.consider import with_intrinsics_considered
-from jcr.estimation.equation import predict
+from jcr.estimation.equation import paper_residuals, predict
 from jcr.estimation.hand_eye import judged
 from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.intrinsics_prior import Camera, decentring
 from jcr.estimation.projection import view_of
-from jcr.estimation.residuals import paper_residuals
 from jcr.estimation.score_test import focal_lengths
 from jcr.estimation.solve import START_NOISE, Solution
 from jcr.estimation.wrist import adjust_wrist, estimate_of, wrist_arm

@@ -6,7 +6,7 @@ Z; other unknowns of the problem follow.
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.geometry import (
@@ -117,3 +117,17 @@ def share_within_limits(step: Float[ndarray, " u"]) -> float:
 def expected_covariance(hessian: Float[ndarray, "*batch 13 13"]) -> Float[ndarray, "*batch 7 7"]:
     """Return the covariance of X and scale that information and the weak prior leave, in COVARIANCE_ORDER."""
     return np.linalg.inv(hessian + weak_prior())[..., :7, :7]
+
+
+def paper_residuals(
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    recon_from_camera: Float[ndarray, "n 4 4"],
+    gripper_from_camera: Transform,
+    scale: float,
+    used: Bool[ndarray, " n"],
+) -> tuple[float, float]:
+    """Return the mean δ_t (m) and δ_R (Frobenius norm) of A·X − X·B(λ) over consecutive used images (paper, eq. 16)."""
+    a, b = (inverse(of[used][:-1]) @ of[used][1:] for of in (base_from_gripper, recon_from_camera))
+    gap = a @ gripper_from_camera - gripper_from_camera @ scale_translation(b, scale)
+    translation = np.linalg.norm(gap[:, :3, 3], axis=1).mean()
+    return float(translation), float(np.linalg.norm(gap[:, :3, :3], axis=(1, 2)).mean())

@@ -11,11 +11,10 @@ from numpy.typing import ArrayLike
 from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.camera_drift import drift_covariance
-from jcr.estimation.equation import residuals
+from jcr.estimation.equation import paper_residuals, residuals
 from jcr.estimation.kinematics import Arm, Joints
 from jcr.estimation.observability import observability
 from jcr.estimation.problem import LinearPrior, offset_prior, scale_prior
-from jcr.estimation.residuals import paper_residuals
 from jcr.estimation.robust import robust_fit
 from jcr.estimation.solve import Solution
 from jcr.estimation.systematic import arm_errors, posed, smooth_errors

@@ -81,7 +81,7 @@ class Alternatives:
 
 
 @dataclass(frozen=True)
-class Tested:
+class ScoreTest:
     """Result of a test of some combinations."""
 
     log_p: float
@@ -313,7 +313,9 @@ def spanned(combinations: Float[ndarray, "e p"]) -> Float[ndarray, "e r"]:
     return u[:, size > 1e-9 * size.max(initial=1e-300)]
 
 
-def tested(equations: Alternatives, free: Float[ndarray, "e p"], beside: Float[ndarray, "e q"]) -> Tested:
+def test_combinations(
+    equations: Alternatives, free: Float[ndarray, "e p"], beside: Float[ndarray, "e q"]
+) -> ScoreTest:
     """Return the test of the combinations `free`, with those of `beside` free under both hypotheses."""
     q, both = beside.shape[1], np.concatenate([beside, free], axis=1)
     fewer, more = spanned(beside), spanned(both)
@@ -321,7 +323,7 @@ def tested(equations: Alternatives, free: Float[ndarray, "e p"], beside: Float[n
     step, gain, covariance = _step(equations, more)
     spread, p = equations.dispersion, max(more.shape[1] - fewer.shape[1], 1)
     to_value = np.linalg.pinv(both)[q:] @ more
-    return Tested(
+    return ScoreTest(
         float(f_distribution.logsf(max(gain - gain_without, 0.0) / spread / p, p, equations.freedom)),
         spread * to_value @ covariance @ to_value.T,
         equations.place_by_column @ (more @ step - fewer @ without),

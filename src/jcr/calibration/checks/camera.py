@@ -22,13 +22,13 @@ from jcr.estimation.model_error import TYPICAL
 from jcr.estimation.problem import OF_IMAGE, PRISM
 from jcr.estimation.score_test import (
     Alternatives,
-    Tested,
+    ScoreTest,
     alternatives,
     beyond_prior,
     differences,
     nuisances_of,
     spanned,
-    tested,
+    test_combinations,
 )
 from jcr.estimation.solve import Solution
 from jcr.findings import Concerns, Finding, FindingKind
@@ -184,7 +184,7 @@ def freed(state: State, best: CameraEffect) -> State | None:
     Return None where the first step towards the effect moves the camera too little, or where the images then determine
     nothing.
     """
-    alone = tested(state.equations, best.both, _all(state))
+    alone = test_combinations(state.equations, best.both, _all(state))
     if not (np.abs(alone.shift) > OF_FIRST_STEP * MATERIAL * state.imaged.std).any():
         return None
     try:
@@ -208,8 +208,8 @@ def is_material(found: Finding, std: Float[ndarray, "6"]) -> bool:
 def camera_finding(after: State, before: State) -> Finding:
     """Return the last camera effect that was freed as a finding."""
     best = after.found[-1]
-    alone = tested(before.equations, best.both, _all(before))
-    last = tested(after.equations, best.free, np.concatenate([_all(before), best.beside], axis=1))
+    alone = test_combinations(before.equations, best.both, _all(before))
+    last = test_combinations(after.equations, best.free, np.concatenate([_all(before), best.beside], axis=1))
     p = float(np.exp(max(alone.log_p + np.log(best.places), -700)))
     size = _of_intrinsics(after, last) if best.kind is FindingKind.INTRINSICS else _size(after, last)
     (then, scale), (now, new_scale) = (after.imaged.answer(one.adjusted) for one in (before, after))
@@ -264,7 +264,7 @@ def best_camera_effect(state: State, dismissed: Sequence[CameraEffect]) -> tuple
 def log_p(one: CameraEffect, state: State, equations: Alternatives) -> float:
     """Return the logarithm of the probability of the effect's gain by chance, times the places searched."""
     beside = np.concatenate([_all(state), one.beside], axis=1)
-    return tested(equations, one.free, beside).log_p + float(np.log(one.places))
+    return test_combinations(equations, one.free, beside).log_p + float(np.log(one.places))
 
 
 def _alike(one: CameraEffect, other: CameraEffect) -> bool:
@@ -320,7 +320,7 @@ def _hypotheses(state: State) -> list[CameraEffect]:
     return found
 
 
-def _of_intrinsics(after: State, last: Tested) -> dict[str, Any]:
+def _of_intrinsics(after: State, last: ScoreTest) -> dict[str, Any]:
     """The fields of a finding that say which intrinsics the images show."""
     units = dict(zip(after.equations.names, after.equations.units, strict=True))
     std = np.sqrt(np.maximum(np.diag(last.covariance), 0.0))
@@ -333,7 +333,7 @@ def _of_intrinsics(after: State, last: Tested) -> dict[str, Any]:
     return {"concerns": "intrinsics", "details": found}
 
 
-def _size(after: State, last: Tested) -> dict[str, Any]:
+def _size(after: State, last: ScoreTest) -> dict[str, Any]:
     """The fields of a finding that say what and how large the fault is."""
     fault, equations = after.found[-1], after.equations
     value = _value(fault, after.total)
