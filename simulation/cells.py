@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from jcr.estimation.arms import arm_named
 from jcr.estimation.observations import Observations
-from jcr.estimation.problem import Arm
+from jcr.estimation.problem import ReportedPoses
 from jcr.estimation.systematic import smooth_errors
 from jcr.geometry import (
     apply_similarity,
@@ -66,11 +66,11 @@ class CellProblem:
     """True X and base_from_world of each arm, as initial estimates."""
 
     @property
-    def arms(self) -> list[Arm]:
+    def arms(self) -> list[ReportedPoses]:
         """Arms as an adjustment takes them, their errors smooth over the poses."""
         count = len(self.reported[0])
         return [
-            Arm(
+            ReportedPoses(
                 rigs=np.arange(count) + count * k,
                 base_from_gripper=poses,
                 error_covariance=smooth_errors(poses),

@@ -81,7 +81,7 @@ def adjust_case(
 ) -> Solution:
     """Adjust the used images and gripper poses of a case, from its fit to poses or from its adjustment.
 
-    `prior` takes the place of the case's camera; the rest is that of Arm and adjust_wrist.
+    `prior` takes the place of the case's camera; the rest is that of ReportedPoses and adjust_wrist.
     """
     fit = case.hand_eye.before or case.hand_eye
     arm = wrist_arm(case.base_from_gripper[case.used], case.systematic)

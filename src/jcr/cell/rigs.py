@@ -16,7 +16,7 @@ from jcr.cell.localise import Shared
 from jcr.cell.placement import CameraPlacement
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.estimation.pose_effects import arm_rows
-from jcr.estimation.problem import Arm
+from jcr.estimation.problem import ReportedPoses
 from jcr.estimation.systematic import smooth_errors
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import Transform, inverse, motion_length, step_between
@@ -160,7 +160,9 @@ class Rigs:
         self._of_arms.append((rig[seen.rows[used]], gripper[used], found))
         return Member(seen=seen.without(why), rig=rig, rig_from_camera=None, arm=len(self.arms))
 
-    def arm_poses(self, options: CalibrateOptions) -> tuple[list[Arm], list[tuple[Transform, Transform]]]:
+    def arm_poses(
+        self, options: CalibrateOptions
+    ) -> tuple[list[ReportedPoses], list[tuple[Transform, Transform]]]:
         """Return the arms, the capture's own first, and initial X and base_from_world of each."""
         robot = robot_errors(self._capture, options).of(self._rows)
         hand_eye = self._hand_eye
@@ -168,7 +170,7 @@ class Rigs:
         kinds = {one.kind for one in hand_eye.findings if one.kind.row.group == "strain"}
         bent = [row.prior_std * row.columns for row in arm_rows(poses) if row.kind in kinds]
         arms = [
-            Arm(
+            ReportedPoses(
                 rigs=np.arange(len(self._rows)),
                 base_from_gripper=poses,
                 error_covariance=robot.systematic,
@@ -176,7 +178,9 @@ class Rigs:
             )
         ]
         for rigs, gripper, _ in self._of_arms:
-            arms.append(Arm(rigs=rigs, base_from_gripper=gripper, error_covariance=smooth_errors(gripper)))
+            arms.append(
+                ReportedPoses(rigs=rigs, base_from_gripper=gripper, error_covariance=smooth_errors(gripper))
+            )
         found = [hand_eye, *(one for _, _, one in self._of_arms)]
         return arms, [(one.gripper_from_camera, one.base_from_recon) for one in found]
 

@@ -34,7 +34,7 @@ share the coefficients s1 to s4 of OpenCV's thin prism distortion."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Arm:
+class ReportedPoses:
     """Reported poses of one arm, and the rigs that it moves."""
 
     rigs: Int[ndarray, " n"]
@@ -111,7 +111,7 @@ class State:
 class Problem:
     """Measurements and priors: reported poses, and observations in images or Gaussian distributions of rigs."""
 
-    arms: tuple[Arm, ...]
+    arms: tuple[ReportedPoses, ...]
     n_rigs: int
     cameras: tuple[Camera, ...] = ()
     observations: Observations | None = None

@@ -8,9 +8,9 @@ from jcr.estimation.boards import BoardShapes, shapes_of
 from jcr.estimation.intrinsics_prior import FIXED, Camera, camera_with_prior
 from jcr.estimation.observations import Observations
 from jcr.estimation.problem import (
-    Arm,
     LinearPrior,
     Problem,
+    ReportedPoses,
     RigGaussian,
     State,
     transferred,
@@ -26,12 +26,14 @@ Start = tuple[Transform, float, Transform]
 """Initial estimate of gripper_from_camera, scale and base_from_recon."""
 
 
-def wrist_arm(base_from_gripper: Poses, error_covariance: Float[ndarray, "s s"] | None = None) -> Arm:
+def wrist_arm(
+    base_from_gripper: Poses, error_covariance: Float[ndarray, "s s"] | None = None
+) -> ReportedPoses:
     """Return an arm that moves rig i at pose i; `error_covariance` None: errors that are smooth over the poses."""
     if error_covariance is None:
         error_covariance = smooth_errors(base_from_gripper)
     rigs = np.arange(len(base_from_gripper))
-    return Arm(rigs=rigs, base_from_gripper=base_from_gripper, error_covariance=error_covariance)
+    return ReportedPoses(rigs=rigs, base_from_gripper=base_from_gripper, error_covariance=error_covariance)
 
 
 def pose_problem(
@@ -73,7 +75,7 @@ def image_problem(
 
 
 def wrist_problem(
-    arm: Arm,
+    arm: ReportedPoses,
     start: Start,
     recon_from_camera: Poses,
     camera: Camera,
@@ -111,7 +113,7 @@ def wrist_problem(
 
 
 def adjust_wrist(  # noqa: PLR0913 (each is a fact about the capture)
-    arm: Arm | Poses,
+    arm: ReportedPoses | Poses,
     start: Start,
     recon_from_camera: Poses,
     camera: Camera | Intrinsics,
@@ -128,7 +130,7 @@ def adjust_wrist(  # noqa: PLR0913 (each is a fact about the capture)
     and intrinsics without a prior are exact. `start_noise` is the initial size of the random errors of the poses
     (m, rad). `near` is a solution of the same poses and of the same points or more, from which the adjustment starts.
     """
-    arm = arm if isinstance(arm, Arm) else wrist_arm(arm)
+    arm = arm if isinstance(arm, ReportedPoses) else wrist_arm(arm)
     if isinstance(camera, Intrinsics):
         camera = camera_with_prior(camera, FIXED)
     problem, state = wrist_problem(
