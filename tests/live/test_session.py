@@ -14,7 +14,6 @@ from numpy import ndarray
 import jcr
 from jcr.live.cameras import Frame
 from jcr.live.folder import LiveFolder
-from jcr.live.page import page_content
 from jcr.live.robot import MOVED_ON, RobotState, next_rest
 from jcr.live.session import Answer
 from jcr.live.terminal import command_of, without_commands
@@ -94,9 +93,10 @@ def test_commands_take_retake_remove_and_undo(tmp_path: Path, tabletop: Path):
             ("undo",),
             ("remove", 1),
             ("undo",),
+            ("undo",),
         ]
     )
-    assert ({"retake": "images/001.png"}, ["the next image replaces images/001.png"]) in heard
+    assert ({"images": ["images/000.png", "images/002.png"]}, ["removed images/001.png"]) in heard
     assert any(answer.get("reason") == "there is no image 9" for answer, _ in heard)
     assert ({"images": ["images/002.png", "images/003.png"]}, ["removed images/000.png"]) in heard
     assert frames_in(tmp_path / "c") == ["images/000.png", "images/001.png", "images/002.png"]
@@ -108,8 +108,8 @@ def test_commands_take_retake_remove_and_undo(tmp_path: Path, tabletop: Path):
 def test_take_and_retake_read_where_the_gripper_is(tmp_path: Path, tabletop: Path):
     taken = Stepped(tmp_path / "c", tabletop)
     heard = taken.run([0, ("retake",)])
-    assert taken.session.state.names == ("images/001.png",) and taken.session.state.replaces is None
-    assert any(answer.get("retake") == "images/000.png" for answer, _ in heard)
+    assert taken.session.state.names == ("images/001.png",)
+    assert ({"images": []}, ["removed images/000.png"]) in heard
     assert np.allclose(taken.folder.images[0].base_from_gripper, taken.poses[0])
     typed = Stepped(tmp_path / "d", tabletop, has_gripper=False)
     assert any("give the pose" in lines[0] for _, lines in typed.run([("take",)]))
@@ -125,20 +125,7 @@ def test_a_connection_that_fails_during_retake_does_not_end_the_capture(tmp_path
     heard = taken.run([0, ("retake",), ("take",), 1])
     reasons = [answer["reason"] for answer, _ in heard if "reason" in answer]
     assert len(reasons) == 2 and all("silent for 5 s" in reason for reason in reasons)
-    # The next image replaced the first.
     assert frames_in(tmp_path / "c") == ["images/001.png"]
-
-
-def test_the_page_is_drawn_while_the_image_that_it_replaces_goes(tmp_path: Path, tabletop: Path):
-    """A state is one moment: drawing it does not look at what the folder holds later."""
-    taken = Stepped(tmp_path / "c", tabletop, has_gripper=False)
-    taken.run([0, 1, ("retake", 1)])
-    before = taken.session.state
-    taken.folder.remove("images/000.png")
-    assert page_content(before, (2.0, 0.3), taken.session.notation)["replaces"] == 1
-    (left,) = taken.folder.images
-    between = type(before)(images=(left,), replaces="images/000.png")
-    assert page_content(between, (2.0, 0.3), taken.session.notation)["replaces"] is None
 
 
 def test_requests_and_commands_of_several_threads_come_one_after_the_other(tmp_path: Path, tabletop: Path):

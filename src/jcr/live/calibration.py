@@ -110,18 +110,17 @@ class LiveCalibration:
         depth_mm: UInt16[ndarray, "h w"] | None = None,
         *,
         color: Literal["rgb", "bgr"] = "rgb",
-        replaces: int | None = None,
     ) -> Progress:
         """Keep an image (h,w,3) uint8 and the gripper pose (4,4) at it, and calibrate with it.
 
         `joints` are the angles of the arm (rad), `time_s` is the time of the image, `depth_mm` (h,w) the image of a
-        depth camera, `color` the order of channels ("bgr" for OpenCV), `replaces` the index of an image that is removed
-        for this one; grey images are converted. Raises InputError that names the image, and leaves the capture as it
-        was, for arrays that are no image or no rigid pose, a pose in another unit than metres, another size than that
-        of the others, and an image that repeats another. Threads may add at once: one of them waits for the other.
+        depth camera, `color` the order of channels ("bgr" for OpenCV); grey images are converted. Raises InputError
+        that names the image, and leaves the capture as it was, for arrays that are no image or no rigid pose, a pose in
+        another unit than metres, another size than that of the others, and an image that repeats another. Threads may
+        add at once: one of them waits for the other.
         """
         with self._lock:
-            self.keep(image, base_from_gripper, joints, time_s, depth_mm, color=color, replaces=replaces)
+            self.keep(image, base_from_gripper, joints, time_s, depth_mm, color=color)
             return self.update()
 
     def keep(
@@ -133,18 +132,16 @@ class LiveCalibration:
         depth_mm: UInt16[ndarray, "h w"] | None = None,
         *,
         color: Literal["rgb", "bgr"] = "rgb",
-        replaces: int | None = None,
     ) -> str:
         """Write an image into the capture as `add`, without calibrating, and return its name; `update` calibrates."""
         with self.live.lock:
             number = f"image {len(self.live.names) + 1}"
             pixels = checked_image(image, color, number)
             pose = checked_pose(base_from_gripper, f"{number}: base_from_gripper")
-            old = None if replaces is None else self._name(replaces)
             if self.live.size == (pixels.shape[1], pixels.shape[0]):
-                self._refuse_repeated(pixels, pose, old, number)
+                self._refuse_repeated(pixels, pose, number)
             angles = None if joints is None else np.asarray(joints, np.float64)
-            return self.live.add(pixels, pose, angles, depth_mm, time_s, replaces=old)
+            return self.live.add(pixels, pose, angles, depth_mm, time_s)
 
     def remove(self, index: int) -> Progress:
         """Remove the image at `index` from the capture, and calibrate without it."""
@@ -222,13 +219,12 @@ class LiveCalibration:
         self,
         image: UInt8[ndarray, "h w 3"],
         base_from_gripper: Float[ndarray, "4 4"],
-        without: str | None,
         number: str,
     ) -> None:
-        """Raise InputError where an image repeats another than the one named `without`."""
+        """Raise InputError where an image repeats another."""
         new = ImageSummary.of(image)
         for one in self.live.images:
-            if one.image == without or not new.is_like(self.live.summary(one.image)):
+            if not new.is_like(self.live.summary(one.image)):
                 continue
             metres, radians = largest_motion(np.stack([one.base_from_gripper, base_from_gripper]))
             if metres < MOVED[0] and radians < MOVED[1]:

@@ -84,13 +84,11 @@ class LiveFolder:
         joints: Float[ndarray, " dof"] | None = None,
         depth_mm: UInt16[ndarray, "h w"] | None = None,
         time_s: float | None = None,
-        replaces: str | None = None,
     ) -> str:
         """Write an image (RGB) with its pose and return its name; capture.json is complete again after that.
 
-        `replaces` names an image that is removed. `joints` (rad) are written when all images have them. Raises
-        InputError where the frame cannot be part of this capture, and OSError where a file cannot be written; the
-        capture is then unchanged.
+        `joints` (rad) are written when all images have them. Raises InputError where the frame cannot be part of this
+        capture, and OSError where a file cannot be written; the capture is then unchanged.
         """
         stem, size = f"{self._next_number:03d}", (image.shape[1], image.shape[0])
         if self.size not in (None, size):
@@ -100,7 +98,7 @@ class LiveFolder:
         entry |= {"joints": None if joints is None else joints.tolist()}
         entry |= {"depth": None if depth_mm is None else f"depth/{stem}.png"}
         new: FrameEntry = validated(FrameEntry, entry, f"image {len(self.images) + 1}")
-        images = (*(one for one in self.images if one.image != replaces), new)
+        images = (*self.images, new)
         if len({len(one.joints) for one in images if one.joints is not None}) > 1:
             raise InputError(f"joints of {new.image}: not as many angles as the other images have; give all")
         self._capture_of(images, size)

@@ -70,17 +70,16 @@ def page_content(
 ) -> dict[str, Any]:
     """Return everything that the templates draw of a state; `required` are mm and degrees.
 
-    "kind" is the colour of the headline ("good", "fair", "bad" or empty), "replaces" the number of the image that the
-    next one replaces, "images" the cards of the list, the newest first.
+    "kind" is the colour of the headline ("good", "fair", "bad" or empty), "images" the cards of the list, the newest
+    first.
     """
-    progress, names = state.progress, state.names
+    progress = state.progress
     kind, headline, lines = _verdict(state, required)
     has_next = _is_proposed(state)
     return {
         "kind": kind,
         "headline": _capitalised(headline),
         "lines": [_capitalised(line) for line in lines],
-        "replaces": names.index(state.replaces) + 1 if state.replaces in names else None,
         "is_over": state.is_over,
         "has_report": has_report,
         "can_undo": state.can_undo,

@@ -13,8 +13,6 @@ import secrets
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -95,11 +93,7 @@ class LiveServer:
         self.session, self.key, self.host = session, listen.token or secrets.token_urlsafe(16), listen.host
         self.takes_samples = takes_samples
         self.sampled_s = time.monotonic()
-        """Time of the last sample."""
-        self._unanswered = 0
-        """Number of samples that are not answered yet."""
-        self._counting = threading.Lock()
-        """Held while `_unanswered` changes."""
+        """Time of the last sample; infinite while one is answered."""
         self._page_version, self._page_s = -1, -np.inf
         """Version of the state that the page has, and the time of its last request."""
         try:
@@ -134,23 +128,12 @@ class LiveServer:
     def await_samples(self, timeout_s: float) -> None:
         """Return when the session is over; raise InputError after `timeout_s` without a sample."""
         while not self.session.state.is_over:
-            if not self._unanswered and time.monotonic() - self.sampled_s > timeout_s:
+            if time.monotonic() - self.sampled_s > timeout_s:
                 raise InputError(
                     f"--poses http: no sample for {timeout_s:.0f} s; the images taken are kept and the same command "
                     "resumes"
                 )
             time.sleep(0.1)
-
-    @contextmanager
-    def answering(self) -> Iterator[None]:
-        """Keep the server from stopping while a sample is answered."""
-        with self._counting:
-            self._unanswered += 1
-        try:
-            yield
-        finally:
-            with self._counting:
-                self._unanswered -= 1
 
     def page_has(self, version: int) -> None:
         """Note the version of the state that the page has."""
@@ -162,9 +145,9 @@ class LiveServer:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Send the last answers and let an open page fetch the last state, then stop."""
+        """Let an open page fetch the last state and send the last answers, then stop."""
         end = time.monotonic() + LAST_S
-        while time.monotonic() < end and (self._unanswered or self._page_is_behind()):
+        while time.monotonic() < end and self._page_is_behind():
             time.sleep(0.05)
         self._server.shutdown()
         self._server.server_close()
@@ -176,9 +159,10 @@ class LiveServer:
 
 
 class _HttpServer(ThreadingHTTPServer):
-    """Socket server with a reference to the `LiveServer` that owns it."""
+    """Socket server with a reference to the `LiveServer` that owns it; closing waits for requests being answered."""
 
     owner: LiveServer
+    daemon_threads = False
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Ignore connections that the client closed; report anything else."""
@@ -221,8 +205,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         """Obey a command of the page, or take a sample."""
         if self.path == "/sample":
-            with self._owner.answering():
-                self._send_json(*self._sampled())
+            self._send_json(*self._sampled())
             return
         path = self._path()
         if path is None:
@@ -256,8 +239,8 @@ class _Handler(BaseHTTPRequestHandler):
         if pose is None:
             owner.session.end()
             return {"accepted": True, "done": True}, 200
-        owner.sampled_s = time.monotonic()
-        answer = owner.session.take(RobotState(owner.sampled_s, pose), waits=True)
+        owner.sampled_s = np.inf
+        answer = owner.session.take(RobotState(time.monotonic(), pose), waits=True)
         owner.sampled_s = time.monotonic()
         # The status tells whether the image is kept, for programs that read a line only.
         return answer, 200 if answer["accepted"] else 422

@@ -83,8 +83,6 @@ class SessionState:
     images: tuple[FrameEntry, ...] = ()
     can_undo: bool = False
     """Whether there is a change that can be taken back."""
-    replaces: str | None = None
-    """Image that the next one replaces."""
     progress: Progress = Progress(images=())
     """Last state of the calibration, which may have fewer images."""
     is_over: bool = False
@@ -199,11 +197,11 @@ class LiveSession:
                 self._undo()
             elif not 1 <= number <= len(names):
                 self._refuse(f"refused: there is no image {number}")
-            elif action == "retake":
-                self._retake(names[number - 1])
             else:
                 self.folder.remove(names[number - 1])
                 self._follow_removal(f"removed {names[number - 1]}")
+                if action == "retake":
+                    self._take_now()
 
     def finish(self) -> "RunResult | None":
         """Return the calibration of all images; None, with a line that says why, where there is none."""
@@ -218,7 +216,6 @@ class LiveSession:
 
     def _take(self, state: RobotState, current: Callable[[], RobotState] | None) -> Answer:
         """Take an image, let its calibration follow, and return the answer."""
-        names, replaced = self.folder.names, self.state.replaces
         try:
             frame = self._frame(state, current)
             name = self.calibration.keep(
@@ -227,7 +224,6 @@ class LiveSession:
                 state.joints,
                 frame.time_s,
                 frame.depth_mm,
-                replaces=names.index(replaced) if replaced in names else None,
             )
         except StopIteration:
             self.end()
@@ -238,7 +234,7 @@ class LiveSession:
             why = f"the image cannot be written ({error.strerror}); free the disk and take it again"
         else:
             self._follow()
-            self._show(f"kept {name}", replaces=None, is_over=len(self.folder.names) >= self.options.most)
+            self._show(f"kept {name}", is_over=len(self.folder.names) >= self.options.most)
             answer: Answer = {"accepted": True, "image": name, "done": self.state.is_over}
             self._tell(answer, [f"kept {name}"])
             return answer
@@ -249,12 +245,11 @@ class LiveSession:
 
     def _frame(self, state: RobotState, current: Callable[[], RobotState] | None) -> Frame:
         """Return a frame at rest; raise InputError with the reason why none is kept, StopIteration at a video's end."""
-        others = [one for one in self.folder.images if one.image != self.state.replaces]
-        pose = state.base_from_gripper
-        for one in others:
+        images, pose = self.folder.images, state.base_from_gripper
+        for one in images:
             if not is_farther(one.base_from_gripper, pose, SAME_PLACE):
                 raise InputError(f"the gripper is where {one.image} was taken; move to another pose")
-        kept = [self.folder.summary(one.image) for one in others]
+        kept = [self.folder.summary(one.image) for one in images]
         try:
             found = frame_at_rest(self._frames, kept, self.options.patience)
         except InputError as error:
@@ -283,34 +278,16 @@ class LiveSession:
             return
         self.take(state, current=self._gripper)
 
-    def _retake(self, name: str) -> None:
-        """Let the next image replace one, and take it at once where the gripper is still there."""
-        event = f"the next image replaces {name}"
-        self._show(event, replaces=name)
-        self._tell({"retake": name}, [event])
-        if self._gripper is None:
-            return
-        there = next(one.base_from_gripper for one in self.folder.images if one.image == name)
-        try:
-            now = self._gripper().base_from_gripper
-        except InputError as error:
-            self._refuse(f"refused: {error}; {event}")
-            return
-        if not is_farther(there, now, SAME_PLACE):
-            self._take_now()
-
     def _undo(self) -> None:
         """Take back the last change."""
-        if self.state.replaces is not None:
-            self._show("no image is replaced", replaces=None)
-        elif self.folder.undo():
+        if self.folder.undo():
             self._follow_removal(f"undone: {len(self.folder.names)} images")
         else:
             self._refuse("refused: nothing to undo")
 
     def _follow_removal(self, event: str) -> None:
         """Calibrate the images that are left."""
-        self._show(event, replaces=None)
+        self._show(event)
         self._follow()
         self._tell({"images": self.folder.names}, [event])
 
@@ -388,7 +365,7 @@ class LiveSession:
                 event=event,
                 is_refusal=is_refusal,
                 images=self.folder.images,
-                can_undo=self.folder.can_undo or changes.get("replaces", self.state.replaces) is not None,
+                can_undo=self.folder.can_undo,
                 **changes,
             )
             self._changed.notify_all()
