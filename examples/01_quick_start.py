@@ -15,11 +15,10 @@ import jcr
 capture = jcr.read_capture(sys.argv[1] if len(sys.argv) > 1 else "examples/tabletop")
 result = jcr.run(capture, sys.argv[2] if len(sys.argv) > 2 else "out/quick_start")
 
-# Where the camera sits on the gripper. Ask `verdict` before you use it: jcr says when it does not know.
-hand_eye = result.hand_eye
-sigma_mm = 1e3 * np.sqrt(np.diag(hand_eye.covariance)[:3])
-print(f"verdict: {hand_eye.verdict}")
-print(f"gripper_from_camera (m):\n{hand_eye.gripper_from_camera.round(5)}")
+# The hand-eye transform. Ask `verdict` before you use it.
+sigma_mm = 1e3 * np.sqrt(np.diag(result.covariance)[:3])
+print(f"verdict: {result.verdict}")
+print(f"gripper_from_camera (m):\n{result.gripper_from_camera.round(5)}")
 print("one sigma of x, y, z: " + ", ".join(f"{sigma:.2f}" for sigma in sigma_mm) + " mm")
 
 # What stands on the table.

@@ -27,15 +27,14 @@ except jcr.InputError as error:
     sys.exit(2)
 seconds = time.perf_counter() - start
 
-hand_eye = result.hand_eye
 truth = np.array(json.loads((capture.folder / "reference.json").read_text())["gripper_from_camera"])
 centers = (capture.base_from_gripper @ truth)[:, :3, 3][result.reconstruction.image_index]
 _, true_scale = fit_similarity(centers, result.reconstruction.recon_from_camera[:, :3, 3])
-error_mm = 1e3 * np.linalg.norm(hand_eye.gripper_from_camera[:3, 3] - truth[:3, 3])
-error_deg = rotation_between_deg(hand_eye.gripper_from_camera[:3, :3], truth[:3, :3])
+error_mm = 1e3 * np.linalg.norm(result.gripper_from_camera[:3, 3] - truth[:3, 3])
+error_deg = rotation_between_deg(result.gripper_from_camera[:3, :3], truth[:3, :3])
 
 print()
 print(summary(result.calibration), end="")
-error_scale = 100 * (hand_eye.scale / true_scale - 1)
+error_scale = 100 * ((result.calibration.scale or 1.0) / true_scale - 1)
 print(f"against the truth: {error_mm:.3f} mm, {error_deg:.4f}°, scale {error_scale:+.3f} % ({seconds:.0f} s)")
 print(f"report: {result.out / 'report.html'}")
