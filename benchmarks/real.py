@@ -17,8 +17,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from benchmarks.page import boards_of, folders_with, mm_deg, number, table
-from benchmarks.peers import opencv
+from benchmarks.page import boards_of, folders_with, number, table
 from benchmarks.real_captures.fetch import recipes
 from benchmarks.references import (
     Corners,
@@ -38,7 +37,6 @@ from jcr.geometry import (
     retract,
     rotation_exp,
     rotation_log,
-    step_between,
     transform,
 )
 from jcr.pipeline.run import RunOptions, calibrate
@@ -77,7 +75,7 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
         rows.append(_row(capture, None, *alone, found))
         if board is not None and "SIDE" not in board:
             marker = _calibrated(capture, board)
-            rows += [_row(capture, board, *marker, found), *_park(capture, board, marker[0], found)]
+            rows.append(_row(capture, board, *marker, found))
         if found is not None:
             references[folder.name] = found
         halves += _halves(capture)
@@ -159,8 +157,6 @@ class Row:
     """Whether it is from images alone, without a board."""
     images: str
     verdict: str = ""
-    off: tuple[float, float] | None = None
-    """mm and degrees from the transform of the reference, whatever the intrinsics."""
     apart: Apart | None = None
     stated_mm: float | None = None
     """Stated bound on 95 % of the errors of a seen point."""
@@ -171,9 +167,9 @@ class Row:
 
     def cells(self) -> list[str]:
         """Return the row of the table."""
-        off, std = self.off or (None, None), self.std or (None, None)
+        std = self.std or (None, None)
         apart = (None, None) if self.apart is None else (self.apart.mm, self.apart.sigmas)
-        values = (*apart, self.stated_mm, *off, *std, self.leave_one_out_mm, self.seconds)
+        values = (*apart, self.stated_mm, *std, self.leave_one_out_mm, self.seconds)
         return [self.capture, self.how, self.images, self.verdict, *(number(value, 2) for value in values)]
 
 
@@ -197,27 +193,12 @@ def _row(
         alone=alone,
         images=f"{sum(image.used for image in result.calibration.images)} of {len(capture)}",
         verdict=result.calibration.verdict or "",
-        off=None
-        if known is None
-        else mm_deg(step_between(found.gripper_from_camera, known.gripper_from_camera)),
         apart=None if known is None else _apart(found, known),
         stated_mm=None if found.in_use is None else found.in_use.seen.within_95_mm,
         std=(1e3 * float(std[:3].max()), float(np.degrees(std[3:].max()))),
         leave_one_out_mm=None if held_out is None else held_out.translation_mm,
         seconds=seconds,
     )
-
-
-def _park(
-    capture: Capture, board: str, result: RunResult | RejectedError, known: Reference | None
-) -> Iterator[Row]:
-    """Compare OpenCV's Park method on the same poses of the board with the reference."""
-    if isinstance(result, RejectedError) or known is None:
-        return
-    rows, made = result.reconstruction.image_index, result.reconstruction
-    x, _ = opencv("Park", result.capture.base_from_gripper[rows], made.recon_from_camera, 1.0)
-    off, images = mm_deg(step_between(x, known.gripper_from_camera)), f"{len(rows)} of {len(capture)}"
-    yield Row(capture=capture.folder.name, how=f"`{board}`, OpenCV Park", alone=False, images=images, off=off)
 
 
 def _halves(capture: Capture) -> Iterator[tuple[str, Apart]]:
@@ -454,7 +435,7 @@ def page(
         "image, at the working distance; in σ of what both state, per axis.",
         "",
         *table(
-            "capture | from | images | verdict | point: mm | σ | 95 % stated below | off: mm | ° | ±σ: mm | ° | "
+            "capture | from | images | verdict | point: mm | σ | 95 % stated below | ±σ: mm | ° | "
             "leave-one-out, mm | s",
             (row.cells() for row in rows),
         ),
