@@ -1,6 +1,5 @@
 """Back ends that take pointmaps: from a file, and from a model of MapAnything's interface."""
 
-import importlib.util
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,45 +10,44 @@ from numpy import ndarray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from jcr.camera import rays
 from jcr.errors import InputError
 from jcr.geometry import apply, fit_similarity, inverse, rotation_between_deg, transform
 from jcr.hub import Weights
 from jcr.pointmaps import predictions
+from jcr.pointmaps.dust3r.pair_graph import complete_pairs
 from jcr.pointmaps.grid import PreparedImages
 from jcr.pointmaps.pairs import pairs_from_arrays
 from jcr.pointmaps.predictions import reconstruct_predictions
 from jcr.records import Capture, Intrinsics, Reconstruction
-from places import ROOT, SHARED
+from places import ROOT
+from simulation.pairs import synthetic_pairs
 
 if TYPE_CHECKING:
     import torch
 
 sys.path.append(str(ROOT / "examples" / "backend_mapanything"))
-ALIGN = SHARED / "align"
 COUNT, WIDTH, HEIGHT = 5, 128, 96
-
-if not ALIGN.is_dir():
-    pytest.skip(f"the generator of synthetic predictions is not in {ALIGN}", allow_module_level=True)
+PAIR_ARRAYS = ("edges", "pts3d", "conf", "pts3d_in_other_view", "conf2")
 
 
 @pytest.fixture(scope="module")
 def truth() -> dict[str, Any]:
     """Pairwise predictions of a table scene and its geometry; the grid's principal point is (W/2, H/2)."""
-    spec = importlib.util.spec_from_file_location("make_synthetic", ALIGN / "make_synthetic.py")
-    assert spec is not None and spec.loader is not None
-    generator = importlib.util.module_from_spec(spec)
-    sys.modules["make_synthetic"] = generator
-    spec.loader.exec_module(generator)
-    made = generator.make(WIDTH, HEIGHT, COUNT, seed=1)
-    v, u = np.mgrid[:HEIGHT, :WIDTH]
-    focal = made["gt_focal"]
-    rays = np.stack([(u - WIDTH / 2) / focal, (v - HEIGHT / 2) / focal, np.ones((HEIGHT, WIDTH))], -1)
-    depth = np.asarray(made["gt_depth"], np.float64)
-    made["rays"] = rays
-    made["points"] = np.array(
-        [apply(pose, rays * z[..., None]) for pose, z in zip(made["gt_poses"], depth, strict=True)]
-    )
-    return made
+    focal = 0.95 * WIDTH
+    grid = Intrinsics(focal, focal, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
+    pairs, made = synthetic_pairs(complete_pairs(COUNT), (WIDTH, HEIGHT), seed=1, intrinsics=grid)
+    points = [
+        apply(pose, rays(grid) * z[..., None])
+        for pose, z in zip(made.base_from_camera, made.depth, strict=True)
+    ]
+    return {name: getattr(pairs, name) for name in PAIR_ARRAYS} | {
+        "gt_focal": focal,
+        "gt_poses": made.base_from_camera,
+        "gt_depth": made.depth,
+        "rays": rays(grid),
+        "points": np.array(points),
+    }
 
 
 @pytest.fixture
@@ -74,7 +72,7 @@ def capture(tmp_path: Path, truth: dict[str, Any]) -> Capture:
 
 
 def pair_arrays(truth: dict[str, Any]) -> dict[str, ndarray]:
-    return {name: truth[name] for name in ("edges", "pts3d", "conf", "pts3d_in_other_view", "conf2")}
+    return {name: truth[name] for name in PAIR_ARRAYS}
 
 
 def pointmap_arrays(truth: dict[str, Any]) -> dict[str, ndarray]:
