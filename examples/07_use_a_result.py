@@ -3,7 +3,9 @@
 python examples/07_use_a_result.py out/quick_start
 """
 
+import json
 import sys
+from pathlib import Path
 
 import numpy as np
 
@@ -19,8 +21,9 @@ base_from_gripper = jcr.read_capture("examples/tabletop").base_from_gripper[0]
 x_in_base, covariance = result.point_in_base(np.array([320.0, 240.0]), 0.45, base_from_gripper)
 print(f"point: {x_in_base.round(4)} m ± {(1e3 * np.sqrt(np.diag(covariance))).round(2)} mm in the base")
 
-# A transform of another tool, such as the 4×4 of cv2.calibrateHandEye: do the stated covariances explain the difference?
-difference = jcr.compare(result.out, "examples/tabletop/reference.json")
+# A 4×4 of another tool, such as cv2.calibrateHandEye: how far is it off?
+other = json.loads(Path("examples/tabletop/reference.json").read_text("utf-8"))["gripper_from_camera"]
+difference = jcr.compare(result, np.array(other))
 print(f"other transform: {(1e3 * difference.translation_m).round(3)} mm apart")
 
 print(f"exported: {jcr.export_run(result.out, 'urdf')}")

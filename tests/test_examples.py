@@ -154,14 +154,12 @@ def test_a_result_places_a_point_compares_exports_and_answers(done: Path, tmp_pa
     text = printed("07_use_a_result", tmp_path, "run")
     capture = jcr.read_capture(EXAMPLES / "tabletop")
     assert capture.intrinsics is not None
-    *found, sigma_x, sigma_y, sigma_z = numbers(
-        r"point: \[ *(\S+) +(\S+) +(\S+)\] m ± \[ *(\S+) +(\S+) +(\S+)\] mm", text.replace("]", " ]")
-    )
+    point, off = (re.findall(rf"^{what}: (.*)$", text, re.M)[0] for what in ("point", "other transform"))
+    x, y, z, *sigmas_mm = map(float, re.findall(r"-?\d+\.\d*", point))
     ray = unproject(capture.intrinsics, np.array([320.0, 240.0]))
     true = apply(capture.base_from_gripper[0] @ true_hand_eye(), 0.45 * ray)
-    assert np.linalg.norm(found - true) < 1e-3 and 0 < max(sigma_x, sigma_y, sigma_z) < 1
-    off_mm = numbers(r"transform: \[ *(\S+) +(\S+) +(\S+) *\] mm apart", text.replace("]", " ]"))
-    assert np.linalg.norm(off_mm) < 0.5
+    assert np.linalg.norm(np.array([x, y, z]) - true) < 1e-3 and 0 < max(sigmas_mm) < 1
+    assert np.linalg.norm([*map(float, re.findall(r"-?\d+\.\d*", off))]) < 0.5
     assert (out / "export" / "hand_eye.urdf").is_file() and "map at the point: occupancy" in text
 
 
