@@ -87,13 +87,6 @@ def capture_of(problem: HandEyeProblem) -> Capture:
     )
 
 
-def chosen(problem: HandEyeProblem, poses: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> HandEye:
-    """What COLMAP's calibration is, of the first images, that have these camera poses."""
-    monkeypatch.setattr(selection, "reconstruct", lambda *_: reconstruction("colmap", poses))
-    options = ReconstructOptions(backend="colmap")
-    return selection.choose(capture_of(problem), options, CalibrateOptions()).hand_eye
-
-
 def auto_result(
     problem: HandEyeProblem,
     answers: dict[str, np.ndarray | Exception],
@@ -427,24 +420,3 @@ def test_where_no_back_end_finds_a_pose_the_run_folder_keeps_the_licence_of_the_
         assert licence in (out / "log.txt").read_text() and licence in (out / "report.html").read_text()
         printed = capsys.readouterr().out
         assert printed.startswith("REJECTED") and not {"  0.", "Accuracy"} & set(printed.split())
-
-
-@pytest.mark.slow
-def test_a_network_that_gives_garbage_is_left_for_colmap_and_the_run_folder_reports_it(
-    small_capture: Path, tmp_path: Path, garbage_weights: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    out = tmp_path / "out"
-    arguments = [str(small_capture), str(out), "--weights", str(garbage_weights), "--quiet"]
-    assert dispatch(["calibrate", *arguments]) == 0
-    found = json.loads((out / "calibration.json").read_text())
-    assert found["backend"] == "colmap" and found["converged"]
-    why = next(text for text in found["notes"] if text.startswith("back end dust3r"))
-    assert "colmap" in why and ("rejected" in why or "failed" in why)
-    assert why in (out / "log.txt").read_text()
-    # Its own answer, asked for by name, is rejected.
-    assert dispatch(["calibrate", *arguments, "--backend", "dust3r"]) == 3
-    found = json.loads((out / "calibration.json").read_text())
-    assert found["backend"] == "dust3r" and not found["converged"]
-    licence = next(text for text in found["notes"] if "licence" in text)
-    assert str(garbage_weights) in licence and licence in (out / "log.txt").read_text()

@@ -12,7 +12,6 @@ import pytest
 
 from jcr import reconstruct as backends
 from jcr import run_folder
-from jcr.calibration.options import CalibrateOptions
 from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.reconstruct import (
@@ -183,17 +182,6 @@ def test_the_captures_own_cameras_are_taken_where_nothing_else_is_asked_for(tmp_
         ReconstructOptions(cameras=Path("mine")),
     ):
         assert with_cameras_of(capture, options) == options
-
-
-def test_options_survive_a_run_folder(tmp_path: Path) -> None:
-    options = ReconstructOptions(predictions=tmp_path / "p.npz", seed=2)
-    state = run_folder.state_of(
-        Capture(folder=tmp_path, images=(), base_from_gripper=np.zeros((0, 4, 4)), image_size=(64, 48)),
-        run_folder.MadeWith(reconstruct=options, calibrate=CalibrateOptions()),
-    )
-    folder = run_folder.RunFolder(tmp_path)
-    folder.keep_state(state)
-    assert folder.options().reconstruct == options
 
 
 def test_a_changed_file_of_predictions_is_another_input(tmp_path: Path) -> None:

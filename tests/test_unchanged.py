@@ -96,6 +96,7 @@ def test_the_second_run_makes_nothing(
     first = dispatch(command)
     said = capsys.readouterr()
     assert first in (0, 3), said.err
+    assert said.out.count("\n") <= 14 and not said.err
     stamps = {file: file.stat().st_mtime_ns for file in out.rglob("*") if file.name != ".lock"}
     start = time.perf_counter()
     assert dispatch(command) == first
@@ -106,6 +107,10 @@ def test_the_second_run_makes_nothing(
     assert {file for file in now if not file.is_dir()} == {file for file in stamps if not file.is_dir()}
     assert all(now[file] == stamps[file] for file in stamps if not file.is_dir())
     assert seconds < SECONDS
+    dispatch([*command, "--require", "50", "9"])
+    assert "unchanged" not in capsys.readouterr().err and made == ["colmap"], (
+        "other options of the calibration"
+    )
 
 
 @pytest.mark.parametrize("format", ["poses.csv", "bag", "LeRobot"])

@@ -22,16 +22,14 @@ FIRST = "images/00.jpg"
         (["--known-length", FIRST, "1", "2", "3", "4000", "50"], "pixel (3, 4000) is outside images/00.jpg"),
     ],
 )
-@pytest.mark.parametrize("command", ["calibrate", "run"])
 def test_a_board_or_a_length_that_cannot_be_is_refused_before_any_work(
     tabletop: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    command: str,
     arguments: list[str],
     words: str,
 ):
     monkeypatch.setattr(stages, "calibrated", lambda *_: pytest.fail("the capture was worked on"))
-    found = run_jcr(command, tabletop, tmp_path / "out", *arguments)
+    found = run_jcr("run", tabletop, tmp_path / "out", *arguments)
     assert found.returncode == 2 and words in found.stderr, found.stderr
     assert len(found.stderr.splitlines()) == 1 and not (tmp_path / "out" / "calibration.json").exists()
