@@ -21,7 +21,7 @@ from jcr.errors import InputError
 from jcr.extras import DISTRIBUTION, is_installed
 from jcr.files import write_text
 
-COMMANDS = {"align": "benchmarks.align_pairs", "fetch-captures": "benchmarks.real_captures.fetch"}
+COMMANDS = {"align": "benchmarks.adam", "fetch-captures": "benchmarks.real_captures.fetch"}
 """Modules of what is no bench, with arguments of its own."""
 if TYPE_CHECKING:
     BenchName = str

@@ -2,26 +2,36 @@
 
 The model is the published one: a depth map, a focal length and a camera per image; a rigid transform and a
 scale per pair, tied to no camera; residual norms (not their squares) weighted by log confidence; Adam from a
-spanning tree of the pairs. It is the baseline that Gauss-Newton is measured against.
+spanning tree of the pairs. It is the baseline that Gauss-Newton is measured against. `python -m benchmarks align` aligns
+one file of pairwise pointmaps by either method.
 """
 
+import json
 import math
-from dataclasses import dataclass
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
+import tyro
 from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from jcr.files import written_whole
 from jcr.geometry import inverse, transform
+from jcr.pointmaps.global_alignment.align import global_align
 from jcr.pointmaps.global_alignment.alignment import Alignment, AlignOptions, Pinhole, pinhole_of
 from jcr.pointmaps.global_alignment.depths import initial_depth
 from jcr.pointmaps.global_alignment.initial_estimate import initial_state
 from jcr.pointmaps.global_alignment.observations import choose_pixels, observe, weigh, weight_is_log
 from jcr.pointmaps.global_alignment.pointmap_residuals import State
-from jcr.pointmaps.pairs import PairPredictions
+from jcr.pointmaps.pairs import PairPredictions, read_pairs
 
 START_PIXELS = 2048
 FOCAL_SLOWNESS = 20.0
@@ -38,6 +48,56 @@ class AdamOptions:
     """Number of steps."""
     learning_rate: float = 0.01
     """Learning rate of the first step; it falls to 0 along a cosine."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Align pairwise pointmaps into one reconstruction.
+
+    PAIRS.npz holds edges (E,2), pts3d and pts3d_in_other_view (E,H,W,3), conf and conf2 (E,H,W). OUT.npz gets
+    poses (N,4,4), camera to recon; focals (N,); depth and confidence (N,H,W); principal_point (2,); pair_scale and
+    pair_residual (E,).
+
+    examples:
+      python -m benchmarks align pairs.npz aligned.npz
+      python -m benchmarks align pairs.npz published.npz --method adam
+    """
+
+    pairs: Annotated[Path, tyro.conf.Positional]
+    """Pairwise pointmaps to read."""
+    result: Annotated[Path, tyro.conf.Positional]
+    """Alignment to write."""
+    method: Literal["fast", "adam"] = "fast"
+    """fast: Gauss-Newton on chosen pixels (jcr.global_align); adam: gradient descent on every pixel, as published."""
+    options: AlignOptions = field(default_factory=AlignOptions)
+    adam: AdamOptions = field(default_factory=AdamOptions)
+
+
+def main(words: Sequence[str]) -> int:
+    """Read the pairs, align them, write the result, and print the seconds of the alignment as JSON."""
+    arguments = tyro.cli(Arguments, prog="python -m benchmarks align", args=words)
+    predictions = read_pairs(arguments.pairs)
+    begin = time.perf_counter()
+    if arguments.method == "adam":
+        alignment = align_adam(predictions, arguments.options, arguments.adam)
+    else:
+        alignment = global_align(predictions, arguments.options)
+    seconds = time.perf_counter() - begin
+    with written_whole(arguments.result) as temporary, open(temporary, "wb") as stream:
+        np.savez(
+            stream,
+            poses=alignment.recon_from_camera,
+            focals=alignment.focal_px[:, 0],
+            depth=alignment.depth,
+            confidence=alignment.confidence,
+            principal_point=np.array(alignment.principal_point_px),
+            pair_scale=alignment.pair_scale,
+            pair_residual=alignment.pair_residual,
+        )
+    for text in (*alignment.warnings, *alignment.notes):
+        sys.stderr.write(f"{text}\n")
+    sys.stdout.write(json.dumps({"method": arguments.method, "seconds": seconds}) + "\n")
+    return 0
 
 
 def align_adam(

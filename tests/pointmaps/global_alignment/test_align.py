@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks import align_pairs
+from benchmarks import adam
 from jcr.errors import InputError, RejectedError
 from jcr.geometry import apply, apply_similarity, fit_similarity, retract, rotation_between_deg
 from jcr.pointmaps.dust3r.pair_graph import complete_pairs, window_pairs
@@ -233,7 +233,7 @@ def test_same_input_same_output():
 
 def command(*arguments: str) -> int:
     """Return the exit status of `python -m benchmarks align`."""
-    return align_pairs.main(arguments)
+    return adam.main(arguments)
 
 
 def test_command_reads_aligns_and_writes(tmp_path, capsys):
