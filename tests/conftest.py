@@ -16,6 +16,7 @@ import pytest
 from PIL import Image
 
 import shape_checks
+from chromium import Chromium
 from jcr.geometry import apply, transform
 from places import ROOT, SHARED
 from sift_once import find_sift_once
@@ -137,6 +138,21 @@ def run_by_command(capture: Path, out: Path) -> None:
 def small_capture(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> Path:
     """Five images of the bundled capture, 200 pixels wide: the first attempt is kept, a whole run takes seconds."""
     return made_once(tmp_path_factory, "capture", lambda folder: shrunk_capture(tabletop, folder, 5, 200))
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
+    """A browser, started once."""
+    opened = Chromium(tmp_path_factory.mktemp("chromium"), "--disable-gpu")
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def chromium(browser: Chromium) -> Chromium:
+    """The browser without the events of earlier tests."""
+    browser.events.clear()
+    return browser
 
 
 @pytest.fixture(scope="session")

@@ -214,16 +214,9 @@ def test_the_camera_now_is_shown_with_its_features(capture: tuple[LiveSession, S
             assert "Few" in answer.headers["X-Features"]
 
 
-@pytest.fixture
-def browser(tmp_path: Path) -> Iterator[Chromium]:
-    opened = Chromium(tmp_path / "profile", "--disable-gpu")
-    yield opened
-    opened.close()
-
-
 @pytest.mark.slow
 def test_the_buttons_take_retake_remove_undo_and_finish_on_a_phone(
-    browser: Chromium, tmp_path: Path, tabletop: Path
+    chromium: Chromium, tmp_path: Path, tabletop: Path
 ):
     poses, at = jcr.read_capture(tabletop).base_from_gripper, [0]
     live, scripted = a_capture(
@@ -234,26 +227,26 @@ def test_the_buttons_take_retake_remove_undo_and_finish_on_a_phone(
     )
 
     def shows(condition: str) -> None:
-        until(lambda: bool(browser.js(f"Boolean({condition})")))
+        until(lambda: bool(chromium.js(f"Boolean({condition})")))
 
     def press(selector: str, images: int) -> None:
         """Click on a button that is enabled, and wait until the page lists that number of images."""
         shows(f"document.querySelector('{selector}:not(:disabled)')")
-        browser.js(f"document.querySelector('{selector}:not(:disabled)').click()")
+        chromium.js(f"document.querySelector('{selector}:not(:disabled)').click()")
         shows(f"document.querySelectorAll('#images figure').length === {images}")
 
     taking = threading.Thread(target=live.run, daemon=True)
     with LiveServer(live) as page:
         taking.start()
-        browser.open(page.address, 390, 844, phone=True)
-        browser.js("window.confirm = question => { window.asked = question; return true; }")
+        chromium.open(page.address, 390, 844, phone=True)
+        chromium.js("window.confirm = question => { window.asked = question; return true; }")
         shows("document.querySelector('[data-press=take]')")
         disabled = "[...document.querySelectorAll('.commands :disabled')].map(b => b.dataset.press).join()"
-        assert browser.js(disabled) == "retake,remove,undo,finish"
+        assert chromium.js(disabled) == "retake,remove,undo,finish"
         press("[data-press=take]", 1)
         press("[data-press=take]", 1)
         shows("document.querySelector('.verdict.bad')")
-        assert "where images/000.png was taken" in browser.js("document.querySelector('.verdict').innerText")
+        assert "where images/000.png was taken" in chromium.js("document.querySelector('.verdict').innerText")
         for at[0] in (1, 2):
             press("[data-press=take]", at[0] + 1)
         press(".commands [data-press=retake]", 3)
@@ -264,14 +257,14 @@ def test_the_buttons_take_retake_remove_undo_and_finish_on_a_phone(
         press("[data-press=undo]", 3)
         shows("document.querySelector('.verdict.good')")
         # Nothing is wider than the window.
-        assert browser.js("document.documentElement.scrollWidth <= innerWidth")
+        assert chromium.js("document.documentElement.scrollWidth <= innerWidth")
         press(".commands [data-press=remove]", 2)
         assert live.folder.names == ["images/000.png", "images/001.png"]
         press("[data-press=finish]", 2)
         taking.join(60)
-        assert live.state.is_over and browser.js("asked") == "End the capture with 2 images?"
+        assert live.state.is_over and chromium.js("asked") == "End the capture with 2 images?"
         live._show(result=scripted.finish(), is_done=True)
         shows("document.querySelector('.verdict h2')?.innerText === 'Accepted'")
-        assert browser.js("document.querySelector('[data-press]')") is None
-        assert browser.js("document.documentElement.scrollWidth <= innerWidth")
-    assert not [event for event in browser.events if event["method"] == "Runtime.exceptionThrown"]
+        assert chromium.js("document.querySelector('[data-press]')") is None
+        assert chromium.js("document.documentElement.scrollWidth <= innerWidth")
+    assert not [event for event in chromium.events if event["method"] == "Runtime.exceptionThrown"]

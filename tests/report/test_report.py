@@ -5,7 +5,6 @@ import itertools
 import json
 import re
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -564,13 +563,6 @@ def test_surface_is_sampled_on_the_surface(run: RunResult, tabletop: Path):
 
 
 @pytest.fixture(scope="module")
-def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
-    browser = Chromium(tmp_path_factory.mktemp("chromium"), "--disable-gpu")
-    yield browser
-    browser.close()
-
-
-@pytest.fixture(scope="module")
 def file(page: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("page") / "report.html"
     path.write_text(page)
@@ -578,7 +570,6 @@ def file(page: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_in_a_browser(chromium: Chromium, file: Path):
-    chromium.events.clear()
     chromium.open(file.as_uri(), 1280)
     assert chromium.js("document.documentElement.scrollHeight") <= 4000
     image = chromium.image("#scene")
@@ -647,7 +638,6 @@ def test_in_a_browser(chromium: Chromium, file: Path):
 
 
 def test_on_a_phone_and_in_the_dark(chromium: Chromium, file: Path):
-    chromium.events.clear()
     chromium.open(file.as_uri(), 400, phone=True)
     assert chromium.js("document.documentElement.scrollWidth") <= 400
     assert chromium.js("document.documentElement.scrollHeight") <= 7000
