@@ -74,7 +74,7 @@ class PixelNoise:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """What of the observations the estimate needs and no adjustment changes."""
+    """Values of the observations that the estimate needs and no adjustment changes."""
 
     camera: Int[ndarray, " k"]
     """Camera of each observation."""

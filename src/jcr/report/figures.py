@@ -33,7 +33,7 @@ class Figure:
     width: float = field(default=WIDTH, kw_only=True)
 
 
-def text(x: float, y: float, words: str, kind: str) -> Shape:
+def caption(x: float, y: float, words: str, kind: str) -> Shape:
     """Return a text whose baseline begins at x, y; with class "end" or "middle" it ends or is centred there."""
     return Shape("text", {"x": f"{x:.1f}", "y": f"{y:.1f}", "class": kind}, words)
 
@@ -62,23 +62,26 @@ def course_figure(title: str, count: Sequence[int], value: Sequence[float], goal
 
     reached = at(first, goal)[1]
     shapes = [
-        text(12.0, 18.0, title, "title"),
+        caption(12.0, 18.0, title, "title"),
         rectangle((left, reached, wide, top + tall - reached), "reached"),
         line([(left, reached), (left + wide, reached)], "goal"),
-        text(left + wide - 4, reached - 5, f"required: {goal:g}{unit}", "small end"),
+        caption(left + wide - 4, reached - 5, f"required: {goal:g}{unit}", "small end"),
     ]
     marks = [step * 10.0**power for power in range(-6, 6) for step in (1, 2, 5)]
     for mark in (mark for mark in marks if low <= mark <= high):
         y = at(first, mark)[1]
-        shapes += [line([(left - 4, y), (left, y)], "frame"), text(left - 7, y + 4, f"{mark:g}", "small end")]
+        shapes += [
+            line([(left - 4, y), (left, y)], "frame"),
+            caption(left - 7, y + 4, f"{mark:g}", "small end"),
+        ]
     shapes.append(rectangle((left, top, wide, tall), "frame"))
     for images in range(first, last + 1, max(1, (last - first) // 8)):
-        shapes.append(text(at(images, goal)[0], top + tall + 16, str(images), "small middle"))
+        shapes.append(caption(at(images, goal)[0], top + tall + 16, str(images), "small middle"))
     points_px = [at(images, y) for images, y in zip(count, value, strict=True)]
     shapes.append(line(points_px, "course"))
     for (x, y), images, number in zip(points_px, count, value, strict=True):
         title_of = Shape("title", {}, f"{images} images: {number:.3g}{unit}")
         dot = {"class": "course-point", "cx": f"{x:.1f}", "cy": f"{y:.1f}", "r": 4}
         shapes.append(Shape("circle", dot, children=(title_of,)))
-    shapes.append(text(left + wide / 2, COURSE_HEIGHT - 8, "images", "small middle"))
+    shapes.append(caption(left + wide / 2, COURSE_HEIGHT - 8, "images", "small middle"))
     return Figure(title, shapes, COURSE_HEIGHT)

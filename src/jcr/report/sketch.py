@@ -9,7 +9,7 @@ from numpy import ndarray
 from jcr.camera import unproject, without_distortion
 from jcr.geometry import apply
 from jcr.records import Intrinsics, Mount
-from jcr.report.figures import WIDTH, Figure, Shape, line, text
+from jcr.report.figures import WIDTH, Figure, Shape, caption, line
 
 HEIGHT, MARGIN = 320.0, 34.0
 """Height of the sketch and its margin (px)."""
@@ -44,10 +44,10 @@ def sketch(parent_from_camera: Float[ndarray, "4 4"], intrinsics: Intrinsics | N
     for begin, ends in ((origin, place(axes)), (centre, place(tips))):
         for name, end in zip("xyz", ends, strict=True):
             x, y = end + 10 * (end - begin) / max(float(np.linalg.norm(end - begin)), 1.0)
-            shapes += [line([begin, end], f"axis-{name}"), text(x, y + 4, name, "small middle")]
+            shapes += [line([begin, end], f"axis-{name}"), caption(x, y + 4, name, "small middle")]
     parent, (x, y) = "gripper" if down else "base", (origin + centre) / 2
-    shapes.append(text(x + 12, y - 6, f"{1e3 * away:.0f} mm", "small"))
-    shapes.append(text(12.0, 18.0, f"{parent.capitalize()} and camera, to scale", "title"))
+    shapes.append(caption(x + 12, y - 6, f"{1e3 * away:.0f} mm", "small"))
+    shapes.append(caption(12.0, 18.0, f"{parent.capitalize()} and camera, to scale", "title"))
     return Figure(
         f"The camera in the frame of the {parent}, {1e3 * away:.0f} mm from its origin", shapes, HEIGHT
     )

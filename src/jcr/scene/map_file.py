@@ -29,7 +29,7 @@ def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
     require_packages("a map")
     from safetensors import SafetensorError, safe_open
 
-    from jcr.scene.scene_map import FORMAT, digest, scene_of
+    from jcr.scene.scene_map import FORMAT, digest, map_from_tensors
 
     try:
         with safe_open(path, "pt") as file:
@@ -45,7 +45,7 @@ def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
             f"{path}: the map file is damaged (its numbers changed since it was written); {again}"
         )
     try:
-        return scene_of(tensors, json.loads(metadata["about"])).to(device)
+        return map_from_tensors(tensors, json.loads(metadata["about"])).to(device)
     except (KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:
         raise InputError(f"{path}: the map file is damaged ({error!r}); {again}") from None
 

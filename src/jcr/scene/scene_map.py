@@ -270,7 +270,7 @@ def digest(tensors: dict[str, Tensor]) -> str:
     return total.hexdigest()
 
 
-def scene_of(tensors: dict[str, Tensor], about: dict[str, Any]) -> SceneMap:
+def map_from_tensors(tensors: dict[str, Tensor], about: dict[str, Any]) -> SceneMap:
     """Return the map that `save` wrote; raise KeyError, ValueError or similar for other content."""
     seen = SeenGrid(tensors.pop("lower"), about["cell"], tensors.pop("seen"))
     lattices = [
