@@ -25,11 +25,11 @@ from torch import Tensor
 
 from jcr.files import written_whole
 from jcr.geometry import inverse, transform
-from jcr.pointmaps.global_alignment.align import global_align
-from jcr.pointmaps.global_alignment.alignment import Alignment, AlignOptions, Pinhole, pinhole_of
+from jcr.pointmaps.global_alignment.align import PIXELS, global_align
+from jcr.pointmaps.global_alignment.alignment import Alignment
 from jcr.pointmaps.global_alignment.depths import initial_depth
 from jcr.pointmaps.global_alignment.initial_estimate import initial_state
-from jcr.pointmaps.global_alignment.observations import choose_pixels, observe, weigh, weight_is_log
+from jcr.pointmaps.global_alignment.observations import Problem, observe
 from jcr.pointmaps.global_alignment.pointmap_residuals import State
 from jcr.pointmaps.pairs import PairPredictions, read_pairs
 
@@ -69,7 +69,8 @@ class Arguments:
     """Alignment to write."""
     method: Literal["fast", "adam"] = "fast"
     """fast: Gauss-Newton on chosen pixels (jcr.global_align); adam: gradient descent on every pixel, as published."""
-    options: AlignOptions = field(default_factory=AlignOptions)
+    pixels: int = PIXELS
+    """Pixels per image of the fast method."""
     adam: AdamOptions = field(default_factory=AdamOptions)
 
 
@@ -79,15 +80,15 @@ def main(words: Sequence[str]) -> int:
     predictions = read_pairs(arguments.pairs)
     begin = time.perf_counter()
     if arguments.method == "adam":
-        alignment = align_adam(predictions, arguments.options, arguments.adam)
+        alignment = align_adam(predictions, arguments.adam)
     else:
-        alignment = global_align(predictions, arguments.options)
+        alignment = global_align(predictions, arguments.pixels)
     seconds = time.perf_counter() - begin
     with written_whole(arguments.result) as temporary, open(temporary, "wb") as stream:
         np.savez(
             stream,
             poses=alignment.recon_from_camera,
-            focals=alignment.focal_px[:, 0],
+            focals=np.full(len(alignment.depth), alignment.focal_px[0]),
             depth=alignment.depth,
             confidence=alignment.confidence,
             principal_point=np.array(alignment.principal_point_px),
@@ -100,22 +101,16 @@ def main(words: Sequence[str]) -> int:
     return 0
 
 
-def align_adam(
-    predictions: PairPredictions, options: AlignOptions | None = None, adam: AdamOptions | None = None
-) -> Alignment:
+def align_adam(predictions: PairPredictions, adam: AdamOptions | None = None) -> Alignment:
     """Align by Adam steps over all pixels of all pairs; the result has no covariance (NaN)."""
-    options, adam = options or AlignOptions(), adam or AdamOptions()
-    pinhole = pinhole_of(predictions, options)
-    log_weight = weight_is_log(predictions)
+    problem = Problem.of(predictions)
     count, height, width = predictions.image_count, *predictions.conf.shape[1:]
-    pixels = choose_pixels(predictions, START_PIXELS)
-    chosen = [observe(predictions, pinhole, k, pixels[k], log_weight) for k in range(count)]
-    start = initial_state(chosen, predictions.edges, pinhole)
-    everything = (observe(predictions, pinhole, k, slice(None), log_weight) for k in range(count))
+    start = initial_state(problem.observe_all(START_PIXELS), predictions.edges)
+    everything = (observe(problem, k, slice(None)) for k in range(count))
     depth = np.stack([initial_depth(o, start) for o in everything])
-    model = PointmapModel(start, depth, predictions, pinhole)
+    model = PointmapModel(start, depth, problem)
     groups = [slice(e, e + PAIRS_AT_ONCE) for e in range(0, len(predictions.edges), PAIRS_AT_ONCE)]
-    _descend(model, predictions, groups, adam, log_weight)
+    _descend(model, problem, groups, adam or AdamOptions())
     with torch.no_grad():
         points = model.points()
         residual = [
@@ -130,29 +125,23 @@ def align_adam(
         recon_from_camera = transform(
             model.rotation(model.camera_quat_xyzw).double().numpy(), model.camera_center.double().numpy()
         )
-        focal = model.focal().double().numpy()
+        focal = float(model.focal())
         return Alignment(
             recon_from_camera=inverse(recon_from_camera[0]) @ recon_from_camera,
-            focal_px=np.stack([focal, focal * pinhole.aspect], axis=1),
-            principal_point_px=pinhole.principal_point_px,
+            focal_px=(focal, focal * problem.aspect),
+            principal_point_px=problem.principal_point_px,
             depth=model.log_depth.exp().reshape(count, height, width).numpy(),
-            confidence=_mean_confidence(predictions, log_weight),
+            confidence=_mean_confidence(problem),
             pair_scale=model.scale().double().numpy(),
             pair_residual=torch.cat(residual).double().numpy(),
             covariance=np.full((6 * count, 6 * count), np.nan),
         )
 
 
-def _descend(
-    model: "PointmapModel",
-    predictions: PairPredictions,
-    groups: list[slice],
-    options: AdamOptions,
-    log_weight: bool,
-) -> None:
-    """Minimise eq. 1 by Adam, the pairs taken in `groups` to bound the memory."""
-    parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    optimizer = torch.optim.Adam(parameters, lr=options.learning_rate, betas=(0.9, 0.9))
+def _descend(model: "PointmapModel", problem: Problem, groups: list[slice], options: AdamOptions) -> None:
+    """Run Adam on eq. 1, the pairs taken in `groups` to bound the memory."""
+    predictions = problem.predictions
+    optimizer = torch.optim.Adam(model.parameters(), lr=options.learning_rate, betas=(0.9, 0.9))
     for step in range(options.steps):
         cosine = math.cos(math.pi * step / options.steps)
         optimizer.param_groups[0]["lr"] = 0.5 * options.learning_rate * (1 + cosine)
@@ -163,7 +152,7 @@ def _descend(
         for group in groups:
             loss = torch.zeros(())
             for view, confidence in enumerate((predictions.conf, predictions.conf2)):
-                weight = torch.from_numpy(weigh(confidence[group], log_weight)).flatten(1)
+                weight = torch.from_numpy(problem.weigh(confidence[group])).flatten(1)
                 loss = loss + (weight * model.distance(gathered, group, view)).mean(dim=1).sum()
             loss.backward()
         points.backward(gathered.grad)
@@ -173,61 +162,57 @@ def _descend(
 class PointmapModel(torch.nn.Module):
     """The unknowns of eq. 1: X̂_i by camera, focal length and depth of each image; P_e and σ_e of each pair."""
 
-    def __init__(
-        self, start: State, depth: Float[ndarray, "n p"], predictions: PairPredictions, pinhole: Pinhole
-    ) -> None:
+    def __init__(self, start: State, depth: Float[ndarray, "n p"], problem: Problem) -> None:
         super().__init__()
+        predictions = problem.predictions
         self.images = torch.from_numpy(predictions.edges)
         self.shown = (predictions.pts3d, predictions.pts3d_in_other_view)
         height, width = predictions.conf.shape[1:]
         x, y = np.meshgrid(np.arange(width), np.arange(height))
-        cx, cy = pinhole.principal_point_px
-        offset = np.stack([(x - cx).ravel(), (y - cy).ravel() / pinhole.aspect], axis=1)
+        cx, cy = problem.principal_point_px
+        offset = np.stack([(x - cx).ravel(), (y - cy).ravel() / problem.aspect], axis=1)
         self.offset = torch.from_numpy(offset.astype(np.float32))
 
         observer = start.recon_from_camera[predictions.edges[:, 0]]
         self.camera_quat_xyzw = _parameter(_quat_xyzw(start.recon_from_camera))
         self.camera_center = _parameter(start.recon_from_camera[:, :3, 3])
         self.log_depth = _parameter(np.log(depth))
-        self.slow_focal = _parameter(
-            FOCAL_SLOWNESS * (start.log_focal[:1] if pinhole.shared else start.log_focal)
-        )
-        self.slow_focal.requires_grad_(pinhole.focal_px is None)
+        self.slow_focal = _parameter(np.array(FOCAL_SLOWNESS * start.log_focal))
         self.pair_quat_xyzw = _parameter(_quat_xyzw(observer))
         self.log_scale = _parameter(start.log_pair_scale)
         # The scale multiplies the whole of P_e in eq. 1, its translation too.
         self.pair_center = _parameter(observer[:, :3, 3] / np.exp(start.log_pair_scale)[:, None])
 
     def focal(self) -> Tensor:
-        """fx (n,)."""
-        return torch.exp(self.slow_focal / FOCAL_SLOWNESS).expand(len(self.camera_center))
+        """Return fx, common to all images."""
+        return torch.exp(self.slow_focal / FOCAL_SLOWNESS)
 
     def scale(self) -> Tensor:
-        """σ_e (e,), their product 1."""
+        """Return σ_e (e,), whose product is 1."""
         return torch.exp(self.log_scale - self.log_scale.mean())
 
     def points(self) -> Tensor:
-        """X̂ (n, pixels, 3) in the recon frame."""
-        ray = self.offset / self.focal()[:, None, None]
+        """Return X̂ (n, pixels, 3) in the recon frame."""
+        ray = (self.offset / self.focal())[None]
         ray = torch.cat([ray, torch.ones_like(ray[..., :1])], dim=2)
         in_camera = torch.exp(self.log_depth)[..., None] * ray
         return in_camera @ self.rotation(self.camera_quat_xyzw).mT + self.camera_center[:, None]
 
     def distance(self, points: Tensor, pairs: slice, view: int) -> Tensor:
-        """‖X̂_i − σ_e P_e X_e,i‖ (pairs, pixels) for the first (0) or second (1) view of some pairs."""
+        """Return ‖X̂_i − σ_e P_e X_e,i‖ (pairs, pixels) for the first (0) or second (1) view of some pairs."""
         shown = torch.from_numpy(self.shown[view][pairs]).flatten(1, 2)
         aligned = shown @ self.rotation(self.pair_quat_xyzw[pairs]).mT + self.pair_center[pairs, None]
         aligned = self.scale()[pairs, None, None] * aligned
         return torch.linalg.vector_norm(points[self.images[pairs, view]] - aligned, dim=2)
 
     def range(self, pairs: slice, view: int) -> Tensor:
-        """Median distance (pairs,) of a view's points from the first camera, recon units."""
+        """Return the median distance (pairs,) of a view's points from the first camera, recon units."""
         shown = torch.from_numpy(self.shown[view][pairs]).flatten(1, 2)
         return self.scale()[pairs] * torch.linalg.vector_norm(shown, dim=2).median(dim=1).values
 
     @staticmethod
     def rotation(quat_xyzw: Tensor) -> Tensor:
-        """Rotation matrices (k,3,3) of quaternions (k,4) of any length."""
+        """Return rotation matrices (k,3,3) of quaternions (k,4) of any length."""
         x, y, z, w = torch.nn.functional.normalize(quat_xyzw, dim=1).unbind(dim=1)
         rows = [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -245,12 +230,13 @@ def _quat_xyzw(recon_from_camera: Float[ndarray, "k 4 4"]) -> Float[ndarray, "k 
     return Rotation.from_matrix(recon_from_camera[:, :3, :3]).as_quat()
 
 
-def _mean_confidence(predictions: PairPredictions, log_weight: bool) -> Float[ndarray, "n h w"]:
+def _mean_confidence(problem: Problem) -> Float[ndarray, "n h w"]:
     """Return the network's confidence averaged over the pairs that show an image; logs where these are the weights."""
+    predictions = problem.predictions
     total = np.zeros((predictions.image_count, *predictions.conf.shape[1:]), np.float32)
     for edge, *confs in zip(predictions.edges, predictions.conf, predictions.conf2, strict=True):
         for image, conf in zip(edge, confs, strict=True):
-            total[image] += weigh(conf, log_weight)
+            total[image] += problem.weigh(conf)
     shown = np.bincount(predictions.edges.ravel(), minlength=len(total))
     mean = total / shown[:, None, None].astype(np.float32)
-    return np.exp(mean) if log_weight else mean
+    return np.exp(mean) if problem.log_weight else mean

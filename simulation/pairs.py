@@ -1,6 +1,6 @@
 """Pairwise pointmaps of a known tabletop scene with the errors a network makes, and the truth beside them."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -48,6 +48,8 @@ class PairErrors:
     """Pairs whose second view is put at a wrong place, as confident as any."""
     noise_pairs: int = 0
     """Pairs whose points are noise, as confident as any."""
+    focal: float = 0.0
+    """Error of the focal length of all pointmaps, relative."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,8 @@ def predicted_pairs(
 ) -> tuple[PairPredictions, PairTruth]:
     """Return predictions of a network for views of known depth (0: nothing there), each pair in a unit of its own."""
     height, width = depth.shape[1:]
-    x_in_camera = depth[..., None] * rays(k)
+    focal = 1 + errors.focal
+    x_in_camera = depth[..., None] * rays(replace(k, fx=focal * k.fx, fy=focal * k.fy))
     count = len(edges)
     unit = np.exp(rng.uniform(-np.log(2), np.log(2), count))
     spoilt = rng.permutation(count)[: errors.wrong_pairs + errors.noise_pairs]

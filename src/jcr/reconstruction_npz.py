@@ -50,6 +50,7 @@ class About(BaseModel):
     intrinsics: IntrinsicsJson
     pointmap_intrinsics: IntrinsicsJson | None = None
     boards: BoardsJson | None = None
+    predicted_focal: tuple[float, float] | None = None
 
 
 def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
@@ -65,6 +66,7 @@ def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
         "intrinsics": asdict(reconstruction.intrinsics),
         "pointmap_intrinsics": None if pointmaps is None else asdict(pointmaps.intrinsics),
         "boards": None if tracks.boards is None else _about_boards(tracks.boards),
+        "predicted_focal": reconstruction.predicted_focal,
     }
     arrays = {
         "image_index": reconstruction.image_index,
@@ -168,6 +170,7 @@ def read_reconstruction(path: Path) -> Reconstruction:
             notes=tuple(about.notes),
             warnings=tuple(about.warnings),
             evidence=_evidence(file),
+            predicted_focal=about.predicted_focal,
         )
         _check(found)
     return found

@@ -237,15 +237,9 @@ def test_one_colour_is_filled_within_its_plane_and_nowhere_matched(scene: Scene,
     filled = inner & (dense.reason == PRIOR)
     assert filled.sum() > 0.8 * inner.sum()
     assert (np.abs(_z(scene, dense) / scene.depth - 1) < 0.005)[filled].mean() > 0.99
-
-
-def test_one_colour_that_goes_on_beyond_the_last_texture_stays_unknown(
-    scene: Scene, dense: Pointmaps
-) -> None:
-    """It may be the floor beside the table as well."""
-    inner = _inner(scene.blank, 12)
-    assert inner.sum() > 500
-    assert (dense.confidence[inner] == 0).mean() > 0.99
+    # One colour that goes on beyond the last texture may be the floor beside the table.
+    beyond = _inner(scene.blank, 12)
+    assert beyond.sum() > 500 and (dense.confidence[beyond] == 0).mean() > 0.99
 
 
 def _inner(mask: Bool[ndarray, "m h w"], margin: int) -> Bool[ndarray, "m h w"]:
@@ -254,21 +248,6 @@ def _inner(mask: Bool[ndarray, "m h w"], margin: int) -> Bool[ndarray, "m h w"]:
     for axis in (1, 2):
         inner &= np.roll(mask, margin, axis) & np.roll(mask, -margin, axis)
     return inner
-
-
-def test_a_pixel_that_no_neighbour_sees_has_no_confidence(scene: Scene, dense: Pointmaps) -> None:
-    neighbours = choose_neighbours(scene.tracks, scene.recon_from_camera, 6)
-    hidden_somewhere = 0
-    for i, others in enumerate(neighbours):
-        seen = np.zeros(scene.depth[i].shape, dtype=int)
-        for j in others:
-            neighbour_from_camera = inverse(scene.recon_from_camera[j]) @ scene.recon_from_camera[i]
-            x = apply(neighbour_from_camera, scene.depth[i][..., None] * rays(PINHOLE))
-            u, v, _ = np.moveaxis(x / x[..., 2:] @ PINHOLE.matrix.T, -1, 0)
-            seen += (u > -2) & (u < PINHOLE.width + 1) & (v > -2) & (v < PINHOLE.height + 1)
-        hidden_somewhere += (seen == 0).sum()
-        assert (dense.confidence[i][seen == 0] == 0).mean() > 0.99
-    assert hidden_somewhere > 100
 
 
 def test_the_gauge_changes_nothing_but_the_unit(scene: Scene, dense: Pointmaps) -> None:

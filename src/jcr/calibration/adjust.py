@@ -12,6 +12,7 @@ from numpy import ndarray
 
 from jcr.calibration.case import Case
 from jcr.calibration.consider import with_intrinsics_considered
+from jcr.camera import parameter_names
 from jcr.estimation.equation import paper_residuals, predict
 from jcr.estimation.hand_eye import judged
 from jcr.estimation.image_equations import median_reprojection_px
@@ -132,8 +133,33 @@ def with_decentring(estimate: Estimate, camera: Intrinsics) -> Estimate:
     )
 
 
+def with_prior_of_intrinsics(estimate: Estimate, camera: Camera) -> Estimate:
+    """Return an estimate from a network's cameras with the prior uncertainty of the intrinsics.
+
+    The focal length does not move these cameras. A wrong principal point rotates all of them, so that the transform and
+    the principal point together place points where they are.
+    """
+    root, names = camera.directions * camera.std, parameter_names(camera.intrinsics)
+    x, by_camera = estimate.gripper_from_camera, np.zeros((7, len(root)))
+    by_camera[3:6, names.index("cx")] = x[:3, 1] / camera.intrinsics.fx
+    by_camera[3:6, names.index("cy")] = -x[:3, 0] / camera.intrinsics.fy
+    rotated, budget = by_camera @ root, estimate.budget
+    if budget is not None:
+        budget = replace(budget, intrinsics=budget.intrinsics + rotated @ rotated.T)
+    return replace(
+        estimate,
+        covariance=estimate.covariance + rotated @ rotated.T,
+        budget=budget,
+        intrinsics_cross=rotated @ root.T,
+        intrinsics_covariance=root @ root.T,
+    )
+
+
 def _considered(case: Case) -> Case:
-    """The case with what errors of its given intrinsics do to a fit to poses, which cannot estimate them."""
+    """Return the case with the errors of its intrinsics, which a fit to poses cannot estimate, as uncertainty."""
+    if case.reconstruction.predicted_focal is not None:
+        known = with_prior_of_intrinsics(case.hand_eye.estimate, case.camera)
+        return replace(case, hand_eye=judged(replace(case.hand_eye, estimate=known)))
     made_with_them = case.reconstruction.evidence is None and not case.tracks.from_pointmaps
     if case.capture.intrinsics is None or not made_with_them or not case.hand_eye.converged:
         return case

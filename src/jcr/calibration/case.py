@@ -81,6 +81,9 @@ class Case:
     def camera(self) -> Camera:
         """Camera with the prior of its intrinsics before the calibration."""
         given, found = self.capture.intrinsics, self.reconstruction.intrinsics
+        if given is None and self.reconstruction.predicted_focal is not None:
+            of_center = {name: ESTIMATED[name] for name in ("aspect", "cx", "cy")}
+            return camera_with_prior(found, {"f": self.reconstruction.predicted_focal[1], **of_center})
         if found.model == "thin_prism" and (given is None or given.model != found.model):
             return camera_with_prior(found, {**(ESTIMATED if given is None else MEASURED), **PRISM})
         return camera_about(found, given is not None, self.capture.intrinsics_std)
@@ -110,9 +113,8 @@ class Case:
     def is_adjustable(self) -> bool:
         """Whether bundle adjustment has something to add to the poses.
 
-        What pointmaps show of the cameras is in their covariance, with the errors that neighbours share; their tracks,
-        taken for independent, make it worse: simulated, 0.2 mm became 1.3 mm. And it takes scale and height from the
-        robot alone.
+        Cameras that are not found by matches come with their covariance and have no tracks. Bundle adjustment takes
+        scale and height from the robot alone.
         """
         return (
             self.reconstruction.evidence is None

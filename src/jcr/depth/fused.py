@@ -119,7 +119,7 @@ def _check(
     consistent: Bool[ndarray, "m h w"],
     tolerance: float,
 ) -> list[ndarray]:
-    """`agreement` of all images, (m,h,w) each; inverse depths that are not known stay as they are."""
+    """Compute `agreement` of all images, (m,h,w) each; inverse depths that are not known stay as they are."""
     compared, width = evidence(inverse_depth, known, consistent), inverse_depth.shape[2]
 
     def one(i: int) -> Float[ndarray, "4 h w"]:
@@ -143,7 +143,7 @@ def _stacked(priors: Sequence[Prior]) -> Prior:
 def _surfaces(
     inverse_depth: Float[ndarray, "m h w"], even: Float[ndarray, "m h w 3"]
 ) -> Float[ndarray, "m h _ 4"]:
-    """Inverse depths and colours, these a little smooth, as `colours_agree` takes them."""
+    """Return inverse depths and slightly smoothed colours in the layout of `colours_agree`."""
     smooth = [cv2.GaussianBlur(image, (0, 0), 1.0) for image in even]
     return padded(np.concatenate([inverse_depth[..., None], smooth], -1))
 
@@ -155,7 +155,7 @@ def _with_planes(
     needed: Int[ndarray, "m 1 1"],
     check: Callable[..., list[ndarray]],
 ) -> FusedDepth:
-    """Depths that were matched (by `reason`) where planes do not contradict them, and planes in place of the others.
+    """Return the matched depths that planes do not contradict, and planes in place of the others.
 
     `alone` are pixels on whose depth two images agree and no third.
     """

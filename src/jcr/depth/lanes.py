@@ -110,7 +110,7 @@ class Lanes:
         return Lanes(self.builder, self.builder.shuffle_vector(self.value, self.value, chosen))
 
     def write(self, start: Any, place: Any) -> None:
-        """Store the lanes as consecutive floats from a place on."""
+        """Write the lanes as consecutive floats from a place on."""
         there = self.builder.bitcast(self.builder.gep(start, [place]), self.value.type.as_pointer())
         self.builder.store(self.value, there, align=4)
 

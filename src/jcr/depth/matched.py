@@ -88,7 +88,7 @@ class _Level:
         recon_from_camera: Float[ndarray, "m 4 4"],
         space: Float[ndarray, " _"],
     ) -> tuple[ndarray, ndarray, ndarray, tuple[np.float32, ...]]:
-        """`packed`, `motions`, `windows` (written to `space`) and k of image i, as the loops take them."""
+        """Return `packed`, `motions`, `windows` (written to `space`) and k of image i for the compiled loops."""
         near = relative(i, others, recon_from_camera, self.pinhole)
         motions = np.concatenate([near.a.reshape(-1, 9), near.b], 1)
         k = tuple(grid(self.pinhole))  # of numbers, that the loops keep in registers

@@ -184,7 +184,7 @@ def random_planes(family, span, k, h, w, seed):
 @compiled
 @no_type_check
 def spread_planes(found, asked, packed, motions, windows, k, search, seed):
-    """Pass over the image once: each pixel takes its neighbours' planes, or a changed one, where it scores better.
+    """Update each pixel once: it takes its neighbours' planes, or a changed one, where it scores better.
 
     Passes alternate in direction (Bleyer et al. 2011, section 3.2), with the lowest bit of the seed. `search` is the
     span of inverse depths, the relative change of it that is tried, and of the normal, how often it is: the change

@@ -1,4 +1,4 @@
-"""Planes where texture ends: what plain regions of an image most likely look like, given the depth around them.
+"""Planes for regions without texture, supported by the matched depth around them.
 
 As in ACMP and ACMMP (Xu and Tao, "Planar prior assisted PatchMatch multi-view stereo", AAAI 2020; "Multi-scale geometric
 consistency guided and planar prior assisted multi-view stereo", PAMI 2022), depths that were matched and agree between
@@ -89,7 +89,7 @@ def evened(
     views: Sequence[Relative],
     pinhole: Intrinsics,
 ) -> Float[ndarray, "m h w 3"]:
-    """Colours (0 to 1) without the images' exposures and the vignetting, as matched points show them.
+    """Return colours (0 to 1) without exposure and vignetting, which are estimated from matched points.
 
     Log brightness of one point in two images differs by their exposures and by a·(r²₁ - r²₂), with r the tangent of the
     angle off axis: least absolute deviations over matched points.
@@ -215,7 +215,7 @@ def _deviations(
 
 
 def _beside_support(label: Int[ndarray, "h w"], on_support: Bool[ndarray, " r"]) -> Bool[ndarray, " r"]:
-    """Regions that touch one on the support plane."""
+    """Return the regions that touch one on the support plane."""
     beside = np.zeros(len(on_support), bool)
     for one, other in ((label[:, 1:], label[:, :-1]), (label[1:], label[:-1])):
         beside[one[on_support[other]]] = True

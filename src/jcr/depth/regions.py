@@ -25,7 +25,7 @@ determine the slope across it, and may belong to the next object."""
 
 
 def colour_regions(color: Float[ndarray, "h w 3"]) -> tuple[Int[ndarray, "h w"], int]:
-    """Label of each pixel's region, and how many there are (Felzenszwalb and Huttenlocher, IJCV 2004).
+    """Return the label of each pixel's region and the number of regions (Felzenszwalb and Huttenlocher, IJCV 2004).
 
     The image is smoothed with its edges kept; noise and JPEG blocks would otherwise join regions.
     """
@@ -44,7 +44,7 @@ def colour_regions(color: Float[ndarray, "h w 3"]) -> tuple[Int[ndarray, "h w"],
 
 
 def _ascending(weight: Float[ndarray, " e"]) -> Int[ndarray, " e"]:
-    """np.argsort of numbers that are not negative, stable, in a fifth of its time: their bits ascend as they do."""
+    """Return the stable np.argsort of numbers that are not negative; sorting their bits takes a fifth of the time."""
     bits = weight.astype(np.float32, copy=False).view(np.uint32)
     by_low = np.argsort(bits.astype(np.uint16), kind="stable")
     return by_low[np.argsort((bits >> 16).astype(np.uint16)[by_low], kind="stable")]
@@ -170,7 +170,7 @@ def _add(moments, u, v):
 @inlined
 @no_type_check
 def _covariance(moments):
-    """Mean x and y, and covariance xx, xy, yy."""
+    """Return mean x and y, and covariance xx, xy, yy."""
     n = moments[0]
     x, y = moments[1] / n, moments[2] / n
     return x, y, moments[3] / n - x * x, moments[4] / n - x * y, moments[5] / n - y * y

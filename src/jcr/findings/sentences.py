@@ -277,7 +277,8 @@ def not_registered(finding: "Finding") -> str:
 
 def intrinsics(finding: "Finding") -> str:
     if finding.p is None:
-        return f"the images show {' and '.join(_of_image_parts(finding))}"
+        shown_by = "pointmaps" if "predicted" in finding.details else "images"
+        return f"the {shown_by} show {' and '.join(_of_image_parts(finding))}"
     return f"the images show {' and '.join(_of_parameters(finding))}"
 
 

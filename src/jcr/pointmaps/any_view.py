@@ -20,8 +20,8 @@ from jcr.errors import InputError
 from jcr.geometry import nearest_rotation
 from jcr.hub import Weights
 from jcr.pointmaps.grid import ImageGrid, prepare_images, resize_and_crop
-from jcr.pointmaps.posed import PosedPointmaps, published_covariance
-from jcr.pointmaps.reconstruction import PredictionSource, reconstruct_pointmaps
+from jcr.pointmaps.posed import PosedPointmaps
+from jcr.pointmaps.reconstruction import reconstruct_pointmaps
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction
 
@@ -71,8 +71,8 @@ def reconstruct_any_view(
     return reconstruct_pointmaps(
         capture,
         replace(images, grid=maps.grid, colors=colors),
-        replace(maps, covariance=published_covariance(maps)),
-        PredictionSource(backend=backend, notes=(weights.note,)),
+        replace(maps, notes=(*maps.notes, weights.note)),
+        backend,
         progress,
     )
 

@@ -1,5 +1,6 @@
 """Pairwise pointmaps as a record and an npz file, the input of global alignment."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,8 +13,14 @@ from jcr.errors import InputError
 from jcr.pointmaps.grid import ImageGrid
 from jcr.records import Intrinsics
 
-ARRAYS = {"edges": 2, "pts3d": 4, "conf": 3, "pts3d_in_other_view": 4, "conf2": 3}
-"""Required keys of a file and their numbers of dimensions, named as in DUSt3R's output."""
+ARRAYS = {
+    "edges": "E 2",
+    "pts3d": "E H W 3",
+    "conf": "E H W",
+    "pts3d_in_other_view": "E H W 3",
+    "conf2": "E H W",
+}
+"""Required arrays of a file and their shapes, named as in DUSt3R's output."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,28 +99,11 @@ def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPrediction
 
     Raises InputError for what is missing or does not agree.
     """
-    for name, dimensions in ARRAYS.items():
-        if name not in arrays:
-            raise InputError(f"{source}: no array {name!r}; pair predictions need {', '.join(ARRAYS)}")
-        if arrays[name].ndim != dimensions:
-            raise InputError(
-                f"{source}: {name} has shape {arrays[name].shape}, it needs {dimensions} dimensions"
-            )
+    check_arrays(arrays, ARRAYS, source)
     edges = arrays["edges"]
     count, height, width = arrays["pts3d"].shape[:3]
-    for name, shape in {
-        "edges": (count, 2),
-        "pts3d": (count, height, width, 3),
-        "conf": (count, height, width),
-        "pts3d_in_other_view": (count, height, width, 3),
-        "conf2": (count, height, width),
-    }.items():
-        if arrays[name].shape != shape:
-            raise InputError(f"{source}: {name} has shape {arrays[name].shape}, pts3d asks for {shape}")
     images = tuple(str(name) for name in arrays.get("images", ()))
     image_count = _check_edges(edges, len(images), source)
-    for name in ("pts3d", "conf", "pts3d_in_other_view", "conf2"):
-        _check_values(name, arrays[name], source)
     intrinsics, grid = camera_of_arrays(arrays, (width, height), source)
     colors = arrays.get("colors")
     if colors is not None and (colors.shape != (image_count, height, width, 3) or colors.dtype != np.uint8):
@@ -141,16 +131,29 @@ def _check_edges(edges: ndarray, names: int, source: str) -> int:
     return images
 
 
-def _check_values(name: str, array: ndarray, source: str) -> None:
-    """Raise InputError for points or confidences that are not finite, or confidences below 0."""
-    # One edge at a time: a mask of all pairs would take a quarter of the pairs' memory.
-    for edge, values in enumerate(array):
-        if not np.isfinite(values).all():
+def check_arrays(arrays: dict[str, ndarray], shapes: Mapping[str, str], source: str) -> None:
+    """Check that arrays are there, finite and of `shapes`, such as "N H W 3" with equal sizes for equal letters.
+
+    Raises InputError for the first that is not, and for a confidence below 0.
+    """
+    sizes: dict[str, int] = {}
+    for name, shape in shapes.items():
+        if name not in arrays:
+            raise InputError(f"{source}: no array {name!r}; needed are {', '.join(shapes)}")
+        array, axes = arrays[name], shape.split()
+        asked = [int(axis) if axis.isdigit() else sizes.get(axis) for axis in axes]
+        fits = array.ndim == len(axes) and array.dtype.kind in "fiu"
+        if not fits or any(size not in (None, own) for size, own in zip(asked, array.shape, strict=True)):
             raise InputError(
-                f"{source}: {name}[{edge}] is not finite everywhere; put 0 there, with confidence 0"
+                f"{source}: {name} is {array.dtype} of shape {array.shape}; it must be numbers of shape {shape}"
             )
-        if name in ("conf", "conf2") and values.min() < 0:
-            raise InputError(f"{source}: {name}[{edge}] is negative somewhere; a confidence is at least 0")
+        sizes |= dict(zip(axes, array.shape, strict=True))
+        # One row at a time: a mask of all pairs would take a quarter of the pairs' memory.
+        for row, values in enumerate(array):
+            if not np.isfinite(values).all():
+                raise InputError(f"{source}: {name}[{row}] is not finite; put 0 there, with confidence 0")
+            if name.startswith("conf") and values.size and values.min() < 0:
+                raise InputError(f"{source}: {name}[{row}] is negative somewhere; a confidence is at least 0")
 
 
 def camera_of_arrays(

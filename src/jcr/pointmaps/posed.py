@@ -8,7 +8,7 @@ from numpy import ndarray
 
 from jcr.camera import rays
 from jcr.pointmaps.grid import ImageGrid
-from jcr.records import CameraEvidence, Intrinsics
+from jcr.records import Intrinsics
 
 SAMPLES = 20_000
 """Approximate number of pixels of all images that the pinhole is fitted to."""
@@ -16,6 +16,8 @@ PREDICTED_STD = (0.02, np.radians(1.5))
 """Standard deviations of a predicted camera that no match confirms: of its distance from the scene (relative), and of
 its rotation per axis (rad). Depth Anything 3's largest model has these on 7-Scenes (27 % of pairs within an average
 threshold of 3°, its benchmark page)."""
+FOCAL_STD = 0.05
+"""Relative standard deviation of a network's focal length, common to its views, which no match confirms."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,15 +36,17 @@ class PosedPointmaps:
     """Whether the unit is meant to be the metre."""
     covariance: Float[ndarray, "r r"] | None = None
     """Covariance of the steps of all cameras (translation, rotation), r = 6n; None: unknown."""
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def on_rays(self, pinhole: Intrinsics) -> "PosedPointmaps":
         """Return the pointmaps with each point moved along z onto the ray of its pixel in a pinhole of the grid."""
         points = self.x_in_camera[..., 2:] * rays(pinhole).astype(np.float32)
         return replace(self, x_in_camera=np.where((self.confidence > 0)[..., None], points, 0))
 
-    def evidence(self) -> CameraEvidence | None:
-        """Return the cameras with their covariance, None where that is unknown."""
-        return None if self.covariance is None else CameraEvidence(self.recon_from_camera, self.covariance)
+    def covariance_or_published(self) -> Float[ndarray, "r r"]:
+        """Return the covariance of the cameras, that of the published errors of a network where it is unknown."""
+        return published_covariance(self) if self.covariance is None else self.covariance
 
 
 def fit_pinhole(maps: PosedPointmaps) -> tuple[Intrinsics, float]:

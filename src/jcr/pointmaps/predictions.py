@@ -14,12 +14,14 @@ from jcr.camera import is_distorted, usable_intrinsics
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, require_rigid
 from jcr.pointmaps.grid import ImageGrid, PreparedImages, image_grid, read_colors
-from jcr.pointmaps.pairs import camera_of_arrays, pairs_from_arrays, read_arrays
+from jcr.pointmaps.pairs import camera_of_arrays, check_arrays, pairs_from_arrays, read_arrays
 from jcr.pointmaps.posed import PosedPointmaps, fit_pinhole
-from jcr.pointmaps.reconstruction import PredictionSource, align_pairs, reconstruct_pointmaps
+from jcr.pointmaps.reconstruction import align_pairs, reconstruct_pointmaps
 from jcr.progress import Progress
 from jcr.records import Capture, Reconstruction
 
+POINTMAPS = {"confidence": "N H W", "recon_from_camera": "N 4 4", "points_in_recon": "N H W 3"}
+"""Required arrays of pointmaps that share a frame, and their shapes."""
 LARGEST_MISFIT = 0.02
 """Median distance of the points' projections from their pixels, over the width, beyond which poses are wrong."""
 
@@ -38,40 +40,19 @@ def reconstruct_predictions(capture: Capture, path: Path, progress: Progress | N
         predictions = replace(predictions, edges=rank[predictions.edges], images=())
         height, width = predictions.conf.shape[1:]
         images = _images(capture, rows, arrays, (width, height), source)
-        maps, origin = align_pairs(predictions, images, PredictionSource(backend="predictions"), progress)
+        maps = align_pairs(predictions, images, progress)
     elif "recon_from_camera" in arrays:
-        rows = _check_pointmaps(capture, arrays, source)
-        height, width = arrays["confidence"].shape[1:]
+        check_arrays(arrays, POINTMAPS, source)
+        count, height, width = arrays["confidence"].shape
+        rows = _rows(tuple(str(name) for name in arrays.get("images", ())), count, capture, source)
         images = _images(capture, rows, arrays, (width, height), source)
         maps = _posed_pointmaps(arrays, np.argsort(rows), images.grid, source)
-        origin = PredictionSource(backend="predictions")
     else:
         raise InputError(
             f"{source}: holds neither 'edges' with pairwise pointmaps nor 'recon_from_camera' with pointmaps; "
             "see jcr docs predictions"
         )
-    return reconstruct_pointmaps(capture, images, maps, origin, progress, np.sort(rows))
-
-
-def _check_pointmaps(capture: Capture, arrays: dict[str, ndarray], source: str) -> Int[ndarray, " m"]:
-    """Return the rows of the capture; raise InputError for pointmaps that are missing or do not agree."""
-    dimensions = {"recon_from_camera": 3, "points_in_recon": 4, "confidence": 3}
-    for name, number in dimensions.items():
-        if name not in arrays:
-            raise InputError(f"{source}: no array {name!r}; pointmaps need {', '.join(dimensions)}")
-        if arrays[name].ndim != number or arrays[name].dtype.kind not in "fiu":
-            raise InputError(
-                f"{source}: {name} must be numbers in {number} dimensions, not {arrays[name].shape}"
-            )
-        if not np.isfinite(arrays[name]).all():
-            raise InputError(f"{source}: {name} is not finite everywhere; put 0 there, with confidence 0")
-    count, height, width = arrays["confidence"].shape
-    for name, shape in (("recon_from_camera", (count, 4, 4)), ("points_in_recon", (count, height, width, 3))):
-        if arrays[name].shape != shape:
-            raise InputError(f"{source}: {name} has shape {arrays[name].shape}, confidence asks for {shape}")
-    if arrays["confidence"].min() < 0:
-        raise InputError(f"{source}: confidence is negative somewhere; 0 is for no estimate")
-    return _rows(tuple(str(name) for name in arrays.get("images", ())), count, capture, source)
+    return reconstruct_pointmaps(capture, images, maps, "predictions", progress, np.sort(rows))
 
 
 def _posed_pointmaps(

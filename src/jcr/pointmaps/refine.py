@@ -28,8 +28,9 @@ LONG_EDGE = 960
 ROUNDS = 3
 KEYPOINTS = 4000
 """Keypoints of all images together."""
-LEAST_MATCHES = 25
-"""Matches of an image in bundle adjustment; with fewer in any image nothing is refined."""
+LEAST_MATCHES = 70
+"""Matches of an image in bundle adjustment; with fewer in any image nothing is refined. The calibration adjusts the
+tracks of three images from 200 observations on."""
 LARGEST_PX = 4.0
 """Reprojection error beyond which a match is left out, in units of the median."""
 BEND_STD = 0.03
@@ -42,8 +43,6 @@ class Refinement:
 
     recon_from_camera: Float[ndarray, "n 4 4"]
     """Adjusted camera poses; the first camera keeps its predicted pose."""
-    covariance: Float[ndarray, "r r"]
-    """Covariance of the steps of all cameras, r = 6n; zero for the first camera."""
     depth_factor: Float[ndarray, "n h w"]
     """Factor of the predicted points on the network's grid."""
     tracks: Tracks
@@ -85,7 +84,6 @@ def refine(
     original_px = replace(images, grid=work).original_px(adjusted.tracks.x_px)
     return Refinement(
         recon_from_camera=poses,
-        covariance=adjusted.shown.rig_covariance(),
         depth_factor=factor,
         tracks=replace(adjusted.tracks, x_px=original_px),
         pinhole=pinhole if images.pinhole is not None else work.original_intrinsics(camera),

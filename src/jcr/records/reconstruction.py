@@ -145,6 +145,10 @@ class Reconstruction:
     evidence: CameraEvidence | None = None
     """Evidence in the same frame, where robot poses were used for `recon_from_camera` or cameras err beside them."""
 
+    predicted_focal: tuple[float, float] | None = None
+    """Focal length of a network (px of the original image) and its relative standard deviation, where no match in the
+    images confirms it; None: the images determine the focal length, or nothing was predicted."""
+
     @property
     def dense(self) -> Pointmaps:
         """The pointmaps, for what comes after densify."""

@@ -120,32 +120,6 @@ def test_pointmaps_equal_the_published_network(name: str) -> None:
     torch.testing.assert_close(view2.confidence, truth["conf2"], **TOLERANCE)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "tiny_linear_portrait_64x48_b2",
-        "tiny_dpt_mixed_48x64_64x48",
-        "tiny_dpt12_48x64_b1",
-        pytest.param("vitl512dpt_48x64", marks=pytest.mark.slow),
-    ],
-)
-@pytest.mark.usefixtures("inference_mode")
-def test_tokens_equal_the_published_network(name: str) -> None:
-    import torch
-
-    from jcr.pointmaps.dust3r.network import grid_positions
-
-    truth, network = fixture(name)
-    features1, features2 = network.encode(truth["img1"]), network.encode(truth["img2"])
-    torch.testing.assert_close(features1.tokens, truth["enc1"], **TOLERANCE)
-    torch.testing.assert_close(features2.tokens, truth["enc2"], **TOLERANCE)
-    assert torch.equal(grid_positions(features1.grid, torch.device("cpu")), truth["pos1"][0])
-    layers1, layers2 = network.decoder_layers(features1, features2)
-    for layer in truth["hooks"][truth["hooks"] > 0].tolist():
-        torch.testing.assert_close(layers1[layer], truth[f"dec1_{layer}"], **TOLERANCE)
-        torch.testing.assert_close(layers2[layer], truth[f"dec2_{layer}"], **TOLERANCE)
-
-
 @pytest.mark.parametrize("keys", sorted(FIXTURES.glob("*_keys.tsv")), ids=lambda path: path.stem)
 def test_state_dict_has_the_published_keys_and_shapes(keys: Path) -> None:
     import torch

@@ -73,36 +73,6 @@ def test_each_pair_is_what_the_network_shows_of_its_two_images(
         np.testing.assert_allclose(pairs.conf2[e], view2.confidence[0], rtol=1e-4, atol=1e-5)
 
 
-def test_out_of_memory_halves_the_batch_and_reports_it(
-    loaded: "LoadedNetwork",
-    images: PreparedImages,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    import torch
-
-    from jcr.pointmaps.dust3r import predictor
-
-    monkeypatch.setitem(predictor.MAX_BATCH, "cpu", 8)
-    decode = loaded.network.decode
-    batches = []
-
-    def decode_up_to_three(a, b):
-        if len(a.tokens) > 3:
-            raise torch.cuda.OutOfMemoryError("out of memory")
-        batches.append(len(a.tokens))
-        return decode(a, b)
-
-    monkeypatch.setattr(loaded.network, "decode", decode_up_to_three)
-    with caplog.at_level(logging.WARNING):
-        pairs = predicted(loaded, images)
-    assert batches == [2] * 6
-    assert "going on with 2 pairs at a time" in caplog.text
-    monkeypatch.undo()
-    undisturbed = predicted(loaded, images)
-    np.testing.assert_allclose(pairs.pts3d, undisturbed.pts3d, rtol=1e-4, atol=1e-5)
-
-
 def test_a_gpu_too_small_for_one_pair_hands_over_to_the_cpu_and_reports_it(
     loaded: "LoadedNetwork",
     images: PreparedImages,
@@ -166,7 +136,7 @@ def test_file_round_trip_and_faults(tmp_path: Path) -> None:
     arrays = {name: np.array(value) for name, value in np.load(path).items()}
     spoilt = {
         "no array 'conf2'": {"conf2": None},
-        "asks for": {"conf": arrays["conf"][:, :4]},
+        "conf is float32 of shape": {"conf": arrays["conf"][:, :4]},
         "not finite": {"pts3d": np.where(arrays["pts3d"] > 2.5, np.nan, arrays["pts3d"])},
         "negative": {"conf": arrays["conf"] - 3},
         "must join two": {"edges": edges + 1},
@@ -174,7 +144,7 @@ def test_file_round_trip_and_faults(tmp_path: Path) -> None:
         "fx, fy, cx, cy": {"intrinsics": np.zeros(4)},
         "grid must be": {"grid": np.zeros((4, 2), int)},
         "colors must be": {"colors": arrays["colors"][:2]},
-        "it needs 4 dimensions": {"pts3d": arrays["pts3d"][0]},
+        "must be numbers of shape E H W 3": {"pts3d": arrays["pts3d"][0]},
     }
     for message, change in spoilt.items():
         np.savez(path, **{k: v for k, v in {**arrays, **change}.items() if v is not None})

@@ -1,5 +1,6 @@
 """Test the calibration from aligned pairs: accuracy, calibrated covariance, scale of metric networks."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
@@ -10,19 +11,22 @@ from PIL import Image
 
 from jcr.calibration.record import calibration_of
 from jcr.calibration.stage import calibrate
+from jcr.camera import unproject
+from jcr.estimation.point_uncertainty import point_covariance
+from jcr.findings import FindingKind
+from jcr.findings.finding import text
 from jcr.findings.sentences import network_scale
-from jcr.geometry import inverse, rotation_exp, rotation_log, transform
+from jcr.geometry import inverse, retract, rotation_exp, rotation_log, step_between, transform
 from jcr.pointmaps.dust3r.pair_graph import complete_pairs
-from jcr.pointmaps.global_alignment.alignment import AlignOptions
 from jcr.pointmaps.grid import ImageGrid, PreparedImages
 from jcr.pointmaps.pairs import PairPredictions
-from jcr.pointmaps.reconstruction import PredictionSource, align_pairs, reconstruct_pointmaps
+from jcr.pointmaps.reconstruction import align_pairs, reconstruct_pointmaps
 from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Capture, HandEye, Reconstruction
 from simulation.pairs import PairErrors, synthetic_pairs
 
 SIZE = (48, 36)
-FEW_PIXELS = AlignOptions(pixels=432)
+FEW_PIXELS = 432
 NOISE = (5e-4, float(np.radians(0.1)))
 
 
@@ -31,7 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of black images, in which nothing matches."""
     made = tmp_path_factory.getbasetemp() / "black"
     made.mkdir(exist_ok=True)
-    for k in range(7):
+    for k in range(12):
         Image.new("RGB", SIZE).save(made / f"{k:02d}.png")
     Case.folder = made
     return made
@@ -52,9 +56,8 @@ class Case:
 
     def reconstruction(self) -> Reconstruction:
         """Return the alignment as a reconstruction; the black images have no matches."""
-        source = PredictionSource(backend="predictions")
-        maps, source = align_pairs(self.predictions, self.images, source, options=FEW_PIXELS)
-        return reconstruct_pointmaps(self.capture, self.images, maps, source)
+        maps = align_pairs(self.predictions, self.images, pixels=FEW_PIXELS)
+        return reconstruct_pointmaps(self.capture, self.images, maps, "predictions")
 
     def error(self, found: HandEye) -> np.ndarray:
         """True less found, in the order of the covariance."""
@@ -109,6 +112,75 @@ def test_a_wrong_gripper_pose_is_left_out():
     assert error @ np.linalg.solve(found.covariance, error) < 18.5  # 99 of 100 draws
 
 
+def slipped(gripper: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return the poses under which the camera slips by 6 mm and 2° after the fifth image."""
+    slip = transform(rotation_exp(np.radians([1.2, -1.2, 1.0])), np.array([0.004, -0.003, 0.003]))
+    return np.concatenate([gripper[:5], gripper[5:] @ x @ inverse(x @ slip)])
+
+
+def late(gripper: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return the poses as they were 5 % of the interval earlier."""
+    back = step_between(gripper[1:], gripper[:-1])
+    return np.concatenate([gripper[:1], retract(gripper[1:], 0.05 * back)])
+
+
+def shuffled(gripper: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return the poses in another order."""
+    return gripper[np.random.default_rng(1).permutation(len(gripper))]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "cause"),
+    [
+        (slipped, FindingKind.SLIP),
+        (late, FindingKind.DELAY),
+        (shuffled, FindingKind.POSES_CONTRADICT_IMAGES),
+    ],
+)
+def test_a_fault_of_the_poses_is_named_beside_a_wrong_focal_length(spoil: Callable, cause: FindingKind):
+    made = case(12, 3, (1e-4, 3e-4), PairErrors(focal=0.03))
+    poses = spoil(made.capture.base_from_gripper, made.gripper_from_camera)
+    wrong = replace(made, capture=replace(made.capture, base_from_gripper=poses))
+    assert calibrate(wrong.capture, wrong.reconstruction()).findings[0].kind is cause
+
+
+@pytest.mark.parametrize("given", [True, False])
+@pytest.mark.parametrize("off", [0.03, -0.1])
+def test_the_focal_length_of_a_network_is_a_measurement(off: float, given: bool):
+    made = case(6, 2, NOISE, PairErrors(focal=off))
+    truth = made.capture.intrinsics
+    assert truth is not None
+    if not given:
+        images = replace(made.images, pinhole=None, intrinsics_of_capture=None)
+        made = replace(made, capture=replace(made.capture, intrinsics=None), images=images)
+    reconstruction = made.reconstruction()
+    found = calibrate(made.capture, reconstruction)
+    assert found.converged
+    error = made.error(found)
+    assert error @ np.linalg.solve(found.covariance, error) < 18.5
+    used = reconstruction.intrinsics
+    assert used.fx / truth.fx - 1 == pytest.approx(0 if given else off, abs=5e-3)
+    assert found.estimate.intrinsics_covariance is not None
+    std = np.sqrt(found.estimate.intrinsics_covariance[0, 0]) / used.fx
+    contradicts = [one for one in found.findings if one.kind is FindingKind.INTRINSICS]
+    assert len(contradicts) == (given and off == -0.1)
+    if contradicts:
+        assert contradicts[0].severity == "warns" and "pointmaps show a focal length of 41 " in text(
+            contradicts[0]
+        )
+    # A corner of the image, at a distance of one metre.
+    corner = np.zeros(2)
+    seen, true = (unproject(one, corner) for one in (used, truth))
+    by = found.gripper_from_camera[:3, :3].T @ made.gripper_from_camera[:3, :3]
+    offset = seen / np.linalg.norm(seen) - by @ true / np.linalg.norm(true)
+    offset -= (
+        found.gripper_from_camera[:3, :3].T @ (made.gripper_from_camera - found.gripper_from_camera)[:3, 3]
+    )
+    covariance = point_covariance(found.estimate, used, corner, 1.0)
+    assert offset @ np.linalg.solve(covariance + 1e-12 * np.eye(3), offset) < 11.3
+    assert std == pytest.approx(0.05 if not given else 0.1 if contradicts else 0.005, rel=0.1)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [(0.0, 0.0), NOISE])
 def test_reported_sigmas_are_those_of_the_errors(noise: tuple[float, float]):
@@ -118,7 +190,9 @@ def test_reported_sigmas_are_those_of_the_errors(noise: tuple[float, float]):
         made = case(4 + seed % 2, seed, noise)
         found = calibrate(made.capture, made.reconstruction())
         error = made.error(found)
-        squared.append(error @ np.linalg.solve(found.covariance, error))
+        # The principal point is exact here, and the errors that it may have rotate the camera.
+        of_pointmaps = found.covariance - found.budget.intrinsics
+        squared.append(error @ np.linalg.solve(of_pointmaps, error))
     # Ten draws of a chi-squared with 7 degrees of freedom average 4.2 to 11.1 in 99 of 100 cases; covariances
     # widened for an estimated noise stay below.
     assert 2.0 < np.mean(squared) < 11.1
@@ -159,3 +233,4 @@ def test_evidence_survives_the_file(tmp_path: Path):
     back = read_reconstruction(tmp_path / "reconstruction.npz")
     np.testing.assert_array_equal(back.evidence.recon_from_camera, made.evidence.recon_from_camera)
     np.testing.assert_array_equal(back.evidence.covariance, made.evidence.covariance)
+    assert back.predicted_focal == made.predicted_focal is not None

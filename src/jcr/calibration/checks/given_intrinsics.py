@@ -1,4 +1,4 @@
-"""Are the intrinsics that were given those of the images?
+"""Tests of given intrinsics against the images and against the focal length of a network.
 
 Given intrinsics are measurements with a small error. The images and the robot's motion determine them all the same:
 freed in the bundle adjustment, focal length, principal point and two radial coefficients have an estimate and a
@@ -14,7 +14,7 @@ from jcr.calibration.case import Case, Checked
 from jcr.calibration.checks.imaged import Imaged, of_case
 from jcr.camera import PARAMETERS, by_parameters, parameters, unproject
 from jcr.estimation.hand_eye import judged
-from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, camera_with_prior
+from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, MEASURED, camera_with_prior
 from jcr.estimation.score_test import freed_intrinsics
 from jcr.estimation.solve import Solution
 from jcr.estimation.wrist import estimate_of
@@ -31,11 +31,13 @@ OFF = 0.01
 OFF_CENTRE = ESTIMATED["cx"]
 """Share of the width: centres of cheap cameras scatter by so much, and an offset that was found with a wrong one is
 right where it is used with the same."""
+OF_NETWORK = 1.64
+"""Standard deviations between a network's focal length and the given one; a tenth of the networks is farther off."""
 CX, CY, K1, K2 = (PARAMETERS.index(name) for name in ("cx", "cy", "k1", "k2"))
 
 
 def intrinsics_contradiction(case: Case) -> Checked:
-    """What the used images show against the intrinsics that were given; nothing where they agree.
+    """Return the contradiction between the used images and the given intrinsics; nothing where they agree.
 
     The calibration is then the one with the intrinsics that the images show, which those that were given are no part of;
     one that was rejected stays, and the finding has the shift.
@@ -65,9 +67,26 @@ def intrinsics_contradiction(case: Case) -> Checked:
     return Checked((replace(contradicted, shift=tuple(shift.tolist())),), case.hand_eye.before)
 
 
+def check_predicted_focal(case: Case) -> Checked:
+    """Return that the focal length of a network contradicts the one that was given; their difference is uncertainty."""
+    given, predicted = case.capture.intrinsics, case.reconstruction.predicted_focal
+    if given is None or predicted is None:
+        return Checked()
+    focal, std = predicted[0], predicted[0] * predicted[1]
+    used, off = case.reconstruction.intrinsics, focal / given.fx - 1
+    if abs(off) < OF_NETWORK * np.hypot(predicted[1], MEASURED["f"]):
+        return Checked()
+    size = {"focal": focal, "focal_std": std, "focal_given": given.fx, "predicted": 1.0}
+    by_focal = camera_with_prior(used, {"f": abs(off)})
+    moved = tuple((by_focal.directions @ by_focal.std).tolist())
+    found = Finding.of(FindingKind.INTRINSICS, "warns", "intrinsics", **size)
+    return Checked((replace(found, shift=(0.0,) * 7, intrinsics_shift=moved),))
+
+
 def contradicted_by(imaged: Imaged, sure: float = SURE) -> tuple[Solution, Finding] | None:
-    """The images adjusted as if no intrinsics had been given for one camera, and what they show against those that were;
-    None where that is nothing. A finding of less than `sure` standard deviations only informs: it leaves doubt.
+    """Adjust the images as if no intrinsics had been given for one camera; return this and the contradiction.
+
+    Return None where there is none. A finding of less than `sure` standard deviations only informs.
 
     Only when one Gauss-Newton step from the adjustment with these, the intrinsics freed, leaves some doubt are the
     intrinsics adjusted until they settle.
@@ -84,7 +103,7 @@ def contradicted_by(imaged: Imaged, sure: float = SURE) -> tuple[Solution, Findi
 
 
 def _found_off(imaged: Imaged, adjusted: Solution, sure: float, share: float) -> dict[str, float]:
-    """Each part of the intrinsics that is off by `sure` standard deviations and by `share` of what matters (px)."""
+    """Return each part of the intrinsics that is off by `sure` standard deviations and by `share` of a limit (px)."""
     given = imaged.start
     camera, covariance = freed_intrinsics(adjusted, camera_with_prior(given, ESTIMATED), imaged.camera)
     by = camera - parameters(given)

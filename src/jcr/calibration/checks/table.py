@@ -18,6 +18,7 @@ from jcr.calibration.checks.capture import (
     check_registered,
 )
 from jcr.calibration.checks.effects import check_effects
+from jcr.calibration.checks.given_intrinsics import check_predicted_focal
 from jcr.calibration.checks.lengths import check_lengths
 from jcr.calibration.checks.robot import check_robot
 from jcr.findings import FindingKind
@@ -49,6 +50,7 @@ CHECKS = (
     Check(check_registered),
     Check(check_convention, _fit_was_rejected),
     Check(check_effects, _is_observable),
+    Check(check_predicted_focal),
     Check(check_boards, lambda case: case.reconstruction.tracks.boards is not None),
     Check(check_lengths),
     Check(check_robot, _is_observable),

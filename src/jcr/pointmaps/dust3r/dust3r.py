@@ -1,5 +1,7 @@
 """The DUSt3R and MASt3R back ends: pairwise pointmaps, global alignment, refinement."""
 
+from dataclasses import replace
+
 from jcr.allocator import give_back
 from jcr.errors import RejectedError
 from jcr.hub import Weights
@@ -7,7 +9,7 @@ from jcr.pointmaps.dust3r.pair_graph import PairGraph
 from jcr.pointmaps.dust3r.predictor import predict_pairs
 from jcr.pointmaps.dust3r.weights import load_weights
 from jcr.pointmaps.grid import prepare_images
-from jcr.pointmaps.reconstruction import PredictionSource, align_pairs, reconstruct_pointmaps
+from jcr.pointmaps.reconstruction import align_pairs, reconstruct_pointmaps
 from jcr.progress import Progress
 from jcr.records import Capture, Reconstruction
 
@@ -33,8 +35,8 @@ def reconstruct_dust3r(
     give_back()  # the network's memory
     notes = (weights.note, *notes)
     try:
-        source = PredictionSource(backend=backend, notes=notes)
-        maps, source = align_pairs(predictions, images, source, progress)
-        return reconstruct_pointmaps(capture, images, maps, source, progress)
+        maps = align_pairs(predictions, images, progress)
+        maps = replace(maps, notes=(*notes, *maps.notes))
+        return reconstruct_pointmaps(capture, images, maps, backend, progress)
     except RejectedError as error:  # the weights and their licence belong to a rejection, too
         raise error.with_more(*notes) from None

@@ -157,25 +157,16 @@ def _build(config: dict[str, object], state: dict[str, Tensor], path: Path) -> D
                 present = state.get(twin, state.get(key))
                 if present is not None:
                     state |= {key: present, twin: present}
-    if missing := sorted(expected.keys() - state.keys()):
-        raise InputError(
-            f"{path}: {len(missing)} tensors are missing, {missing[0]} first; fetch the file again"
-        )
-    if foreign := sorted(state.keys() - expected.keys()):
-        raise InputError(f"{path}: {len(foreign)} tensors are not of this network, {foreign[0]} first")
-    for key, tensor in state.items():
-        if not isinstance(tensor, Tensor) or tensor.shape != expected[key].shape:
-            shape = tuple(getattr(tensor, "shape", ()))
-            raise InputError(
-                f"{path}: {key} is {shape}, the configuration asks for {tuple(expected[key].shape)}"
-            )
-    network.load_state_dict({key: tensor.float() for key, tensor in state.items()}, assign=True)
+    try:
+        network.load_state_dict({key: tensor.float() for key, tensor in state.items()}, assign=True)
+    except (RuntimeError, AttributeError) as error:
+        raise InputError(f"{path}: its tensors are not those of its configuration ({_line(error)})") from None
     return network.eval().requires_grad_(False)
 
 
 @functools.cache
 def _announce(note: str) -> None:
-    """Once per process and source."""
+    """Write the source and licence of weights to stderr, once per process and source."""
     sys.stderr.write(f"{note}\n")
 
 

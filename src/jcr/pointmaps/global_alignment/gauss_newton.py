@@ -12,14 +12,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy import ndarray
 from scipy.sparse import csr_array
 
 from jcr.errors import RejectedError
 from jcr.geometry import adjoint, inverse, retract, twist_from_step
 from jcr.least_squares import one_blas_thread
-from jcr.pointmaps.global_alignment.alignment import Alignment, AlignOptions, Pinhole, pinhole_of
+from jcr.pointmaps.global_alignment.alignment import Alignment
 from jcr.pointmaps.global_alignment.depths import fused_depth
 from jcr.pointmaps.global_alignment.initial_estimate import initial_state
 from jcr.pointmaps.global_alignment.normal_equations import (
@@ -29,12 +29,7 @@ from jcr.pointmaps.global_alignment.normal_equations import (
     ReducedEquations,
     image_equations,
 )
-from jcr.pointmaps.global_alignment.observations import (
-    ImageObservations,
-    choose_pixels,
-    observe,
-    weight_is_log,
-)
+from jcr.pointmaps.global_alignment.observations import ImageObservations, Problem, observe
 from jcr.pointmaps.global_alignment.pointmap_residuals import Noise, State, measure_noise, residuals
 from jcr.pointmaps.pairs import PairPredictions
 from jcr.progress import Progress
@@ -62,35 +57,6 @@ USELESS = 0.2
 UNDETERMINED = "the pointmaps of the pairs have too little in common to be aligned"
 
 
-@dataclass(frozen=True)
-class Problem:
-    """Predictions with the fixed parameters of their alignment."""
-
-    predictions: PairPredictions
-    pinhole: Pinhole
-    log_weight: bool
-
-    @classmethod
-    def of(cls, predictions: PairPredictions, options: AlignOptions) -> "Problem":
-        """Return the problem of some predictions under `options`."""
-        return cls(predictions, pinhole_of(predictions, options), weight_is_log(predictions))
-
-    @property
-    def layout(self) -> Layout:
-        """Layout of the unknowns."""
-        count = self.predictions.image_count
-        focals = 0 if self.pinhole.focal_px else 1 if self.pinhole.shared else count
-        return Layout(count, len(self.predictions.edges), focals)
-
-    def observe(self, image: int, pixels: Int[ndarray, " m"] | slice) -> ImageObservations:
-        """Gather all pointmaps at some pixels of one image."""
-        return observe(self.predictions, self.pinhole, image, pixels, self.log_weight)
-
-    def observe_all(self, count: int) -> list[ImageObservations]:
-        """Gather all pointmaps at about `count` pixels of every image."""
-        return [self.observe(k, pixels) for k, pixels in enumerate(choose_pixels(self.predictions, count))]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Solution:
     """The result of Gauss-Newton."""
@@ -107,16 +73,16 @@ class Solution:
     """Whether the last step was small enough."""
 
 
-def solve(problem: Problem, options: AlignOptions) -> Solution:
-    """Estimate cameras, focal lengths, pair scales and the depths of `options.pixels` pixels per image."""
-    images = problem.observe_all(min(COARSE_PIXELS, options.pixels))
-    state = initial_state(images, problem.predictions.edges, problem.pinhole)
+def solve(problem: Problem, pixels: int) -> Solution:
+    """Estimate cameras, focal length, pair scales and the depths of about `pixels` pixels per image."""
+    images, edges = problem.observe_all(min(COARSE_PIXELS, pixels)), problem.predictions.edges
+    state, layout = initial_state(images, edges), Layout(len(images), len(edges))
     pair_spread = START_SPREAD * np.repeat([np.exp(np.median(np.concatenate(state.log_depth))), 1.0], 3)
-    coarse = gauss_newton(images, state, problem.layout, pair_spread, COARSE_TOLERANCE)
-    images = problem.observe_all(options.pixels)
+    coarse = gauss_newton(images, state, layout, pair_spread, COARSE_TOLERANCE)
+    images = problem.observe_all(pixels)
     depth = [fused_depth(o, coarse.state, noise)[0] for o, noise in zip(images, coarse.noise, strict=True)]
     state = replace(coarse.state, log_depth=[np.log(z) for z in depth])
-    return gauss_newton(images, state, problem.layout, coarse.pair_spread, FINE_TOLERANCE)
+    return gauss_newton(images, state, layout, coarse.pair_spread, FINE_TOLERANCE)
 
 
 @one_blas_thread
@@ -241,10 +207,9 @@ def _after_step(
         ties = image.ties
         pair_error[o.second_pairs] = ties.error + np.einsum("kij,kj->ki", ties.axes, pair_step)
         variance[o.second_pairs] = image.reduced.error_variance
-    focals = [layout.focal(k) for k in range(layout.images)]
     after = State(
         recon_from_camera=retract(state.recon_from_camera, step[: 6 * layout.images].reshape(-1, 6)),
-        log_focal=state.log_focal + np.array([0.0 if c is None else step[c] for c in focals]),
+        log_focal=state.log_focal + float(step[layout.focal]),
         log_pair_scale=state.log_pair_scale + step[layout.scales],
         pair_error=pair_error,
         log_depth=log_depth,
@@ -276,7 +241,7 @@ def dense_alignment(problem: Problem, solution: Solution, progress: Progress | N
         for start in range(0, height * width, DEPTH_CHUNK):
             chunk = slice(start, start + DEPTH_CHUNK)
             depth[k, chunk], confidence[k, chunk] = fused_depth(
-                problem.observe(k, chunk), state, solution.noise[k]
+                observe(problem, k, chunk), state, solution.noise[k]
             )
 
     # numpy lets go of the interpreter during its loops, so threads share the cores.
@@ -284,12 +249,12 @@ def dense_alignment(problem: Problem, solution: Solution, progress: Progress | N
         for done, _ in enumerate(pool.map(settle, range(count)), start=1):
             if progress is not None:
                 progress("align pairs", done / count)
-    focal = np.exp(state.log_focal)
+    focal = float(np.exp(state.log_focal))
     residual = _pair_residuals(predictions, solution)
     return Alignment(
         recon_from_camera=state.recon_from_camera,
-        focal_px=np.stack([focal, focal * problem.pinhole.aspect], axis=1),
-        principal_point_px=problem.pinhole.principal_point_px,
+        focal_px=(focal, focal * problem.aspect),
+        principal_point_px=problem.principal_point_px,
         depth=depth.reshape(count, height, width),
         confidence=(np.exp(confidence) if problem.log_weight else confidence).reshape(count, height, width),
         pair_scale=np.exp(state.log_pair_scale),
@@ -337,12 +302,9 @@ def _selection(o: ImageObservations, layout: Layout, to_twist: Float[ndarray, "n
     twists, scales = np.arange(6 * n).reshape(n, 6, 1), 6 * n + np.arange(maps)
     blocks, block = (n, 6, 6), np.arange(6)
     own, observers = 6 * o.image + block, 6 * o.observers[:, None, None] + block
-    rows = [np.broadcast_to(twists, blocks).ravel()] * 2 + [scales]
-    columns = [np.broadcast_to(of, blocks).ravel() for of in (own, observers)] + [layout.scales[o.pair]]
-    signs = [np.tile(to_twist[o.image].ravel(), n), -to_twist[o.observers].ravel(), np.ones(maps)]
-    if (focal := layout.focal(o.image)) is not None:
-        rows.append(np.array([6 * n + maps]))
-        columns.append(np.array([focal]))
-        signs.append(np.ones(1))
+    rows = [np.broadcast_to(twists, blocks).ravel()] * 2 + [scales, [6 * n + maps]]
+    columns = [np.broadcast_to(of, blocks).ravel() for of in (own, observers)]
+    columns += [layout.scales[o.pair], [layout.focal]]
+    signs = [np.tile(to_twist[o.image].ravel(), n), -to_twist[o.observers].ravel(), np.ones(maps + 1)]
     entries = np.concatenate(signs), (np.concatenate(rows), np.concatenate(columns))
     return csr_array(entries, shape=(6 * n + maps + 1, layout.size))

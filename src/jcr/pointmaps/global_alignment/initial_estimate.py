@@ -6,10 +6,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.errors import InputError
+from jcr.errors import RejectedError
 from jcr.estimation.absolute_pose import ransac_pose
 from jcr.geometry import apply, fit_similarity, inverse
-from jcr.pointmaps.global_alignment.alignment import Pinhole
 from jcr.pointmaps.global_alignment.observations import ImageObservations
 from jcr.pointmaps.global_alignment.pointmap_residuals import State
 
@@ -25,9 +24,9 @@ class PairSimilarities:
     """Median distance after the fit, relative to the distance of the points."""
 
 
-def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"], pinhole: Pinhole) -> State:
+def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"]) -> State:
     """Estimate the state to a few per cent: every image's own depth, chained along the pairs that agree best."""
-    focal = _focal(images, pinhole)
+    focal = _focal(images)
     depth, unit = _depths(images, focal, len(edges))
     pairs = _similarities(images, edges, focal, depth, unit)
     cost = pairs.residual + _contradiction(edges, pairs, len(images))
@@ -38,20 +37,18 @@ def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"], p
     recon_from_camera[:, :3, 3] *= np.exp(-shift)
     return State(
         recon_from_camera=recon_from_camera,
-        log_focal=np.log(focal),
+        log_focal=float(np.log(focal)),
         log_pair_scale=log_scale[edges[:, 0]] - unit,
         pair_error=np.zeros((len(edges), 6)),
         log_depth=[np.log(z) + scale for z, scale in zip(depth, log_scale, strict=True)],
     )
 
 
-def _focal(images: list[ImageObservations], pinhole: Pinhole) -> Float[ndarray, " n"]:
-    """Estimate fx per image: the median over the first views of pixel radius over tangent of the angle off the axis.
+def _focal(images: list[ImageObservations]) -> float:
+    """Estimate fx: the median over the first views of pixel radius over tangent of the angle off the axis.
 
-    Raises InputError where no first view shows it.
+    Raises RejectedError where no first view shows it.
     """
-    if pinhole.focal_px is not None:
-        return np.full(len(images), pinhole.focal_px)
     ratios = []
     for o in images:
         n = o.direction[o.second_count :]
@@ -59,23 +56,20 @@ def _focal(images: list[ImageObservations], pinhole: Pinhole) -> Float[ndarray, 
         radius = np.broadcast_to(np.hypot(*o.pixel_offset), usable.shape)
         ratios.append((radius * n[:, 2])[usable] / np.hypot(n[:, 0], n[:, 1])[usable])
     if not sum(ratio.size for ratio in ratios):
-        raise InputError("no first view of a pair has points in front of the camera; give the intrinsics")
-    shared = float(np.median(np.concatenate(ratios)))
-    if pinhole.shared:
-        return np.full(len(images), shared)
-    return np.array([np.median(ratio) if ratio.size else shared for ratio in ratios])
+        raise RejectedError("no first view of a pair has points in front of its camera")
+    return float(np.median(np.concatenate(ratios)))
 
 
 def _depths(
-    images: list[ImageObservations], focal: Float[ndarray, " n"], pairs: int
+    images: list[ImageObservations], focal: float, pairs: int
 ) -> tuple[list[Float[ndarray, " _"]], Float[ndarray, " e"]]:
     """Estimate the depth of each image in its own unit, and the log of each pair's unit in that of its first image."""
     depth = []
     unit = np.zeros(pairs)
-    for o, f in zip(images, focal, strict=True):
+    for o in images:
         first = slice(o.second_count, None)
         if len(o.pair) == o.second_count:
-            depth.append(_depth_by_resection(o, float(f)))
+            depth.append(_depth_by_resection(o, focal))
             continue
         forward = np.maximum(o.direction[first, 2], 1e-6).astype(np.float64)
         log_depth = o.log_range[first] + np.log(forward)
@@ -108,18 +102,18 @@ def _depth_by_resection(o: ImageObservations, focal: float) -> Float[ndarray, " 
 def _similarities(
     images: list[ImageObservations],
     edges: Int[ndarray, "e 2"],
-    focal: Float[ndarray, " n"],
+    focal: float,
     depth: list[Float[ndarray, " _"]],
     unit: Float[ndarray, " e"],
 ) -> PairSimilarities:
     """Register each image's own points to its second views (Umeyama 1991, weights by Geman-McClure)."""
     first_from_second, log_ratio = np.empty((len(edges), 4, 4)), np.empty(len(edges))
     residual = np.empty(len(edges))
-    for o, f, z in zip(images, focal, depth, strict=True):
+    for o, z in zip(images, depth, strict=True):
         n = o.second_count
         if n == 0:
             continue
-        x = np.concatenate([o.pixel_offset / f, np.ones_like(o.pixel_offset[:1])]) * z
+        x = np.concatenate([o.pixel_offset / focal, np.ones_like(o.pixel_offset[:1])]) * z
         scale = np.exp(o.log_range[:n] - unit[o.pair[:n], None])
         y = np.swapaxes(o.direction[:n] * scale[:, None], 1, 2)
         weight = o.weight[:n].astype(np.float64)

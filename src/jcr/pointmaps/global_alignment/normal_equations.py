@@ -18,28 +18,25 @@ from jcr.pointmaps.global_alignment.pointmap_residuals import Noise, Residuals, 
 
 @dataclass(frozen=True)
 class Layout:
-    """Order of the unknowns in the reduced system: steps of the cameras, log focals, log pair scales."""
+    """Order of the unknowns in the reduced system: steps of the cameras, log focal, log pair scales."""
 
     images: int
     pairs: int
-    focals: int
-    """0: given; 1: shared; else one per image."""
 
     @property
     def size(self) -> int:
         """Number of unknowns."""
-        return 6 * self.images + self.focals + self.pairs
+        return 6 * self.images + 1 + self.pairs
 
-    def focal(self, image: int) -> int | None:
-        """Return the column of the log focal of an image; None where it is given."""
-        if self.focals == 0:
-            return None
-        return 6 * self.images + (image if self.focals > 1 else 0)
+    @property
+    def focal(self) -> int:
+        """Column of the log focal."""
+        return 6 * self.images
 
     @property
     def scales(self) -> Int[ndarray, " e"]:
         """Columns of the log pair scales."""
-        return 6 * self.images + self.focals + np.arange(self.pairs)
+        return 6 * self.images + 1 + np.arange(self.pairs)
 
 
 def depth_equations(

@@ -8,13 +8,42 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.pointmaps.global_alignment.alignment import Pinhole
 from jcr.pointmaps.pairs import PairPredictions
 
 CELL_SIDE = 4
 """Residuals are correlated over an image; their cell means on a 4x4 grid measure by how much."""
 POOR = 0.2
 """Share of a good pixel's weight below which a cell's best pixel is left out."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Predictions with the fixed parameters of their alignment."""
+
+    predictions: PairPredictions
+    principal_point_px: tuple[float, float]
+    """x, y on the pointmaps' grid, pixel (0, 0) being a centre."""
+    aspect: float
+    """Ratio fy / fx."""
+    log_weight: bool
+    """Whether confidences follow DUSt3R, from 1 up with weight log C; else they are weights."""
+
+    @classmethod
+    def of(cls, predictions: PairPredictions) -> "Problem":
+        """Return the problem of some predictions; the principal point is the middle without their intrinsics."""
+        given = predictions.intrinsics
+        height, width = predictions.conf.shape[1:]
+        middle = ((width - 1) / 2, (height - 1) / 2) if given is None else (given.cx, given.cy)
+        largest = max(float(conf.max()) for conf in predictions.conf)
+        return cls(predictions, middle, given.fy / given.fx if given else 1.0, largest > 1.0)
+
+    def weigh(self, confidence: Float[ndarray, "*k"]) -> Float[ndarray, "*k"]:
+        """Return the weights of confidences, at least 0."""
+        return np.log(np.maximum(confidence, 1.0)) if self.log_weight else confidence
+
+    def observe_all(self, count: int) -> "list[ImageObservations]":
+        """Gather all pointmaps at about `count` pixels of every image."""
+        return [observe(self, k, pixels) for k, pixels in enumerate(choose_pixels(self, count))]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,12 +84,13 @@ class ImageObservations:
         return self.observer[self.second]
 
 
-def choose_pixels(predictions: PairPredictions, count: int) -> list[Int[ndarray, " _"]]:
+def choose_pixels(problem: Problem, count: int) -> list[Int[ndarray, " _"]]:
     """Choose per image the most confident pixel of each of about `count` equal cells; return flat indices.
 
     Equal cells keep the whole field of view, which a plain ranking by confidence would give up. Cells without
     a pixel worth having (sky) are left out. Raises InputError for an image without any confidence.
     """
+    predictions = problem.predictions
     height, width = predictions.conf.shape[1:]
     side = np.sqrt(max(1.0, height * width / count))
     rows, columns = max(1, round(height / side)), max(1, round(width / side))
@@ -78,36 +108,21 @@ def choose_pixels(predictions: PairPredictions, count: int) -> list[Int[ndarray,
         total[second] += conf2.ravel()
     shown = np.bincount(predictions.edges.ravel(), minlength=len(total)).astype(np.float32)
     chosen = []
-    for k, weight in enumerate(weigh(total / shown[:, None], weight_is_log(predictions))):
+    for k, weight in enumerate(problem.weigh(total / shown[:, None])):
         best = np.maximum.reduceat(weight[by_cell], starts)
         if best.max() <= 0:
-            name = predictions.images[k] if predictions.images else f"#{k}"
-            raise InputError(f"no pixel of image {name} has any confidence; leave the image out")
+            raise InputError(
+                f"no pixel of image {predictions.names[k]} has any confidence; leave the image out"
+            )
         winners = by_cell[weight[by_cell] == best[cell[by_cell]]]
         winners = winners[np.unique(cell[winners], return_index=True)[1]]
         chosen.append(winners[best > POOR * np.quantile(best, 0.9)])
     return chosen
 
 
-def weigh(confidence: Float[ndarray, "*k"], log_weight: bool) -> Float[ndarray, "*k"]:
-    """Return the weights of confidences, at least 0."""
-    return np.log(np.maximum(confidence, 1.0)) if log_weight else confidence
-
-
-def weight_is_log(predictions: PairPredictions) -> bool:
-    """Test whether confidences follow DUSt3R, from 1 up with weight log C; else they are weights."""
-    largest = max(float(conf.max()) for conf in predictions.conf)
-    return largest > 1.0
-
-
-def observe(
-    predictions: PairPredictions,
-    pinhole: Pinhole,
-    image: int,
-    pixels: Int[ndarray, " m"] | slice,
-    log_weight: bool,
-) -> ImageObservations:
+def observe(problem: Problem, image: int, pixels: Int[ndarray, " m"] | slice) -> ImageObservations:
     """Gather the pointmaps of all pairs at `pixels` (flat indices) of one image."""
+    predictions = problem.predictions
     height, width = predictions.conf.shape[1:]
     as_second = np.flatnonzero(predictions.edges[:, 1] == image)
     as_first = np.flatnonzero(predictions.edges[:, 0] == image)
@@ -120,15 +135,15 @@ def observe(
     distance = np.sqrt(np.einsum("kcm,kcm->km", points, points))
     usable = distance > 1e-12
     distance[~usable] = 1.0
-    weight = weigh(confidence, log_weight)
+    weight = problem.weigh(confidence)
     flat = np.arange(height * width)[pixels]
     y, x = np.divmod(flat, width)
-    cx, cy = pinhole.principal_point_px
+    cx, cy = problem.principal_point_px
     coarse = (y * CELL_SIDE // height) * CELL_SIDE + x * CELL_SIDE // width
     pair = np.concatenate([as_second, as_first])
     return ImageObservations(
         image=image,
-        pixel_offset=np.stack([x - cx, (y - cy) / pinhole.aspect]).astype(np.float32),
+        pixel_offset=np.stack([x - cx, (y - cy) / problem.aspect]).astype(np.float32),
         cell=(coarse[:, None] == np.arange(CELL_SIDE**2)).astype(np.float32),
         pair=pair,
         observer=predictions.edges[pair, 0],

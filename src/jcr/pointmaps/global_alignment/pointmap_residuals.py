@@ -32,7 +32,8 @@ class State:
     """Unknowns of the alignment."""
 
     recon_from_camera: Float[ndarray, "n 4 4"]
-    log_focal: Float[ndarray, " n"]
+    log_focal: float
+    """Log of fx, px."""
     log_pair_scale: Float[ndarray, " e"]
     pair_error: Float[ndarray, "e 6"]
     """Twist (v, ω), in the axes of a pair's first camera, by which the network misplaced its second view."""
@@ -79,7 +80,7 @@ def residuals(observations: ImageObservations, state: State, log_depth: Float[nd
 
     depth = np.exp(log_depth).astype(np.float32)
     ray = np.ones((3, len(depth)), np.float32)
-    ray[:2] = o.pixel_offset * np.float32(np.exp(-state.log_focal[o.image]))
+    ray[:2] = o.pixel_offset * np.float32(np.exp(-state.log_focal))
     depth_arm = camera[:3, :3].astype(np.float32) @ (ray * depth)
     focal_arm = camera[:3, 2:3].astype(np.float32) * depth - depth_arm
 
