@@ -1,4 +1,4 @@
-"""A table with a box and a ball whose every distance is known, as a ring of cameras would see it."""
+"""Table with a box and a ball, whose distances are known, and a ring of cameras around it."""
 
 import numpy as np
 from jaxtyping import Float
@@ -8,7 +8,7 @@ from jcr.camera import rays
 from jcr.records import Intrinsics, PointCloud
 
 TABLE_HALF = np.array([0.4, 0.35, 0.02])
-"""Its top is z = 0."""
+"""Half of the table's sides (m); its top is z = 0."""
 BOX_CENTER, BOX_HALF = np.array([0.12, 0.05, 0.05]), np.array([0.06, 0.04, 0.05])
 BALL_CENTER, BALL_RADIUS = np.array([-0.12, -0.05, 0.06]), 0.06
 LABELS = ("none", "table", "box", "ball")
@@ -19,7 +19,7 @@ FOCAL_PX, WIDTH, HEIGHT = 250.0, 240, 200
 def signed_distance(
     x: Float[ndarray, "n 3"], without_box: bool = False, without_ball: bool = False
 ) -> Float[ndarray, " n"]:
-    """Metres to the nearest true surface, negative inside."""
+    """Return metres to the nearest true surface, negative inside."""
 
     def to_box(center: ndarray, half: ndarray) -> ndarray:
         q = np.abs(x - center) - half
@@ -34,19 +34,19 @@ def signed_distance(
 
 
 def camera_centers(cameras: int) -> Float[ndarray, "m 3"]:
-    """On a ring, alternately high and low."""
+    """Return places on a ring, alternately high and low."""
     rotation = 2 * np.pi * np.arange(cameras) / cameras
     up = np.radians(np.where(np.arange(cameras) % 2, 35, 65))
     return 0.7 * np.stack([np.cos(up) * np.cos(rotation), np.cos(up) * np.sin(rotation), np.sin(up)], -1)
 
 
 def true_color(x: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
-    """A smooth pattern in [0, 1]."""
+    """Return a smooth pattern in [0, 1]."""
     return 0.5 + 0.45 * np.sin(x * [30, 40, 50] + [0, 1, 2])
 
 
 def cloud(points: int = 60_000, cameras: int = 10, noise: float = 0.0, seed: int = 0) -> PointCloud:
-    """What the cameras see, with Gaussian noise (m) along the rays."""
+    """Return the points that the cameras see, with Gaussian noise (m) along the rays."""
     draw = np.random.default_rng(seed)
     column, row = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     parts = []
@@ -81,7 +81,7 @@ def cloud(points: int = 60_000, cameras: int = 10, noise: float = 0.0, seed: int
 
 
 def looking_at_table(cameras: int) -> Float[ndarray, "m 4 4"]:
-    """base_from_camera of the ring, at different distances and rotated about their axes."""
+    """Return base_from_camera of the ring, at different distances and rotated about their axes."""
     poses = np.tile(np.eye(4), (cameras, 1, 1))
     for k, center in enumerate(camera_centers(cameras)):
         z = -center / np.linalg.norm(center)
@@ -94,7 +94,7 @@ def looking_at_table(cameras: int) -> Float[ndarray, "m 4 4"]:
 
 
 def cast_depth(base_from_camera: Float[ndarray, "4 4"], intrinsics: Intrinsics) -> Float[ndarray, "h w"]:
-    """Depth along the optical axis (m) at every pixel; 0 where nothing is hit."""
+    """Return depth along the optical axis (m) at every pixel; 0 where nothing is hit."""
     ray = rays(intrinsics).reshape(-1, 3)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     reach, _ = _cast(base_from_camera[:3, 3], ray @ base_from_camera[:3, :3].T)

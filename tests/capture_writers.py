@@ -95,7 +95,7 @@ def write_npy(folder: Path, capture: Capture) -> Path:
 def write_tum(
     folder: Path, capture: Capture, header: str = "", start: int = 1_700_000_000_123_456_789
 ) -> Path:
-    """A trajectory beside images that are named by their time stamps, in nanoseconds, half-way between samples.
+    """Write a trajectory beside images that are named by their time stamps (ns), half-way between samples.
 
     The gripper stands at each image's pose from one sample to the next.
     """
@@ -116,7 +116,7 @@ def write_tum(
 
 
 def write_colmap(folder: Path, capture: Capture, recon_from_camera: np.ndarray) -> Path:
-    """A model without points in sparse/0, its images in images/, and a table with their names."""
+    """Write a model without points in sparse/0, its images in images/, and a table with their names."""
     import pycolmap
 
     write_table(folder, capture)
@@ -231,7 +231,7 @@ def arm_poses(angles: np.ndarray) -> np.ndarray:
 
 
 def assert_joints(capture: Capture, angles: np.ndarray) -> None:
-    """The capture has these joint angles, in any order, and the URDF beside its images, which explains its poses."""
+    """Write these joint angles, in any order, and the URDF that explains the poses into a capture."""
     assert capture.joints is not None and capture.urdf == capture.folder / "robot.urdf"
     order, expected = np.argsort(capture.joints[:, 0]), np.argsort(angles[:, 0])
     np.testing.assert_allclose(capture.joints[order], angles[expected], atol=1e-6)
@@ -263,7 +263,7 @@ def write_lerobot(
     fps: int = 10,
     codec: str | None = "libsvtav1",
 ) -> Path:
-    """A data set of episodes (images, states), with one camera; v3.0 keeps them all in one table and video.
+    """Write a data set of episodes (images, states) with one camera; v3.0 keeps them all in one table and video.
 
     Without a codec the images are in the table, as PNG files.
     """

@@ -1,4 +1,4 @@
-"""A headless browser for the tests of pages."""
+"""Headless browser for the tests of pages."""
 
 import base64
 import io
@@ -18,7 +18,7 @@ from PIL import Image
 
 
 class Chromium:
-    """A headless browser, spoken to in its DevTools protocol through a pair of pipes."""
+    """Headless browser, controlled by its DevTools protocol through a pair of pipes."""
 
     def __init__(self, profile: Path, *more_flags: str) -> None:
         names = ("chromium", "chromium-browser", "google-chrome")
@@ -112,7 +112,7 @@ class Chromium:
         return answer["result"].get("value")
 
     def image(self, selector: str) -> np.ndarray:
-        """An element as it is seen (h,w,3), once it is drawn; a page that is emulated on a phone scrolls elsewhere."""
+        """Return the image of an element (h,w,3), once it is drawn; a page that is emulated on a phone scrolls elsewhere."""
         self.draw()
         box = self.js(
             f"(() => {{ const b = document.querySelector('{selector}').getBoundingClientRect(); return"
@@ -122,7 +122,7 @@ class Chromium:
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB"))
 
     def center(self, selector: str) -> tuple[float, float]:
-        """Of an element in the window (pixels), scrolled to and drawn there: mouse and finger reach it."""
+        """Return the middle of an element in the window (pixels), after it was scrolled to and drawn."""
         self.js(f"document.querySelector('{selector}').scrollIntoView({{block: 'center'}})")
         self.draw()
         box = self.js(

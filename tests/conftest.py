@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 def shrunk_capture(source: Path, folder: Path, images: int, width: int) -> Path:
-    """The first images of a capture and their poses, in `folder`, reduced to a width in pixels."""
+    """Write the first images of a capture, reduced to a width in pixels, and their poses into `folder`."""
     (folder / "images").mkdir(parents=True)
     content = json.loads((source / "capture.json").read_text())
     frames, intrinsics = content["frames"][:images], content["intrinsics"]
@@ -55,7 +55,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 
 SLOW_FIXTURES = {"done", "small_done", "opengl", "real_captures", "tiny_sam", "garbage_weights"}
-"""They run the command line, draw, reconstruct from images, or load a network."""
+"""Fixtures that run the command line, draw, reconstruct from images, or load a network."""
 
 
 FIRST = (
@@ -77,7 +77,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Modules and tests stay to the end: the garbage collector, 4 % of the suite's time, need not walk them."""
+    """Take modules and tests, which stay to the end, from the garbage collector: it took 4 % of the suite's time."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(10_000, 20, 20)
@@ -85,7 +85,7 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """No test of the fast tier starts a process; wide-scoped fixtures run inside this, too."""
+    """Let no test of the fast tier start a process, nor its fixtures of a wide scope."""
 
     def refuse(*arguments: object, **options: object) -> NoReturn:
         pytest.fail(f"{item.nodeid} starts a process: mark it slow")
@@ -111,12 +111,12 @@ def pytest_runtest_call() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def tabletop() -> Path:
-    """The bundled capture."""
+    """Return the bundled capture."""
     return ROOT / "examples" / "tabletop"
 
 
 def made_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
-    """A folder that `make` fills, once for all workers of pytest-xdist; no test changes it."""
+    """Return a folder that `make` fills once for all workers of pytest-xdist; no test changes it."""
     base = tmp_path_factory.getbasetemp()
     together = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "made"
     together.mkdir(exist_ok=True)
@@ -136,7 +136,7 @@ def run_by_command(capture: Path, out: Path) -> None:
 
 @pytest.fixture(scope="session")
 def small_capture(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> Path:
-    """Five images of the bundled capture, 200 pixels wide: the first attempt is kept, a whole run takes seconds."""
+    """Return five images of the bundled capture, 200 pixels wide, of which a whole run takes seconds."""
     return made_once(tmp_path_factory, "capture", lambda folder: shrunk_capture(tabletop, folder, 5, 200))
 
 
@@ -157,20 +157,20 @@ def chromium(browser: Chromium) -> Chromium:
 
 @pytest.fixture(scope="session")
 def done(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> Path:
-    """The run folder of the bundled capture, a copy of this worker's own."""
+    """Return the run folder of the bundled capture, a copy of this worker's own."""
     made = made_once(tmp_path_factory, "tabletop", lambda out: run_by_command(tabletop, out))
     return shutil.copytree(made, tmp_path_factory.mktemp("run") / "tabletop")
 
 
 @pytest.fixture(scope="session")
 def small_done(tmp_path_factory: pytest.TempPathFactory, small_capture: Path) -> Path:
-    """The run folder of `small_capture`; no test changes it."""
+    """Return the run folder of `small_capture`; no test changes it."""
     return made_once(tmp_path_factory, "small", lambda out: run_by_command(small_capture, out))
 
 
 @pytest.fixture(scope="session")
 def true_mesh(tabletop: Path) -> "trimesh.Trimesh":
-    """The simulated table of the bundled capture and all that stands on it, in the base frame."""
+    """Return the simulated table of the bundled capture and all objects on it, in the base frame."""
     import trimesh
 
     scene = make_scene("tabletop", read_truth(tabletop).seed)
@@ -184,7 +184,7 @@ def true_mesh(tabletop: Path) -> "trimesh.Trimesh":
 
 @pytest.fixture(scope="session")
 def real_captures() -> Path:
-    """Real captures with references, which live beside the project and not in it."""
+    """Return real captures with references, which are beside the project and not in it."""
     folder = SHARED / "data"
     if not folder.is_dir():
         pytest.skip(f"the real captures are not at {folder}")

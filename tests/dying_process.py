@@ -1,4 +1,4 @@
-"""A task that takes its process with it, where a spawned process can import it."""
+"""Task that ends its process, where a spawned process can import it."""
 
 import os
 
@@ -6,7 +6,7 @@ from jcr.pipeline.batch import Row, Task
 
 
 def dies_on_bad(task: Task) -> Row:
-    """What a process short of memory does."""
+    """End this process as the system ends one that is short of memory."""
     if task.capture.name == "bad":
         os._exit(9)
     return Row(capture=str(task.capture), out=str(task.out), status="accepted", offset_std_mm=1.0)

@@ -1,4 +1,4 @@
-"""A controller that speaks the protocol of its maker's own package, as far as reading poses needs."""
+"""Controllers with the protocols of their makers' packages, as far as reading poses needs."""
 
 import json
 import socket
@@ -17,7 +17,7 @@ from jcr.geometry import rotation_log
 
 @contextmanager
 def fake_xarm(host: str, pose: ndarray, joints: ndarray) -> Iterator[None]:
-    """A controller in a process of its own: the makers' packages hold Python's lock while they wait for it."""
+    """Run a controller in a process of its own: the makers' packages hold Python's lock while they wait for it."""
     numbers = [*pose.ravel().tolist(), *joints.tolist()]
     command = [sys.executable, __file__, host, json.dumps(numbers)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:

@@ -1,4 +1,4 @@
-"""The command line without a process of its own, which would import everything again."""
+"""Command line without a process of its own, which would import everything again."""
 
 import contextlib
 import io

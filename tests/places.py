@@ -1,4 +1,4 @@
-"""Where the project lies, and what may lie beside it."""
+"""Folders of the project and of what may be beside it."""
 
 from pathlib import Path
 

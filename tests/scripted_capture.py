@@ -1,4 +1,4 @@
-"""A capture whose calibration is scripted: what `LiveSession` does with its states, without reconstructing anything."""
+"""Live capture with scripted calibrations, for tests of `LiveSession` without a reconstruction."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -28,7 +28,7 @@ RATE = 10
 
 
 def a_hand_eye(met: bool) -> HandEye:
-    """An accepted calibration that meets what is required, or does not."""
+    """Return an accepted calibration that meets its requirement, or does not."""
     rng = np.random.default_rng(0)
     poses = transform(rotation_exp(0.5 * rng.normal(size=(10, 3))), 0.2 * rng.normal(size=(10, 3)))
     found = jcr.solve_hand_eye(poses, poses @ transform(np.eye(3), np.array([0.05, 0.0, 0.1])))
@@ -45,7 +45,7 @@ def a_hand_eye(met: bool) -> HandEye:
 
 @dataclass
 class Scripted:
-    """A calibration that is accurate from a number of images on; `contradicted` is an image with a wrong pose."""
+    """Calibration that is accurate from a number of images on; `contradicted` is an image with a wrong pose."""
 
     live: LiveFolder
     arm: None = None
@@ -118,7 +118,7 @@ def a_capture(
     accurate_from: int = 100,
     **options: Any,
 ) -> tuple[LiveSession, Scripted]:
-    """A capture into a folder by these frames."""
+    """Return a session that captures these frames into a folder, and its calibration."""
     scripted: Any = Scripted(LiveFolder(folder), accurate_from=accurate_from)
     camera = Camera(frames, lambda: None)
     options = {"require": REQUIRED} | options
@@ -126,7 +126,7 @@ def a_capture(
 
 
 def still_frames(image: Callable[[], ndarray]) -> Iterator[Frame]:
-    """What `image` gives, four times a second."""
+    """Yield the result of `image` four times a second."""
     step = 0
     while True:
         yield Frame(image(), 0.25 * step)
@@ -155,7 +155,7 @@ def poses(tabletop: Path) -> list[ndarray]:
 
 
 def video(path: Path, tabletop: Path, images: range, rest_s: int = 1) -> Path:
-    """The arm rests for a while before each image and swings for half a second in between."""
+    """Write a video in which the arm rests before each image and swings for half a second in between."""
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), RATE, (640, 480))
     for k in images:
         rgb = still(tabletop, k)

@@ -10,7 +10,7 @@ from types import FunctionType
 from typing import Any
 
 CALLS = 4
-"""Of one function in one test."""
+"""Checked calls of one function in one test."""
 
 _checks: Counter[tuple[str, str]] = Counter()
 _resting: list[FunctionType] = []
@@ -24,7 +24,7 @@ def begin() -> None:
 
 
 def checked(function: Callable[..., Any]) -> Callable[..., Any]:
-    """What jaxtyping calls to check arguments, or a result: beartype, until `CALLS` calls were found right.
+    """Check arguments or a result for jaxtyping by beartype, until `CALLS` calls were right.
 
     Beartype writes a checker when a function is first called: of all that are imported a test calls a few.
     """

@@ -15,7 +15,7 @@ Arrays = tuple[np.ndarray, ...]
 
 
 def once(function: Callable[..., Arrays], most: int) -> Callable[..., Arrays]:
-    """The function, which does not compute the same again."""
+    """Return the function with its results kept, so that it computes nothing twice."""
     known: dict[object, Arrays] = {}
     lock = threading.Lock()
 
