@@ -112,7 +112,7 @@ class Chromium:
         return answer["result"].get("value")
 
     def image(self, selector: str) -> np.ndarray:
-        """Return the image of an element (h,w,3), once it is drawn; a page that is emulated on a phone scrolls elsewhere."""
+        """Return the image of an element (h,w,3), once it is drawn; a page emulated on a phone scrolls elsewhere."""
         self.draw()
         box = self.js(
             f"(() => {{ const b = document.querySelector('{selector}').getBoundingClientRect(); return"
