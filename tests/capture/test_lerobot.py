@@ -155,13 +155,13 @@ def small(tmp_path_factory: pytest.TempPathFactory, tabletop: Path, problem: Han
         ({"episode": (3,)}, "there is no episode 3; they are counted from 0"),
         (
             {"camera_topic": "front"},
-            "choose the wrist camera with --camera-topic: observation.images.wrist",
+            "the wrist camera: front is not there; choose one with --camera-topic: observation.images.wrist",
         ),
         (
             {"joint_topic": "state"},
-            "no state; choose the robot's state with --joint-topic: .*cartesian_position",
+            "the robot's state: state is not there; choose one with --joint-topic: .*cartesian_position",
         ),
-        ({"urdf": Path("nowhere.urdf")}, "no observation.state; choose"),
+        ({"urdf": Path("nowhere.urdf")}, "the robot's state: choose one with --joint-topic"),
         ({"pose_convention": "matrix"}, "6 numbers, a pose of this convention has 16"),
     ],
 )

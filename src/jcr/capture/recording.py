@@ -24,6 +24,16 @@ BESIDE_ALL_POSES_NS = 1e15
 """Gap (ns) beyond which the frame is before the first pose or after the last."""
 
 
+def chosen_name(names: Sequence[str], asked: str | None, usual: Sequence[str], what: str, option: str) -> str:
+    """Return the topic or key that an option asks for, or the only usual one; raise InputError that lists all names."""
+    if asked in names:
+        return str(asked)
+    if asked is None and len(usual) == 1:
+        return usual[0]
+    wrong = "" if asked is None else f"{asked} is not there; "
+    raise InputError(f"{what}: {wrong}choose one with {option}: {', '.join(names) or 'there are none'}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Recording:
     """Frames of a recording, a row each, whose images are read on demand."""

@@ -15,8 +15,6 @@ from jcr.rounding import significant
 
 CONFIRMING_IMAGES = 8
 """Least number of used images with which the leave-one-out error can confirm an accuracy."""
-EARLIER = 5
-"""Number of earlier accuracies that are printed."""
 FIRST_ADVICE = "rotate the wrist by 20° or more, and move, between images"
 
 
@@ -140,10 +138,6 @@ def progress_lines(state: Progress, notation: Notation) -> list[str]:
     if state.hand_eye is None and len(state.images) <= 1:
         return [FIRST_ADVICE]
     lines = [str(state).split("\n")[0]]
-    if len(earlier := state.history[-EARLIER - 1 : -1]) and state.now is not None:
-        course = " → ".join(significant(one.translation_mm) for one in (*earlier, state.now))
-        angles = " → ".join(significant(one.rotation_deg) for one in (*earlier, state.now))
-        lines.append(f"  image by image: {course} mm, {angles}°")
     if (error := state.leave_one_out) is not None:
         lines.append(
             f"  leave-one-out error {significant(error.translation_mm)} mm and {significant(error.rotation_deg)}°"

@@ -15,7 +15,7 @@ from jcr.capture.formats import Format
 from jcr.capture.joints import JointTrack, read_arm
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import speed
-from jcr.capture.recording import Picture, Recording, capture_of_recording
+from jcr.capture.recording import Picture, Recording, capture_of_recording, chosen_name
 from jcr.capture.ros_image import depth_of, image_of
 from jcr.capture.tf_tree import TfTree
 from jcr.errors import InputError
@@ -202,7 +202,7 @@ def _camera_topic(reader: Any, options: ReadOptions, path: Path) -> str:
         for topic in topics
         if "depth" not in topic.lower() and topic.removesuffix("/compressed") not in {*topics} - {topic}
     ]
-    return _chosen(
+    return chosen_name(
         topics, options.camera_topic, colour, f"{path}: the wrist camera's topic", "--camera-topic"
     )
 
@@ -215,18 +215,8 @@ def _pose_connections(reader: Any, options: ReadOptions, path: Path) -> list[Any
             raise InputError(f"{path}: no /tf; give --urdf for joint states, or record tf as well")
         return found
     topics = sorted({c.topic for c in reader.connections if c.msgtype == JOINTS})
-    topic = _chosen(topics, options.joint_topic, topics, f"{path}: the joint states", "--joint-topic")
+    topic = chosen_name(topics, options.joint_topic, topics, f"{path}: the joint states", "--joint-topic")
     return [c for c in reader.connections if c.topic == topic]
-
-
-def _chosen(topics: list[str], asked: str | None, usual: list[str], what: str, option: str) -> str:
-    """Return the topic of an option, or the only usual one; raise InputError that lists the existing topics."""
-    if asked in topics:
-        return str(asked)
-    if asked is None and len(usual) == 1:
-        return usual[0]
-    wrong = "" if asked is None else f"{asked} is not there; "
-    raise InputError(f"{what}: {wrong}choose one with {option}: {', '.join(topics) or 'there are none'}")
 
 
 def _joint_track(

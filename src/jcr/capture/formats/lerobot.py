@@ -18,7 +18,7 @@ from jcr.capture.joints import read_arm
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_json, validated
 from jcr.capture.pose_track import pose_track, speed
-from jcr.capture.recording import Picture, Recording, capture_of_recording
+from jcr.capture.recording import Picture, Recording, capture_of_recording, chosen_name
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.progress import Progress
@@ -81,12 +81,21 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     Raises InputError that lists the existing cameras, states or episodes where the options name others.
     """
     info: Info = validated(Info, read_json(path / INFO), str(path / INFO))
-    camera, key = _camera(info.features, options, path), _state_key(info.features, options, path)
+    features = info.features
+    cameras = [key for key, feature in features.items() if feature.dtype in ("video", "image")]
+    camera = chosen_name(
+        cameras, options.camera_topic, cameras, f"{path}: the wrist camera", "--camera-topic"
+    )
+    states = [key for key, feature in features.items() if feature.dtype.startswith("float")]
+    usual = [key for key in (CARTESIAN, STATE) if key in states and not (key == CARTESIAN and options.urdf)][
+        :1
+    ]
+    key = chosen_name(states, options.joint_topic, usual, f"{path}: the robot's state", "--joint-topic")
     episodes = [read_episode(path, info, camera, key, index) for index in options.episode]
     if len({episode.state.shape[1] for episode in episodes}) > 1:
         raise InputError(f"{path}: {key} has another length in another episode; read one episode")
     state = np.concatenate([episode.state for episode in episodes])
-    poses, joints = _poses(state, key, info.features[key], options, path)
+    poses, joints = _poses(state, key, features[key], options, path)
     ends = np.cumsum([len(episode.time_s) for episode in episodes])
     rows = np.split(np.arange(ends[-1]), ends[:-1])
     recording = Recording(
@@ -227,29 +236,6 @@ def _video_frames(
         raise InputError(
             f"{file}: has no frame at {due[0]:.3f} s, which the data set lists; download it again"
         )
-
-
-def _camera(features: dict[str, Feature], options: ReadOptions, path: Path) -> str:
-    """Return the key of the wrist camera; raise InputError with the keys that there are."""
-    cameras = [key for key, feature in features.items() if feature.dtype in ("video", "image")]
-    if options.camera_topic in cameras:
-        return str(options.camera_topic)
-    if options.camera_topic is None and len(cameras) == 1:
-        return cameras[0]
-    raise InputError(
-        f"{path}: choose the wrist camera with --camera-topic: {', '.join(cameras) or 'there are no videos or images'}"
-    )
-
-
-def _state_key(features: dict[str, Feature], options: ReadOptions, path: Path) -> str:
-    """Return the key of the robot's state; raise InputError with the keys that there are."""
-    key = options.joint_topic or (CARTESIAN if CARTESIAN in features and options.urdf is None else STATE)
-    if key not in features:
-        states = [name for name, feature in features.items() if feature.dtype.startswith("float")]
-        raise InputError(
-            f"{path}: no {key}; choose the robot's state with --joint-topic: {', '.join(states)}"
-        )
-    return key
 
 
 def _poses(
