@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.options import GRASPING, CalibrateOptions
 from jcr.calibration.poses import calibrate_poses
 from jcr.calibration.record import Calibration, calibration_of, write_calibration
-from jcr.calibration.requirement import GRASPING, advised, assumptions_of_poses
+from jcr.calibration.requirement import advised, assumptions_of_poses
 from jcr.calibration.robot_errors import errors_of
 from jcr.calibration.words import summary
 from jcr.capture.read import read_capture

@@ -9,6 +9,9 @@ import tyro
 from jcr.errors import InputError
 from jcr.records import Where
 
+GRASPING = (5.0, 1.0)
+"""mm, degrees: a parallel gripper that opens 10 mm wider than its object has 5 mm to either side, and a degree moves the
+tip of a finger of 100 mm by 2 mm."""
 MOST_POSES = 12
 """Largest number of gripper poses that are proposed to reach the requirement; beyond it no number is given."""
 LengthInImage = tuple[str, float, float, float, float, float]

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.calibration.case import Case
-from jcr.calibration.options import MOST_POSES, CalibrateOptions
+from jcr.calibration.options import GRASPING, MOST_POSES, CalibrateOptions
 from jcr.calibration.robot_errors import RobotErrors, of_poses
 from jcr.estimation.equation import Poses
 from jcr.estimation.next_poses import (
@@ -44,9 +44,6 @@ from jcr.records import (
     Where,
 )
 
-GRASPING = (5.0, 1.0)
-"""Default requirement, mm and degrees: a parallel gripper that opens 10 mm wider than its object has 5 mm to either
-side, and a degree moves the tip of a finger of 100 mm by 2 mm."""
 PROPOSED = 2
 """Number of gripper poses proposed after a calibration, if these are enough."""
 COMPARED, EXISTING = 80, 40

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from jcr.calibration.requirement import GRASPING
+from jcr.calibration.options import GRASPING
 from jcr.capture.images import read_image
 from jcr.findings import sentence
 from jcr.findings.sentences import reached_in_words

@@ -29,6 +29,7 @@ from jcr.calibration.checks.camera import (
 )
 from jcr.calibration.checks.given_intrinsics import intrinsics_contradiction
 from jcr.calibration.checks.imaged import Imaged, of_case
+from jcr.calibration.options import GRASPING
 from jcr.camera import parameters, with_thin_prism
 from jcr.estimation.components import most_likely
 from jcr.estimation.equation import SCALE, UNKNOWNS, columns_of_arm
@@ -61,8 +62,9 @@ MATERIAL = 0.5
 """Standard deviations by which an effect must move the camera on some axis to be reported."""
 MIN_IMAGES = 6
 """Fewest images with which the sizes of the errors are known beside an effect."""
-LARGE_MOTION = 3e-3, float(np.radians(0.5))
-"""m, rad: beyond these a motion of the camera or the base rejects; robots whose joints have play show smaller ones."""
+LARGE_MOTION = GRASPING[0] * 1e-3, float(np.radians(GRASPING[1]))
+"""m, rad: beyond these a motion of the camera or the base rejects. A smaller one is part of the uncertainty, and the
+requirement decides."""
 
 
 def check_effects(case: Case) -> Checked:
