@@ -103,7 +103,7 @@ def _row(folder: Path, features: FeatureName, gate: bool) -> Row:
 
 
 def _without_gate():
-    """Replace matching and mapping by those without gripper poses: all pairs, none judged, no image placed."""
+    """Replace the matching by one without gripper poses: all pairs, none judged."""
 
     def match_all(
         matcher: Matcher, gripper: Float[ndarray, "n 4 4"], working: Intrinsics, *_: object
@@ -112,7 +112,4 @@ def _without_gate():
         geometries = matcher.geometries(pairs, np.zeros((len(pairs), 2)))
         return Matched(geometries=geometries, gate=None, intrinsics=working)
 
-    def place_none(database: Path, model: object, matcher: Matcher, matched: Matched, *_: object) -> object:
-        return model, matched
-
-    return patch.multiple(mapping, match_with_robot=match_all, _with_predicted_images=place_none)
+    return patch.object(mapping, "match_with_robot", match_all)
