@@ -19,7 +19,6 @@ from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
 from jcr.estimation.arms import RobotName, arm_named
 from jcr.estimation.inverse_kinematics import reach_toward
-from jcr.features.kept import FOLDER
 from jcr.geometry import apply, inverse, retract, rotation_angle, step_between
 from jcr.live.calibration import LiveCalibration
 from jcr.live.progress import Progress
@@ -244,10 +243,7 @@ def fed(folder: Path) -> Fed:
                 live.add(image, pose)
                 latency.append(time.process_time() - begun)
             finished, finish_s = _timed(live.finish)
-        # The folder at once has nothing that the live calibration kept.
-        shutil.copytree(
-            out / "live", out / "bare", ignore=shutil.ignore_patterns(Path(FOLDER).parts[0], LIVE)
-        )
+        shutil.copytree(out / "live", out / "bare", ignore=shutil.ignore_patterns(LIVE))
         batch, at_once_s = _timed(lambda: calibrate(out / "bare", out / "batch"))
     sigmas = None
     if finished is not None and batch is not None:

@@ -1,4 +1,4 @@
-"""Features of images along a table, as a perfect matcher has them, and what the search of pairs makes of them."""
+"""Features of images along a table, matched without error, and the pairs that the search finds."""
 
 from collections.abc import Sequence
 
@@ -22,7 +22,7 @@ GRIPPER_FROM_CAMERA = transform(rotation_exp(np.array([0.1, -0.2, 0.4])), np.arr
 class PointsOfATable:
     """Features that match without error, of points along a table; a camera sees a fifth of its length."""
 
-    every_pair = 12
+    every_pair, farthest = 12, 0.7
 
     def __init__(self, minds_roll: bool) -> None:
         rng = np.random.default_rng(0)
@@ -44,12 +44,15 @@ class PointsOfATable:
             seen = np.flatnonzero(((x_px > 0) & (x_px < [639, 479])).all(1))
             self.ids.append(seen)
             self.x_px.append(x_px[seen] + rng.normal(scale=0.3, size=(len(seen), 2)))
+        of_point = rng.normal(size=(len(points), 32)).astype(np.float32)
+        of_point /= np.linalg.norm(of_point, axis=1, keepdims=True)
+        self.descriptors = [of_point[seen] for seen in self.ids]
         self.asked: dict[bool, list[Key]] = {True: [], False: []}
 
         self.base_from_gripper: Transforms = self.base_from_camera @ inverse(GRIPPER_FROM_CAMERA)
 
     def common(self, key: Key, coarse: bool = False) -> Int[ndarray, "m 2"]:
-        """Rows of the points that two images see; coarse: of every third."""
+        """Return rows of the points that two images see; coarse: of every third."""
         first, second = (self.ids[k] for k in key)
         both, i, j = np.intersect1d(first, second, return_indices=True)
         some = both % 3 == 0 if coarse else np.full(len(both), True)
@@ -59,12 +62,14 @@ class PointsOfATable:
         self.asked[coarse] += pairs
         return [self.common(key, coarse) for key in pairs]
 
-    def descriptors(self, row: int, roll: float) -> tuple[int, ndarray]:
-        raise NotImplementedError
+
+def matcher_of_points(features: PointsOfATable) -> Matcher:
+    """Return the matcher of these features."""
+    return Matcher(features, np.ones(2), camera_of(INTRINSICS, True), True, 0)
 
 
 def matched_pairs_of(features: PointsOfATable, base_from_gripper: Transforms) -> Matched:
-    """The pairs of all images, by these gripper poses."""
-    matcher = Matcher(features, np.ones(2), camera_of(INTRINSICS, True), True, 0)
+    """Return the pairs of all images, by these gripper poses."""
+    matcher = matcher_of_points(features)
     names = [f"{k}.png" for k in range(IMAGES)]
     return match_with_robot(matcher, base_from_gripper, INTRINSICS, True, names, (640, 480))

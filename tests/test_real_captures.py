@@ -39,9 +39,7 @@ def test_within_reach_of_the_marker_reference(
     base_from_recon, scale = fit_similarity(centers, found.recon_from_camera[:, :3, 3])
     fitted = apply_similarity(base_from_recon, scale, found.recon_from_camera[:, :3, 3])
     off_m = np.linalg.norm(fitted - centers, axis=1)
-    # Structure from motion puts one camera of doosan_bench 11 mm off; the calibration rejects that image by name.
-    used = solved.inliers
-    assert used.sum() >= count - 1 and np.median(off_m) < 3e-3 and off_m[used].max() < 0.01
+    assert solved.inliers.sum() == count and np.median(off_m) < 3e-3 and off_m.max() < 0.01
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ KILLS = int(os.environ.get("JCR_TEST_KILLS", "2"))
 IMAGES = 5
 PROCESSES = multiprocessing.get_context("forkserver")
 PROCESSES.set_forkserver_preload(
-    ["jcr.pipeline.run", "jcr.live.calibration", "jcr.sfm.growing", "jcr.report.html"]
+    ["jcr.pipeline.run", "jcr.live.calibration", "jcr.sfm.live_map", "jcr.report.html"]
 )
 
 

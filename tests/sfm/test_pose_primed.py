@@ -1,5 +1,6 @@
 """Pose-primed mapping: poses that are roughly right, of another X, exchanged, shuffled; images that nothing ties."""
 
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from jcr.features.verify import write_geometries, write_keypoints
 from jcr.geometry import Transforms, nearest_rotation, rotation_between_deg, rotation_exp, transform
 from jcr.sfm.mapping import adjust_robustly, camera_of, enter, map_incrementally, quiet_colmap
 from jcr.sfm.pose_primed import map_from_cameras, map_from_gripper_poses, poses_of, with_missing_images
-from points_of_a_table import IMAGES, INTRINSICS, PointsOfATable, matched_pairs_of
+from points_of_a_table import IMAGES, INTRINSICS, PointsOfATable, matched_pairs_of, matcher_of_points
 
 pytestmark = pytest.mark.slow
 
@@ -142,6 +143,32 @@ def test_missing_images_are_added_from_the_map_s_own_x(tmp_path: Path, table: Po
     model = map_from_cameras(database, camera, some, adjust)
     reported = table.base_from_gripper.copy()
     reported[11] = reported[25]  # a stale pose
-    whole = with_missing_images(database, model, reported, adjust)
+    whole = with_missing_images(database, model, reported, matcher_of_points(table), adjust)
     assert sorted(image_id - 1 for image_id in whole.reg_image_ids()) == [k for k in range(IMAGES) if k != 11]
     assert off_mm(table, whole) < 1.0
+
+
+def test_an_image_of_few_matches_is_completed_by_points_of_the_map(tmp_path: Path, table: PointsOfATable):
+    matched = matched_pairs_of(table, table.base_from_gripper)
+    few = {}
+    for key, geometry in matched.geometries.items():
+        if 11 not in key:
+            few[key] = geometry
+        elif key == (10, 11):
+            few[key] = deepcopy(geometry)
+            few[key].inlier_matches = geometry.inlier_matches[:40]
+    database = database_of(tmp_path, table, replace(matched, geometries=few))
+    cameras = {row: pose for row, pose in rough_cameras(table).items() if row != 11}
+    model = map_from_cameras(database, camera_of(INTRINSICS, True), cameras, adjust)
+    model = with_missing_images(database, model, table.base_from_gripper, matcher_of_points(table), adjust)
+    assert model.num_reg_images() == IMAGES
+    ids = [
+        {
+            int(table.ids[one.image_id - 1][one.point2D_idx])
+            for one in model.point3D(tracked.point3D_id).track.elements
+        }
+        for tracked in model.image(12).points2D
+        if tracked.has_point3D()
+    ]
+    assert len(ids) > 200 and all(len(one) == 1 for one in ids)
+    assert off_mm(table, model) < 1.0

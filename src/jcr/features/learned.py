@@ -7,14 +7,14 @@ import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 from numpy import ndarray
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from jcr.features import xfeat
@@ -55,6 +55,7 @@ class LearnedFeatures:
 
     minds_roll = True
     every_pair = 12
+    farthest = xfeat.FARTHEST
 
     def __init__(self, images: Sequence[UInt8[ndarray, "h w 3"]], report: Progress = silent) -> None:
         """Load the networks; keypoints are found when pairs are matched."""
@@ -63,26 +64,20 @@ class LearnedFeatures:
         self._sets: dict[tuple[int, int], _Keypoints] = {}
         self.x_px: list[Float[ndarray, "_ 2"]] = [np.zeros((0, 2)) for _ in images]
         """Keypoints of every image at all angles, px; pixel centres are whole numbers."""
-
-    def add(self, image: UInt8[ndarray, "h w 3"]) -> int:
-        """Append an image and return its row."""
-        self._images.append(image)
-        self.x_px.append(np.zeros((0, 2)))
-        return len(self._images) - 1
-
-    def match(self, i: int, j: int, roll_i: float, roll_j: float) -> Int[ndarray, "m 2"]:
-        """Return rows of the matching keypoints of images i and j, rotated by these angles (rad) before."""
-        return self.matches([(i, j)], np.array([[roll_i, roll_j]]))[0]
+        self.descriptors: list[Float32[ndarray, "_ d"]] = [np.zeros((0, xfeat.LENGTH), np.float32)] * len(
+            images
+        )
+        """Descriptors of these keypoints, of unit length."""
 
     def matches(
         self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], coarse: bool = False
     ) -> list[Int[ndarray, "_ 2"]]:
         """Match many pairs on all cores; `coarse` uses the best COARSE keypoints of each image only."""
-        with _one_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:
+        with ThreadPoolExecutor(os.cpu_count(), initializer=_one_thread) as pool:
             self._find_all(pairs, rolls, pool)
             most = COARSE if coarse else KEYPOINTS
             found = [
-                (self._found(i, float(roll_i)).best(most), self._found(j, float(roll_j)).best(most))
+                (self._sets[_key(i, roll_i)].best(most), self._sets[_key(j, roll_j)].best(most))
                 for (i, j), (roll_i, roll_j) in zip(pairs, rolls, strict=True)
             ]
             rows = pool.map(lambda both: self._matched(*both), found)
@@ -109,13 +104,6 @@ class LearnedFeatures:
         for key, found in zip(new, pool.map(self._detected, new), strict=True):
             self._keep(key, *found)
 
-    def _found(self, row: int, roll: float) -> _Keypoints:
-        """Return the keypoints of an image rotated by an angle (rad), found at the first call."""
-        key = _key(row, roll)
-        if key not in self._sets:
-            self._keep(key, *self._detected(key))
-        return self._sets[key]
-
     def _detected(self, key: tuple[int, int]) -> tuple[_Keypoints, Float[ndarray, "k 2"]]:
         """Return the keypoints of an image rotated by whole degrees, and their positions in the image as given."""
         row, degrees = key
@@ -132,6 +120,7 @@ class LearnedFeatures:
         row, _ = key
         self._sets[key] = replace(found, start=len(self.x_px[row]))
         self.x_px[row] = np.concatenate([self.x_px[row], x_px])
+        self.descriptors[row] = np.concatenate([self.descriptors[row], found.descriptor.numpy()])
 
 
 def _key(row: int, roll: float) -> tuple[int, int]:
@@ -173,12 +162,7 @@ def _mapped(x_px: Float[ndarray, "k 2"], to_from: Float[ndarray, "3 3"]) -> Floa
     return x_px @ to_from[:2, :2].T + to_from[:2, 2]
 
 
-@contextmanager
-def _one_thread():
-    """Limit torch to one thread: its threads wait for each other after every short operation, ten times slower."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
+def _one_thread() -> None:
+    """Limit torch to one thread in this thread alone; several wait for each other after every short operation."""
+    torch.get_num_threads()  # Torch sets the number of a thread when it is first used there, and not again.
+    threadpool_limits(1, user_api="openmp")

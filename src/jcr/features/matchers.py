@@ -5,12 +5,14 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Literal, Protocol, runtime_checkable
 
+import numpy as np
 import pycolmap
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 from numpy import ndarray
 
-from jcr.features.gate import Key
-from jcr.features.verify import Geometries, matched
+from jcr.features.gate import Key, Pair
+from jcr.features.verify import Geometries, View, matched, pair_of
+from jcr.records import Intrinsics
 
 FeatureName = Literal["sift", "xfeat"]
 
@@ -21,6 +23,10 @@ class Features(Protocol):
 
     x_px: list[Float[ndarray, "_ 2"]]
     """Keypoints of every image found so far, px; pixel centres are whole numbers."""
+    descriptors: list[Float32[ndarray, "_ d"]]
+    """Descriptors of these keypoints, of unit length."""
+    farthest: float
+    """Largest distance of the descriptors of a match."""
 
     @property
     def minds_roll(self) -> bool:
@@ -49,8 +55,13 @@ class Matcher:
         self._features, self._scale = features, scale
         self._camera, self.known, self.seed = camera, known, seed
         self.minds_roll, self.every_pair = features.minds_roll, features.every_pair
+        self.farthest = features.farthest
         self.raw: dict[Key, Int[ndarray, "_ 2"]] = {}
         """All matches of the pairs that were tried last, right or wrong."""
+        self._verified: dict[tuple[Key, bytes], pycolmap.TwoViewGeometry | None] = {}
+        """Geometries by pair and matches."""
+        self._pairs: dict[tuple[Key, int, Intrinsics], tuple[Pair, pycolmap.TwoViewGeometry]] = {}
+        """Pairs by the identity of their geometry, which is kept with them so that no other takes its place."""
         self.x_px = self._at_work()
         """Keypoints at the working size; more come with every angle by which an image is rotated."""
 
@@ -58,15 +69,50 @@ class Matcher:
         self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], coarse: bool = False
     ) -> Geometries:
         """Return verified two-view geometries of pairs, their images rotated (rad) before; `coarse` as in Features."""
-        self.raw |= dict(zip(pairs, self._features.matches(pairs, rolls, coarse), strict=True))
+        new = [k for k, key in enumerate(pairs) if self.minds_roll or key not in self.raw]
+        some = [pairs[k] for k in new]
+        self.raw |= dict(zip(some, self._features.matches(some, rolls[new], coarse), strict=True))
         self.x_px = self._at_work()
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             found = pool.map(lambda key: self.verified(key, self.raw[key]), pairs)
             return {key: geometry for key, geometry in zip(pairs, found, strict=True) if geometry is not None}
 
+    @property
+    def descriptors(self) -> list[Float32[ndarray, "_ d"]]:
+        """Unit descriptors of the keypoints of every image."""
+        return self._features.descriptors
+
     def verified(self, key: Key, rows: Int[ndarray, "m 2"]) -> pycolmap.TwoViewGeometry | None:
-        """Return the geometry of some of a pair's matches; None where too few agree on one."""
-        return matched(self.x_px, self._camera, *key, rows, self.seed, self.known)
+        """Return the geometry of some of a pair's matches, kept in memory; None where too few agree on one."""
+        depends = key, np.ascontiguousarray(rows).tobytes()
+        if depends not in self._verified:
+            self._verified[depends] = matched(self.x_px, self._camera, *key, rows, self.seed, self.known)
+        return self._verified[depends]
+
+    def pair(self, view: View, key: Key, geometry: pycolmap.TwoViewGeometry) -> Pair:
+        """Return a geometry with its readings through the view's intrinsics, kept in memory."""
+        depends = key, id(geometry), view.intrinsics
+        if depends not in self._pairs:
+            self._pairs[depends] = pair_of(view, *key, geometry), geometry
+        return self._pairs[depends][0]
+
+    def image_added(self) -> None:
+        """Read the keypoints of an image that the features have since the last pairs."""
+        self.x_px = self._at_work()
+
+    def image_removed(self, row: int) -> None:
+        """Forget the pairs of an image that the features no longer have; the rows of later images are one less."""
+        self.x_px = self._at_work()
+
+        def after(key: Key) -> Key:
+            """Return the rows of a pair without the image."""
+            return key[0] - (key[0] > row), key[1] - (key[1] > row)
+
+        self._pairs.clear()
+        self.raw = {after(key): rows for key, rows in self.raw.items() if row not in key}
+        self._verified = {
+            (after(key), rows): one for (key, rows), one in self._verified.items() if row not in key
+        }
 
     def _at_work(self) -> list[Float[ndarray, "_ 2"]]:
         return [(x + 0.5) * self._scale - 0.5 for x in self._features.x_px]

@@ -9,8 +9,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from numpy import ndarray
 
 from jcr.features.gate import Key
-from jcr.features.kept import KeptFeatures
-from jcr.features.sift import Sift, detect, grey_of, matches
+from jcr.features.sift import FARTHEST, Sift, detect, grey_of, matches
 from jcr.progress import Progress, steps
 
 
@@ -19,6 +18,7 @@ class SiftFeatures:
 
     minds_roll = False
     every_pair = 24
+    farthest = FARTHEST
 
     def __init__(
         self,
@@ -26,34 +26,33 @@ class SiftFeatures:
         size: tuple[int, int],
         threads: int,
         report: Progress,
-        kept: KeptFeatures | None = None,
     ) -> None:
-        """Features that are kept are not found again."""
+        """Find the features of all images, some at once."""
         self.x_px: list[Float[ndarray, "_ 2"]] = []
         """Keypoints of every image, in pixels of images of `size`."""
-        self._descriptors: list[Float32[ndarray, "_ 128"]] = []
-        self._size, self._kept = size, kept
+        self.descriptors: list[Float32[ndarray, "_ 128"]] = []
+        """Descriptors of these keypoints, of unit length."""
+        self._size = size
         with ThreadPoolExecutor(threads) as pool:
-            found = pool.map(self._of_image, range(len(images)), images)
+            found = pool.map(self._of_image, images)
             for _, one in zip(steps(report, "features", images), found, strict=True):
                 self._append(one)
 
     def add(self, image: UInt8[ndarray, "h w 3"]) -> None:
         """Find the features of one more image."""
-        self._append(self._of_image(len(self.x_px), image))
+        self._append(self._of_image(image))
+
+    def remove(self, row: int) -> None:
+        """Remove an image; the rows of later ones are one less."""
+        del self.x_px[row], self.descriptors[row]
 
     def _append(self, found: Sift) -> None:
         self.x_px.append(found[0])
-        self._descriptors.append(found[1])
+        self.descriptors.append(found[1])
 
-    def _of_image(self, row: int, image: UInt8[ndarray, "h w 3"]) -> Sift:
-        kept = self._kept
-        if kept is not None and (there := kept.features(row, self._size)) is not None:
-            return there
-        found = detect(grey_of(image, self._size))
-        if kept is not None and kept.is_written:
-            kept.keep_features(row, self._size, found)
-        return found
+    def _of_image(self, image: UInt8[ndarray, "h w 3"]) -> Sift:
+        """Return the features of an image at the working size."""
+        return detect(grey_of(image, self._size))
 
     def matches(
         self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], coarse: bool = False
@@ -61,7 +60,7 @@ class SiftFeatures:
         """Return rows of matching keypoints of each pair; SIFT uses neither the rotations (rad) nor `coarse`."""
 
         def of_pair(key: Key) -> Int[ndarray, "_ 2"]:
-            return np.stack(matches(self._descriptors[key[0]], self._descriptors[key[1]]), 1)
+            return np.stack(matches(self.descriptors[key[0]], self.descriptors[key[1]]), 1)
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             return list(pool.map(of_pair, pairs))

@@ -22,7 +22,7 @@ from jcr.features.matchers import Matcher
 from jcr.features.pairs import FEW, FIRST_NEIGHBOURS, NEIGHBOURS, all_pairs, near_pairs, seen_in_common
 from jcr.features.still import hidden, still_cells
 from jcr.features.still import in_words as still_in_words
-from jcr.features.verify import Geometries, View, pair_of
+from jcr.features.verify import Geometries, View
 from jcr.geometry import rotation_angle
 from jcr.records import Intrinsics
 
@@ -120,7 +120,7 @@ class _Search:
             clean = self._seen(key, geometry)
             if clean is None:
                 continue
-            pair = pair_of(self.view, *key, clean)
+            pair = self.matcher.pair(self.view, key, clean)
             if key not in self.geometries or self._better(pair, self.pairs[key]):
                 self.geometries[key], self.pairs[key], self.rotations[key] = clean, pair, todo[key]
 
@@ -139,7 +139,7 @@ class _Search:
             if clean is None:
                 del self.geometries[key], self.pairs[key]
             elif clean is not geometry:
-                self.geometries[key], self.pairs[key] = clean, pair_of(self.view, *key, clean)
+                self.geometries[key], self.pairs[key] = clean, self.matcher.pair(self.view, key, clean)
 
     def without_first_motion(self, pairs: Sequence[Pair]) -> dict[Key, tuple[Pair, pycolmap.TwoViewGeometry]]:
         """Return second geometries of pairs, from matches that are not in the first ones."""
@@ -149,7 +149,7 @@ class _Search:
             taken = {(int(a), int(b)) for a, b in pair.rows}
             left = np.array([row for row in raw if (int(row[0]), int(row[1])) not in taken], dtype=int)
             if len(left) and (geometry := self.matcher.verified(pair.key, left)) is not None:
-                found[pair.key] = pair_of(self.view, *pair.key, geometry), geometry
+                found[pair.key] = self.matcher.pair(self.view, pair.key, geometry), geometry
         return found
 
     def second_motions_confirmed(self, found: Gate) -> Gate:
@@ -292,7 +292,9 @@ def _with_intrinsics(search: _Search, guess: Intrinsics) -> Gate:
     intrinsics = focal_by_robot(list(search.matcher.x_px), size, search.geometries.items(), search.motion)
     if intrinsics is not None:
         search.view = View.of(search.matcher.x_px, intrinsics)
-        search.pairs = {key: pair_of(search.view, *key, found) for key, found in search.geometries.items()}
+        search.pairs = {
+            key: search.matcher.pair(search.view, key, found) for key, found in search.geometries.items()
+        }
     return search.gate()
 
 

@@ -1,7 +1,7 @@
 """Calibration that is updated after each image of a capture, with its accuracy, findings and the next gripper pose."""
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -36,7 +36,7 @@ from jcr.live.progress import Accuracy, Progress
 from jcr.live.stillness import ImageSummary
 from jcr.options import checked_options
 from jcr.records import Capture, HandEye, Intrinsics, Reconstruction, Tracks
-from jcr.sfm.growing import Growing
+from jcr.sfm.live_map import LiveMap
 
 if TYPE_CHECKING:
     from jcr.results import RunResult
@@ -87,7 +87,7 @@ class LiveCalibration:
         check_options(self._options)
         name = self._options.robot or folder.robot
         self._reach = Reach(None if name is None else arm_named(name), reach)
-        self._map: Growing | None = None
+        self._map: LiveMap | None = None
         self._mapped: list[str] = []
         self._of_image: dict[str, tuple[Finding, ...]] = {}
         self._history: tuple[Accuracy, ...] = ()
@@ -156,7 +156,7 @@ class LiveCalibration:
             return self.update()
 
     def finish(self, out: str | Path | None = None) -> "RunResult":
-        """Calibrate all images by `jcr.calibrate`, from the features and matches that were found.
+        """Calibrate all images by `jcr.calibrate`.
 
         `out` is the run folder; None: the folder `result` of the capture. Raises as `jcr.calibrate` does.
         """
@@ -174,19 +174,13 @@ class LiveCalibration:
         with self._lock:
             capture = self.live.capture()
             names, before = [] if capture is None else list(capture.images), len(self._mapped)
-            for name in [name for name in self._mapped if name not in names]:
-                self._forget(name)
-            # An image that is back is not the last one: the images after it are mapped after it again.
-            pairs = enumerate(zip(self._mapped, names, strict=False))
-            same = next((k for k, (mapped, name) in pairs if mapped != name), len(self._mapped))
-            for name in self._mapped[same:]:
-                self._forget(name)
             new = [name for name in names if name not in self._mapped]
-            if capture is not None:
-                self._extend(capture)
-            elif self._map is not None:
-                self._map.close()
+            self._of_image = {name: found for name, found in self._of_image.items() if name in names}
+            if capture is None:
                 self._map = None
+            else:
+                self._extend(capture, new)
+            self._mapped = names
             added = new[-1] if new and before <= len(names) else None
             self._refused.clear()
             self.progress = self._calibrated(capture, added)
@@ -201,10 +195,8 @@ class LiveCalibration:
             return self.progress
 
     def close(self) -> None:
-        """Remove the working files, and the files of images that were removed from the capture."""
+        """Remove the files of images that were removed from the capture."""
         with self._lock:
-            if self._map is not None:
-                self._map.close()
             self.live.close()
             self._opened.close()
 
@@ -236,30 +228,12 @@ class LiveCalibration:
                 f"{np.degrees(radians):.0f}°; check that the camera's stream is live"
             )
 
-    def _forget(self, name: str) -> None:
-        """Remove an image from the map."""
-        if self._map is not None:
-            self._map.remove(self._mapped.index(name))
-        self._mapped.remove(name)
-        self._of_image.pop(name, None)
-
-    def _extend(self, capture: Capture) -> None:
-        """Map the images of a capture that are not mapped yet."""
-        for count in range(len(self._mapped) + 1, len(capture) + 1):
-            name = capture.images[count - 1]
-            image = read_image(capture.folder / name)
-            self._of_image[name] = self._image_findings(name, image)
-            if self._map is None or self._map.is_to_be_mapped_again:
-                if self._map is not None:
-                    self._map.close()
-                # All remaining images are mapped at once, as after an interruption.
-                self._map = Growing(capture)
-                for other in capture.images[count:]:
-                    self._of_image[other] = self._image_findings(other, read_image(capture.folder / other))
-                self._mapped = list(capture.images)
-                return
-            self._map.add(_first(capture, count), image)
-            self._mapped.append(name)
+    def _extend(self, capture: Capture, new: Sequence[str]) -> None:
+        """Map the images of a capture, of which these are new."""
+        images = {name: read_image(capture.folder / name) for name in new}
+        self._of_image |= {name: self._image_findings(name, image) for name, image in images.items()}
+        self._map = self._map or LiveMap(capture)
+        self._map.update(capture, images)
 
     def _image_findings(self, name: str, image: UInt8[ndarray, "h w 3"]) -> tuple[Finding, ...]:
         """Return the findings about an image by itself and its time."""
@@ -396,13 +370,6 @@ def checked_pose(base_from_gripper: ArrayLike, where: str) -> Float[ndarray, "4 
             f"{a_metre}"
         )
     return pose
-
-
-def _first(capture: Capture, count: int) -> Capture:
-    """Return the capture of the first images."""
-    return replace(
-        capture, images=capture.images[:count], base_from_gripper=capture.base_from_gripper[:count]
-    )
 
 
 def _longest(tracks: Tracks, most: int) -> Tracks:

@@ -27,7 +27,6 @@ def reconstruct_colmap(
     Known intrinsics are held, unknown ones are estimated. Raises RejectedError when fewer than three images
     register: how many did, the likely reason, and what to do instead.
     """
-    from jcr.features.kept import KeptFeatures
     from jcr.sfm.mapping import structure_from_motion
 
     options = options or ColmapOptions()
@@ -43,7 +42,6 @@ def reconstruct_colmap(
             report,
             capture.base_from_gripper,
             capture.images,
-            KeptFeatures.of(capture) if options.features == "sift" else None,
         )
     except RejectedError as error:
         raise error.with_more(*warnings) from None

@@ -23,7 +23,6 @@ from numpy import ndarray
 from jcr.allocator import give_back
 from jcr.camera import HALF_PIXEL, fold_distance_px, resized
 from jcr.errors import RejectedError
-from jcr.features.kept import KeepingMatcher, KeptFeatures
 from jcr.features.matchers import Matcher
 from jcr.features.sift import grey_of
 from jcr.features.sift_features import SiftFeatures
@@ -61,12 +60,10 @@ def structure_from_motion(
     report: Progress,
     base_from_gripper: Float[ndarray, "n 4 4"],
     names: Sequence[str],
-    kept: KeptFeatures | None,
 ) -> Reconstruction:
     """Reconstruct camera poses and tracks of images of one camera; one seed gives one result, bit for bit.
 
-    The gripper poses check the matches (`match.stage`); `names` are those of the images, for notes. SIFT features and
-    pairs that are `kept` are not found again.
+    The gripper poses check the matches (`features.stage`); `names` are those of the images, for notes.
 
     `known` intrinsics are the only ones of `all_intrinsics`, do not fold over, and stay fixed; unknown ones are starting
     points, tried in turn, for a focal length and two radial coefficients. Raises RejectedError when fewer than three
@@ -76,11 +73,11 @@ def structure_from_motion(
     with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
         cameras = enter(database, len(images), all_intrinsics, known, options.working_size_px)
-        matcher = matcher_of(options, images, cameras[0], known, report, kept)
+        matcher = matcher_of(options, images, cameras[0], known, report)
         matched = matched_pairs(
             database, matcher, base_from_gripper, all_intrinsics[0], cameras, known, names, report
         )
-        model = _map_of_pairs(database, matched, cameras, base_from_gripper, known, seed, report)
+        model = map_of_pairs(database, matcher, matched, cameras, base_from_gripper, report)
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise _not_registered(database, len(images), model)
         _thin(model, seed)
@@ -112,13 +109,12 @@ def structure_from_motion(
     )
 
 
-def _map_of_pairs(
+def map_of_pairs(
     database: Path,
+    matcher: Matcher,
     matched: Matched,
     cameras: list[pycolmap.Camera],
     base_from_gripper: Float[ndarray, "n 4 4"],
-    known: bool,
-    seed: int,
     report: Progress,
 ) -> pycolmap.Reconstruction | None:
     """Return the map of the matched pairs: of many images primed by the gripper poses, else by COLMAP's mapper.
@@ -126,7 +122,7 @@ def _map_of_pairs(
     On twelve real captures of 8 to 24 images priming had one capture 2 mm farther from its reference and one with an
     image less; it saves time where there are many images.
     """
-    count, model = len(base_from_gripper), None
+    count, known, model = len(base_from_gripper), matcher.known, None
 
     def adjust(made: pycolmap.Reconstruction, scale_px: float) -> None:
         adjust_robustly(made, known, _ROUGHLY, scale_px)
@@ -136,9 +132,9 @@ def _map_of_pairs(
             database, cameras[0], matched.gate, matched.geometries, base_from_gripper, adjust
         )
     if model is None or model.num_reg_images() < count:
-        model = map_incrementally(database, count, cameras, known, seed, report, model)
+        model = map_incrementally(database, count, cameras, known, matcher.seed, report, model)
     if model is not None and model.num_reg_images() < count:
-        model = with_missing_images(database, model, base_from_gripper, adjust)
+        model = with_missing_images(database, model, base_from_gripper, matcher, adjust)
     return model
 
 
@@ -146,10 +142,7 @@ def enter(
     database: Path, count: int, all_intrinsics: Sequence[Intrinsics], known: bool, working_size_px: int
 ) -> list[pycolmap.Camera]:
     """Create a database of `count` images without features, and return COLMAP's cameras at the working size."""
-    width, height = all_intrinsics[0].width, all_intrinsics[0].height
-    scale = min(1.0, working_size_px / max(width, height))
-    size = round(width * scale), round(height * scale)
-    cameras = [camera_of(resized(intrinsics, *size), known) for intrinsics in all_intrinsics]
+    cameras = working_cameras(all_intrinsics, known, working_size_px)
     with closing(pycolmap.Database.open(database)) as db:
         db.write_camera(cameras[0], use_camera_id=True)
         rig = pycolmap.Rig(rig_id=1)
@@ -164,20 +157,26 @@ def enter(
     return cameras
 
 
+def working_cameras(
+    all_intrinsics: Sequence[Intrinsics], known: bool, working_size_px: int
+) -> list[pycolmap.Camera]:
+    """Return COLMAP's cameras at the working size, whose long side is at most `working_size_px`."""
+    width, height = all_intrinsics[0].width, all_intrinsics[0].height
+    scale = min(1.0, working_size_px / max(width, height))
+    size = round(width * scale), round(height * scale)
+    return [camera_of(resized(intrinsics, *size), known) for intrinsics in all_intrinsics]
+
+
 def matcher_of(
     options: ColmapOptions,
     images: Sequence[UInt8[ndarray, "h w 3"]],
     camera: pycolmap.Camera,
     known: bool,
     report: Progress,
-    kept: KeptFeatures | None = None,
 ) -> Matcher:
     """Return the matcher of some kind of features; SIFT is found here, networks find theirs when they match."""
     if options.features == "sift":
-        found = sift_features(images, camera, report, kept)
-        if kept is None:
-            return Matcher(found, np.ones(2), camera, known, options.seed)
-        return KeepingMatcher(found, camera, known, options.seed, kept)
+        return Matcher(sift_features(images, camera, report), np.ones(2), camera, known, options.seed)
     from jcr.features.learned import LearnedFeatures
 
     height, width = images[0].shape[:2]
@@ -189,12 +188,11 @@ def sift_features(
     images: Sequence[UInt8[ndarray, "h w 3"]],
     camera: pycolmap.Camera,
     report: Progress,
-    kept: KeptFeatures | None = None,
 ) -> SiftFeatures:
     """Return the SIFT features of images at the size of a camera."""
     give_back()
     threads = min(os.cpu_count() or 1, _SIFT_THREADS)
-    found = SiftFeatures(images, (camera.width, camera.height), threads, report, kept)
+    found = SiftFeatures(images, (camera.width, camera.height), threads, report)
     give_back()
     return found
 

@@ -19,8 +19,10 @@ from jcr.estimation.closed_form import motions
 from jcr.estimation.robust import robust_fit
 from jcr.features.epipolar import translation_of_x
 from jcr.features.gate import Gate
+from jcr.features.matchers import Matcher
 from jcr.features.verify import Geometries
 from jcr.geometry import inverse, transform
+from jcr.sfm.completion import complete_images
 
 PASSES = ((32.0, 1, 4.0), (8.0, 1, 1.0), (4.0, 5, 0.5))
 """Largest reprojection error of a point (px), refinements of each triangulation, and scale (px) of the loss of the
@@ -62,27 +64,50 @@ def map_from_gripper_poses(
 
 
 def with_missing_images(
-    database: Path, model: pycolmap.Reconstruction, base_from_gripper: Float[ndarray, "n 4 4"], adjust: Adjust
+    database: Path,
+    model: pycolmap.Reconstruction,
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    matcher: Matcher,
+    adjust: Adjust,
 ) -> pycolmap.Reconstruction:
-    """Return the model with the images that it lacks, where points confirm the cameras that its own X predicts."""
+    """Return the model with the images that it lacks, where points confirm the cameras that its own X predicts.
+
+    The mapper left them out because few matches tie them to the others; more points are searched in them.
+    """
     rows = sorted(image_id - 1 for image_id in model.reg_image_ids())
-    if len(rows) < LEAST_MAPPED:
+    mapped = dict(zip(rows, poses_of(model, rows), strict=True))
+    predicted = predicted_cameras(mapped, base_from_gripper)
+    if predicted is None:
         return model
-    mapped = poses_of(model, rows)
-    fit = robust_fit(base_from_gripper[rows], mapped)
+    larger = map_from_cameras(database, model.camera(1), predicted | mapped, adjust)
+    if larger.num_reg_images() <= len(rows):
+        return model
+    added = {image_id - 1 for image_id in larger.reg_image_ids()} - set(rows)
+    complete_images(larger, added, matcher, lambda made: adjust(made, PASSES[-1][2]))
+    return larger
+
+
+def predicted_cameras(mapped: Cameras, base_from_gripper: Float[ndarray, "n 4 4"]) -> Cameras | None:
+    """Return the cameras of all images by the X of mapped ones; None where these are too few or show no scale."""
+    if len(mapped) < LEAST_MAPPED:
+        return None
+    rows = sorted(mapped)
+    fit = robust_fit(base_from_gripper[rows], np.stack([mapped[row] for row in rows]))
     agree, state = fit.problem.used, fit.state
     assert agree is not None
     if state.scale <= 0 or agree.sum() < LEAST_MAPPED - 1:
-        return model
+        return None
     predicted = inverse(state.z[0]) @ base_from_gripper @ state.x[0]
     predicted[:, :3, 3] /= state.scale
-    cameras = dict(enumerate(predicted)) | dict(zip(rows, mapped, strict=True))
-    larger = map_from_cameras(database, model.camera(1), cameras, adjust)
-    return larger if larger.num_reg_images() > len(rows) else model
+    return dict(enumerate(predicted))
 
 
 def map_from_cameras(
-    database: Path, camera: pycolmap.Camera, recon_from_camera: Cameras, adjust: Adjust
+    database: Path,
+    camera: pycolmap.Camera,
+    recon_from_camera: Cameras,
+    adjust: Adjust,
+    passes: Sequence[tuple[float, int, float]] = PASSES,
 ) -> pycolmap.Reconstruction:
     """Return a model of rough cameras after triangulation of all verified matches and adjustment, in turn.
 
@@ -90,7 +115,7 @@ def map_from_cameras(
     The model has no image where fewer than two remain.
     """
     poses, model = recon_from_camera, pycolmap.Reconstruction()
-    for largest_px, refinements, scale_px in PASSES:
+    for largest_px, refinements, scale_px in passes:
         if len(poses) < 2:
             return pycolmap.Reconstruction()
         model = triangulated(database, camera, poses, largest_px, refinements)

@@ -1,0 +1,153 @@
+"""Map of a capture that is being taken: every image is matched as in a batch, with features and pairs kept in memory.
+
+The cameras of the last map, and a new one predicted from them and the gripper poses, prime the next map.
+"""
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+
+from jcr.features.matchers import Matcher
+from jcr.features.sift_features import SiftFeatures
+from jcr.features.verify import Geometries
+from jcr.progress import silent
+from jcr.records import Capture, Reconstruction
+from jcr.sfm.colmap import starting_intrinsics
+from jcr.sfm.mapping import (
+    adjust_robustly,
+    enter,
+    intrinsics_of,
+    map_of_pairs,
+    matched_pairs,
+    quiet_colmap,
+    tracks_of,
+    working_cameras,
+)
+from jcr.sfm.options import ColmapOptions
+from jcr.sfm.pose_primed import PASSES, Cameras, map_from_cameras, poses_of, predicted_cameras
+
+OPTIONS = ColmapOptions()
+"""Options of a calibration without options."""
+FEW = 5
+"""Number of images up to which COLMAP maps all with each new one; the first pair may have been an unlucky one."""
+AGAIN = 1.3
+"""Growth of the number of images after which COLMAP maps all again where images stay out of the map."""
+
+
+class LiveMap:
+    """Cameras and tracks of the images of a capture that is being taken."""
+
+    def __init__(self, capture: Capture) -> None:
+        """Begin a map without images; the intrinsics are those of the capture, or estimated."""
+        self._all_intrinsics, self._known, _ = starting_intrinsics(capture)
+        camera = working_cameras(self._all_intrinsics, self._known, OPTIONS.working_size_px)[0]
+        self._features = SiftFeatures([], (camera.width, camera.height), 1, silent)
+        self._matcher = Matcher(self._features, np.ones(2), camera, self._known, OPTIONS.seed)
+        self._names: list[str] = []
+        self._geometries: Geometries = {}
+        self._model: pycolmap.Reconstruction | None = None
+        self._cameras: dict[str, Float[ndarray, "4 4"]] = {}
+        """recon_from_camera of the mapped images in the last map."""
+        self._whole_of = 0
+        """Number of images that COLMAP mapped last."""
+        self._places: list[int] = []
+
+    @property
+    def registered(self) -> list[int]:
+        """Rows of the capture with a camera in the map."""
+        return sorted(self._places[self._names.index(name)] for name in self._cameras)
+
+    def matched_with(self, place: int) -> int:
+        """Return the number of other images that an image matches and the gripper poses do not contradict."""
+        row = self._places.index(place)
+        return sum(row in key for key in self._geometries)
+
+    def update(self, capture: Capture, new: Mapping[str, UInt8[ndarray, "h w 3"]]) -> None:
+        """Map the images of a capture; `new` holds those that the map has not, and images that are gone leave it."""
+        with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-live-") as folder:
+            database = Path(folder) / "database.db"
+            cameras = enter(
+                database, len(capture), self._all_intrinsics, self._known, OPTIONS.working_size_px
+            )
+            self._take(capture, new)
+            poses = capture.base_from_gripper[self._places]
+            matched = matched_pairs(
+                database,
+                self._matcher,
+                poses,
+                self._all_intrinsics[0],
+                cameras,
+                self._known,
+                self._names,
+                silent,
+            )
+            self._geometries = matched.geometries
+            self._model = self._extended(database, poses)
+            if self._model is None:
+                self._model = map_of_pairs(database, self._matcher, matched, cameras, poses, silent)
+                self._whole_of = len(capture)
+            if self._model is not None:
+                adjust_robustly(self._model, fix_intrinsics=self._known)
+        rows = self._rows()
+        mapped = [] if self._model is None else poses_of(self._model, rows)
+        self._cameras = {self._names[row]: pose for row, pose in zip(rows, mapped, strict=True)}
+
+    def _take(self, capture: Capture, new: Mapping[str, UInt8[ndarray, "h w 3"]]) -> None:
+        """Remove the features of images that the capture no longer has, and find those of new ones."""
+        for name in [name for name in self._names if name not in capture.images]:
+            row = self._names.index(name)
+            self._features.remove(row)
+            self._matcher.image_removed(row)
+            self._names.remove(name)
+            self._cameras.pop(name, None)
+        for name in capture.images:
+            if name not in self._names:
+                self._features.add(new[name])
+                self._matcher.image_added()
+                self._names.append(name)
+        place = {name: row for row, name in enumerate(capture.images)}
+        self._places = [place[name] for name in self._names]
+
+    def _extended(self, database: Path, poses: Float[ndarray, "n 4 4"]) -> pycolmap.Reconstruction | None:
+        """Return a map primed by the last one; None where COLMAP is to map all images."""
+        count = len(poses)
+        if self._model is None or count <= FEW:
+            return None
+        last: Cameras = {self._names.index(name): pose for name, pose in self._cameras.items()}
+        predicted = predicted_cameras(last, poses)
+        if predicted is None:
+            return None
+
+        def adjust(made: pycolmap.Reconstruction, scale_px: float) -> None:
+            adjust_robustly(made, self._known, 1e-3, scale_px)
+
+        model = map_from_cameras(database, self._model.camera(1), predicted | last, adjust, PASSES[1:])
+        lost, left = len(last) - model.num_reg_images(), count - model.num_reg_images()
+        return None if lost > 0 or (left > 0 and count > AGAIN * self._whole_of) else model
+
+    def _rows(self) -> list[int]:
+        """Return the rows of the matcher's images that are in the model."""
+        if self._model is None or self._model.num_reg_images() < 2:
+            return []
+        return sorted(image_id - 1 for image_id in self._model.reg_image_ids())
+
+    def reconstruction(self) -> Reconstruction | None:
+        """Return the map as a reconstruction, rows counted as in the capture; None with fewer than two cameras."""
+        rows = sorted(self._rows(), key=lambda row: self._places[row])
+        if self._model is None or not rows:
+            return None
+        intrinsics = self._all_intrinsics[0]
+        if not self._known:
+            intrinsics = intrinsics_of(self._model.camera(1), intrinsics)
+        return Reconstruction(
+            image_index=np.array([self._places[row] for row in rows]),
+            recon_from_camera=poses_of(self._model, rows),
+            intrinsics=intrinsics,
+            tracks=tracks_of(self._model, [row + 1 for row in rows], (intrinsics.width, intrinsics.height)),
+            backend="colmap",
+        )

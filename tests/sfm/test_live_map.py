@@ -1,0 +1,61 @@
+"""Map of a capture that is being taken: images that come, leave and come back are matched once."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jcr
+from jcr.capture.images import read_image
+from jcr.features import sift_features
+from jcr.geometry import apply_similarity, fit_similarity
+from jcr.records import Capture
+from jcr.sfm.live_map import LiveMap
+
+pytestmark = pytest.mark.slow
+
+
+def some_of(capture: Capture, rows: list[int]) -> Capture:
+    """Return a capture of some images."""
+    return replace(
+        capture,
+        images=tuple(capture.images[row] for row in rows),
+        base_from_gripper=capture.base_from_gripper[rows],
+    )
+
+
+def off_mm(capture: Capture, found: LiveMap) -> float:
+    """Return the largest distance of a camera from where the reference and its gripper put it, of all images."""
+    made = found.reconstruction()
+    assert made is not None and made.image_index.tolist() == list(range(len(capture)))
+    reference = np.array(json.loads((capture.folder / "reference.json").read_text())["gripper_from_camera"])
+    centers, own = (capture.base_from_gripper @ reference)[:, :3, 3], made.recon_from_camera[:, :3, 3]
+    base_from_recon, scale = fit_similarity(centers, own)
+    away = np.linalg.norm(apply_similarity(base_from_recon, scale, own) - centers, axis=1)
+    return 1e3 * float(away.max())
+
+
+def test_images_that_come_leave_and_come_back_are_matched_once(
+    tabletop: Path, monkeypatch: pytest.MonkeyPatch
+):
+    whole, matched = jcr.read_capture(tabletop), list[int]()
+    real = sift_features.matches
+    monkeypatch.setattr(sift_features, "matches", lambda *of: (matched.append(1), real(*of))[1])
+    live = LiveMap(whole)
+
+    def update(rows: list[int], new: list[int]) -> Capture:
+        """Map the images of these rows, of which some are new, and return their capture."""
+        capture, before = some_of(whole, rows), len(matched)
+        live.update(capture, {whole.images[row]: read_image(tabletop / whole.images[row]) for row in new})
+        others = len(rows) - len(new)
+        assert len(matched) - before == others * len(new) + len(new) * (len(new) - 1) // 2
+        return capture
+
+    update(list(range(6)), list(range(6)))
+    assert off_mm(update(list(range(7)), [6]), live) < 1.0
+    capture = update([0, 1, 3, 4, 5, 6], [])
+    assert off_mm(capture, live) < 1.0 and live.registered == list(range(6))
+    capture = update(list(range(7)), [2])
+    assert off_mm(capture, live) < 1.0 and live.matched_with(2) >= 3
