@@ -48,7 +48,7 @@ def _complete(model: pycolmap.Reconstruction, image_id: int, matcher: Matcher, r
     image, x_px = model.image(image_id), matcher.x_px[image_id - 1]
     observed = {keypoint.point3D_id for keypoint in image.points2D if keypoint.has_point3D()}
     free = np.array([k for k, keypoint in enumerate(image.points2D) if not keypoint.has_point3D()], int)
-    point_ids = np.array(sorted(set(model.point3D_ids()) - observed), np.uint64)
+    point_ids = np.array(sorted(set(model.point3D_ids()) - observed), int)
     if not len(free) or not len(point_ids):
         return
     xyz = np.array([model.point3D(int(one)).xyz for one in point_ids])

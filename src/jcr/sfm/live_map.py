@@ -35,8 +35,6 @@ OPTIONS = ColmapOptions()
 """Options of a calibration without options."""
 FEW = 5
 """Number of images up to which COLMAP maps all with each new one; the first pair may have been an unlucky one."""
-AGAIN = 1.3
-"""Growth of the number of images after which COLMAP maps all again where images stay out of the map."""
 
 
 class LiveMap:
@@ -53,8 +51,6 @@ class LiveMap:
         self._model: pycolmap.Reconstruction | None = None
         self._cameras: dict[str, Float[ndarray, "4 4"]] = {}
         """recon_from_camera of the mapped images in the last map."""
-        self._whole_of = 0
-        """Number of images that COLMAP mapped last."""
         self._places: list[int] = []
 
     @property
@@ -87,10 +83,8 @@ class LiveMap:
                 silent,
             )
             self._geometries = matched.geometries
-            self._model = self._extended(database, poses)
-            if self._model is None:
-                self._model = map_of_pairs(database, self._matcher, matched, cameras, poses, silent)
-                self._whole_of = len(capture)
+            begun = self._extended(database, poses)
+            self._model = map_of_pairs(database, self._matcher, matched, cameras, poses, silent, begun)
             if self._model is not None:
                 adjust_robustly(self._model, fix_intrinsics=self._known)
         rows = self._rows()
@@ -115,8 +109,7 @@ class LiveMap:
 
     def _extended(self, database: Path, poses: Float[ndarray, "n 4 4"]) -> pycolmap.Reconstruction | None:
         """Return a map primed by the last one; None where COLMAP is to map all images."""
-        count = len(poses)
-        if self._model is None or count <= FEW:
+        if self._model is None or len(poses) <= FEW:
             return None
         last: Cameras = {self._names.index(name): pose for name, pose in self._cameras.items()}
         predicted = predicted_cameras(last, poses)
@@ -127,8 +120,7 @@ class LiveMap:
             adjust_robustly(made, self._known, 1e-3, scale_px)
 
         model = map_from_cameras(database, self._model.camera(1), predicted | last, adjust, PASSES[1:])
-        lost, left = len(last) - model.num_reg_images(), count - model.num_reg_images()
-        return None if lost > 0 or (left > 0 and count > AGAIN * self._whole_of) else model
+        return model if model.num_reg_images() >= len(last) else None
 
     def _rows(self) -> list[int]:
         """Return the rows of the matcher's images that are in the model."""
