@@ -120,8 +120,9 @@ def map_of_pairs(
 ) -> pycolmap.Reconstruction | None:
     """Return the map of the matched pairs: of many images primed by the gripper poses, else by COLMAP's mapper.
 
-    A map that is `begun` is continued with the images that it lacks and that match others. On twelve real captures of 8 to 24 images priming had one capture 2 mm farther from its reference and one with an
-    image less; it saves time where there are many images.
+    A map that is `begun` is continued with the images that it lacks and that match others. On twelve real captures of
+    8 to 24 images priming had one capture 2 mm farther from its reference and one with an image less; it saves time
+    where there are many images.
     """
     count, known, model = len(base_from_gripper), matcher.known, begun
     matching = {row for key in matched.geometries for row in key}
