@@ -177,7 +177,8 @@ def _git(repository: str, *words: str) -> bytes:
     """Run git on a repository and return its output."""
     done = subprocess.run(["git", "-C", repository, *words], capture_output=True)
     if done.returncode:
-        raise InputError(f"git {words[0]}: {done.stderr.decode(errors='replace').strip().splitlines()[-1]}")
+        lines = done.stderr.decode(errors="replace").strip().splitlines() or ["no message"]
+        raise InputError(f"git {words[0]} failed: {lines[-1]}")
     return done.stdout
 
 
