@@ -15,13 +15,12 @@ from numpy import ndarray
 
 from benchmarks.page import table
 from benchmarks.peers import opencv
-from jcr.calibration.adjust import adjusted
+from jcr.calibration.adjust import adjust_images
 from jcr.calibration.case import of_images
-from jcr.calibration.fit import fitted
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.requirement import assumptions_of, reached
 from jcr.calibration.robot_errors import robot_errors
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate, fit_poses
 from jcr.camera import parameters, unproject, with_parameters
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.estimation.hand_eye import solve_hand_eye
@@ -263,8 +262,8 @@ def _ratios(draws: int) -> Iterator[list[float]]:
         capture, reconstruction = _made(seed)
         options = CalibrateOptions()
         robot, rows = robot_errors(capture, options), spread_rows(len(capture))
-        case = fitted(capture, _only(reconstruction, rows), options, robot.of(rows))
-        case = adjusted(case)
+        case = fit_poses(capture, _only(reconstruction, rows), options, robot.of(rows))
+        case = adjust_images(case)
         hand_eye = calibrate(capture, reconstruction, options)
         if not (hand_eye.converged and case.hand_eye.converged) or hand_eye.in_use is None:
             continue

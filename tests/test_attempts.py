@@ -165,18 +165,13 @@ def test_of_two_that_are_rejected_the_one_that_shows_the_cause_is_kept(
         value=0.03,
         details={"part": "translation"},
     )
-    intrinsics = Finding(
-        kind=FindingKind.INTRINSICS,
-        severity="rejects",
-        concerns="intrinsics",
-        details={"focal": 310.0, "focal_std": 2.0, "focal_given": 465.0},
-    )
+    sheared = Finding(kind=FindingKind.ROLLING_SHUTTER, severity="rejects", value=9.0, std=0.5, p=1e-9)
     leave_one_out = sound.leave_one_out
     assert leave_one_out is not None
     of_backend = {
         "colmap": sound.with_findings(uncertain),
         "mast3r": replace(sound, leave_one_out=replace(leave_one_out, translation_mm=40.0)).with_findings(
-            uncertain, intrinsics
+            uncertain, sheared
         ),
     }
     monkeypatch.setattr(selection, "calibrate", lambda _, made, __: of_backend[made.backend])

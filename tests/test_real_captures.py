@@ -1,6 +1,7 @@
 """Real captures with a reference that someone else measured; skipped where they are not at hand."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,9 @@ import pytest
 
 import jcr
 from jcr.calibration.stage import calibrate
+from jcr.capture.images import read_image
 from jcr.findings import FindingKind
-from jcr.geometry import apply_similarity, fit_similarity, rotation_between_deg
+from jcr.geometry import apply_similarity, fit_similarity, rotation_between_deg, step_between
 from jcr.sfm.colmap import reconstruct_colmap
 
 
@@ -73,3 +75,24 @@ def test_another_first_pair_is_tried_where_the_first_bends_unknown_intrinsics(re
     capture = jcr.read_capture(real_captures / "elephant_floor")
     assert capture.intrinsics is None
     assert len(reconstruct_colmap(capture).image_index) == len(capture)
+
+
+@pytest.mark.slow
+def test_images_that_are_added_live_have_the_findings_of_a_batch(real_captures: Path, tmp_path: Path):
+    """Thirteen images: "camera moved on the gripper" was reported live, and gone at the sixteenth."""
+    whole = jcr.read_capture(real_captures / "ur_snack_table")
+    capture = replace(whole, images=whole.images[:13], base_from_gripper=whole.base_from_gripper[:13])
+    batch = calibrate(capture, reconstruct_colmap(capture))
+    live = jcr.LiveCalibration(tmp_path / "live", intrinsics=capture.intrinsics)
+    for name, pose in zip(capture.images, capture.base_from_gripper, strict=True):
+        live.add(read_image(capture.folder / name), pose)
+    progress = live.progress
+    live.close()
+    assert progress.hand_eye is not None and batch.verdict == progress.hand_eye.verdict == "accepted"
+    kinds = [
+        [one.kind for one in found if one.severity != "informs"]
+        for found in (batch.findings, progress.findings)
+    ]
+    assert kinds[0] == kinds[1]
+    off = step_between(batch.gripper_from_camera, progress.hand_eye.gripper_from_camera)
+    assert (np.abs(off) < 2 * np.sqrt(np.diag(batch.covariance)[:6])).all()

@@ -9,7 +9,10 @@ from .capture.read import read_capture as read_capture
 from .capture.ros_image import read_ros_camera_info as read_ros_camera_info
 from .capture.ros_image import read_ros_depth as read_ros_depth
 from .capture.ros_image import read_ros_image as read_ros_image
+from .cell.carried import eye_to_hand as eye_to_hand
+from .cell.placement import CameraPlacement as CameraPlacement
 from .cell.placement import CamerasFile as CamerasFile
+from .cell.stage import place_camera as place_camera
 from .depth.options import DepthOptions as DepthOptions
 from .errors import InputError as InputError
 from .errors import RejectedError as RejectedError

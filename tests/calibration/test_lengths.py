@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jcr.calibration import fit
 from jcr.calibration.checks import lengths
 from jcr.calibration.checks.lengths import Length, finding_of
 from jcr.calibration.options import CalibrateOptions
@@ -36,7 +35,7 @@ def calibrated(
 
 def of_pixels(monkeypatch: pytest.MonkeyPatch, metres_per_unit: float) -> None:
     """A known length makes the simulated reconstruction, which is in metres, so much larger."""
-    for module in (fit, lengths):
+    for module in (stage, lengths):
         monkeypatch.setattr(module, "length_cue", lambda *_: (metres_per_unit, 0.01))
 
 

@@ -14,7 +14,7 @@ import struct
 import subprocess
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,18 +24,13 @@ from PIL import Image
 
 import jcr
 from jcr import run_folder
-from jcr.calibration.checks import capture as capture_checks
 from jcr.calibration.record import read_calibration
-from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.cli import dispatch
 from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import forward_kinematics
-from jcr.geometry import inverse, rotation_exp, rotation_log, transform
 from jcr.pipeline import run, selection
-from jcr.records import Capture, Reconstruction
 from jcr.run_folder import RunFolder
-from simulation.faults import Faults, faulty_capture, reconstructed
 from simulation.problems import hand_eye_problem
 
 SIZE = (96, 72)
@@ -601,40 +596,6 @@ def test_a_reconstruction_of_another_version_is_distinguished(
     assert dispatch(["map", str(out), "--quiet"]) == 2
     said = capsys.readouterr().err
     assert "'jcr.reconstruction/1', not 'jcr.reconstruction/8'; delete it and run again" in said
-
-
-@pytest.fixture(scope="module")
-def faultless() -> tuple[Capture, Reconstruction]:
-    """A simulated capture, which as it is gives a calibration that is accepted."""
-    made = reconstructed(faulty_capture(np.random.default_rng(0), 8, Faults()), estimated=False)
-    assert calibrate(*made).converged
-    return made
-
-
-def in_degrees(pose: np.ndarray) -> np.ndarray:
-    """A rotation vector in degrees, taken for radians."""
-    return transform(rotation_exp(np.degrees(rotation_log(pose[:3, :3]))), pose[:3, 3])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "change",
-    [
-        pytest.param(lambda poses: np.roll(poses, 1, axis=0), id="shuffled"),
-        pytest.param(lambda poses: np.stack([in_degrees(pose) for pose in poses]), id="degrees"),
-        pytest.param(inverse, id="inverses"),
-        pytest.param(lambda poses: np.repeat(poses[:1], len(poses), axis=0), id="one pose for all"),
-    ],
-)
-def test_poses_that_read_well_and_mean_nothing_are_rejected(
-    faultless: tuple[Capture, Reconstruction], change, monkeypatch: pytest.MonkeyPatch
-):
-    # Whether they fit when read otherwise takes seconds, and is tested elsewhere.
-    monkeypatch.setattr(capture_checks, "better_reading", lambda *_: None)
-    capture, reconstruction = faultless
-    wrong = replace(capture, base_from_gripper=change(capture.base_from_gripper))
-    found = calibrate(wrong, reconstruction)
-    assert not found.converged and found.warnings
 
 
 def test_a_full_disk_leaves_the_earlier_results(tmp_path: Path, small_done: Path, capsys):

@@ -1,6 +1,6 @@
-"""The second step of a calibration: images, points, intrinsics and robot adjusted together (estimation/).
+"""Bundle adjustment of a case: images, points, intrinsics and robot poses together (estimation/).
 
-Where images add nothing to the poses, what the errors of given intrinsics would do is added to the fit instead.
+Where images are not adjusted, the covariance of the fit to poses includes the errors of given intrinsics.
 """
 
 from collections.abc import Iterator
@@ -38,7 +38,7 @@ SETTLED_ENOUGH = 0.5
 are not reported either (checks/effects.py)."""
 
 
-def adjusted(case: Case) -> Case:
+def adjust_images(case: Case) -> Case:
     """Adjust the images of a case and replace its fit from poses by the calibration that results.
 
     A rejected fit is replaced too: without intrinsics the fit from poses alone is poor, and the adjustment is not. On
@@ -109,7 +109,7 @@ def _start_noise(fit: HandEye) -> tuple[float, float]:
 
 
 def focal_of_each(case: Case) -> Float[ndarray, "e p"]:
-    """The combinations that give every used image a focal length of its own."""
+    """Return the combinations that give every used image a focal length of its own."""
     return focal_lengths(case.reconstruction.intrinsics, len(case.used))
 
 
@@ -176,7 +176,7 @@ def _considered(case: Case) -> Case:
 
 
 def refined_by(case: Case, found: Solution) -> HandEye:
-    """The calibration of a case as an adjustment has it; not judged yet."""
+    """Return the calibration of a case from an adjustment, without the findings that its numbers decide."""
     before, used = case.hand_eye.before or case.hand_eye, case.used
     estimate = estimate_of(found, case.tracks)
     if case.capture.intrinsics is None and estimate.intrinsics is not None:
@@ -208,7 +208,7 @@ def refined_by(case: Case, found: Solution) -> HandEye:
 
 
 def _leave_one_out(found: Solution) -> LeaveOneOut | None:
-    """Each image's gripper pose predicted by an adjustment that does not use it."""
+    """Return the mean error of gripper poses that are predicted by an adjustment without their image."""
     left_out = found.leave_one_out()[0]
     m = len(left_out)
     if m < 4:

@@ -1,4 +1,4 @@
-"""What a calibration has come to: the record that passes from the fit through the adjustment to the checks."""
+"""State of a calibration as it passes through fit, bundle adjustment and checks."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -25,10 +25,11 @@ from jcr.findings import Finding
 from jcr.records import Capture, HandEye, Reconstruction, SceneUncertainty, Tracks
 
 MIN_OBSERVATIONS = 200
-"""Fewer correspondences than this do not refine what the poses show."""
+"""Fewest observations with which images are adjusted; fewer do not refine what the poses show."""
 MIN_IMAGES = 3
+"""Fewest images that are adjusted."""
 MOST_OBSERVATIONS = 60_000
-"""Adjusted with the robot, which limits what more of them could add: 25 images of 640x480 have as many."""
+"""Most observations that are adjusted: the robot limits what more could add, and 25 images of 640x480 have as many."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +40,7 @@ class Case:
     reconstruction: Reconstruction
     options: CalibrateOptions
     robot: RobotErrors
-    """Of the registered images' poses."""
+    """Systematic errors of the registered images' poses."""
     priors: tuple[LinearPrior, ...]
     """Measurements of scale and height beside the robot's poses."""
     hand_eye: HandEye
@@ -53,23 +54,23 @@ class Case:
 
     @property
     def base_from_gripper(self) -> Float[ndarray, "m 4 4"]:
-        """As reported, of the registered images."""
+        """Reported gripper poses of the registered images."""
         return self.capture.base_from_gripper[self.reconstruction.image_index]
 
     @property
     def recon_from_camera(self) -> Float[ndarray, "m 4 4"]:
-        """As the images alone show them where that is known, else as reconstructed."""
+        """Camera poses by the images alone where these are known, else those of the reconstruction."""
         evidence = self.reconstruction.evidence
         return self.reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera
 
     @property
     def used(self) -> Int[ndarray, " u"]:
-        """Registered images that the calibration rests on."""
+        """Rows of the registered images that are used."""
         return np.flatnonzero(self.hand_eye.inliers)
 
     @property
     def names(self) -> list[str]:
-        """Of the registered images."""
+        """Names of the registered images."""
         return [self.capture.images[row] for row in self.reconstruction.image_index]
 
     @property
@@ -90,14 +91,14 @@ class Case:
 
     @cached_property
     def tracks(self) -> Tracks:
-        """Observations in the used images; of more than are adjusted those of a random choice of the points."""
+        """Observations in the used images, at most MOST_OBSERVATIONS."""
         if self.chosen_tracks is not None:
             return self.chosen_tracks
         return some_of_many(of_images(self.reconstruction.tracks, self.hand_eye.inliers), MOST_OBSERVATIONS)
 
     @property
     def scene_distance_m(self) -> float | None:
-        """Median distance from the camera to what it sees; None where the calibration is not made of images."""
+        """Median distance from the camera to the scene; None where the images were not adjusted."""
         if self.adjusted is None or self.hand_eye.before is None:
             return None
         return float(np.median(self.adjusted.images.view.depth)) * self.adjusted.state.scale
@@ -111,7 +112,7 @@ class Case:
 
     @property
     def is_adjustable(self) -> bool:
-        """Whether bundle adjustment has something to add to the poses.
+        """Whether bundle adjustment can refine the fit to poses.
 
         Cameras that are not found by matches come with their covariance and have no tracks. Bundle adjustment takes
         scale and height from the robot alone.
@@ -125,35 +126,36 @@ class Case:
 
     @property
     def shows_camera(self) -> bool:
-        """Whether the images can tell anything against their camera: pointmaps were made with intrinsics of their own,
-        and of degenerate motions what is missing comes first."""
+        """Whether effects on the camera can be tested.
+
+        Pointmaps were made with intrinsics of their own, and degenerate motions are reported first.
+        """
         return (
             self.is_adjustable and not self.tracks.from_pointmaps and self.hand_eye.observability.observable
         )
 
 
 @dataclass(frozen=True)
-class Checked:
-    """What a check of a case returns."""
+class CheckResult:
+    """Findings of a check, and the calibration that it replaces."""
 
     findings: tuple[Finding, ...] = ()
     """Strongest first."""
     hand_eye: HandEye | None = None
-    """The calibration with what was measured in it, or the one to keep in place of the present one; None: it stays."""
+    """Calibration that takes the place of the case's; None: that stays."""
     adjusted: Solution | None = None
-    """The adjustment that it is made of, where that is another one."""
+    """Adjustment that `hand_eye` is made of, where that is another one."""
 
 
 def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
-    """The observations of the used images, whose rows are counted again."""
+    """Return the observations of the used images, whose rows are counted again."""
     kept = tracks.only(used[tracks.image])
     row = np.cumsum(used) - 1
     return replace(kept, image=row[kept.image])
 
 
 def some_of_many(tracks: Tracks, most: int) -> Tracks:
-    """All observations, or where there are more than `most` those of a random choice of the points and of all corners
-    of boards."""
+    """Return all observations, or, of more than `most`, those of randomly chosen points and of all board corners."""
     if len(tracks.image) <= most:
         return tracks
     count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
@@ -164,5 +166,5 @@ def some_of_many(tracks: Tracks, most: int) -> Tracks:
 
 
 def of_points(tracks: Tracks, chosen: Bool[ndarray, " p"]) -> Tracks:
-    """The observations of some of the points, which keep their rows."""
+    """Return the observations of some of the points, which keep their rows."""
     return tracks.only(chosen[tracks.point])

@@ -1,4 +1,4 @@
-"""What errors of given intrinsics do to a calibration from camera poses alone, which cannot estimate them.
+"""Effect of errors of given intrinsics on a calibration from camera poses alone, which cannot estimate them.
 
 The estimate is kept and its covariance becomes C + S Φ Sᵀ, with Φ that of the intrinsics (the consider covariance of
 Schmidt; Tapley, Schutz and Born, "Statistical Orbit Determination", 2004, chapter 6).
@@ -20,7 +20,7 @@ from jcr.geometry import apply, inverse, rotation_exp, skew, step_between, trans
 from jcr.records import HandEye, Tracks
 
 FEWEST = 6
-"""Observations of an image whose camera's motion with the intrinsics can be found."""
+"""Fewest observations of an image from which the motion of its camera with the intrinsics is computed."""
 
 
 def with_intrinsics_considered(
@@ -32,10 +32,10 @@ def with_intrinsics_considered(
     priors: tuple[LinearPrior, ...],
     systematic: Float[ndarray, "s s"],
 ) -> HandEye:
-    """The calibration with the errors of its intrinsics in its covariance and budget.
+    """Return the calibration with the errors of its intrinsics in its covariance and budget.
 
-    All arguments are of the used images. S by solving again with the cameras that one standard deviation of each
-    parameter would have given: those that keep the pixels of `tracks` where they are.
+    All arguments are of the used images. The sensitivity S follows from solutions with the cameras that one standard
+    deviation of each parameter would give: cameras that keep the pixels of `tracks` in place.
     """
     seen = [np.flatnonzero(tracks.image == row) for row in range(len(recon_from_camera))]
     if hand_eye.budget is None or min(map(len, seen)) < FEWEST:
@@ -75,7 +75,7 @@ def _camera_with_other_intrinsics(
     rows: ndarray,
     camera: Camera,
 ) -> Float[ndarray, "c 4 4"]:
-    """The camera as one standard deviation more of each parameter would have placed it, by its own points."""
+    """Return the camera poses that fit the image's points after one standard deviation more of each parameter."""
     x_in_camera = apply(inverse(recon_from_camera), tracks.points_in_recon[tracks.point[rows]].astype(float))
     by_x = by_point(camera.intrinsics, x_in_camera)
     by_pose = np.concatenate([by_x, -by_x @ skew(x_in_camera)], axis=2).reshape(-1, 6)

@@ -1,7 +1,7 @@
-"""Pose-convention diagnosis: gripper poses that do not fit the images, read in other ways people write them.
+"""Diagnosis of pose conventions: gripper poses that contradict the images, read by other conventions and orders.
 
-Readings are ranked by screw congruence (a gripper's rotation between two images has the angle of its
-camera's), and the best of them solved. Nothing is ever applied: a reading that fits is named.
+Readings are ranked by screw congruence (gripper and camera rotate by the same angle between two images), and the best
+are solved. A reading that fits is named, and never applied.
 """
 
 import warnings
@@ -25,21 +25,21 @@ from jcr.geometry import inverse, transform
 from jcr.records import HandEye, RobotNoise
 
 SOLVED = 24
-"""At most this many readings are solved in full, the most congruent ones."""
+"""Largest number of readings that are solved in full, the most congruent ones."""
 SAME_ANGLE = np.radians(0.1)
-"""Relabelled axes keep every angle: among readings this alike, the usual mistakes are solved first."""
+"""Difference of angles (rad) within which readings rank alike, so that usual mistakes are solved first."""
 FITS = 3.0
-"""mm; poses that agree with the images to this need no other reading."""
+"""Misfit (mm) up to which poses need no other reading."""
 CONGRUENT = np.radians(1.5)
-"""Readings whose angles miss the cameras' by less than this are worth solving."""
+"""Difference of angles (rad) up to which readings are solved."""
 BETTER = 3.0
-"""A reading is named when it fits this many times better than the poses as given."""
+"""Factor by which a reading must fit better than the poses as given."""
 ROUGHLY = 2.0
-"""A closed form shows how well a reading fits to this factor."""
+"""Factor to which a closed form shows the misfit of a reading."""
 ROTATION, ON_MULTIPLE = 2 * np.pi, 1.5
 """Degrees: numbers that were taken as radians are known up to multiples of the one, and lie as near one as the other."""
 MIN_SHARE = 0.8
-"""of the images must agree under it."""
+"""Smallest share of the images that agree under a reading."""
 INVERSES = "their inverses (gripper_from_base was given)"
 WXYZ = "quaternions w, x, y, z that were taken as x, y, z, w"
 XYZW = "quaternions x, y, z, w that were taken as w, x, y, z"
@@ -56,7 +56,7 @@ OPTIONS = {
     XYZW: "in a table add --pose-convention quat-xyzw",
     TRANSPOSED: "in a table of matrices add --pose-convention franka",
 }
-"""What reads poses so."""
+"""Remedy of each reading."""
 EULER_ORDERS = (
     *("xyz", "ZYX", "zyx", "XYZ", "ZYZ", "zyz", "xzy", "yxz", "yzx", "zxy", "XZY", "YXZ", "YZX", "ZXY"),
     *("xyx", "xzx", "yxy", "yzy", "zxz", "XYX", "XZX", "YXY", "YZY", "ZXZ"),
@@ -65,9 +65,9 @@ EULER_ORDERS = (
 
 
 def _euler_mistakes() -> list[tuple[str, str]]:
-    """The order that angles were taken in, and the one that was meant, the usual ones first, each mistake once.
+    """Return pairs of the order that angles were taken in and the intended one, usual mistakes first.
 
-    Angles about fixed axes are those about the moving ones, reversed, so that a mistake has two names.
+    Angles about fixed axes are angles about moving axes in reverse order, so that each mistake has two names.
     """
     rank = {order: k for k, order in enumerate(EULER_ORDERS)}
     found: dict[frozenset[tuple[str, str]], tuple[str, str]] = {}
@@ -83,14 +83,14 @@ EULER_MISTAKES = _euler_mistakes()
 
 @dataclass(frozen=True)
 class Reading:
-    """One way to read the poses, and how well it fits."""
+    """Convention or order of the poses, and its misfit."""
 
     name: str
     translation_mm: float
-    """Errors per axis that the fit leaves, random and systematic; infinite when nothing fits."""
+    """Errors per axis that the fit leaves, random and systematic."""
     rotation_deg: float
     used: int
-    """Images that agree."""
+    """Number of images that agree."""
 
     @property
     def misfit(self) -> float:
@@ -112,7 +112,7 @@ def better_reading(
     by_name: Mapping[bool, Poses] | None = None,
     solved: HandEye | None = None,
 ) -> tuple[Reading, Reading] | None:
-    """The reading that fits far better than the poses as given, and those; None when there is none.
+    """Return the reading that fits far better than the poses as given, and the reading as given; None without one.
 
     `by_name` holds the poses by other orders of the images' names: as numbers (True), as text (False). `solved` is the
     calibration of the poses as given, where there is one from the camera poses alone.
@@ -154,7 +154,7 @@ def better_reading(
 
 
 def convention_finding(found: tuple[Reading, Reading], severity: Severity = "rejects") -> Finding:
-    """That the poses fit when read so, and what reads them so."""
+    """Return the finding that the poses fit under another reading, with the remedy."""
     best, given = (
         f"{reading.translation_mm:.1f} mm and {reading.rotation_deg:.2f}° per axis over {reading.used} images"
         for reading in found
@@ -173,19 +173,18 @@ def _solved(candidate: _Candidate, recon_from_camera: Poses) -> Reading:
 
 
 def _reading(candidate: _Candidate, solved: HandEye) -> Reading:
-    """A candidate, and how well its calibration fits."""
+    """Return a candidate with the misfit of its calibration."""
     return Reading(candidate.name, *_mm_deg(solved.robot_noise), int(solved.inliers.sum()))
 
 
 def _mm_deg(noise: RobotNoise) -> tuple[float, float]:
-    """Of all errors together."""
+    """Return random and systematic errors together, mm and degrees per axis."""
     metres, radians = noise.together
     return 1e3 * metres, float(np.degrees(radians))
 
 
 def _least_misfit(candidate: _Candidate, recon_from_camera: Poses, agree: Bool[ndarray, " k"]) -> float:
-    """Misfit of a candidate in the images that agree best: in a tenth of the time of a whole solution, which uses
-    more."""
+    """Return the misfit of a candidate in the images that agree best, in a tenth of the time of a whole solution."""
     gripper, camera = candidate.base_from_gripper[agree], recon_from_camera[candidate.image[agree]]
     problem, state = pose_problem(gripper, camera, initial_estimate(gripper, camera))
     fit = solve(problem, state, averaged=False)
@@ -193,10 +192,9 @@ def _least_misfit(candidate: _Candidate, recon_from_camera: Poses, agree: Bool[n
 
 
 def _roughly(candidate: _Candidate, recon_from_camera: Poses) -> tuple[Bool[ndarray, " k"], float]:
-    """The images that agree best, and the error (m) that a closed form leaves in them: in a hundredth of the time of a
-    fit.
+    """Return the images that agree best, and the error (m) that a closed form leaves in them.
 
-    Infinite where its scale is negative: so it fits mirrored poses, which nobody can see from.
+    It takes a hundredth of the time of a fit. The error is infinite where the scale is negative, as of mirrored poses.
     """
     camera = recon_from_camera[candidate.image]
     agree, error = least_trimmed(candidate.base_from_gripper, camera)
@@ -205,7 +203,7 @@ def _roughly(candidate: _Candidate, recon_from_camera: Poses) -> tuple[Bool[ndar
 
 
 def _incongruence(candidate: _Candidate, camera_angle: Float[ndarray, "n n"]) -> float:
-    """Typical difference (rad) between the angles of gripper and camera motions."""
+    """Return the typical difference (rad) between the angles of gripper and camera motions."""
     gap = np.abs(
         _angles(candidate.base_from_gripper) - camera_angle[np.ix_(candidate.image, candidate.image)]
     )
@@ -213,13 +211,13 @@ def _incongruence(candidate: _Candidate, camera_angle: Float[ndarray, "n n"]) ->
 
 
 def _angles(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n n"]:
-    """Angles (rad) of all relative rotations, by their traces: rough near 0 and π, but quick."""
+    """Return the angles (rad) of all relative rotations by their traces, which are imprecise near 0 and π."""
     flat = a_from_b[:, :3, :3].reshape(-1, 9)
     return np.arccos(np.clip((flat @ flat.T - 1) / 2, -1, 1))
 
 
 def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
-    """As given first; then one mistake at a time."""
+    """Yield the poses as given, then with one mistake each."""
     n = len(base_from_gripper)
     every = np.arange(n)
     yield _Candidate("they are given", base_from_gripper, every)
@@ -256,7 +254,7 @@ def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
 
 
 def _euler(rotation: Rotation, order: str) -> Float[ndarray, "*batch 3"]:
-    """Euler angles (rad), also at gimbal lock, where SciPy warns that any of the equal answers will do."""
+    """Return Euler angles (rad), without the warning of SciPy at gimbal lock."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return rotation.as_euler(order)

@@ -1,4 +1,4 @@
-"""What a user can measure with a ruler to replace what the motions do not show."""
+"""Lengths measured with a ruler that replace what the motions do not show: a height, a distance in an image."""
 
 import numpy as np
 from jaxtyping import Float
@@ -12,19 +12,19 @@ from jcr.geometry import Poses, rotation_angle
 from jcr.records import Capture, HandEye, Reconstruction
 
 LENGTH_STD = 0.01
-"""Relative: a pixel's breadth at either end of a length of a hundred pixels."""
+"""Relative standard deviation of a length: one pixel at either end of a hundred pixels."""
 HEIGHT_STD = 1e-3
-"""m, one sigma of a height measured with a ruler."""
+"""Standard deviation (m) of a height measured with a ruler."""
 CONTRADICTED = (4.0, 0.02)
 """Standard deviations, and share of the scale, from which a known scale and the robot's motion exclude each other."""
 ONE_AXIS = np.radians(6)
-"""Planar motion keeps its axis within this, on average."""
+"""Largest mean deviation (rad) of the rotation axis of a planar motion."""
 
 
 def height_cue(base_from_gripper: Poses, height: float) -> tuple[Float[ndarray, "3"], float, float]:
-    """The camera's height (m) above the gripper's origin along the axis that all rotations share.
+    """Return the axis that all rotations share, the camera's height (m) along it, and its standard deviation.
 
-    Raises InputError where they share none: the height is then no cue, but a result.
+    Raises InputError where the rotations share no axis.
     """
     u, _, vt = np.linalg.svd(base_from_gripper[:, :3, :3].mean(0))
     up = np.sign(u[2, 0]) or 1.0
@@ -63,7 +63,7 @@ def length_cue(
     ends_px: Float[ndarray, "2 2"],
     length: float,
 ) -> tuple[float, float]:
-    """Metres per recon unit from the length (m) between two pixels of one image.
+    """Return the metres per recon unit from the length (m) between two pixels of one image, and its relative error.
 
     Raises InputError when the image or a surface at either pixel is not there.
     """
@@ -74,9 +74,9 @@ def length_cue(
 def surface_at(
     capture: Capture, reconstruction: Reconstruction, image: str, x_px: Float[ndarray, "2"], asked_by: str
 ) -> Float[ndarray, "3"]:
-    """The surface point (recon frame) that a pixel of an image shows.
+    """Return the surface point (recon frame) of a pixel of an image.
 
-    Raises InputError, which names who asked, when the image or a surface at that pixel is not there.
+    Raises InputError, which names the option `asked_by`, where there is no such image or surface.
     """
     rows = [k for k, row in enumerate(reconstruction.image_index) if capture.images[row] == image]
     if not rows:
@@ -95,10 +95,9 @@ def surface_at(
 
 
 def scale_contradiction(free: HandEye, metric_std: float) -> Finding | None:
-    """That the robot's motion excludes that the reconstruction is in metres; None where it does not.
+    """Return the finding that the robot's motion excludes that the reconstruction is in metres; None where it does not.
 
-    `free` is a calibration that was not given it; `metric_std` is how well the metre is known (relative one
-    sigma).
+    `free` is a calibration without that scale; `metric_std` is the relative standard deviation of the metre.
     """
     if not free.converged:
         return None

@@ -1,4 +1,4 @@
-"""The calibration of camera poses that somebody else found, without images."""
+"""Calibration from given camera poses, without images."""
 
 from dataclasses import replace
 
@@ -15,23 +15,23 @@ from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.hand_eye import SCALE_STD, solve_hand_eye
 from jcr.estimation.wrist import pose_problem
-from jcr.findings import Finding, FindingKind
+from jcr.findings import Finding, FindingKind, is_explained
 from jcr.records import HandEye, PosePairs
 
 METRIC_STD = 0.005
-"""Relative; a printed marker has its stated size to half a percent."""
+"""Relative standard deviation of the size of a printed marker."""
 
 
 def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -> HandEye:
-    """Hand-eye calibration from camera poses that were given, without images.
+    """Calibrate from given camera poses, without images.
 
-    Where they are metric, the scale that is found tells whether the marker had the size that was given; motions
-    that do not show a scale are helped by taking it as 1.
+    The estimated scale of metric poses tests the given size of the marker; where motions do not determine the scale, it
+    is taken as 1.
     """
     check_options(options := options or CalibrateOptions())
     robot = errors_of(pairs.base_from_gripper, None if options.robot is None else arm_named(options.robot))
     hand_eye = _calibrated_poses(pairs, options, robot)
-    if hand_eye.observability.observable:
+    if hand_eye.observability.observable and not is_explained(hand_eye.findings):
         start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon
         problem, state = pose_problem(
             pairs.base_from_gripper,
@@ -97,6 +97,6 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotE
 
 
 def is_one(hand_eye: HandEye) -> bool:
-    """Whether the scale is 1 within what is known of it."""
+    """Return whether the scale is 1 within its uncertainty."""
     off = abs(float(np.log(hand_eye.scale)))
     return off < max(3 * float(np.sqrt(hand_eye.covariance[6, 6])), METRIC_STD)

@@ -1,4 +1,4 @@
-"""What is known of the systematic errors of gripper poses before they are fitted: those of an arm, or of any."""
+"""Prior covariance of the systematic errors of gripper poses, of a known arm or of any."""
 
 from dataclasses import dataclass, replace
 
@@ -22,25 +22,27 @@ from jcr.records import Capture
 
 @dataclass(frozen=True)
 class RobotErrors:
-    """What is known of the systematic errors of gripper poses before they are fitted."""
+    """Prior covariance of the systematic errors of gripper poses, and the arm that it follows from."""
 
     systematic: Float[ndarray, "r r"]
-    """Their covariance at 1 rad, r = 6 times the poses."""
+    """Covariance of the errors at 1 rad, r = 6 times the poses."""
     arm: Arm | None = None
-    """With its tool; None where it is not known."""
+    """Arm with its tool; None where it is not known."""
     joints: Joints | None = None
-    """Of the arm, at the poses."""
+    """Joint angles at the poses."""
     unused: Finding | None = None
-    """Why the arm that a capture names is not used."""
+    """Finding that the arm of the capture is not used; None where it is used, or none is named."""
 
     def of(self, poses: Int[ndarray, " m"]) -> "RobotErrors":
-        """Of some of the poses."""
+        """Return the errors of some of the poses."""
         joints = None if self.joints is None else self.joints[poses]
         return replace(self, systematic=of_poses(self.systematic, poses), joints=joints)
 
     def with_poses(self, base_from_gripper: Poses, added: Float[ndarray, "c 4 4"]) -> Float[ndarray, "s s"]:
-        """Covariance at 1 rad of the errors of these poses and then of others that the robot may go to, in the posture
-        that it has at the nearest of these."""
+        """Return the covariance at 1 rad of the errors of these poses, then of others.
+
+        The arm takes the others in the posture of the nearest of these poses.
+        """
         if len(added) == 0:
             return self.systematic
         if self.arm is None or self.joints is None:
@@ -50,10 +52,10 @@ class RobotErrors:
 
 
 def robot_errors(capture: Capture, options: CalibrateOptions, later: Capture | None = None) -> RobotErrors:
-    """What is known of the errors of the capture's gripper poses and of `later` ones of the same robot.
+    """Return the errors of the capture's gripper poses and of `later` ones of the same robot.
 
-    InputError where the poses are not those of the arm that the user named, or all too long by one factor for that of
-    their joint angles; an arm that only the capture names is then not used.
+    Raises InputError where the poses are not those of the arm that the user named, or are all too long by one factor for
+    their joint angles. An arm that only the capture names is not used then.
     """
     gripper, joints = capture.base_from_gripper, capture.joints
     if later is not None:
@@ -71,9 +73,9 @@ def robot_errors(capture: Capture, options: CalibrateOptions, later: Capture | N
 
 
 def errors_of(gripper: Poses, arm: Arm | None = None, joints: Joints | None = None) -> RobotErrors:
-    """Of these poses of an arm at these joint angles (rad), or of any robot; unknown angles are found from the poses.
+    """Return the errors of poses of an arm at joint angles (rad), or of any robot; unknown angles follow from the poses.
 
-    InputError where poses, joints and arm do not fit.
+    Raises InputError where poses, joints and arm do not fit.
     """
     if arm is None:
         return RobotErrors(smooth_errors(gripper))
@@ -91,6 +93,6 @@ def _arm(capture: Capture, options: CalibrateOptions) -> Arm | None:
 
 
 def of_poses(covariance: Float[ndarray, "r r"], poses: Int[ndarray, " m"]) -> Float[ndarray, "s s"]:
-    """The covariance of some of the poses."""
+    """Return the covariance of some of the poses."""
     rows = (6 * poses[:, None] + np.arange(6)).ravel()
     return covariance[np.ix_(rows, rows)]

@@ -1,18 +1,23 @@
-"""The calibration of a capture: fit, adjust, checks, verdict, requirement."""
+"""Calibration of a capture: fit to camera poses, bundle adjustment, checks, verdict, requirement."""
 
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 
-from jcr.calibration.adjust import adjusted
+from jcr.calibration.adjust import adjust_images
 from jcr.calibration.case import Case
 from jcr.calibration.checks.table import CHECKS
-from jcr.calibration.fit import fitted
+from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised, assumptions_of
 from jcr.calibration.robot_errors import RobotErrors, robot_errors
 from jcr.calibration.verdict import with_checked
+from jcr.errors import RejectedError
+from jcr.estimation.hand_eye import SCALE_STD, Offset, solve_hand_eye
 from jcr.estimation.point_uncertainty import with_given_intrinsics
+from jcr.estimation.problem import offset_prior, scale_prior
 from jcr.least_squares import one_blas_thread
 from jcr.records import Capture, HandEye, Reconstruction
 
@@ -21,12 +26,12 @@ from jcr.records import Capture, HandEye, Reconstruction
 def calibrate(
     capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions | None = None
 ) -> HandEye:
-    """Hand-eye calibration of the registered images; per-pose fields are in the reconstruction's order.
+    """Calibrate the registered images; per-pose fields are in the reconstruction's order.
 
-    Camera poses that come with their covariance are weighed with it, and that is all. Else bundle adjustment
-    follows on correspondences found in the images; on those between pointmaps, whose errors neighbours share,
-    its result stands only where its leave-one-out error is smaller. Raises InputError for options that cannot be, and
-    RejectedError with fewer than two registered images.
+    Camera poses with a covariance are weighed with it and not adjusted. Other images are adjusted with the poses; on
+    correspondences between pointmaps, whose errors neighbours share, the adjustment stands only where its leave-one-out
+    error is smaller. Raises InputError for options that cannot be, and RejectedError with fewer than two registered
+    images.
     """
     check_options(options := options or CalibrateOptions())
     robot = robot_errors(capture, options).of(reconstruction.image_index)
@@ -44,8 +49,8 @@ def calibrate(
 def checked(
     capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrors
 ) -> Case:
-    """The same without advice: fit, adjustment, and what the checks found. `robot` is of the registered images."""
-    case = adjusted(fitted(capture, reconstruction, options, robot))
+    """Return the case after fit, adjustment and checks, without advice; `robot` is of the registered images."""
+    case = adjust_images(fit_poses(capture, reconstruction, options, robot))
     for check in CHECKS:
         if check.needs(case):
             try:
@@ -55,3 +60,77 @@ def checked(
                 if case.hand_eye.converged:
                     raise
     return case
+
+
+def fit_poses(
+    capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrors
+) -> Case:
+    """Fit the hand-eye transform to camera poses, with the known lengths that replace what the motions do not show.
+
+    `robot` is of the registered images' poses. Raises RejectedError with fewer than two registered images.
+    """
+    registered = len(reconstruction.image_index)
+    if registered < 2:
+        raise RejectedError(
+            f"{registered} of {len(capture)} images registered",
+            "overlap the views more",
+            also=(*reconstruction.warnings, *reconstruction.notes),
+        )
+    gripper = capture.base_from_gripper[reconstruction.image_index]
+    (scale, offset), contradiction = _measured(capture, reconstruction, options), None
+    if scale is not None and offset is None:
+        # Where the motions determine the scale, it is compared with the length beside others (checks/lengths.py).
+        scale = None if _solved(gripper, reconstruction, options, robot).converged else scale
+    if scale is offset is None and (metric_std := reconstruction.metric_std) is not None:
+        free = _solved(gripper, reconstruction, options, robot)
+        contradiction = scale_contradiction(free, metric_std)
+        scale = 1.0, metric_std
+    hand_eye = _solved(gripper, reconstruction, options, robot, scale, offset)
+    priors = () if scale is None else (scale_prior(*scale),)
+    priors += () if offset is None else (offset_prior(*offset),)
+    hand_eye = replace(hand_eye, estimate=replace(hand_eye.estimate, intrinsics=reconstruction.intrinsics))
+    return Case(
+        capture=capture,
+        reconstruction=reconstruction,
+        options=options,
+        robot=robot,
+        priors=priors,
+        hand_eye=hand_eye if contradiction is None else hand_eye.with_findings(contradiction),
+    )
+
+
+def _solved(
+    gripper: Float[ndarray, "m 4 4"],
+    reconstruction: Reconstruction,
+    options: CalibrateOptions,
+    robot: RobotErrors,
+    scale: tuple[float, float] | None = None,
+    offset: Offset | None = None,
+) -> HandEye:
+    evidence = reconstruction.evidence
+    return solve_hand_eye(
+        gripper,
+        reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera,
+        robot_noise=options.robot_noise_m_rad,
+        scale=None if scale is None else scale[0],
+        scale_std=SCALE_STD if scale is None else scale[1],
+        offset=offset,
+        camera_covariance=None if evidence is None else evidence.covariance,
+        systematic=robot.systematic,
+        in_sequence=False,
+    )
+
+
+def _measured(
+    capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions
+) -> tuple[tuple[float, float] | None, Offset | None]:
+    """Return the scale and the height that the user measured, each with its standard deviation."""
+    gripper = capture.base_from_gripper[reconstruction.image_index]
+    scale = offset = None
+    if options.known_height is not None:
+        offset = height_cue(gripper, options.known_height / 1e3)
+    if options.known_length is not None:
+        image, *ends, length_mm = options.known_length
+        ends_px = np.array(ends).reshape(2, 2)
+        scale = length_cue(capture, reconstruction, image, ends_px, length_mm / 1e3)
+    return scale, offset

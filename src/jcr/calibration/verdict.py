@@ -1,25 +1,25 @@
-"""What findings do to a calibration: their shifts count as uncertainty, and what is too uncertain is rejected."""
+"""Findings in a calibration: their shifts add to its covariance, and a result that becomes too uncertain is rejected."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from jcr.calibration.case import Case, Checked
+from jcr.calibration.case import Case, CheckResult
 from jcr.estimation.hand_eye import judged
 from jcr.findings import Finding, verdict_of
 from jcr.records import HandEye
 
 
-def with_checked(case: Case, checked: Checked) -> Case:
-    """The case after a check."""
+def with_checked(case: Case, checked: CheckResult) -> Case:
+    """Return the case after a check."""
     hand_eye, adjusted = checked.hand_eye or case.hand_eye, checked.adjusted or case.adjusted
     return replace(case, hand_eye=with_findings(hand_eye, checked.findings), adjusted=adjusted)
 
 
 def with_findings(hand_eye: HandEye, findings: tuple[Finding, ...]) -> HandEye:
-    """A calibration with findings, and with their shifts in its covariance.
+    """Return a calibration with findings, and with their shifts in its covariance.
 
-    One whose shift makes the calibration too uncertain rejects it, and so does one that explains why it was rejected.
+    A finding rejects the calibration where its shift makes it too uncertain, or where it explains a rejection.
     """
     named: list[Finding] = []
     for finding in findings:

@@ -9,8 +9,8 @@ from numpy import ndarray
 
 from jcr.calibration.case import MIN_OBSERVATIONS, of_images
 from jcr.calibration.options import CalibrateOptions
-from jcr.cell.localise import Known
-from jcr.cell.rigs import Member, Rigs
+from jcr.cell.camera_views import CameraViews
+from jcr.cell.rigs import Rigs
 from jcr.estimation.intrinsics_prior import Camera, camera_about
 from jcr.estimation.observations import Observations
 from jcr.estimation.problem import Problem, RigGaussian, State, with_observations
@@ -18,6 +18,7 @@ from jcr.estimation.score_test import freed, with_camera
 from jcr.estimation.solve import Solution, solve
 from jcr.findings import FindingKind
 from jcr.records import Capture, HandEye, Intrinsics, Reconstruction
+from jcr.sfm.register import KnownImages
 from jcr.sfm.track_refinement import KEYPOINT_STD_PX
 
 EXACT = 1e-6
@@ -71,8 +72,8 @@ def cell_images(
     capture: Capture,
     reconstruction: Reconstruction,
     hand_eye: HandEye,
-    known: Known,
-    members: Sequence[Member],
+    known: KnownImages,
+    members: Sequence[CameraViews],
     rigs: Rigs,
     options: CalibrateOptions,
 ) -> CellImages:
@@ -89,7 +90,8 @@ def cell_images(
     points = [hand_eye.scale * own.points_in_recon.astype(float)]
     count = len(own.points_in_recon)
     for c, member in enumerate(members, start=1):
-        for k, one in member.used:
+        assert member.rig is not None
+        for k, one in member.used.items():
             n = len(one.x_px)
             image += [np.full(n, len(rig)), one.row]
             x_px += [one.x_px, one.row_x_px]
@@ -129,7 +131,7 @@ def cell_images(
 
 
 def _cameras(
-    capture: Capture, own: Intrinsics, hand_eye: HandEye, members: Sequence[Member]
+    capture: Capture, own: Intrinsics, hand_eye: HandEye, members: Sequence[CameraViews]
 ) -> tuple[Camera, ...]:
     """Return the cameras with the prior of their intrinsics; a mount is free only beside another camera on its rig.
 
@@ -140,12 +142,12 @@ def _cameras(
     cameras = [camera_about(own, given, capture.intrinsics_std)]
     for member in members:
         known = member.camera.intrinsics is not None
-        camera = camera_about(member.seen.intrinsics, known, member.camera.intrinsics_std)
+        camera = camera_about(member.intrinsics, known, member.camera.intrinsics_std)
         cameras.append(replace(camera, mount_free=member.rig_from_camera is not None))
     return tuple(cameras)
 
 
-def _as_given(reconstruction: Reconstruction, hand_eye: HandEye, known: Known) -> RigGaussian:
+def _as_given(reconstruction: Reconstruction, hand_eye: HandEye, known: KnownImages) -> RigGaussian:
     """Return the distribution of the used images' poses, where other than features found in the images decided them."""
     rows = np.flatnonzero(hand_eye.inliers)
     spread_of = np.zeros((6 * len(rows), 6 * len(rows)))

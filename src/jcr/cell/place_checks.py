@@ -6,24 +6,31 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.cell.localise import LEAST_SPREAD, spread
+from jcr.cell.camera_views import CameraViews
+from jcr.cell.localise import spread
 from jcr.cell.placement import ImageUse
-from jcr.cell.rigs import Member
 from jcr.estimation.hand_eye import MAX_STD
 from jcr.findings import Finding, FindingKind
 from jcr.records import Intrinsics, Mount
 
-MEDIAN_PX = 3.0
-"""Largest median reprojection error of an image that fits one pose, for images 1600 px wide."""
+CONTRADICTS = 5.0
+"""Factor of the median reprojection error of all images of the cell from which an image contradicts a pose."""
+LEAST_PX = 1.0
+"""Smallest median reprojection error (px) that contradicts a pose, for images up to 1600 px wide."""
+LEAST_SPREAD = 0.05
+"""Smallest share of the image's area that the points should span; crowded points determine a pose badly."""
 FAR_FROM_GRIPPER = 0.5
 """Distance (m) from the gripper's frame beyond which a camera is likely to be mounted elsewhere."""
 
 
-def contradicting_image(images: Sequence[ImageUse], member: Member) -> Finding | None:
-    """Return the finding of an image that contradicts the pose of all the camera's images."""
+def contradicting_image(images: Sequence[ImageUse], views: CameraViews, typical_px: float) -> Finding | None:
+    """Return the finding of an image that contradicts the pose of all the camera's images.
+
+    `typical_px` is the median reprojection error of all images of the cell.
+    """
     worst = max(images, key=lambda image: image.reprojection_px or 0.0)
-    px, camera = worst.reprojection_px or 0.0, member.camera
-    if px <= MEDIAN_PX * max(1.0, camera.image_size[0] / 1600):
+    px, camera = worst.reprojection_px or 0.0, views.camera
+    if px <= max(CONTRADICTS * typical_px, LEAST_PX * max(1.0, camera.image_size[0] / 1600)):
         return None
     return Finding.of(FindingKind.IMAGE_MISSES, "rejects", "mount", worst.image, value=px, mount=camera.mount)
 
@@ -40,9 +47,9 @@ def place_uncertain(
     return Finding.of(FindingKind.PLACE_UNCERTAIN, "rejects", remedy, value=metres, **details)
 
 
-def crowded_points(member: Member) -> Finding | None:
+def crowded_points(views: CameraViews) -> Finding | None:
     """Return the finding of points that span little of every image."""
-    widest = max(spread(one) for one in member.seen.shared if one is not None)
+    widest = max(map(spread, views.registered.values()))
     if widest >= LEAST_SPREAD:
         return None
     return Finding.of(FindingKind.POINTS_CROWDED, "warns", "images", value=widest)

@@ -1,7 +1,7 @@
 """Placement of further cameras and arms of a cell: the records, and their file cameras.json."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -215,6 +215,28 @@ class CamerasFile(Part):
     cameras: list[CameraPlacement]
     arms: list[ArmPlacement]
     version: str
+
+    def base_from_camera(
+        self,
+        camera: CellCamera,
+        found: CameraPlacement,
+        base_from_gripper: Mapping[int, Float[ndarray, "4 4"]],
+    ) -> list[Float[ndarray, "4 4"]]:
+        """Return base_from_camera of every used image of a placed camera whose gripper pose is known.
+
+        `base_from_gripper` is that of the capture's own arm, by the row of the capture.
+        """
+        parent_from_camera = found.parent_from_camera
+        used = [k for k, image in enumerate(found.images) if image.used]
+        if parent_from_camera is None:
+            return []
+        if camera.mount == "base":
+            return [parent_from_camera for _ in used]
+        if camera.base_from_gripper is not None:
+            base = next(np.array(arm.base_from_other_base) for arm in self.arms if arm.name == camera.arm)
+            return [base @ camera.base_from_gripper[k] @ parent_from_camera for k in used]
+        rows = [] if camera.frame is None else camera.frame[used].tolist()
+        return [base_from_gripper[row] @ parent_from_camera for row in rows if row in base_from_gripper]
 
     def as_json(self) -> dict[str, Any]:
         """Return the content as it is written."""

@@ -3,7 +3,7 @@
 A camera whose images contradict how it is mounted is refused here, before anything is adjusted.
 """
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -12,48 +12,26 @@ from numpy import ndarray
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
 from jcr.cell.camera_views import CameraViews
-from jcr.cell.localise import Shared
 from jcr.cell.placement import CameraPlacement
+from jcr.distributions import chi2
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.estimation.pose_effects import arm_rows
 from jcr.estimation.problem import ReportedPoses
 from jcr.estimation.systematic import smooth_errors
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import Transform, inverse, motion_length, step_between
-from jcr.records import Capture, CellCamera, HandEye
+from jcr.records import Capture, HandEye
 
 SAME_PLACE = (0.02, np.radians(2.0))
-"""m, rad: images of one fixed camera, or places of a camera on its gripper, differ by no more."""
-SAME_PLACE_OF_UNKNOWN = (0.2, np.radians(6.0))
-"""Share of the distance of the scene, rad: this limit for a focal length that one image determines."""
+"""m, rad: gripper poses that differ by less are one."""
+MAP_STD = (4e-3, np.radians(0.25))
+"""m, rad: standard deviations of a place by errors of map and intrinsics, which its covariance does not contain."""
+APART = float(chi2.isf(1e-6, 6))
+"""Squared Mahalanobis distance from which two places of a camera differ."""
 AT_A_FRAME = (0.01, np.radians(1.0))
 """m, rad: nearer than this to where the wrist camera was, a fixed camera is likely to be that camera."""
 LEAST_POSES = 3
 """Fewest images of another arm, or of another camera on the gripper."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Member:
-    """A camera with the images that are used."""
-
-    seen: CameraViews
-    rig: Int[ndarray, " k"]
-    """The rig of each image; -1 where it is not used."""
-    rig_from_camera: Float[ndarray, "4 4"] | None
-    """Pose in the rig; None for its first camera."""
-    arm: int | None
-    """Place of its arm among the ties; None: fixed."""
-    findings: tuple[Finding, ...] = ()
-
-    @property
-    def camera(self) -> CellCamera:
-        """Camera of the images."""
-        return self.seen.camera
-
-    @property
-    def used(self) -> list[tuple[int, Shared]]:
-        """The images that are used, with their numbers."""
-        return [(k, one) for k, one in enumerate(self.seen.shared) if one is not None and self.rig[k] >= 0]
 
 
 class Rigs:
@@ -67,9 +45,9 @@ class Rigs:
         self.arms: list[str] = []
         self._of_arms: list[tuple[Int[ndarray, " n"], Float[ndarray, "n 4 4"], HandEye]] = []
 
-    def add(self, seen: CameraViews) -> Member | CameraPlacement:
+    def add(self, seen: CameraViews) -> CameraViews | CameraPlacement:
         """Add the images of a camera to the rigs; return a rejected placement where it cannot be placed."""
-        if not len(seen.rows):
+        if not seen.registered:
             most = int(np.argmax(seen.counts))
             best, count = seen.camera.images[most], float(seen.counts[most])
             return seen.refused(FindingKind.FEW_POINTS_SHARED, "images", best, value=count)
@@ -77,24 +55,20 @@ class Rigs:
             return self._on_other_arm(seen, seen.camera.arm)
         return self._on_same_gripper(seen) if seen.camera.mount == "gripper" else self._fixed(seen)
 
-    def _fixed(self, seen: CameraViews) -> Member | CameraPlacement:
-        places = seen.places
+    def _fixed(self, seen: CameraViews) -> CameraViews | CameraPlacement:
+        places, covariances = seen.places, seen.covariances
         names = [seen.camera.images[k] for k in seen.rows]
-        metres, radians = _apart(places[:, None], places)
-        most_m, most_rad = SAME_PLACE
-        if not seen.agrees_with_given:
-            most_m, most_rad = SAME_PLACE_OF_UNKNOWN[0] * seen.distance, SAME_PLACE_OF_UNKNOWN[1]
-        if metres.max() > most_m or radians.max() > most_rad:
-            a, b = np.unravel_index((metres / most_m + radians / most_rad).argmax(), metres.shape)
-            apart = {"value": float(metres[a, b]), "rotation": float(radians[a, b])}
+        squared = _squared(places[:, None], covariances[:, None], places, covariances)
+        if squared.max() > APART:
+            a, b = np.unravel_index(squared.argmax(), squared.shape)
+            metres, radians = _apart(places[[a]], places[[b]])
+            apart = {"value": float(metres[0]), "rotation": float(radians[0])}
             return seen.refused(FindingKind.NOT_FIXED, "mount", names[a], names[b], **apart)
-        middle = int(metres.sum(1).argmin())
-        rig = np.full(len(seen.shared), -1)
+        middle = places[int(squared.sum(1).argmin())]
+        rig = np.full(len(seen.found), -1)
         rig[seen.rows] = len(self.poses)
-        self.poses.append(places[middle])
-        return Member(
-            seen=seen, rig=rig, rig_from_camera=None, arm=None, findings=self._at_own_camera(places[middle])
-        )
+        self.poses.append(middle)
+        return replace(seen, rig=rig, findings=self._at_own_camera(middle))
 
     def _at_own_camera(self, place: Float[ndarray, "4 4"]) -> tuple[Finding, ...]:
         """Return the finding of a camera that coincides with a pose of the capture's own camera."""
@@ -106,9 +80,9 @@ class Rigs:
             Finding.of(FindingKind.AT_ANOTHER_CAMERA, "warns", "mount", one, camera=own) for one in images
         )
 
-    def _on_same_gripper(self, seen: CameraViews) -> Member | CameraPlacement:
+    def _on_same_gripper(self, seen: CameraViews) -> CameraViews | CameraPlacement:
         assert seen.camera.frame is not None
-        rig, unused = np.full(len(seen.shared), -1), dict[int, str]()
+        rig, unused = np.full(len(seen.found), -1), dict[int, str]()
         for k in seen.rows.tolist():
             frame = int(seen.camera.frame[k])
             at = np.flatnonzero(self._rows == frame)
@@ -126,20 +100,22 @@ class Rigs:
             return seen.refused(
                 FindingKind.ONE_GRIPPER_POSE, "images", *(seen.camera.images[k] for k in taken)
             )
-        on_rig = inverse(wrist) @ seen.places[np.isin(seen.rows, taken)]
+        among = np.isin(seen.rows, taken)
+        places, covariances = seen.places[among], seen.covariances[among]
+        on_rig = inverse(wrist) @ places
         between = np.asarray(motion_length(inverse(on_rig)[:, None] @ on_rig[None]))
         middle = int(np.median(between, axis=1).argmin())
-        metres, radians = _apart(on_rig[middle], on_rig)
-        astray = (metres > SAME_PLACE[0]) | (radians > SAME_PLACE[1])
+        expected = wrist @ on_rig[middle]
+        astray = _squared(places, covariances, expected, covariances[middle]) > APART
         if astray.mean() > 0.4:
-            most_m, own = float(metres.max()), self._capture.camera_name
+            most_m, own = float(_apart(places, expected)[0].max()), self._capture.camera_name
             return seen.refused(FindingKind.NOT_RIGID, "mount", value=most_m, camera=own)
         rig[taken[astray]] = -1
         why = "its place on the gripper is not that of its other images"
         seen = seen.without(dict.fromkeys(taken[astray].tolist(), why))
-        return Member(seen=seen, rig=rig, rig_from_camera=on_rig[middle], arm=0)
+        return replace(seen, rig=rig, rig_from_camera=on_rig[middle], arm=0)
 
-    def _on_other_arm(self, seen: CameraViews, arm: str) -> Member | CameraPlacement:
+    def _on_other_arm(self, seen: CameraViews, arm: str) -> CameraViews | CameraPlacement:
         assert seen.camera.base_from_gripper is not None
         if arm in self.arms:
             return seen.refused(FindingKind.SECOND_ON_ARM, arm=arm)
@@ -151,14 +127,14 @@ class Rigs:
         found = solve_hand_eye(gripper, places, scale=1.0, scale_std=std, in_sequence=False)
         if not found.converged:
             return seen.not_placed(*found.findings)
-        rig = np.full(len(seen.shared), -1)
+        rig = np.full(len(seen.found), -1)
         used = np.flatnonzero(found.inliers)
         rig[seen.rows[used]] = len(self.poses) + np.arange(len(used))
         why = {int(seen.rows[k]): str(found.images.reasons[k]) for k in np.flatnonzero(~found.inliers)}
         self.poses += list(places[used])
         self.arms.append(arm)
         self._of_arms.append((rig[seen.rows[used]], gripper[used], found))
-        return Member(seen=seen.without(why), rig=rig, rig_from_camera=None, arm=len(self.arms))
+        return replace(seen.without(why), rig=rig, arm=len(self.arms))
 
     def arm_poses(
         self, options: CalibrateOptions
@@ -183,6 +159,18 @@ class Rigs:
             )
         found = [hand_eye, *(one for _, _, one in self._of_arms)]
         return arms, [(one.gripper_from_camera, one.base_from_recon) for one in found]
+
+
+def _squared(
+    places: Float[ndarray, "*#k 4 4"],
+    covariances: Float[ndarray, "*#k 6 6"],
+    others: Float[ndarray, "*#k 4 4"],
+    covariances_of_others: Float[ndarray, "*#k 6 6"],
+) -> Float[ndarray, "..."]:
+    """Return the squared Mahalanobis distance between poses, which broadcast."""
+    step = step_between(places, others)
+    covariance = covariances + covariances_of_others + 2 * np.diag(np.repeat(MAP_STD, 3) ** 2)
+    return (step * np.linalg.solve(covariance, step[..., None])[..., 0]).sum(-1)
 
 
 def _apart(

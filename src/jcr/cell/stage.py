@@ -7,21 +7,21 @@ others rests on the same images.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.checks.camera import with_contradiction
-from jcr.calibration.checks.effects import effects
-from jcr.calibration.checks.given_intrinsics import contradicted_by
-from jcr.calibration.checks.imaged import Imaged
+from jcr.calibration.checks.camera import all_combinations
+from jcr.calibration.checks.camera_adjustment import CameraAdjustment
+from jcr.calibration.checks.effects import as_adopted, effects
 from jcr.calibration.options import CalibrateOptions
-from jcr.camera import usable_intrinsics
 from jcr.capture.images import read_image
+from jcr.cell.added import camera_of
 from jcr.cell.camera_views import CameraViews
 from jcr.cell.images import CellImages, cell_images
-from jcr.cell.localise import Shared, guessed_intrinsics, known_images, localised
+from jcr.cell.localise import localise
 from jcr.cell.place_checks import contradicting_image, crowded_points, far_from_gripper, place_uncertain
 from jcr.cell.placement import (
     ArmPlacement,
@@ -30,9 +30,8 @@ from jcr.cell.placement import (
     ImageUse,
     TransformUncertainty,
 )
-from jcr.cell.rigs import Member, Rigs
+from jcr.cell.rigs import Rigs
 from jcr.estimation.image_equations import median_reprojection_px
-from jcr.estimation.intrinsics_prior import ESTIMATED, camera_with_prior
 from jcr.estimation.problem import State
 from jcr.estimation.solve import Solution
 from jcr.findings import Finding, FindingKind
@@ -40,11 +39,25 @@ from jcr.geometry import inverse, scale_translation
 from jcr.intrinsics_json import IntrinsicsAndStd
 from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress, silent, steps
-from jcr.records import Capture, CellCamera, HandEye, Reconstruction
+from jcr.records import Capture, CellCamera, HandEye, Intrinsics, Reconstruction
+from jcr.sfm.register import KnownImages, Registration
 
-SURE_OF_INTRINSICS = 3.5
-"""Standard deviations from which a further camera's images are said to contradict its intrinsics: one image of 127
-points showed those of another camera, 3.5 % too long, by 4.4."""
+
+def place_camera(
+    capture: Capture,
+    calibration: HandEye,
+    reconstruction: Reconstruction,
+    images: Sequence[str | Path],
+    intrinsics: Intrinsics | None = None,
+) -> CameraPlacement:
+    """Place a fixed camera by its images of the scene of a calibrated capture.
+
+    `reconstruction` is the one that the calibration was made from; unknown intrinsics are estimated. Raises InputError
+    for files that are not images of one camera. A camera that cannot be placed is returned with the reason.
+    """
+    camera = camera_of("camera", [Path(image) for image in images], None, (capture.camera_name,))
+    camera = replace(camera, intrinsics=intrinsics)
+    return place_cameras(capture, [camera], reconstruction, calibration).cameras[0]
 
 
 @one_blas_thread
@@ -71,19 +84,17 @@ def place_cameras(
     # In metres from the first: the equations that follow are better for it, and distances can be spoken of.
     own = scale_translation(reconstruction.recon_from_camera[used], hand_eye.scale)
     images = [read_image(capture.folder / capture.images[row]) for row in rows]
-    known = known_images(images, reconstruction.intrinsics, own)
-    found: dict[str, list[Shared | int]] = {camera.name: [] for camera in others}
+    known = KnownImages.of(images, reconstruction.intrinsics, own)
+    found: dict[str, list[Registration | int]] = {camera.name: [] for camera in others}
     todo = [(camera, image) for camera in others for image in camera.images]
     for camera, image in steps(progress, "other cameras", todo):
-        intrinsics, _ = usable_intrinsics(camera.intrinsics)
         pixels = read_image((camera.folder or capture.folder) / image)
-        start = intrinsics or guessed_intrinsics(camera.image_size)
-        found[camera.name].append(localised(known, pixels, start, intrinsics is not None))
+        found[camera.name].append(localise(known, pixels, camera))
     rigs = Rigs(capture, hand_eye, own, rows)
-    placed: list[Member] = []
+    placed: list[CameraViews] = []
     failed: list[CameraPlacement] = []
     for camera in others:
-        member = rigs.add(CameraViews.of(camera, found[camera.name]))
+        member = rigs.add(CameraViews(camera=camera, found=tuple(found[camera.name])))
         if isinstance(member, CameraPlacement):
             failed.append(member)
         else:
@@ -110,9 +121,10 @@ def place_cameras(
     return CellPlacement(tuple(cameras[camera.name] for camera in others), tuple(arms), answer, of)
 
 
-def _place_of(member: Member, c: int) -> Callable[[State], Float[ndarray, "4 4"]]:
+def _place_of(member: CameraViews, c: int) -> Callable[[State], Float[ndarray, "4 4"]]:
     """Return parent_from_camera of the c-th camera as a function of the state."""
-    rig, arm = int(member.rig[member.rig >= 0][0]), member.arm
+    assert member.rig is not None
+    rig, arm = int(member.rig[next(iter(member.used))]), member.arm
 
     def parent_from_camera(placed: State) -> Float[ndarray, "4 4"]:
         if arm is None:
@@ -124,14 +136,14 @@ def _place_of(member: Member, c: int) -> Callable[[State], Float[ndarray, "4 4"]
 
 def _examined(
     images: CellImages,
-    members: Sequence[Member],
+    members: Sequence[CameraViews],
     places: Sequence[Callable[[State], Float[ndarray, "4 4"]]],
     hand_eye: HandEye,
 ) -> tuple[Solution, list[tuple[Finding, ...]]]:
     """Adjust all images, and test those of each camera (calibration/checks/effects.py).
 
-    Where they contradict intrinsics that were given, or leave doubt of them, the images are adjusted as if none had
-    been: of one image the given ones would weigh more than what it shows, and the answer be wrong by many sigmas.
+    The adjustment adopts the effects on the cameras: of one image given intrinsics that are wrong would weigh more than
+    what it shows.
     """
     answer, found = images.adjusted(), list[tuple[Finding, ...]]()
     tested: set[int | None] = {0}
@@ -146,14 +158,11 @@ def _examined(
         imaged = _imaged(
             images, answer, _placement(member, c, answer, place, hand_eye), c, (arm, place), is_given
         )
-        _, faults = effects(imaged)
-        contradiction = None
-        if is_given and all(one.kind is FindingKind.INTRINSICS for one in faults):
-            contradiction = contradicted_by(imaged, SURE_OF_INTRINSICS)
-        if contradiction is not None:
-            answer, contradicted = contradiction
-            images = images.with_freed(camera_with_prior(imaged.start, ESTIMATED), c)
-            faults = with_contradiction(faults, (contradicted,))
+        state, faults = effects(imaged)
+        if state.found:
+            images = images.with_freed(imaged.prior, c, all_combinations(state.found))
+            answer = images.adjusted()
+            faults = tuple(as_adopted(one) if one.kind.row.group == "camera" else one for one in faults)
         found.append(faults)
     return answer, found
 
@@ -165,11 +174,11 @@ def _imaged(
     c: int,
     arm_and_place: tuple[int | None, Callable[[State], Float[ndarray, "4 4"]]],
     is_given: bool,
-) -> Imaged:
+) -> CameraAdjustment:
     """Return a further camera, the c-th, as its checks take it, with the arm whose poses are tested with it."""
     assert found.covariance is not None
     arm, place = arm_and_place
-    return Imaged(
+    return CameraAdjustment(
         adjusted=answer,
         adjust=lambda prior, combinations, bent: (
             images.with_confirmed(arm, bent).with_freed(prior, c, combinations).adjusted()
@@ -187,7 +196,7 @@ def _imaged(
 
 
 def _placement(
-    member: Member,
+    member: CameraViews,
     c: int,
     answer: Solution,
     parent_from_camera: Callable[[State], Float[ndarray, "4 4"]],
@@ -201,11 +210,10 @@ def _placement(
     covariance = covariance + _by_faults(answer, answer.derivative(parent_from_camera), hand_eye)
     of_all = median_reprojection_px(problem, answer.images.view)
     medians = of_all[problem.observations.camera == c].tolist()
-    px = dict(zip((k for k, _ in member.used), medians, strict=True))
-    uses = zip(camera.images, member.seen.counts, member.seen.reasons, strict=True)
+    px = dict(zip(member.used, medians, strict=True))
     images = [
-        ImageUse(image=image, used=reason is None, points=count, reprojection_px=px.get(k), reason=reason)
-        for k, (image, count, reason) in enumerate(uses)
+        ImageUse(image=image, used=k in px, points=count, reprojection_px=px.get(k), reason=member.reason(k))
+        for k, (image, count) in enumerate(zip(camera.images, member.counts, strict=True))
     ]
     intrinsics, std = problem.intrinsics(answer.state)[c], np.sqrt(np.diag(answer.intrinsics_covariance(c)))
 
@@ -214,7 +222,7 @@ def _placement(
 
     # An image that contradicts the pose also makes it uncertain.
     checked = (
-        contradicting_image(images, member) or uncertain(),
+        contradicting_image(images, member, float(np.median(of_all))) or uncertain(),
         *member.findings,
         crowded_points(member),
         far_from_gripper(transform, camera.mount),
@@ -224,7 +232,7 @@ def _placement(
         covariance = covariance + fault.covariance[:6, :6]
         rejected = any(one.severity == "rejects" for one in findings)
         findings.append(replace(fault, severity="rejects") if rejected or uncertain() else fault)
-    distance_m = member.seen.distance * answer.state.scale
+    distance_m = member.distance * answer.state.scale
     return CameraPlacement.of(
         camera,
         images,

@@ -90,7 +90,6 @@ def _as_json(found: "Verification") -> dict[str, object]:
         "drift_std_mm": (1e3 * found.std[:3]).tolist(),
         "drift_std_deg": np.degrees(found.std[3:]).tolist(),
         "p_value": found.p_value,
-        "misfit_p_value": found.misfit_p_value,
         "detectable_mm": 1e3 * found.detectable[0],
         "detectable_deg": float(np.degrees(found.detectable[1])),
         "images": list(found.images),

@@ -198,13 +198,19 @@ def judged(hand_eye: HandEye) -> HandEye:
     return replace(hand_eye, findings=strongest_first(findings))
 
 
+def poses_agree(noise: RobotNoise) -> bool:
+    """Return whether gripper poses with this noise belong to the images at all."""
+    metres, radians = noise.together
+    return metres <= MAX_NOISE[0] and bool(radians <= MAX_NOISE[1])
+
+
 def _of_agreement(hand_eye: HandEye) -> Iterator[Finding]:
     """Yield findings that too few images agree, or that poses contradict the images."""
     used, n = float(hand_eye.inliers.sum()), len(hand_eye.inliers)
     if used < max(3, MIN_SHARE_USED * n) and n > 2:
         yield Finding.of(FindingKind.FEW_AGREE, "rejects", "reconstruction", value=used, images=float(n))
-    metres, radians = hand_eye.robot_noise.together
-    if metres > MAX_NOISE[0] or radians > MAX_NOISE[1]:
+    if not poses_agree(hand_eye.robot_noise):
+        metres, radians = hand_eye.robot_noise.together
         kind = FindingKind.POSES_CONTRADICT_IMAGES
         yield Finding.of(kind, "rejects", "reconstruction", value=metres, rotation=radians)
 

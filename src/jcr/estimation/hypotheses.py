@@ -94,14 +94,19 @@ def best_tests(equations: Equations, log_sizes: LogSizes, rows: Sequence[Row]) -
     return sorted(tests, key=lambda test: test.log_p)
 
 
-def confirm(equations: Equations, row: Row, places: int = 1) -> Test:
-    """Return Wald's test of a row, with the sizes of the errors estimated again while its columns are free."""
+def confirm(equations: Equations, row: Row, places: int = 1, freedom: float | None = None) -> Test:
+    """Return Wald's test of a row, with the sizes of the errors estimated again while its columns are free.
+
+    The chance is averaged over the sizes. `freedom` is that of the sizes at each point of the average; None: of all
+    residuals, which counts their uncertainty twice and is on the safe side.
+    """
     free = with_columns(equations, row.columns)
     count, d = equations.jacobian.shape[1], row.columns.shape[1]
     likeliest, information = most_likely(free)
     found = solve_equations(free, likeliest)
     without = solve_equations(equations, likeliest)
-    freedom = max(len(equations.residual) - UNKNOWNS - d, 1)
+    if freedom is None:
+        freedom = max(len(equations.residual) - UNKNOWNS - d, 1)
     log_shares = []
     # With few poses the sizes are hardly known, and larger ones leave more to chance.
     for weight, _, each in over_sizes(free, likeliest, information):

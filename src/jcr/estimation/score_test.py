@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.camera import parameter_names, parameters
+from jcr.camera import parameter_names
 from jcr.distributions import f as f_distribution
 from jcr.estimation.cholesky import cholesky, over
 from jcr.estimation.image_equations import ImageEvidence, evidence
@@ -206,30 +206,6 @@ def _distances(images: ImageEvidence, mine: Int[ndarray, " m"]) -> Float[ndarray
     depth, image = images.view.depth, images.problem.observations.image
     distance = np.array([np.median(depth[image == k]) if (image == k).any() else np.nan for k in mine])
     return np.where(np.isfinite(distance), distance, np.nanmedian(distance))
-
-
-def freed_intrinsics(
-    solution: Solution, prior: Camera, camera: int = 0
-) -> tuple[Float[ndarray, " q"], Float[ndarray, "q q"]]:
-    """Return the parameters of a camera after one Gauss-Newton step under another prior, and their covariance."""
-    problem, state = solution.problem, solution.images.state
-    now, columns = parameters(problem.intrinsics(state)[camera]), problem.columns.intrinsics[camera]
-    off = now - parameters(problem.cameras[camera].intrinsics)
-    steps = np.r_[
-        state.camera_steps[: columns.start],
-        np.linalg.pinv(prior.directions) @ off,
-        state.camera_steps[columns.stop :],
-    ]
-    prior = replace(prior, intrinsics=problem.cameras[camera].intrinsics)
-    freed_problem = with_free(problem, cameras=with_camera(problem, prior, camera).cameras)
-    wider = evidence(freed_problem, replace(state, camera_steps=steps))
-    likely = solution.most_likely
-    at = replace(wider.state, x=likely.x, scale=likely.scale, z=likely.z)
-    found = solve_equations(pose_equations(freed_problem, at, wider).equations, solution.log_sizes)
-    begin = problem.arm_unknowns + columns.start
-    own = slice(begin, begin + len(prior.std))
-    covariance = found.covariance[own, own]
-    return now + prior.directions @ found.step[own], prior.directions @ covariance @ prior.directions.T
 
 
 def with_camera(problem: Problem, prior: Camera, camera: int = 0) -> Problem:

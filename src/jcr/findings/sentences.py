@@ -276,39 +276,26 @@ def not_registered(finding: "Finding") -> str:
 
 
 def intrinsics(finding: "Finding") -> str:
-    if finding.p is None:
-        shown_by = "pointmaps" if "predicted" in finding.details else "images"
-        return f"the {shown_by} show {' and '.join(_of_image_parts(finding))}"
+    if "focal" in finding.details:
+        focal, std, given = (_number(finding, f"focal{of}") for of in ("", "_std", "_given"))
+        return f"the pointmaps show a focal length of {focal:.0f} ± {significant(std)} px where {given:.0f} is given"
     return f"the images show {' and '.join(_of_parameters(finding))}"
 
 
-def _of_image_parts(finding: "Finding") -> list[str]:
-    """Return the parts of the intrinsics that differ enough to matter: focal length, distortion, principal point."""
-    by, said = finding.details, []
-    if "focal" in by:
-        focal, std, given = (_number(finding, f"focal{of}") for of in ("", "_std", "_given"))
-        said.append(f"a focal length of {focal:.0f} ± {significant(std)} px where {given:.0f} is given")
-    if "bend" in by:
-        px, std = (_number(finding, f"bend{of}") for of in ("", "_std"))
-        said.append(f"a distortion up to {px:.1f} ± {significant(std)} px from the one used")
-    if "cx" in by:
-        cx, cy, std, cx_given, cy_given = (
-            _number(finding, name) for name in ("cx", "cy", "centre_std", "cx_given", "cy_given")
-        )
-        said.append(
-            f"a principal point of ({cx:.0f}, {cy:.0f}) ± {significant(std)} px where ({cx_given:.0f}, {cy_given:.0f}) "
-            "is given"
-        )
-    return said
+def to_intrinsics(finding: "Finding") -> str:
+    if "estimated" in finding.details:
+        return "use the transform with the intrinsics of this calibration"
+    return "calibrate the intrinsics again at this resolution, or give no intrinsics (null) to have them estimated"
 
 
 def _of_parameters(finding: "Finding") -> list[str]:
     """Return each parameter that differs surely, as found and as given."""
     by, said = finding.details, []
+    before = "was estimated first" if "estimated" in by else "is given"
     common = {"fx_std", "fy_std"} <= by.keys() and _is_common(finding)
     if common:
         fx, std, given = (_number(finding, f"fx{of}") for of in ("", "_std", "_given"))
-        said.append(f"a focal length of {fx:.1f} ± {significant(std)} px where {given:.1f} is given")
+        said.append(f"a focal length of {fx:.1f} ± {significant(std)} px where {given:.1f} {before}")
     for pair, what, px, digits in PAIRS[common:]:
         known = [name for name in pair if f"{name}_std" in by]
         if any(_sigmas(finding, name) > SURE for name in known):
@@ -317,7 +304,7 @@ def _of_parameters(finding: "Finding") -> list[str]:
                 for of in ("", "_given")
             )
             most = significant(max(_number(finding, f"{name}_std") for name in known))
-            said.append(f"{what} ({found}) ± {most}{px} where ({was}) is given")
+            said.append(f"{what} ({found}) ± {most}{px} where ({was}) {before}")
     return said or ["other intrinsics than those used, no one of them surely by itself"]
 
 
@@ -336,10 +323,11 @@ def _is_common(finding: "Finding") -> bool:
 
 
 def one_part(finding: "Finding") -> str:
+    """Return which part of the images to calibrate after a change, and what must be as it was for the other part."""
     part = {"before": "up to {images[0]}", "after": "from {images[1]} on"}[str(finding.details["longer"])]
+    kept = "the camera still sits" if finding.concerns == "mount" else "base and scene still stand"
     return filled(
-        f"calibrate the {{count:.0f}} images {part} alone, and those of the other part only where the camera still sits "
-        "as it did then",
+        f"calibrate the {{count:.0f}} images {part} alone, and those of the other part only where {kept} as then",
         finding,
     )
 

@@ -136,9 +136,8 @@ class FindingKind(StrEnum):
         "switch image stabilisation off, or fix the optics", explains=MISFIT,
         means="image-stabilised or loose optics",
         evidence="px, when gravity lies in the image; the chance `p`")
-    INTRINSICS = "intrinsics contradict the images", Row("camera", sentences.intrinsics,
-        "calibrate the intrinsics again at this resolution, or give no intrinsics (null) to have them "
-        "estimated", explains=MISFIT,
+    INTRINSICS = "intrinsics contradict the images", Row("camera", sentences.intrinsics, sentences.to_intrinsics,
+        explains=MISFIT, help="calibrate them again at this resolution, or give none (null) to have them estimated",
         means="the given intrinsics are not those of the images; parameters in `details`",
         evidence="the chance `p`")
     SLIP = "camera moved on the gripper", Row("order",
@@ -276,6 +275,11 @@ class FindingKind(StrEnum):
         "only {value:.0f} of {of:.0f} images are used, and their motions alone are degenerate, those of "
         "all are not", "let the views overlap more and show more texture, or use a board (jcr docs markers)",
         explains=(*MISFIT, *TOO_FEW), evidence="images")
+    PIECES = "reconstruction in pieces", Row("reconstruction",
+        "the reconstruction is in pieces: {value:.0f} of {of:.0f} images, such as {images[0]}, agree with their gripper "
+        "poses among themselves and contradict the other images",
+        "avoid patterns that repeat, as of a board alone, or name the board (--board); let the views overlap more",
+        explains=MISFIT, evidence="images of the further pieces")
     POSES_SWAPPED = "gripper poses exchanged", Row("single",
         "{images[0]} and {images[1]} have each other's gripper pose", "exchange the two poses",
         explains=MISFIT)

@@ -13,7 +13,7 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from jcr.calibration.case import Case, of_points
-from jcr.calibration.checks.left_out import SAME
+from jcr.calibration.checks.capture import SAME
 from jcr.calibration.checks.views import STILL as MOVED
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised, assumptions_of

@@ -58,7 +58,6 @@ class Verification:
     """Drift: translation (m) and rotation vector (rad) of the camera in gripper axes."""
     std: Float[ndarray, "6"]
     p_value: float
-    misfit_p_value: float | None
     detectable: tuple[float, float]
     """m, rad: a drift of this size in the worst direction would be found nine times in ten."""
     images: tuple[str, ...]
@@ -344,7 +343,7 @@ def _used(calibration: Calibration, reconstruction: Reconstruction) -> Bool[ndar
 def _judged(
     found: Drift, options: VerifyOptions, images: tuple[str, ...], notes: tuple[str, ...], how: str
 ) -> Verification:
-    if found.misfit_p_value is not None and found.misfit_p_value < options.alpha and found.cause != "scene":
+    if found.is_noisier:
         notes += ("the images disagree with one another; something else than the camera moved too, or the robot "
                   "is less exact than when it was calibrated",)  # fmt: skip
     return Verification(
@@ -353,7 +352,6 @@ def _judged(
         offset=found.offset,
         std=np.sqrt(np.diag(found.covariance)),
         p_value=found.p_value,
-        misfit_p_value=found.misfit_p_value,
         detectable=found.detectable,
         images=images,
         notes=notes,
@@ -407,7 +405,6 @@ def _of_two(
         offset=offset,
         std=np.sqrt(np.diag(covariance)),
         p_value=p_value,
-        misfit_p_value=None,
         detectable=detectable(covariance, options.alpha),
         images=images,
         notes=notes,

@@ -10,7 +10,6 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from jcr.cell.placement import CameraPlacement
-from jcr.cell.poses import base_from_camera as poses_of
 from jcr.geometry import apply_similarity, inverse
 from jcr.records import CellCamera, Intrinsics
 from jcr.report.images import image_numbers, shown_names
@@ -227,7 +226,7 @@ def _places(
         return [np.array(found.parent_from_camera)]
     if found.name not in known:
         return []
-    return [*poses_of(known[found.name], found, result.cameras, by_row).values()]
+    return result.cameras.base_from_camera(known[found.name], found, by_row)
 
 
 def _bases(result: RunResult) -> list[dict[str, Any]]:

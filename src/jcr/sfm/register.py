@@ -6,6 +6,7 @@ end will do; the covariance of a new one includes that of the points.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
@@ -39,6 +40,57 @@ class Features:
     """Descriptors of unit length."""
 
 
+@dataclass(frozen=True)
+class KnownImages:
+    """Images of one camera with known poses, and their features."""
+
+    camera: Intrinsics
+    recon_from_camera: Float[ndarray, "m 4 4"]
+    features: tuple[Features, ...]
+
+    @classmethod
+    def of(
+        cls,
+        images: Sequence[UInt8[ndarray, "h w 3"]],
+        camera: Intrinsics,
+        recon_from_camera: Float[ndarray, "m 4 4"],
+    ) -> "KnownImages":
+        """Find the features of images with known poses."""
+        return cls(camera, recon_from_camera, tuple(features(image, camera) for image in images))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SharedPoints:
+    """Features of a new image triangulated from images with known poses."""
+
+    known: KnownImages
+    x_px: Float[ndarray, "n 2"]
+    """Pixels of the new image's features."""
+    points: Float[ndarray, "n 3"]
+    spread: Float[ndarray, "n 3 3"]
+    """Covariance of the points for rays of 1 rad noise."""
+    good: Bool[ndarray, " n"]
+    """Whether two or more rays agree on the point."""
+    feature: Int[ndarray, " c"]
+    """Feature of each observation in the known images."""
+    row: Int[ndarray, " c"]
+    row_x_px: Float[ndarray, "c 2"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Registration:
+    """Pose of a new image, and the points that it shares with images of known poses."""
+
+    pose: CameraPose
+    points_in_recon: Float[ndarray, "p 3"]
+    x_px: Float[ndarray, "p 2"]
+    """Pixels of the new image."""
+    row: Int[ndarray, " k"]
+    """Image of known pose of each further observation."""
+    row_x_px: Float[ndarray, "k 2"]
+    row_point: Int[ndarray, " k"]
+
+
 def register(
     reconstruction: Reconstruction,
     older: Sequence[UInt8[ndarray, "h w 3"]],
@@ -48,12 +100,10 @@ def register(
 
     `older` are the images of the reconstruction's rows, in their order; all are of one camera.
     """
-    intrinsics = reconstruction.intrinsics
-    known = [features(image, intrinsics) for image in older]
-    return [
-        _registered(features(image, intrinsics), known, reconstruction.recon_from_camera, intrinsics)
-        for image in new
-    ]
+    camera = reconstruction.intrinsics
+    known = KnownImages.of(older, camera, reconstruction.recon_from_camera)
+    found = [registration(shared_points(known, features(image, camera)), camera) for image in new]
+    return [one.pose if isinstance(one, Registration) else one for one in found]
 
 
 def features(image: UInt8[ndarray, "h w 3"], intrinsics: Intrinsics) -> Features:
@@ -67,27 +117,65 @@ def features(image: UInt8[ndarray, "h w 3"], intrinsics: Intrinsics) -> Features
     )
 
 
-def _registered(
-    new: Features, known: list[Features], recon_from_camera: Float[ndarray, "m 4 4"], camera: Intrinsics
-) -> CameraPose | int:
-    """Return the pose on which the triangulated points agree, or their number where fewer than MIN_POINTS do."""
-    of_row = [matches(new.descriptors, others.descriptors) for others in known]
+def shared_points(known: KnownImages, new: Features) -> SharedPoints:
+    """Match the features of a new image with those of known images, and triangulate them from these."""
+    of_row = [matches(new.descriptors, others.descriptors) for others in known.features]
     feature = np.concatenate([mine for mine, _ in of_row])
-    row = np.repeat(np.arange(len(known)), [len(mine) for mine, _ in of_row])
-    seen = np.concatenate([known[k].rays[theirs] for k, (_, theirs) in enumerate(of_row)])
-    gate = GATE_PX / camera.fx
-    points, spread, good = triangulated(feature, row, seen, recon_from_camera, gate, len(new.rays))
-    if good.sum() < MIN_POINTS:
-        return int(good.sum())
-    std_px, found = 1.0, None
-    for _ in range(2):  # the older images have the noise that is found in the new one
-        covariance = (std_px / camera.fx) ** 2 * spread[good]
-        found = absolute_pose(new.x_px[good], points[good], camera, covariance, GATE_PX)
-        if found is None or found.inlier.sum() < MIN_POINTS:
-            return 0 if found is None else int(found.inlier.sum())
-        std_px = found.std_px
-    assert found is not None
-    return found
+    row = np.repeat(np.arange(len(of_row)), [len(mine) for mine, _ in of_row])
+    theirs = list(zip(known.features, (rows for _, rows in of_row), strict=True))
+    rays = np.concatenate([one.rays[rows] for one, rows in theirs])
+    gate = GATE_PX / known.camera.fx
+    points, spread, good = triangulated(feature, row, rays, known.recon_from_camera, gate, len(new.rays))
+    return SharedPoints(
+        known=known,
+        x_px=new.x_px,
+        points=points,
+        spread=spread,
+        good=good,
+        feature=feature,
+        row=row,
+        row_x_px=np.concatenate([one.x_px[rows] for one, rows in theirs]),
+    )
+
+
+def registration(
+    shared: SharedPoints,
+    camera: Intrinsics,
+    focal: Literal["given", "free"] = "given",
+    gate_px: float = GATE_PX,
+) -> Registration | int:
+    """Return the pose on which the shared points agree, or their number where fewer than MIN_POINTS do."""
+    candidates, known = np.flatnonzero(shared.good), shared.known
+    if len(candidates) < MIN_POINTS:
+        return len(candidates)
+    points, std_px, pose = shared.points[candidates], 1.0, None
+    for _ in range(2):  # the known images have the noise that is found in the new one
+        covariance = (std_px / known.camera.fx) ** 2 * shared.spread[candidates]
+        pose = absolute_pose(shared.x_px[candidates], points, camera, covariance, gate_px, focal)
+        if pose is None or pose.inlier.sum() < MIN_POINTS:
+            return 0 if pose is None else int(pose.inlier.sum())
+        std_px = pose.std_px
+    assert pose is not None
+    agreed = candidates[pose.inlier]
+    # Observations of the known images count where their point projects.
+    rotation, centre = (
+        part[shared.row] for part in (known.recon_from_camera[:, :3, :3], known.recon_from_camera[:, :3, 3])
+    )
+    in_camera = np.einsum("cji,cj->ci", rotation, shared.points[shared.feature] - centre)
+    ahead = in_camera[:, 2] > 1e-6
+    projected = project(known.camera, np.where(ahead[:, None], in_camera, [0.0, 0.0, 1.0]))
+    miss_px = np.linalg.norm(projected - shared.row_x_px, axis=1)
+    kept = ahead & (miss_px < GATE_PX) & np.isin(shared.feature, agreed)
+    number = np.zeros(len(shared.x_px), int)
+    number[agreed] = np.arange(len(agreed))
+    return Registration(
+        pose=pose,
+        points_in_recon=shared.points[agreed],
+        x_px=shared.x_px[agreed],
+        row=shared.row[kept],
+        row_x_px=shared.row_x_px[kept],
+        row_point=number[shared.feature[kept]],
+    )
 
 
 def triangulated(

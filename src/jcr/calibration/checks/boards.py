@@ -1,4 +1,4 @@
-"""Boards and tags beside features: where they were found, how large and how bent they are."""
+"""Check of boards and tags beside features: images that show them, size and bend."""
 
 from dataclasses import replace
 
@@ -6,15 +6,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.case import Case, Checked
+from jcr.calibration.case import Case, CheckResult
 from jcr.estimation.solve import Solution, size_of_boards
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import apply
 from jcr.records import BoardFound, Boards
 
 
-def check_boards(case: Case) -> Checked:
-    """What became of the boards that were to be looked for, and what size the robot makes of them."""
+def check_boards(case: Case) -> CheckResult:
+    """Report boards that were not found or that moved, and their size by the robot."""
     boards = case.reconstruction.tracks.boards
     assert boards is not None
     findings = list[Finding]()
@@ -30,7 +30,7 @@ def check_boards(case: Case) -> Checked:
         findings.append(Finding.of(FindingKind.BOARD_MOVED, "warns", "images", *elsewhere, board=boards.spec))
     hand_eye = case.hand_eye
     if case.adjusted is None or case.adjusted.problem.boards is None:
-        return Checked(tuple(findings))
+        return CheckResult(tuple(findings))
     found = board_found(case.adjusted, boards)
     if boards.size_std is None and hand_eye.before is not None:
         side = 1e-3 * found.side_mm, 1e-3 * found.side_std_mm
@@ -38,7 +38,7 @@ def check_boards(case: Case) -> Checked:
             Finding.of(FindingKind.BOARD_SIDE, "informs", value=side[0], std=side[1], board=boards.spec)
         )
     evidence = replace(hand_eye.scale_evidence, board=found)
-    return Checked(tuple(findings), replace(hand_eye, scale_evidence=evidence))
+    return CheckResult(tuple(findings), replace(hand_eye, scale_evidence=evidence))
 
 
 def board_found(adjusted: Solution, boards: Boards) -> BoardFound:

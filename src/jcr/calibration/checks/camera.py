@@ -15,8 +15,9 @@ from numpy import ndarray
 
 from jcr.calibration.adjust import adjust_case, focal_of_each
 from jcr.calibration.case import Case, of_points
-from jcr.calibration.checks.imaged import Imaged
+from jcr.calibration.checks.camera_adjustment import CameraAdjustment
 from jcr.camera import parameter_names, parameters
+from jcr.distributions import f as f_distribution
 from jcr.estimation.hypotheses import Row
 from jcr.estimation.model_error import TYPICAL
 from jcr.estimation.problem import OF_IMAGE, PRISM
@@ -36,15 +37,17 @@ from jcr.geometry import step_between
 from jcr.records import Intrinsics, Tracks
 
 LOG_P = float(np.log(1e-6))
-"""Chance of any one alarm where there is nothing, before it is divided by the number of places of a change."""
+"""Logarithm of the probability of a false alarm of one effect, over all places of a change."""
+LOG_P_GIVEN = float(np.log(1e-4))
+"""LOG_P of given intrinsics: one hypothesis of a camera, whose finding also needs a difference that matters."""
 MATERIAL = 0.5
-"""Standard deviations by which a fault must move the camera's place on some axis to be reported."""
+"""Standard deviations by which a fault must move the camera on some axis to be reported."""
 OF_FIRST_STEP = 0.2
-"""Share of that which the first step towards a fault must go, for the adjustments that follow take long."""
+"""Share of MATERIAL that the first step towards a fault must reach before it is adjusted."""
 MOST_POINTS, WELL_SEEN = 800, 3
-"""Points that take part, first those in this many images: more tell a fault no better, and take time."""
+"""Largest number of points that take part, first those in this many images: more show a fault no better."""
 MOST_BYTES, BYTES_PER_IMAGE = 100_000_000, 16 * OF_IMAGE
-"""Of the derivatives of all observations by the nuisances of each image: of 58 000 observations by 200 images they were
+"""Limits on the derivatives of all observations by the nuisances of each image: 58 000 observations of 200 images need
 740 MB, and the equations several times that."""
 LEAST_PX = {
     FindingKind.ROLLING_SHUTTER: 3.0,
@@ -52,36 +55,31 @@ LEAST_PX = {
     FindingKind.CENTRE_SAGS: 3.0,
     FindingKind.THIN_PRISM: 1.0,
 }
-"""What is measured in pixels and smaller is what a distortion model leaves over."""
+"""Smallest size (px) that is reported; smaller effects are remaining errors of the distortion model."""
+OFF, OFF_CENTRE = 0.01, 0.015
+"""Differences of focal length and principal point from given ones, in focal lengths, that are a fault: factory values
+and calibrations of another day are off by 0.3 to 0.9 % and a few pixels."""
 OF_EACH = {FindingKind.FOCUS_BY_IMAGE, FindingKind.ROLLING_SHUTTER_BY_IMAGE}
+"""Effects that differ from image to image."""
 SURE = 2.0
-"""Standard deviations of what differs from image to image: of hundreds of images the chance of less is small for any
-noise that is estimated a little too small. Of a dozen images what is that improbable is larger."""
-MIN_IMAGES = 5
+"""Smallest size, in standard deviations, of effects that differ from image to image: of many images smaller ones
+are improbable wherever the noise is estimated a little too small."""
+MIN_IMAGES = 6
+"""Fewest images that show effects which differ between images; fewer show intrinsics that are wrong in all."""
 LEAST_PART = 2
-"""Images before and after a change."""
+"""Fewest images before and after a change."""
 ASPECT = ("fx", "p1", "p2")
-"""Of estimated intrinsics, whose focal length is one and whose tangential distortion is none: what is tested."""
+"""Parameters that are tested of estimated intrinsics, which have one focal length and no tangential distortion."""
 CONCERNS: dict[FindingKind, Concerns] = {
     FindingKind.THIN_PRISM: "intrinsics",
     FindingKind.CENTRE_SAGS: "mount",
 }
-"""What would help where other images would not."""
+"""Remedy of effects that other images do not help against."""
 FOCUS = {FindingKind.FOCUS_BY_DISTANCE, FindingKind.FOCUS_BY_IMAGE, FindingKind.ZOOM}
-"""Of a focal length that differs between images, one is named."""
+"""Effects of a focal length that differs between images, of which one is named."""
 NEARLY_ALL = 0.9
-"""Of the squares of what the focal length differs by."""
+"""Share of the squared differences of focal lengths that a simpler effect must explain."""
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-
-
-def with_contradiction(
-    faults: tuple[Finding, ...], contradiction: tuple[Finding, ...]
-) -> tuple[Finding, ...]:
-    """What was found of one camera, where its given intrinsics are contradicted as a whole: with the parameters that a
-    test of these named, if it did."""
-    named = [one for one in faults if contradiction and one.kind is FindingKind.INTRINSICS]
-    whole = [replace(one, shift=contradiction[0].shift, intrinsics_shift=None) for one in named]
-    return (*(one for one in faults if one not in named), *(whole or contradiction))
 
 
 @dataclass(frozen=True)
@@ -90,14 +88,14 @@ class CameraEffect:
 
     kind: FindingKind
     free: Float[ndarray, "e p"]
-    """The combinations that it is about."""
+    """Combinations that the effect consists of."""
     beside: Float[ndarray, "e q"]
-    """What is free with it and shows nothing."""
+    """Combinations that are free beside it and are no part of it."""
     _: KW_ONLY
     places: int = 1
-    """That were searched."""
+    """Number of places that were searched."""
     after: int = 0
-    """Image before a change."""
+    """Number of the image before a change."""
 
     def with_parameters(self, before: int, now: int) -> "CameraEffect":
         """Return the effect on a camera of `now` parameters, the first of which are the `before` that it has now."""
@@ -110,7 +108,7 @@ class CameraEffect:
 
     @property
     def both(self) -> Float[ndarray, "e r"]:
-        """All that it frees."""
+        """All combinations that are freed."""
         return np.concatenate([self.beside, self.free], axis=1)
 
 
@@ -118,14 +116,14 @@ class CameraEffect:
 class State:
     """Adjustment of the images with effects on the camera and on the gripper poses free."""
 
-    imaged: Imaged
+    imaged: CameraAdjustment
     found: tuple[CameraEffect, ...]
     adjusted: Solution
     poses: tuple[Row, ...] = ()
     """Effects on the gripper poses."""
 
     @staticmethod
-    def start(imaged: Imaged) -> "State":
+    def start(imaged: CameraAdjustment) -> "State":
         """Return the adjustment as it is; a focal length of each image is free where the user asked for that."""
         if (free := imaged.free) is None:
             return State(imaged, (), imaged.adjusted)
@@ -137,34 +135,38 @@ class State:
 
         Raises LinAlgError where the images then determine nothing any more.
         """
-        combinations = np.concatenate([one.both for one in found], axis=1) if found else None
         columns = [one.prior_std * one.columns[self.imaged.rows_of_arm] for one in poses]
         bent = np.concatenate(columns, axis=1) if columns else None
-        adjusted = self.imaged.adjust(self.imaged.prior, combinations, bent)
+        adjusted = self.imaged.adjust(self.imaged.prior, all_combinations(found), bent)
         return replace(self, found=tuple(found), adjusted=adjusted, poses=tuple(poses))
 
     @cached_property
     def equations(self) -> Alternatives:
-        """Of what may be freed beside."""
+        """Equations of the columns that may be freed."""
         return self.equations_with(None)
 
     def equations_with(self, model_error_std: float | None) -> Alternatives:
-        """The same where what the cameras' models leave is of this size."""
+        """Return these equations for a size of the camera-model error; None: as estimated."""
         imaged = self.imaged
         return alternatives(self.adjusted, imaged.prior, imaged.camera, imaged.place, model_error_std)
 
     @property
     def camera(self) -> Intrinsics:
-        """As adjusted."""
+        """Adjusted intrinsics."""
         return self.adjusted.images.view.cameras[self.imaged.camera]
 
     @property
     def total(self) -> Float[ndarray, " e"]:
-        """How far the columns that may be freed are from where they start."""
+        """Displacement of the columns that may be freed from their initial values."""
         problem, imaged = self.adjusted.problem, self.imaged
         of_camera = beyond_prior(self.adjusted, imaged.prior, imaged.camera) / self.equations.units
         of_all = problem.nuisances(self.adjusted.images.state)
         return np.r_[of_camera, of_all[nuisances_of(imaged.images, problem.n_images)]]
+
+
+def all_combinations(effects: Sequence[CameraEffect]) -> Float[ndarray, "e r"] | None:
+    """Return the combinations that all effects free; None without an effect."""
+    return np.concatenate([one.both for one in effects], axis=1) if effects else None
 
 
 def of_fewer_points(case: Case) -> Case:
@@ -185,7 +187,8 @@ def freed(state: State, best: CameraEffect) -> State | None:
     nothing.
     """
     alone = test_combinations(state.equations, best.both, _all(state))
-    if not (np.abs(alone.shift) > OF_FIRST_STEP * MATERIAL * state.imaged.std).any():
+    is_given = best.kind is FindingKind.INTRINSICS and state.imaged.is_given
+    if not is_given and not (np.abs(alone.shift) > OF_FIRST_STEP * MATERIAL * state.imaged.std).any():
         return None
     try:
         after = state.with_free((*state.found, best), state.poses)
@@ -196,7 +199,7 @@ def freed(state: State, best: CameraEffect) -> State | None:
 
 
 def is_material(found: Finding, std: Float[ndarray, "6"]) -> bool:
-    """Whether what was freed is large enough to be a fault, and moves the calibration."""
+    """Return whether what was freed is large enough to be a fault, and moves the calibration."""
     if found.value is not None and found.std is not None:
         least = SURE * found.std if found.kind in OF_EACH else -np.inf
         if found.value < max(least, LEAST_PX.get(found.kind, -np.inf)):
@@ -205,12 +208,47 @@ def is_material(found: Finding, std: Float[ndarray, "6"]) -> bool:
     return bool((np.abs(found.shift[:6]) > MATERIAL * std).any())
 
 
+def contradicted_intrinsics(state: State, dismissed: Sequence[CameraEffect]) -> CameraEffect | None:
+    """Return the effect of given intrinsics that the images contradict; None where they agree.
+
+    The score test compares with intrinsics that are off by what is usual, and the adjustment may have left those that
+    were given. Here its estimate is compared with them (Wald's test), where nothing else explains the images.
+    """
+    is_dismissed = any(one.kind is FindingKind.INTRINSICS for one in dismissed)
+    if state.found or is_dismissed or _log_p_of_given(state) > LOG_P_GIVEN:
+        return None
+    return next(one for one in _hypotheses(state) if one.kind is FindingKind.INTRINSICS)
+
+
+def is_far_off(state: State) -> bool:
+    """Return whether focal length or principal point differ from given ones by OFF."""
+    if not state.imaged.is_given:
+        return False
+    given = state.imaged.start
+    off = np.abs(parameters(state.camera) - parameters(given))[:4]
+    return bool((off > given.fx * np.array([OFF, OFF, OFF_CENTRE, OFF_CENTRE])).any())
+
+
+def _log_p_of_given(state: State) -> float:
+    """Return the logarithm of the probability of the estimated intrinsics if the given ones were exact; 0 near them."""
+    if not is_far_off(state):
+        return 0.0
+    by = (parameters(state.camera) - parameters(state.imaged.start))[:4]
+    covariance = state.adjusted.intrinsics_covariance(state.imaged.camera)[:4, :4]
+    size = np.sqrt(np.diag(covariance))
+    ratio = (by / size) @ np.linalg.pinv(covariance / np.outer(size, size), rcond=1e-9) @ (by / size) / 4
+    return float(f_distribution.logsf(float(ratio), 4, state.equations.freedom))
+
+
 def camera_finding(after: State, before: State) -> Finding:
     """Return the last camera effect that was freed as a finding."""
     best = after.found[-1]
     alone = test_combinations(before.equations, best.both, _all(before))
     last = test_combinations(after.equations, best.free, np.concatenate([_all(before), best.beside], axis=1))
-    p = float(np.exp(max(alone.log_p + np.log(best.places), -700)))
+    log_chance = alone.log_p + np.log(best.places)
+    if best.kind is FindingKind.INTRINSICS:
+        log_chance = min(log_chance, _log_p_of_given(before))
+    p = float(np.exp(max(log_chance, -700)))
     size = _of_intrinsics(after, last) if best.kind is FindingKind.INTRINSICS else _size(after, last)
     (then, scale), (now, new_scale) = (after.imaged.answer(one.adjusted) for one in (before, after))
     moved = parameters(after.camera) - parameters(before.camera)
@@ -225,8 +263,7 @@ def camera_finding(after: State, before: State) -> Finding:
 
 
 def of_some(tracks: Tracks, most: int) -> Tracks:
-    """A random choice of the points that most images see, with no more than `most` observations, and all corners of
-    boards."""
+    """Return randomly chosen points that most images see, of at most `most` observations, and all board corners."""
     count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
     order = np.random.default_rng(0).permutation(len(count))
     enough = order[np.argsort(count[order] < WELL_SEEN, kind="stable")]
@@ -237,7 +274,7 @@ def of_some(tracks: Tracks, most: int) -> Tracks:
 
 
 def _all(state: State) -> Float[ndarray, "e r"]:
-    """The combinations that are free already; of those that are the same, one."""
+    """Return a basis of the combinations that are free already."""
     nothing = np.zeros((state.equations.columns, 1))
     return spanned(np.concatenate([nothing, *(one.both for one in state.found)], axis=1))
 
@@ -252,13 +289,19 @@ def best_camera_effect(state: State, dismissed: Sequence[CameraEffect]) -> tuple
         one
         for one in _hypotheses(state)
         if not any(_alike(one, other) for other in (*state.found, *dismissed))
-        and log_p(one, state, state.equations) <= LOG_P
+        and log_p(one, state, state.equations) <= _limit(one, state)
     ]
     if not likely:
         return None, 0.0
     typical = state.equations if len(likely) == 1 else state.equations_with(TYPICAL)
     best = min(likely, key=lambda one: log_p(one, state, typical))
     return best, log_p(best, state, state.equations)
+
+
+def _limit(one: CameraEffect, state: State) -> float:
+    """Return the logarithm of the probability up to which an effect is significant."""
+    is_given = one.kind is FindingKind.INTRINSICS and state.imaged.is_given
+    return LOG_P_GIVEN if is_given else LOG_P
 
 
 def log_p(one: CameraEffect, state: State, equations: Alternatives) -> float:
@@ -272,7 +315,7 @@ def _alike(one: CameraEffect, other: CameraEffect) -> bool:
 
 
 def _simpler(state: State) -> CameraEffect | None:
-    """A focal length that follows distance, or changed once, where that explains nearly all that it scatters."""
+    """Return a focal length that follows distance, or changed once, where that explains nearly all of its scatter."""
     scatter = state.found[-1]
     focal = scatter.free @ _value(scatter, state.total)
 
@@ -285,7 +328,7 @@ def _simpler(state: State) -> CameraEffect | None:
 
 
 def _value(fault: CameraEffect, total: Float[ndarray, " e"]) -> Float[ndarray, " p"]:
-    """Of the combinations that a hypothesis is about."""
+    """Return the estimates of the combinations of an effect."""
     return np.linalg.lstsq(fault.both, total, rcond=None)[0][fault.beside.shape[1] :]
 
 
@@ -299,6 +342,10 @@ def _hypotheses(state: State) -> list[CameraEffect]:
         equations.of_camera(("fx", "fy")).sum(1, keepdims=True),
         np.zeros((equations.columns, 0)),
     )
+    # Intrinsics that are wrong in all images include the focal length that shows nothing in the others.
+    intrinsics = CameraEffect(FindingKind.INTRINSICS, equations.of_camera(_freed(state)), nothing)
+    if m < MIN_IMAGES:
+        return [intrinsics]
     x, y = equations.down_in_camera[:, :2].T
     sag = [equations.of_images("x", x[:, None]), equations.of_images("y", y[:, None])]
     found = [
@@ -315,17 +362,15 @@ def _hypotheses(state: State) -> list[CameraEffect]:
     found.append(CameraEffect(FindingKind.CENTRE_SAGS, np.concatenate(sag, axis=1), of_centre))
     if len(state.adjusted.problem.cameras) == 1:  # all images share the glass
         found.append(CameraEffect(FindingKind.THIN_PRISM, np.eye(equations.columns)[:, -PRISM:], of_centre))
-    # Intrinsics that are wrong in all images include the focal length that shows nothing in the others.
-    found.append(CameraEffect(FindingKind.INTRINSICS, equations.of_camera(_freed(state)), nothing))
-    return found
+    return [*found, intrinsics]
 
 
 def _of_intrinsics(after: State, last: ScoreTest) -> dict[str, Any]:
-    """The fields of a finding that say which intrinsics the images show."""
+    """Return the fields of a finding that state the intrinsics which the images show."""
     units = dict(zip(after.equations.names, after.equations.units, strict=True))
     std = np.sqrt(np.maximum(np.diag(last.covariance), 0.0))
     given, now = parameters(after.imaged.start), parameters(after.camera)
-    found: dict[str, float] = {}
+    found: dict[str, float] = {} if after.imaged.is_given else {"estimated": 1.0}
     for name, old, new in zip(parameter_names(after.camera), given, now, strict=True):
         if name in INTRINSICS:
             found |= {name: float(new), f"{name}_given": float(old)}
@@ -334,7 +379,7 @@ def _of_intrinsics(after: State, last: ScoreTest) -> dict[str, Any]:
 
 
 def _size(after: State, last: ScoreTest) -> dict[str, Any]:
-    """The fields of a finding that say what and how large the fault is."""
+    """Return the fields of a finding that state the size of the effect."""
     fault, equations = after.found[-1], after.equations
     value = _value(fault, after.total)
     std = np.sqrt(np.maximum(np.diag(last.covariance), 0.0))
@@ -362,7 +407,7 @@ def _size(after: State, last: ScoreTest) -> dict[str, Any]:
 def _largest_px(
     after: State, value: Float[ndarray, "4"], covariance: Float[ndarray, "4 4"]
 ) -> tuple[float, float]:
-    """The displacement by a thin prism where it is largest among the points, and its standard deviation."""
+    """Return the largest displacement by a thin prism among the points, and its standard deviation."""
     by = after.adjusted.problem.prism
     moved = np.linalg.norm(by @ value, axis=1)
     k = int(moved.argmax())
@@ -371,6 +416,6 @@ def _largest_px(
 
 
 def _freed(state: State) -> tuple[str, ...]:
-    """Parameters of the intrinsics that are tested, of those that the model has."""
+    """Return the parameters of the camera model that are tested."""
     tested_names = INTRINSICS if state.imaged.is_given else ASPECT
     return tuple(name for name in tested_names if name in state.equations.names)

@@ -1,38 +1,57 @@
-"""What capture, arm and reconstruction show by themselves: too few images used, the pose convention, warnings."""
+"""Checks of capture, arm and reconstruction: too few images used, pose convention, pieces, warnings."""
 
 from dataclasses import replace
 
-from jcr.calibration.case import Case, Checked
+import numpy as np
+
+from jcr.calibration.case import MIN_IMAGES, Case, CheckResult
 from jcr.calibration.conventions import better_reading, convention_finding
 from jcr.capture.checks import how_rotated
 from jcr.capture.pairing import paired_by_name
+from jcr.estimation.closed_form import initial_estimate
+from jcr.estimation.equation import predict
 from jcr.estimation.observability import observability
+from jcr.estimation.robust import least_trimmed
 from jcr.findings import Finding, FindingKind
+from jcr.geometry import inverse, scale_translation, step_between
+
+SAME = (10e-3, float(np.radians(1.0)))
+"""m, rad: nearer than this a gripper pose is that of the image."""
+LEAST_OF_PIECE = 3
+"""Fewest images of a further piece of a reconstruction; two agree by chance."""
+CONCENTRATED = 4
+"""Estimates from the half of the images that agree best (Rousseeuw and Van Driessen 1999)."""
+MOST_IN_PIECES = 2 / 3
+"""Smallest share of the images beside the largest piece that are in further pieces."""
 
 
-def check_registered(case: Case) -> Checked:
-    """Report that too few images are used: the motions of all would be observable, those of the used images are not.
+def check_registered(case: Case) -> CheckResult:
+    """Report that too few images are used: all motions together would be observable, those of the used images are not.
 
-    The motions are then not the cause, and other motions are no remedy.
+    The motions are then not the cause, and other motions are no remedy. Where all registered images would do, their
+    poses contradict them and the used ones agree by chance: what these leave unobservable is not reported.
     """
     hand_eye, capture = case.hand_eye, case.capture
-    every = len(case.used) == len(capture)
-    if every or not hand_eye.observability.findings or observability(capture.base_from_gripper).findings:
-        return Checked()
+    unseen = hand_eye.observability.findings
+    if len(case.used) == len(capture) or not unseen or observability(capture.base_from_gripper).findings:
+        return CheckResult()
+    contradicted = any(one.kind is FindingKind.FEW_AGREE for one in hand_eye.findings)
+    if contradicted and not observability(case.base_from_gripper).findings:
+        rest = tuple(one for one in hand_eye.findings if one not in unseen)
+        return CheckResult(hand_eye=replace(hand_eye, findings=rest))
     rejected = any(one.severity == "rejects" for one in hand_eye.findings)
     counts = {"value": float(len(case.used)), "of": float(len(capture))}
     few = Finding.of(FindingKind.FEW_USED, "rejects" if rejected else "warns", "reconstruction", **counts)
     findings = tuple(
-        replace(one, concerns="reconstruction") if one.kind is FindingKind.UNOBSERVABLE else one
-        for one in hand_eye.findings
+        replace(one, concerns="reconstruction") if one in unseen else one for one in hand_eye.findings
     )
-    return Checked((few,), replace(hand_eye, findings=findings))
+    return CheckResult((few,), replace(hand_eye, findings=findings))
 
 
-def check_convention(case: Case) -> Checked:
-    """The convention by which the gripper poses fit, where there is one.
+def check_convention(case: Case) -> CheckResult:
+    """Report the convention by which the gripper poses fit, where there is one.
 
-    Of degenerate motions another may fit by chance: what is missing comes first.
+    Degenerate motions fit another convention by chance, and are reported first.
     """
     rows, capture = case.reconstruction.image_index, case.capture
     by_name = paired_by_name(capture.images, capture.base_from_gripper)
@@ -43,25 +62,54 @@ def check_convention(case: Case) -> Checked:
     solved = fit if alone and fit.robot_noise.given is None else None
     found = better_reading(case.base_from_gripper, case.recon_from_camera, by_name, solved)
     if found is None:
-        return Checked()
+        return CheckResult()
     observable = case.hand_eye.observability.observable
-    return Checked((convention_finding(found, "rejects" if observable else "warns"),))
+    return CheckResult((convention_finding(found, "rejects" if observable else "warns"),))
 
 
-def check_arm(case: Case) -> Checked:
-    """Why the arm that the capture names is not used."""
-    return Checked(() if case.robot.unused is None else (case.robot.unused,))
+def check_pieces(case: Case) -> CheckResult:
+    """Report a reconstruction in pieces: images that agree with their poses among themselves, not with the others.
+
+    The transform of the images that agree shows base_from_recon of each image. Wrong poses scatter it, while each piece
+    of a reconstruction has one of its own.
+    """
+    gripper, camera = case.base_from_gripper, case.recon_from_camera
+    if case.hand_eye.converged or len(gripper) < LEAST_OF_PIECE + MIN_IMAGES:
+        return CheckResult()
+    agree, _ = least_trimmed(gripper, camera)
+    for _ in range(CONCENTRATED):
+        x, scale, z = initial_estimate(gripper[agree], camera[agree])
+        off = np.linalg.norm(step_between(gripper, predict(x, scale, z, camera)) / np.repeat(SAME, 3), axis=1)
+        agree = off <= np.sort(off)[max(MIN_IMAGES, len(off) // 2) - 1]
+    x, scale, z = initial_estimate(gripper[agree], camera[agree])
+    each = gripper @ x @ inverse(scale_translation(camera, scale))
+    predicted = each[:, None] @ scale_translation(camera, scale) @ inverse(x)
+    off = np.linalg.norm(step_between(gripper, predicted).reshape(*predicted.shape[:2], 2, 3), axis=-1)
+    near = (off < SAME).all(-1)
+    largest = near[int(near.sum(1).argmax())]
+    others = np.flatnonzero(~largest)
+    in_pieces = near[np.ix_(others, others)].sum(1) >= LEAST_OF_PIECE
+    if largest.sum() < MIN_IMAGES or in_pieces.sum() < max(LEAST_OF_PIECE, MOST_IN_PIECES * len(others)):
+        return CheckResult()
+    names = [case.names[row] for row in others[in_pieces]]
+    counts = {"value": float(len(names)), "of": float(len(gripper))}
+    return CheckResult((Finding.of(FindingKind.PIECES, "rejects", "reconstruction", *names, **counts),))
 
 
-def check_images(case: Case) -> Checked:
-    """That the images were rotated to be read."""
+def check_arm(case: Case) -> CheckResult:
+    """Report that the arm of the capture is not used."""
+    return CheckResult(() if case.robot.unused is None else (case.robot.unused,))
+
+
+def check_images(case: Case) -> CheckResult:
+    """Report that the images were rotated when they were read."""
     rotated = how_rotated(case.capture)
-    return Checked(() if rotated is None else (rotated,))
+    return CheckResult(() if rotated is None else (rotated,))
 
 
-def check_reconstruction(case: Case) -> Checked:
-    """What the back end warned of."""
-    return Checked(
+def check_reconstruction(case: Case) -> CheckResult:
+    """Report the warnings of the back end."""
+    return CheckResult(
         tuple(
             Finding.of(FindingKind.RECONSTRUCTION, "warns", text=text)
             for text in case.reconstruction.warnings

@@ -1,8 +1,7 @@
-"""A depth camera against the robot: its scale error, and its noise by distance, at the features of the images.
+"""Comparison of a depth camera with the robot: its scale error, and its noise by distance, at the features.
 
-Depth cameras are off by a few percent in scale, differently from one to the next, and their noise grows with the square
-of the distance (Khoshelham and Elberink, Sensors 2012). The robot's metre is the better one, so depth has no part in the
-calibration; it is measured by it.
+The scale of depth cameras is off by a few percent, and their noise grows with the square of the distance (Khoshelham
+and Elberink, Sensors 2012). The robot's metre is the better one, so that depth has no part in the calibration.
 """
 
 import numpy as np
@@ -14,17 +13,17 @@ from jcr.geometry import apply, inverse
 from jcr.records import Capture, DepthCheck, HandEye, Reconstruction
 
 MIN_IMAGES, MIN_FEATURES = 3, 60
-"""Fewer do not tell."""
+"""Fewest images and features that are compared."""
 OUTSIDE = 0.3
-"""Relative difference beyond which a depth is of another thing than its feature, once the common one is taken off."""
+"""Relative difference from the common one beyond which a depth is that of another surface."""
 BINS = 8
-"""Of distance, in which noise is measured."""
+"""Bins of distance in which noise is measured."""
 NORMAL = 1.4826
 """Standard deviations of a normal error in its median absolute deviation."""
 
 
 def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye) -> DepthCheck | None:
-    """Scale and noise of the depth images by the robot; None without any, or where too few features have a depth.
+    """Return scale and noise of the depth images by the robot; None where too few features have a depth.
 
     Raises InputError where a depth image cannot be read.
     """
@@ -59,7 +58,7 @@ def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: Hand
 def _pairs(
     capture: Capture, reconstruction: Reconstruction, scale: float, depths: tuple[str | None, ...]
 ) -> tuple[Float[ndarray, " k"], Float[ndarray, " k"], Int[ndarray, " k"]]:
-    """Measured depths (m) and those by the robot of all features that have both, and their images."""
+    """Return measured depths (m), depths by the robot, and images of all features that have both."""
     tracks = reconstruction.tracks
     parts = []
     for k, row in enumerate(reconstruction.image_index):
@@ -83,7 +82,7 @@ def _pairs(
 
 
 def _noise(depth: Float[ndarray, " k"], residual: Float[ndarray, " k"]) -> tuple[float, float]:
-    """a (m) and b (1/m) of sigma² = a² + (b z²)², by the spread of the residuals in bins of distance."""
+    """Return a (m) and b (1/m) of sigma² = a² + (b z²)² by the spread of the residuals in bins of distance."""
     from scipy.optimize import nnls  # few captures have a depth camera, and it takes 0.1 s
 
     bins = np.array_split(np.argsort(depth), BINS)

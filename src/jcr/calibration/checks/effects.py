@@ -14,26 +14,27 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.calibration.adjust import adjust_case, refined_by
-from jcr.calibration.case import Case, Checked
+from jcr.calibration.case import Case, CheckResult
 from jcr.calibration.checks.camera import (
     LOG_P,
     CameraEffect,
     State,
+    all_combinations,
     best_camera_effect,
     camera_finding,
+    contradicted_intrinsics,
     freed,
+    is_far_off,
     is_material,
     log_p,
     of_fewer_points,
-    with_contradiction,
 )
-from jcr.calibration.checks.given_intrinsics import intrinsics_contradiction
-from jcr.calibration.checks.imaged import Imaged, of_case
+from jcr.calibration.checks.camera_adjustment import CameraAdjustment, of_case
 from jcr.calibration.options import GRASPING
 from jcr.camera import parameters, with_thin_prism
 from jcr.estimation.components import most_likely
 from jcr.estimation.equation import SCALE, UNKNOWNS, columns_of_arm
-from jcr.estimation.hand_eye import MAX_NOISE, judged
+from jcr.estimation.hand_eye import judged, poses_agree
 from jcr.estimation.hypotheses import Row, Test, best_tests, explains_by_order
 from jcr.estimation.mixed_model import Equations, LogSizes, solve_equations
 from jcr.estimation.pose_effects import PLAUSIBLE, STRAINS, arm_rows, order_rows
@@ -67,29 +68,28 @@ LARGE_MOTION = GRASPING[0] * 1e-3, float(np.radians(GRASPING[1]))
 requirement decides."""
 
 
-def check_effects(case: Case) -> Checked:
-    """Return what the used images and gripper poses show against one camera on one straight arm, in any order.
-
-    Given intrinsics that the images contradict as a whole are replaced by those that the images show.
-    """
+def check_effects(case: Case) -> CheckResult:
+    """Return what the used images and gripper poses show against one camera on one straight arm, in any order."""
     longer = _with_rejected_runs(case)
     if case.adjusted is None or longer.adjusted is None or not case.shows_camera:
-        return Checked(_effects_of_poses(longer))
-    imaged = of_case(of_fewer_points(longer))
-    state, findings = effects(imaged)
-    if imaged.is_given and all(one.kind is FindingKind.INTRINSICS for one in findings):
-        checked = intrinsics_contradiction(case)
-        return replace(checked, findings=with_contradiction(findings, checked.findings))
-    return Checked(findings) if longer is not case else _adopted(case, state, findings)
+        return CheckResult(_effects_of_poses(longer))
+    state, findings = effects(of_case(of_fewer_points(longer)))
+    return CheckResult(findings) if longer is not case else _adopted(case, state, findings)
 
 
-def effects(imaged: Imaged) -> tuple[State, tuple[Finding, ...]]:
-    """Return the adjustment with all effects free that one camera's images show, and a finding of each."""
+def effects(imaged: CameraAdjustment) -> tuple[State, tuple[Finding, ...]]:
+    """Return the adjustment with all effects free that one camera's images show, and a finding of each.
+
+    An effect beside which the gripper poses still contradict the images is not their cause, and is not reported.
+    """
     state, findings = State.start(imaged), list[Finding]()
     dismissed, passed = list[CameraEffect](), set[FindingKind]()
-    while len(findings) < AT_ONCE and len(imaged.names) >= MIN_IMAGES:
-        of_camera, log_chance = best_camera_effect(state, dismissed)
+    camera_explains = True
+    while len(findings) < AT_ONCE:
+        of_camera, log_chance = best_camera_effect(state, dismissed) if camera_explains else (None, 0.0)
         test = _best_pose_effect(state, passed)
+        if of_camera is None and test is None and camera_explains:
+            of_camera = contradicted_intrinsics(state, dismissed)
         if of_camera is None and test is None:
             break
         if test is not None and (of_camera is None or _explains(state, test, of_camera, log_chance)):
@@ -101,12 +101,31 @@ def effects(imaged: Imaged) -> tuple[State, tuple[Finding, ...]]:
         elif of_camera is not None:
             after = freed(state, of_camera)
             found = None if after is None else camera_finding(after, state)
-            if after is None or found is None or not is_material(found, imaged.std):
+            camera_explains = after is None or poses_agree(after.adjusted.noise)
+            if after is None or found is None or not camera_explains or not _matters(found, after):
                 dismissed.append(of_camera)
                 continue
             state = after
             findings.append(found)
     return state, tuple(findings)
+
+
+def _matters(found: Finding, after: State) -> bool:
+    """Return whether an effect moves the camera, or contradicts given intrinsics that users have elsewhere."""
+    if found.kind is FindingKind.INTRINSICS and is_far_off(after):
+        return True
+    return is_material(found, _std_of(after))
+
+
+def _std_of(state: State) -> Float[ndarray, "6"]:
+    """Return the uncertainty of the camera's place by which effects are measured.
+
+    A rejected calibration is uncertain by the effect itself: that uncertainty counts which remains beside the effects.
+    """
+    imaged = state.imaged
+    if imaged.std.any():
+        return imaged.std
+    return np.sqrt(np.diag(state.adjusted.transform(imaged.place)[1]))
 
 
 def _explains(state: State, test: Test, of_camera: CameraEffect, log_chance: float) -> bool:
@@ -183,8 +202,7 @@ def best_pose_effect(poses: ArmEquations, passed: Collection[FindingKind]) -> Te
         kind = test.row.kind
         if test.log_p > LOG_ALPHA.get(kind, LOG_ALPHA_OF_ORDER):
             continue
-        left = test.noise.together
-        if not test.is_within(PLAUSIBLE[kind]) or left[0] > MAX_NOISE[0] or left[1] > MAX_NOISE[1]:
+        if not test.is_within(PLAUSIBLE[kind]) or not poses_agree(test.noise):
             return None
         if kind in SHARES and not _is_of_the_order(poses, test):
             continue
@@ -272,13 +290,13 @@ def _size_of_strain(test: Test) -> dict[str, Any]:
     }
 
 
-def _adopted(case: Case, state: State, findings: tuple[Finding, ...]) -> Checked:
+def _adopted(case: Case, state: State, findings: tuple[Finding, ...]) -> CheckResult:
     """Return the calibration with the effects that its model can carry; one that is rejected stays."""
     adjusted, adopted = with_effects(case, state, findings)
     if adjusted is None:
-        return Checked(findings)
+        return CheckResult(findings)
     refined = judged(refined_by(case, adjusted))
-    return Checked(adopted, refined, adjusted) if refined.converged else Checked(findings)
+    return CheckResult(adopted, refined, adjusted) if refined.converged else CheckResult(findings)
 
 
 def with_effects(
@@ -300,23 +318,27 @@ def with_effects(
         case = replace(case, reconstruction=reconstruction, adjusted=None)
         own, own_now = len(parameters(state.camera)), len(parameters(camera))
         found = [one.with_parameters(own, own_now) for one in found if one.kind is not FindingKind.THIN_PRISM]
-    combinations = np.concatenate([one.both for one in found], axis=1) if found else None
     bent = np.concatenate([row.prior_std * row.columns for row in strains], axis=1) if strains else None
-    adjusted = adjust_case(case, combinations=combinations, confirmed_errors=bent)
+    adjusted = adjust_case(case, combinations=all_combinations(found), confirmed_errors=bent)
     straight = [np.zeros(7)] * len(strains)
     if bent is not None:
         straight[0] = straight_shift(adjusted.equations, adjusted.log_sizes, bent)[:7]
     shifts = dict(zip((row.kind for row in strains), straight, strict=True))
-    return adjusted, tuple(_as_adopted(one, shifts.get(one.kind), adjusted) for one in findings)
+    return adjusted, tuple(_with_rest(one, shifts.get(one.kind), adjusted) for one in findings)
 
 
-def _as_adopted(found: Finding, straight: Float[ndarray, "7"] | None, adjusted: Solution) -> Finding:
+def _with_rest(found: Finding, straight: Float[ndarray, "7"] | None, adjusted: Solution) -> Finding:
     """Return a finding with the uncertainty that remains after the calibration adopted the effect."""
     if found.kind.row.group == "camera":
-        return replace(found, shift=None, intrinsics_shift=None)
+        return as_adopted(found)
     if straight is None:
         return found
     return replace(found, shift=tuple(_with_metre(found, straight, adjusted).tolist()))
+
+
+def as_adopted(found: Finding) -> Finding:
+    """Return the finding of an effect that is part of the calibration, which no uncertainty remains of."""
+    return replace(found, shift=None, intrinsics_shift=None)
 
 
 def _with_metre(found: Finding, shift: Float[ndarray, "7"], adjusted: Solution) -> Float[ndarray, "7"]:

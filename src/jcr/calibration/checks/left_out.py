@@ -1,9 +1,10 @@
-"""Are the gripper poses of images that take no part in an accepted calibration wrong, and whose are they?"""
+"""Check of the gripper poses of images that an accepted calibration does not use."""
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.calibration.checks.capture import SAME
 from jcr.capture.images import read_image
 from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.equation import predict
@@ -12,15 +13,12 @@ from jcr.geometry import step_between
 from jcr.records import Capture, HandEye, Reconstruction
 from jcr.sfm.register import register
 
-SAME = (10e-3, np.radians(1.0))
-"""m, rad: nearer than this a pose is that of the image."""
-
 
 def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: HandEye) -> tuple[Finding, ...]:
-    """Poses that were exchanged, and those that their images contradict; of images that cannot be located, nothing.
+    """Return the findings of exchanged poses and of poses that their images contradict.
 
-    The matching leaves out images whose poses contradict it. Located by their features alone, they show where the
-    gripper was.
+    The matching leaves out images whose poses contradict it; registered by their features alone, they show the gripper
+    pose. Images that cannot be registered have no finding.
     """
     shown = _shown_poses(capture, made, hand_eye)
     is_pose_of: dict[int, int] = {}
@@ -49,7 +47,7 @@ def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: HandEye) ->
 def _shown_poses(
     capture: Capture, made: Reconstruction, hand_eye: HandEye
 ) -> dict[int, Float[ndarray, "4 4"]]:
-    """base_from_gripper, by row, of each image that is left out, from where the others show its camera."""
+    """Return base_from_gripper, by row, of each image that is left out, from its camera pose among the others."""
     used = set(made.image_index[hand_eye.inliers].tolist())
     camera = dict(zip(made.image_index.tolist(), made.recon_from_camera, strict=True))
     unseen = [row for row in range(len(capture)) if row not in camera]

@@ -1,9 +1,7 @@
-"""Lengths beside the robot's positions: boards, a known length, a depth camera, a network that predicts metres.
+"""Comparison of known lengths with the robot's positions: boards, a known length, a depth camera, a network's metre.
 
-Each is compared with the robot's positions and with each other. Where none contradicts another the scale is the weighted
-mean of the robot's and of those that agree with it: they are priors in the mixed model, which weighs the robot's
-positions as their errors deserve. Where two contradict each other, the scale stays the robot's, and a finding names the
-two.
+Lengths that agree with the robot become priors of the mixed model. Where two lengths contradict each other, the scale
+stays the robot's, and a finding names both.
 """
 
 from collections.abc import Iterator
@@ -16,7 +14,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.adjust import refined_by
-from jcr.calibration.case import Case, Checked
+from jcr.calibration.case import Case, CheckResult
 from jcr.calibration.checks.depth_camera import depth_check
 from jcr.calibration.cues import CONTRADICTED, length_cue
 from jcr.estimation.equation import SCALE
@@ -27,20 +25,19 @@ from jcr.findings import Finding, FindingKind
 from jcr.records import HandEye, LengthCheck, LengthName, ScaleCheck, ScaleEvidence
 
 DEPTH_STD, NETWORK_STD = 0.02, 0.05
-"""Relative, of the metre of depth cameras, which are off by a few percent, and of networks, at times by ten."""
+"""Relative standard deviations of the metre of depth cameras, off by a few percent, and of networks, by up to ten."""
 ROBOT_STD = 0.002
-"""Relative: by how much a robot's positions may be too long all alike, which no pose shows and its covariance leaves
-out."""
+"""Relative standard deviation of a factor common to all of a robot's positions, which no pose shows."""
 SIGMAS = 3.5
 """Standard deviations of a difference from which two lengths contradict each other."""
 LEAST = 0.005
-"""And its least size: the robot's own covariance leaves out what is wrong with its lengths all alike."""
+"""Smallest relative difference of two lengths that contradict each other."""
 AGREES = 2.0
 """Standard deviations of a difference up to which a length is weighed with the robot's. Between these and SIGMAS neither
 is likely, and of positions that are 1 % too long weighing takes the transform from 1.0 mm off to 1.4: the poses give way
 by rotating and shifting it, where the whole answer is but too large."""
 EXACT = 0.015
-"""Relative standard deviation of a length that is exact enough to reject a calibration by."""
+"""Relative standard deviation up to which a length can reject a calibration."""
 WORTH = 10.0
 """Standard deviations of the robot's scale: a length less exact than that hardly moves it, and is compared alone."""
 Name = LengthName | Literal["robot"]
@@ -48,22 +45,22 @@ Name = LengthName | Literal["robot"]
 
 @dataclass(frozen=True)
 class Length:
-    """Logarithm of how much longer it is by the robot's positions than as stated, and one sigma of its own."""
+    """Logarithm of a length by the robot's positions over its stated value, and its own standard deviation."""
 
     name: Name
     off: float
     std: float
 
     def agrees_with(self, other: "Length") -> bool:
-        """Whether the two differ by no more than they usually do."""
+        """Return whether the difference of two lengths is usual."""
         return abs(self.off - other.off) < AGREES * float(np.hypot(self.std, other.std))
 
 
-def check_lengths(case: Case) -> Checked:
-    """The scale with every length that is known, or which two of them contradict each other."""
+def check_lengths(case: Case) -> CheckResult:
+    """Estimate the scale with all known lengths, or report two that contradict each other."""
     hand_eye, lengths = _measured(case)
     if not lengths:
-        return Checked(_from_robot_alone(case, hand_eye), hand_eye)
+        return CheckResult(_from_robot_alone(case, hand_eye), hand_eye)
     robot = Length("robot", 0.0, float(np.sqrt(hand_eye.covariance[6, 6])))
     pair = contradiction([robot, *lengths]) if hand_eye.converged else None
     is_made_of_images = hand_eye.converged and case.adjusted is not None and hand_eye.before is not None
@@ -86,17 +83,17 @@ def check_lengths(case: Case) -> Checked:
     if pair is not None:
         others = [one for one in (robot, *lengths) if one not in pair]
         found = finding_of(*pair, others, hand_eye)
-        return Checked((found, *_from_robot_alone(case, hand_eye)), hand_eye)
+        return CheckResult((found, *_from_robot_alone(case, hand_eye)), hand_eye)
     fault = _fault(hand_eye, lengths)
     if weighed:
         return _fused(case, hand_eye, weighed, fault)
     if hand_eye.converged and fault.any():
         hand_eye = judged(replace(hand_eye, estimate=hand_eye.estimate.with_fault(fault)))
-    return Checked(_from_robot_alone(case, hand_eye), hand_eye)
+    return CheckResult(_from_robot_alone(case, hand_eye), hand_eye)
 
 
 def _measured(case: Case) -> tuple[HandEye, list[Length]]:
-    """The lengths that a case has, and the calibration with what was measured of them."""
+    """Return the calibration with the measurements of lengths, and the lengths."""
     hand_eye, found = case.hand_eye, list[Length]()
     boards, adjusted = case.reconstruction.tracks.boards, case.adjusted
     if adjusted is not None and boards is not None and hand_eye.before is not None:
@@ -121,7 +118,7 @@ def _measured(case: Case) -> tuple[HandEye, list[Length]]:
 
 
 def _of_boards(adjusted: Solution, size_std: float | None) -> Iterator[Length]:
-    """The size of the boards, where it is known and they were adjusted."""
+    """Yield the size of the boards, where it is known and they were adjusted."""
     if size_std is None or adjusted.problem.boards is None:
         return
     off, by_unknown = size_of_boards(adjusted)
@@ -141,7 +138,7 @@ def _with(hand_eye: HandEye, **measured: object) -> HandEye:
 
 
 def contradiction(lengths: list[Length]) -> tuple[Length, Length] | None:
-    """The two that contradict each other most surely; None where none do."""
+    """Return the two lengths that contradict each other most surely; None where none do."""
 
     def sigmas(pair: tuple[Length, Length]) -> float:
         return abs(pair[0].off - pair[1].off) / float(np.hypot(pair[0].std, pair[1].std))
@@ -151,7 +148,7 @@ def contradiction(lengths: list[Length]) -> tuple[Length, Length] | None:
 
 
 def finding_of(one: Length, other: Length, others: list[Length], hand_eye: HandEye) -> Finding:
-    """That two lengths contradict each other; the robot is the first where it is one of them.
+    """Return the finding that two lengths contradict each other; the robot is the first where it is one of them.
 
     Where an exact one of the `others` agrees with one of the two alone, the remaining one is wrong.
     """
@@ -184,12 +181,12 @@ def finding_of(one: Length, other: Length, others: list[Length], hand_eye: HandE
 
 
 def _shift(off: float, hand_eye: HandEye) -> Float[ndarray, "7"]:
-    """How far a calibration would move if the robot's positions were too long: all that is in its metre is shorter."""
+    """Return the change of a calibration if the robot's positions were too long by exp(off)."""
     return -off * np.r_[hand_eye.gripper_from_camera[:3, 3], np.zeros(3), 1.0]
 
 
 def _from_robot_alone(case: Case, hand_eye: HandEye) -> tuple[Finding, ...]:
-    """That the scale comes from the robot's positions alone, where nothing was compared with it but a network."""
+    """Return the finding that the scale comes from the robot alone, where nothing but a network was compared with it."""
     compared = any(one.name != "network" for one in hand_eye.scale_evidence.lengths)
     if compared or case.priors or case.reconstruction.metric_std is not None:
         return ()
@@ -197,7 +194,7 @@ def _from_robot_alone(case: Case, hand_eye: HandEye) -> tuple[Finding, ...]:
 
 
 def _fault(hand_eye: HandEye, lengths: list[Length]) -> Float[ndarray, "7 7"]:
-    """Covariance of what the most exact of the lengths differs by beyond what both may be off by: the robot may be."""
+    """Return the covariance of the difference of the most exact length from the robot beyond their uncertainties."""
     best = min(lengths, key=lambda one: one.std)
     beyond = best.off**2 - best.std**2 - float(hand_eye.covariance[6, 6])
     if best.std >= EXACT or beyond <= 0:
@@ -206,8 +203,8 @@ def _fault(hand_eye: HandEye, lengths: list[Length]) -> Float[ndarray, "7 7"]:
     return np.outer(shift, shift)
 
 
-def _fused(case: Case, hand_eye: HandEye, lengths: list[Length], fault: Float[ndarray, "7 7"]) -> Checked:
-    """The calibration with the lengths as priors of its scale."""
+def _fused(case: Case, hand_eye: HandEye, lengths: list[Length], fault: Float[ndarray, "7 7"]) -> CheckResult:
+    """Return the calibration with the lengths as priors of its scale."""
     assert case.adjusted is not None
     log_scale, boards = float(np.log(case.adjusted.most_likely.scale)), case.reconstruction.tracks.boards
     by_scale = np.eye(case.adjusted.problem.unknowns)[SCALE.start]
@@ -233,4 +230,4 @@ def _fused(case: Case, hand_eye: HandEye, lengths: list[Length], fault: Float[nd
         percent = 100 * ((1 + evidence.depth.off_percent / 100) / longer - 1)
         evidence = replace(evidence, depth=replace(evidence.depth, off_percent=percent))
     refined = replace(refined, estimate=estimate, findings=hand_eye.findings, scale_evidence=evidence)
-    return Checked(_from_robot_alone(case, refined), judged(refined), adjusted)
+    return CheckResult(_from_robot_alone(case, refined), judged(refined), adjusted)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jcr.calibration.case import Case, Checked
+from jcr.calibration.case import Case, CheckResult
 from jcr.estimation.pose_effects import joint_offsets
 from jcr.estimation.pose_equations import pose_equations
 from jcr.estimation.wrist import pose_problem
@@ -17,14 +17,14 @@ SURE = 2.5
 """Standard deviations from which a joint's offset is named."""
 
 
-def check_robot(case: Case) -> Checked:
+def check_robot(case: Case) -> CheckResult:
     """Return the offsets of a known arm's joints, from the fit to poses.
 
     A camera that is not as its model has it changes the cameras' poses: then no joint is named.
     """
     used, arm, joints = case.used, case.robot.arm, case.robot.joints
     if len(used) < MIN_EXAMINED or arm is None or joints is None:
-        return Checked()
+        return CheckResult()
     hand_eye = case.hand_eye
     fit = hand_eye.before or hand_eye
     problem, state = pose_problem(
@@ -38,7 +38,7 @@ def check_robot(case: Case) -> Checked:
     examined = RobotExamined(hand_eye.robot_noise, offsets)
     of_camera = any(finding.kind.row.group == "camera" for finding in hand_eye.findings)
     found = None if of_camera else _joint_finding(offsets)
-    return Checked(() if found is None else (found,), replace(hand_eye, robot=examined))
+    return CheckResult(() if found is None else (found,), replace(hand_eye, robot=examined))
 
 
 def _joint_finding(offsets: JointOffsets) -> Finding | None:

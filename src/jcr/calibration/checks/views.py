@@ -1,6 +1,6 @@
-"""What do the images show by themselves, whatever their poses are? A camera at rest, and images that are blurred.
+"""Checks of the images without their poses: a camera at rest, and blurred images.
 
-Of either, features are too few or do not move, and what is then found of motion or texture is a consequence.
+Both leave too few features or features that do not move; findings of motion or texture are then consequences.
 """
 
 from collections.abc import Iterable
@@ -14,14 +14,13 @@ from jcr.geometry import largest_motion
 from jcr.records import Capture
 
 STILL = (20e-3, np.radians(5.0))
-"""m, rad: a gripper that moves farther is seen to, in images of a camera that it carries."""
+"""m, rad: larger motions of the gripper are visible in the images of a wrist camera."""
 MANY = 1 / 4
-"""Share of blurred images that explains a rejection; of fewer the others are enough."""
+"""Share of blurred images from which they explain a rejection."""
 
 
 def view_findings(capture: Capture) -> tuple[Finding, ...]:
-    """What its images alone show against a capture, causes of a rejection where it is rejected; empty of sharp images of
-    several views."""
+    """Return the findings of the images alone: none for sharp images of several views."""
     first = read_image(capture.folder / capture.images[0])
     metres, radians = largest_motion(capture.base_from_gripper)
     is_still = metres > STILL[0] or radians > STILL[1]
@@ -46,7 +45,7 @@ def view_findings(capture: Capture) -> tuple[Finding, ...]:
 
 
 def as_causes(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """The findings of the images alone on a capture that is rejected; those that concern many images reject it."""
+    """Return findings of the images alone for a rejected capture; those that concern many images reject."""
     return tuple(
         replace(one, severity="rejects")
         if one.kind is FindingKind.BLURRED and len(one.images) > MANY * float(one.details["of"])

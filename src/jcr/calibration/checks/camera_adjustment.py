@@ -1,4 +1,4 @@
-"""One camera among those of an adjustment, as the checks of a camera take it: that of a capture, or a further one."""
+"""Interface of the tests of effects to one camera of an adjustment: that of a capture, or a further one."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,35 +17,35 @@ from jcr.estimation.wrist import estimate_of
 from jcr.records import Intrinsics
 
 Combinations = Float[ndarray, "e p"]
-"""Of the columns of score_test.Alternatives."""
+"""Combinations of the columns of score_test.Alternatives."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Imaged:
-    """One camera, and how its images are adjusted again with more of it free."""
+class CameraAdjustment:
+    """Camera of an adjustment, and the function that adjusts its images again with more of it free."""
 
     adjusted: Solution
     adjust: Callable[[Camera, Combinations | None, Float[ndarray, "s b"] | None], Solution]
     """Adjust all images with another prior of this camera's intrinsics, with combinations of its columns free, and with
     errors of one standard deviation of the gripper poses."""
     names: Sequence[str]
-    """Of its images."""
+    """Names of its images."""
     start: Intrinsics
-    """Those that were given, or that the reconstruction found."""
+    """Intrinsics that were given, or that the reconstruction estimated."""
     is_given: bool
     prior: Camera
     std: Float[ndarray, "6"]
-    """Of the camera's place; 0 where it is rejected, for then no fault is small."""
+    """Standard deviations of the camera's pose; 0 where it is rejected."""
     answer: Callable[[Solution], tuple[Float[ndarray, "4 4"], float]]
-    """That place as an adjustment has it, and the scale."""
+    """Function that returns the camera's pose by an adjustment, and the scale."""
     camera: int = 0
-    """Its number among the adjusted."""
+    """Number of the camera among the adjusted ones."""
     place: Callable[[State], Float[ndarray, "4 4"]] = first_x
-    """Where it is on its parent."""
+    """Function that returns the camera's pose on its parent."""
     arm: int | None = 0
     """Number of the arm whose gripper poses are tested with the camera; None where another camera's test has them."""
     free: Combinations | None = None
-    """That `adjusted` has free."""
+    """Combinations that are free in `adjusted`."""
 
     @property
     def rows_of_arm(self) -> slice:
@@ -56,7 +56,7 @@ class Imaged:
 
     @property
     def images(self) -> Int[ndarray, " m"]:
-        """Rows of its images among the adjusted."""
+        """Rows of the camera's images among the adjusted ones."""
         assert self.adjusted.problem.observations is not None
         return np.flatnonzero(self.adjusted.problem.observations.camera == self.camera)
 
@@ -67,15 +67,15 @@ class Imaged:
         return self.adjusted.problem.observations.x_px[self.adjusted.problem.camera_rows[self.camera]]
 
 
-def of_case(case: Case) -> Imaged:
-    """A capture's own camera."""
+def of_case(case: Case) -> CameraAdjustment:
+    """Return the capture's own camera."""
     assert case.adjusted is not None
 
     def answer(adjusted: Solution) -> tuple[Float[ndarray, "4 4"], float]:
         estimate = estimate_of(adjusted, case.tracks)
         return estimate.gripper_from_camera, estimate.scale
 
-    return Imaged(
+    return CameraAdjustment(
         adjusted=case.adjusted,
         adjust=lambda prior, combinations, bent: adjust_case(
             case, prior=prior, combinations=combinations, confirmed_errors=bent
