@@ -5,14 +5,14 @@ import pytest
 from scipy.stats import chi2
 
 from jcr.calibration.difference import difference
-from jcr.calibration.known_transform import Known
+from jcr.calibration.known_transform import StatedTransform
 from jcr.geometry import retract, rotation_exp, transform
 
 X = transform(rotation_exp(np.array([0.3, -1.0, 0.4])), np.array([0.05, 0.02, 0.08]))
 
 
-def known(x: np.ndarray, parts: dict[str, np.ndarray]) -> Known:
-    return Known(x, sum(parts.values(), np.zeros((6, 6))), parts)
+def known(x: np.ndarray, parts: dict[str, np.ndarray]) -> StatedTransform:
+    return StatedTransform(x, sum(parts.values(), np.zeros((6, 6))), parts)
 
 
 def test_p_values_of_drawn_differences_are_uniform_and_shares_sum_to_one():
@@ -40,6 +40,6 @@ def test_the_cause_that_varies_along_the_difference_explains_it():
 
 
 def test_without_any_covariance_there_is_a_difference_and_no_verdict():
-    found = difference(Known(X, None, {}), Known(retract(X, np.full(6, 1e-3)), None, {}))
+    found = difference(StatedTransform(X, None, {}), StatedTransform(retract(X, np.full(6, 1e-3)), None, {}))
     assert found.p_value is None and found.sigmas is None
     assert np.linalg.norm(found.translation_m) == pytest.approx(1e-3 * np.sqrt(3))

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from jcr.calibration.known_transform import Known, known_calibration, read_hand_eye
+from jcr.calibration.known_transform import StatedTransform, known_calibration, read_hand_eye
 from jcr.calibration.record import Calibration
 from jcr.distributions import chi2
 from jcr.errors import InputError
@@ -54,7 +54,7 @@ def compare(calibration: Comparable, other: Comparable) -> Difference:
     return difference(_known(calibration), _known(other))
 
 
-def _known(one: Comparable) -> Known:
+def _known(one: Comparable) -> StatedTransform:
     """Return transform and covariance of what `compare` takes."""
     if isinstance(one, str | Path):
         return read_hand_eye(Path(one))
@@ -64,10 +64,10 @@ def _known(one: Comparable) -> Known:
     matrix = np.asarray(one, float)
     if matrix.shape != (4, 4):
         raise InputError(f"a transform of shape {matrix.shape}; give a 4×4 gripper_from_camera")
-    return Known(require_rigid(matrix, "gripper_from_camera"), None, {})
+    return StatedTransform(require_rigid(matrix, "gripper_from_camera"), None, {})
 
 
-def difference(ours: Known, other: Known) -> Difference:
+def difference(ours: StatedTransform, other: StatedTransform) -> Difference:
     """Return the difference of one calibration from another, compared with the covariances that they state.
 
     A cause of covariance Pₖ explains ΔᵀV⁻¹PₖV⁻¹Δ of ΔᵀV⁻¹Δ, V = ΣPₖ: the squared size of its best linear prediction.

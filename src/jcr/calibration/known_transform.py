@@ -16,7 +16,7 @@ from jcr.errors import InputError
 
 
 @dataclass(frozen=True)
-class Known:
+class StatedTransform:
     """Transform and covariance of a calibration, or of a reference."""
 
     gripper_from_camera: Float[ndarray, "4 4"]
@@ -28,7 +28,7 @@ class Known:
     """Reason of the rejection; None where it is accepted, or has no verdict."""
 
 
-def read_hand_eye(path: Path) -> Known:
+def read_hand_eye(path: Path) -> StatedTransform:
     """Read gripper_from_camera, and its covariance where the file has one; raise InputError without a transform.
 
     A reference.json may state `std_mm` and `std_deg`, along the axes of the gripper.
@@ -51,17 +51,17 @@ def read_hand_eye(path: Path) -> Known:
     transform = found.gripper_from_camera
     if found.std_mm is not None and found.std_deg is not None:
         std = np.r_[np.array(found.std_mm) / 1e3, np.radians(found.std_deg)]
-        return Known(transform, np.diag(std**2), {})
-    return Known(transform, None, {})
+        return StatedTransform(transform, np.diag(std**2), {})
+    return StatedTransform(transform, None, {})
 
 
-def known_calibration(calibration: Calibration, name: str = "the calibration") -> Known:
+def known_calibration(calibration: Calibration, name: str = "the calibration") -> StatedTransform:
     """Return the transform of a calibration with its covariance and the parts of it; raise InputError without one."""
     if calibration.parent_from_camera is None or calibration.uncertainty is None:
         raise InputError(f"{name}: has no {calibration.mount}_from_camera; that calibration failed")
     budget = calibration.uncertainty.budget
     shares = {} if budget is None else {name: share for name, share in budget if share is not None}
-    return Known(
+    return StatedTransform(
         calibration.gripper_from_camera,
         calibration.covariance[:6, :6],
         {name: share.covariance[:6, :6] for name, share in shares.items() if share.covariance is not None},

@@ -235,7 +235,7 @@ class Uncertainty(Part):
         )
 
 
-class Observed(Part):
+class MotionObservability(Part):
     """Observability of the motions."""
 
     observable: bool
@@ -295,7 +295,7 @@ class RobotErrors(Part):
         )
 
 
-class GivenIntrinsicsKept(Part):
+class GivenIntrinsicsPair(Part):
     """Transform for the intrinsics that were given, and the accuracy of that pair."""
 
     gripper_from_camera: Matrix
@@ -346,7 +346,7 @@ class Calibration(Part):
     uncertainty: Uncertainty | None
     """Along axes of the gripper; of a fixed camera along axes of the base."""
     held_out: LeaveOneOut | None
-    observability: Observed
+    observability: MotionObservability
     robot_noise: Noise | None
     intrinsics: IntrinsicsAndStd | None
     """Intrinsics that belong to the transform."""
@@ -370,7 +370,7 @@ class Calibration(Part):
     """Back ends that were tried, in order; empty where camera poses were given."""
     notes: list[str] = []
     """Remarks of the stages, and findings in words that require no action."""
-    with_given_intrinsics: GivenIntrinsicsKept | None = None
+    with_given_intrinsics: GivenIntrinsicsPair | None = None
     """Transform for the intrinsics that were given; null where none were."""
 
     @model_validator(mode="after")

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from jcr.calibration.record import (
     Calibration,
-    GivenIntrinsicsKept,
+    GivenIntrinsicsPair,
     Proposal,
     SeenAndCorners,
     Uncertainty,
@@ -260,7 +260,7 @@ def seen_in_words(seen: SeenAndCorners) -> str:
     )
 
 
-def given_in_words(given: GivenIntrinsicsKept) -> str:
+def given_in_words(given: GivenIntrinsicsPair) -> str:
     """Return how far apart the given and the estimated intrinsics place a point, each with its own transform."""
     return (
         f"with the given intrinsics and their transform (with_given_intrinsics) the same point is "

@@ -110,7 +110,7 @@ def check_capture(
     """
     if isinstance(capture, str | Path):
         capture = read_and_compare(capture, progress=progress)
-    alone, shown = _examine_alone(capture), _Compared()
+    alone, shown = _examine_alone(capture), _Comparison()
     if isinstance(capture, PosePairs):
         shown = _compare_pairs(capture, robot_noise)
     elif look and verdict_of(alone.views) != "rejected":
@@ -142,7 +142,7 @@ def check_capture(
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Alone:
+class _CaptureFindings:
     """Findings of files, poses and images by themselves."""
 
     robot: RobotErrors
@@ -159,10 +159,10 @@ class _Alone:
     """Finding of a robot whose model is not used."""
 
 
-def _examine_alone(capture: Capture | PosePairs) -> _Alone:
+def _examine_alone(capture: Capture | PosePairs) -> _CaptureFindings:
     gripper = capture.base_from_gripper
     move_m, rotation_rad = largest_motion(gripper)
-    alone = _Alone(
+    alone = _CaptureFindings(
         robot=errors_of(gripper),
         move_m=move_m,
         rotation_rad=rotation_rad,
@@ -180,7 +180,7 @@ def _examine_alone(capture: Capture | PosePairs) -> _Alone:
     return _with_images(alone, capture) if isinstance(capture, Capture) else alone
 
 
-def _with_images(alone: _Alone, capture: Capture) -> _Alone:
+def _with_images(alone: _CaptureFindings, capture: Capture) -> _CaptureFindings:
     robot, views = robot_errors(capture, CalibrateOptions()), view_findings(capture)
     brightness, sharpness = _brightness_and_sharpness_of_each(capture)
     blurred = {name for one in views if one.kind is FindingKind.BLURRED for name in one.images}
@@ -207,7 +207,7 @@ def _camera(capture: Capture | PosePairs) -> PredictedCamera | None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Compared:
+class _Comparison:
     """Comparison of gripper poses with cameras."""
 
     hand_eye: HandEye | None = None
@@ -234,7 +234,7 @@ def _compare_with_images(
     seed: int,
     progress: Progress | None,
     thorough: bool,
-) -> _Compared:
+) -> _Comparison:
     """Compare the gripper poses with few small images and, where that is not enough, with all of them."""
     if not thorough and len(capture) > QUICK:
         rows = spread_rows(len(capture))
@@ -323,7 +323,7 @@ def _compare_registered(
     seed: int,
     progress: Progress | None,
     size_px: int | None = None,
-) -> _Compared:
+) -> _Comparison:
     """Compare the gripper poses with cameras that are reconstructed from features."""
     options = ColmapOptions(seed=seed)
     if size_px is not None:
@@ -334,7 +334,7 @@ def _compare_registered(
         board = None
         if size_px is None:
             board = proposed([read_image(capture.folder / name) for name in capture.images])
-        return _Compared(findings=(*no_reconstruction(error), *(() if board is None else (board,))))
+        return _Comparison(findings=(*no_reconstruction(error), *(() if board is None else (board,))))
     rows = found.image_index
     options_then = CalibrateOptions(robot_noise=_mm_deg(robot_noise))
     case = checked(capture, found, options_then, robot.of(rows))
@@ -347,22 +347,22 @@ def _compare_registered(
     )
 
 
-def _compare_by_calibration(capture: Capture, case: Case) -> _Compared:
+def _compare_by_calibration(capture: Capture, case: Case) -> _Comparison:
     """Return the findings of a calibration, with those of the poses that it left out."""
     hand_eye = case.hand_eye
     if hand_eye.converged:
         hand_eye = hand_eye.with_findings(*left_out_poses(capture, case.reconstruction, hand_eye))
-    return _Compared(hand_eye=hand_eye, findings=hand_eye.findings)
+    return _Comparison(hand_eye=hand_eye, findings=hand_eye.findings)
 
 
-def _compare_pairs(pairs: PosePairs, noise: tuple[float, float] | None) -> _Compared:
+def _compare_pairs(pairs: PosePairs, noise: tuple[float, float] | None) -> _Comparison:
     """Compare gripper poses with camera poses that were given, by the calibration of both."""
     hand_eye = calibrate_poses(pairs, CalibrateOptions(robot_noise=_mm_deg(noise)))
     used, assumptions = hand_eye.inliers, None
     if hand_eye.converged:
         scale_std = SCALE_STD if pairs.is_metric and is_one(hand_eye) else None
         assumptions = assumptions_of_poses(hand_eye, pairs.base_from_gripper[used], scale_std)
-    return _Compared(
+    return _Comparison(
         hand_eye=hand_eye,
         findings=hand_eye.findings,
         registered=np.flatnonzero(used),

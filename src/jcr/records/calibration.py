@@ -7,10 +7,18 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.findings import Finding, FindingKind, remedy, verdict_of
+from jcr.findings import (
+    Finding,
+    FindingKind,
+    Verdict,
+    doubt_of,
+    remedy,
+    strongest_first,
+    verdict_of,
+    warnings_of,
+)
 from jcr.findings.requirement import Requirement
 from jcr.findings.sentences import unobservable
-from jcr.records.assessed import Assessed
 from jcr.records.capture import Intrinsics
 
 
@@ -415,7 +423,7 @@ class Plan:
 
 
 @dataclass(frozen=True, kw_only=True)
-class HandEye(Assessed):
+class HandEye:
     """State of a calibration as it passes through fit, bundle adjustment and checks."""
 
     estimate: Estimate
@@ -431,6 +439,33 @@ class HandEye(Assessed):
     """None where no intrinsics were given, or they were not estimated beside that."""
     before: "HandEye | None" = None
     """The fit to camera poses alone; None where that decided."""
+
+    findings: tuple[Finding, ...] = ()
+    """Findings, strongest first; of the same severity causes before consequences."""
+
+    def with_findings(self, *findings: Finding) -> "HandEye":
+        """Return the calibration with more findings, each in its place."""
+        return replace(self, findings=strongest_first((*self.findings, *findings)))
+
+    @property
+    def verdict(self) -> Verdict:
+        """Verdict of the worst finding."""
+        return verdict_of(self.findings)
+
+    @property
+    def converged(self) -> bool:
+        """Whether it is accepted."""
+        return self.verdict != "rejected"
+
+    @property
+    def doubt(self) -> str | None:
+        """Reason of the rejection in words; None where it is accepted."""
+        return doubt_of(self.findings)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Findings that reject or warn, in words."""
+        return warnings_of(self.findings)
 
     @property
     def gripper_from_camera(self) -> Float[ndarray, "4 4"]:
