@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from jcr.calibration import stage
 from jcr.calibration.checks import lengths
 from jcr.calibration.checks.lengths import Length, finding_of
 from jcr.calibration.options import CalibrateOptions
