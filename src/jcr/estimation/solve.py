@@ -80,10 +80,10 @@ class Solution:
     poses: PoseEquations
     size_information: Information
     """Expected information of the log sizes of the robot's errors."""
-    evidence: ImageEvidence | None
-    settled: bool
+    evidence: ImageEvidence | None = None
+    settled: bool = True
     """Whether sizes and steps settled before the largest number of rounds."""
-    iterations: int
+    iterations: int = 0
     last_step: float = 0.0
     """Largest step of an arm's unknown in the last round, in standard deviations; 0 without observations."""
     smooth: SmoothSolution | None = None
@@ -205,9 +205,9 @@ def solve(
     uncertainty. `start_noise` is the initial size of the random errors of the poses (m, rad).
     """
     if problem.observations is None:
-        return (_solve_smooth if smooth.is_smooth(problem, averaged) else _solve_poses)(
-            problem, start, averaged
-        )
+        if smooth.is_smooth(problem, averaged):
+            return _solve_smooth(problem, start, averaged)
+        return _with_covariance(problem, start, None, averaged)
     if start.pixel_noise is None:
         start = _adjusted_to_poses(problem, start, problem.robot_noise_floor or start_noise)
     state, images, settled, rounds, last_step = _rounds(problem, start)
@@ -248,8 +248,6 @@ def expected_solution(
         poses=poses,
         size_information=np.eye(len(found.log_sizes)),
         evidence=images,
-        settled=True,
-        iterations=0,
     )
 
 
@@ -354,11 +352,6 @@ class _JointStep:
         return _most_likely_arms(problem, state, evidence(problem, state), STEP_SETTLED**2)
 
 
-def _solve_poses(problem: Problem, start: State, averaged: bool) -> Solution:
-    """Solve a problem without observations."""
-    return _with_covariance(problem, start, None, averaged)
-
-
 def _solve_smooth(problem: Problem, state: State, averaged: bool) -> Solution:
     """Solve a problem of many exact camera poses whose systematic errors are smooth."""
     basis, settled = smooth.decomposed(problem), ARMS_SETTLED if averaged else NEARLY_SETTLED
@@ -386,9 +379,6 @@ def _solve_smooth(problem: Problem, state: State, averaged: bool) -> Solution:
         most_likely=likely,
         poses=pose_equations(problem, likely, None),
         size_information=information,
-        evidence=None,
-        settled=True,
-        iterations=0,
         smooth=found,
     )
 
@@ -415,8 +405,6 @@ def _with_covariance(
         poses=poses,
         size_information=information,
         evidence=images,
-        settled=True,
-        iterations=0,
     )
 
 
