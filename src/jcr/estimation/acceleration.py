@@ -18,7 +18,7 @@ FARTHEST = 5.0
 
 
 class Acceleration:
-    """The last rounds of an iteration."""
+    """Anderson acceleration from the last rounds of an iteration."""
 
     def __init__(self) -> None:
         self._ends: list[Float[ndarray, " n"]] = []

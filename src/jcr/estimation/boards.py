@@ -1,13 +1,13 @@
-"""The shape of boards and tags, known before: a normal prior of their corners in the adjustment of images.
+"""Known shapes of boards and tags, as a normal prior of their corners in the adjustment of images.
 
-A body is a rig that no arm moves. It observes its own corners as a camera observes points, but in three dimensions: with
-the body's rotation R and origin t, its size e^l and its deformation D a, the residual of the corner that is printed at x
-and is at p in the world is e^(-l) Rᵀ (p - t) - x - D a, independent of the world's similarity. All bodies of a capture
-come from one printer, so they share l. A board bends and is stretched in a few smooth ways beside that; what is left is
-independent from corner to corner.
+A body is a rig that no arm moves. It observes its own corners as a camera observes points, but in three dimensions:
+with the body's rotation R and origin t, its size e^l and its deformation D a, the residual of the corner that is
+printed at x and is at p in the world is e^(-l) Rᵀ (p - t) - x - D a, independent of the world's similarity. All bodies
+of a capture come from one printer, so they share l. A board bends and is stretched in a few smooth ways beside that;
+what is left is independent from corner to corner.
 
-How large each is: with the shape free, ten real boards of 100 to 250 mm leave 0.05 to 0.25 mm about a surface of second
-order, their triangulation included (docs/results/real.md), and sheets bend by up to 3.6 mm, which the corners
+How large each is: with the shape free, ten real boards of 100 to 250 mm leave 0.05 to 0.25 mm about a surface of
+second order, their triangulation included (docs/results/real.md), and sheets bend by up to 3.6 mm, which the corners
 show to a few hundredths: the prior of the bend decides only where they show little.
 """
 
@@ -39,7 +39,7 @@ FEWEST_CORNERS = 4
 
 @dataclass(frozen=True, kw_only=True)
 class BoardShapes:
-    """Corners of bodies, in the order of their points; an element each."""
+    """Corners of bodies and their shapes, one element for each corner in the order of the points."""
 
     point: Int[ndarray, " c"]
     """Row of the scene's points, ascending."""
@@ -146,7 +146,7 @@ class BoardShapes:
 
 @dataclass(frozen=True)
 class _SeenBody:
-    """The corners of a body that take part, and about where it is in the world."""
+    """Observed corners of a body, and its initial pose in the world."""
 
     point: Int[ndarray, " c"]
     """Row of the scene's points."""

@@ -50,7 +50,7 @@ def initial_estimate(
         w = np.ones(len(base_from_gripper)) if weights is None else weights
         way, center = base_from_gripper[:, :3, 3], recon_from_camera[:, :3, 3]
         extent, seen = (np.linalg.norm(_centred(of, w)) for of in (way, center))
-        # Of a camera that only rotates every scale is as good.
+        # Every scale fits a camera that only rotates.
         scale = extent / seen if seen > RELATIVE_CUT * np.linalg.norm(center) else 1.0
     return x, float(scale) or 1.0, z
 
@@ -143,8 +143,8 @@ def _translations(
     position = base_from_gripper[..., :3, 3]
     rows = np.concatenate([rotation, -in_base[..., None], -position[..., None]], axis=-1)
     rows = _centred(rows.reshape(*in_base.shape[:-1], 15), weights).reshape(rows.shape)
-    # A column of unit size: what is cut as unseen must not depend on the reconstruction's unit. Centres that differ by
-    # rounding alone are one.
+    # The column has unit size, so that the cut of unobservable directions does not depend on the reconstruction's unit.
+    # Centres that differ by rounding alone count as one.
     size, whole = np.sqrt((rows[..., 3] ** 2).mean((-1, -2))), np.sqrt((center**2).mean((-1, -2)))
     unit = np.where(size > RELATIVE_CUT * whole, size, np.inf)
     rows[..., 3] /= unit[..., None, None]

@@ -32,7 +32,7 @@ Stack = Float[ndarray, "*k p p"]
 
 @dataclass(frozen=True)
 class Posterior:
-    """The unknowns averaged over the sizes."""
+    """Unknowns averaged over the sizes of the errors."""
 
     step: Float[ndarray, " p"]
     covariance: Square
@@ -186,7 +186,7 @@ def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covari
         systematic = systematic + exact.variances(log_sizes)[2] * gain @ exact.systematic @ gain.T
     if exact.confirmed is not None:
         systematic = systematic + gain @ exact.confirmed @ gain.T
-    # What neither robot nor cameras show.
+    # The part that neither robot nor cameras determine.
     images = solution.covariance @ exact.prior_information @ solution.covariance
     if exact.known is not None:
         images = images + gain @ exact.known @ gain.T
@@ -211,7 +211,7 @@ def budget_of(parts: Sequence[Float[ndarray, "_ _"]], covariance: Float[ndarray,
         robot_random=random,
         robot_systematic=systematic,
         intrinsics=intrinsics,
-        # Unobservable directions are in it, and the rounding of their large numbers.
+        # This part contains unobservable directions, and the rounding of their large numbers.
         images=images,
         faults=np.zeros((7, 7)),
     )

@@ -1,4 +1,4 @@
-"""The hand-eye equation of an image: residuals of its reported gripper pose and their derivatives.
+"""Hand-eye equation of an image: residuals of its reported gripper pose and their derivatives.
 
 Each image gives `base_from_gripper · X = Z · S_λ(world_from_rig)`. The first 13 unknowns are steps of
 geometry.retract: of X (6), of the logarithm of the scale λ, of Z (6). Each further arm adds the 12 steps of its X and

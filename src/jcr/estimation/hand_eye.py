@@ -187,7 +187,7 @@ JUDGED = frozenset(
 def judged(hand_eye: HandEye) -> HandEye:
     """Return the calibration with findings of the kinds JUDGED by its present numbers, after those of other kinds."""
     uncertain = tuple(_of_uncertainty(hand_eye))
-    # A direction that is observed weakly explains an uncertainty that rejects, and is named before it.
+    # A weakly observed direction explains an uncertainty that rejects, and is therefore named first.
     weak = "rejects" if uncertain else "warns"
     others = [
         replace(finding, severity=weak) if "nearly" in finding.details else finding
@@ -220,7 +220,7 @@ def _of_uncertainty(hand_eye: HandEye) -> Iterator[Finding]:
     if not hand_eye.observability.observable:
         return
     std = np.sqrt(np.diag(hand_eye.covariance))
-    # Of few images half the uncertainty may be that the robot pose noise is hardly known.
+    # With few images, half of the uncertainty may come from the poorly known robot pose noise.
     unknown = hand_eye.robot_noise.given is None and int(hand_eye.inliers.sum()) < FEW
     parts = {"translation": std[:3].max(), "rotation": std[3:6].max(), "scale": std[6]}
     for (part, value), limit in zip(parts.items(), MAX_STD, strict=True):

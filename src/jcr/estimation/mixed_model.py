@@ -45,7 +45,7 @@ Covariance = Float[ndarray, "s s"]
 
 @dataclass(frozen=True, kw_only=True)
 class Equations:
-    """The linearised equations of the used poses; s = 6 times their number, p unknowns."""
+    """Linearised equations of the used poses; s = 6 times their number, p unknowns."""
 
     residual: Residuals
     """Steps (geometry.retract) from the reported to the predicted poses in turn: m, then rad; both in base axes."""

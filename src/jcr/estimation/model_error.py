@@ -47,7 +47,7 @@ def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], 
     """
     posterior = np.linalg.inv(covariance)
     right = posterior @ likeliest
-    # Of the images alone, along directions that they measure independently.
+    # The images alone count, along directions that they measure independently.
     known, directions = np.linalg.eigh(posterior - np.eye(len(likeliest)) * std**-2.0)
     known, right = np.maximum(known, 0.0), directions.T @ right
     variance = std**2

@@ -28,7 +28,7 @@ factory's calibration changes lengths by less."""
 
 
 class LengthError(InputError):
-    """Error that gripper positions are longer or shorter than the arm's by one factor, which no image shows."""
+    """Error for gripper positions that are longer or shorter than the arm's by one factor, which no image shows."""
 
 
 def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Poses) -> Arm:

@@ -34,7 +34,7 @@ def excitation(
     """Return the excitation of X and λ by gripper poses (n,4,4); without an X the camera is assumed at the gripper."""
     n = len(base_from_gripper)
     offset = np.zeros(3) if gripper_from_camera is None else gripper_from_camera[:3, 3]
-    # An offset that was never seen may be anything; the excitation hardly depends on a plausible one.
+    # An unobserved offset may have any value; the excitation hardly depends on a plausible one.
     offset = offset * min(1.0, ARM / max(float(np.linalg.norm(offset)), 1e-9))
     x = transform(np.eye(3), offset)
     camera = base_from_gripper @ x
@@ -71,7 +71,7 @@ def observability(
         return Observability()
     findings = _explained(base_from_gripper, recon_from_camera, found, unseen)
     if found.value[0] >= EXACT * few:
-        # A weak direction has a standard deviation, and that decides (solve.judged); the motions only explain it.
+        # A weak direction has a standard deviation, and that decides (hand_eye.judged); the motions only explain it.
         findings = [
             replace(one, severity="warns", details={**one.details, "nearly": 1.0}) for one in findings
         ]
@@ -114,7 +114,7 @@ def _lost_scale(base_from_gripper: Poses, recon_from_camera: Poses | None) -> Fi
     tool = still_point(base_from_gripper)[0]
     if recon_from_camera is None:
         return _unseen("one point", tool, "gripper")
-    # Which point it is, the cameras know better than X, whose offset trades against the lost scale.
+    # The cameras determine the point better than X, whose offset trades against the lost scale.
     in_camera, moves, spread = still_point(recon_from_camera)
     if moves > 0.5 * spread:
         return _unseen("own centre")

@@ -161,7 +161,7 @@ def with_given_intrinsics(
     same_model = with_thin_prism(given) if camera.model == "thin_prism" else given
     off = parameters(same_model) - parameters(camera)
     step = cross @ np.linalg.pinv(estimate.intrinsics_covariance, rcond=1e-12, hermitian=True) @ off
-    # A user of the pair has other distances, and no scale.
+    # The pair is used with other distances, and without the scale.
     step[6] = 0.0
     pair = replace(
         estimate,

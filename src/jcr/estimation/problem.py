@@ -1,4 +1,4 @@
-"""The estimation problem, its state, and the layout of the columns of its equations.
+"""Estimation problem, its state, and the layout of the columns of its equations.
 
 A rig is a rigid body that carries cameras or corners: the wrist of an arm at one image, a fixed camera, or a board.
 `world` has any origin and unit; the images determine the rigs up to one similarity of it. The rigs that an arm moves

@@ -23,7 +23,7 @@ CENTRE = slice(2, 4)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class View:
-    """The observed points in their cameras, and the residuals."""
+    """Observed points in the frames of their cameras, and the residuals."""
 
     cameras: tuple[Intrinsics, ...]
     from_rig: Float[ndarray, "k 3"]

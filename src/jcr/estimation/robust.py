@@ -215,7 +215,7 @@ def _congruent_triples(a: Float[ndarray, "n n 4 4"], b: Float[ndarray, "n n 4 4"
         row = np.arange(n)
         i, j, k = np.nonzero((row[:, None, None] < row[:, None]) & (row[:, None] < row))
     worst = np.maximum(np.maximum(gap[i, j], gap[i, k]), gap[j, k])
-    # Two motions about one axis fix nothing: prefer triples that rotate about two.
+    # Two motions about one axis determine no X: triples that rotate about two axes are preferred.
     axes = sine_axis(a[..., :3, :3])
     spread = np.linalg.norm(np.cross(axes[i, j], axes[i, k]), axis=1)
     # The 0.3 quantile of all gaps comes from pairs of sound images even when 30 % of the images are wrong.

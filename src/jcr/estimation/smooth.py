@@ -53,7 +53,7 @@ class SmoothModel:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SmoothSolution:
-    """The physical unknowns at one value of the sizes."""
+    """Physical unknowns at one value of the sizes."""
 
     model: SmoothModel
     log_sizes: LogSizes

@@ -1,8 +1,8 @@
-"""The solution of an estimation problem: sizes of all errors and a Gauss-Newton step of all unknowns, in turn.
+"""Solution of an estimation problem: the sizes of all errors and a Gauss-Newton step of all unknowns, in turn.
 
-Without observations the unknowns are those of the arms. With observations, arms, cameras, rigs and points step together,
-and Anderson's acceleration (acceleration.py) shortens the way to the fixed point. The result is averaged over the sizes
-of the robot's errors (covariance.py).
+Without observations the unknowns are those of the arms. With observations, arms, cameras, rigs and points step
+together, and Anderson's acceleration (acceleration.py) shortens the way to the fixed point. The result is averaged
+over the sizes of the robot's errors (covariance.py).
 """
 
 from collections.abc import Callable, Sequence

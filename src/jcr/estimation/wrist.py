@@ -1,4 +1,4 @@
-"""The estimation problem of one wrist camera, each of whose images is a rig, and of camera poses without images."""
+"""Estimation problems of one wrist camera, each of whose images is a rig, and of camera poses without images."""
 
 import numpy as np
 from jaxtyping import Float
