@@ -46,7 +46,7 @@ class Case:
     hand_eye: HandEye
     """The calibration as it stands."""
     carries: Literal["camera", "scene"] = "camera"
-    """What the gripper carries; the camera is fixed where it carries the scene."""
+    """Load of the gripper; the camera is fixed where the gripper carries the scene."""
     chosen_tracks: Tracks | None = None
     """Observations in the used images that take part, where not all do."""
     adjusted: Solution | None = None

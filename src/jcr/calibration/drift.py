@@ -48,7 +48,7 @@ class Drift:
     p_value: float
     """Probability of a motion like this or larger where nothing has moved."""
     cause: Cause
-    """Which motion explains the images better: that of the camera on the gripper, or that of the scene in the base."""
+    """Motion that explains the images better: of the camera on the gripper, or of the scene in the base."""
     detectable: tuple[float, float]
     """m, rad: motions in the worst direction that the test at this `alpha` would find nine times in ten."""
     is_noisier: bool

@@ -1,4 +1,4 @@
-"""How a calibration is found; apart from the stage, so that the command line's help need not import SciPy."""
+"""Options of a calibration, apart from the stage that imports SciPy, for the help of the command line."""
 
 from dataclasses import dataclass
 from math import inf, isfinite, radians
@@ -20,13 +20,13 @@ LengthInImage = tuple[str, float, float, float, float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateOptions:
-    """How the hand-eye calibration is found."""
+    """Required accuracy, checks and priors of a hand-eye calibration."""
 
     require: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
     """Required accuracy: 95 % of errors must be below this, else exit status 3. Unset: a calibration worse than 5 mm and
     1°, which are enough for grasping, only gives a warning."""
     require_at: Where = "seen"
-    """What must be as accurate. seen: a point at the centre of an image, at the working distance, placed by intrinsics
+    """Quantity that the limit refers to. seen: a point at the centre of an image, at the working distance, by intrinsics
     and transform together; camera: the camera on the gripper by itself; scene: the mapped points in the base frame."""
     next_poses: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Number of gripper poses to propose even where the calibration is as accurate as required."""
