@@ -71,6 +71,8 @@ class _Search:
     """Parts of the image that do not move."""
     rotations: dict[Key, tuple[float, float]] = field(default_factory=dict)
     """Angles (rad) by which the images of each pair were rotated."""
+    judged: tuple[list[Pair], Gate] | None = None
+    """Pairs that were judged last, and their gate."""
     tried: set[tuple[int, int, int, int, bool]] = field(default_factory=set)
     """Pairs, the angles (degrees) by which their images were rotated, and whether of the best keypoints alone."""
 
@@ -177,8 +179,15 @@ class _Search:
 
     def gate(self, known: Gate | None = None) -> Gate:
         """Return the gate of all pairs so far."""
-        of_x = None if known is None else known.of_x
-        return robot.judge(list(self.pairs.values()), self.motion, self.systematic, of_x)
+        of_x, pairs = None if known is None else known.of_x, list(self.pairs.values())
+        if self.judged is not None and self.judged[1].of_x is not None:
+            before, found = self.judged
+            if len(before) == len(pairs) and all(
+                one is other for one, other in zip(before, pairs, strict=True)
+            ):
+                return found
+        self.judged = pairs, robot.judge(pairs, self.motion, self.systematic, of_x)
+        return self.judged[1]
 
     def _better(self, new: Pair, old: Pair) -> bool:
         """Test whether a pair's new geometry is confirmed where the old one is not, or has more matches."""

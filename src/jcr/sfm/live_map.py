@@ -1,6 +1,6 @@
 """Map of a capture that is being taken: every image is matched as in a batch, with features and pairs kept in memory.
 
-The cameras of the last map, and a new one predicted from them and the gripper poses, prime the next map.
+The cameras of the last map, and new ones by absolute pose from its points, prime the next map.
 """
 
 import tempfile
@@ -12,11 +12,13 @@ import pycolmap
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
+from jcr.camera import resized
+from jcr.estimation.absolute_pose import absolute_pose
 from jcr.features.matchers import Matcher
 from jcr.features.sift_features import SiftFeatures
 from jcr.features.verify import Geometries
 from jcr.progress import silent
-from jcr.records import Capture, Reconstruction
+from jcr.records import Capture, Intrinsics, Reconstruction
 from jcr.sfm.colmap import starting_intrinsics
 from jcr.sfm.mapping import (
     adjust_robustly,
@@ -29,12 +31,14 @@ from jcr.sfm.mapping import (
     working_cameras,
 )
 from jcr.sfm.options import ColmapOptions
-from jcr.sfm.pose_primed import PASSES, Cameras, map_from_cameras, poses_of, predicted_cameras
+from jcr.sfm.pose_primed import LEAST_POINTS, Cameras, map_from_cameras, poses_of
 
 OPTIONS = ColmapOptions()
 """Options of a calibration without options."""
 FEW = 5
 """Number of images up to which COLMAP maps all with each new one; the first pair may have been an unlucky one."""
+LAST_PASS = (4.0, 1, 0.5)
+"""Pass of pose-primed mapping (pose_primed.PASSES) from cameras that are known to a pixel."""
 
 
 class LiveMap:
@@ -49,14 +53,12 @@ class LiveMap:
         self._names: list[str] = []
         self._geometries: Geometries = {}
         self._model: pycolmap.Reconstruction | None = None
-        self._cameras: dict[str, Float[ndarray, "4 4"]] = {}
-        """recon_from_camera of the mapped images in the last map."""
         self._places: list[int] = []
 
     @property
     def registered(self) -> list[int]:
         """Rows of the capture with a camera in the map."""
-        return sorted(self._places[self._names.index(name)] for name in self._cameras)
+        return sorted(self._places[row] for row in self._rows())
 
     def matched_with(self, place: int) -> int:
         """Return the number of other images that an image matches and the gripper poses do not contradict."""
@@ -83,13 +85,10 @@ class LiveMap:
                 silent,
             )
             self._geometries = matched.geometries
-            begun = self._extended(database, poses)
+            begun = self._extended(database, matched.geometries)
             self._model = map_of_pairs(database, self._matcher, matched, cameras, poses, silent, begun)
-            if self._model is not None:
+            if self._model is not None and self._model is not begun:
                 adjust_robustly(self._model, fix_intrinsics=self._known)
-        rows = self._rows()
-        mapped = [] if self._model is None else poses_of(self._model, rows)
-        self._cameras = {self._names[row]: pose for row, pose in zip(rows, mapped, strict=True)}
 
     def _take(self, capture: Capture, new: Mapping[str, UInt8[ndarray, "h w 3"]]) -> None:
         """Remove the features of images that the capture no longer has, and find those of new ones."""
@@ -98,7 +97,7 @@ class LiveMap:
             self._features.remove(row)
             self._matcher.image_removed(row)
             self._names.remove(name)
-            self._cameras.pop(name, None)
+            self._model = None  # Its images are named by their rows.
         for name in capture.images:
             if name not in self._names:
                 self._features.add(new[name])
@@ -107,20 +106,47 @@ class LiveMap:
         place = {name: row for row, name in enumerate(capture.images)}
         self._places = [place[name] for name in self._names]
 
-    def _extended(self, database: Path, poses: Float[ndarray, "n 4 4"]) -> pycolmap.Reconstruction | None:
+    def _extended(self, database: Path, geometries: Geometries) -> pycolmap.Reconstruction | None:
         """Return a map primed by the last one; None where COLMAP is to map all images."""
-        if self._model is None or len(poses) <= FEW:
+        if self._model is None or len(self._names) <= FEW:
             return None
-        last: Cameras = {self._names.index(name): pose for name, pose in self._cameras.items()}
-        predicted = predicted_cameras(last, poses)
-        if predicted is None:
-            return None
+        rows = self._rows()
+        cameras: Cameras = dict(zip(rows, poses_of(self._model, rows), strict=True))
+        for row in sorted(set(range(len(self._names))) - set(rows)):
+            if (pose := self._resected(self._model, row, geometries)) is not None:
+                cameras[row] = pose
 
         def adjust(made: pycolmap.Reconstruction, scale_px: float) -> None:
-            adjust_robustly(made, self._known, 1e-3, scale_px)
+            adjust_robustly(made, self._known, scale_px=scale_px)
 
-        model = map_from_cameras(database, self._model.camera(1), predicted | last, adjust, PASSES[1:])
-        return model if model.num_reg_images() >= len(last) else None
+        model = map_from_cameras(database, self._model.camera(1), cameras, adjust, (LAST_PASS,))
+        return model if model.num_reg_images() >= len(rows) else None
+
+    def _resected(
+        self, model: pycolmap.Reconstruction, row: int, geometries: Geometries
+    ) -> Float[ndarray, "4 4"] | None:
+        """Return recon_from_camera of a new image from its matches with points of the last map; None where few agree."""
+        points: dict[int, ndarray] = {}
+        for key, geometry in geometries.items():
+            other = key[1 - key.index(row)] if row in key else row
+            if other == row or not model.exists_image(other + 1):
+                continue
+            observed, matches = model.image(other + 1).points2D, np.asarray(geometry.inlier_matches, int)
+            for mine, theirs in matches if key[0] == row else matches[:, ::-1]:
+                if observed[int(theirs)].has_point3D():
+                    points[int(mine)] = model.point3D(observed[int(theirs)].point3D_id).xyz
+        if len(points) < LEAST_POINTS:
+            return None
+        camera = model.camera(1)
+        intrinsics = resized(self._intrinsics(), camera.width, camera.height)
+        x_px = self._matcher.x_px[row][list(points)]
+        found = absolute_pose(x_px, np.array(list(points.values())), intrinsics, gate_px=LAST_PASS[0])
+        return None if found is None or found.inlier.sum() < LEAST_POINTS else found.a_from_camera
+
+    def _intrinsics(self) -> Intrinsics:
+        """Return the intrinsics of the images, given or of the map."""
+        given = self._all_intrinsics[0]
+        return given if self._known or self._model is None else intrinsics_of(self._model.camera(1), given)
 
     def _rows(self) -> list[int]:
         """Return the rows of the matcher's images that are in the model."""
@@ -133,9 +159,7 @@ class LiveMap:
         rows = sorted(self._rows(), key=lambda row: self._places[row])
         if self._model is None or not rows:
             return None
-        intrinsics = self._all_intrinsics[0]
-        if not self._known:
-            intrinsics = intrinsics_of(self._model.camera(1), intrinsics)
+        intrinsics = self._intrinsics()
         return Reconstruction(
             image_index=np.array([self._places[row] for row in rows]),
             recon_from_camera=poses_of(self._model, rows),
