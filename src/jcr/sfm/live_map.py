@@ -37,6 +37,8 @@ OPTIONS = ColmapOptions()
 """Options of a calibration without options."""
 FEW = 5
 """Number of images up to which COLMAP maps all with each new one; the first pair may have been an unlucky one."""
+ENOUGH = 1e-3
+"""Relative change of the cost that ends an adjustment; the calibration of each state adjusts the images again."""
 LAST_PASS = (4.0, 1, 0.5)
 """Pass of pose-primed mapping (pose_primed.PASSES) from cameras that are known to a pixel."""
 
@@ -117,7 +119,7 @@ class LiveMap:
                 cameras[row] = pose
 
         def adjust(made: pycolmap.Reconstruction, scale_px: float) -> None:
-            adjust_robustly(made, self._known, scale_px=scale_px)
+            adjust_robustly(made, self._known, ENOUGH, scale_px)
 
         model = map_from_cameras(database, self._model.camera(1), cameras, adjust, (LAST_PASS,))
         return model if model.num_reg_images() >= len(rows) else None
