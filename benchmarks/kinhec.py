@@ -16,6 +16,7 @@ from scipy.stats import chi2
 
 from benchmarks.page import table
 from jcr.estimation.hand_eye import solve_hand_eye
+from jcr.extras import extra
 from jcr.geometry import rotation_angle, step_between
 
 OURS = "jcr"
@@ -38,6 +39,7 @@ class Result:
 
 def run() -> str:
     """Return the page in Markdown: errors of all solvers, and χ² of jcr, per track."""
+    extra("kinhec.benchmark", "dev", "bench kinhec")
     results = measure()
     accepted = [one for found in results.values() for one in found[OURS] if one.accepted]
     beyond = np.mean([one.squared > REGION for one in accepted])
