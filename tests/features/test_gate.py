@@ -97,7 +97,7 @@ def test_wrong_pairs_are_contradicted_and_right_ones_are_not(seed: int):
     assert {pair.key for pair in gate.contradicted} == {pairs[k].key for k in wrong}
     x = translation_of_x(gate, motions(problem.base_from_gripper))
     assert x is not None
-    assert np.linalg.norm(x.gripper_from_camera[:3, 3] - problem.gripper_from_camera[:3, 3]) < 5e-3
+    assert np.linalg.norm(x[:3, 3] - problem.gripper_from_camera[:3, 3]) < 5e-3
 
 
 def test_the_second_reading_of_a_plane_is_tried():

@@ -4,8 +4,6 @@ R_X t_B is known but for its length, so (R_A − I) t_X + t_A = s R_X t_B is lin
 direction: no scale and no map are needed.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
@@ -24,17 +22,8 @@ ROUNDS = 15
 POINTS_OF_PAIR = 60
 
 
-@dataclass(frozen=True)
-class RoughX:
-    """X before any map."""
-
-    gripper_from_camera: Float[ndarray, "4 4"]
-    covariance: Float[ndarray, "6 6"]
-    """Covariance of (translation, rotation vector) in gripper axes, m and rad."""
-
-
-def translation_of_x(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> RoughX | None:
-    """X from the confirmed pairs; None while its rotation is unknown."""
+def translation_of_x(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> Float[ndarray, "4 4"] | None:
+    """Return gripper_from_camera from the confirmed pairs; None while its rotation is unknown."""
     if found.of_x is None or not found.confirmed:
         return None
     gripper = np.stack([motion[pair.key] for pair in found.confirmed])
@@ -52,16 +41,14 @@ def translation_of_x(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> RoughX |
         weight = 1 / (1 + (residual / 3) ** 2) / std**2
         information = np.einsum("p,pki,pkj->ij", weight, a, a) + prior
         t = -np.linalg.solve(information, np.einsum("p,pki,pk->i", weight, a, b))
-    covariance = np.zeros((6, 6))
-    covariance[:3, :3], covariance[3:, 3:] = np.linalg.inv(information), found.of_x.covariance
-    return RoughX(transform(found.of_x.rotation, t), covariance)
+    return transform(found.of_x.rotation, t)
 
 
 def scene_points(
-    view: View, found: Gate, motion: Float[ndarray, "n n 4 4"], x: RoughX
+    view: View, found: Gate, motion: Float[ndarray, "n n 4 4"], gripper_from_camera: Float[ndarray, "4 4"]
 ) -> Float[ndarray, "p 3"]:
     """Return points that confirmed pairs see, in the frame of the first gripper (m), as midpoints of two rays."""
-    first_from_camera = motion[0] @ x.gripper_from_camera
+    first_from_camera = motion[0] @ gripper_from_camera
     kept = [np.zeros((0, 3))]
     for pair in found.confirmed:
         rows = pair.rows[:: max(1, len(pair.rows) // POINTS_OF_PAIR)]

@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from jcr.features.rotation import RotationOfX, rotation_of_x
 from jcr.features.two_view import Reading
-from jcr.geometry import inverse, rotation_angle
+from jcr.geometry import rotation_angle
 
 ROBOT_STD = math.radians(0.3)
 """Standard deviation of a reported gripper rotation; an industrial arm errs by 0.05°, a servo arm by 1°."""
@@ -179,10 +179,3 @@ def by_quarters(roll: float) -> float:
     quarters = round(roll / (math.pi / 2)) * math.pi / 2
     nearest = quarters if abs(roll - quarters) <= UPRIGHT_ENOUGH else math.radians(round(math.degrees(roll)))
     return nearest % (2 * math.pi)
-
-
-def predicted(
-    motion: Float[ndarray, "*batch 4 4"], gripper_from_camera: Float[ndarray, "4 4"]
-) -> Float[ndarray, "*batch 4 4"]:
-    """camera_i_from_camera_j in metres, from gripper motions."""
-    return inverse(gripper_from_camera) @ motion @ gripper_from_camera

@@ -12,13 +12,9 @@ DECIMALS = 9
 """Number of decimals of a pose that count, so that rounding by a file format changes no order."""
 
 
-def order_key(base_from_gripper: Float[ndarray, "4 4"]) -> tuple[float, ...]:
-    """Return the sort key of a gripper pose: position (m), x first, then rotation."""
-    # Adding zero makes -0 and 0 the same.
-    pose = np.round(base_from_gripper, DECIMALS) + 0.0
-    return (*pose[:3, 3].tolist(), *pose[:3, :3].ravel().tolist())
-
-
 def order_by_pose(base_from_gripper: Float[ndarray, "n 4 4"]) -> Int[ndarray, " n"]:
     """Return rows of gripper poses in the order of reconstruction; equal poses keep their order."""
-    return np.array(sorted(range(len(base_from_gripper)), key=lambda k: order_key(base_from_gripper[k])))
+    # Adding zero makes -0 and 0 the same. A pose is sorted by its position, x first, then by its rotation.
+    pose = np.round(base_from_gripper, DECIMALS) + 0.0
+    keys = np.concatenate([pose[:, :3, 3], pose[:, :3, :3].reshape(-1, 9)], axis=1)
+    return np.lexsort(keys.T[::-1])

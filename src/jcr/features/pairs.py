@@ -58,7 +58,7 @@ def seen_in_common(view: View, found: Gate, motion: Float[ndarray, "n n 4 4"]) -
     points = scene_points(view, found, motion, x)
     if len(points) < 20:
         return []
-    first_from_camera = motion[0] @ x.gripper_from_camera
+    first_from_camera = motion[0] @ x
     camera_from_first = inverse(first_from_camera)
     inside = np.stack([_in_image(view.intrinsics, apply(pose, points)) for pose in camera_from_first])
     counted = inside.astype(np.float32)  # of 200 images 10⁷ numbers

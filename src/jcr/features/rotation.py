@@ -41,13 +41,11 @@ def rotation_of_x(
     gripper: Float[ndarray, "p 3 3"],
     camera: Float[ndarray, "p 3 3"],
     tolerance: Float[ndarray, " p"],
-    weight: Float[ndarray, " p"] | None = None,
 ) -> RotationOfX | None:
     """R_X from relative rotations i_from_j of gripper and camera; None where no three pairs about two axes agree.
 
-    `tolerance` (rad) is by how much a sound pair may disagree, `weight` how many independent witnesses it is.
+    `tolerance` (rad) is the largest disagreement of a sound pair.
     """
-    weight = np.ones(len(gripper)) if weight is None else weight
     axis_a, axis_b = sine_axis(gripper), sine_axis(camera)
     first, second = np.triu_indices(len(gripper), 1)
     across = np.linalg.norm(np.cross(axis_a[first], axis_a[second]), axis=1)
@@ -67,12 +65,12 @@ def rotation_of_x(
     for start in range(0, len(hypotheses), 256):
         few = hypotheses[start : start + 256]
         gap = _gap(few[:, None], gripper, camera)
-        score = (weight * np.maximum(1 - (gap / tolerance) ** 2, 0)).sum(1)
+        score = np.maximum(1 - (gap / tolerance) ** 2, 0).sum(1)
         if score.max() > best_score:
             best, best_score = few[int(score.argmax())], float(score.max())
     if best is None:
         return None
-    return _least_squares_rotation(best, gripper, camera, tolerance, weight)
+    return _least_squares_rotation(best, gripper, camera, tolerance)
 
 
 def _least_squares_rotation(
@@ -80,7 +78,6 @@ def _least_squares_rotation(
     gripper: Float[ndarray, "p 3 3"],
     camera: Float[ndarray, "p 3 3"],
     tolerance: Float[ndarray, " p"],
-    weight: Float[ndarray, " p"],
 ) -> RotationOfX | None:
     information = np.zeros((3, 3))
     agreeing = np.zeros(len(gripper), dtype=bool)
@@ -92,7 +89,7 @@ def _least_squares_rotation(
             return None
         # rotated → exp(w) rotated exp(-w): the residual, in the axes after rotated, changes by (rotatedᵀ − I) w.
         jacobian = np.swapaxes(rotated, 1, 2) - np.eye(3)
-        w = np.where(agreeing, weight / (1 + (2 * np.linalg.norm(residual, axis=1) / tolerance) ** 2), 0.0)
+        w = np.where(agreeing, 1 / (1 + (2 * np.linalg.norm(residual, axis=1) / tolerance) ** 2), 0.0)
         information = np.einsum("p,pki,pkj->ij", w, jacobian, jacobian)
         gradient = np.einsum("p,pki,pk->i", w, jacobian, residual)
         step = np.linalg.solve(information + 1e-9 * np.eye(3), gradient)

@@ -55,9 +55,7 @@ def map_from_gripper_poses(
     x = translation_of_x(found, motions(base_from_gripper))
     if x is None:
         return None
-    model = map_from_cameras(
-        database, camera, dict(enumerate(base_from_gripper @ x.gripper_from_camera)), adjust
-    )
+    model = map_from_cameras(database, camera, dict(enumerate(base_from_gripper @ x)), adjust)
     if model.compute_num_observations() < LEAST_SHARE * _matching_keypoints(geometries):
         return None
     return model
