@@ -11,7 +11,7 @@ from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output
 from jcr.cli.source import run_options
 from jcr.depth.options import DepthOptions
-from jcr.pipeline.batch import BatchOptions
+from jcr.pipeline.batch_options import BatchOptions
 from jcr.reconstruct import ReconstructOptions
 from jcr.scene.options import CloudOptions, MapOptions
 

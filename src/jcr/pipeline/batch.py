@@ -22,6 +22,7 @@ from jcr.errors import InputError, RejectedError
 from jcr.extras import extra
 from jcr.files import write_text
 from jcr.findings import Verdict, sentence, verdict_of
+from jcr.pipeline.batch_options import BatchOptions
 from jcr.pipeline.run import RunOptions, finished, run
 from jcr.progress import Progress, silent
 from jcr.report.render import render
@@ -29,23 +30,6 @@ from jcr.run_folder import CAPTURE, RunFolder, locked
 
 RETRIES = 3
 """Number of times a task is started again whose Ray node died."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class BatchOptions:
-    """Options of the batch."""
-
-    processes: int | None = None
-    """Captures at a time on this machine (unset: one for every two cores); cores are shared out among them."""
-    calibrate_only: bool = False
-    """Calibration and report alone: no cloud and no map."""
-    ray: str | None = None
-    """Run on a Ray cluster at this address (auto: the one this machine belongs to). Every node must see the same
-    folders. Needs the extra jcr-handeye[cluster]."""
-    cpus_per_task: int = 2
-    """Cores that a capture takes, with --ray."""
-    gpus_per_task: float = 0.0
-    """GPUs that a capture takes, with --ray; 0.25 lets four share one."""
 
 
 @dataclass(frozen=True, kw_only=True)
