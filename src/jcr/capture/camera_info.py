@@ -69,8 +69,8 @@ class IntrinsicsEntry(BaseModel):
                 f"{where}: the principal point ({self.cx:.4g}, {self.cy:.4g}) lies outside the {size[0]}x{size[1]} "
                 "images; give the intrinsics of this resolution, or null to estimate them"
             )
-        numbers = (getattr(self, key) for key in NAMES)
-        return Intrinsics(*numbers, *size, coefficients_of(distortion), self.model)
+        coefficients = coefficients_of(distortion)
+        return Intrinsics(self.fx, self.fy, self.cx, self.cy, *size, coefficients, self.model)
 
 
 class StdEntry(BaseModel):
@@ -148,7 +148,9 @@ def intrinsics_of_ros(
         raise InputError(f"{where}: the camera matrix has {len(matrix)} numbers, not nine")
     if not any(matrix):
         return None
-    known = _ROS_MODELS.get(model, "pinhole" if not any(coefficients) else None)
+    known = _ROS_MODELS.get(model)
+    if known is None and not any(coefficients):
+        known = "pinhole"
     if known is None or any(coefficients[len(COEFFICIENTS[known]) :]):
         raise InputError(
             f"{where}: distortion model {shown(model)} with {len(coefficients)} coefficients; jcr knows plumb_bob (5), "

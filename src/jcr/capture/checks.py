@@ -159,7 +159,5 @@ def how_rotated(capture: Capture) -> Finding | None:
     """Return the finding on images that their EXIF tag rotates; None without such a tag."""
     if capture.orientation == 1:
         return None
-    details = {"rotated": ROTATED[capture.orientation]}
-    return Finding.of(
-        FindingKind.IMAGES_ROTATED, "warns", "none", value=float(capture.orientation), **details
-    )
+    tag, rotated = float(capture.orientation), ROTATED[capture.orientation]
+    return Finding.of(FindingKind.IMAGES_ROTATED, "warns", "none", value=tag, rotated=rotated)

@@ -135,7 +135,7 @@ def checked_rows(
     """
     form = CONVENTIONS[convention]
     per_m, per_rad = _in_metres_and_radians(form, units)
-    finite = (np.abs(numbers) < HUGE).all(1)
+    finite = np.asarray((np.abs(numbers) < HUGE).all(axis=1))
     if form.rotation == "rows":
         _require_rows(numbers[finite].reshape(-1, 4, 4), where)
     at = {"rows": [3, 7, 11], "columns": [12, 13, 14]}.get(form.rotation, [0, 1, 2])

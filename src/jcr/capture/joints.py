@@ -96,7 +96,7 @@ def read_arm(options: ReadOptions) -> RecordedArm:
     slides = np.array([urdf.joint_map[name].type == "prismatic" for name in names])
     return RecordedArm(
         urdf=urdf,
-        base=base,
+        base=str(base),
         gripper=str(gripper),
         joints=names,
         unit=np.where(slides, length, angle),

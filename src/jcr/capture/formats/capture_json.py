@@ -166,7 +166,7 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
     frames = []
     for row, (name, pose) in enumerate(zip(capture.images, capture.base_from_gripper, strict=True)):
         more = {key: values[row] for key, values in optional.items() if values and values[row] is not None}
-        frames.append(FrameEntry(image=name, base_from_gripper=pose, **more))
+        frames.append(FrameEntry.model_validate({"image": name, "base_from_gripper": pose} | more))
     given = capture.intrinsics
     stated: dict[str, Any] = {
         "frames": frames,
