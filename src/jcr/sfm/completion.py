@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jcr.camera import HALF_PIXEL
 from jcr.features.matchers import Matcher
@@ -56,7 +56,7 @@ def _complete(model: pycolmap.Reconstruction, image_id: int, matcher: Matcher, r
     x_in_camera = xyz @ pose.rotation.matrix().T + pose.translation
     ahead = x_in_camera[:, 2] > 0
     point_ids = point_ids[ahead]
-    near = cKDTree(x_px[free] + HALF_PIXEL).query_ball_point(
+    near = KDTree(x_px[free] + HALF_PIXEL).query_ball_point(
         np.asarray(model.camera(image.camera_id).img_from_cam(x_in_camera[ahead])).reshape(-1, 2), radius_px
     )
     point = np.repeat(np.arange(len(near)), [len(some) for some in near])
