@@ -62,14 +62,11 @@ def test_a_wrong_focal_length_is_named_before_what_follows_from_it(tabletop: Pat
     content = json.loads((folder / "capture.json").read_text())
     content["intrinsics"] |= {name: 1.5 * content["intrinsics"][name] for name in ("fx", "fy")}
     (folder / "capture.json").write_text(json.dumps(content))
-    assert dispatch(["check", str(folder)]) == 3
-    said = capsys.readouterr()
-    assert re.search(
-        r"\nCause       the images show a focal length of 30[345]\.\d ± \S+ px where 456\.0 is given",
-        said.out,
-    )
-    assert said.out.startswith("REJECTED") and "add images" not in said.out
-    assert "Expected" not in said.out and "Agreement" not in said.out
+    assert dispatch(["check", str(folder)]) == 0  # the calibration estimates it
+    said = capsys.readouterr().out
+    first = next(line for line in said.splitlines() if line.startswith("WARNING"))
+    assert re.search(r"the images show a focal length of 30[345]\.\d ± \S+ px where 456\.0 is given", first)
+    assert said.startswith("ACCEPTED with 1 warning") and "add images" not in said
 
 
 def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():

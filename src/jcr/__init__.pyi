@@ -12,6 +12,8 @@ from .capture.ros_image import read_ros_image as read_ros_image
 from .cell.carried import eye_to_hand as eye_to_hand
 from .cell.placement import CameraPlacement as CameraPlacement
 from .cell.placement import CamerasFile as CamerasFile
+from .cell.placement import ImageUse as ImageUse
+from .cell.placement import TransformUncertainty as TransformUncertainty
 from .cell.stage import place_camera as place_camera
 from .depth.options import DepthOptions as DepthOptions
 from .errors import InputError as InputError
@@ -23,6 +25,7 @@ from .export.options import ExportOptions as ExportOptions
 from .findings import Finding as Finding
 from .findings import FindingKind as FindingKind
 from .geometry import Similarity as Similarity
+from .intrinsics_json import IntrinsicsAndStd as IntrinsicsAndStd
 from .live.calibration import LiveCalibration as LiveCalibration
 from .live.cameras import Camera as Camera
 from .live.cameras import Frame as Frame

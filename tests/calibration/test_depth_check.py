@@ -207,7 +207,10 @@ def test_depth_images_of_a_capture_are_found_and_faults_named(tmp_path: Path):
     capture = read_capture(written())
     assert capture.depths == ("depth/0.png", "depth/1.png", "depth/2.png", None)
     assert read_depth(folder / "depth/2.png", (30, 20))[5, 5] == pytest.approx(0.702)
-    for wrong, said in ((5, "as text"), ("../x.png", "depth of frame 0"), ("depth/9.png", "not there")):
+    left = read_capture(written(depth=5))
+    assert left.images == tuple(f"images/{k}.png" for k in (1, 2, 3))
+    assert any("frame 0" in note and "depth: Input should be a valid string" in note for note in left.notes)
+    for wrong, said in (("../x.png", "depth of frame 0.*leads out of"), ("depth/9.png", "not there")):
         with pytest.raises(InputError, match=said):
             read_capture(written(depth=wrong))
     with pytest.raises(InputError, match="16 bits"):

@@ -117,7 +117,7 @@ def first_fault(error: ValidationError) -> str:
     """Return the first fault that a schema finds, with its place."""
     first = error.errors()[0]
     place = ".".join(str(part)[:LONGEST_SHOWN] for part in first["loc"])
-    what = first["msg"].removeprefix("Value error, ")
+    what = "is missing" if first["type"] == "missing" else first["msg"].removeprefix("Value error, ")
     return f"{place}: {what}" if place else what
 
 

@@ -52,10 +52,9 @@ class _Help(io.StringIO):
         super().__init__()
         self.output = output
 
-    @property
-    def encoding(self) -> str | None:
-        """Encoding of the output, which decides how tyro draws boxes."""
-        return self.output.encoding
+    def __getattribute__(self, name: str) -> Any:
+        """Return an attribute; the encoding, by which tyro draws boxes, is that of the output."""
+        return self.output.encoding if name == "encoding" else super().__getattribute__(name)
 
     def isatty(self) -> bool:
         """Test whether the output is a terminal."""
@@ -72,7 +71,8 @@ def _wrapped_paragraphs() -> Iterator[None]:
     finally:
         lines = printed.getvalue().split("\n")
         wrapped = (textwrap.fill(line, width) if line[:1].isalpha() else line for line in lines)
-        sys.stdout.write("\n".join(wrapped))
+        if printed.getvalue():  # an output without room fails even for nothing
+            sys.stdout.write("\n".join(wrapped))
 
 
 def write_completion(records: Mapping[str, type], arguments: Sequence[str]) -> None:

@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from jcr.camera import by_point, project, unproject
 from jcr.geometry import apply, inverse, retract, rotation_angle, rotation_exp, skew, step_between, transform
-from jcr.least_squares import minimise
+from jcr.least_squares import Loss, minimise
 from jcr.records import Intrinsics
 
 FOCAL_FACTORS = np.geomspace(0.4, 2.5, 14)
@@ -63,11 +63,13 @@ def absolute_pose(
     gate_px: float = 2.0,
     focal: Literal["given", "free"] = "given",
     planar: bool = False,
+    loss: Loss = "cauchy",
 ) -> CameraPose | None:
     """Return the pose that most points agree on within `gate_px`; None where fewer than six (planar: four) agree.
 
     `planar` states that the points lie in a plane; then both poses of the plane are refined and the better one is
     returned. The standard deviation of the pixels is estimated from the residuals beside `point_covariance`.
+    `loss` "linear" is for detected corners, whose identity is certain.
     """
     least = 4 if planar else 6
     spread = np.zeros((len(points), 3, 3)) if point_covariance is None else point_covariance
@@ -84,7 +86,7 @@ def absolute_pose(
         one
         for start in starts
         if start[2].sum() == most >= least
-        and (one := _refined(x_px, points, spread, start, gate_px, 7 if focal == "free" else 6, least))
+        and (one := _refined(x_px, points, spread, start, gate_px, 7 if focal == "free" else 6, least, loss))
     ]
     if not found:
         return None
@@ -148,8 +150,10 @@ def _refined(
     gate_px: float,
     p: int,
     least: int,
+    loss: Loss,
 ) -> CameraPose | None:
-    """Return the pose of least reprojection error under a Cauchy loss; noise and inliers are estimated in turn."""
+    """Return the pose of least reprojection error under a loss; noise and inliers are estimated in turn."""
+    scale, inefficiency = (LOSS_SCALE, INEFFICIENCY) if loss == "cauchy" else (1.0, 1.0)
     (pose, camera, inlier), found = start, None
     for _ in range(ROUNDS):
         residual, jacobian = _reprojection(x_px, points, pose, camera, p)
@@ -166,18 +170,18 @@ def _refined(
             state: tuple[ndarray, Intrinsics], white: ndarray = white, seen: tuple[ndarray, ndarray] = seen
         ) -> tuple[ndarray, ndarray]:
             residual, jacobian = _reprojection(*seen, *state, p)
-            return (white @ residual[..., None])[..., 0] / LOSS_SCALE, white @ jacobian / LOSS_SCALE
+            return (white @ residual[..., None])[..., 0] / scale, white @ jacobian / scale
 
         def moved(state: tuple[ndarray, Intrinsics], step: ndarray) -> tuple[ndarray, Intrinsics]:
             return retract(state[0], step[:6]), _scaled(state[1], np.exp(step[6:].sum()))
 
         before = pose
-        pose, camera = minimise(whitened, (pose, camera), moved, "cauchy").unknowns
+        pose, camera = minimise(whitened, (pose, camera), moved, loss).unknowns
         residual, jacobian = _reprojection(*seen, pose, camera, p)
         rows = (white @ jacobian).reshape(-1, p)
         found = CameraPose(
             a_from_camera=pose,
-            covariance=INEFFICIENCY * np.linalg.inv(rows.T @ rows),
+            covariance=inefficiency * np.linalg.inv(rows.T @ rows),
             camera=camera,
             inlier=inlier,
             std_px=std_px,

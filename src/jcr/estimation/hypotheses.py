@@ -105,14 +105,13 @@ def confirm(equations: Equations, row: Row, places: int = 1, freedom: float | No
     likeliest, information = most_likely(free)
     found = solve_equations(free, likeliest)
     without = solve_equations(equations, likeliest)
-    if freedom is None:
-        freedom = max(len(equations.residual) - UNKNOWNS - d, 1)
+    under = float(max(len(equations.residual) - UNKNOWNS - d, 1)) if freedom is None else freedom
     log_shares = []
     # With few poses the sizes are hardly known, and larger ones leave more to chance.
     for weight, _, each in over_sizes(free, likeliest, information):
         size, covariance = each.step[:, count:], each.covariance[:, count:, count:]
         ratio = (size * np.linalg.solve(covariance, size[..., None])[..., 0]).sum(1) / d
-        log_tail = np.array([f_distribution.logsf(float(one), d, freedom) for one in ratio])
+        log_tail = np.array([f_distribution.logsf(float(one), d, under) for one in ratio])
         log_shares.append(np.log(np.maximum(weight, 1e-300)) + log_tail)
     return Test(
         row=row,

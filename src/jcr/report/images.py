@@ -99,7 +99,8 @@ def pixels_of_file(intrinsics: Intrinsics | None, size: tuple[int, int]) -> dict
 
 def _reprojections(result: RunResult) -> dict[int, str]:
     """Return an SVG path per image of the capture: reprojection errors of some features."""
-    tracks, intrinsics = result.reconstruction.tracks, result.intrinsics
+    tracks = result.reconstruction.tracks
+    intrinsics = result.intrinsics or result.reconstruction.intrinsics
     if len(tracks.image) == 0:
         return {}
     errors, straight = reprojections_px(result.reconstruction), without_distortion(intrinsics)

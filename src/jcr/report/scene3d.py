@@ -44,7 +44,8 @@ def scene_section(
     next_poses = [np.array(pose.base_from_gripper) for pose in result.calibration.next_poses]
     others = _others(result, base_from_camera)
     x, centers = result.hand_eye.gripper_from_camera, base_from_camera[:, :3, 3]
-    data = scene_data([*layers, _tracks(result)], views, next_poses, x, result.intrinsics, centers)
+    intrinsics = result.intrinsics or result.reconstruction.intrinsics
+    data = scene_data([*layers, _tracks(result)], views, next_poses, x, intrinsics, centers)
     data |= {"others": others, "bases": _bases(result)}
     checks = [("cameras", "cameras", True), *([("others", "other cameras", True)] * bool(others))]
     checks += [("grippers", "grippers", True), ("grid", "base and grid", True)]
