@@ -150,7 +150,9 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
 
 @pytest.fixture
 def chromium(browser: Chromium) -> Chromium:
-    """The browser without the events of earlier tests."""
+    """The browser with an empty page, without the events of earlier tests; a live page goes on asking its server."""
+    browser.events.clear()
+    browser.open("about:blank", 800)
     browser.events.clear()
     return browser
 

@@ -203,7 +203,7 @@ FRAME_FAULTS = {
     ),
     "pose missing": (
         lambda c: edit(c, lambda j: j["frames"][1].pop("base_from_gripper")),
-        r"frame 1 \(images/01\.jpg\): base_from_gripper: Field required",
+        r"frame 1 \(images/01\.jpg\): base_from_gripper: is missing",
     ),
     "image twice": (
         lambda c: edit(c, lambda j: j["frames"][1].update(image="images/00.jpg")),

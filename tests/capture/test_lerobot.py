@@ -231,7 +231,7 @@ def test_damaged_sets_are_one_line(tmp_path: Path, small: Path, tabletop: Path):
         (video, b"nonsense", "not a readable video"),
         (video, (small / video).read_bytes()[:3000], "not a readable video"),
         (data, b"nonsense", "not a readable table"),
-        ("meta/info.json", b"{}", "features: Field required"),
+        ("meta/info.json", b"{}", "features: is missing"),
     ):
         copy = tmp_path / "copy"
         shutil.rmtree(copy, ignore_errors=True)
