@@ -14,7 +14,12 @@ class Part(BaseModel):
     """A part of a file: what it names and nothing else, numbers that are finite; made of its fields, or of a record."""
 
     model_config = ConfigDict(
-        extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True, from_attributes=True
+        extra="forbid",
+        frozen=True,
+        allow_inf_nan=False,
+        defer_build=True,
+        from_attributes=True,
+        protected_namespaces=(),
     )
 
     def __eq__(self, other: object) -> bool:
