@@ -44,12 +44,12 @@ def parameter_names(camera: Intrinsics) -> tuple[str, ...]:
 
 
 def parameters(camera: Intrinsics) -> Float[ndarray, " p"]:
-    """The camera as a vector: PARAMETERS, and the other coefficients of its model."""
+    """Return the camera as a vector: PARAMETERS, and the other coefficients of its model."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
 
 
 def with_parameters(camera: Intrinsics, values: Float[ndarray, " p"]) -> Intrinsics:
-    """A camera of the same model and image size with the values that `parameters` gives."""
+    """Return a camera of the same model and image size with the values of a vector of `parameters`."""
     fx, fy, cx, cy, *distortion = (float(value) for value in values)
     return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=coefficients_of(distortion))
 
@@ -66,7 +66,7 @@ def with_thin_prism(camera: Intrinsics) -> Intrinsics:
 
 
 def without_distortion(camera: Intrinsics) -> Intrinsics:
-    """The pinhole with the same focal lengths and principal point."""
+    """Return the pinhole with the same focal lengths and principal point."""
     return replace(camera, distortion=NO_DISTORTION, model="pinhole")
 
 
@@ -96,7 +96,7 @@ def unproject(camera: Intrinsics, x_px: Float[ndarray, "*batch 2"]) -> Float[nda
 
 
 def by_point(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Float[ndarray, "*batch 2 3"]:
-    """Derivatives of `project` by the point."""
+    """Return the derivatives of `project` by the point."""
     depth = x_in_camera[..., 2]
     x, y = x_in_camera[..., 0] / depth, x_in_camera[..., 1] / depth
     x_by_x, x_by_y, y_by_x, y_by_y = _slopes(camera, x, y)
@@ -110,7 +110,7 @@ def by_point(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Flo
 def by_parameters(
     camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]
 ) -> Float[ndarray, "*batch 2 p"]:
-    """Derivatives of `project` by the camera's `parameters`."""
+    """Return the derivatives of `project` by the camera's `parameters`."""
     x, y = x_in_camera[..., 0] / x_in_camera[..., 2], x_in_camera[..., 1] / x_in_camera[..., 2]
     out = np.zeros((*x.shape, 2, 4 + len(camera.distortion)), x.dtype)
     out[..., 0, 0], out[..., 1, 1] = _distorted(camera, x, y)
@@ -155,7 +155,7 @@ def _slopes(
 
 
 def _radial(camera: Intrinsics, r2: Coordinate) -> tuple[Coordinate, Coordinate]:
-    """The factor by which rays at x² + y² = r2 move outwards, and its derivative by r2."""
+    """Return the factor by which rays at x² + y² = r2 move outwards, and its derivative by r2."""
     if camera.model == "fisheye":
         k = camera.distortion
         r = np.sqrt(np.maximum(r2, _NEAR_AXIS))
@@ -177,7 +177,7 @@ def _radial(camera: Intrinsics, r2: Coordinate) -> tuple[Coordinate, Coordinate]
 def _by_coefficients(
     camera: Intrinsics, x: Coordinate, y: Coordinate
 ) -> tuple[Float[ndarray, "*batch c"], Float[ndarray, "*batch c"]]:
-    """Derivatives (...,c) of `_distorted`'s x and y by the coefficients of the camera's distortion."""
+    """Return the derivatives (...,c) of `_distorted`'s x and y by the coefficients of the distortion."""
     r2, xy = x * x + y * y, 2 * x * y
     if camera.model == "fisheye":
         r = np.sqrt(np.maximum(r2, _NEAR_AXIS))
@@ -284,7 +284,7 @@ def zoomed(camera: Intrinsics, factor: float) -> Intrinsics:
 
 
 def pinhole_inside(camera: Intrinsics, long_side_px: int) -> Intrinsics:
-    """The largest undistorted pinhole grid whose every pixel lies in the frame, its long side as asked.
+    """Return the largest undistorted pinhole grid inside the frame, with the long side that is given.
 
     Of a distortion that folds over, what lies within the fold: a rectangle of the frame's shape.
     """
@@ -314,7 +314,7 @@ def rays(pinhole: Intrinsics) -> Float[ndarray, "h w 3"]:
 def undistort_image(
     image: UInt8[ndarray, "h w 3"], camera: Intrinsics, pinhole: Intrinsics
 ) -> UInt8[ndarray, "h2 w2 3"]:
-    """The image resampled to an undistorted grid; averaged over areas where the grid is coarser."""
+    """Return the image resampled to an undistorted grid; averaged over areas where the grid is coarser."""
     return undistortion(camera, pinhole)(image)
 
 

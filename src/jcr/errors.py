@@ -5,7 +5,7 @@ from difflib import get_close_matches
 
 
 def printable(text: str) -> str:
-    """The text without what a terminal would obey: names in files may hold any character."""
+    """Return the text without control characters of a terminal: names in files may hold any character."""
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 

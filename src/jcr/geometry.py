@@ -91,7 +91,7 @@ def inverse(a_from_b: Transforms) -> Transforms:
 def retract(
     a_from_b: Float[ndarray, "*#batch 4 4"], step: Float[ndarray, "*#batch 6"]
 ) -> Float[ndarray, "... 4 4"]:
-    """Transforms (...,4,4) after steps (...,6) as this module defines them: t + v, exp(w) R."""
+    """Return transforms (...,4,4) after steps (...,6) as this module defines them: t + v, exp(w) R."""
     return transform(
         rotation_exp(step[..., 3:]) @ a_from_b[..., :3, :3], a_from_b[..., :3, 3] + step[..., :3]
     )
@@ -100,7 +100,7 @@ def retract(
 def step_between(
     a_from_b: Float[ndarray, "*#batch 4 4"], target: Float[ndarray, "*#batch 4 4"]
 ) -> Float[ndarray, "... 6"]:
-    """Steps (...,6) that take `a_from_b` to `target`: the inverse of `retract`, rotations up to a rotation by 180°."""
+    """Return the steps (...,6) from `a_from_b` to `target`: the inverse of `retract`, up to a rotation by 180°."""
     rotation = target[..., :3, :3] @ np.swapaxes(a_from_b[..., :3, :3], -1, -2)
     return np.concatenate([target[..., :3, 3] - a_from_b[..., :3, 3], rotation_log(rotation)], axis=-1)
 
@@ -176,7 +176,7 @@ def apply_similarity(a_from_b: Transform, scale: float, x_in_b: Vectors) -> Vect
 
 
 def nearest_rotation(matrix: Rotations) -> Rotations:
-    """The proper rotations (...,3,3) closest to the matrices in Frobenius norm (det = +1)."""
+    """Return the proper rotations (...,3,3) closest to the matrices in Frobenius norm (det = +1)."""
     u, _, vt = np.linalg.svd(matrix)
     sign = np.ones(matrix.shape[:-1])
     sign[..., 2] = np.sign(np.linalg.det(u @ vt))
@@ -215,7 +215,7 @@ def across_lines(direction: Vectors) -> Rotations:
 def nearest_to_lines(
     origin: Float[ndarray, "*#batch n 3"], direction: Float[ndarray, "*#batch n 3"]
 ) -> Float[ndarray, "... 3"]:
-    """The points (...,3) nearest to n lines each, given by a point and a unit direction (...,n,3)."""
+    """Return the points (...,3) nearest to n lines each, given by a point and a unit direction (...,n,3)."""
     across = across_lines(direction)
     normal = across.sum(-3) + PARALLEL * np.eye(3)
     return np.linalg.solve(normal, (across @ origin[..., None]).sum(-3))[..., 0]
@@ -227,7 +227,7 @@ def motion_length(motion: Transforms) -> Float[ndarray, "*batch"] | np.floating:
 
 
 def largest_motion(a_from_b: Float[ndarray, "n 4 4"]) -> tuple[float, float]:
-    """The longest translation (m) and the largest rotation (rad) between any two of them."""
+    """Return the longest translation (m) and the largest rotation (rad) between any two of the transforms."""
     motion = inverse(a_from_b)[:, None] @ a_from_b[None]
     return float(np.linalg.norm(motion[..., :3, 3], axis=-1).max()), float(
         np.max(rotation_angle(motion[..., :3, :3]))
@@ -249,7 +249,7 @@ def roll_pitch_yaw(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "3"]:
 
 
 def require_rigid(matrix: Transform, where: str) -> Transform:
-    """The matrix with its rotation made exact; InputError saying how far from rigid it is, and why.
+    """Return the matrix with its rotation made exact; raise InputError where it is too far from rigid.
 
     `where` begins the message: the file and frame, or the argument, that the matrix came from.
     """

@@ -16,7 +16,7 @@ def silent(stage: str, fraction: float) -> None:
 
 
 def steps(progress: Progress, stage: str, items: Sequence[Item]) -> Iterator[Item]:
-    """The items one by one, their share of the stage reported before and after each."""
+    """Yield the items one by one, and report their share of the stage before and after each."""
     for k, item in enumerate(items):
         progress(stage, k / len(items))
         yield item

@@ -133,7 +133,7 @@ def _open_closed_streams() -> None:
 
 
 def dispatch(arguments: Sequence[str]) -> int:
-    """The exit status of one command line."""
+    """Run one command line and return its exit status."""
     if not arguments or arguments[0] in ("-h", "--help"):
         sys.stdout.write(_OVERVIEW.format(commands="\n\n".join(_listed(group) for group in GROUPS)))
         return 0
@@ -165,12 +165,12 @@ def _module_of(command: str) -> str:
 
 
 def _listed(group: str) -> str:
-    """The commands of a group below its name."""
+    """Return the commands of a group below its name."""
     return "\n".join([f"{group}:", *(f"  {name:<10} {about}" for name, about in GROUPS[group].items())])
 
 
 def call(load: Callable[[], ModuleType], program: str, arguments: Sequence[str]) -> int:
-    """The exit status of the command whose module `load` gives; what goes wrong is one line on stderr."""
+    """Run the command whose module `load` imports; return its exit status and print an error as one line on stderr."""
     return _guarded(lambda: _call(load(), program, arguments))
 
 

@@ -32,7 +32,7 @@ class VerboseOutput(Output):
 
 
 def plain(record: object) -> dict[str, Any]:
-    """The fields of a record for JSON, its arrays as lists."""
+    """Return the fields of a record for JSON, its arrays as lists."""
     return {
         name: value.tolist() if hasattr(value, "tolist") else value for name, value in vars(record).items()
     }

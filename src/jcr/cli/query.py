@@ -130,7 +130,7 @@ def _read_csv(path: Path) -> ndarray:
 
 
 def _finite(column: ndarray) -> list:
-    """The column for JSON, which knows no NaN."""
+    """Return the column for JSON, with None in place of NaN."""
     if column.dtype.kind != "f":
         return column.tolist()
     return [None if np.isnan(value) else round(float(value), 6) for value in column]

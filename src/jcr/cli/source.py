@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def _announce(path: Path) -> None:
-    """A first sign of life, before the packages that read images are imported."""
+    """Report that the command has started, before the packages that read images are imported."""
     if sys.stderr.isatty() and path.exists():
         sys.stderr.write(f"reading {path}\n")
         sys.stderr.flush()
@@ -35,7 +35,7 @@ def source(path: Path, options: ReadOptions, out: Path, progress: "Progress") ->
 
 
 def run_options(arguments: Any, **chosen: Any) -> "RunOptions":
-    """The options of the stages among a command's arguments, `chosen` ones in their place."""
+    """Return the options of the stages among a command's arguments, `chosen` ones in their place."""
     from jcr.results import RunOptions
 
     given = {
@@ -45,7 +45,7 @@ def run_options(arguments: Any, **chosen: Any) -> "RunOptions":
 
 
 def with_images(found: "Capture | PosePairs", path: Path, needed: str) -> "Capture":
-    """The capture; InputError, which ends with what is `needed`, where there are poses alone."""
+    """Return the capture; raise InputError, which ends with `needed`, where there are poses alone."""
     from jcr.errors import InputError
     from jcr.records import PosePairs
 

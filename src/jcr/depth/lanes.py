@@ -105,7 +105,7 @@ class Lanes:
         return Lanes(self.builder, self.builder.call(root, [self.value]))
 
     def at(self, lanes: Any) -> "Lanes":
-        """Return the numbers of some lanes, in a given order."""
+        """Return the vector of the values of the lanes with these constant indices, in their order."""
         chosen = Lanes.constant(self.builder, lanes, INT).value
         return Lanes(self.builder, self.builder.shuffle_vector(self.value, self.value, chosen))
 

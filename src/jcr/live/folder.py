@@ -158,7 +158,7 @@ class LiveFolder:
         return before.time_s - now.time_s if now.time_s <= before.time_s else None
 
     def capture(self) -> Capture | None:
-        """Return the images as a capture, a single one too; None where there is none."""
+        """Return the images kept so far as a capture; None before the first image."""
         images = self.images
         return None if not images or self.size is None else self._capture_of(images, self.size)
 

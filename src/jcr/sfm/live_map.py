@@ -151,7 +151,7 @@ class LiveMap:
         return given if self._known or self._model is None else intrinsics_of(self._model.camera(1), given)
 
     def _rows(self) -> list[int]:
-        """Return the rows of the matcher's images that are in the model."""
+        """Return the rows, among the matcher's images, of the images that the model has registered."""
         if self._model is None or self._model.num_reg_images() < 2:
             return []
         return sorted(image_id - 1 for image_id in self._model.reg_image_ids())
