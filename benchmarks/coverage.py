@@ -269,9 +269,8 @@ def _ratios(draws: int) -> Iterator[list[float]]:
             continue
         prediction = predict(assumptions_of(case), capture.base_from_gripper, robot.systematic)
         foretold, reported = (
-            (reached(one.estimate, one.in_use, "seen")[0], *reached(one.estimate, one.in_use, "camera"))
-            for one in (prediction, hand_eye)
-            if one.in_use is not None
+            (reached(one, use, "seen")[0], *reached(one, use, "camera"))
+            for one, use in ((prediction.estimate, prediction.in_use), (hand_eye, hand_eye.in_use))
         )
         yield np.divide(foretold, reported).tolist()
 

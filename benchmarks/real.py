@@ -123,7 +123,7 @@ def _pixels(camera: Intrinsics) -> Float[ndarray, "9 2"]:
 def _stated(found: HandEye, camera: Intrinsics, distance_m: float) -> Float[ndarray, "9 3 3"]:
     """Return the stated covariances of the points in gripper axes."""
     turn = found.gripper_from_camera[:3, :3]
-    return turn @ point_covariance(found.estimate, camera, _pixels(camera), distance_m) @ turn.T
+    return turn @ point_covariance(found, camera, _pixels(camera), distance_m) @ turn.T
 
 
 def _apart(found: HandEye, other: HandEye | Reference) -> Apart | None:
@@ -386,7 +386,7 @@ def seen_in_base(
 
 def predicted(camera: WristCamera, hand_eye: HandEye, corners: Corners, noise_px: float) -> list[float]:
     """Return the scatter in draws of the errors that the calibration states, of gripper poses and of pixels."""
-    rng, estimate = np.random.default_rng(0), hand_eye.estimate
+    rng, estimate = np.random.default_rng(0), hand_eye
     points = triangulated(camera, corners)
     values, vectors = np.linalg.eigh(joint_covariance(estimate))
     spread, of_pose = vectors * np.sqrt(values.clip(0)), np.repeat(hand_eye.robot_noise.together, 3)

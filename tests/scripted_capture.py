@@ -20,7 +20,7 @@ from jcr.live.folder import LiveFolder
 from jcr.live.progress import Accuracy, Progress
 from jcr.live.robot import RobotState
 from jcr.live.session import Answer, LiveSession, SessionOptions
-from jcr.records import HandEye, Plan, Requirement
+from jcr.records import HandEye, Requirement
 
 REQUIRED = (2.0, 0.3)
 RATE = 10
@@ -40,7 +40,7 @@ def a_hand_eye(met: bool) -> HandEye:
         reached_mm=1.0 if met else 3.0,
         reached_deg=0.1,
     )
-    return replace(found, plan=Plan(requirement=required))
+    return replace(found, requirement=required)
 
 
 @dataclass

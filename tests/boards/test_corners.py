@@ -75,8 +75,8 @@ def test_a_board_that_was_moved_is_used_where_most_images_show_it_and_the_others
     assert named.images == ("06.png", "07.png", "08.png") and "it was moved, or there are two" in sentence(
         named
     )
-    assert hand_eye.converged and hand_eye.scale_evidence.board is not None
-    assert hand_eye.scale_evidence.board.images == 6
+    assert hand_eye.converged and hand_eye.board is not None
+    assert hand_eye.board.images == 6
 
 
 def test_a_board_that_no_image_shows_is_named_and_features_alone_are_used(monkeypatch: pytest.MonkeyPatch):

@@ -28,7 +28,6 @@ from jcr.records import (
     Intrinsics,
     Pointmaps,
     Reconstruction,
-    ScaleEvidence,
     Tracks,
 )
 
@@ -40,7 +39,7 @@ X = transform(rotation_exp(np.array([0.1, -0.2, 1.5])), np.array([0.05, -0.02, 0
 
 def with_depth(capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye) -> HandEye:
     found = depth_check(capture, reconstruction, hand_eye)
-    return replace(hand_eye, scale_evidence=ScaleEvidence(depth=found))
+    return replace(hand_eye, depth=found)
 
 
 @pytest.fixture(scope="module")
@@ -115,9 +114,7 @@ def test_the_robot_shows_that_the_depth_is_too_long_and_how_noisy(measured: tupl
     noise = np.hypot(check.noise_m, check.noise_per_m * depth**2)
     assert noise == pytest.approx(NOISE_PER_M * depth**2, rel=0.35)
     assert (check.std_m(depth) > noise).all()
-    content = calibration_of(
-        capture, reconstruction, replace(hand_eye, scale_evidence=ScaleEvidence(depth=check)), {}, "0"
-    )
+    content = calibration_of(capture, reconstruction, replace(hand_eye, depth=check), {}, "0")
     said = f"depth camera: its lengths are {check.off_percent:.2g} ± {check.std_percent:.1g} % too long "
     assert any(line.startswith(said) for line in details(content))
     assert Calibration.model_validate_json(json.dumps(content.as_json()), strict=True) == content
@@ -180,7 +177,7 @@ def test_depth_of_another_unit_is_named_and_left_out(measured: tuple):
     found, notes = with_measured_depth(
         capture,
         reconstruction,
-        replace(hand_eye, scale_evidence=ScaleEvidence(depth=replace(check, off_percent=900.0))),
+        replace(hand_eye, depth=replace(check, off_percent=900.0)),
     )
     assert found is reconstruction and "+900 % off by the robot" in notes[0]
     _, notes = with_measured_depth(capture, reconstruction, hand_eye)

@@ -182,10 +182,8 @@ def test_a_thin_prism_becomes_part_of_the_intrinsics():
     """Without it in the model, the rotation is 2.3° off: a prism and a rotated camera look alike."""
     found, hand_eye = calibrated(NAMED["thin prism"][0], 3)
     camera = hand_eye.intrinsics
-    assert (
-        camera is not None and camera.model == "thin_prism" and hand_eye.estimate.intrinsics_std is not None
-    )
-    std = hand_eye.estimate.intrinsics_std[-4:]
+    assert camera is not None and camera.model == "thin_prism" and hand_eye.intrinsics_std is not None
+    std = hand_eye.intrinsics_std[-4:]
     assert (np.abs(np.array(camera.distortion[-4:]) - [0.02, 0.0, 0.01, 0.0]) < 3 * std).all()
     assert outcome(found, hand_eye).is_sound
 

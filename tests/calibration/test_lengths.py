@@ -49,7 +49,7 @@ def test_a_board_that_agrees_with_the_robot_makes_the_scale_more_certain():
     alone, _ = calibrated(None)
     both, x = calibrated(Sheet())
     assert both.covariance[6, 6] < 0.9 * alone.covariance[6, 6]
-    (board,) = both.scale_evidence.lengths
+    (board,) = both.lengths
     assert board.name == "board" and board.used and abs(board.robot_longer_percent) < 1
     assert not any(one.kind is FindingKind.SCALE_FROM_ROBOT for one in both.findings)
     assert both.converged and not both.warnings
@@ -66,7 +66,7 @@ def test_positions_too_long_are_named_with_the_board_and_the_truth_is_within_wha
     hand_eye, x = calibrated(Sheet(bend_m=2e-3), pose_scale)
     named = of_kind(hand_eye, FindingKind.BOARD_SIZE)
     assert named.std is not None and named.value == pytest.approx(pose_scale - 1, abs=3 * named.std)
-    assert not hand_eye.scale_evidence.lengths[0].used
+    assert not hand_eye.lengths[0].used
     assert hand_eye.converged == (abs(pose_scale - 1) < 0.03)
     error = np.r_[step_between(hand_eye.gripper_from_camera, x), -np.log(hand_eye.scale)]
     assert (np.abs(error) < 3 * np.sqrt(np.diag(hand_eye.covariance))).all()
@@ -87,7 +87,7 @@ def test_the_side_of_a_board_of_unknown_size_is_stated_by_the_robot():
     assert "if they measure 25.5 mm" in sentence(side) or "if they measure 25 mm, give 0.025" in sentence(
         side
     )
-    assert hand_eye.converged and hand_eye.scale_evidence.lengths == ()
+    assert hand_eye.converged and hand_eye.lengths == ()
 
 
 def test_a_known_length_that_contradicts_the_robot_rejects_unless_a_board_agrees_with_the_robot(
@@ -108,7 +108,7 @@ def test_a_known_length_that_contradicts_the_robot_rejects_unless_a_board_agrees
         "the size of the board and the known length contradict each other by 4.8 ± 1.0 %; check the known length: the "
         "size of the board and the robot's positions agree"
     )
-    assert [one.name for one in both.scale_evidence.lengths] == ["board", "known length"]
+    assert [one.name for one in both.lengths] == ["board", "known length"]
 
 
 def test_a_depth_camera_that_contradicts_robot_and_board_is_named_with_the_percent(

@@ -74,7 +74,7 @@ def test_wrong_poses_are_named_and_no_others(count, wrong, kind):
             gripper[bad] = mirror @ gripper[bad] @ mirror
         solved = jcr.solve_hand_eye(gripper, problem.recon_from_camera)
         assert sorted(np.flatnonzero(~solved.inliers)) == sorted(bad)
-        assert [reason is not None for reason in solved.images.reasons] == list(~solved.inliers)
+        assert [reason is not None for reason in solved.reasons] == list(~solved.inliers)
         assert solved.converged
         # Fewer images know less, but the wrong ones must not pull.
         both = solved.covariance + clean.covariance

@@ -49,27 +49,17 @@ def test_a_rejected_calibration_that_knows_where_the_camera_looks_aims_the_next_
     capture, hand_eye = seen()
     assert not hand_eye.is_sound and not hand_eye.observability.observable
     # Of planar rotations the translation along their axis stays open; only the rotation is known here.
-    aimed = replace(
-        hand_eye,
-        estimate=replace(
-            hand_eye.estimate, gripper_from_camera=TILTED, covariance=np.diag([*6 * [1e-6], 1e-6])
-        ),
-    )
+    aimed = replace(hand_eye, gripper_from_camera=TILTED, covariance=np.diag(7 * [1e-6]))
     attempts = Attempts(capture, np.arange(4))
     assert past_scene(next_pose(attempts, aimed)) < np.radians(8)
-    unknown = replace(
-        aimed, estimate=replace(aimed.estimate, covariance=np.diag([*3 * [AIMED[0] ** 2], *3 * [0.1], 1e-6]))
-    )
+    unknown = replace(aimed, covariance=np.diag([*3 * [AIMED[0] ** 2], *3 * [0.1], 1e-6]))
     assert np.array_equal(next_pose(attempts, unknown), next_pose(attempts, None))
 
 
 @pytest.mark.parametrize("is_calibrated", [True, False])
 def test_each_refused_pose_is_followed_by_one_elsewhere_that_is_rotated_little(is_calibrated: bool):
     capture, hand_eye = seen()
-    aimed = replace(
-        hand_eye,
-        estimate=replace(hand_eye.estimate, gripper_from_camera=TILTED, covariance=np.diag(7 * [1e-6])),
-    )
+    aimed = replace(hand_eye, gripper_from_camera=TILTED, covariance=np.diag(7 * [1e-6]))
     attempts = Attempts(capture, np.arange(4))
     for _ in range(5):
         new = next_pose(attempts, aimed if is_calibrated else None)

@@ -22,13 +22,9 @@ from jcr.records import (
     MATCHED,
     PRIOR,
     Capture,
-    Estimate,
     HandEye,
-    ImageResiduals,
-    PaperResiduals,
     Pointmaps,
     Reconstruction,
-    RobotExamined,
     RobotNoise,
     Tracks,
 )
@@ -119,19 +115,14 @@ def known_reconstruction(truth: Truth, rendered: list[View]) -> tuple[Reconstruc
         backend="truth",
     )
     hand_eye = HandEye(
-        estimate=Estimate(
-            gripper_from_camera=truth.gripper_from_camera,
-            scale=SCALE,
-            base_from_recon=base_from_recon,
-            covariance=1e-10 * np.eye(7),
-        ),
-        images=ImageResiduals(
-            inliers=np.ones(views, bool),
-            translation_residual_m=np.zeros(views),
-            rotation_residual_rad=np.zeros(views),
-        ),
-        residuals=PaperResiduals(0.0, 0.0),
-        robot=RobotExamined(RobotNoise(translation=0.0, rotation=0.0, estimated=False)),
+        gripper_from_camera=truth.gripper_from_camera,
+        scale=SCALE,
+        base_from_recon=base_from_recon,
+        covariance=1e-10 * np.eye(7),
+        inliers=np.ones(views, bool),
+        translation_residual_m=np.zeros(views),
+        rotation_residual_rad=np.zeros(views),
+        robot_noise=RobotNoise(translation=0.0, rotation=0.0, estimated=False),
     )
     return reconstruction, hand_eye
 

@@ -17,15 +17,11 @@ from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import (
     Capture,
-    Estimate,
     HandEye,
-    ImageResiduals,
     Intrinsics,
-    PaperResiduals,
     PointCloud,
     Pointmaps,
     Reconstruction,
-    RobotExamined,
     RobotNoise,
     Tracks,
 )
@@ -340,17 +336,15 @@ def test_label_images_that_cannot_be_used_are_named(
 
 
 def hand_eye() -> HandEye:
-    estimate = Estimate(
-        gripper_from_camera=np.eye(4), scale=1.0, base_from_recon=np.eye(4), covariance=np.zeros((7, 7))
-    )
-    none = np.zeros(2)
     return HandEye(
-        estimate=estimate,
-        images=ImageResiduals(
-            inliers=np.ones(2, bool), translation_residual_m=none, rotation_residual_rad=none
-        ),
-        residuals=PaperResiduals(0.0, 0.0),
-        robot=RobotExamined(RobotNoise(translation=0.0, rotation=0.0, estimated=False)),
+        gripper_from_camera=np.eye(4),
+        scale=1.0,
+        base_from_recon=np.eye(4),
+        covariance=np.zeros((7, 7)),
+        inliers=np.ones(2, bool),
+        translation_residual_m=np.zeros(2),
+        rotation_residual_rad=np.zeros(2),
+        robot_noise=RobotNoise(translation=0.0, rotation=0.0, estimated=False),
     )
 
 

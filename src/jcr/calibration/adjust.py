@@ -26,11 +26,9 @@ from jcr.geometry import inverse, retract, scale_translation, step_between
 from jcr.records import (
     Estimate,
     HandEye,
-    ImageResiduals,
     Intrinsics,
     LeaveOneOut,
     PaperResiduals,
-    RobotExamined,
 )
 
 SETTLED_ENOUGH = 0.5
@@ -133,7 +131,7 @@ def with_decentring(estimate: Estimate, camera: Intrinsics) -> Estimate:
     )
 
 
-def with_prior_of_intrinsics(estimate: Estimate, camera: Camera) -> Estimate:
+def with_prior_of_intrinsics(estimate: HandEye, camera: Camera) -> HandEye:
     """Return an estimate from a network's cameras with the prior uncertainty of the intrinsics.
 
     The focal length does not move these cameras. A wrong principal point rotates all of them, so that the transform and
@@ -158,8 +156,8 @@ def with_prior_of_intrinsics(estimate: Estimate, camera: Camera) -> Estimate:
 def _considered(case: Case) -> Case:
     """Return the case with the errors of its intrinsics, which a fit to poses cannot estimate, as uncertainty."""
     if case.reconstruction.predicted_focal is not None:
-        known = with_prior_of_intrinsics(case.hand_eye.estimate, case.camera)
-        return replace(case, hand_eye=judged(replace(case.hand_eye, estimate=known)))
+        known = with_prior_of_intrinsics(case.hand_eye, case.camera)
+        return replace(case, hand_eye=judged(known))
     made_with_them = case.reconstruction.evidence is None and not case.tracks.from_pointmaps
     if case.capture.intrinsics is None or not made_with_them or not case.hand_eye.converged:
         return case
@@ -192,16 +190,12 @@ def refined_by(case: Case, found: Solution) -> HandEye:
     reprojection[used] = median_reprojection_px(found.problem, found.images.view)
     return replace(
         before,
-        estimate=estimate,
-        images=ImageResiduals(
-            inliers=before.inliers,
-            translation_residual_m=metres,
-            rotation_residual_rad=radians,
-            reasons=before.images.reasons,
-            reprojection_px=reprojection,
-        ),
+        **vars(estimate),
+        translation_residual_m=metres,
+        rotation_residual_rad=radians,
+        reprojection_px=reprojection,
         residuals=PaperResiduals(*paper_residuals(gripper, camera, x, estimate.scale, before.inliers)),
-        robot=RobotExamined(found.noise),
+        robot_noise=found.noise,
         leave_one_out=_leave_one_out(found),
         before=before,
     )

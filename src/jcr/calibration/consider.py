@@ -61,12 +61,11 @@ def with_intrinsics_considered(
         x_k, scale_k = solved(moved[:, k])
         shifts[:, k] = np.append(step_between(x, x_k), np.log(scale_k / scale))
     considered = shifts @ shifts.T
-    estimate = replace(
-        hand_eye.estimate,
+    return replace(
+        hand_eye,
         covariance=hand_eye.covariance + considered,
         budget=replace(hand_eye.budget, intrinsics=hand_eye.budget.intrinsics + considered),
     )
-    return replace(hand_eye, estimate=estimate)
 
 
 def _camera_with_other_intrinsics(

@@ -63,7 +63,6 @@ from jcr.records import (
     PosePairs,
     Reconstruction,
     Requirement,
-    RobotExamined,
     RobotNoise,
     ScaleCheck,
     Seen,
@@ -282,15 +281,15 @@ class RobotErrors(Part):
     """The joints from the base on; null where the arm is not known."""
 
     @classmethod
-    def of(cls, robot: RobotExamined) -> "RobotErrors":
+    def of(cls, robot: HandEye) -> "RobotErrors":
         """Return the errors of a robot that the residuals show."""
         offsets, joints = robot.joint_offsets, None
         if offsets is not None:
             degrees = np.degrees([offsets.offset, offsets.std]).T.tolist()
             joints = [JointOffset(offset_deg=offset, std_deg=std) for offset, std in degrees]
         return cls(
-            systematic_deg=float(np.degrees(robot.noise.systematic)),
-            **mm_and_deg(*robot.noise.systematic_left),
+            systematic_deg=float(np.degrees(robot.robot_noise.systematic)),
+            **mm_and_deg(*robot.robot_noise.systematic_left),
             joints=joints,
         )
 
@@ -561,7 +560,7 @@ def calibration_of(
     used = reconstruction.intrinsics if isinstance(reconstruction, Reconstruction) else None
     intrinsics = hand_eye.intrinsics or used
     camera, resting = NAMES[mount]
-    noise, measured = hand_eye.robot_noise, hand_eye.scale_evidence
+    noise = hand_eye.robot_noise
     content = {
         "mount": mount,
         camera: hand_eye.gripper_from_camera,
@@ -569,18 +568,18 @@ def calibration_of(
         **{name: getattr(hand_eye, name) for name in OF_HAND_EYE},
         "backend": reconstruction.backend,
         "images": image_verdicts(capture, reconstruction, hand_eye),
-        "uncertainty": Uncertainty.of(hand_eye.estimate, hand_eye.in_use),
+        "uncertainty": Uncertainty.of(hand_eye, hand_eye.in_use),
         "held_out": hand_eye.leave_one_out,
         "robot_noise": mm_and_deg(noise.translation, noise.rotation) | {"estimated": noise.estimated},
-        "intrinsics": IntrinsicsAndStd.of(intrinsics, hand_eye.estimate.intrinsics_std),
+        "intrinsics": IntrinsicsAndStd.of(intrinsics, hand_eye.intrinsics_std),
         "timings_s": timings_s,
         "version": version,
         "next_poses": [{name: pose[name] for name in Proposal.model_fields} for pose in proposals],
-        "scale_check": measured.network,
-        "robot_errors": RobotErrors.of(hand_eye.robot),
-        "depth_check": measured.depth,
-        "lengths": list(measured.lengths),
-        "board": measured.board,
+        "scale_check": hand_eye.network,
+        "robot_errors": RobotErrors.of(hand_eye),
+        "depth_check": hand_eye.depth,
+        "lengths": list(hand_eye.lengths),
+        "board": hand_eye.board,
         "attempts": list(attempts),
     }
     if mount == "base":
@@ -618,21 +617,21 @@ def image_verdicts(
 ) -> list[ImageVerdict]:
     """Return the use and the residuals of every image of the capture."""
     row_of = {int(row): k for k, row in enumerate(reconstruction.image_index)}
-    images, verdicts = hand_eye.images, []
+    verdicts = []
     for row, name in enumerate(capture.images):
         k = row_of.get(row)
         if k is None:
             why = f"not registered by {reconstruction.backend}"
             verdicts.append(ImageVerdict(image=name, used=False, reason=why))
             continue
-        pixels = np.nan if images.reprojection_px is None else float(images.reprojection_px[k])
+        pixels = np.nan if hand_eye.reprojection_px is None else float(hand_eye.reprojection_px[k])
         verdicts.append(
             ImageVerdict(
                 image=name,
-                used=bool(images.inliers[k]),
-                reason=images.reasons[k],
-                translation_residual_mm=1e3 * float(images.translation_residual_m[k]),
-                rotation_residual_deg=float(np.degrees(images.rotation_residual_rad[k])),
+                used=bool(hand_eye.inliers[k]),
+                reason=hand_eye.reasons[k],
+                translation_residual_mm=1e3 * float(hand_eye.translation_residual_m[k]),
+                rotation_residual_deg=float(np.degrees(hand_eye.rotation_residual_rad[k])),
                 reprojection_px=None if np.isnan(pixels) else pixels,
             )
         )

@@ -37,7 +37,6 @@ from jcr.records import (
     HandEye,
     InUse,
     NextPose,
-    Plan,
     Requirement,
     RobotNoise,
     SceneUncertainty,
@@ -168,7 +167,7 @@ def advised(
     calibration, `scene` is the uncertainty of the scene, where images were adjusted.
     """
     used, robot = gripper[hand_eye.inliers], robot.of(np.flatnonzero(hand_eye.inliers))
-    hand_eye = replace(hand_eye, in_use=in_use(hand_eye.estimate, assumptions.distance_m, scene))
+    hand_eye = replace(hand_eye, in_use=in_use(hand_eye, assumptions.distance_m, scene))
     required = _required(hand_eye, options)
     # Wrong intrinsics and a strained robot stay the same with further images.
     lasting = [
@@ -191,7 +190,9 @@ def advised(
         proposed = Proposals.of(assumptions, used, robot, PROPOSED).next_poses(PROPOSED)
     seen = excitation(used, hand_eye.gripper_from_camera) if len(used) > 1 else None
     earlier = tuple(one for one in hand_eye.findings if one.kind is not FindingKind.NOT_EXACT_ENOUGH)
-    hand_eye = replace(hand_eye, plan=Plan(seen, tuple(proposed), required), findings=earlier)
+    hand_eye = replace(
+        hand_eye, excitation=seen, next_poses=tuple(proposed), requirement=required, findings=earlier
+    )
     short = not_exact_enough(required, hand_eye.budget is not None and hand_eye.budget.mostly_systematic)
     return hand_eye if short is None or not hand_eye.converged else hand_eye.with_findings(short)
 
@@ -232,7 +233,7 @@ def _required(hand_eye: HandEye, options: CalibrateOptions) -> Requirement:
     """Return the requirement beside the accuracy in use of a calibration."""
     found, at = hand_eye.in_use, options.require_at
     assert found is not None
-    reached_mm, reached_deg = reached(hand_eye.estimate, found, at)
+    reached_mm, reached_deg = reached(hand_eye, found, at)
     translation_mm, rotation_deg = options.require or GRASPING
     return Requirement(
         translation_mm=translation_mm,

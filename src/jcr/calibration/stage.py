@@ -41,7 +41,7 @@ def calibrate(
     )
     if capture.intrinsics is None or (distance_m := case.scene_distance_m) is None:
         return hand_eye
-    pair = with_given_intrinsics(hand_eye.estimate, reconstruction.intrinsics, distance_m)
+    pair = with_given_intrinsics(hand_eye, reconstruction.intrinsics, distance_m)
     return replace(hand_eye, with_given_intrinsics=pair)
 
 
@@ -88,7 +88,7 @@ def fit_poses(
     hand_eye = _solved(gripper, reconstruction, options, robot, scale, offset)
     priors = () if scale is None else (scale_prior(*scale),)
     priors += () if offset is None else (offset_prior(*offset),)
-    hand_eye = replace(hand_eye, estimate=replace(hand_eye.estimate, intrinsics=reconstruction.intrinsics))
+    hand_eye = replace(hand_eye, intrinsics=reconstruction.intrinsics)
     return Case(
         capture=capture,
         reconstruction=reconstruction,

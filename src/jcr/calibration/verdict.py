@@ -29,7 +29,7 @@ def with_findings(hand_eye: HandEye, findings: tuple[Finding, ...]) -> HandEye:
         accepted = hand_eye.converged and verdict_of([*named, finding]) != "rejected"
         both = finding.shift, finding.intrinsics_shift
         shifts = None if both[1] is None else (np.array(both[0]), np.array(both[1]))
-        hand_eye = replace(hand_eye, estimate=hand_eye.estimate.with_fault(finding.covariance, shifts))
+        hand_eye = hand_eye.with_fault(finding.covariance, shifts)
         # More images, the remedy for a large covariance, do not help against a fault: that finding is left out.
         if not accepted or not judged(hand_eye).converged:
             finding = replace(finding, severity="rejects")

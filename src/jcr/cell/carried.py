@@ -101,9 +101,9 @@ def refined(
     assert answer is not None
     again = replace(
         found,
-        estimate=estimate_of(answer, case.tracks),
-        robot=replace(found.robot, noise=answer.noise),
-        plan=replace(found.plan, next_poses=()),
+        **vars(estimate_of(answer, case.tracks)),
+        robot_noise=answer.noise,
+        next_poses=(),
         findings=tuple(one for one in found.findings if one.kind not in EFFECTS),
     )
     return judged(with_findings(judged(again), effects_found))

@@ -130,7 +130,7 @@ class Rigs:
         rig = np.full(len(seen.found), -1)
         used = np.flatnonzero(found.inliers)
         rig[seen.rows[used]] = len(self.poses) + np.arange(len(used))
-        why = {int(seen.rows[k]): str(found.images.reasons[k]) for k in np.flatnonzero(~found.inliers)}
+        why = {int(seen.rows[k]): str(found.reasons[k]) for k in np.flatnonzero(~found.inliers)}
         self.poses += list(places[used])
         self.arms.append(arm)
         self._of_arms.append((rig[seen.rows[used]], gripper[used], found))

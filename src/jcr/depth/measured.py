@@ -31,7 +31,7 @@ def with_measured_depth(
     Depth is divided by what the robot says it is too long. Where images match a depth too, the two are averaged if they
     agree, and else the matched one stays, for several images say it; planes that were filled in give way.
     """
-    check = hand_eye.scale_evidence.depth
+    check = hand_eye.depth
     if capture.depths is None:
         return reconstruction, ()
     if check is None or not hand_eye.is_sound:

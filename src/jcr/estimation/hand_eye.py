@@ -21,15 +21,7 @@ from jcr.estimation.systematic import arm_errors, posed, smooth_errors
 from jcr.findings import Finding, FindingKind, strongest_first
 from jcr.geometry import Poses, require_rigid
 from jcr.least_squares import one_blas_thread
-from jcr.records import (
-    Estimate,
-    HandEye,
-    ImageResiduals,
-    LeaveOneOut,
-    PaperResiduals,
-    RobotExamined,
-    RobotNoise,
-)
+from jcr.records import HandEye, LeaveOneOut, PaperResiduals, RobotNoise
 
 MAX_NOISE = (0.02, np.radians(3.0))
 """Largest noise (m, rad), beyond that of the worst servo arm; poses and images then do not belong together."""
@@ -147,25 +139,20 @@ def _with_residuals(gripper: Poses, camera: Poses, fit: Solution, distinct: Int[
     x, scale, z = fit.state.x[0], fit.state.scale, fit.state.z[0]
     used = fit.problem.used[distinct]
     seen = observability(gripper[used], x, camera[used], fit.problem.priors)
-    delta_t, delta_r = paper_residuals(gripper, camera, x, scale, used)
     residual, _ = residuals(x, scale, z, gripper, camera)
     metres, radians = np.linalg.norm(residual.reshape(-1, 2, 3), axis=2).T
     return HandEye(
-        estimate=Estimate(
-            gripper_from_camera=x,
-            scale=scale,
-            base_from_recon=z,
-            covariance=fit.covariance[:7, :7],
-            budget=fit.budget,
-        ),
-        images=ImageResiduals(
-            inliers=used,
-            translation_residual_m=metres,
-            rotation_residual_rad=radians,
-            reasons=_reasons(used, metres, radians, fit.noise),
-        ),
-        residuals=PaperResiduals(delta_t, delta_r),
-        robot=RobotExamined(fit.noise),
+        gripper_from_camera=x,
+        scale=scale,
+        base_from_recon=z,
+        covariance=fit.covariance[:7, :7],
+        budget=fit.budget,
+        inliers=used,
+        translation_residual_m=metres,
+        rotation_residual_rad=radians,
+        reasons=_reasons(used, metres, radians, fit.noise),
+        residuals=PaperResiduals(*paper_residuals(gripper, camera, x, scale, used)),
+        robot_noise=fit.noise,
         leave_one_out=_leave_one_out(fit, fit.problem.used),
         findings=seen.findings,
     )
@@ -257,7 +244,7 @@ def _disagreement(hand_eye: HandEye) -> tuple[float, float]:
     fitted = count / max(count - 13, 1)
     metres, radians = (
         float(np.sqrt(fitted * (residual[used] ** 2).mean() / 3))
-        for residual in (hand_eye.images.translation_residual_m, hand_eye.images.rotation_residual_rad)
+        for residual in (hand_eye.translation_residual_m, hand_eye.rotation_residual_rad)
     )
     return metres, radians
 

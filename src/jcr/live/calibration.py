@@ -399,18 +399,17 @@ def _contradicting(case: Case, hand_eye: HandEye) -> list[Finding]:
     """Return a finding for each image whose gripper pose a sound calibration rejects."""
     if not hand_eye.is_sound:
         return []
-    images = hand_eye.images
     return [
         Finding.of(
             FindingKind.POSE_CONTRADICTS_IMAGE,
             "warns",
             "poses",
             case.names[row],
-            value=float(images.translation_residual_m[row]),
-            rotation=float(images.rotation_residual_rad[row]),
+            value=float(hand_eye.translation_residual_m[row]),
+            rotation=float(hand_eye.rotation_residual_rad[row]),
         )
-        for row in np.flatnonzero(~images.inliers)
-        if images.translation_residual_m[row] > SAME[0] or images.rotation_residual_rad[row] > SAME[1]
+        for row in np.flatnonzero(~hand_eye.inliers)
+        if hand_eye.translation_residual_m[row] > SAME[0] or hand_eye.rotation_residual_rad[row] > SAME[1]
     ]
 
 

@@ -1,7 +1,7 @@
 """State of a calibration, with its uncertainty, and the records that it is made of."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -270,6 +270,9 @@ class ModelError:
     """By how much the parameters (camera.parameters) express each polynomial where the images have points."""
 
 
+AnyEstimate = TypeVar("AnyEstimate", bound="Estimate")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
     """Estimated transform, scale and intrinsics, with their covariances."""
@@ -299,10 +302,10 @@ class Estimate:
         return None if known is None else np.sqrt(np.diag(known))
 
     def with_fault(
-        self,
+        self: AnyEstimate,
         covariance: Float[ndarray, "7 7"],
         shifts: tuple[Float[ndarray, "7"], Float[ndarray, " q"]] | None = None,
-    ) -> "Estimate":
+    ) -> AnyEstimate:
         """Return the estimate, as uncertain as a fault with this covariance makes it.
 
         `shifts` are those of COVARIANCE_ORDER and of camera.parameters together, where the intrinsics move with it.
@@ -321,20 +324,6 @@ class Estimate:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class ImageResiduals:
-    """Residual and verdict of each pose that the solver was given."""
-
-    inliers: Bool[ndarray, " n"]
-    translation_residual_m: Float[ndarray, " n"]
-    """Distance from where the fit puts the gripper."""
-    rotation_residual_rad: Float[ndarray, " n"]
-    reasons: tuple[str | None, ...] = ()
-    """Why it was rejected, None when used."""
-    reprojection_px: Float[ndarray, " n"] | None = None
-    """Median reprojection error after bundle adjustment; NaN where it took no part."""
-
-
 @dataclass(frozen=True)
 class PaperResiduals:
     """Residuals of consecutive used poses, as the paper defines them."""
@@ -343,15 +332,6 @@ class PaperResiduals:
     """Mean δ_t (m)."""
     rotation: float
     """Mean δ_R, Frobenius norm."""
-
-
-@dataclass(frozen=True)
-class RobotExamined:
-    """Errors of the robot that the residuals show."""
-
-    noise: RobotNoise
-    joint_offsets: JointOffsets | None = None
-    """None where the arm is not known."""
 
 
 LengthName = Literal["board", "known length", "depth camera", "network"]
@@ -396,50 +376,44 @@ class BoardFound:
     """Corners of the body that bends most: x and y on the body, and height above its plane, by the robot's positions."""
 
 
-@dataclass(frozen=True)
-class ScaleEvidence:
-    """Measures of the scale beside the robot's positions."""
+@dataclass(frozen=True, kw_only=True)
+class HandEye(Estimate):
+    """Numerical state of a calibration as it passes through fit, bundle adjustment and checks."""
 
+    inliers: Bool[ndarray, " n"]
+    """Whether each pose that the solver was given is used."""
+    translation_residual_m: Float[ndarray, " n"]
+    """Distance of each gripper from where the fit puts it."""
+    rotation_residual_rad: Float[ndarray, " n"]
+    reasons: tuple[str | None, ...] = ()
+    """Why each pose was rejected, None where it is used."""
+    reprojection_px: Float[ndarray, " n"] | None = None
+    """Median reprojection error after bundle adjustment; NaN of images that took no part."""
+    residuals: PaperResiduals = PaperResiduals(0.0, 0.0)
+    robot_noise: RobotNoise
+    joint_offsets: JointOffsets | None = None
+    """None where the arm is not known."""
+    leave_one_out: LeaveOneOut | None = None
     network: ScaleCheck | None = None
     """None where the reconstruction's unit is not meant to be the metre."""
     depth: DepthCheck | None = None
     """None without depth images, or where too few features have a depth."""
     lengths: tuple[LengthCheck, ...] = ()
-    """Every length that was compared with the robot's."""
+    """Every length that was compared with the robot's positions."""
     board: BoardFound | None = None
     """None where no board took part beside features."""
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Required accuracy, and the poses that would reach it."""
-
     excitation: Excitation | None = None
     """Excitation by the used poses."""
     next_poses: tuple[NextPose, ...] = ()
     """Gripper poses that would shrink the reported uncertainty most; `like` counts the used poses."""
     requirement: Requirement | None = None
-    """None where the solver was asked and not the calibration stage."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class HandEye:
-    """State of a calibration as it passes through fit, bundle adjustment and checks."""
-
-    estimate: Estimate
-    images: ImageResiduals
-    residuals: PaperResiduals
-    robot: RobotExamined
-    leave_one_out: LeaveOneOut | None = None
-    scale_evidence: ScaleEvidence = ScaleEvidence()
-    plan: Plan = Plan()
+    """Required and reached accuracy; None of a fit outside the stage calibrate."""
     in_use: InUse | None = None
     """Point uncertainty; None of a fit outside the stage calibrate."""
     with_given_intrinsics: WithGivenIntrinsics | None = None
     """None where no intrinsics were given, or they were not estimated beside that."""
     before: "HandEye | None" = None
     """The fit to camera poses alone; None where that decided."""
-
     findings: tuple[Finding, ...] = ()
     """Findings, strongest first; of the same severity causes before consequences."""
 
@@ -466,56 +440,6 @@ class HandEye:
     def warnings(self) -> tuple[str, ...]:
         """Findings that reject or warn, in words."""
         return warnings_of(self.findings)
-
-    @property
-    def gripper_from_camera(self) -> Float[ndarray, "4 4"]:
-        """Hand-eye transform; base_from_camera of a fixed camera."""
-        return self.estimate.gripper_from_camera
-
-    @property
-    def scale(self) -> float:
-        """Metres per unit of the reconstruction."""
-        return self.estimate.scale
-
-    @property
-    def base_from_recon(self) -> Float[ndarray, "4 4"]:
-        """Rigid; maps recon coordinates *already multiplied by scale* to the base frame."""
-        return self.estimate.base_from_recon
-
-    @property
-    def covariance(self) -> Float[ndarray, "7 7"]:
-        """Covariance in COVARIANCE_ORDER."""
-        return self.estimate.covariance
-
-    @property
-    def budget(self) -> Budget | None:
-        """Parts of the covariance."""
-        return self.estimate.budget
-
-    @property
-    def intrinsics(self) -> Intrinsics | None:
-        """Refined by bundle adjustment; None when poses alone were given."""
-        return self.estimate.intrinsics
-
-    @property
-    def inliers(self) -> Bool[ndarray, " n"]:
-        """Per pose given to the solver: whether it is used."""
-        return self.images.inliers
-
-    @property
-    def robot_noise(self) -> RobotNoise:
-        """Noise of the gripper poses."""
-        return self.robot.noise
-
-    @property
-    def requirement(self) -> Requirement | None:
-        """Required and reached accuracy; None of a fit outside the stage calibrate."""
-        return self.plan.requirement
-
-    @property
-    def next_poses(self) -> tuple[NextPose, ...]:
-        """Gripper poses worth adding."""
-        return self.plan.next_poses
 
     @property
     def observability(self) -> Observability:

@@ -30,7 +30,7 @@ Bar = tuple[str, float, float, str]
 def motion_section(result: RunResult | PosesResult) -> Section:
     """Return excitation of the seven directions, standard deviations of their parts, and the poses to add."""
     observed, uncertainty = result.calibration.observability, result.calibration.uncertainty
-    found = result.hand_eye.plan.excitation
+    found = result.hand_eye.excitation
     content = {
         "unobservable": list(zip(observed.unobservable, observed.advice, strict=False)),
         "is_observable": observed.observable,

@@ -22,8 +22,8 @@ def residuals_section(result: RunResult | PosesResult) -> Section:
     fits = [now] if before is None else [now, before]
     names, used = shown_names(result.calibration.images), now.inliers
     columns = []
-    mm = [1e3 * fit.images.translation_residual_m for fit in fits]
-    deg = [np.degrees(fit.images.rotation_residual_rad) for fit in fits]
+    mm = [1e3 * fit.translation_residual_m for fit in fits]
+    deg = [np.degrees(fit.rotation_residual_rad) for fit in fits]
     for values, unit in ((mm, " mm"), (deg, "°")):
         longest = max(float(value[used].max(initial=0.0)) for value in values) or 1.0
         columns.append([_bar([value[k] for value in values], longest, unit) for k in range(len(used))])

@@ -30,7 +30,7 @@ SHORTEST = 8
 def seen_section(result: RunResult) -> Section | None:
     """Return contours of the 95 % bound of a point's error over an image; None without intrinsics."""
     uncertainty, hand_eye = result.calibration.uncertainty, result.hand_eye
-    if uncertainty is None or uncertainty.seen is None or hand_eye.estimate.intrinsics_cross is None:
+    if uncertainty is None or uncertainty.seen is None or hand_eye.intrinsics_cross is None:
         return None
     kept = result.calibration.with_given_intrinsics
     distance_m = 1e-3 * uncertainty.seen.distance_mm

@@ -160,8 +160,8 @@ def test_the_focal_length_of_a_network_is_a_measurement(off: float, given: bool)
     assert error @ np.linalg.solve(found.covariance, error) < 18.5
     used = reconstruction.intrinsics
     assert used.fx / truth.fx - 1 == pytest.approx(0 if given else off, abs=5e-3)
-    assert found.estimate.intrinsics_covariance is not None
-    std = np.sqrt(found.estimate.intrinsics_covariance[0, 0]) / used.fx
+    assert found.intrinsics_covariance is not None
+    std = np.sqrt(found.intrinsics_covariance[0, 0]) / used.fx
     contradicts = [one for one in found.findings if one.kind is FindingKind.INTRINSICS]
     assert len(contradicts) == (given and off == -0.1)
     if contradicts:
@@ -176,7 +176,7 @@ def test_the_focal_length_of_a_network_is_a_measurement(off: float, given: bool)
     offset -= (
         found.gripper_from_camera[:3, :3].T @ (made.gripper_from_camera - found.gripper_from_camera)[:3, 3]
     )
-    covariance = point_covariance(found.estimate, used, corner, 1.0)
+    covariance = point_covariance(found, used, corner, 1.0)
     assert offset @ np.linalg.solve(covariance + 1e-12 * np.eye(3), offset) < 11.3
     assert std == pytest.approx(0.05 if not given else 0.1 if contradicts else 0.005, rel=0.1)
 
@@ -211,7 +211,7 @@ def test_a_metric_network_is_fixed_against_the_robot(factor: float, off_percent:
     )
     reconstruction = replace(made, predictions=network).reconstruction()
     found = calibrate(made.capture, reconstruction)
-    check = found.scale_evidence.network
+    check = found.network
     assert abs(check.off_percent - off_percent) < 4 * check.std_percent * factor
     assert check.std_percent < 0.2 * factor
     content = calibration_of(made.capture, reconstruction, found, {}, "0")
@@ -224,7 +224,7 @@ def test_a_metric_network_is_fixed_against_the_robot(factor: float, off_percent:
 
 def test_a_network_without_a_metre_shows_nothing_of_the_scale():
     made = case(4, 3, (1e-4, 2e-4))
-    assert calibrate(made.capture, made.reconstruction()).scale_evidence.network is None
+    assert calibrate(made.capture, made.reconstruction()).network is None
 
 
 def test_evidence_survives_the_file(tmp_path: Path):

@@ -37,8 +37,7 @@ def check_boards(case: Case) -> CheckResult:
         findings.append(
             Finding.of(FindingKind.BOARD_SIDE, "informs", value=side[0], std=side[1], board=boards.spec)
         )
-    evidence = replace(hand_eye.scale_evidence, board=found)
-    return CheckResult(tuple(findings), replace(hand_eye, scale_evidence=evidence))
+    return CheckResult(tuple(findings), replace(hand_eye, board=found))
 
 
 def board_found(adjusted: Solution, boards: Boards) -> BoardFound:

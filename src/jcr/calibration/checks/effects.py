@@ -365,8 +365,9 @@ def _with_rejected_runs(case: Case) -> Case:
     in_order = with_rejected_runs(case.hand_eye.inliers)
     if (in_order == case.hand_eye.inliers).all():
         return case
-    images = replace(case.hand_eye.images, inliers=in_order)
-    longer = replace(case, hand_eye=replace(case.hand_eye, images=images), chosen_tracks=None, adjusted=None)
+    longer = replace(
+        case, hand_eye=replace(case.hand_eye, inliers=in_order), chosen_tracks=None, adjusted=None
+    )
     if case.adjusted is None:
         return longer
     try:

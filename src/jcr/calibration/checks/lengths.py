@@ -22,7 +22,7 @@ from jcr.estimation.hand_eye import judged
 from jcr.estimation.problem import LinearPrior
 from jcr.estimation.solve import Solution, size_of_boards, with_priors
 from jcr.findings import Finding, FindingKind
-from jcr.records import HandEye, LengthCheck, LengthName, ScaleCheck, ScaleEvidence
+from jcr.records import HandEye, LengthCheck, LengthName, ScaleCheck
 
 DEPTH_STD, NETWORK_STD = 0.02, 0.05
 """Relative standard deviations of the metre of depth cameras, off by a few percent, and of networks, by up to ten."""
@@ -79,7 +79,7 @@ def check_lengths(case: Case) -> CheckResult:
         for one in lengths
         if one.name != "robot"
     )
-    hand_eye = _with(hand_eye, lengths=checks)
+    hand_eye = replace(hand_eye, lengths=checks)
     if pair is not None:
         others = [one for one in (robot, *lengths) if one not in pair]
         found = finding_of(*pair, others, hand_eye)
@@ -88,7 +88,7 @@ def check_lengths(case: Case) -> CheckResult:
     if weighed:
         return _fused(case, hand_eye, weighed, fault)
     if hand_eye.converged and fault.any():
-        hand_eye = judged(replace(hand_eye, estimate=hand_eye.estimate.with_fault(fault)))
+        hand_eye = judged(hand_eye.with_fault(fault))
     return CheckResult(_from_robot_alone(case, hand_eye), hand_eye)
 
 
@@ -108,12 +108,12 @@ def _measured(case: Case) -> tuple[HandEye, list[Length]]:
             DEPTH_STD, np.sqrt(max((depth.std_percent / 100) ** 2 - hand_eye.covariance[6, 6], 0.0))
         )
         found.append(Length("depth camera", -float(np.log1p(depth.off_percent / 100)), float(off_std)))
-        hand_eye = _with(hand_eye, depth=depth)
+        hand_eye = replace(hand_eye, depth=depth)
     # A unit with a stated standard deviation was used for the scale, and is no check of it.
     if case.reconstruction.is_metric and case.reconstruction.metric_std is None:
         # A network's length of 1 is `scale` metres by the robot.
         found.append(Length("network", float(np.log(hand_eye.scale)), NETWORK_STD))
-        hand_eye = _with(hand_eye, network=_network_check(hand_eye))
+        hand_eye = replace(hand_eye, network=_network_check(hand_eye))
     return hand_eye, found
 
 
@@ -130,11 +130,6 @@ def _of_boards(adjusted: Solution, size_std: float | None) -> Iterator[Length]:
 def _network_check(hand_eye: HandEye) -> ScaleCheck:
     std_percent = 100 * float(np.sqrt(hand_eye.covariance[6, 6])) / hand_eye.scale
     return ScaleCheck(100 * (1 / hand_eye.scale - 1), std_percent)
-
-
-def _with(hand_eye: HandEye, **measured: object) -> HandEye:
-    evidence: ScaleEvidence = replace(hand_eye.scale_evidence, **measured)
-    return replace(hand_eye, scale_evidence=evidence)
 
 
 def contradiction(lengths: list[Length]) -> tuple[Length, Length] | None:
@@ -187,7 +182,7 @@ def _shift(off: float, hand_eye: HandEye) -> Float[ndarray, "7"]:
 
 def _from_robot_alone(case: Case, hand_eye: HandEye) -> tuple[Finding, ...]:
     """Return the finding that the scale comes from the robot alone, where nothing but a network was compared with it."""
-    compared = any(one.name != "network" for one in hand_eye.scale_evidence.lengths)
+    compared = any(one.name != "network" for one in hand_eye.lengths)
     if compared or case.priors or case.reconstruction.metric_std is not None:
         return ()
     return (Finding.of(FindingKind.SCALE_FROM_ROBOT, "informs"),)
@@ -218,16 +213,23 @@ def _fused(case: Case, hand_eye: HandEye, lengths: list[Length], fault: Float[nd
             known.append(LinearPrior(by_scale, log_scale - one.off, float(np.hypot(one.std, ROBOT_STD))))
     adjusted = with_priors(case.adjusted, known)
     refined = refined_by(case, adjusted)
-    estimate = refined.estimate.with_fault(fault)
+    refined = refined.with_fault(fault)
     for one in hand_eye.findings:
         if one.shift is not None:
             of_camera = one.intrinsics_shift
             shifts = None if of_camera is None else (np.array(one.shift), np.array(of_camera))
-            estimate = estimate.with_fault(one.covariance, shifts)
-    evidence, longer = hand_eye.scale_evidence, estimate.scale / hand_eye.scale
-    if evidence.depth is not None:
+            refined = refined.with_fault(one.covariance, shifts)
+    depth = hand_eye.depth
+    if depth is not None:
         # What is measured with depth images is in the metre that the map has.
-        percent = 100 * ((1 + evidence.depth.off_percent / 100) / longer - 1)
-        evidence = replace(evidence, depth=replace(evidence.depth, off_percent=percent))
-    refined = replace(refined, estimate=estimate, findings=hand_eye.findings, scale_evidence=evidence)
+        percent = 100 * ((1 + depth.off_percent / 100) * hand_eye.scale / refined.scale - 1)
+        depth = replace(depth, off_percent=percent)
+    refined = replace(
+        refined,
+        findings=hand_eye.findings,
+        depth=depth,
+        network=hand_eye.network,
+        lengths=hand_eye.lengths,
+        board=hand_eye.board,
+    )
     return CheckResult(_from_robot_alone(case, refined), judged(refined), adjusted)

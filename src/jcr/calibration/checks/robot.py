@@ -9,7 +9,7 @@ from jcr.estimation.pose_effects import joint_offsets
 from jcr.estimation.pose_equations import pose_equations
 from jcr.estimation.wrist import pose_problem
 from jcr.findings import Finding, FindingKind
-from jcr.records import JointOffsets, RobotExamined
+from jcr.records import JointOffsets
 
 MIN_EXAMINED = 4
 """Fewest images from which joint offsets are estimated."""
@@ -35,10 +35,9 @@ def check_robot(case: Case) -> CheckResult:
         noise_floor=fit.robot_noise.given,
     )
     offsets = joint_offsets(pose_equations(problem, state, None), arm, joints[used])
-    examined = RobotExamined(hand_eye.robot_noise, offsets)
     of_camera = any(finding.kind.row.group == "camera" for finding in hand_eye.findings)
     found = None if of_camera else _joint_finding(offsets)
-    return CheckResult(() if found is None else (found,), replace(hand_eye, robot=examined))
+    return CheckResult(() if found is None else (found,), replace(hand_eye, joint_offsets=offsets))
 
 
 def _joint_finding(offsets: JointOffsets) -> Finding | None:
