@@ -37,21 +37,19 @@ def most_likely(
     equations: Equations,
     start: LogSizes | None = None,
     settled: float = SETTLED,
-    score: Callable[[LogSizes], tuple[float, LogSizes, Information]] | None = None,
 ) -> tuple[LogSizes, Information]:
     """Return the log sizes at the mode of their posterior, to a last step `settled`, and their expected information.
 
     Fisher scoring uses the curvature that the last step showed (BFGS, Nocedal and Wright, "Numerical optimization",
     2006, eq. 6.19): where the expected information is half of the curvature, steps swing about the mode.
     """
-    score = score or (lambda at: _score(equations, at))
     at = np.log(equations.typical) if start is None else start
-    value, gradient, information = score(at)
+    value, gradient, information = _score(equations, at)
     curvature = information
     for _ in range(40):
         step = np.linalg.solve(curvature, gradient)
         step /= max(1.0, float(np.abs(step).max()))
-        while (scored := score(at + step))[0] < value and np.abs(step).max() > settled:
+        while (scored := _score(equations, at + step))[0] < value and np.abs(step).max() > settled:
             step = step / 2
         if scored[0] < value:
             break

@@ -23,8 +23,8 @@ from jcr.estimation.wrist import pose_problem
 from jcr.geometry import ARM, Poses, rotation_angle, transform
 
 Images = Bool[ndarray, " n"]
-Fit = tuple[float, Float[ndarray, "n 6"], Float[ndarray, "n 6 6"]]
-"""Log evidence of a fit, and the leave-one-out residuals of all poses with their covariances."""
+Fit = tuple[float, Float[ndarray, "n 6"], Float[ndarray, "n 6 6"], Float[ndarray, " c"]]
+"""Log evidence of a fit, leave-one-out residuals of all poses with their covariances, log sizes of the errors."""
 
 SHARE_RIGHT = 0.65
 """Share of images that the trimmed fit relies on; up to the rest may be wrong."""
@@ -81,13 +81,14 @@ def robust_fit(
 
     def fit_to(used: Images, averaged: bool = False) -> Solution:
         x, scale, z = initial_estimate(base_from_gripper, recon_from_camera, used.astype(float))
-        start = replace(state, x=x[None], scale=scale, z=z[None])
+        sizes = next(iter(fits.values()))[3] if fits else None
+        start = replace(state, x=x[None], scale=scale, z=z[None], robot_log_sizes=sizes)
         return solve(replace(every, used=used), start, averaged=averaged)
 
     def fitted(used: Images) -> Fit:
         if used.tobytes() not in fits:
             found = fit_to(used)
-            fits[used.tobytes()] = found.log_evidence, *found.leave_one_out()
+            fits[used.tobytes()] = found.log_evidence, *found.leave_one_out(), found.log_sizes
         return fits[used.tobytes()]
 
     used = np.ones(n, dtype=bool)
@@ -148,7 +149,7 @@ def _evidence(fit: Fit, used: Images) -> float:
 
 def _distance(fit: Fit) -> Float[ndarray, " n"]:
     """Return the squared distance of each pose from a fit without it, in the expected covariance."""
-    _, left_out, covariance = fit
+    _, left_out, covariance, _ = fit
     gap = np.linalg.solve(covariance, left_out[..., None])[..., 0]
     return np.einsum("ni,ni->n", left_out, gap)
 

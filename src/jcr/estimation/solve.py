@@ -12,13 +12,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.estimation import smooth
 from jcr.estimation.acceleration import Acceleration
 from jcr.estimation.cholesky import cholesky, inverse_of, lower, over
-from jcr.estimation.components import SETTLED, Information, log_evidence, most_likely
+from jcr.estimation.components import Information, log_evidence, most_likely
 from jcr.estimation.covariance import expected_posterior, posterior
 from jcr.estimation.elimination import Normal
-from jcr.estimation.equation import SCALE, UNKNOWNS, pose_by_pose, share_within_limits, weak_prior
+from jcr.estimation.equation import SCALE, pose_by_pose, share_within_limits, weak_prior
 from jcr.estimation.image_equations import (
     SIZES_SETTLED,
     ImageEvidence,
@@ -45,8 +44,6 @@ from jcr.estimation.problem import (
     with_free,
 )
 from jcr.estimation.projection import view_of
-from jcr.estimation.smooth import SmoothSolution
-from jcr.estimation.systematic import Region
 from jcr.geometry import Transform, step_between
 from jcr.least_squares import one_blas_thread
 from jcr.records import Budget, ModelError, RobotNoise
@@ -86,8 +83,6 @@ class Solution:
     iterations: int = 0
     last_step: float = 0.0
     """Largest step of an arm's unknown in the last round, in standard deviations; 0 without observations."""
-    smooth: SmoothSolution | None = None
-    """Solution of many poses in the eigenvectors of their systematic errors; None: of the equations themselves."""
 
     @property
     def equations(self) -> Equations:
@@ -114,14 +109,12 @@ class Solution:
     @property
     def log_evidence(self) -> float:
         """Log density of the used residuals, averaged over unknowns and sizes, times (2π)^(3m)."""
-        found = self.smooth or solve_equations(self.equations, self.log_sizes)
+        found = solve_equations(self.equations, self.log_sizes)
         return log_evidence(self.equations, float(found.log_posterior), self.size_information)
 
     def leave_one_out(self) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 6"]]:
         """Return the residual of each reported pose from a solution without it (m, rad; base axes), and its covariance,
         the pose's own errors included."""
-        if self.smooth is not None:
-            return smooth.left_out(self.smooth, self.problem, self.most_likely)
         poses, noise = self.poses, self.noise
         solution, random = (
             solve_equations(self.equations, self.log_sizes),
@@ -205,8 +198,6 @@ def solve(
     uncertainty. `start_noise` is the initial size of the random errors of the poses (m, rad).
     """
     if problem.observations is None:
-        if smooth.is_smooth(problem, averaged):
-            return _solve_smooth(problem, start, averaged)
         return _with_covariance(problem, start, None, averaged)
     if start.pixel_noise is None:
         start = _adjusted_to_poses(problem, start, problem.robot_noise_floor or start_noise)
@@ -352,37 +343,6 @@ class _JointStep:
         return _most_likely_arms(problem, state, evidence(problem, state), STEP_SETTLED**2)
 
 
-def _solve_smooth(problem: Problem, state: State, averaged: bool) -> Solution:
-    """Solve a problem of many exact camera poses whose systematic errors are smooth."""
-    basis, settled = smooth.decomposed(problem), ARMS_SETTLED if averaged else NEARLY_SETTLED
-    for _ in range(STEPS):
-        model = smooth.smooth_model(problem, state, basis)
-        found, information = smooth.likeliest(model, state.robot_log_sizes, SETTLED)
-        region = Region.of_unknowns(np.delete(model.equations.jacobian, SCALE, axis=1), UNKNOWNS)
-        step = smooth.effective_step(found, region)
-        step *= share_within_limits(step)
-        state = replace(full_step(problem, state, step), robot_log_sizes=found.log_sizes)
-        if float(step @ np.linalg.solve(found.covariance, step)) < settled:
-            break
-    model = smooth.smooth_model(problem, state, basis)
-    region = Region.of_unknowns(np.delete(model.equations.jacobian, SCALE, axis=1), UNKNOWNS)
-    found, information = smooth.likeliest(model, state.robot_log_sizes, SETTLED)
-    likely = replace(state, robot_log_sizes=found.log_sizes)
-    step, covariance, budget = (
-        smooth.effective(found, region) if averaged else (np.zeros(UNKNOWNS), found.covariance, None)
-    )
-    return Solution(
-        problem=problem,
-        state=full_step(problem, likely, step),
-        covariance=covariance,
-        budget=budget,
-        most_likely=likely,
-        poses=pose_equations(problem, likely, None),
-        size_information=information,
-        smooth=found,
-    )
-
-
 def _with_covariance(
     problem: Problem, state: State, images: ImageEvidence | None, averaged: bool
 ) -> Solution:
@@ -409,16 +369,17 @@ def _with_covariance(
 
 
 def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | None, settled: float) -> State:
-    """Step the arms' unknowns and the sizes of the robot's errors, until a step is below `settled` squared standard
-    deviations."""
-    arms, fine = problem.arm_unknowns, SETTLED if images is None else SIZES_SETTLED / 3
-    for _ in range(STEPS):
+    """Estimate the sizes of the robot's errors, then step the arms' unknowns until a step is below `settled` squared
+    standard deviations."""
+    arms, sizes = problem.arm_unknowns, state.robot_log_sizes
+    for count in range(STEPS):
         equations = pose_equations(problem, state, images).equations
-        log_sizes, _ = most_likely(equations, state.robot_log_sizes, fine)
-        solution = solve_equations(equations, log_sizes)
+        if count < 2:
+            sizes, _ = most_likely(equations, sizes, SIZES_SETTLED / 3)
+        solution = solve_equations(equations, sizes)
         step = np.zeros(problem.unknowns)
         step[:arms] = share_within_limits(solution.step[:arms]) * solution.step[:arms]
-        state = replace(full_step(problem, state, step), robot_log_sizes=log_sizes)
+        state = replace(full_step(problem, state, step), robot_log_sizes=sizes)
         if float(((solution.information_root.T @ step) ** 2).sum()) < settled:
             break
     return state
