@@ -12,9 +12,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from jcr.camera import rays
 from jcr.capture.images import encode_png
-from jcr.depth.densify import densify
+from jcr.depth.densify import choose_neighbours, dense_pointmaps, densify, sweep_planes
 from jcr.depth.options import DepthOptions
-from jcr.depth.views import choose_neighbours, sweep_planes
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import (
     BOTH,
@@ -123,8 +122,6 @@ def dense(scene: Scene) -> Pointmaps:
 
 
 def _dense(scene: Scene, recon_from_camera: ndarray, tracks: Tracks, **options: Any) -> Pointmaps:
-    from jcr.depth.dense import dense_pointmaps
-
     neighbours = choose_neighbours(tracks, recon_from_camera, 6)
     planes = sweep_planes(tracks, recon_from_camera)
     images = scene.images
@@ -139,8 +136,11 @@ def _z(scene: Scene, dense: Pointmaps, recon_from_camera: ndarray | None = None)
     return np.stack([apply(camera_from_recon, x)[..., 2] for camera_from_recon, x in pairs])
 
 
-def test_the_number_of_threads_changes_no_bit(scene: Scene, dense: Pointmaps) -> None:
-    tight = _dense(scene, scene.recon_from_camera, scene.tracks, threads=1)
+def test_the_number_of_threads_changes_no_bit(
+    scene: Scene, dense: Pointmaps, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("jcr.depth.densify.MOST_THREADS", 1)
+    tight = _dense(scene, scene.recon_from_camera, scene.tracks)
     for name in ("points_in_recon", "confidence", "reason", "depth_std"):
         np.testing.assert_array_equal(getattr(tight, name), getattr(dense, name))
 
@@ -155,8 +155,9 @@ def test_memory_that_ends_in_a_worker_thread_ends_the_stage(
         raise MemoryError("Unable to allocate 5.62 MiB")
 
     monkeypatch.setattr("jcr.depth.matched.peaks", exhausted)
+    monkeypatch.setattr("jcr.depth.densify.MOST_THREADS", threads)
     with pytest.raises(MemoryError, match="Unable to allocate"):
-        _dense(scene, scene.recon_from_camera, scene.tracks, threads=threads)
+        _dense(scene, scene.recon_from_camera, scene.tracks)
 
 
 def test_depth_is_found_and_reasons_and_sigmas_are_honest(scene: Scene, dense: Pointmaps) -> None:
@@ -199,7 +200,7 @@ def test_windows_lie_on_slopes() -> None:
     fronto[:, :, 2] = 1 / np.array([0.9, 0.25])
     neighbours = [np.array([1, 2]), np.array([0, 2]), np.array([1, 0])]
     inverse_depth, score = match_depth(
-        np.stack(images), poses, PINHOLE, neighbours, fronto, 1, lambda _: None
+        np.stack(images), poses, PINHOLE, neighbours, fronto, range(3), 1, lambda _: None
     )
     middle = np.s_[1, 20:-20, 40:-40]
     assert (score[middle] > 0.8).mean() > 0.9
@@ -219,8 +220,7 @@ def test_only_a_confirmed_depth_sees_through_a_point() -> None:
     view = relative(0, np.arange(1, 4), poses, PINHOLE)
     for confirmed, seeing in ((chance, 0), (known, 1)):
         compared = evidence(inverse_depth, known, confirmed)
-        rest = (view.others, view.a, view.b, view.centre, grid(PINHOLE), PINHOLE.width, 0.01)
-        mean, count, through, information = agreement(0, compared, *rest)
+        mean, count, through, information = agreement(0, compared, *view, grid(PINHOLE), PINHOLE.width, 0.01)
         middle = np.s_[10:-10, 10:-10]
         assert (count[middle] == 2).all() and (through[middle] == seeing).all()
         np.testing.assert_allclose(mean[middle], 1.0, rtol=1e-6)

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jcr.camera import pinhole_inside
 from jcr.capture.read import read_capture
-from jcr.depth.dense import pointmaps_of
-from jcr.depth.densify import undistorted
+from jcr.depth.densify import pointmaps_of, undistorted
 from jcr.depth.depth_npz import is_made_from, read_depth, write_depth
 from jcr.geometry import rotation_exp, transform
 from jcr.records import Reconstruction, Tracks
@@ -19,7 +19,8 @@ def made(tabletop: Path, rows: int) -> Reconstruction:
     capture = read_capture(tabletop)
     assert capture.intrinsics is not None
     rng, index = np.random.default_rng(0), np.arange(rows)
-    pinhole, colors = undistorted(capture.folder, [capture.images[k] for k in index], capture.intrinsics)
+    pinhole = pinhole_inside(capture.intrinsics, 400)
+    colors = undistorted(capture.folder, [capture.images[k] for k in index], capture.intrinsics, pinhole)
     shape = colors.shape[:3]
     cameras = transform(rotation_exp(rng.normal(size=(rows, 3))), rng.normal(size=(rows, 3)))
     reason = rng.integers(0, 4, shape).astype(np.uint8)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from PIL import Image
 
-from jcr.camera import project
+from jcr.camera import pinhole_inside, project
 from jcr.capture.read import read_capture
 from jcr.depth.densify import densify, undistorted
 from jcr.depth.options import DepthOptions
@@ -130,8 +130,9 @@ def test_same_pixels_same_result(capture: Capture, four: Reconstruction, tmp_pat
     np.testing.assert_array_equal(again.recon_from_camera, four.recon_from_camera)
     np.testing.assert_array_equal(again.tracks.x_px, four.tracks.x_px)
     np.testing.assert_array_equal(again.tracks.points_in_recon, four.tracks.points_in_recon)
-    _, upright = undistorted(capture.folder, rotated.images, four.intrinsics)
-    np.testing.assert_array_equal(undistorted(tmp_path, names, again.intrinsics)[1], upright)
+    pinhole = pinhole_inside(four.intrinsics, 400)
+    upright = undistorted(capture.folder, rotated.images, four.intrinsics, pinhole)
+    np.testing.assert_array_equal(undistorted(tmp_path, names, again.intrinsics, pinhole), upright)
 
 
 def test_distortion_that_folds_over_is_not_used(capture: Capture, four: Reconstruction) -> None:

@@ -7,17 +7,13 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
-from numpy import ndarray
 from pydantic import BaseModel, ConfigDict
 
-from jcr.camera import undistortion
-from jcr.capture.images import read_image
-from jcr.depth.dense import pointmaps_of
+from jcr.depth.densify import pointmaps_of, undistorted
 from jcr.geometry import apply, inverse
 from jcr.intrinsics_json import IntrinsicsJson
 from jcr.reconstruction_npz import check_arrays, read_npz, write_npz
-from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction
+from jcr.records import Capture, Pointmaps, Reconstruction
 
 FILE = "depth.npz"
 FORMAT = "jcr.depth/2"
@@ -73,24 +69,13 @@ def read_depth(path: Path, reconstruction: Reconstruction, capture: Capture | No
         shape = len(reconstruction.image_index), pinhole.height, pinhole.width
         arrays = {name: file[name] for name in ("depth", "relative_std", "confidence")}
         check_arrays({name: (array, shape) for name, array in arrays.items()})
-        planes = [np.unpackbits(file[name], count=int(np.prod(shape))) for name in ("matched", "filled")]
-        return pointmaps_of(
-            arrays["depth"],
-            arrays["relative_std"],
-            arrays["confidence"],
-            (planes[0] | planes[1] << 1).reshape(shape),
-            np.full((*shape, 3), GREY, np.uint8)
-            if capture is None
-            else _colors(capture, reconstruction, pinhole),
-            reconstruction.recon_from_camera,
-            pinhole,
+        matched, filled = (
+            np.unpackbits(file[name], count=int(np.prod(shape))) for name in ("matched", "filled")
         )
-
-
-def _colors(
-    capture: Capture, reconstruction: Reconstruction, pinhole: Intrinsics
-) -> UInt8[ndarray, "m h w 3"]:
-    """Return the registered images on the undistorted grid."""
-    undistort = undistortion(reconstruction.intrinsics, pinhole)
-    names = [capture.images[row] for row in reconstruction.image_index]
-    return np.stack([undistort(read_image(capture.folder / name)) for name in names])
+        if capture is None:
+            colors = np.full((*shape, 3), GREY, np.uint8)
+        else:
+            names = [capture.images[row] for row in reconstruction.image_index]
+            colors = undistorted(capture.folder, names, reconstruction.intrinsics, pinhole)
+        reason = (matched | filled << 1).reshape(shape)
+        return pointmaps_of(*arrays.values(), reason, colors, reconstruction.recon_from_camera, pinhole)

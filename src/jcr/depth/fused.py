@@ -1,9 +1,7 @@
 """Matched depths, checked across views, and planes where there are none: one depth, reason and sigma a pixel."""
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass, fields
-from functools import partial
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -12,8 +10,8 @@ from numpy import ndarray
 
 from jcr.camera import rays
 from jcr.depth.consistency import agreement, evidence, padded
-from jcr.depth.matched import Relative, grid, relative
-from jcr.depth.priors import ON_PLANE, Prior, evened, planar_prior, support_plane
+from jcr.depth.matched import grid, relative
+from jcr.depth.priors import ON_PLANE, evened, planar_prior, support_plane
 from jcr.geometry import apply
 from jcr.records import BOTH, MATCHED, NO_DEPTH, PRIOR, Intrinsics
 
@@ -30,23 +28,12 @@ so that it is more than the scatter of one."""
 PRIOR_FLOOR = 0.002
 """Relative sigma of a depth that rests on a plane, beside what the pixels scatter that carry it."""
 PAIR_CORRELATION = 0.5
-"""Largest deviation from its region's plane of a depth on which two images agree and no third; without the plane, a
-third of such depths are off by 5 mm."""
+"""Least correlation of a depth on which two images agree and no third, and which its region's plane confirms; without
+the plane, a third of such depths are off by 5 mm."""
 BOTH_CONFIDENCE = 2.0
 """Factor of the confidence of a matched depth on its region's plane: at most a quarter as many are off by 5 mm."""
 PRIOR_CONFIDENCE = 0.5
 """Confidence of a prior for each image that agrees, where a matched pixel has its correlation."""
-
-
-@dataclass(frozen=True)
-class FusedDepth:
-    """Per pixel of every image."""
-
-    inverse_depth: Float[ndarray, "m h w"]
-    confidence: Float[ndarray, "m h w"]
-    reason: UInt8[ndarray, "m h w"]
-    std: Float[ndarray, "m h w"]
-    """Relative, one sigma; 0 without depth."""
 
 
 def fused_depth(
@@ -61,18 +48,33 @@ def fused_depth(
     priors: bool,
     threads: int,
     report: Callable[[float], None],
-) -> FusedDepth:
-    """Return the depths that views agree on, and with `priors` those of planes that no view contradicts.
+) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+    """Return inverse depth, confidence, reason and relative sigma (m,h,w) of what views agree on.
 
-    A matched depth needs two images that agree (one, if there are no more than two) and, but for `changing` scenes, more
-    than twice as many as see through it. To see through, an image's own depth must have as many that agree: what is
-    found where nothing matches is as often behind a surface as before it.
+    With `priors` also the depths of planes that no view contradicts. A matched depth needs two images that agree (one,
+    if there are no more than two) and, but for `changing` scenes, more than twice as many as see through it. To see
+    through, an image's own depth must have as many that agree: what is found where nothing matches is as often behind
+    a surface as before it. Confidence and sigma are 0 without depth.
     """
     views = [relative(i, others, recon_from_camera, pinhole) for i, others in enumerate(neighbours)]
-    needed = np.array([1 if len(view.others) < 3 else 2 for view in views])[:, None, None]
-    known = score >= LEAST_CORRELATION
+    needed = np.array([1 if len(others) < 3 else 2 for others in neighbours])[:, None, None]
+    known, k, width = score >= LEAST_CORRELATION, grid(pinhole), pinhole.width
     with ThreadPoolExecutor(threads) as pool:
-        check = partial(_check, pool, views, grid(pinhole))
+
+        def check(
+            depth: Float[ndarray, "m h w"],
+            known: Bool[ndarray, "m h w"],
+            sees: Bool[ndarray, "m h w"],
+            tolerance: float,
+        ) -> list[ndarray]:
+            """Return `agreement` of all images, (m,h,w) each; inverse depths that are not known stay as they are."""
+            compared = evidence(depth, known, sees)
+            found = pool.map(
+                lambda i: agreement(i, compared, *views[i], k, width, tolerance), range(len(views))
+            )
+            mean, *others = np.stack(list(found), 1)
+            return [np.where(known, mean, depth), *others]
+
         count = through = information = np.zeros(0)
         consistent = known
         for tolerance in AGREEMENT:
@@ -81,104 +83,60 @@ def fused_depth(
         report(0.2)
         matched = consistent if changing else consistent & (count > 2 * through)
         std = MATCHING_STD_PX / np.sqrt(np.maximum(information, 1e-12)) / inverse_depth
-        confidence = (np.minimum(score, 1) * count).astype(np.float32)
+        confidence = np.minimum(score, 1) * count
         if not priors or matched.sum() < FEWEST_MATCHED:
-            reason = np.where(matched, MATCHED, NO_DEPTH).astype(np.uint8)
-            return FusedDepth(inverse_depth, _where(matched, confidence), reason, _where(matched, std))
+            return _chosen(inverse_depth, [matched], [confidence], [MATCHED], [std])
 
         support = _support(inverse_depth, matched, recon_from_camera, pinhole)
-        even = evened(colors, inverse_depth, matched, views, pinhole)
-        surfaces = _surfaces(np.where(matched, inverse_depth, 0), even)
+        smooth = [
+            cv2.GaussianBlur(image, (0, 0), 1.0)
+            for image in evened(colors, inverse_depth, matched, views, pinhole)
+        ]
+        surfaces = padded(np.concatenate([np.where(matched, inverse_depth, 0)[..., None], smooth], -1))
         report(0.4)
 
-        def prior(i: int) -> Prior:
-            return planar_prior(
-                i, surfaces, inverse_depth[i], matched[i], views[i], support, recon_from_camera[i], pinhole
-            )
+        def prior(i: int) -> tuple[ndarray, ...]:
+            image = surfaces, inverse_depth[i], matched[i], views[i]
+            return planar_prior(i, *image, support, recon_from_camera[i], pinhole)
 
-        found = _stacked(list(pool.map(prior, range(len(colors)))))
+        found = [np.stack(maps) for maps in zip(*pool.map(prior, range(len(colors))), strict=True)]
+        plane_depth, holds, confirms, agreeing, contradicts, plane_std = found
         report(0.8)
-        alone = known & (count == 1) & (through == 0) & (score >= PAIR_CORRELATION)
-        fused = _with_planes(
-            FusedDepth(inverse_depth, confidence, np.where(matched, MATCHED, NO_DEPTH).astype(np.uint8), std),
-            found,
-            alone,
-            needed,
-            check,
-        )
+        plane_std = np.hypot(plane_std, PRIOR_FLOOR)
+        on_plane = confirms & (np.abs(plane_depth / inverse_depth - 1) < ON_PLANE)
+        pair = known & (count == 1) & (through == 0) & (score >= PAIR_CORRELATION)
+        matched = (matched & ~contradicts) | (pair & on_plane)
+        both = matched & on_plane
+        filled = holds & ~matched
+        inverse_depth = np.where(filled, plane_depth, inverse_depth)
+        there = matched | filled
+        _, count, through, _ = check(inverse_depth, there, there, ON_PLANE)
+        filled &= (count >= np.minimum(needed, agreeing)) & (count > 2 * through)
+        # Beside outlines two images may give the nearer depth alike; a third that has the plane behind it shows that.
+        through = check(inverse_depth, there, both | filled, ON_PLANE)[2]
+        matched &= both | (through == 0)
         report(1.0)
-    return fused
+    return _chosen(
+        inverse_depth,
+        [both, matched, filled],
+        [BOTH_CONFIDENCE * confidence, confidence, PRIOR_CONFIDENCE * count],
+        [BOTH, MATCHED, PRIOR],
+        [1 / np.sqrt(std**-2 + plane_std**-2), std, plane_std],
+    )
 
 
-def _check(
-    pool: Executor,
-    views: Sequence[Relative],
-    k: Float[ndarray, "4"],
+def _chosen(
     inverse_depth: Float[ndarray, "m h w"],
-    known: Bool[ndarray, "m h w"],
-    consistent: Bool[ndarray, "m h w"],
-    tolerance: float,
-) -> list[ndarray]:
-    """Compute `agreement` of all images, (m,h,w) each; inverse depths that are not known stay as they are."""
-    compared, width = evidence(inverse_depth, known, consistent), inverse_depth.shape[2]
-
-    def one(i: int) -> Float[ndarray, "4 h w"]:
-        v = views[i]
-        return agreement(i, compared, v.others, v.a, v.b, v.centre, k, width, tolerance)
-
-    mean, *others = np.stack(list(pool.map(one, range(len(views)))), 1)
-    return [np.where(known, mean, inverse_depth), *others]
-
-
-def _where(there: Bool[ndarray, "m h w"], values: Float[ndarray, "m h w"]) -> Float[ndarray, "m h w"]:
-    """Return the values there, and 0 elsewhere."""
-    return np.where(there, values, 0).astype(np.float32)
-
-
-def _stacked(priors: Sequence[Prior]) -> Prior:
-    """Return the maps of all images, (m,h,w) each."""
-    return Prior(**{one.name: np.stack([getattr(p, one.name) for p in priors]) for one in fields(Prior)})
-
-
-def _surfaces(
-    inverse_depth: Float[ndarray, "m h w"], even: Float[ndarray, "m h w 3"]
-) -> Float[ndarray, "m h _ 4"]:
-    """Return inverse depths and slightly smoothed colours in the layout of `colours_agree`."""
-    smooth = [cv2.GaussianBlur(image, (0, 0), 1.0) for image in even]
-    return padded(np.concatenate([inverse_depth[..., None], smooth], -1))
-
-
-def _with_planes(
-    matching: FusedDepth,
-    planes: Prior,
-    alone: Bool[ndarray, "m h w"],
-    needed: Int[ndarray, "m 1 1"],
-    check: Callable[..., list[ndarray]],
-) -> FusedDepth:
-    """Return the matched depths that planes do not contradict, and planes in place of the others.
-
-    `alone` are pixels on whose depth two images agree and no third.
-    """
-    inverse_depth, matched = matching.inverse_depth, matching.reason == MATCHED
-    plane_std = np.hypot(planes.std, PRIOR_FLOOR)
-    on_plane = np.abs(planes.inverse_depth / inverse_depth - 1) < ON_PLANE
-    matched = (matched & ~planes.contradicts) | (alone & planes.confirms & on_plane)
-    both = matched & planes.confirms & on_plane
-    filled = planes.holds & ~matched
-    inverse_depth = np.where(filled, planes.inverse_depth, inverse_depth)
-    there = matched | filled
-    _, count, through, _ = check(inverse_depth, there, there, ON_PLANE)
-    filled &= (count >= np.minimum(needed, planes.agreeing)) & (count > 2 * through)
-    # Beside outlines two images may give the nearer depth alike; a third that has the plane behind it knows better.
-    through = check(inverse_depth, there, both | filled, ON_PLANE)[2]
-    matched &= both | (through == 0)
-    which = [both, matched, filled]
-    confidences = [BOTH_CONFIDENCE * matching.confidence, matching.confidence, PRIOR_CONFIDENCE * count]
-    stds = [1 / np.sqrt(matching.std**-2 + plane_std**-2), matching.std, plane_std]
-    return FusedDepth(
+    which: list[Bool[ndarray, "m h w"]],
+    confidences: list[Float[ndarray, "m h w"]],
+    reasons: list[int],
+    stds: list[Float[ndarray, "m h w"]],
+) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+    """Return inverse depth, confidence, reason and sigma of the first kind that holds at each pixel."""
+    return (
         inverse_depth,
         np.select(which, confidences, 0).astype(np.float32),
-        np.select(which, [BOTH, MATCHED, PRIOR], NO_DEPTH).astype(np.uint8),
+        np.select(which, reasons, NO_DEPTH).astype(np.uint8),
         np.select(which, stds, 0).astype(np.float32),
     )
 
@@ -195,5 +153,4 @@ def _support(
     for pose, per_depth, there in zip(recon_from_camera, inverse_depth, matched, strict=True):
         some = np.flatnonzero(there)[::10]
         x_in_recon.append(apply(pose, direction[some] / per_depth.ravel()[some, None].astype(float)))
-    tolerance = 0.004 / float(np.median(inverse_depth[matched]))
-    return support_plane(np.concatenate(x_in_recon), tolerance)
+    return support_plane(np.concatenate(x_in_recon), 0.004 / float(np.median(inverse_depth[matched])))

@@ -2,12 +2,11 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from queue import SimpleQueue
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8, UInt16, UInt64
+from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import rays, resized
@@ -29,16 +28,9 @@ LEAST = 0.25
 """Least inverse depth of the search, as a share of the largest one of the tracks."""
 
 
-@dataclass(frozen=True)
-class Relative:
-    """Projection of an image's pixels into its neighbours: u ~ a·ray + b·(inverse depth)."""
-
-    others: Int[ndarray, " n"]
-    """Rows of the neighbours."""
-    a: Float[ndarray, "n 3 3"]
-    b: Float[ndarray, "n 3"]
-    centre: Float[ndarray, " n"]
-    """z of the neighbour's camera in this image's."""
+Relative = tuple[Int[ndarray, " n"], Float[ndarray, "n 3 3"], Float[ndarray, "n 3"], Float[ndarray, " n"]]
+"""Projection of an image's pixels into its neighbours, u ~ a·ray + b·(inverse depth): rows of the neighbours, a, b, and
+z of each neighbour's camera in the image's camera."""
 
 
 def relative(
@@ -46,15 +38,9 @@ def relative(
 ) -> Relative:
     """Return the projection of image i into others, in the grid of `pinhole`."""
     motion = inverse(recon_from_camera[others]) @ recon_from_camera[i]
-    a = pinhole.matrix @ motion[:, :3, :3]
-    b = motion[:, :3, 3] @ pinhole.matrix.T
-    centre = inverse(motion)[:, 2, 3]
-    return Relative(
-        others.astype(np.int64),
-        np.ascontiguousarray(a, np.float32),
-        np.ascontiguousarray(b, np.float32),
-        centre.astype(np.float32),
-    )
+    a, b = pinhole.matrix @ motion[:, :3, :3], motion[:, :3, 3] @ pinhole.matrix.T
+    a, b, centre = (np.ascontiguousarray(part, np.float32) for part in (a, b, inverse(motion)[:, 2, 3]))
+    return others.astype(np.int64), a, b, centre
 
 
 def grid(pinhole: Intrinsics) -> Float[ndarray, "4"]:
@@ -62,24 +48,14 @@ def grid(pinhole: Intrinsics) -> Float[ndarray, "4"]:
     return np.array([pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy], np.float32)
 
 
-@dataclass(frozen=True)
 class _Level:
-    """All images at one resolution."""
+    """All images at one resolution: colours, their sums (greys), and the greys as windows of other images read them."""
 
-    pinhole: Intrinsics
-    colors: UInt8[ndarray, "m h w 3"]
-    greys: UInt16[ndarray, "m h w"]
-    """The sums of the three colours."""
-    packed: UInt64[ndarray, "m y x"]
-    """The greys as the windows of other images read them."""
-
-    @classmethod
-    def of(cls, colors: UInt8[ndarray, "m _ _ 3"], pinhole: Intrinsics) -> "_Level":
-        size = (pinhole.width, pinhole.height)
-        fitting = [cv2.resize(color, size, interpolation=cv2.INTER_AREA) for color in colors]
-        greys = [cv2.transform(color.astype(np.uint16), np.ones((1, 3))) for color in fitting]
-        packed = [quads(np.pad(grey, PAD, "edge")) for grey in greys]
-        return cls(pinhole, np.stack(fitting), np.stack(greys), np.stack(packed))
+    def __init__(self, colors: UInt8[ndarray, "m _ _ 3"], pinhole: Intrinsics) -> None:
+        size, self.pinhole = (pinhole.width, pinhole.height), pinhole
+        self.colors = [cv2.resize(color, size, interpolation=cv2.INTER_AREA) for color in colors]
+        self.greys = [cv2.transform(color.astype(np.uint16), np.ones((1, 3))) for color in self.colors]
+        self.packed = np.stack([quads(np.pad(grey, PAD, "edge")) for grey in self.greys])
 
     def views(
         self,
@@ -89,8 +65,8 @@ class _Level:
         space: Float[ndarray, " _"],
     ) -> tuple[ndarray, ndarray, ndarray, tuple[np.float32, ...]]:
         """Return `packed`, `motions`, `windows` (written to `space`) and k of image i for the compiled loops."""
-        near = relative(i, others, recon_from_camera, self.pinhole)
-        motions = np.concatenate([near.a.reshape(-1, 9), near.b], 1)
+        _, a, b, _ = relative(i, others, recon_from_camera, self.pinhole)
+        motions = np.concatenate([a.reshape(-1, 9), b], 1)
         k = tuple(grid(self.pinhole))  # of numbers, that the loops keep in registers
         return self.packed[others], motions, windows(continued(self.colors[i], self.greys[i]), space), k
 
@@ -108,22 +84,23 @@ def match_depth(
     pinhole: Intrinsics,
     neighbours: Sequence[Int[ndarray, " _"]],
     planes: Float[ndarray, "m 2 3"],
+    rows: Sequence[int],
     threads: int,
     report: Callable[[float], None],
-) -> tuple[Float[ndarray, "m h w"], Float[ndarray, "m h w"]]:
-    """Return inverse depth (per recon unit) and correlation (-1 to 1) of every pixel's best plane, image by image.
+) -> tuple[Float[ndarray, "k h w"], Float[ndarray, "k h w"]]:
+    """Return inverse depth (per recon unit) and correlation (-1 to 1) of every pixel's best plane for images `rows`.
 
     `planes` of `views.sweep_planes` span what is searched, and half of the first guesses are parallel to them. The
     result is the same whatever the number of threads.
     """
-    half = _Level.of(colors, resized(pinhole, pinhole.width // 2, pinhole.height // 2))
-    full = _Level.of(colors, pinhole)
-    h, w = half.greys.shape[1:]
+    half = _Level(colors, resized(pinhole, pinhole.width // 2, pinhole.height // 2))
+    full = _Level(colors, pinhole)
+    h, w = half.greys[0].shape
     spaces = SimpleQueue[ndarray]()
     for _ in range(threads):
-        spaces.put(np.empty(floats_of_windows(*full.greys.shape[1:]), np.float32))
+        spaces.put(np.empty(floats_of_windows(*full.greys[0].shape), np.float32))
 
-    def match(i: int, space: Float[ndarray, " _"]) -> tuple[Float[ndarray, "h w"], Float[ndarray, "h w"]]:
+    def match(i: int, space: Float[ndarray, " _"]) -> Float[ndarray, "2 h w"]:
         others, seed = neighbours[i][:COMPARED], 100 * i
         family = np.ascontiguousarray(planes[i])
         reach = np.einsum("di,hwi->dhw", family, rays(half.pinhole))
@@ -143,19 +120,19 @@ def match_depth(
         for n, (size, tries) in enumerate(_FINE):
             spread_planes(found, asked, *views, (*span, size, tries, n == 0), seed + n)
         depth = peaks(found, asked, *views, np.float32(_PEAK))
-        return np.maximum(depth, np.float32(0.5 * span[0]))[:, : pinhole.width], found[3, :, : pinhole.width]
+        return np.stack([np.maximum(depth, np.float32(0.5 * span[0])), found[3]])[..., : pinhole.width]
 
-    def one(i: int) -> tuple[Float[ndarray, "h w"], Float[ndarray, "h w"]]:
+    def one(i: int) -> Float[ndarray, "2 h w"]:
         space = spaces.get()
         try:
             return match(i, space)
         finally:
             spaces.put(space)  # after an error too, or the other threads wait for the buffer without end
 
-    depths, correlations = [], []
+    results = []
     with ThreadPoolExecutor(threads) as pool:
-        for n, (depth, score) in enumerate(pool.map(one, range(len(colors)))):
-            depths.append(depth)
-            correlations.append(score)
-            report((n + 1) / len(colors))
-    return np.stack(depths), np.stack(correlations)
+        for found in pool.map(one, rows):
+            results.append(found)
+            report(len(results) / len(rows))
+    inverse_depth, score = np.stack(results, 1)
+    return inverse_depth, score

@@ -9,7 +9,6 @@ the same colour and none of them sees through it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -44,24 +43,6 @@ _POINTS, _TRIALS = 4000, 400
 """Number of samples in the search for the support plane."""
 _PAIRS = 600
 """Pixels of an image whose brightness is compared with other images'."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Prior:
-    """Depths of the planes of one image, or of all."""
-
-    inverse_depth: Float[ndarray, "*m h w"]
-    holds: Bool[ndarray, "*m h w"]
-    """Colours agree with it and nothing sees through it."""
-    confirms: Bool[ndarray, "*m h w"]
-    """It holds, or the one other image that looks there agrees: enough where the pixel's own match lies on it."""
-    agreeing: UInt8[ndarray, "*m h w"]
-    """Images that show the plane's point in the pixel's colour; of the support plane one is enough. No more of them
-    than that need to agree."""
-    contradicts: Bool[ndarray, "*m h w"]
-    """Matched pixels that a well-carried plane shows to be wrong."""
-    std: Float[ndarray, "*m h w"]
-    """Relative, of inverse depth."""
 
 
 def support_plane(x_in_recon: Float[ndarray, "n 3"], tolerance: float, seed: int = 0) -> Float[ndarray, "4"]:
@@ -108,8 +89,8 @@ def evened(
         chosen = draw.permutation(len(v))[:_PAIRS]
         v, u = v[chosen], u[chosen]
         ray = np.stack([(u - k[2]) / k[0], (v - k[3]) / k[1], np.ones(len(u))], -1)
-        for n, j in enumerate(view.others):
-            x, y, z = (ray @ view.a[n].T + view.b[n] * inverse_depth[i, v, u][:, None]).T
+        for j, a, b, _ in zip(*view, strict=True):
+            x, y, z = (ray @ a.T + b * inverse_depth[i, v, u][:, None]).T
             x, y = np.rint(x / z), np.rint(y / z)
             inside = (z > 0) & (x >= 0) & (y >= 0) & (x < w) & (y < h)
             x, y = np.where(inside, x, 0).astype(int), np.where(inside, y, 0).astype(int)
@@ -144,80 +125,52 @@ def planar_prior(
     support: Float[ndarray, "4"],
     recon_from_camera: Float[ndarray, "4 4"],
     pinhole: Intrinsics,
-) -> Prior:
-    """Return the planes of image i's regions; `support` is in the recon frame.
+) -> tuple[ndarray, ...]:
+    """Return maps (h,w) of the planes of image i's regions; `support` is a plane (normal, d) in the recon frame.
 
     `surfaces` hold the matched inverse depths of all images and their colours, gain-compensated and a little smooth, as
-    `colours_agree` takes them.
+    `colours_agree` takes them. The maps: inverse depth; whether it holds, since colours agree and nothing sees through
+    it; whether it is confirmed, since it holds or the one other image that looks there agrees, which is enough where the
+    pixel's own match lies on it; images that show the point in the pixel's colour (of the support plane one is
+    enough); matched pixels that a well-carried plane shows to be wrong; relative sigma of inverse depth.
     """
+    k = grid(pinhole)
     label, count = colour_regions(np.ascontiguousarray(surfaces[i, :, : pinhole.width, 1:]))
-    plane = _plane_in_camera(support, recon_from_camera)
+    # The support plane as p with p·x = 1 in the camera; 0 where it runs through the camera.
+    offset = float(support[:3] @ recon_from_camera[:3, 3] + support[3])
+    plane = -recon_from_camera[:3, :3].T @ support[:3] / offset if offset else np.zeros(3)
     planes, on_support, inliers, fixed, rest, middle, shape = region_planes(
-        label, count, inverse_depth, matched, plane, grid(pinhole).astype(float), ON_PLANE, i
+        label, count, inverse_depth, matched, rays(pinhole), plane, ON_PLANE, i
     )
-    away = _deviations(label, middle, shape)
+    pixel = np.stack(np.meshgrid(np.arange(label.shape[1]), np.arange(label.shape[0])), -1) - middle[label]
+    # Mahalanobis distance from the pixels that carry the region's plane.
+    away = np.sqrt(np.maximum(np.einsum("hwi,hwij,hwj->hw", pixel, shape[label], pixel), 0))
     # Patches of shade and print on the support plane that carry no plane of their own.
-    lonely = _beside_support(label, on_support & (inliers > 0)) & (inliers == 0) & (fixed < FEWEST)
-    lonely &= np.bincount(label.ravel(), minlength=count) < PATCH * label.size
+    size = np.bincount(label.ravel(), minlength=count)
+    lonely = _beside(label, on_support) & (inliers == 0) & (fixed < FEWEST) & (size < PATCH * label.size)
     planes[lonely] = plane
     predicted = np.einsum("hwi,hwi->hw", planes[label], rays(pinhole)).astype(np.float32)
     carried = (inliers > 0) & (inliers >= CARRIED * fixed)
-    near = on_support[label] | lonely[label] | (away < FARTHEST)
+    near = (on_support | lonely)[label] | (away < FARTHEST)
     asked = (carried | lonely)[label] & (predicted > 0) & near
-    same, unlike, through = colours_agree(
-        i,
-        padded(np.where(asked, predicted, 0)[None])[0],
-        surfaces,
-        view.others,
-        view.a,
-        view.b,
-        grid(pinhole),
-        pinhole.width,
-        SAME_COLOUR,
-    )
+    points = padded(np.where(asked, predicted, 0)[None])[0]
+    same, unlike, through = colours_agree(i, points, surfaces, *view[:3], k, pinhole.width, SAME_COLOUR)
     holds = asked & (same >= FEWEST_VIEWS) & (same >= 2 * unlike) & (through == 0)
     # Where one image alone looks besides this one, it must agree, and the depth must rest on more than a colour.
     alone = asked & (same == 1) & (unlike == 0) & (through == 0)
     holds |= alone & on_support[label]
     # On top of a thing the plane would lie below its colours, which then differ along its outline in the other views.
-    fixed_share = np.bincount(label.ravel(), holds.ravel()) / np.bincount(label.ravel())
-    holds &= ~(lonely & (fixed_share < WHOLE))[label]
-    off = np.abs(predicted / inverse_depth - 1) > OFF_PLANE
-    strong = asked & (inliers >= STRONG * fixed)[label]
-    return Prior(
-        inverse_depth=predicted,
-        holds=holds,
-        confirms=holds | alone,
-        agreeing=np.where(on_support[label], np.minimum(same, 1), same).astype(np.uint8),
-        contradicts=strong & matched & off,
-        std=(rest[label] * np.where((on_support | lonely)[label], 1.0, np.maximum(away, 1.0))).astype(
-            np.float32
-        ),
-    )
+    holds &= ~(lonely & (np.bincount(label.ravel(), holds.ravel()) / size < WHOLE))[label]
+    wrong = asked & (inliers >= STRONG * fixed)[label] & (np.abs(predicted / inverse_depth - 1) > OFF_PLANE)
+    std = rest[label] * np.where((on_support | lonely)[label], 1.0, np.maximum(away, 1.0))
+    agreeing = np.where(on_support[label], np.minimum(same, 1), same).astype(np.uint8)
+    return predicted, holds, holds | alone, agreeing, wrong & matched, std.astype(np.float32)
 
 
-def _plane_in_camera(
-    plane: Float[ndarray, "4"], recon_from_camera: Float[ndarray, "4 4"]
-) -> Float[ndarray, "3"]:
-    """Return a plane (n, d) of the recon frame as p with p·x = 1 in a camera's; 0 where it runs through the camera."""
-    offset = float(plane[:3] @ recon_from_camera[:3, 3] + plane[3])
-    return -recon_from_camera[:3, :3].T @ plane[:3] / offset if offset else np.zeros(3)
-
-
-def _deviations(
-    label: Int[ndarray, "h w"], middle: Float[ndarray, "r 2"], shape: Float[ndarray, "r 3"]
-) -> Float[ndarray, "h w"]:
-    """Return each pixel's Mahalanobis distance from the pixels that support its region's plane."""
-    pixel = np.stack(np.meshgrid(np.arange(label.shape[1]), np.arange(label.shape[0])), -1)
-    du, dv = np.moveaxis(pixel - middle[label], -1, 0)
-    xx, xy, yy = np.moveaxis(shape[label], -1, 0)
-    return np.sqrt(np.maximum(xx * du**2 + 2 * xy * du * dv + yy * dv**2, 0))
-
-
-def _beside_support(label: Int[ndarray, "h w"], on_support: Bool[ndarray, " r"]) -> Bool[ndarray, " r"]:
-    """Return the regions that touch one on the support plane."""
-    beside = np.zeros(len(on_support), bool)
+def _beside(label: Int[ndarray, "h w"], chosen: Bool[ndarray, " r"]) -> Bool[ndarray, " r"]:
+    """Return the regions that touch a chosen one."""
+    beside = np.zeros(len(chosen), bool)
     for one, other in ((label[:, 1:], label[:, :-1]), (label[1:], label[:-1])):
-        beside[one[on_support[other]]] = True
-        beside[other[on_support[one]]] = True
+        beside[one[chosen[other]]] = True
+        beside[other[chosen[one]]] = True
     return beside

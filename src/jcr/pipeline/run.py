@@ -109,7 +109,7 @@ def _why_no_map(estimate_depth: bool = False) -> str | None:
     from jcr.scene.map_file import require_packages
 
     if estimate_depth:
-        from jcr.depth.compile_loops import compile_loops
+        from jcr.depth.densify import compile_loops
 
         compile_loops()
     try:
