@@ -67,8 +67,10 @@ def read_depth(path: Path, reconstruction: Reconstruction, capture: Capture | No
     with read_npz(path, FORMAT) as (text, file):
         pinhole = About.model_validate_json(text, strict=True).intrinsics.record()
         shape = len(reconstruction.image_index), pinhole.height, pinhole.width
-        arrays = {name: file[name] for name in ("depth", "relative_std", "confidence")}
-        check_arrays({name: (array, shape) for name, array in arrays.items()})
+        depth, std, confidence = (file[name] for name in ("depth", "relative_std", "confidence"))
+        check_arrays(
+            {"depth": (depth, shape), "relative_std": (std, shape), "confidence": (confidence, shape)}
+        )
         matched, filled = (
             np.unpackbits(file[name], count=int(np.prod(shape))) for name in ("matched", "filled")
         )
@@ -78,4 +80,4 @@ def read_depth(path: Path, reconstruction: Reconstruction, capture: Capture | No
             names = [capture.images[row] for row in reconstruction.image_index]
             colors = undistorted(capture.folder, names, reconstruction.intrinsics, pinhole)
         reason = (matched | filled << 1).reshape(shape)
-        return pointmaps_of(*arrays.values(), reason, colors, reconstruction.recon_from_camera, pinhole)
+        return pointmaps_of(depth, std, confidence, reason, colors, reconstruction.recon_from_camera, pinhole)

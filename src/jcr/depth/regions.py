@@ -115,11 +115,11 @@ def region_planes(
     determinant[np.abs(determinant) < 1e-6] = np.inf
     tried = (ya * np.cross(b, c) + yb * np.cross(c, a) + yc * ab) / determinant
     tried = np.concatenate([tried, np.broadcast_to(support, (n, 1, 3))], 1)
-    relative = np.float32(ray / depth[:, None])
+    relative = (ray / depth[:, None]).astype(np.float32)
     best, on = np.empty((n, 3)), np.zeros(n, bool)
     for r, (first, pixels) in enumerate(zip(start, size, strict=True)):
         some = slice(first, first + pixels, -(-pixels // SAMPLED))
-        agree = np.count_nonzero(np.abs(relative[some] @ np.float32(tried[r].T) - 1) < tolerance, 0)
+        agree = np.count_nonzero(np.abs(relative[some] @ tried[r].T.astype(np.float32) - 1) < tolerance, 0)
         most = agree[:-1].argmax()
         on[r] = agree[-1] > 0 and agree[-1] >= 0.8 * agree[most]
         best[r] = support if on[r] else tried[r, most]
