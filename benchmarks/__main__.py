@@ -5,6 +5,8 @@ import platform
 import shlex
 import subprocess
 import sys
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
 from importlib import import_module
@@ -15,18 +17,36 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from benchmarks.suite import run_all, write_index
-from benchmarks.table import BENCHES
 from jcr.errors import InputError
 from jcr.extras import DISTRIBUTION, is_installed
 from jcr.files import write_text
 
+ROBOTS, HONEST, MAPPED, TIME, OTHERS = PARTS = (
+    "Real robots and captures",
+    "Is the stated accuracy true, and are faults found?",
+    "Depth, map and objects",
+    "Time and memory",
+    "Beside other methods",
+)
+BENCHES = {
+    "real": (ROBOTS, "Real captures"),
+    "features": (ROBOTS, "Features on real captures"),
+    "cameras": (ROBOTS, "Several cameras"),
+    "coverage": (HONEST, "Is ± true?"),
+    "faults": (HONEST, "Faults"),
+    "live": (HONEST, "Live calibration"),
+    "map": (MAPPED, "The map"),
+    "speed": (TIME, "Speed"),
+    "peers": (OTHERS, "Peers"),
+    "kinhec": (OTHERS, "KinHEC"),
+    "pointmaps": (OTHERS, "Pointmaps"),
+}
+"""Part of the index and title of each bench, a module of this package with a function `run`, in the index's order."""
 COMMANDS = {"align": "benchmarks.adam", "fetch-captures": "benchmarks.real_captures.fetch"}
 """Modules of what is no bench, with arguments of its own."""
-if TYPE_CHECKING:
-    BenchName = str
-else:
-    BenchName = Literal[("all", *sorted(BENCHES))]
+CLAIM = "> "
+"""Prefix of the lines of a page that state its result in a sentence."""
+BenchName = str if TYPE_CHECKING else Literal[("all", *sorted(BENCHES))]
 
 
 @dataclass(frozen=True)
@@ -47,11 +67,9 @@ class Arguments:
     captures: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[DIR]")] = None
     """Folder that holds capture folders, for benches of real captures."""
     boards: tuple[str, ...] = ()
-    """CAPTURE=BOARD, a board as in jcr run --board, for benches that use boards."""
-    runs: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Folder in which a bench keeps its runs and looks for those of an earlier call."""
+    """CAPTURE=BOARD, a board as in jcr run --board, for the bench `real`."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Also write NAME.md, the images of that bench and the index README.md into this folder."""
+    """Also write NAME.md and the index README.md into this folder."""
 
 
 def main(arguments: Arguments) -> int:
@@ -60,15 +78,14 @@ def main(arguments: Arguments) -> int:
         if arguments.out is None:
             raise InputError("bench all: name the folder for the tables with --out DIR")
         return run_all(arguments.out, arguments.captures, arguments.boards)
-    bench = import_module(f"benchmarks.{arguments.name}")
-    options = ("captures", "boards", "runs", "out")
-    given = {name: value for name in options if (value := getattr(arguments, name))}
-    taken = signature(bench.run).parameters
+    run = import_module(f"benchmarks.{arguments.name}").run
+    given = {name: value for name in ("captures", "boards") if (value := getattr(arguments, name))}
+    taken = signature(run).parameters
     if "captures" in taken and arguments.captures is None:
         raise InputError(f"bench {arguments.name}: name the folder that holds the captures")
-    if excess := given.keys() - taken.keys() - {"out"}:
+    if excess := given.keys() - taken.keys():
         raise InputError(f"bench {arguments.name}: does not use {', '.join(sorted(excess))}; leave it out")
-    page = heading(arguments) + bench.run(**{name: value for name, value in given.items() if name in taken})
+    page = heading(arguments) + run(**given)
     sys.stdout.write(page)
     if arguments.out is not None:
         write_text(arguments.out / f"{arguments.name}.md", page)
@@ -76,40 +93,75 @@ def main(arguments: Arguments) -> int:
     return 0
 
 
+def run_all(out: Path, captures: Path | None, boards: Sequence[str] = ()) -> int:
+    """Run every bench in a process of its own, write pages and index into `out`, and return 1 if one failed, else 0.
+
+    Benches of real captures need `captures`.
+    """
+    passed = True
+    for name in BENCHES:
+        taken = signature(import_module(f"benchmarks.{name}").run).parameters
+        if "captures" in taken and captures is None:
+            continue
+        words = [str(captures)] if "captures" in taken else []
+        words += ["--boards", *boards] if boards and "boards" in taken else []
+        begun, checkout = time.perf_counter(), str(Path(__file__).parents[1])
+        path = os.pathsep.join([checkout, os.environ.get("PYTHONPATH", "")])
+        command = [sys.executable, "-m", "benchmarks", name, *words, "--out", str(out)]
+        done = subprocess.run(
+            command, env=os.environ | {"PYTHONPATH": path}, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL
+        )
+        lines = done.stderr.decode().strip().splitlines() or [""]
+        outcome = f"exit status {done.returncode}: {lines[-1]}" if done.returncode else "done"
+        sys.stderr.write(f"{name}: {outcome}, {time.perf_counter() - begun:.0f} s\n")
+        passed &= done.returncode == 0
+    return int(not passed)
+
+
+def claims(page: Path) -> str:
+    """Return the sentences in which a page states its result."""
+    lines = page.read_text().splitlines()
+    return " ".join(line.removeprefix(CLAIM) for line in lines if line.startswith(CLAIM))
+
+
+def write_index(out: Path) -> None:
+    """Write README.md into `out`: the pages that are there by part, with their results."""
+    lines = [
+        "# Results",
+        "",
+        "Written by `python -m benchmarks`; each page has its command, commit and machine.",
+    ]
+    for part in PARTS:
+        rows = [
+            f"| [{title}]({name}.md) | {claims(out / f'{name}.md').replace('|', chr(92) + '|')} |"
+            for name, (own, title) in BENCHES.items()
+            if own == part and (out / f"{name}.md").is_file()
+        ]
+        lines += ["", f"## {part}", "", "| bench | result |", "|---|---|", *rows] if rows else []
+    lines += ["", "```{toctree}", ":hidden:", ":glob:", "", "*", "```", ""]
+    write_text(out / "README.md", "\n".join(lines))
+
+
 def heading(arguments: Arguments) -> str:
-    """Return title, command, date, commit and machine of a page."""
+    """Return title, subject, command, date, commit, machine and versions of a page."""
     command = ["python", "-m", "benchmarks", arguments.name]
     if arguments.captures is not None:
         # The path of the folder is a detail of this machine.
         command += [arguments.captures.name, *(["--boards", *arguments.boards] if arguments.boards else [])]
-    bench = BENCHES[arguments.name]
-    return (
-        f"# {bench.title}\n\n{bench.what}\n\n    {shlex.join(command)}\n\n"
-        f"{date.today().isoformat()}, commit `{_commit()}`. {_machine()}\n\n"
-    )
-
-
-def _commit() -> str:
-    """Return the short name of the commit that is checked out, or "unknown"."""
-    command = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
-    try:
-        done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True)
-    except OSError:
-        return "unknown"
-    return done.stdout.strip() or "unknown"
-
-
-def _machine() -> str:
-    """Return processor, cores and versions in a sentence."""
+    subject = (import_module(f"benchmarks.{arguments.name}").__doc__ or "").partition("\n")[0]
+    git = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
+    done = subprocess.run(git, cwd=Path(__file__).parent, capture_output=True, text=True)
     names = (DISTRIBUTION, "numpy", "scipy", "torch", "pycolmap")
-    versions = ", ".join(
-        f"{name} {version(name)}" for name in names if name == DISTRIBUTION or is_installed(name)
-    )
+    versions = [f"{name} {version(name)}" for name in names if name == DISTRIBUTION or is_installed(name)]
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    processor = models[0] if models else platform.machine()
-    return f"{processor}, {os.cpu_count()} cores, Python {platform.python_version()}, {versions}."
+    processor = [*models, platform.machine()][0]
+    return (
+        f"# {BENCHES[arguments.name][1]}\n\n{subject}\n\n    {shlex.join(command)}\n\n"
+        f"{date.today().isoformat()}, commit `{done.stdout.strip() or 'unknown'}`. {processor}, {os.cpu_count()} "
+        f"cores, Python {platform.python_version()}, {', '.join(versions)}.\n\n"
+    )
 
 
 if __name__ == "__main__":

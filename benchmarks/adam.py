@@ -11,7 +11,7 @@ import math
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -25,7 +25,7 @@ from torch import Tensor
 
 from jcr.files import written_whole
 from jcr.geometry import inverse, transform
-from jcr.pointmaps.global_alignment.align import PIXELS, global_align
+from jcr.pointmaps.global_alignment.align import global_align
 from jcr.pointmaps.global_alignment.alignment import Alignment
 from jcr.pointmaps.global_alignment.depths import initial_depth
 from jcr.pointmaps.global_alignment.initial_estimate import initial_state
@@ -33,21 +33,13 @@ from jcr.pointmaps.global_alignment.observations import Problem, observe
 from jcr.pointmaps.global_alignment.pointmap_residuals import State
 from jcr.pointmaps.pairs import PairPredictions, read_pairs
 
+STEPS, LEARNING_RATE = 300, 0.01
+"""Steps, and learning rate of the first; it falls to 0 along a cosine."""
 START_PIXELS = 2048
 FOCAL_SLOWNESS = 20.0
 """The optimised focal parameter is this times log f, so that one step changes it by little (as published)."""
 PAIRS_AT_ONCE = 16
 """Bounds the memory of one forward and backward pass."""
-
-
-@dataclass(frozen=True)
-class AdamOptions:
-    """Options of the gradient descent."""
-
-    steps: int = 300
-    """Number of steps."""
-    learning_rate: float = 0.01
-    """Learning rate of the first step; it falls to 0 along a cosine."""
 
 
 @dataclass(frozen=True)
@@ -69,9 +61,6 @@ class Arguments:
     """Alignment to write."""
     method: Literal["fast", "adam"] = "fast"
     """fast: Gauss-Newton on chosen pixels (jcr.global_align); adam: gradient descent on every pixel, as published."""
-    pixels: int = PIXELS
-    """Pixels per image of the fast method."""
-    adam: AdamOptions = field(default_factory=AdamOptions)
 
 
 def main(words: Sequence[str]) -> int:
@@ -79,10 +68,7 @@ def main(words: Sequence[str]) -> int:
     arguments = tyro.cli(Arguments, prog="python -m benchmarks align", args=words)
     predictions = read_pairs(arguments.pairs)
     begin = time.perf_counter()
-    if arguments.method == "adam":
-        alignment = align_adam(predictions, arguments.adam)
-    else:
-        alignment = global_align(predictions, arguments.pixels)
+    alignment = align_adam(predictions) if arguments.method == "adam" else global_align(predictions)
     seconds = time.perf_counter() - begin
     with written_whole(arguments.result) as temporary, open(temporary, "wb") as stream:
         np.savez(
@@ -101,16 +87,36 @@ def main(words: Sequence[str]) -> int:
     return 0
 
 
-def align_adam(predictions: PairPredictions, adam: AdamOptions | None = None) -> Alignment:
+def align_adam(predictions: PairPredictions, steps: int = STEPS) -> Alignment:
     """Align by Adam steps over all pixels of all pairs; the result has no covariance (NaN)."""
     problem = Problem.of(predictions)
     count, height, width = predictions.image_count, *predictions.conf.shape[1:]
     start = initial_state(problem.observe_all(START_PIXELS), predictions.edges)
     everything = (observe(problem, k, slice(None)) for k in range(count))
-    depth = np.stack([initial_depth(o, start) for o in everything])
-    model = PointmapModel(start, depth, problem)
+    model = PointmapModel(start, np.stack([initial_depth(o, start) for o in everything]), problem)
     groups = [slice(e, e + PAIRS_AT_ONCE) for e in range(0, len(predictions.edges), PAIRS_AT_ONCE)]
-    _descend(model, problem, groups, adam or AdamOptions())
+    optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE, betas=(0.9, 0.9))
+    for step in range(steps):
+        optimizer.param_groups[0]["lr"] = 0.5 * LEARNING_RATE * (1 + math.cos(math.pi * step / steps))
+        optimizer.zero_grad()
+        points = model.points()
+        # Each group's gradient is gathered on a copy of the points, which then passes it on once.
+        gathered = points.detach().requires_grad_()
+        for group in groups:
+            loss = torch.zeros(())
+            for view, confidence in enumerate((predictions.conf, predictions.conf2)):
+                weight = torch.from_numpy(problem.weigh(confidence[group])).flatten(1)
+                loss = loss + (weight * model.distance(gathered, group, view)).mean(dim=1).sum()
+            loss.backward()
+        points.backward(gathered.grad)
+        optimizer.step()
+    # The network's confidence, averaged over the pairs that show an image.
+    total = np.zeros((count, height, width), np.float32)
+    for edge, *confidences in zip(predictions.edges, predictions.conf, predictions.conf2, strict=True):
+        for image, confidence in zip(edge, confidences, strict=True):
+            total[image] += problem.weigh(confidence)
+    shown = np.bincount(predictions.edges.ravel(), minlength=count)
+    mean = total / shown[:, None, None].astype(np.float32)
     with torch.no_grad():
         points = model.points()
         residual = [
@@ -131,32 +137,11 @@ def align_adam(predictions: PairPredictions, adam: AdamOptions | None = None) ->
             focal_px=(focal, focal * problem.aspect),
             principal_point_px=problem.principal_point_px,
             depth=model.log_depth.exp().reshape(count, height, width).numpy(),
-            confidence=_mean_confidence(problem),
+            confidence=np.exp(mean) if problem.log_weight else mean,
             pair_scale=model.scale().double().numpy(),
             pair_residual=torch.cat(residual).double().numpy(),
             covariance=np.full((6 * count, 6 * count), np.nan),
         )
-
-
-def _descend(model: "PointmapModel", problem: Problem, groups: list[slice], options: AdamOptions) -> None:
-    """Run Adam on eq. 1, the pairs taken in `groups` to bound the memory."""
-    predictions = problem.predictions
-    optimizer = torch.optim.Adam(model.parameters(), lr=options.learning_rate, betas=(0.9, 0.9))
-    for step in range(options.steps):
-        cosine = math.cos(math.pi * step / options.steps)
-        optimizer.param_groups[0]["lr"] = 0.5 * options.learning_rate * (1 + cosine)
-        optimizer.zero_grad()
-        points = model.points()
-        # Each group's gradient is gathered on a copy of the points, which then passes it on once.
-        gathered = points.detach().requires_grad_()
-        for group in groups:
-            loss = torch.zeros(())
-            for view, confidence in enumerate((predictions.conf, predictions.conf2)):
-                weight = torch.from_numpy(problem.weigh(confidence[group])).flatten(1)
-                loss = loss + (weight * model.distance(gathered, group, view)).mean(dim=1).sum()
-            loss.backward()
-        points.backward(gathered.grad)
-        optimizer.step()
 
 
 class PointmapModel(torch.nn.Module):
@@ -228,15 +213,3 @@ def _parameter(values: ndarray) -> torch.nn.Parameter:
 
 def _quat_xyzw(recon_from_camera: Float[ndarray, "k 4 4"]) -> Float[ndarray, "k 4"]:
     return Rotation.from_matrix(recon_from_camera[:, :3, :3]).as_quat()
-
-
-def _mean_confidence(problem: Problem) -> Float[ndarray, "n h w"]:
-    """Return the network's confidence averaged over the pairs that show an image; logs where these are the weights."""
-    predictions = problem.predictions
-    total = np.zeros((predictions.image_count, *predictions.conf.shape[1:]), np.float32)
-    for edge, *confs in zip(predictions.edges, predictions.conf, predictions.conf2, strict=True):
-        for image, conf in zip(edge, confs, strict=True):
-            total[image] += problem.weigh(conf)
-    shown = np.bincount(predictions.edges.ravel(), minlength=len(total))
-    mean = total / shown[:, None, None].astype(np.float32)
-    return np.exp(mean) if problem.log_weight else mean

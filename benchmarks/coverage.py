@@ -1,36 +1,36 @@
-"""`benchmarks coverage`: shares of errors inside the stated 95 % and 3 σ, and the uncertainty predicted by `jcr check`.
+"""Shares of errors inside the stated uncertainty, and predicted uncertainty.
 
 Three simulated tables against the effective transform: poses of arms with systematic errors, points that the camera
 sees, and predicted over reported uncertainty.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from benchmarks.page import table
+from benchmarks.page import number, squared_distance, table
 from benchmarks.peers import opencv
+from benchmarks.references import nine_pixels, placed
 from jcr.calibration.adjust import adjust_images
 from jcr.calibration.case import of_images
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.requirement import assumptions_of, reached
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate, fit_poses
-from jcr.camera import parameters, unproject, with_parameters
+from jcr.camera import parameters, with_parameters
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.estimation.hand_eye import solve_hand_eye
-from jcr.estimation.intrinsics_prior import ESTIMATED, Camera, camera_with_prior
+from jcr.estimation.intrinsics_prior import ESTIMATED, camera_with_prior
 from jcr.estimation.point_uncertainty import point_covariance, within_95
 from jcr.estimation.prediction import predict
 from jcr.estimation.wrist import adjust_wrist, estimate_of
-from jcr.geometry import apply, step_between
+from jcr.geometry import step_between
 from jcr.pipeline.check import spread_rows
-from jcr.records import Capture, Estimate, HandEye, Intrinsics, Reconstruction
+from jcr.records import Capture, HandEye, Intrinsics, Reconstruction
 from simulation.arms import PresetName
 from simulation.problems import INTRINSICS, BentProblem, bent_problem, error, observed
 
@@ -64,11 +64,7 @@ def run() -> str:
     return "\n".join([*_claims(robots, seen, ahead), *_tables(robots, seen, ahead)]) + "\n"
 
 
-# Poses of arms with systematic errors.
-
-
-@dataclass(frozen=True)
-class RobotRow:
+class RobotRow(NamedTuple):
     """Results of one solver for arms with errors of one size, against the effective transform."""
 
     preset: PresetName
@@ -98,26 +94,29 @@ def measure_robots(
         for count in counts:
             problems = [bent_problem(arm_named(arm), preset, count, k) for arm in arms for k in range(draws)]
             for known, solve in SOLVERS.items():
-                rows.append(_robot_row(preset, count, known, [(p, solve(p)) for p in problems]))
+                answers = [solve(p) for p in problems]
+                off = _errors(problems, [(one.gripper_from_camera, one.scale) for one in answers])
+                accepted = np.array([one.converged for one in answers])
+                shares = []
+                if accepted.any():
+                    covariance = np.array([one.covariance[:6, :6] for one in answers if one.converged])
+                    std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+                    worst = np.abs(off[accepted] / std).max(1)
+                    squared = squared_distance(off[accepted], covariance).mean() / 6
+                    shares = [float((worst > 3).mean()), float((worst > 5).mean()), float(squared)]
+                rows.append(
+                    RobotRow(preset, count, known, *_median_error(off), float(accepted.mean()), *shares)
+                )
             park = [opencv("Park", p.base_from_gripper, p.recon_from_camera, p.scale) for p in problems]
-            off = np.array([error(p, *found)[:6] for p, found in zip(problems, park, strict=True)])
-            rows.append(RobotRow(preset, count, PEER, *_median_error(off), 1.0))
+            rows.append(RobotRow(preset, count, PEER, *_median_error(_errors(problems, park)), 1.0))
     return rows
 
 
-def _robot_row(
-    preset: PresetName, count: int, known: str, answers: list[tuple[BentProblem, HandEye]]
-) -> RobotRow:
-    off = np.array([error(problem, one.gripper_from_camera, one.scale)[:6] for problem, one in answers])
-    covariance = np.array([one.covariance[:6, :6] for _, one in answers])
-    accepted = np.array([one.converged for _, one in answers])
-    head = preset, count, known, *_median_error(off), float(accepted.mean())
-    if not accepted.any():
-        return RobotRow(*head)
-    off, covariance = off[accepted], covariance[accepted]
-    worst = np.abs(off / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))).max(1)
-    squared = np.einsum("ki,ki->k", off, np.linalg.solve(covariance, off[..., None])[..., 0])
-    return RobotRow(*head, float((worst > 3).mean()), float((worst > 5).mean()), float(squared.mean() / 6))
+def _errors(
+    problems: Sequence[BentProblem], found: Sequence[tuple[Float[ndarray, "4 4"], float]]
+) -> Float[ndarray, "k 6"]:
+    """Return the errors of found transforms and scales."""
+    return np.array([error(p, *one)[:6] for p, one in zip(problems, found, strict=True)])
 
 
 def _median_error(off: Float[ndarray, "k 6"]) -> tuple[float, float]:
@@ -126,16 +125,13 @@ def _median_error(off: Float[ndarray, "k 6"]) -> tuple[float, float]:
     return 1e3 * float(metres), float(np.degrees(radians))
 
 
-# Points that the camera sees.
-
-
-@dataclass(frozen=True)
-class Knowledge:
+class Knowledge(NamedTuple):
     """Knowledge of the intrinsics, and the camera that took the images."""
 
     name: str
     start: Callable[[np.random.Generator], Intrinsics]
-    prior: Callable[[Intrinsics], Camera]
+    """Draws the initial intrinsics."""
+    is_given: bool = False
     camera: Intrinsics = INTRINSICS
 
 
@@ -156,21 +152,16 @@ def _guessed(camera: Intrinsics) -> Callable[[np.random.Generator], Intrinsics]:
     return draw
 
 
-def _estimated(found: Intrinsics) -> Camera:
-    return camera_with_prior(found, ESTIMATED)
-
-
 WAYS = (
-    Knowledge("given", lambda rng: INTRINSICS, camera_with_prior),
-    Knowledge("given, 0.5 % and 3 px off", _off, camera_with_prior),
-    Knowledge("not given", _guessed(INTRINSICS), _estimated),
-    Knowledge("not given, more distortion than the model", _guessed(BENT), _estimated, BENT),
+    Knowledge("given", lambda rng: INTRINSICS, True),
+    Knowledge("given, 0.5 % and 3 px off", _off, True),
+    Knowledge("not given", _guessed(INTRINSICS)),
+    Knowledge("not given, more distortion than the model", _guessed(BENT), camera=BENT),
 )
 
 
-@dataclass(frozen=True)
-class SeenRow:
-    """Errors of seen points over all captures of a row."""
+class SeenRow(NamedTuple):
+    """Errors of seen points over all captures of a robot, a number of images and a knowledge of the intrinsics."""
 
     preset: PresetName
     count: int
@@ -200,53 +191,32 @@ def measure_seen(
 
 
 def _seen_row(preset: PresetName, count: int, known: Knowledge, draws: int) -> SeenRow:
-    within, three, errors, stated, camera = [], [], [], [], []
+    three, lengths, stated, moved = [], [], [], []
     for seed in range(draws):
         problem = bent_problem(arm_named(ROBOT_NAMES[seed % len(ROBOT_NAMES)]), preset, count, seed)
         rng = np.random.default_rng([seed, 9])
         tracks = observed(problem, rng, POINTS, PIXEL_STD, known.camera)
         if len(tracks.image) < 100 * count:
             continue
-        start, solved = known.start(rng), solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+        solved = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
         fit = solved.gripper_from_camera, solved.scale, solved.base_from_recon
-        found = adjust_wrist(
-            problem.base_from_gripper, fit, problem.recon_from_camera, known.prior(start), tracks
-        )
+        start = known.start(rng)
+        free = camera_with_prior(start) if known.is_given else camera_with_prior(start, ESTIMATED)
+        found = adjust_wrist(problem.base_from_gripper, fit, problem.recon_from_camera, free, tracks)
         estimate = estimate_of(found, tracks)
-        off, covariance = _point_errors(problem, known.camera, estimate)
-        below = np.array([within_95(one) for one in covariance])
-        within.append(np.linalg.norm(off, axis=1) < below)
+        assert estimate.intrinsics is not None
+        # Errors of points in axes of the estimated camera, and their stated covariance.
+        x, x_px = estimate.gripper_from_camera, nine_pixels(known.camera)
+        there = placed(x, estimate.intrinsics, x_px, DISTANCE_M * estimate.scale / problem.scale)
+        off = (placed(problem.gripper_from_camera, known.camera, x_px, DISTANCE_M) - there) @ x[:3, :3]
+        covariance = point_covariance(estimate, estimate.intrinsics, x_px, DISTANCE_M)
         three.append((np.abs(off) < 3 * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))).all(1))
-        errors.append(np.linalg.norm(off, axis=1))
-        stated.append(below)
-        camera.append(
-            np.linalg.norm(step_between(estimate.gripper_from_camera, problem.gripper_from_camera)[:3])
-        )
-    medians = (1e3 * float(np.median(values)) for values in (errors, stated, camera))
-    return SeenRow(preset, count, known.name, float(np.mean(within)), float(np.mean(three)), *medians)
-
-
-def _point_errors(
-    problem: BentProblem, camera: Intrinsics, estimate: Estimate
-) -> tuple[Float[ndarray, "k 3"], Float[ndarray, "k 3 3"]]:
-    """Return errors of seen points in axes of the estimated camera, and the stated covariance of each."""
-    share = np.array([0.1, 0.5, 0.9])
-    x_px = np.stack(np.meshgrid(share * camera.width, share * camera.height), -1).reshape(-1, 2)
-    assert estimate.intrinsics is not None
-
-    def placed(x: Float[ndarray, "4 4"], own: Intrinsics, distance: float) -> Float[ndarray, "k 3"]:
-        ray = unproject(own, x_px)
-        return apply(x, distance * ray / np.linalg.norm(ray, axis=1, keepdims=True))
-
-    found = placed(
-        estimate.gripper_from_camera, estimate.intrinsics, DISTANCE_M * estimate.scale / problem.scale
-    )
-    off = placed(problem.gripper_from_camera, camera, DISTANCE_M) - found
-    stated = point_covariance(estimate, estimate.intrinsics, x_px, DISTANCE_M)
-    return off @ estimate.gripper_from_camera[:3, :3], stated
-
-
-# Predicted uncertainty.
+        lengths.append(np.linalg.norm(off, axis=1))
+        stated.append([within_95(one) for one in covariance])
+        moved.append(np.linalg.norm(step_between(x, problem.gripper_from_camera)[:3]))
+    within = float((np.array(lengths) < stated).mean())
+    medians = (1e3 * float(np.median(values)) for values in (lengths, stated, moved))
+    return SeenRow(preset, count, known.name, within, float(np.mean(three)), *medians)
 
 
 def predicted(draws: int = PREDICTED_DRAWS) -> Float[ndarray, "k 3"]:
@@ -254,16 +224,12 @@ def predicted(draws: int = PREDICTED_DRAWS) -> Float[ndarray, "k 3"]:
 
     Captures differ in arm, its errors, number of images, intrinsics and noise.
     """
-    return np.array(list(_ratios(draws))).reshape(-1, 3)
-
-
-def _ratios(draws: int) -> Iterator[list[float]]:
+    ratios = []
     for seed in range(draws):
         capture, reconstruction = _made(seed)
         options = CalibrateOptions()
         robot, rows = robot_errors(capture, options), spread_rows(len(capture))
-        case = fit_poses(capture, _only(reconstruction, rows), options, robot.of(rows))
-        case = adjust_images(case)
+        case = adjust_images(fit_poses(capture, _only(reconstruction, rows), options, robot.of(rows)))
         hand_eye = calibrate(capture, reconstruction, options)
         if not (hand_eye.converged and case.hand_eye.converged) or hand_eye.in_use is None:
             continue
@@ -272,7 +238,8 @@ def _ratios(draws: int) -> Iterator[list[float]]:
             (reached(one, use, "seen")[0], *reached(one, use, "camera"))
             for one, use in ((prediction.estimate, prediction.in_use), (hand_eye, hand_eye.in_use))
         )
-        yield np.divide(foretold, reported).tolist()
+        ratios.append(np.divide(foretold, reported))
+    return np.reshape(ratios, (-1, 3))
 
 
 def _made(seed: int) -> tuple[Capture, Reconstruction]:
@@ -286,7 +253,7 @@ def _made(seed: int) -> tuple[Capture, Reconstruction]:
         images=tuple(f"{k}.png" for k in range(count)),
         base_from_gripper=problem.base_from_gripper,
         image_size=(start.width, start.height),
-        intrinsics=None if known.name.startswith("not") else start,
+        intrinsics=start if known.is_given else None,
         joints=problem.joints if seed % 2 else None,
         robot=name if seed % 2 else None,
     )
@@ -300,17 +267,13 @@ def _made(seed: int) -> tuple[Capture, Reconstruction]:
 
 
 def _only(made: Reconstruction, rows: np.ndarray) -> Reconstruction:
-    among = np.isin(np.arange(len(made.image_index)), rows)
     return Reconstruction(
         image_index=rows,
         recon_from_camera=made.recon_from_camera[rows],
         intrinsics=made.intrinsics,
-        tracks=of_images(made.tracks, among),
+        tracks=of_images(made.tracks, np.isin(np.arange(len(made.image_index)), rows)),
         backend=made.backend,
     )
-
-
-# The page.
 
 
 def _claims(
@@ -318,10 +281,15 @@ def _claims(
 ) -> Iterator[str]:
     ours = [row for row in robots if row.known in SOLVERS and row.known != WHITE and row.accepted > 0]
     white = [row for row in robots if row.known == WHITE and row.preset != "white" and row.accepted > 0]
+    # Per cent of all accepted results; all rows have as many draws.
+    pooled, alone = (
+        100 * np.average([row.beyond_3 for row in rows], weights=[row.accepted for row in rows])
+        for rows in (ours, white)
+    )
     yield (
-        f"> Arms with systematic errors: {_pooled(ours):.1f} % of the accepted results are beyond 3 of their own σ on "
+        f"> Arms with systematic errors: {pooled:.1f} % of the accepted results are beyond 3 of their own σ on "
         f"an axis, {100 * max(row.beyond_3 for row in ours):.0f} % in the worst row; with white noise alone "
-        f"{_pooled(white):.0f} %."
+        f"{alone:.0f} %."
     )
     shares = [100 * row.within_95 for row in seen]
     yield (
@@ -337,39 +305,46 @@ def _claims(
     yield f"> Predicted and reported uncertainty agree within a factor of {FACTOR:g}: {'; '.join(parts)}."
 
 
-def _pooled(rows: Sequence[RobotRow]) -> float:
-    """Return per cent of all accepted results beyond three σ; all rows have as many draws."""
-    accepted = sum(row.accepted for row in rows)
-    return 100 * sum(row.accepted * row.beyond_3 for row in rows) / accepted if accepted else np.nan
-
-
 def _tables(
     robots: Sequence[RobotRow], seen: Sequence[SeenRow], ahead: Float[ndarray, "k 3"]
 ) -> Iterator[str]:
     yield from ("", "## Arms with systematic errors", "")
     head = "errors | images | solver | median error | accepted | > 3 σ | > 5 σ | squared distance / 6"
-    yield from table(head, map(_robot_cells, robots))
+    yield from table(
+        head,
+        (
+            [
+                *row[:3],
+                f"{row.mm:.2f} mm {row.deg:.3f}°",
+                *map(_percent, row[5:8]),
+                number(row.squared) or "–",
+            ]
+            for row in robots
+        ),
+    )
     yield from ("", "## Points that the camera sees", "")
     yield from (f"Nine pixels of the image, {POINTS} points with {PIXEL_STD} px, {DRAWS} captures a row.", "")
     head = "robot | images | intrinsics | within their 95 % | within 3 σ | median error | 95 % stated below | camera"
-    yield from table(head, map(_seen_cells, seen))
+    yield from table(
+        head,
+        (
+            [
+                *row[:3],
+                _percent(row.within_95),
+                f"{100 * row.within_3:.1f} %",
+                *(f"{mm:.2f} mm" for mm in row[5:]),
+            ]
+            for row in seen
+        ),
+    )
     yield from ("", "## Predicted over reported uncertainty", "")
     quantiles = np.quantile(ahead, (0.0, 0.25, 0.5, 0.75, 1.0), axis=0).T
     names = ("seen point", "camera on the gripper", "rotation")
     yield from table(
         "95 % of errors of | least | 25 % | median | 75 % | most",
-        ([name, *(f"{q:.2f}" for q in row)] for name, row in zip(names, quantiles, strict=True)),
+        ([name, *map(number, row)] for name, row in zip(names, quantiles, strict=True)),
     )
 
 
-def _robot_cells(row: RobotRow) -> list[str]:
-    shares = (row.accepted, row.beyond_3, row.beyond_5)
-    cells = [f"{100 * share:.0f} %" if np.isfinite(share) else "–" for share in shares]
-    squared = f"{row.squared:.2f}" if np.isfinite(row.squared) else "–"
-    return [row.preset, f"{row.count}", row.known, f"{row.mm:.2f} mm {row.deg:.3f}°", *cells, squared]
-
-
-def _seen_cells(row: SeenRow) -> list[str]:
-    shares = (f"{100 * row.within_95:.0f} %", f"{100 * row.within_3:.1f} %")
-    lengths = (f"{mm:.2f} mm" for mm in (row.seen_mm, row.stated_mm, row.camera_mm))
-    return [row.preset, f"{row.count}", row.known, *shares, *lengths]
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if np.isfinite(share) else "–"

@@ -1,4 +1,4 @@
-"""`benchmarks faults`: captures with one fault each, and captures without one: detections, silent errors, false alarms.
+"""Captures with one fault each, and captures without a fault.
 
 Two tables. Observations: gripper poses and image points of simulated faults through structure from motion and the
 calibration stage. Images: rendered images with one fault through all of `jcr calibrate`, so that features, mapper and
@@ -9,7 +9,6 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,18 +18,18 @@ from numpy import ndarray
 from scipy.special import chdtrc
 
 import jcr
-from benchmarks.page import mm_deg, table
+from benchmarks.page import mm_deg, squared_distance, table
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.errors import InputError, RejectedError
-from jcr.findings import Finding, FindingKind, kinds_of
+from jcr.findings import FindingKind, kinds_of
 from jcr.geometry import step_between
 from jcr.records import HandEye
 from simulation import image_faults as make
 from simulation.faults import Faults, FaultyCapture, faulty_capture, reconstructed
 from simulation.image_faults import IMAGES as FEW_IMAGES
 from simulation.image_faults import ImageFault
-from simulation.rendered import Rendered, rendered
+from simulation.rendered import rendered
 
 IMAGES, SCENES = 12, 5
 """Images of a capture of observations, and rendered scenes."""
@@ -180,12 +179,13 @@ def run() -> str:
     """Return the page in Markdown: claims, the two tables of faults, and false alarms."""
     observed = {case: [outcome(*calibrated(case.fault, k, given=case.given)) for k in range(DRAWS)]
                 for case in OBSERVED if isinstance(case.fault, Faults)}  # fmt: skip
-    images = {
-        case: [through_images(1, case.fault, case.given)]
-        for case in RENDERED
-        if isinstance(case.fault, ImageFault)
-    }
-    clean = [_clean(seed) for seed in range(CLEAN)]
+    images = {case: [through_images(1, case.fault, case.given)]
+              for case in RENDERED if isinstance(case.fault, ImageFault)}  # fmt: skip
+    clean = []
+    for seed in range(CLEAN):  # 8 to 20 images, robots of 0.1 to 0.45 mm, intrinsics given and estimated
+        size = 2.0 ** (seed % 4 - 1)
+        faults = Faults(robot_noise=(1e-4 * size + 5e-5, 3e-4 * size))
+        clean.append(outcome(*calibrated(faults, 1000 + seed, (8, 12, 20)[seed % 3], seed % 2 == 0)))
     clean_images = [through_images(1000 + k, ImageFault(), k % 2 == 0) for k in range(CLEAN_IMAGES)]
     return page(observed, images, clean, clean_images)
 
@@ -207,22 +207,9 @@ def outcome(found: FaultyCapture, hand_eye: HandEye) -> Outcome:
     return _judged(hand_eye, (found.gripper_from_camera, found.gripper_from_camera_after), frozenset())
 
 
-def _clean(seed: int) -> Outcome:
-    """Calibrate a capture without a fault: 8 to 20 images, robots of 0.1 to 0.45 mm, intrinsics given and estimated."""
-    size = 2.0 ** (seed % 4 - 1)
-    faults = Faults(robot_noise=(1e-4 * size + 5e-5, 3e-4 * size))
-    return outcome(*calibrated(faults, 1000 + seed, (8, 12, 20)[seed % 3], given=seed % 2 == 0))
-
-
-@cache
-def _scene(number: int) -> Rendered:
-    """Render a scene once."""
-    return rendered(number)
-
-
 def through_images(seed: int, fault: ImageFault, given: bool) -> Outcome:
     """Draw a capture of images with a fault and run `jcr calibrate` on it."""
-    capture = make.draw(_scene(seed % SCENES), seed, fault, given=given)
+    capture = make.draw(rendered(seed % SCENES), seed, fault, given=given)
     with tempfile.TemporaryDirectory() as folder:
         try:
             result = jcr.calibrate(make.write(capture, Path(folder) / "capture"), Path(folder) / "out")
@@ -241,18 +228,16 @@ def _judged(hand_eye: HandEye, truths: Iterable[Float[ndarray, "4 4"]], left_out
     std = np.sqrt(np.diag(covariance))
     steps = [step_between(hand_eye.gripper_from_camera, x) for x in truths]
     step = max(steps, key=lambda one: float(np.abs(one / std).max()))
-    joint_p = float(chdtrc(6, step @ np.linalg.solve(covariance, step)))
-    kinds = frozenset(finding.kind for finding in _warnings(hand_eye.findings))
+    joint_p = float(chdtrc(6, squared_distance(step, covariance)))
+    # Findings that a user reads as a warning; insufficient accuracy is no fault.
+    kinds = frozenset(
+        one.kind
+        for one in hand_eye.findings
+        if one.severity != "informs" and one.kind is not FindingKind.NOT_EXACT_ENOUGH
+    )
     return Outcome(
         hand_eye.converged, kinds, left_out, *mm_deg(step), float(np.abs(step / std).max()), joint_p
     )
-
-
-def _warnings(findings: Iterable[Finding]) -> list[Finding]:
-    """Return the findings that a user reads as a warning; insufficient accuracy is no fault."""
-    return [
-        one for one in findings if one.severity != "informs" and one.kind is not FindingKind.NOT_EXACT_ENOUGH
-    ]
 
 
 Rows = dict[Case, list[Outcome]]

@@ -1,18 +1,19 @@
-"""`benchmarks live DIR`: images until a claimed accuracy is confirmed, and live calibration beside that at once."""
+"""Images until a claimed accuracy is confirmed, and live calibration beside that at once."""
 
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from benchmarks.page import folders_with, table
+from benchmarks.page import folders_with_captures, table
 from jcr.calibration.options import CalibrateOptions
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
@@ -45,9 +46,12 @@ from simulation.taken import pinhole
 
 REQUIRE = (2.0, 0.3)
 """mm, degrees: 95 % of errors of a seen point, and of directions there."""
+GOAL = f"{REQUIRE[0]:g} mm and {REQUIRE[1]:g}°"
 FIRST, MOST = 3, 24
 """Images at varied poses with which every way begins, and images after which a capture ends without a claim."""
 SCENES = 2
+WAYS = ("proposed", "varied", "random")
+"""Ways to choose the next pose: as the calibration proposes, by the pattern `varied`, or at random over the table."""
 ARMS: tuple[RobotName, ...] = ("ur5e", "panda", "fr3", "ur10e", "xarm6")
 AROUND = 0.5
 """m, of a UR5e: distance from which random poses look at the middle of the table."""
@@ -68,25 +72,71 @@ class Cell:
     """Joint angles of the pattern `varied`."""
     seed: int
 
-    def effective(self, joints: Float[ndarray, "n dof"]) -> Float[ndarray, "4 4"]:
-        """Return the effective gripper_from_camera about these joint angles."""
-        rng = np.random.default_rng([self.seed, 80])
-        count = -(-EFFECTIVE_POSES // len(joints))
-        around = np.concatenate([about_posture(self.arm.arm, posture, count, rng) for posture in joints])
-        return effective_fit(self.arm, around, (self.physical, np.eye(4))).gripper_from_camera
+
+class Run(NamedTuple):
+    """One simulated capture, ended by its claim or by the last image that was allowed."""
+
+    way: str
+    images: int
+    claimed: bool
+    is_true: bool
+    """Whether both errors are within what was required."""
+    cells: list[str]
+
+
+class Fed(NamedTuple):
+    """One real capture, image by image and at once."""
+
+    same: bool
+    """Whether both verdicts are the same."""
+    sigmas: float | None
+    """Largest difference in standard deviations of the one at once; None where one has no calibration."""
+    cells: list[str]
+
+
+def run(captures: Path) -> str:
+    """Return the page in Markdown: simulated captures by each way, and real ones image by image."""
+    runs = [run_of(cell_of(seed), way) for seed in range(SCENES) for way in WAYS]
+    real, seconds = [fed(folder) for folder in folders_with_captures(captures)], latencies()
+    needed = []
+    for way in WAYS:
+        counts = [one.images if one.claimed else np.inf for one in runs if one.way == way]
+        most = f"more than {MOST}" if np.isinf(max(counts)) else f"{max(counts):g}"
+        needed.append(f"{way} {np.median(counts):g} ({min(counts):g} to {most})")
+    claimed = [one for one in runs if one.claimed]
+    apart = [one.sigmas for one in real if one.sigmas is not None]
+    lines = [
+        f"> Images until {GOAL} are claimed and confirmed, median and range: {'; '.join(needed)}. "
+        f"{sum(one.is_true for one in claimed)} of {len(claimed)} claims are true.",
+        f"> Live and at once: the same verdict in {sum(one.same for one in real)} of {len(real)} "
+        f"captures, at most {max(apart, default=0.0):.2g} σ apart; {seconds[AT - 1]:.1f} s of processor after image "
+        f"{AT}, {seconds[-1]:.1f} s after image {len(seconds)} (640x480).",
+        "",
+        "A rendered camera on an arm with errors of 0.1° a joint and 0.3 mm a link goes to poses until the calibration "
+        f"claims {GOAL} (95 % of errors of a seen point) and its leave-one-out error confirms it, which takes 8 images "
+        "at least. Errors are against the effective transform about the poses of the capture.",
+        "",
+        *table(
+            "scene, arm | poses | images | claimed mm | ° | error mm | ° | claim | last image, s",
+            (one.cells for one in runs),
+        ),
+        "",
+        *table(
+            f"capture | images | verdict live | at once | apart, σ | image {AT}, s | last, s | slowest, s | end, s | "
+            "at once, s",
+            (one.cells for one in real),
+        ),
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def cell_of(seed: int) -> Cell:
     """Draw the cell of a seed."""
     hand_eye, errors, motion, camera = (np.random.default_rng([seed, 40 + k]) for k in (0, 1, 3, 4))
     arm = arm_named(ARMS[seed % len(ARMS)])
-    bent, target, x = (
-        bend(arm, PRESETS["typical"].sizes, errors),
-        table_center(arm),
-        hand_eye_on(arm, hand_eye),
-    )
+    x, target = hand_eye_on(arm, hand_eye), table_center(arm)
     return Cell(
-        arm=bent,
+        arm=bend(arm, PRESETS["typical"].sizes, errors),
         scene=moved(make_scene("tabletop", seed), target),
         camera=pinhole(camera),
         physical=x,
@@ -95,91 +145,29 @@ def cell_of(seed: int) -> Cell:
     )
 
 
-def _proposed(cell: Cell, state: Progress, count: int) -> Float[ndarray, "4 4"]:
-    assert state.next_pose is not None
-    return state.next_pose.base_from_gripper
-
-
-def _varied(cell: Cell, state: Progress, count: int) -> Float[ndarray, "4 4"]:
-    return cell.arm.reported(cell.varied[count : count + 1])[0]
-
-
-def _random(cell: Cell, state: Progress, count: int) -> Float[ndarray, "4 4"]:
-    rng = np.random.default_rng([cell.seed, 60, count])
-    azimuth, elevation = rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(45, 85))
-    far = AROUND * rng.uniform(0.8, 1.3) * max(view_size(cell.arm.arm), 0.55)
-    toward = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    middle = cell.scene.table_center_in_base
-    return looking_at(middle + far * np.array(toward), middle, rng) @ inverse(cell.physical)
-
-
-WAYS: dict[str, Callable[[Cell, Progress, int], Float[ndarray, "4 4"]]] = {
-    "proposed": _proposed,
-    "varied": _varied,
-    "random": _random,
-}
-"""Functions that give the next base_from_gripper from the state and the number of images so far."""
-
-
-@dataclass(frozen=True)
-class Run:
-    """One simulated capture, ended by its claim or by the last image that was allowed."""
-
-    scene: str
-    way: str
-    images: int
-    claimed: bool
-    claimed_mm: float
-    claimed_deg: float
-    error_mm: float
-    """Error of a seen point at the distance of the scene."""
-    error_deg: float
-    seconds: float
-    """Processor time of the last image's calibration."""
-
-    @property
-    def is_true(self) -> bool:
-        """Whether both errors are within what was required."""
-        return self.error_mm <= REQUIRE[0] and self.error_deg <= REQUIRE[1]
-
-    def cells(self) -> list[str]:
-        """Return the row of the table."""
-        claim = ("true" if self.is_true else "false") if self.claimed else "none"
-        numbers = (self.claimed_mm, self.claimed_deg, self.error_mm, self.error_deg)
-        return [
-            self.scene,
-            self.way,
-            f"{self.images}",
-            *(f"{x:.2f}" for x in numbers),
-            claim,
-            f"{self.seconds:.1f}",
-        ]
-
-
 def run_of(cell: Cell, way: str) -> Run:
     """Take a capture by one way until its claim is confirmed."""
     white = np.repeat(PRESETS["typical"].white, 3)
     rng = np.random.default_rng([cell.seed, 70])
     state, seconds, joints = Progress(images=()), 0.0, cell.varied[0]
-    wanted, visited = list[Float[ndarray, "4 4"]](), list[Float[ndarray, " dof"]]()
-
-    def poses() -> Iterator[Float[ndarray, "4 4"]]:
-        while True:
-            yield wanted[-1]
-
-    seen = render(cell.scene, cell.camera, poses(), with_truth=False)
-    options, arm = CalibrateOptions(require=REQUIRE), cell.arm.arm
+    places, visited, arm = list[Float[ndarray, "4 4"]](), list[Float[ndarray, " dof"]](), cell.arm.arm
+    seen = render(cell.scene, cell.camera, (places[-1] for _ in range(MOST)), with_truth=False)
     with tempfile.TemporaryDirectory() as folder:
-        live = LiveCalibration(Path(folder) / "c", intrinsics=cell.camera, robot=arm.name, options=options)
+        live = LiveCalibration(
+            Path(folder) / "c",
+            intrinsics=cell.camera,
+            robot=arm.name,
+            options=CalibrateOptions(require=REQUIRE),
+        )
         for count in range(MOST):
             if count < FIRST:
                 joints = cell.varied[count]
             elif way == "proposed" and state.next_joints is not None:
                 joints = state.next_joints
             else:
-                joints = reach_toward(arm, WAYS[way](cell, state, count)[None], joints[None])[0]
+                joints = reach_toward(arm, _next_pose(cell, way, state, count)[None], joints[None])[0]
             visited.append(joints)
-            wanted.append(cell.arm.true(joints[None])[0] @ cell.physical)
+            places.append(cell.arm.true(joints[None])[0] @ cell.physical)
             reported = retract(cell.arm.reported(joints[None]), white * rng.normal(size=(1, 6)))[0]
             begun = time.process_time()
             state = live.add(next(seen).image, reported, joints)
@@ -189,45 +177,33 @@ def run_of(cell: Cell, way: str) -> Run:
         live.close()
     found = state.hand_eye
     assert found is not None and state.now is not None and found.in_use is not None
-    ahead = np.array([0.0, 0.0, 1e-3 * found.in_use.seen.distance_mm])
-    x, effective = found.gripper_from_camera, cell.effective(np.array(visited))
-    return Run(
-        scene=f"{cell.seed}, {arm.name}",
-        way=way,
-        images=len(state.images),
-        claimed=state.requirement_met,
-        claimed_mm=state.now.translation_mm,
-        claimed_deg=state.now.rotation_deg,
-        error_mm=1e3 * float(np.linalg.norm(apply(x, ahead) - apply(effective, ahead))),
-        error_deg=float(np.degrees(rotation_angle(x[:3, :3].T @ effective[:3, :3]))),
-        seconds=seconds,
-    )
+    # The truth is the effective transform about the postures of the capture.
+    draw, each = np.random.default_rng([cell.seed, 80]), -(-EFFECTIVE_POSES // len(visited))
+    around = np.concatenate([about_posture(arm, posture, each, draw) for posture in visited])
+    effective = effective_fit(cell.arm, around, (cell.physical, np.eye(4))).gripper_from_camera
+    x, ahead = found.gripper_from_camera, np.array([0.0, 0.0, 1e-3 * found.in_use.seen.distance_mm])
+    mm = 1e3 * float(np.linalg.norm(apply(x, ahead) - apply(effective, ahead)))
+    deg = float(np.degrees(rotation_angle(x[:3, :3].T @ effective[:3, :3])))
+    is_true = mm <= REQUIRE[0] and deg <= REQUIRE[1]
+    claim = ("true" if is_true else "false") if state.requirement_met else "none"
+    numbers = [f"{value:.2f}" for value in (state.now.translation_mm, state.now.rotation_deg, mm, deg)]
+    cells = [f"{cell.seed}, {arm.name}", way, f"{len(visited)}", *numbers, claim, f"{seconds:.1f}"]
+    return Run(way, len(visited), state.requirement_met, is_true, cells)
 
 
-# Live beside at once.
-
-
-@dataclass(frozen=True)
-class Fed:
-    """One real capture, image by image and at once."""
-
-    capture: str
-    images: int
-    verdicts: tuple[str, str]
-    """Verdict at the end of the live calibration, and of the calibration at once."""
-    sigmas: float | None
-    """Largest difference in standard deviations of the latter; None where one has no calibration."""
-    latency_s: tuple[float, ...]
-    """Processor time of each image."""
-    finish_s: float
-    at_once_s: float
-
-    def cells(self) -> list[str]:
-        """Return the row of the table."""
-        at = f"{self.latency_s[AT - 1]:.1f}" if self.images >= AT else ""
-        apart = "" if self.sigmas is None else f"{self.sigmas:.2g}"
-        seconds = (self.latency_s[-1], max(self.latency_s), self.finish_s, self.at_once_s)
-        return [self.capture, f"{self.images}", *self.verdicts, apart, at, *(f"{s:.1f}" for s in seconds)]
+def _next_pose(cell: Cell, way: str, state: Progress, count: int) -> Float[ndarray, "4 4"]:
+    """Return the next base_from_gripper by one of WAYS."""
+    if way == "proposed":
+        assert state.next_pose is not None
+        return state.next_pose.base_from_gripper
+    if way == "varied":
+        return cell.arm.reported(cell.varied[count : count + 1])[0]
+    rng = np.random.default_rng([cell.seed, 60, count])
+    azimuth, elevation = rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(45, 85))
+    far = AROUND * rng.uniform(0.8, 1.3) * max(view_size(cell.arm.arm), 0.55)
+    toward = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    middle = cell.scene.table_center_in_base
+    return looking_at(middle + far * np.array(toward), middle, rng) @ inverse(cell.physical)
 
 
 def fed(folder: Path) -> Fed:
@@ -235,9 +211,8 @@ def fed(folder: Path) -> Fed:
     capture, latency = read_capture(folder), []
     with tempfile.TemporaryDirectory() as temporary:
         out = Path(temporary)
-        with closing(
-            LiveCalibration(out / "live", intrinsics=capture.intrinsics, robot=capture.robot)
-        ) as live:
+        own = LiveCalibration(out / "live", intrinsics=capture.intrinsics, robot=capture.robot)
+        with closing(own) as live:
             for name, pose in zip(capture.images, capture.base_from_gripper, strict=True):
                 image, begun = read_image(folder / name), time.process_time()
                 live.add(image, pose)
@@ -251,15 +226,10 @@ def fed(folder: Path) -> Fed:
         away = step_between(finished.hand_eye.gripper_from_camera, batch.hand_eye.gripper_from_camera)
         sigmas = float(np.abs(away / std).max())
     verdicts = ["none" if one is None else str(one.verdict) for one in (finished, batch)]
-    return Fed(
-        folder.name,
-        len(capture),
-        (verdicts[0], verdicts[1]),
-        sigmas,
-        tuple(latency),
-        finish_s,
-        at_once_s,
-    )
+    cells = [folder.name, f"{len(capture)}", *verdicts, "" if sigmas is None else f"{sigmas:.2g}"]
+    cells.append(f"{latency[AT - 1]:.1f}" if len(latency) >= AT else "")
+    cells += [f"{seconds:.1f}" for seconds in (latency[-1], max(latency), finish_s, at_once_s)]
+    return Fed(verdicts[0] == verdicts[1], sigmas, cells)
 
 
 def _timed(calibration: Callable[[], RunResult]) -> tuple[RunResult | None, float]:
@@ -274,8 +244,7 @@ def _timed(calibration: Callable[[], RunResult]) -> tuple[RunResult | None, floa
 def latencies() -> list[float]:
     """Return processor seconds after each image of a simulated capture at varied poses."""
     cell, found = cell_of(0), []
-    places = cell.arm.true(cell.varied) @ cell.physical
-    seen = render(cell.scene, cell.camera, iter(places), with_truth=False)
+    seen = render(cell.scene, cell.camera, cell.arm.true(cell.varied) @ cell.physical, with_truth=False)
     with (
         tempfile.TemporaryDirectory() as folder,
         closing(LiveCalibration(Path(folder) / "c", intrinsics=cell.camera)) as live,
@@ -285,44 +254,3 @@ def latencies() -> list[float]:
             live.add(view.image, pose)
             found.append(time.process_time() - begun)
     return found
-
-
-def run(captures: Path) -> str:
-    """Return the page in Markdown: simulated captures by each way, and real ones image by image."""
-    runs = [run_of(cell_of(seed), way) for seed in range(SCENES) for way in WAYS]
-    return page(runs, [fed(folder) for folder in folders_with(captures, "capture.json")], latencies())
-
-
-def page(runs: Sequence[Run], real: Sequence[Fed], seconds: Sequence[float]) -> str:
-    """Return the page of measured captures in Markdown."""
-    needed = []
-    for way in WAYS:
-        counts = [one.images if one.claimed else np.inf for one in runs if one.way == way]
-        most = f"more than {MOST}" if np.isinf(max(counts)) else f"{max(counts):g}"
-        needed.append(f"{way} {np.median(counts):g} ({min(counts):g} to {most})")
-    claimed = [one for one in runs if one.claimed]
-    apart = [one.sigmas for one in real if one.sigmas is not None]
-    goal = f"{REQUIRE[0]:g} mm and {REQUIRE[1]:g}°"
-    lines = [
-        f"> Images until {goal} are claimed and confirmed, median and range: {'; '.join(needed)}. "
-        f"{sum(one.is_true for one in claimed)} of {len(claimed)} claims are true.",
-        f"> Live and at once: the same verdict in {sum(len({*one.verdicts}) == 1 for one in real)} of {len(real)} "
-        f"captures, at most {max(apart, default=0.0):.2g} σ apart; {seconds[AT - 1]:.1f} s of processor after image "
-        f"{AT}, {seconds[-1]:.1f} s after image {len(seconds)} (640x480).",
-        "",
-        "A rendered camera on an arm with errors of 0.1° a joint and 0.3 mm a link goes to poses until the calibration "
-        f"claims {goal} (95 % of errors of a seen point) and its leave-one-out error confirms it, which takes 8 images "
-        "at least. Errors are against the effective transform about the poses of the capture.",
-        "",
-        *table(
-            "scene, arm | poses | images | claims mm | ° | error mm | ° | claim | last image, s",
-            (one.cells() for one in runs),
-        ),
-        "",
-        *table(
-            f"capture | images | verdict live | at once | apart, σ | image {AT}, s | last, s | slowest, s | end, s | "
-            "at once, s",
-            (one.cells() for one in real),
-        ),
-    ]
-    return "\n".join(lines) + "\n"

@@ -1,6 +1,7 @@
 """Tables, distances in mm and degrees, and captures that several benches share."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.geometry import rotation_between_deg
+from jcr.records import Capture
 
 
 def table(head: str, rows: Iterable[Iterable[object]]) -> list[str]:
@@ -17,7 +19,7 @@ def table(head: str, rows: Iterable[Iterable[object]]) -> list[str]:
     return lines + [f"| {' | '.join(map(str, row))} |" for row in rows]
 
 
-def number(value: float | None, digits: int) -> str:
+def number(value: float | None, digits: int = 2) -> str:
     """Return a cell of a table, empty where there is no value."""
     return "" if value is None or np.isnan(value) else f"{value:.{digits}f}"
 
@@ -27,23 +29,39 @@ def mm_deg(step: Float[ndarray, " p"]) -> tuple[float, float]:
     return 1e3 * float(np.linalg.norm(step[:3])), float(np.degrees(np.linalg.norm(step[3:6])))
 
 
+def largest_std(covariance: Float[ndarray, "p p"]) -> tuple[float, float]:
+    """Return the largest standard deviation on an axis of a transform, mm and degrees."""
+    std = np.sqrt(np.diag(covariance)[:6])
+    return 1e3 * float(std[:3].max()), float(np.degrees(std[3:].max()))
+
+
+def squared_distance(
+    off: Float[ndarray, "*k p"], covariance: Float[ndarray, "*k p p"]
+) -> Float[ndarray, "*k"]:
+    """Return squared Mahalanobis distances."""
+    return (off * np.linalg.solve(covariance, off[..., None])[..., 0]).sum(-1)
+
+
 def apart(x: Float[ndarray, "4 4"], reference: Float[ndarray, "4 4"]) -> tuple[float, float]:
     """Return the distance of two hand-eye transforms in mm and degrees."""
     mm = 1e3 * float(np.linalg.norm(x[:3, 3] - reference[:3, 3]))
     return mm, float(rotation_between_deg(x[:3, :3], reference[:3, :3]))
 
 
-def folders_with(captures: Path, file: str) -> list[Path]:
-    """Return the folders below `captures` that hold a file of this name; raise InputError where there is none."""
-    folders = sorted(path.parent for path in captures.glob(f"*/{file}"))
+def of_rows(capture: Capture, rows: Sequence[int]) -> Capture:
+    """Return a capture with some of its images, without their depth."""
+    return replace(
+        capture,
+        images=tuple(capture.images[row] for row in rows),
+        base_from_gripper=capture.base_from_gripper[rows],
+        joints=None if capture.joints is None else capture.joints[rows],
+        depths=None,
+    )
+
+
+def folders_with_captures(captures: Path) -> list[Path]:
+    """Return the folders below `captures` that hold a capture.json; raise InputError where there is none."""
+    folders = sorted(path.parent for path in captures.glob("*/capture.json"))
     if not folders:
-        raise InputError(f"{captures}: no folder below it holds a {file}")
+        raise InputError(f"{captures}: no folder below it holds a capture.json")
     return folders
-
-
-def boards_of(boards: Sequence[str], folders: Sequence[Path], captures: Path) -> dict[str, str]:
-    """Return boards given as CAPTURE=BOARD by capture; raise InputError for a capture that is not there."""
-    named = {name: board for name, _, board in (text.partition("=") for text in boards)}
-    if unknown := named.keys() - {folder.name for folder in folders}:
-        raise InputError(f"--boards {', '.join(sorted(unknown))}: no such capture in {captures}")
-    return named

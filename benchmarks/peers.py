@@ -1,7 +1,8 @@
-"""`benchmarks peers`: hand-eye solvers on the same poses and images, and global alignment beside the published one."""
+"""Hand-eye solvers, images and global alignment beside other methods."""
 
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,6 @@ from jcr.errors import RejectedError
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.estimation.wrist import adjust_wrist, recon_frame
 from jcr.geometry import (
-    Transforms,
     apply_similarity,
     fit_similarity,
     inverse,
@@ -31,14 +31,12 @@ from jcr.geometry import (
 )
 from jcr.pointmaps.dust3r.pair_graph import complete_pairs
 from jcr.pointmaps.global_alignment.align import global_align
-from jcr.pointmaps.global_alignment.alignment import Alignment
 from jcr.reconstruct import ReconstructOptions, reconstruct
-from jcr.records import Capture
 from simulation.capture import SimulateOptions, simulate
 from simulation.pairs import PairErrors, pairs_of_capture, synthetic_pairs, write_pairs
 from simulation.problems import INTRINSICS, HandEyeProblem, error, hand_eye_problem, observed
 from simulation.scenes import SceneName
-from simulation.truth import Truth, read_truth
+from simulation.truth import read_truth
 
 Poses = Float[ndarray, "n 4 4"]
 Answer = tuple[Float[ndarray, "4 4"], float]
@@ -113,36 +111,31 @@ NOISE, VISION = (5e-4, float(np.radians(0.1))), (2e-4, float(np.radians(0.02)))
 """m, rad per axis of the gripper poses, and of the camera poses, as structure from motion leaves them."""
 SCALE = 2.0
 """Metres per unit, inside the only range that the paper's grid search covers."""
-
-
-def _pose_only(problem: HandEyeProblem, seed: int) -> Answer:
-    """Solve by poses alone."""
-    solved = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
-    return solved.gripper_from_camera, solved.scale
-
-
-def _bundle(problem: HandEyeProblem, seed: int) -> Answer:
-    """Solve by the points that the images show."""
-    start = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
-    used = start.inliers
-    tracks = of_images(observed(problem, np.random.default_rng(seed), 300, 0.3), used)
-    fit = start.gripper_from_camera, start.scale, start.base_from_recon
-    gripper, camera = problem.base_from_gripper[used], problem.recon_from_camera[used]
-    adjusted = adjust_wrist(gripper, fit, camera, INTRINSICS, tracks)
-    return adjusted.state.x[0], recon_frame(adjusted, tracks)[0]
-
-
-SOLVERS: dict[str, Callable[[HandEyeProblem, int], Answer]] = {
-    "jcr, poses only": _pose_only,
-    "jcr, bundle adjustment": _bundle,
-    "paper's grid search": lambda p, seed: grid_search(p.base_from_gripper, p.recon_from_camera),
-    "Andreff with scale": lambda p, seed: andreff_with_scale(p.base_from_gripper, p.recon_from_camera),
-} | {
-    f"OpenCV {name}, scale given": lambda p, seed, name=name: opencv(
-        name, p.base_from_gripper, p.recon_from_camera, p.scale
-    )
-    for name in OPENCV_METHODS
+PAPER_SOLVERS: dict[str, Callable[[Poses, Poses], Answer]] = {
+    "paper's grid search": grid_search,
+    "Andreff with scale": andreff_with_scale,
 }
+"""Solvers of camera and gripper poses alone, which estimate the scale."""
+
+
+def _answers(problem: HandEyeProblem, seed: int) -> Iterator[tuple[str, Answer | None]]:
+    """Yield the answer of every method, None where one of OpenCV's gives up, as some do with wrong poses."""
+    gripper, camera = problem.base_from_gripper, problem.recon_from_camera
+    solved = solve_hand_eye(gripper, camera)
+    yield "jcr, poses only", (solved.gripper_from_camera, solved.scale)
+    used = solved.inliers
+    tracks = of_images(observed(problem, np.random.default_rng(seed), 300, 0.3), used)
+    fit = solved.gripper_from_camera, solved.scale, solved.base_from_recon
+    adjusted = adjust_wrist(gripper[used], fit, camera[used], INTRINSICS, tracks)
+    yield "jcr, bundle adjustment", (adjusted.state.x[0], recon_frame(adjusted, tracks)[0])
+    for name, solve in PAPER_SOLVERS.items():
+        yield name, solve(gripper, camera)
+    for name in OPENCV_METHODS:
+        try:
+            answer = opencv(name, gripper, camera, problem.scale)
+        except cv2.error:
+            answer = None
+        yield f"OpenCV {name}, scale given", answer
 
 
 def _problem(seed: int, count: int, wrong: int) -> HandEyeProblem:
@@ -156,25 +149,18 @@ def _problem(seed: int, count: int, wrong: int) -> HandEyeProblem:
     return problem
 
 
-def _cell(solver: Callable[[HandEyeProblem, int], Answer], count: int, wrong: int) -> str:
-    """Return median and rms error in mm, and the median in degrees."""
-    errors = []
-    for seed in range(TRIALS):
-        problem = _problem(seed, count, wrong)
-        try:
-            errors.append(mm_deg(error(problem, *solver(problem, seed))))
-        except cv2.error:  # with wrong poses among them some of OpenCV's methods give up
-            errors.append((np.inf, np.inf))
-    (mm, deg), rms = np.median(errors, axis=0), np.sqrt(np.square(errors).mean(0))[0]
-    return f"{mm:.2f} / {rms:.2f} / {deg:.3f}"
-
-
 def solvers_page() -> Iterator[str]:
     """Yield the claim and the table of the solvers."""
-    rows = {
-        name: [*(_cell(solve, count, 0) for count in COUNTS), *(_cell(solve, MANY, wrong) for wrong in WRONG)]
-        for name, solve in SOLVERS.items()
-    }
+    rows: dict[str, list[str]] = defaultdict(list)
+    for count, wrong in (*((count, 0) for count in COUNTS), *((MANY, wrong) for wrong in WRONG)):
+        errors: Errors = defaultdict(list)
+        for seed in range(TRIALS):
+            problem = _problem(seed, count, wrong)
+            for name, answer in _answers(problem, seed):
+                errors[name].append((np.inf, np.inf) if answer is None else mm_deg(error(problem, *answer)))
+        for name, found in errors.items():
+            (mm, deg), rms = np.median(found, axis=0), np.sqrt(np.square(found).mean(0))[0]
+            rows[name].append(f"{mm:.2f} / {rms:.2f} / {deg:.3f}")
     parts = [
         f"{name} {rows[name][len(COUNTS) - 1]}" for name in ("jcr, bundle adjustment", "paper's grid search")
     ]
@@ -197,72 +183,54 @@ WEBCAM = {"noise": 3.0, "blur": 0.7, "vignetting": 0.35, "jpeg_quality": 75, "ro
 PUBLISHED = PairErrors(warp=0.04, bend=0.01, pair_rotation_deg=0.6)
 """Errors of the size that DUSt3R's paper publishes (arXiv 2312.14132): 3.6 % mean error of depth, 3.5 % there on DTU;
 second views rotated by 1.0° (rms), medians of 1.0° to 1.3° there on most of 7-Scenes."""
-PAPER_SOLVERS: dict[str, Callable[[Poses, Poses], Answer]] = {
-    "paper's grid search": grid_search,
-    "Andreff with scale": andreff_with_scale,
-}
-"""Solvers of camera and gripper poses alone, which estimate the scale."""
-Errors = dict[tuple[str, str], list[tuple[float, float]]]
-"""mm and degrees of every capture, by reconstruction and method; NaN where there is no result."""
+Errors = dict[str, list[tuple[float, float]]]
+"""mm and degrees of every capture by method; NaN where there is no result."""
 
 
-def image_errors() -> tuple[Errors, dict[str, int]]:
-    """Return the errors of every method, and how many captures jcr accepts, by the reconstruction."""
-    errors: Errors = {}
-    accepted: dict[str, int] = {}
+def images_page() -> Iterator[str]:
+    """Yield the claim and the table of simulated images."""
+    errors: dict[str, Errors] = {name: defaultdict(list) for name in ("COLMAP", "simulated predictions")}
+    accepted: dict[str, int] = defaultdict(int)
     for seed in range(CAPTURES):
         with tempfile.TemporaryDirectory() as folder:
             options = SimulateOptions(scene=SCENES[seed % len(SCENES)], images=FEW, seed=seed, **WEBCAM)
             made, pairs = simulate(Path(folder) / "capture", options), Path(folder) / "pairs.npz"
-            capture, truth = read_capture(made), read_truth(made)
             write_pairs(pairs, pairs_of_capture(made, errors=PUBLISHED, seed=seed)[0])
-            for source, choice in (
-                ("COLMAP", ReconstructOptions(backend="colmap")),
-                ("simulated predictions", ReconstructOptions(predictions=pairs)),
-            ):
-                found, converged = _methods(capture, truth, choice)
-                accepted[source] = accepted.get(source, 0) + converged
-                for name, error_of in found.items():
-                    errors.setdefault((source, name), []).append(error_of)
-    return errors, accepted
-
-
-def _methods(
-    capture: Capture, truth: Truth, choice: ReconstructOptions
-) -> tuple[dict[str, tuple[float, float]], bool]:
-    """Return the errors of jcr and the paper's solvers on one reconstruction, and whether jcr accepts it."""
-    true, none = truth.gripper_from_camera, (np.nan, np.nan)
-    found, converged = dict.fromkeys(("jcr", *PAPER_SOLVERS), none), False
-    try:
-        made = reconstruct(capture, choice)
-    except RejectedError:
-        return found, converged
-    # The scale lies in the only range that the paper's grid covers.
-    centers = truth.base_from_camera[made.image_index, :3, 3]
-    unit = fit_similarity(centers, made.recon_from_camera[:, :3, 3])[1]
-    rescaled = scale_translation(made.recon_from_camera, unit / SCALE)
-    for name, solver in PAPER_SOLVERS.items():
-        found[name] = apart(solver(capture.base_from_gripper[made.image_index], rescaled)[0], true)
-    try:
-        hand_eye = calibrate(capture, made)
-        found["jcr"], converged = apart(hand_eye.gripper_from_camera, true), hand_eye.converged
-    except RejectedError:
-        pass
-    return found, converged
-
-
-def images_page(errors: Errors, accepted: dict[str, int]) -> Iterator[str]:
-    """Yield the claim and the table of simulated images."""
+            choices = ReconstructOptions(backend="colmap"), ReconstructOptions(predictions=pairs)
+            for (source, found), choice in zip(errors.items(), choices, strict=True):
+                converged, of_methods = _methods(made, choice)
+                accepted[source] += converged
+                for name in ("jcr", *PAPER_SOLVERS):
+                    found[name].append(of_methods.get(name, (np.nan, np.nan)))
     rows, parts = [], []
-    for (source, name), found in errors.items():
-        (mm, deg), rms = np.nanmedian(found, axis=0), np.sqrt(np.nanmean(np.square(found), axis=0))[0]
-        results = np.isfinite(found).all(1).sum()
-        verdicts = f"{accepted[source]} of {len(found)}" if name == "jcr" else ""
-        rows.append([source, name, results, verdicts, f"{mm:.2f}", f"{rms:.2f}", f"{deg:.3f}"])
-        parts.append(f"{name} on {source} {mm:.2f} and {rms:.2f} mm")
+    for source, methods in errors.items():
+        for name, found in methods.items():
+            (mm, deg), rms = np.nanmedian(found, axis=0), np.sqrt(np.nanmean(np.square(found), axis=0))[0]
+            results = np.isfinite(found).all(1).sum()
+            verdicts = f"{accepted[source]} of {len(found)}" if name == "jcr" else ""
+            rows.append([source, name, results, verdicts, f"{mm:.2f}", f"{rms:.2f}", f"{deg:.3f}"])
+            parts.append(f"{name} on {source} {mm:.2f} and {rms:.2f} mm")
     yield f"> {FEW} images of plain tables by a webcam, median and rms: {'; '.join(parts)}."
     yield from ("", f"Simulated scenes {', '.join(SCENES)}, {CAPTURES} captures.", "")
     yield from table("reconstruction | method | results | accepted | median mm | rms mm | median °", rows)
+
+
+def _methods(made: Path, choice: ReconstructOptions) -> tuple[bool, dict[str, tuple[float, float]]]:
+    """Return whether jcr accepts a reconstruction of a capture, and the errors of jcr and the paper's solvers on it."""
+    capture, truth = read_capture(made), read_truth(made)
+    true, found = truth.gripper_from_camera, {}
+    try:
+        made_of = reconstruct(capture, choice)
+        # The scale lies in the only range that the paper's grid covers.
+        centers = truth.base_from_camera[made_of.image_index, :3, 3]
+        unit = fit_similarity(centers, made_of.recon_from_camera[:, :3, 3])[1]
+        rescaled = scale_translation(made_of.recon_from_camera, unit / SCALE)
+        for name, solver in PAPER_SOLVERS.items():
+            found[name] = apart(solver(capture.base_from_gripper[made_of.image_index], rescaled)[0], true)
+        hand_eye = calibrate(capture, made_of)
+    except RejectedError:
+        return False, found
+    return hand_eye.converged, found | {"jcr": apart(hand_eye.gripper_from_camera, true)}
 
 
 # Global alignment.
@@ -274,56 +242,47 @@ def alignment_page() -> Iterator[str]:
     """Yield the claim and the table of processor seconds and errors of global alignment, ours and the published one."""
     import torch  # without which the other peers run
 
-    from benchmarks.adam import AdamOptions, align_adam
+    from benchmarks.adam import align_adam
 
     torch.set_num_threads(1)
-    rows, ratio, ours_s = [], 0.0, 0.0
+    rows, spent = [], {}
     for size in SIZES:
         predictions, truth = synthetic_pairs(complete_pairs(IMAGES), size)
         # 300 steps at the larger size take a quarter of an hour: extrapolated from a few.
         steps = STEPS if size == SIZES[0] else FEW_STEPS
-        ours, ours_s = _processor_s(lambda p=predictions: global_align(p))
-        published, some_s = _processor_s(
-            lambda p=predictions, n=steps: align_adam(p, adam=AdamOptions(steps=n))
-        )
-        published_s = some_s * STEPS / steps
-        ratio = published_s / ours_s
-        for name, found, seconds in (
-            ("jcr.global_align", ours, ours_s),
-            (f"Adam, {STEPS} steps", published, published_s),
+        for name, align, done in (
+            ("jcr.global_align", global_align, STEPS),
+            (f"Adam, {STEPS} steps", lambda pairs, n=steps: align_adam(pairs, n), steps),
         ):
+            begun = time.process_time()
+            found = align(predictions)
+            spent[name] = (time.process_time() - begun) * STEPS / done
             mm, deg = camera_errors(truth.base_from_camera, found.recon_from_camera)
-            errors = [f"{mm:.2f}", f"{deg:.3f}"] if found is ours or steps == STEPS else ["", ""]
-            rows.append([f"{size[0]}x{size[1]}", name, f"{seconds:.1f}", *errors])
+            errors = [f"{mm:.2f}", f"{deg:.3f}"] if done == STEPS else ["", ""]
+            rows.append([f"{size[0]}x{size[1]}", name, f"{spent[name]:.1f}", *errors])
+    ours_s, published_s = spent.values()
     yield (
         f"> Global alignment of {IMAGES * (IMAGES - 1)} pairs at 512x384 takes {ours_s:.1f} s of processor; "
-        f"{STEPS} steps of Adam, the published method, would take {ratio:.0f} times as long."
+        f"{STEPS} steps of Adam, the published method, would take {published_s / ours_s:.0f} times as long."
     )
     yield from ("", *table("pairs of | method | processor, s | cameras off: mm | °", rows))
 
 
-def _processor_s(align: Callable[[], Alignment]) -> tuple[Alignment, float]:
-    """Return an alignment and the processor seconds that it took."""
-    begun = time.process_time()
-    return align(), time.process_time() - begun
-
-
-def camera_errors(base_from_camera: Transforms, recon_from_camera: Transforms) -> tuple[float, float]:
+def camera_errors(base_from_camera: Poses, recon_from_camera: Poses) -> tuple[float, float]:
     """Return mean distance (mm) and angle (degrees) of the cameras from the truth, after the best similarity."""
-    base_from_recon, scale = fit_similarity(base_from_camera[:, :3, 3], recon_from_camera[:, :3, 3])
-    centers = apply_similarity(base_from_recon, scale, recon_from_camera[:, :3, 3])
+    true, found = base_from_camera[:, :3, 3], recon_from_camera[:, :3, 3]
+    base_from_recon, scale = fit_similarity(true, found)
+    off = np.linalg.norm(apply_similarity(base_from_recon, scale, found) - true, axis=1)
     rotations = base_from_recon[:3, :3] @ recon_from_camera[:, :3, :3]
     angle = rotation_between_deg(rotations, base_from_camera[:, :3, :3])
-    return 1e3 * float(np.linalg.norm(centers - base_from_camera[:, :3, 3], axis=1).mean()), float(
-        angle.mean()
-    )
+    return 1e3 * float(off.mean()), float(angle.mean())
 
 
 def run() -> str:
     """Return the page in Markdown."""
     parts = {
         "Hand-eye solvers": solvers_page(),
-        "Images": images_page(*image_errors()),
+        "Images": images_page(),
         "Global alignment": alignment_page(),
     }
     claims, lines = [], []

@@ -1,30 +1,27 @@
-"""`benchmarks pointmaps`: the whole job from pairwise pointmaps with a network's errors, against the truth."""
+"""The whole job from pairwise pointmaps with a network's errors, against the truth."""
 
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.page import mm_deg, table
+from benchmarks.page import mm_deg, squared_distance, table
 from jcr.capture.read import read_capture
-from jcr.geometry import fit_similarity
+from jcr.geometry import fit_similarity, step_between
 from jcr.pipeline.run import RunOptions
 from jcr.pipeline.run import run as run_all
 from jcr.reconstruct import ReconstructOptions
-from jcr.results import RunResult
 from simulation.capture import SimulateOptions, simulate
 from simulation.pairs import pairs_of_capture, write_pairs
-from simulation.problems import HandEyeProblem, error
-from simulation.surface import truth_points
+from simulation.surface import surface_in_workspace
 from simulation.truth import read_truth
 
 IMAGES, NOISES = (3, 5, 10), ((0.0, 0.0), (0.5, 0.1))
 """Numbers of images, and robot pose noise in mm and degrees per axis."""
 
 
-@dataclass(frozen=True)
-class EndToEnd:
+class EndToEnd(NamedTuple):
     """Errors of one run from its truth."""
 
     translation_mm: float
@@ -45,11 +42,13 @@ def run() -> str:
         for images in IMAGES:
             found = end_to_end(images, 0, noise)
             cells = [
-                f"{found.translation_mm:.2f} mm",
-                f"{found.rotation_deg:.3f}°",
-                f"{found.scale_percent:.2f} %",
+                text.format(value)
+                for text, value in zip(
+                    ("{:.2f} mm", "{:.3f}°", "{:.2f} %", "{:.1f} mm", "{:.1f}", "{:.0f} s"),
+                    found,
+                    strict=True,
+                )
             ]
-            cells += [f"{found.surface_mm:.1f} mm", f"{found.sigmas:.1f}", f"{found.seconds:.0f} s"]
             rows.append([robot, images, *cells])
             claim = (
                 f"> The whole job from simulated predictions of {images} images, robot pose noise {robot}: "
@@ -66,37 +65,23 @@ def run() -> str:
 def end_to_end(images: int, seed: int, noise: tuple[float, float]) -> EndToEnd:
     """Simulate a capture, predict pointmaps with errors, run everything; `noise` of the robot in mm and degrees."""
     with tempfile.TemporaryDirectory() as folder:
-        made = simulate(
-            Path(folder) / "capture", SimulateOptions(images=images, seed=seed, robot_noise=noise)
-        )
-        predictions, _ = pairs_of_capture(made, seed=seed)
-        pairs = Path(folder) / "pairs.npz"
-        write_pairs(pairs, predictions)
+        simulated = SimulateOptions(images=images, seed=seed, robot_noise=noise)
+        made, pairs = simulate(Path(folder) / "capture", simulated), Path(folder) / "pairs.npz"
+        write_pairs(pairs, pairs_of_capture(made, seed=seed)[0])
         options = RunOptions(reconstruct=ReconstructOptions(predictions=pairs))
         result = run_all(read_capture(made), Path(folder) / "out", options)
-        return _scored(result, made)
-
-
-def _scored(result: RunResult, capture: Path) -> EndToEnd:
-    """Compare a run with the truth of its simulated capture."""
-    truth, found = read_truth(capture), result.hand_eye
-    surface, _ = truth_points(capture)
+        truth = read_truth(made)
+        x = surface_in_workspace(truth).x_in_base
     assert result.scene is not None
-    distance = np.abs(np.asarray(result.scene.query(surface[:: max(1, len(surface) // 20_000)]).distance))
-    cameras = result.reconstruction.recon_from_camera
-    true_scale = fit_similarity(truth.base_from_camera[:, :3, 3], cameras[:, :3, 3])[1]
-    problem = HandEyeProblem(
-        truth.base_from_gripper,
-        cameras,
-        truth.gripper_from_camera,
-        true_scale,
-        truth.base_from_gripper,
-    )
-    off = error(problem, found.gripper_from_camera, found.scale)
+    distance = np.abs(np.asarray(result.scene.query(x[:: max(1, len(x) // 20_000)]).distance))
+    centers = result.reconstruction.recon_from_camera[:, :3, 3]
+    true_scale, found = fit_similarity(truth.base_from_camera[:, :3, 3], centers)[1], result.hand_eye
+    step = step_between(found.gripper_from_camera, truth.gripper_from_camera)
+    off = np.r_[step, np.log(true_scale / found.scale)]
     return EndToEnd(
         *mm_deg(off),
         100 * abs(float(off[6])),
         1e3 * float(np.nanmedian(distance)),
-        float(np.sqrt(off @ np.linalg.solve(found.covariance, off) / 7)),
+        float(np.sqrt(squared_distance(off, found.covariance) / 7)),
         sum(result.calibration.timings_s.values()),
     )

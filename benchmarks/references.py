@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.optimize import least_squares
 
-from jcr.boards.detection import Sighting, boards, most_seen
+from jcr.boards.detection import boards, most_seen
 from jcr.camera import NO_DISTORTION, parameters, project, unproject, with_parameters
 from jcr.capture.images import read_image
 from jcr.errors import RejectedError
@@ -35,6 +35,8 @@ PRIOR = np.array([0.3, 0.3, 0.05, 0.05, 0.5, 0.5, 0.01, 0.01, 0.5])
 to the width, k1, k2, p1, p2, k3. They keep apart what frontal views of a small board do not."""
 SHEET_M = 0.003
 """Standard deviation of the height of a sheet's edge over its middle, m."""
+SHARES = np.array([0.1, 0.5, 0.9])
+"""Shares of width and height at which points are placed."""
 
 
 @dataclass(frozen=True)
@@ -71,28 +73,18 @@ class Reference:
     corners: int
     size: float
     """Size of the board over the stated one."""
-    noise: tuple[float, float]
+    noise: Float[ndarray, "2"]
     """Standard deviations of the reported gripper poses, m and rad per axis."""
     rms_px: float
 
-    @property
-    def std(self) -> tuple[float, float]:
-        """Largest standard deviation of X on an axis, mm and degrees."""
-        std = np.sqrt(np.diag(self.covariance)[:6])
-        return 1e3 * float(std[:3].max()), float(np.degrees(std[3:].max()))
-
 
 def find_corners(capture: Capture, board: str, rows: Sequence[int] | None = None) -> Corners:
-    """Return the corners of a board in the images of a capture, or in some of them."""
-    chosen = range(len(capture)) if rows is None else rows
+    """Return the corners of the body of a board that is seen most often in the images of a capture, or in some."""
     for word, length in LENGTHS_M.items():
         board = board.replace(word, length)
+    chosen = range(len(capture)) if rows is None else rows
     images = [read_image(capture.folder / capture.images[row]) for row in chosen]
-    return corners_of(most_seen(boards(board), images)[1])
-
-
-def corners_of(sightings: Sequence[Sequence[Sighting]]) -> Corners:
-    """Return the observations of the body seen most often; `sightings` of each image."""
+    sightings = most_seen(boards(board), images)[1]
     bodies = [s.body for shown in sightings for s in shown]
     body = max(sorted(set(bodies)), key=bodies.count, default=0)
     seen = [(k, s) for k, shown in enumerate(sightings) for s in shown if s.body == body]
@@ -107,38 +99,9 @@ def corners_of(sightings: Sequence[Sequence[Sighting]]) -> Corners:
     return corners.of(np.ones(len(corners.image), bool))
 
 
-def reference(
-    base_from_gripper: Float[ndarray, "n 4 4"],
-    corners: Corners,
-    size: tuple[int, int],
-    intrinsics: Intrinsics | None = None,
-) -> Reference:
-    """Estimate X and intrinsics from the corners of a board; `intrinsics` are where the search begins.
-
-    Raises RejectedError where fewer than FEWEST_IMAGES images show the board.
-    """
-    if len(np.unique(corners.image)) < FEWEST_IMAGES:
-        raise RejectedError("too few images share the corners of a board", "name it with --boards")
-    fit = _Fit.begin(base_from_gripper, corners, size, intrinsics)
-    for k in range(ROUNDS):
-        fit = fit.improved()
-        if k == 1:
-            off = np.linalg.norm(fit.corner_residuals(fit.values), axis=1)
-            fit = fit.without(off < OUTLIER * max(np.sqrt(2) * fit.std_px, 1.5 * float(np.median(off))))
-    x, camera = fit.x(fit.values), fit.camera(fit.values)
-    chosen = np.r_[0:6, 12:21]
-    covariance = fit.covariance()[np.ix_(chosen, chosen)] * np.outer(fit.unit(), fit.unit())
-    off = fit.corner_residuals(fit.values)
-    return Reference(
-        gripper_from_camera=x,
-        intrinsics=camera,
-        covariance=covariance,
-        images=len(np.unique(fit.corners.image)),
-        corners=len(fit.corners.x_in_board),
-        size=float(np.exp(fit.values[21])),
-        noise=fit.noise,
-        rms_px=float(np.sqrt((off**2).sum(1).mean())),
-    )
+def nine_pixels(camera: Intrinsics) -> Float[ndarray, "9 2"]:
+    """Return pixels over the image, the centre in the middle."""
+    return np.stack(np.meshgrid(SHARES * camera.width, SHARES * camera.height), -1).reshape(-1, 2)
 
 
 def placed(
@@ -155,137 +118,114 @@ def placed_covariance(
     """Return the covariance (m²) of `placed` points of a reference."""
     here = placed(found.gripper_from_camera, found.intrinsics, x_px, distance_m)
     columns = []
-    for k, std in enumerate(np.sqrt(np.diag(found.covariance))):
-        step = np.zeros(15)
-        step[k] = 1e-3 * std
+    for step in np.diag(1e-3 * np.sqrt(np.diag(found.covariance))):
         camera = with_parameters(found.intrinsics, parameters(found.intrinsics) + step[6:])
         there = placed(retract(found.gripper_from_camera, step[:6]), camera, x_px, distance_m)
-        columns.append((there - here) / step[k])
+        columns.append((there - here) / step.sum())
     by = np.stack(columns, axis=-1)
     return by @ found.covariance @ np.swapaxes(by, -1, -2)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Fit:
-    """Least-squares problem at one point.
+def reference(
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    corners: Corners,
+    size: tuple[int, int],
+    intrinsics: Intrinsics | None = None,
+) -> Reference:
+    """Estimate X and intrinsics from the corners of a board; `intrinsics` are where the search begins.
 
-    Its values: X (6), base_from_board (6), intrinsics (9, in units of PRIOR), log size and shape of the board (4), and
-    the error of each used gripper pose (6 each, in units of the noise). All steps are from where the search began.
+    Raises RejectedError where fewer than FEWEST_IMAGES images show the board.
     """
+    if len(used := np.unique(corners.image)) < FEWEST_IMAGES:
+        raise RejectedError("too few images share the corners of a board", "name it with --boards")
+    gripper = base_from_gripper[used]
+    begin_x, begin_board, begin_camera = _begin(gripper, corners, size, intrinsics)
+    corners = replace(corners, image=np.searchsorted(used, corners.image))
+    middle = corners.x_in_board.mean(0)
+    about = corners.x_in_board - middle
+    across = about[:, :2] / max(float(np.abs(about[:, :2]).max()), 1e-9)
+    shape = np.column_stack([across[:, 0] ** 2, across[:, 0] * across[:, 1], across[:, 1] ** 2])
+    unit = PRIOR * np.r_[[begin_camera.fx] * 2, [begin_camera.width] * 2, np.ones(5)]
+    std_px, noise = 1.0, np.array([2e-3, 5e-3])
+    # X (6), base_from_board (6), intrinsics (9, in units of PRIOR), log size and shape of the board (4), and the error
+    # of each used gripper pose (6 each, in units of the noise). All steps are from where the search began.
+    values = np.zeros(25 + 6 * len(used))
 
-    base_from_gripper: Float[ndarray, "n 4 4"]
-    corners: Corners
-    begin_x: Float[ndarray, "4 4"]
-    begin_board: Float[ndarray, "4 4"]
-    begin_camera: Intrinsics
-    values: Float[ndarray, " v"]
-    std_px: float = 1.0
-    noise: tuple[float, float] = (2e-3, 5e-3)
+    def camera_of(values: Float[ndarray, " v"]) -> Intrinsics:
+        return with_parameters(begin_camera, parameters(begin_camera) + unit * values[12:21])
 
-    @staticmethod
-    def begin(
-        base_from_gripper: Float[ndarray, "n 4 4"],
-        corners: Corners,
-        size: tuple[int, int],
-        intrinsics: Intrinsics | None,
-    ) -> "_Fit":
-        """Begin with the poses of OpenCV's calibration and the hand-eye transform of Park and Martin."""
-        used = np.unique(corners.image)
-        points = [corners.x_in_board[corners.corner[corners.image == k]].astype(np.float32) for k in used]
-        pixels = [corners.x_px[corners.image == k].astype(np.float32)[:, None] for k in used]
-        middle = (size[0] - 1) / 2, (size[1] - 1) / 2
-        camera = intrinsics or Intrinsics(1.0 * size[0], 1.0 * size[0], *middle, *size, NO_DISTORTION)
-        flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_PRINCIPAL_POINT
-        flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-        _, matrix, _, rotations, translations = cv2.calibrateCamera(
-            points, pixels, size, camera.matrix.copy(), np.zeros(5), flags=flags
-        )
-        camera = Intrinsics(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *size, NO_DISTORTION)
-        board = np.stack(
-            [transform(rotation_exp(r[:, 0]), t[:, 0]) for r, t in zip(rotations, translations, strict=True)]
-        )
-        gripper = base_from_gripper[used]
-        rotation, translation = cv2.calibrateHandEye(
-            list(gripper[:, :3, :3]), list(gripper[:, :3, 3]), list(board[:, :3, :3]), list(board[:, :3, 3]),
-            method=cv2.CALIB_HAND_EYE_PARK,
-        )  # fmt: skip
-        x = transform(rotation, translation[:, 0])
-        places = gripper @ x @ board
-        middle_row = int(np.linalg.norm(places[:, :3, 3] - np.median(places[:, :3, 3], 0), axis=1).argmin())
-        rows = np.searchsorted(used, corners.image)
-        return _Fit(
-            base_from_gripper=gripper,
-            corners=replace(corners, image=rows),
-            begin_x=x,
-            begin_board=places[middle_row],
-            begin_camera=camera,
-            values=np.zeros(25 + 6 * len(used)),
-        )
-
-    def x(self, values: Float[ndarray, " v"]) -> Float[ndarray, "4 4"]:
-        """Return gripper_from_camera."""
-        return retract(self.begin_x, values[:6])
-
-    def unit(self) -> Float[ndarray, " 15"]:
-        """Units of X and the intrinsics in `values`."""
-        camera = self.begin_camera
-        return np.r_[np.ones(6), PRIOR * np.r_[[camera.fx] * 2, [camera.width] * 2, np.ones(5)]]
-
-    def camera(self, values: Float[ndarray, " v"]) -> Intrinsics:
-        """Return the intrinsics."""
-        return with_parameters(
-            self.begin_camera, parameters(self.begin_camera) + self.unit()[6:] * values[12:21]
-        )
-
-    def corner_residuals(self, values: Float[ndarray, " v"]) -> Float[ndarray, "k 2"]:
+    def off_px(values: Float[ndarray, " v"]) -> Float[ndarray, "k 2"]:
         """Return seen minus projected pixels."""
-        poses = retract(self.base_from_gripper, values[25:].reshape(-1, 6) * np.repeat(self.noise, 3))
-        board = self.corners.x_in_board - self.corners.x_in_board.mean(0)
-        across = board[:, :2] / max(float(np.abs(board[:, :2]).max()), 1e-9)
-        shape = np.column_stack([across[:, 0] ** 2, across[:, 0] * across[:, 1], across[:, 1] ** 2])
-        in_board = np.exp(values[21]) * board
+        poses = retract(gripper, values[25:].reshape(-1, 6) * np.repeat(noise, 3))
+        in_board = np.exp(values[21]) * about
         in_board[:, 2] += SHEET_M * shape @ values[22:25]
-        in_base = apply(retract(self.begin_board, values[6:12]), in_board + self.corners.x_in_board.mean(0))
-        camera_from_base = inverse(poses @ self.x(values))[self.corners.image]
-        at = np.einsum("kij,kj->ki", camera_from_base[:, :3, :3], in_base[self.corners.corner])
-        return self.corners.x_px - project(self.camera(values), at + camera_from_base[:, :3, 3])
+        in_base = apply(retract(begin_board, values[6:12]), in_board + middle)
+        camera_from_base = inverse(poses @ retract(begin_x, values[:6]))[corners.image]
+        at = np.einsum("kij,kj->ki", camera_from_base[:, :3, :3], in_base[corners.corner])
+        return corners.x_px - project(camera_of(values), at + camera_from_base[:, :3, 3])
 
-    def residuals(self, values: Float[ndarray, " v"]) -> Float[ndarray, " r"]:
+    def residuals(values: Float[ndarray, " v"]) -> Float[ndarray, " r"]:
         """Return all residuals in standard deviations; the size of the board is free."""
-        return np.r_[(self.corner_residuals(values) / self.std_px).ravel(), values[12:21], values[22:]]
+        return np.r_[(off_px(values) / std_px).ravel(), values[12:21], values[22:]]
 
-    def improved(self) -> "_Fit":
-        """Return the fit after a minimisation, with the variances that then explain pixels and gripper poses best."""
-        values = least_squares(self.residuals, self.values, method="lm", max_nfev=40 * len(self.values)).x
-        at = replace(self, values=values)
-        covariance, jacobian = at.covariance(), at._jacobian()
-        count = 2 * len(self.corners.image)
+    def derivatives() -> tuple[Float[ndarray, "r v"], Float[ndarray, "v v"]]:
+        """Return the Jacobian by central differences, and the covariance of the values."""
+        steps = 1e-5 * np.eye(len(values))
+        jacobian = np.stack([(residuals(values + d) - residuals(values - d)) / 2e-5 for d in steps], axis=1)
+        return jacobian, np.linalg.inv(jacobian.T @ jacobian)
+
+    for k in range(ROUNDS):
+        values = least_squares(residuals, values, method="lm", max_nfev=40 * len(values)).x
+        jacobian, covariance = derivatives()
+        # The variances that explain pixels and gripper poses best.
+        count = 2 * len(corners.image)
         spread = np.einsum("ij,jk,ik->i", jacobian[:count], covariance, jacobian[:count]).sum()
-        std_px = self.std_px * np.sqrt((np.sum(at.residuals(values)[:count] ** 2) + spread) / count)
+        pixel_std = std_px * np.sqrt((np.sum(residuals(values)[:count] ** 2) + spread) / count)
         squared = (values[25:] ** 2 + np.diag(covariance)[25:]).reshape(-1, 2, 3).mean((0, 2))
-        noise = np.array(self.noise) * np.sqrt(squared)
-        values[25:] /= np.tile(np.repeat(np.sqrt(squared), 3), len(self.base_from_gripper))
-        return replace(at, values=values, std_px=float(std_px), noise=(float(noise[0]), float(noise[1])))
-
-    def covariance(self) -> Float[ndarray, "v v"]:
-        """Return the covariance of the values."""
-        jacobian = self._jacobian()
-        return np.linalg.inv(jacobian.T @ jacobian)
-
-    def _jacobian(self) -> Float[ndarray, "r v"]:
-        """Return derivatives of the residuals by central differences."""
-        steps = 1e-5 * np.eye(len(self.values))
-        return np.stack(
-            [(self.residuals(self.values + d) - self.residuals(self.values - d)) / 2e-5 for d in steps],
-            axis=1,
-        )
-
-    def without(self, good: Bool[ndarray, " k"]) -> "_Fit":
-        """Return the fit of some of the observations; an image that has none keeps its reported pose."""
-        corners = self.corners
-        return replace(
-            self,
-            corners=replace(
+        std_px, noise = float(pixel_std), noise * np.sqrt(squared)
+        values[25:] /= np.tile(np.repeat(np.sqrt(squared), 3), len(gripper))
+        if k == 1:
+            off = np.linalg.norm(off_px(values), axis=1)
+            good = off < OUTLIER * max(np.sqrt(2) * std_px, 1.5 * float(np.median(off)))
+            corners = replace(
                 corners, image=corners.image[good], corner=corners.corner[good], x_px=corners.x_px[good]
-            ),
-        )
+            )
+    chosen = np.r_[0:6, 12:21]
+    return Reference(
+        gripper_from_camera=retract(begin_x, values[:6]),
+        intrinsics=camera_of(values),
+        covariance=derivatives()[1][np.ix_(chosen, chosen)] * np.outer(*[np.r_[np.ones(6), unit]] * 2),
+        images=len(np.unique(corners.image)),
+        corners=len(corners.x_in_board),
+        size=float(np.exp(values[21])),
+        noise=noise,
+        rms_px=float(np.sqrt((off_px(values) ** 2).sum(1).mean())),
+    )
+
+
+def _begin(
+    gripper: Float[ndarray, "m 4 4"], corners: Corners, size: tuple[int, int], intrinsics: Intrinsics | None
+) -> tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"], Intrinsics]:
+    """Return X, base_from_board and intrinsics by OpenCV's calibration and the hand-eye method of Park and Martin."""
+    rows = [corners.image == k for k in np.unique(corners.image)]
+    middle = (size[0] - 1) / 2, (size[1] - 1) / 2
+    camera = intrinsics or Intrinsics(1.0 * size[0], 1.0 * size[0], *middle, *size, NO_DISTORTION)
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_PRINCIPAL_POINT
+    flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    _, matrix, _, rotations, translations = cv2.calibrateCamera(
+        [corners.x_in_board[corners.corner[own]].astype(np.float32) for own in rows],
+        [corners.x_px[own].astype(np.float32)[:, None] for own in rows],
+        size, camera.matrix.copy(), np.zeros(5), flags=flags,
+    )  # fmt: skip
+    board = np.stack(
+        [transform(rotation_exp(r[:, 0]), t[:, 0]) for r, t in zip(rotations, translations, strict=True)]
+    )
+    rotation, translation = cv2.calibrateHandEye(
+        list(gripper[:, :3, :3]), list(gripper[:, :3, 3]), list(board[:, :3, :3]), list(board[:, :3, 3]),
+        method=cv2.CALIB_HAND_EYE_PARK,
+    )  # fmt: skip
+    x = transform(rotation, translation[:, 0])
+    places = gripper @ x @ board
+    nearest = int(np.linalg.norm(places[:, :3, 3] - np.median(places[:, :3, 3], 0), axis=1).argmin())
+    camera = Intrinsics(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *size, NO_DISTORTION)
+    return x, places[nearest], camera

@@ -1,4 +1,4 @@
-"""`benchmarks speed`: processor time of jobs and stages beside COLMAP alone, and growth with the number of images."""
+"""Processor time and memory of jobs and stages beside COLMAP alone, and growth with the number of images."""
 
 import json
 import os
@@ -7,31 +7,25 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.page import apart, table
+from benchmarks.page import apart, of_rows, table
 from jcr.errors import InputError
 
 CAPTURE = Path("examples/tabletop")
 REPEATS = 3
 SIZES, OBSERVED = (8, 16, 32, 64), (15, 50, 100)
 """Numbers of rendered images, and of images of simulated observations."""
-ALONE, ALL, CALIBRATED, KEPT, MISSING = (
-    "COLMAP alone",
-    "`jcr run`",
-    "`jcr calibrate`",
-    "`jcr calibrate`, reconstruction kept",
-    "`jcr calibrate` of a missing folder",
-)
+ALONE, ALL, CALIBRATED = "COLMAP alone", "`jcr run`", "`jcr calibrate`"
 STAGES = ("reconstruct", "calibrate", "densify", "map", "report")
 
 
-@dataclass(frozen=True)
-class Spent:
+class Spent(NamedTuple):
     """Resources of one process."""
 
     processor_s: float
@@ -45,36 +39,32 @@ def run() -> str:
     """Return the page in Markdown: medians of a few rounds in which every job runs once, a process each."""
     if not (CAPTURE / "capture.json").is_file():
         raise InputError(f"bench speed: {CAPTURE} is not here; run it in the root of the project")
-    spent: dict[str, list[Spent]] = {}
+    spent: dict[str, list[Spent]] = defaultdict(list)
     stages: list[dict[str, float]] = []
-    off = ""
+    off = 0.0, 0.0
     for _ in range(REPEATS):
         with tempfile.TemporaryDirectory() as place:
             for name, one in _jobs(Path(place)):
-                spent.setdefault(name, []).append(one)
+                spent[name].append(one)
             stages.append(json.loads((Path(place) / "stages.json").read_text()))
-            off = _error(CAPTURE, Path(place) / "whole")
-    of = {
-        name: Spent(*np.median([_numbers(one) for one in each], axis=0).tolist())
-        for name, each in spent.items()
-    }
+            off = _off(Path(place) / "whole", CAPTURE)
+    of = {name: Spent(*np.median(each, axis=0).tolist()) for name, each in spent.items()}
     alone, grown = of[ALONE].processor_s, _growth()
-    first, last = grown[0], grown[-1]
+    growth = grown[-1][2].processor_s / grown[0][2].processor_s
     lines = [
         f"> `jcr run` on {CAPTURE} takes {of[ALL].processor_s:.1f} s of processor, "
         f"{of[ALL].processor_s / alone:.1f} times COLMAP alone on the same images, {of[ALL].wall_s:.0f} s of time and "
-        f"{of[ALL].peak_mib / 1024:.1f} GiB, and is {off} off the truth; `jcr calibrate` "
+        f"{of[ALL].peak_mib / 1024:.1f} GiB, and is {off[0]:.2f} mm and {off[1]:.3f}° off the truth; `jcr calibrate` "
         f"{of[CALIBRATED].processor_s / alone:.1f} times.",
-        f"> From {first['images']} to {last['images']} images processor time grows "
-        f"{last['processor_s'] / first['processor_s']:.1f} times.",
+        f"> From {SIZES[0]} to {SIZES[-1]} images processor time grows {growth:.1f} times.",
         "",
         f"Medians of {REPEATS} rounds. *COLMAP alone*: features, exhaustive matching and mapping, with its defaults.",
         "",
         *table(
             "job | processor, s | times COLMAP | wall, s | peak, GiB",
             (
-                [name, f"{one.processor_s:.1f}", f"{one.processor_s / alone:.2f}", *_wall_and_peak(one)]
-                for name, one in of.items()
+                [name, f"{cpu:.1f}", f"{cpu / alone:.2f}", f"{wall:.1f}", f"{peak / 1024:.2f}"]
+                for name, (cpu, wall, peak) in of.items()
             ),
         ),
         "",
@@ -88,12 +78,8 @@ def run() -> str:
         *table(
             "images | registered | processor, s | peak, MiB | off, mm",
             (
-                [
-                    one["images"],
-                    one["registered"],
-                    *(f"{one[key]:.2f}" for key in ("processor_s", "peak_mib", "off_mm")),
-                ]
-                for one in grown
+                [count, registered, f"{one.processor_s:.2f}", f"{one.peak_mib:.2f}", f"{mm:.2f}"]
+                for count, (registered, mm), one in grown
             ),
         ),
         "",
@@ -104,21 +90,11 @@ def run() -> str:
     return "\n".join(lines) + "\n"
 
 
-def _numbers(one: Spent) -> tuple[float, float, float]:
-    return one.processor_s, one.wall_s, one.peak_mib
-
-
-def _wall_and_peak(one: Spent) -> tuple[str, str]:
-    return f"{one.wall_s:.1f}", f"{one.peak_mib / 1024:.2f}"
-
-
-def _error(capture: Path, out: Path) -> str:
-    """Return the distance of a run's transform from the truth in words."""
+def _off(result: Path, capture: Path) -> tuple[float, float]:
+    """Return the distance (mm, degrees) of a run's transform from the truth."""
     from jcr.calibration.known_transform import read_hand_eye
 
-    found, true = (read_hand_eye(path).gripper_from_camera for path in (out, capture / "reference.json"))
-    mm, deg = apart(found, true)
-    return f"{mm:.2f} mm and {deg:.3f}°"
+    return apart(*(read_hand_eye(path).gripper_from_camera for path in (result, capture / "reference.json")))
 
 
 def _jobs(place: Path) -> Iterator[tuple[str, Spent]]:
@@ -129,8 +105,10 @@ def _jobs(place: Path) -> Iterator[tuple[str, Spent]]:
     _spent(_call(f"run_by_stage({str(place)!r})"))
     yield CALIBRATED, _spent([*jcr, "calibrate", str(CAPTURE), str(kept), "--quiet"])
     (kept / "calibration.json").unlink()
-    yield KEPT, _spent([*jcr, "calibrate", str(CAPTURE), str(kept), "--quiet"])
-    yield MISSING, _spent([*jcr, "calibrate", str(place / "nothing"), str(place / "none")], status=2)
+    again = _spent([*jcr, "calibrate", str(CAPTURE), str(kept), "--quiet"])
+    yield f"{CALIBRATED}, reconstruction kept", again
+    missing = [*jcr, "calibrate", str(place / "nothing"), str(place / "none")]
+    yield f"{CALIBRATED} of a missing folder", _spent(missing, status=2)
 
 
 def _call(function: str) -> list[str]:
@@ -169,14 +147,9 @@ def run_by_stage(place: str) -> None:
     from jcr.report import html
 
     spent: dict[str, float] = dict.fromkeys(STAGES, 0.0)
-    parts = (
-        (selection, "reconstruct", "reconstruct"),
-        (selection, "calibrate", "calibrate"),
-        (stages, "densify", "densify"),
-        (stages, "mapped", "map"),
-        (html, "report_html", "report"),
-    )
-    for module, function, name in parts:
+    functions = "reconstruct", "calibrate", "densify", "mapped", "report_html"
+    modules = selection, selection, stages, stages, html
+    for module, function, name in zip(modules, functions, STAGES, strict=True):
         setattr(module, function, _timed(getattr(module, function), spent, name))
     jcr.run(CAPTURE, Path(place) / "run")
     (Path(place) / "stages.json").write_text(json.dumps(spent))
@@ -194,8 +167,8 @@ def _timed(function: Callable, spent: dict[str, float], name: str) -> Callable:
     return timed
 
 
-def _growth() -> list[dict[str, float]]:
-    """Return what reconstruction and calibration of more and more rendered images take, a process each."""
+def _growth() -> list[tuple[int, tuple[int, float], Spent]]:
+    """Return number of images, registered ones with the error in mm, and resources, for more and more images."""
     from simulation.capture import SimulateOptions, simulate
 
     found = []
@@ -204,25 +177,22 @@ def _growth() -> list[dict[str, float]]:
         simulate(capture, SimulateOptions(images=max(SIZES), robot_noise=(0.2, 0.05), truth="scene"))
         for count in SIZES:
             spent = _spent(_call(f"reconstruct_first({str(capture)!r}, {count}, {str(facts)!r})"))
-            found.append(json.loads(facts.read_text()) | vars(spent))
+            found.append((count, tuple(json.loads(facts.read_text())), spent))
     return found
 
 
 def reconstruct_first(folder: str, count: int, facts: str) -> None:
-    """Reconstruct and calibrate the first images of a capture, and write the result to `facts`."""
+    """Reconstruct and calibrate the first images of a capture; write images registered and error in mm to `facts`."""
     from jcr.calibration.known_transform import read_hand_eye
     from jcr.calibration.stage import calibrate
     from jcr.capture.read import read_capture
     from jcr.sfm.colmap import reconstruct_colmap
 
-    whole = read_capture(Path(folder))
-    capture = replace(whole, images=whole.images[:count], base_from_gripper=whole.base_from_gripper[:count])
+    capture = of_rows(read_capture(Path(folder)), range(count))
     made = reconstruct_colmap(capture)
     reference = read_hand_eye(Path(folder) / "reference.json").gripper_from_camera
     off_mm, _ = apart(calibrate(capture, made).gripper_from_camera, reference)
-    Path(facts).write_text(
-        json.dumps({"images": count, "registered": len(made.image_index), "off_mm": off_mm})
-    )
+    Path(facts).write_text(json.dumps([len(made.image_index), off_mm]))
 
 
 def _calibration(images: int) -> tuple[int, int, str]:

@@ -1,7 +1,6 @@
 """Solid space of a simulated scene, and the surface that its images show."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -13,7 +12,7 @@ from jcr.camera import rays
 from jcr.geometry import apply, inverse, transform
 from simulation.meshes import Mesh
 from simulation.scenes import Scene
-from simulation.truth import Truth, read_truth, true_depth, true_labels
+from simulation.truth import Truth, true_depth, true_labels
 
 
 def solid_labels(scene: Scene, x_in_base: Float[ndarray, "n 3"]) -> Int[ndarray, "n"]:
@@ -79,9 +78,8 @@ def true_surface(truth: Truth) -> Surface:
     return Surface(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def truth_points(folder: Path) -> tuple[Float[ndarray, "n 3"], Int[ndarray, "n"]]:
-    """Return points of table and objects in the workspace (m, base frame) and their labels, from all images."""
-    truth = read_truth(folder)
+def surface_in_workspace(truth: Truth) -> Surface:
+    """Return the surface of table and objects in the workspace that the images show."""
     surface, (low, high) = true_surface(truth), truth.workspace_in_base
     there = (surface.label > 0) & ((surface.x_in_base >= low) & (surface.x_in_base <= high)).all(1)
-    return surface.x_in_base[there], surface.label[there]
+    return Surface(*(one[there] for one in vars(surface).values()))

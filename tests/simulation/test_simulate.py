@@ -18,7 +18,7 @@ from simulation.capture import SimulateOptions, simulate
 from simulation.poses import gripper_poses, random_hand_eye
 from simulation.render import render
 from simulation.scenes import RECIPES, make_scene
-from simulation.surface import truth_points
+from simulation.surface import surface_in_workspace
 from simulation.truth import read_truth, true_depth, true_labels
 
 CAMERA = Intrinsics(610.0, 610.0, 319.5, 239.5, 640, 480)
@@ -122,13 +122,13 @@ def test_capture_and_truth_agree(simulated):
     for k, image in enumerate(truth.images):
         assert cv2.imread(str(simulated / image)).shape == (480, 640, 3)
         assert true_depth(truth, k).shape == true_labels(truth, k).shape == (480, 640)
-    points, labels = truth_points(simulated)
+    surface = surface_in_workspace(truth)
     # Every object is seen up to its top: none rises above its height, none sinks into the table.
     for thing in truth.objects:
-        height = points[labels == thing.label][:, 2] - truth.table_height
+        height = surface.x_in_base[surface.label == thing.label][:, 2] - truth.table_height
         assert height.max() == pytest.approx(thing.height, abs=5e-4)
         assert height.min() > -2e-4
-    table = points[labels == 1]
+    table = surface.x_in_base[surface.label == 1]
     assert np.abs(table[:, 2] - truth.table_height).max() < 2e-4
 
 
