@@ -10,8 +10,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from scipy.spatial.transform import Rotation, Slerp
 
-from jcr.capture.depth_images import read_depth
-from jcr.capture.images import read_image
+from jcr.capture.images import read_depth, read_image
 from jcr.extras import extra
 from jcr.geometry import rotation_between_deg, transform
 from jcr.records import Capture

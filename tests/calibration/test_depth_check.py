@@ -12,8 +12,7 @@ from jcr.calibration.checks.depth_camera import depth_check
 from jcr.calibration.record import Calibration, calibration_of
 from jcr.calibration.words import details
 from jcr.camera import rays
-from jcr.capture.depth_images import read_depth
-from jcr.capture.images import encode_png
+from jcr.capture.images import encode_png, read_depth
 from jcr.capture.read import read_capture
 from jcr.depth.measured import with_measured_depth
 from jcr.errors import InputError

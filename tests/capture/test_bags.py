@@ -13,8 +13,7 @@ import capture_writers as writers
 import jcr
 from in_process import run_jcr
 from jcr.capture.best_frames import best_frames
-from jcr.capture.depth_images import read_depth
-from jcr.capture.images import encode_png
+from jcr.capture.images import encode_png, read_depth
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import NEVER, pose_track
 from jcr.capture.recording import Recording, capture_of_recording

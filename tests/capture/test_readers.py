@@ -311,10 +311,10 @@ FAULTS: dict[str, tuple[Spoil, str, str]] = {
         lambda f: edit_line(f, 3, lambda line: line.rsplit(",", 1)[0]), "auto", "row 3 has 7 columns, not 8"
     ),
     "millimetres": (
-        lambda f: scaled(f, "rpy", RPY, 1e3), "auto", "look like millimetres: add --pose-units mm-rad"
+        lambda f: scaled(f, "rpy", RPY, 1e3), "auto", "look like millimetres: .*add --pose-units mm-rad"
     ),
     "centimetres": (
-        lambda f: scaled(f, "rpy", RPY, 1e2), "auto", "look like centimetres: add --pose-units cm-rad"
+        lambda f: scaled(f, "rpy", RPY, 1e2), "auto", "look like centimetres: .*add --pose-units cm-rad"
     ),
     "degrees": (
         lambda f: scaled(f, "rpy", RPY, 1, 57.3), "auto", "look like degrees: add --pose-units m-deg"
@@ -327,7 +327,7 @@ FAULTS: dict[str, tuple[Spoil, str, str]] = {
     ),
     "columns for rows": (
         lambda f: scaled(f, "franka", "image," + ",".join(CONVENTIONS["matrix"].columns)), "auto",
-        "--pose-convention franka",
+        "transposed",
     ),
     "rx ry rz": (
         lambda f: scaled(f, "ur", "image,x,y,z,rx,ry,rz"), "auto", "rotation vector .* or angles"

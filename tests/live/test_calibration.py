@@ -227,7 +227,7 @@ def test_what_cannot_be_kept_is_named_and_nothing_is_written(tmp_path: Path, tab
             (other, poses[1] @ np.diag([2.0, 2, 2, 1]), "scaled by 2"),
             (other, mirrored, "a reflection"),
             (other, not_finite, "NaN"),
-            (other, in_mm, "looks like millimetres: divide the translation by 1000"),
+            (other, in_mm, "look like millimetres: divide the translations by 1000"),
             (image, poses[1], "image 2: is the same as images/000.png, though the gripper moved by"),
             (image, poses[0], "image 2: repeats images/000.png, image and pose"),
         ):

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from pydantic import BeforeValidator, PlainSerializer
 
-from jcr.capture.conventions import METRES_LIMIT, far_rows, likely_unit, tolerated
+from jcr.capture.conventions import far_faults, tolerated
 from jcr.capture.images import other_size, read_oriented
 from jcr.capture.options import MAX_FRAMES, MIN_FRAMES
 from jcr.capture.plain_files import contained, first_few
@@ -43,24 +43,31 @@ def checked_capture(
     for k, name in enumerate(images):
         contained(folder, name, f"{where}: frame {k}")
     found = dict(faults or {})
-    far, farthest, many = far_rows(base_from_gripper[:, :3, 3])
-    if many:
-        name, short, a_metre = likely_unit(farthest)
-        raise InputError(
-            f"{where}: the gripper is up to {farthest:.4g} from the base; these look like {name}: "
-            f"divide the translations by {a_metre} (a pose table: --pose-units {short}-rad or {short}-deg)"
-        )
-    for k in far:
-        found[k] = (
-            f"{where}: the pose of {images[k]} is over {METRES_LIMIT:.0f} m from the base; record it again"
-        )
-    decoded = _decoded(folder, images, found)
+    found |= far_faults(
+        base_from_gripper[:, :3, 3], where, [f"{where}: the pose of {name}" for name in images]
+    )
+    decoded, digests = dict[int, tuple[tuple[int, int], int]](), dict[bytes, int]()
+    for k in sorted(set(range(len(images))) - found.keys()):
+        try:
+            pixels, orientation = read_oriented(folder / images[k])
+        except InputError as error:
+            found[k] = str(error)
+            continue
+        decoded[k] = (pixels.shape[1], pixels.shape[0]), orientation
+        same = digests.setdefault(hashlib.sha256(pixels.tobytes()).digest(), k)
+        if same != k:
+            text = f"the same image as {images[same]}; drop one of the frames or take it again"
+            found[k] = f"{folder / images[k]}: {text}"
+    usual = Counter(size for size, _ in decoded.values()).most_common(1)
+    for k, (size, _) in decoded.items():
+        if size != usual[0][0]:
+            like = images[next(j for j in decoded if decoded[j][0] == usual[0][0])]
+            found[k] = str(other_size(f"{folder / images[k]}: image", size, usual[0][0], like))
     rows = [k for k in range(len(images)) if k not in found]
     if found and (len(found) > tolerated(len(images)) or len(rows) < min(MIN_FRAMES, len(images))):
-        others = (
-            f" ({len(found)} of {len(images)} frames cannot be used: {first_few([images[k] for k in found])})"
-        )
-        raise InputError(found[min(found)] + (others if len(found) > 1 else ""))
+        names = first_few([images[k] for k in found])
+        others = f" ({len(found)} of {len(images)} frames cannot be used: {names})" if len(found) > 1 else ""
+        raise InputError(found[min(found)] + others)
     capture = Capture(
         folder=folder,
         images=tuple(images[k] for k in rows),
@@ -70,33 +77,6 @@ def checked_capture(
         notes=tuple(f"left out: {found[k]}" for k in sorted(found)),
     )
     return capture, rows
-
-
-def _decoded(
-    folder: Path, images: Sequence[str], found: dict[int, str]
-) -> dict[int, tuple[tuple[int, int], int]]:
-    """Return size (px) and orientation of each image; images that cannot be used are added to `found`."""
-    decoded, digests = dict[int, tuple[tuple[int, int], int]](), dict[bytes, int]()
-    for k in range(len(images)):
-        if k in found:
-            continue
-        try:
-            pixels, orientation = read_oriented(folder / images[k])
-        except InputError as error:
-            found[k] = str(error)
-            continue
-        decoded[k] = (pixels.shape[1], pixels.shape[0]), orientation
-        same = digests.setdefault(hashlib.sha256(pixels.tobytes()).digest(), k)
-        if same != k:
-            found[k] = (
-                f"{folder / images[k]}: the same image as {images[same]}; drop one of the frames or take it again"
-            )
-    usual = Counter(size for size, _ in decoded.values()).most_common(1)
-    for k, (size, _) in decoded.items():
-        if size != usual[0][0]:
-            like = images[next(j for j in decoded if decoded[j][0] == usual[0][0])]
-            found[k] = str(other_size(f"{folder / images[k]}: image", size, usual[0][0], like))
-    return decoded
 
 
 def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
@@ -119,7 +99,7 @@ def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> No
         )
 
 
-def read_rigid(value: Any, where: str) -> Float[ndarray, "4 4"]:
+def read_rigid(value: Any, where: str = "matrix") -> Float[ndarray, "4 4"]:
     """Return a rigid 4x4 from nested lists; raise InputError that says how it differs from rigid."""
     try:
         matrix = np.array(value, dtype=np.float64)
@@ -130,13 +110,12 @@ def read_rigid(value: Any, where: str) -> Float[ndarray, "4 4"]:
     return require_rigid(matrix, where)
 
 
-def _rigid(value: Any) -> Float[ndarray, "4 4"]:
-    """Return the rigid transform of a file's rows; an array is one already, and stays as it is to the last bit."""
-    return value if isinstance(value, ndarray) else read_rigid(value, "matrix")
-
-
-RigidMatrix = Annotated[Any, BeforeValidator(_rigid), PlainSerializer(lambda pose: pose.tolist())]
-"""Rigid transform (4,4) in a file."""
+RigidMatrix = Annotated[
+    Any,
+    BeforeValidator(lambda value: value if isinstance(value, ndarray) else read_rigid(value)),
+    PlainSerializer(lambda pose: pose.tolist()),
+]
+"""Rigid transform (4,4) in a file; an array is one already, and stays as it is to the last bit."""
 
 
 def _common_orientation(folder: Path, orientation_of: Mapping[str, int]) -> int:

@@ -1,5 +1,6 @@
 """Conventions in which robots and their controllers write poses: rows of numbers to transforms and back."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,8 +22,6 @@ LEAST_REACH = 0.25
 """Smallest reach of an arm with a camera, m."""
 METRES_LIMIT = 10.0
 """Largest distance of a gripper from its base in metres; in millimetres no gripper stays that near."""
-
-
 QUATERNIONS = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}
 """Notations of quaternions, and where x, y, z, w stand in each."""
 
@@ -49,6 +48,11 @@ class Convention:
         length, _, angle = (f"{self.length}-{self.angle}" if asked == "auto" else asked).partition("-")
         return length, angle
 
+    def scales(self, asked: UnitsName) -> tuple[float, float]:
+        """Return metres per unit of position, radians per unit of angle."""
+        length, angle = self.units(asked)
+        return METRES[length], np.radians(1.0) if angle == "deg" else 1.0
+
 
 _XYZ = ("x", "y", "z")
 _XYZW, _WXYZ = ("qx", "qy", "qz", "qw"), ("qw", "qx", "qy", "qz")
@@ -74,8 +78,6 @@ CONVENTIONS = {
     "unitree": Convention(_XYZ + _RPY, "xyz"),
     "realman": Convention(_XYZ + _WXYZ, "wxyz"),
 }
-
-
 OF_ARM = {
     "ur3e": "ur",
     "ur5e": "ur",
@@ -102,7 +104,7 @@ def numbers_from_poses(
 ) -> Float[ndarray, "n k"]:
     """Return rows in a convention's columns, the inverse of `poses_from_numbers`."""
     form = CONVENTIONS[convention]
-    position_unit, angle_unit = _in_metres_and_radians(form, units)
+    position_unit, angle_unit = form.scales(units)
     position = base_from_gripper[:, :3, 3] / position_unit
     if form.rotation in ("rows", "columns"):
         matrices = transform(base_from_gripper[:, :3, :3], position)
@@ -131,50 +133,40 @@ def checked_rows(
     """Return base_from_gripper (n,4,4) of rows in a convention's columns, and the messages of rows that are no pose.
 
     The pose of such a row is NaN. `units` other than auto override the convention's own. Raises InputError on units
-    that cannot be meant, and on matrices by columns in place of rows.
+    that cannot be meant.
     """
     form = CONVENTIONS[convention]
-    per_m, per_rad = _in_metres_and_radians(form, units)
-    finite = np.asarray((np.abs(numbers) < HUGE).all(axis=1))
-    if form.rotation == "rows":
-        _require_rows(numbers[finite].reshape(-1, 4, 4), where)
-    at = {"rows": [3, 7, 11], "columns": [12, 13, 14]}.get(form.rotation, [0, 1, 2])
-    faults = _check_units(np.where(finite[:, None], numbers, 0.0), at, form, units, where)
-    poses = np.full((len(numbers), 4, 4), np.nan)
-    for row in range(len(numbers)):
-        if not finite[row]:
-            text = f"holds NaN or infinity (or beyond {HUGE:.0e}); record it again or drop the row"
-            faults[row] = f"{where}: pose {row + 1} {text}"
-        if row not in faults:
-            try:
-                poses[row] = _pose(numbers[row], form, per_m, per_rad, f"{where}: pose {row + 1}")
-            except InputError as error:
-                faults[row] = str(error)
-    return poses, faults
-
-
-def _pose(
-    numbers: Float[ndarray, " k"], form: Convention, per_m: float, per_rad: float, where: str
-) -> Float[ndarray, "4 4"]:
-    """Return base_from_gripper of the numbers of one pose; raise InputError where they are none."""
-    if form.rotation in ("rows", "columns"):
-        rows = numbers.reshape(4, 4) if form.rotation == "rows" else numbers.reshape(4, 4).T
-        matrix = transform(rows[:3, :3], rows[:3, 3] * per_m)
-        matrix[3] = rows[3]
-        return require_rigid(matrix, where)
+    per_m, per_rad = form.scales(units)
+    names = [f"{where}: pose {k + 1}" for k in range(len(numbers))]
+    text = f"holds NaN or infinity (or beyond {HUGE:.0e}); record it again or drop the row"
+    unusable = ~(np.abs(numbers) < HUGE).all(axis=1)
+    faults = {k: f"{names[k]} {text}" for k in np.flatnonzero(unusable).tolist()}
+    numbers = np.where(unusable[:, None], 0.0, numbers)
+    is_matrix, rest = form.rotation in ("rows", "columns"), numbers[:, 3:].copy()
+    poses = numbers.reshape(-1, 4, 4) if is_matrix else transform(np.eye(3), numbers[:, :3])
+    poses = np.swapaxes(poses, 1, 2).copy() if form.rotation == "columns" else poses
+    poses[:, :3, 3] *= per_m
+    faults |= far_faults(poses[:, :3, 3], where, names)
+    _require_units(poses[:, :3, 3], rest, form, units, where)
     if form.rotation in QUATERNIONS:
-        quaternion = numbers[3:][QUATERNIONS[form.rotation]]
-        if abs((length := float(np.linalg.norm(quaternion))) - 1) > QUATERNION_TOLERANCE:
-            raise InputError(
-                f"{where}: its quaternion has length {length:.4g}, not 1; check which columns are the quaternion, and "
-                "say how it is written (--pose-convention quat-xyzw or quat-wxyz)"
-            )
-        rotation = Rotation.from_quat(quaternion)
+        length = np.linalg.norm(rest, axis=1)
+        for k in np.flatnonzero(np.abs(length - 1) > QUATERNION_TOLERANCE).tolist():
+            text = f"its quaternion has length {length[k]:.4g}, not 1; check which columns are the quaternion, and "
+            text += "say how it is written (--pose-convention quat-xyzw or quat-wxyz)"
+            faults.setdefault(k, f"{names[k]}: {text}")
+            rest[k] = [1.0, 0.0, 0.0, 0.0]
+        poses[:, :3, :3] = Rotation.from_quat(rest[:, QUATERNIONS[form.rotation]]).as_matrix()
     elif form.rotation == "rotvec":
-        rotation = Rotation.from_rotvec(numbers[3:] * per_rad)
-    else:
-        rotation = Rotation.from_euler(form.rotation, numbers[3:] * per_rad)
-    return transform(rotation.as_matrix(), numbers[:3] * per_m)
+        poses[:, :3, :3] = Rotation.from_rotvec(rest * per_rad).as_matrix()
+    elif not is_matrix:
+        poses[:, :3, :3] = Rotation.from_euler(form.rotation, rest * per_rad).as_matrix()
+    for k in range(len(poses)) if is_matrix else ():
+        try:
+            poses[k] = require_rigid(poses[k], names[k])
+        except InputError as error:
+            faults.setdefault(k, str(error))
+    poses[list(faults)] = np.nan
+    return poses, faults
 
 
 def tolerated(count: int) -> int:
@@ -182,56 +174,39 @@ def tolerated(count: int) -> int:
     return max(1, count // 4)
 
 
-def likely_unit(farthest: float) -> tuple[str, str, int]:
-    """Return the unit of positions too far away for metres: its name, its sign, and how many are a metre."""
-    return ("centimetres", "cm", 100) if farthest < 1000 * LEAST_REACH else ("millimetres", "mm", 1000)
-
-
-def far_rows(position: Float[ndarray, "n 3"]) -> tuple[list[int], float, bool]:
-    """Return the rows that are too far from the base for metres, the farthest distance, and whether they are many."""
+def far_faults(position: Float[ndarray, "n 3"], where: str, names: Sequence[str]) -> dict[int, str]:
+    """Return the messages of single rows too far from the base for metres; raise InputError where many are."""
     distance = np.linalg.norm(np.nan_to_num(position), axis=1)
     rows = np.flatnonzero(distance > METRES_LIMIT).tolist()
-    return rows, float(distance.max(initial=0.0)), len(rows) > tolerated(len(distance))
-
-
-def _require_rows(matrices: Float[ndarray, "n 4 4"], where: str) -> None:
-    """Raise InputError where numbers that should be matrices by rows are by columns."""
-    last = [0, 0, 0, 1]
-    if np.allclose(matrices[:, :, 3], last, atol=1e-9) and not np.allclose(matrices[:, 3], last, atol=1e-9):
+    if len(rows) > tolerated(len(distance)) or (rows and len(distance) == 1):
+        farthest = float(distance.max())
+        is_cm = farthest < 1000 * LEAST_REACH
+        name, short, a_metre = ("centimetres", "cm", 100) if is_cm else ("millimetres", "mm", 1000)
         raise InputError(
-            f"{where}: the 16 numbers of a pose are a matrix by columns, as a Franka gives them: add "
-            "--pose-convention franka"
+            f"{where}: the gripper is up to {farthest:.4g} from the base; these look like {name}: divide the "
+            f"translations by {a_metre} (a pose table: add --pose-units {short}-rad, or {short}-deg where angles are in "
+            "degrees)"
         )
+    text = "m from the base, the others are nearer; record it again"
+    return {k: f"{names[k]} is {distance[k]:.4g} {text}" for k in rows}
 
 
-def _in_metres_and_radians(form: Convention, units: UnitsName) -> tuple[float, float]:
-    """Return metres per unit of position, radians per unit of angle."""
-    length, angle = form.units(units)
-    return METRES[length], np.radians(1.0) if angle == "deg" else 1.0
-
-
-def _check_units(
-    numbers: Float[ndarray, "n k"], at: list[int], form: Convention, units: UnitsName, where: str
-) -> dict[int, str]:
-    """Return messages of single rows that are too far away; raise InputError on units that cannot be meant.
-
-    `at` are the columns of the position.
-    """
-    per_m, per_rad = _in_metres_and_radians(form, units)
-    position = numbers[:, at] * per_m
-    far, farthest, many = far_rows(position)
-    if many or len(position) == 1 and far:
-        name, short, _ = likely_unit(farthest)
+def _require_units(
+    position: Float[ndarray, "n 3"],
+    rest: Float[ndarray, "n r"],
+    form: Convention,
+    units: UnitsName,
+    where: str,
+) -> None:
+    """Raise InputError on units that cannot be meant, by positions (m) and the numbers of the rotations."""
+    per_m, per_rad = form.scales(units)
+    farthest = float(np.linalg.norm(position, axis=1).max(initial=0.0)) / per_m
+    largest = float(np.abs(rest).max(initial=0.0)) if form.has_angles else 0.0
+    if units == "auto" and per_m < 1 and 0 < farthest < METRES_LIMIT:
         raise InputError(
-            f"{where}: the gripper is up to {farthest / per_m:.4g} from the base; these look like {name}: "
-            f"add --pose-units {short}-rad (or {short}-deg where angles are in degrees)"
-        )
-    if units == "auto" and per_m < 1 and 0 < farthest < METRES_LIMIT * per_m:
-        raise InputError(
-            f"{where}: the gripper is at most {farthest / per_m:.4g} from the base, too near for this convention's "
+            f"{where}: the gripper is at most {farthest:.4g} from the base, too near for this convention's "
             "millimetres; for metres add --pose-units m-deg (or m-rad)"
         )
-    largest = float(np.abs(numbers[:, 3:]).max(initial=0.0)) if form.has_angles else 0.0
     if per_rad == 1.0 and largest > RADIANS_LIMIT:
         raise InputError(
             f"{where}: angles go up to {largest:.4g}; these look like degrees: add --pose-units m-deg "
@@ -242,6 +217,3 @@ def _check_units(
             f"{where}: angles are at most {largest:.3g}, too small for this convention's degrees; "
             "for radians add --pose-units mm-rad (or m-rad)"
         )
-    text = "pose {} is {:.4g} m from the base, the others are nearer; record it again"
-    distance = np.linalg.norm(position, axis=1)
-    return {row: f"{where}: {text.format(row + 1, distance[row])}" for row in far}

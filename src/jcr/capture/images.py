@@ -19,10 +19,6 @@ BLURRED = 0.25
 """Share of the usual sharpness below which an image is called blurred."""
 ORIENTATION = 0x0112
 """EXIF tag of the orientation."""
-PNG_DEPTH = 24
-"""Byte of a PNG's header with the bits of a sample."""
-BITS_PER_SAMPLE = 258
-"""TIFF tag of the bits of a sample."""
 DEFECTIVE = 10_000
 """Number of pixels of which one may be defective."""
 BLURRED_EDGE = 1 / 80
@@ -34,6 +30,8 @@ LEAST_CONTRAST = 20
 """Grey levels that the strongest edges climb, or there is none to judge by."""
 ONE_VIEW = 0.5
 """Share of the sum of the squared details of two images; unrelated images differ by the whole sum."""
+DEPTH = "depth"
+"""Folder of depth images: 16-bit PNG in mm, aligned with the colour images, 0 where there is none."""
 DARK, BRIGHT = 12, 243
 """Mean grey levels of 255 beyond which an image shows nothing."""
 
@@ -57,9 +55,10 @@ def read_oriented(path: Path) -> tuple[UInt8[ndarray, "h w 3"], int]:
                 count = getattr(opened, "n_frames", 1)
                 if opened.format != "MPO" and count > 1:
                     raise InputError(f"{path}: holds {count} images; save one as PNG or JPEG")
+                is_deep = ";16" in str(opened.tile)  # Pillow's mode of coloured images does not tell
                 opened.load()
                 orientation = opened.getexif().get(ORIENTATION, 1)
-                if (deep := _sixteen_bit(path, opened)) is not None:
+                if (deep := _sixteen_bit(path, opened, is_deep)) is not None:
                     eight = np.minimum(deep >> (_bits(deep) - 8), 255)
                     shown = Image.fromarray(eight.astype(np.uint8))
                     shown.getexif()[ORIENTATION] = orientation
@@ -76,7 +75,7 @@ def read_oriented(path: Path) -> tuple[UInt8[ndarray, "h w 3"], int]:
     return pixels, orientation if orientation in range(1, 9) else 1
 
 
-def _sixteen_bit(path: Path, opened: Image.Image) -> UInt16[ndarray, "h w *rgb"] | None:
+def _sixteen_bit(path: Path, opened: Image.Image, is_deep: bool) -> UInt16[ndarray, "h w *rgb"] | None:
     """Return the pixels of a 16-bit image, grey or RGB; None of any other. Pillow keeps 8 bits of coloured ones.
 
     Raises InputError for fractions and for more than 16 bits: which values are black and white is not in the file.
@@ -88,21 +87,11 @@ def _sixteen_bit(path: Path, opened: Image.Image) -> UInt16[ndarray, "h w *rgb"]
         if values.min(initial=0) < 0 or values.max(initial=0) > 65535:
             raise InputError(f"{path}: pixels of more than 16 bits; save it with 8 or 16 bits")
         return values.astype(np.uint16)
-    if opened.mode not in ("LA", "RGB", "RGBA") or _depth(path, opened) != 16:
+    if not is_deep:
         return None
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     bgr = cv2.imread(str(path), flags)
     return None if bgr is None or bgr.dtype != np.uint16 else np.asarray(bgr[..., ::-1])
-
-
-def _depth(path: Path, opened: Image.Image) -> int:
-    """Return the bits of a sample of a PNG or a TIFF, which Pillow's mode does not tell; 8 of any other."""
-    if opened.format == "TIFF":
-        return max(opened.tag_v2.get(BITS_PER_SAMPLE, (8,)))  # type: ignore[attr-defined]
-    if opened.format != "PNG":
-        return 8
-    with path.open("rb") as stream:
-        return stream.read(PNG_DEPTH + 1)[PNG_DEPTH]
 
 
 def _bits(deep: UInt16[ndarray, "h w *rgb"]) -> int:
@@ -113,6 +102,23 @@ def _bits(deep: UInt16[ndarray, "h w *rgb"]) -> int:
     rank = -2 - deep.size // DEFECTIVE
     largest = int(np.partition(deep, rank, axis=None)[rank])
     return next(bits for bits in (8, 10, 12, 14, 16) if largest < 1 << bits)
+
+
+def read_depth(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h w"]:
+    """Read the depth along the optical axis (m) at the pixels of images of `size`; 0 where none was measured.
+
+    Raises InputError where the file is no 16-bit grey image of that size.
+    """
+    require_file(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such depth image; correct its name in the capture or add it")
+    depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if depth is None or depth.dtype != np.uint16 or depth.ndim != 2:
+        raise InputError(f"{path}: no depth image of 16 bits and one channel (mm); save it as 16-bit PNG")
+    if (found := depth.shape[::-1]) != size:
+        remedy = "align depth with colour (ROS: align_depth.enable, librealsense: rs.align)"
+        raise other_size(f"{path}: depth", found, size, remedy=remedy)
+    return depth.astype(np.float32) / 1000
 
 
 def other_size(

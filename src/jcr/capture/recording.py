@@ -10,8 +10,7 @@ from numpy import ndarray
 
 from jcr.capture.best_frames import best_frames
 from jcr.capture.checks import checked_capture
-from jcr.capture.depth_images import FOLDER as DEPTH
-from jcr.capture.images import encode_png, sharpness
+from jcr.capture.images import DEPTH, encode_png, sharpness
 from jcr.capture.options import ReadOptions
 from jcr.errors import InputError
 from jcr.files import write_bytes

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from jcr.camera import project, rays
-from jcr.capture.depth_images import read_depth
+from jcr.capture.images import read_depth
 from jcr.geometry import apply, inverse
 from jcr.records import MATCHED, PRIOR, Capture, HandEye, Reconstruction
 

@@ -21,7 +21,7 @@ from jcr.calibration.robot_errors import RobotErrors, robot_errors
 from jcr.calibration.stage import checked
 from jcr.capture.camera_info import IntrinsicsEntry
 from jcr.capture.checks import read_rigid
-from jcr.capture.conventions import far_rows, likely_unit
+from jcr.capture.conventions import far_faults
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
@@ -362,13 +362,7 @@ def checked_pose(base_from_gripper: ArrayLike, where: str) -> Float[ndarray, "4 
             f"{where}: a rotation (3x3) has no translation; give 4x4 with the position in metres"
         )
     pose = read_rigid(base_from_gripper, where)
-    far, farthest, _ = far_rows(pose[None, :3, 3])
-    if far:
-        name, _, a_metre = likely_unit(farthest)
-        raise InputError(
-            f"{where}: the gripper is {farthest:.4g} from the base; that looks like {name}: divide the translation by "
-            f"{a_metre}"
-        )
+    far_faults(pose[None, :3, 3], where, [where])
     return pose
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.capture.depth_images import read_depth
+from jcr.capture.images import read_depth
 from jcr.geometry import apply, inverse
 from jcr.records import Capture, DepthCheck, HandEye, Reconstruction
 

@@ -17,18 +17,16 @@ from jcr.errors import InputError
 SUFFIXES = (".yaml", ".yml", ".json", ".samples")
 PAIRS = (("effector_wrt_world", "object_wrt_sensor"), ("robot", "tracking"))
 """Keys of a sample's gripper pose and marker pose: MoveIt Calibration, easy_handeye2."""
-_ROTATIONS = {
-    "orientation": "quat", "rotation": "quat", "quaternion": "quat", "quat": "quat", "q": "quat", "quat_xyzw": "quat",
-    "quat_wxyz": "wxyz", "rvec": "vector", "rotvec": "vector", "rotation_vector": "vector", "axis_angle": "vector",
-    "rpy": "rpy", "euler": "rpy", "roll_pitch_yaw": "rpy",
-}  # fmt: skip
-"""Notations of a rotation by the names of its key."""
-_NAMES = {
-    "quat": ("qx", "qy", "qz", "qw"), "wxyz": ("qw", "qx", "qy", "qz"), "vector": ("rvec_x", "rvec_y", "rvec_z"),
-    "rpy": ("roll", "pitch", "yaw"),
-}  # fmt: skip
-Entry = dict[str, str] | list[str]
-"""Cells of one pose: by the names of a table's columns, or plain numbers."""
+_XYZW, _WXYZ = ("qx", "qy", "qz", "qw"), ("qw", "qx", "qy", "qz")
+_CELLS_OF_ROTATION = (
+    dict.fromkeys(("orientation", "rotation", "quaternion", "quat", "q", "quat_xyzw"), _XYZW)
+    | dict.fromkeys(("rvec", "rotvec", "rotation_vector", "axis_angle"), ("rvec_x", "rvec_y", "rvec_z"))
+    | dict.fromkeys(("rpy", "euler", "roll_pitch_yaw"), ("roll", "pitch", "yaw"))
+    | {"quat_wxyz": _WXYZ}
+)
+"""Names of a rotation's cells by the name of its key."""
+Entry = dict[str, Any] | list[Any]
+"""Cells of one pose, texts or numbers: by the names of a table's columns, or in order."""
 
 
 def read_content(file: Path) -> Any:
@@ -38,8 +36,7 @@ def read_content(file: Path) -> Any:
 
 def pair_keys(content: Any) -> tuple[str, str] | None:
     """Return the keys of the two poses of each sample; None where a file's content is no list of samples."""
-    entries = _entries(content)
-    first = entries[0] if entries else None
+    first = next(iter(_entries(content)), None)
     return next((keys for keys in PAIRS if isinstance(first, dict) and set(keys) <= first.keys()), None)
 
 
@@ -50,7 +47,7 @@ def read_entries(content: Any, where: str, key: str | None = None) -> list[Entry
         raise InputError(f"{where}: holds no list of poses; write one entry per image")
     if key is not None:
         entries = [entry.get(key) if isinstance(entry, dict) else None for entry in entries]
-    return [_cells(entry, f"{where}: entry {k}") for k, entry in enumerate(entries, start=1)]
+    return [_entry(entry, f"{where}: entry {k}") for k, entry in enumerate(entries, start=1)]
 
 
 def _entries(content: Any) -> list[Any]:
@@ -65,73 +62,63 @@ def _entries(content: Any) -> list[Any]:
     return next((value for value in lists if isinstance(value[0], dict | list)), [])
 
 
-def _cells(entry: Any, where: str) -> Entry:
-    """Return the cells of one entry; InputError where it holds no pose."""
+def _entry(entry: Any, where: str) -> Entry:
+    """Return the cells of one entry; raise InputError where it holds no pose."""
     if isinstance(entry, list) and len(entry) not in (3, 4, 12, 16) and all(map(_is_plain, entry)):
-        return [_text(value) for value in entry]
-    cells = dict[str, str]()
-    for name, text in _flattened(entry, ""):
-        if cells.setdefault(name, text) != text:
+        return entry
+    cells = dict[str, Any]()
+    for name, cell in _cells(entry, ""):
+        if cells.setdefault(name, cell) != cell:
             raise InputError(f"{where}: holds two values of {name[:20]}; give one pose per entry")
     if "m00" in cells and "m03" not in cells and {"x", "y", "z"} <= cells.keys():
         cells |= {f"m{row}3": cells.pop(axis) for row, axis in enumerate("xyz")}
     if not cells:
-        raise InputError(
-            f"{where}: {shown(entry)} is no pose; give position and orientation, or a 4x4 matrix"
-        )
+        text = "is no pose; give position and orientation, or a 4x4 matrix"
+        raise InputError(f"{where}: {shown(entry)} {text}")
     return cells
 
 
-def _flattened(value: Any, key: str) -> Iterator[tuple[str, str]]:
+def _cells(value: Any, key: str) -> Iterator[tuple[str, Any]]:
     """Yield names and cells of a pose and of its parts; `key` is the key of the value."""
-    rotation = _ROTATIONS.get(key)
+    names = _CELLS_OF_ROTATION.get(key)
     if isinstance(value, dict):
-        lower = {str(name).lower(): part for name, part in value.items()}
-        seconds = next((lower[name] for name in ("sec", "secs") if name in lower), None)
-        nanoseconds = next((lower[name] for name in ("nanosec", "nsecs") if name in lower), 0)
+        parts = {str(name).lower(): part for name, part in value.items()}
+        seconds, nanoseconds = (
+            parts.get("sec", parts.get("secs")),
+            parts.get("nanosec", parts.get("nsecs", 0)),
+        )
         if type(seconds) is int and type(nanoseconds) is int:
-            yield "timestamp", str(seconds * 10**9 + nanoseconds)
-        elif set("xyzw") <= lower.keys():
-            yield from ((f"q{axis}", _text(lower[axis])) for axis in "xyzw")
-        elif rotation is not None and set("xyz") <= lower.keys():
-            yield from _of_list([lower[axis] for axis in "xyz"], rotation)
+            yield "timestamp", seconds * 10**9 + nanoseconds
+        elif set("xyzw") <= parts.keys():
+            yield from ((f"q{axis}", parts[axis]) for axis in "xyzw")
+        elif names is not None and set("xyz") <= parts.keys():
+            yield from _cells([parts[axis] for axis in "xyz"], key)
         else:
-            for name, part in lower.items():
+            for name, part in parts.items():
                 if name not in dict(PAIRS).values():
-                    yield from _flattened(part, name)
+                    yield from _cells(part, name)
     elif isinstance(value, list):
-        yield from _of_list(value, rotation)
+        yield from _cells_of_list(value, names)
     elif key and _is_plain(value):
-        yield key, _text(value)
+        yield key, value
 
 
-def _of_list(value: list[Any], rotation: str | None) -> Iterator[tuple[str, str]]:
-    """Yield the cells of a matrix, a quaternion, three numbers of a rotation, or a position."""
-    if value and all(isinstance(row, list) for row in value):
-        rows, columns = len(value), {len(row) for row in value}
-        if rows not in (3, 4) or not columns <= {3, 4} or len(columns) > 1:
-            return
-        value = [cell for row in value for cell in row]
-        width = columns.pop()
-    else:
-        width = 4 if len(value) in (12, 16) else 0
-    if not all(map(_is_plain, value)):
+def _cells_of_list(value: list[Any], names: tuple[str, ...] | None) -> Iterator[tuple[str, Any]]:
+    """Yield the cells of a matrix, of a rotation whose cells have these names, or of a position."""
+    rows = [row if isinstance(row, list) else [row] for row in value]
+    flat, widths = [cell for row in rows for cell in row], {len(row) for row in rows}
+    width = {9: 3, 12: 4, 16: 4}.get(len(flat), 0)
+    if not all(map(_is_plain, flat)) or not widths <= {1, width}:
         return
     if width:
-        yield from ((f"m{k // width}{k % width}", _text(cell)) for k, cell in enumerate(value))
-    elif len(value) == 4:
-        yield from zip(_NAMES[rotation or "quat"], map(_text, value), strict=False)
-    elif len(value) == 3:
-        of_rotation = ("rx", "ry", "rz") if rotation in (None, "quat", "wxyz") else _NAMES[rotation]
-        names = ("x", "y", "z") if rotation is None else of_rotation
-        yield from zip(names, map(_text, value), strict=True)
+        yield from ((f"m{k // width}{k % width}", cell) for k, cell in enumerate(flat))
+    elif len(flat) == 4:
+        yield from zip(names or _XYZW, flat, strict=False)
+    elif len(flat) == 3:
+        angles = ("rx", "ry", "rz") if names in (_XYZW, _WXYZ) else names
+        yield from zip(angles or "xyz", flat, strict=True)
 
 
 def _is_plain(value: Any) -> bool:
     """Return whether a value is text or a number."""
     return isinstance(value, str | int | float) and not isinstance(value, bool)
-
-
-def _text(value: Any) -> str:
-    """Return the text of a cell."""
-    return value if isinstance(value, str) else repr(value)

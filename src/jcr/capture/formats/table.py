@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,8 +15,8 @@ from numpy import ndarray
 from jcr.capture.camera_info import FILE, read_camera_info
 from jcr.capture.checks import checked_capture, require_frames
 from jcr.capture.conventions import CONVENTIONS, checked_rows, tolerated
-from jcr.capture.depth_images import depth_beside
 from jcr.capture.formats import Format, pose_lists
+from jcr.capture.images import DEPTH
 from jcr.capture.options import ConventionName, ReadOptions, UnitsName
 from jcr.capture.pairing import pair_with_images, stamp_ns
 from jcr.capture.plain_files import read_npy, read_text, shown
@@ -55,9 +55,9 @@ _DECIMAL_COMMA = re.compile(r"^([+-]?\d+),(\d+(?:[eE][+-]?\d+)?)$")
 
 @dataclass(frozen=True, kw_only=True)
 class PoseColumns:
-    """Columns of a file of poses as text."""
+    """Columns of a file of poses: texts or numbers."""
 
-    cells: dict[str, tuple[str, ...]]
+    cells: dict[str, tuple[Any, ...]]
     """Cells by the columns' names: lower case, without units; tx, pos_x, q_x … as x and qx."""
     units: frozenset[str] = frozenset()
     """Units that the names give: of mm, cm, m, deg, rad."""
@@ -103,9 +103,18 @@ def read(path: Path, options: ReadOptions) -> Capture:
     table = read_pose_table(file, options)
     images, poses, faults, notes = pair_with_images(folder, file, table, options)
     capture, _ = checked_capture(folder, images, poses, str(file), faults)
-    depths = depth_beside(folder, capture.images)
-    capture = replace(capture, source=file, notes=(*notes, *capture.notes), depths=depths)
-    return replace(with_camera_info(capture, options), pose_convention=table.convention)
+    names = [f"{DEPTH}/{Path(name).stem}.png" for name in capture.images]
+    depths = tuple(name if (folder / name).is_file() else None for name in names)
+    info = options.camera_info or folder / FILE
+    known = options.camera_info is not None or info.is_file()
+    return replace(
+        capture,
+        source=file,
+        notes=(*notes, *capture.notes),
+        depths=depths if any(depths) else None,
+        intrinsics=read_camera_info(info, capture.image_size) if known else None,
+        pose_convention=table.convention,
+    )
 
 
 def find_table(path: Path) -> Path | None:
@@ -115,29 +124,58 @@ def find_table(path: Path) -> Path | None:
     return next((path / name for name in TABLES if (path / name).is_file()), None)
 
 
-def with_camera_info(capture: Capture, options: ReadOptions) -> Capture:
-    """Return the capture with the intrinsics of a camera_info YAML, where there is one and it has none yet."""
-    file = options.camera_info or capture.folder / FILE
-    if options.camera_info is None and (capture.intrinsics is not None or not file.is_file()):
-        return capture
-    return replace(capture, intrinsics=read_camera_info(file, capture.image_size))
-
-
 def read_pose_table(file: Path, options: ReadOptions) -> PoseTable:
     """Read the poses of a file; InputError naming the column at fault, or the option that it needs."""
-    columns = read_columns(file, options)
-    image = next((columns.cells[name] for name in _IMAGE if name in columns.cells), None)
-    stamp = next((columns.cells[name] for name in _STAMP if name in columns.cells), None)
-    require_frames(0 if image is None else len(image), str(file), 0)
-    convention = convention_of(columns, options, str(file))
-    poses, faults = poses_of_columns(columns, replace(options, pose_convention=convention), str(file))
-    stamps = None if stamp is None else np.array([stamp_ns(text, str(file)) for text in stamp])
+    if file.suffix in pose_lists.SUFFIXES:
+        entries = pose_lists.read_entries(pose_lists.read_content(file), str(file))
+        return pose_table(columns_of_entries(entries, options, str(file)), options, str(file))
+    return pose_table(_columns(*_read_rows(file), options, str(file)), options, str(file))
+
+
+def pose_table(columns: PoseColumns, options: ReadOptions, where: str) -> PoseTable:
+    """Return the poses of named columns, NaN for a few rows that hold none; raise InputError where more hold none."""
+    cells = columns.cells
+    image, stamp = (
+        next((cells[name] for name in names if name in cells), None) for names in (_IMAGE, _STAMP)
+    )
+    require_frames(0 if image is None else len(image), where, 0)
+    convention = _convention_of(columns, options, where)
+    wanted, rows = CONVENTIONS[convention].columns, len(next(iter(cells.values())))
+    if set(_LAST_ROW) <= set(wanted) and not set(_LAST_ROW) & set(cells):
+        cells = cells | {name: (cell,) * rows for name, cell in _LAST_ROW.items()}
+    if missing := [name for name in wanted if name not in cells]:
+        raise InputError(
+            f"{where}: no column {', '.join(missing)}, which --pose-convention {convention} needs; "
+            f"it has {', '.join(cells)}"
+        )
+    numbers, texts = np.full((rows, len(wanted)), np.nan), dict[int, str]()
+    for k, name in enumerate(wanted):
+        for row, cell in enumerate(cells[name]):
+            if (number := _number(cell)) is not None:
+                numbers[row, k] = number
+            else:
+                text = f"{shown(cell)} is not a number; correct or drop the row"
+                texts.setdefault(row, f"{where}: row {row + 1}, column {name}: {text}")
+    units = options.pose_units
+    if units == "auto" and columns.units:
+        length, angle = CONVENTIONS[convention].units()
+        length = next((unit for unit in ("mm", "cm", "m") if unit in columns.units), length)
+        angle = next((unit for unit in ("deg", "rad") if unit in columns.units), angle)
+        units = next(units for units in get_args(UnitsName) if units == f"{length}-{angle}")
+    poses, faults = checked_rows(numbers, convention, units, where)
+    faults |= texts
+    if len(faults) > tolerated(rows):
+        raise InputError(faults[min(faults)])
     return PoseTable(
-        base_from_gripper=poses, images=image, stamp_ns=stamps, convention=convention, faults=faults
+        base_from_gripper=poses,
+        images=None if image is None else tuple(map(str, image)),
+        stamp_ns=None if stamp is None else np.array([stamp_ns(str(cell), where) for cell in stamp]),
+        convention=convention,
+        faults=faults,
     )
 
 
-def convention_of(columns: PoseColumns, options: ReadOptions, where: str) -> ConventionName:
+def _convention_of(columns: PoseColumns, options: ReadOptions, where: str) -> ConventionName:
     """Return the convention of named columns: the one of the options, or the one that the names show."""
     if options.pose_convention != "auto" or columns.convention != "auto":
         return options.pose_convention if options.pose_convention != "auto" else columns.convention
@@ -155,62 +193,12 @@ def convention_of(columns: PoseColumns, options: ReadOptions, where: str) -> Con
     )
 
 
-def poses_of_columns(
-    columns: PoseColumns, options: ReadOptions, where: str
-) -> tuple[Float[ndarray, "n 4 4"], dict[int, str]]:
-    """Return base_from_gripper (n,4,4), NaN for a few rows that hold no pose, and the messages of these rows."""
-    convention = convention_of(columns, options, where)
-    wanted = CONVENTIONS[convention].columns
-    cells, rows = columns.cells, len(next(iter(columns.cells.values())))
-    if set(_LAST_ROW) <= set(wanted) and not set(_LAST_ROW) & set(cells):
-        cells = cells | {name: (cell,) * rows for name, cell in _LAST_ROW.items()}
-    if missing := [name for name in wanted if name not in cells]:
-        raise InputError(
-            f"{where}: no column {', '.join(missing)}, which --pose-convention {convention} needs; "
-            f"it has {', '.join(cells)}"
-        )
-    numbers, faults = np.full((rows, len(wanted)), np.nan), dict[int, str]()
-    for k, name in enumerate(wanted):
-        for row, cell in enumerate(cells[name]):
-            if is_number(cell):
-                numbers[row, k] = float(cell)
-            else:
-                text = f"{shown(cell)} is not a number; correct or drop the row"
-                faults.setdefault(row, f"{where}: row {row + 1}, column {name}: {text}")
-    units = _units(convention, columns.units, options)
-    poses, wrong = checked_rows(numbers, convention, units, where)
-    faults = wrong | faults
-    if len(faults) > tolerated(rows):
-        raise InputError(faults[min(faults)])
-    return poses, faults
-
-
-def is_number(cell: str) -> bool:
-    """Return whether a cell is a number, as Python's own floats are written."""
+def _number(cell: Any) -> float | None:
+    """Return a cell as a number, as Python's own floats are written; None where it is none."""
     try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def _units(convention: str, named: frozenset[str], options: ReadOptions) -> UnitsName:
-    """Return the units of the options, else of the columns' names, and for the rest of the convention."""
-    if options.pose_units != "auto" or not named:
-        return options.pose_units
-    length, angle = CONVENTIONS[convention].units()
-    length = next((unit for unit in ("mm", "cm", "m") if unit in named), length)
-    angle = next((unit for unit in ("deg", "rad") if unit in named), angle)
-    return next(units for units in get_args(UnitsName) if units == f"{length}-{angle}")
-
-
-def read_columns(file: Path, options: ReadOptions) -> PoseColumns:
-    """Read the named columns of a file."""
-    if file.suffix in pose_lists.SUFFIXES:
-        entries = pose_lists.read_entries(pose_lists.read_content(file), str(file))
-        return columns_of_entries(entries, options, str(file))
-    header, rows = _read_rows(file)
-    return _columns(header, rows, options, str(file))
+        return float(cell)
+    except (TypeError, ValueError, OverflowError):
+        return None
 
 
 def columns_of_entries(entries: Sequence[pose_lists.Entry], options: ReadOptions, where: str) -> PoseColumns:
@@ -223,7 +211,7 @@ def columns_of_entries(entries: Sequence[pose_lists.Entry], options: ReadOptions
 
 
 def _columns(
-    header: Sequence[str] | None, rows: list[list[str]], options: ReadOptions, where: str
+    header: Sequence[str] | None, rows: Sequence[Sequence[Any]], options: ReadOptions, where: str
 ) -> PoseColumns:
     """Return columns by their names; InputError where a row has too many or too few cells."""
     if not rows:
@@ -241,20 +229,17 @@ def _columns(
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise InputError(f"{where}: two columns are named {', '.join(sorted(twice))}; keep one")
-    convention: ConventionName = "auto"
-    for cell in header:
-        convention = _EXPLICIT.get(cell, convention)
     return PoseColumns(
         cells=dict(zip(names, cells, strict=True)),
         units=frozenset(units) - {"", "s", "ns"},
-        convention=convention,
+        convention=next((_EXPLICIT[cell] for cell in header if cell in _EXPLICIT), "auto"),
     )
 
 
-def _named(where: str, columns: list[tuple[str, ...]], options: ReadOptions) -> dict[str, tuple[str, ...]]:
+def _named(where: str, columns: list[tuple[Any, ...]], options: ReadOptions) -> dict[str, tuple[Any, ...]]:
     """Name columns without a header: an image's name in front, or a stamp, and then those of the convention."""
-    named = dict[str, tuple[str, ...]]()
-    if not is_number(columns[0][0]):
+    named = dict[str, tuple[Any, ...]]()
+    if _number(columns[0][0]) is None:
         named["image"] = columns.pop(0)
     convention = options.pose_convention
     if convention == "auto":
@@ -278,10 +263,14 @@ def _named(where: str, columns: list[tuple[str, ...]], options: ReadOptions) -> 
     return named | dict(zip(wanted, columns, strict=True))
 
 
-def _read_rows(file: Path) -> tuple[Sequence[str] | None, list[list[str]]]:
+def _read_rows(file: Path) -> tuple[Sequence[str] | None, Sequence[Sequence[Any]]]:
     """Read the header, None where there is none, and the cells of every row."""
     if file.suffix == ".npy":
-        return None, _rows_of_array(file)
+        array = read_npy(file)
+        if array.dtype.kind not in "fiu" or array.ndim not in (2, 3) or not array.size:
+            text = "no table of numbers; save (n,4,4) matrices or (n,k) rows with numpy.save"
+            raise InputError(f"{file}: {text}")
+        return None, array.reshape(len(array), -1).tolist()
     lines = [line.strip() for line in read_text(file).splitlines() if line.strip()]
     comments = [line.lstrip("# ") for line in lines if line.startswith("#")]
     lines = [line for line in lines if not line.startswith("#")]
@@ -300,7 +289,7 @@ def _read_rows(file: Path) -> tuple[Sequence[str] | None, list[list[str]]]:
     rows = [[cell.strip().strip('"') for cell in row] for row in rows]
     if separator != ",":  # as spreadsheets write numbers where the comma is the decimal mark
         rows = [[_DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in row] for row in rows]
-    if rows and not any(map(is_number, rows[0])):
+    if rows and all(_number(cell) is None for cell in rows[0]):
         return rows[0], rows[1:]
     # TUM and ethz-asl write the names of their columns as a comment.
     for comment in reversed(comments):
@@ -323,16 +312,8 @@ def _rows_of_ur(file: Path, lines: list[str]) -> tuple[Sequence[str], list[list[
             raise InputError(
                 f"{file}: line {number} holds no p[x, y, z, rx, ry, rz] as the others: {shown(line)}; correct or drop it"
             )
-    first = () if len(rows[0]) == 6 else ("timestamp" if is_number(rows[0][0]) else "image",)
+    first = () if len(rows[0]) == 6 else ("image",) if _number(rows[0][0]) is None else ("timestamp",)
     return (*first, "x", "y", "z", "ur_x", "ur_y", "ur_z"), rows
-
-
-def _rows_of_array(file: Path) -> list[list[str]]:
-    """Return the cells of a NumPy array of matrices or rows of numbers."""
-    array = read_npy(file)
-    if array.dtype.kind not in "fiu" or array.ndim not in (2, 3) or not array.size:
-        raise InputError(f"{file}: no table of numbers; save (n,4,4) matrices or (n,k) rows with numpy.save")
-    return [[repr(value) for value in row] for row in array.reshape(len(array), -1).tolist()]
 
 
 def _name_and_unit(cell: str) -> tuple[str, str]:
