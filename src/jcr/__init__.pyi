@@ -77,7 +77,7 @@ from .scene.options import CloudOptions as CloudOptions
 from .scene.options import MapOptions as MapOptions
 from .scene.robot import RobotSpheres as RobotSpheres
 from .scene.robot import load_robot as load_robot
-from .scene.sample import Sample as Sample
+from .scene.scene_map import Sample as Sample
 from .scene.scene_map import SceneMap as SceneMap
 from .segments.measure import Measurement as Measurement
 from .segments.options import SegmentOptions as SegmentOptions

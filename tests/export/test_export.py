@@ -26,6 +26,7 @@ from jcr.cli import dispatch
 from jcr.errors import InputError, RejectedError
 from jcr.export import ros
 from jcr.export.formats import FORMATS, export_run
+from jcr.export.options import ExportOptions
 from jcr.export.provenance import Provenance
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics, PointCloud, Tracks
@@ -226,11 +227,11 @@ def test_urdf_of_wrist_and_fixed_cameras_of_two_arms_is_one_tree(tmp_path: Path)
 
     wrist, second = camera("tool0", "wrist"), camera("tool0", "second")
     path = tmp_path / "cell.urdf"
-    path.write_text(ros.urdf(wrist, second))
+    path.write_text(ros.urdf(wrist, [second]))
     assert yourdfpy.URDF.load(path).base_link == "tool0"  # no frame that the run does not need
     right = replace(camera("base_link", "right_base_link"), base="base_link")
     path.write_text(
-        ros.urdf(wrist, second, camera("base_link", "overhead"), camera("tool0", "eye", "right_"), right)
+        ros.urdf(wrist, [second, camera("base_link", "overhead"), camera("tool0", "eye", "right_"), right])
     )
     robot = yourdfpy.URDF.load(path)
     children = [joint.child for joint in robot.robot.joints]
@@ -322,7 +323,7 @@ def test_colmap_model_reprojects_its_points_exactly(
     from jcr.export.views import write_colmap
 
     out = tmp_path / "model"
-    write_colmap(out, views, Provenance("base_link", DOUBT), undistorted, link=False)
+    write_colmap(out, views, Provenance("base_link", DOUBT), ExportOptions(undistort=undistorted))
     model = pycolmap.Reconstruction()
     getattr(model, read)(str(out / "sparse" / "0"))
     assert model.num_images() == 3
@@ -364,7 +365,8 @@ def test_nerfstudio_cameras_see_the_points_where_the_images_do(
         image=zeros,
         camera_centers_in_base=np.zeros((1, 3)),
     )
-    write_nerfstudio(out, views, cloud, Provenance("base_link"), undistorted, link=not undistorted)
+    options = ExportOptions(undistort=undistorted, link_images=not undistorted)
+    write_nerfstudio(out, views, cloud, Provenance("base_link"), options)
     content = json.loads((out / "transforms.json").read_text())
     assert content["about"]["frame"] == "base_link" and content["about"]["unit"] == "m"
     assert len(content["frames"]) == 3
@@ -399,7 +401,7 @@ def test_images_rotated_by_a_tag_are_copied_upright(views: "PosedImages", tmp_pa
     source = views.folder / views.images[0]
     pixels = read_image(source)
     Image.fromarray(pixels).save(source, exif=tag)
-    write_colmap(tmp_path / "model", views, Provenance("base_link"), undistorted=False, link=True)
+    write_colmap(tmp_path / "model", views, Provenance("base_link"), ExportOptions(link_images=True))
     copied = tmp_path / "model" / "images" / "left_0.png"
     assert not copied.is_symlink() and (copied.parent / "left_1.png").is_symlink()
     np.testing.assert_array_equal(read_image(copied), pixels[::-1, ::-1])

@@ -13,8 +13,7 @@ pytestmark = pytest.mark.slow  # torch
 
 
 def test_rays_cross_what_is_before_a_wall_and_hit_the_wall() -> None:
-    from jcr.scene.carve import carve
-    from jcr.scene.seen import CROSSED, HIT
+    from jcr.scene.seen import CROSSED, HIT, carve
 
     side = np.linspace(-0.05, 0.05, 101)
     wall = np.stack([*np.meshgrid(side, side), np.full((101, 101), 0.002)], -1).reshape(-1, 3)
@@ -35,9 +34,8 @@ def test_rays_cross_what_is_before_a_wall_and_hit_the_wall() -> None:
 
 def test_priors_make_surfaces_and_nothing_free() -> None:
     from jcr.scene.build import build_scene
-    from jcr.scene.carve import carve
     from jcr.scene.options import MapOptions
-    from jcr.scene.seen import CROSSED, HIT
+    from jcr.scene.seen import CROSSED, HIT, carve
 
     whole = analytic_scene.cloud(20_000)
     left = whole.points_in_base[:, 0] < 0

@@ -120,20 +120,6 @@ def test_joints_move_the_spheres_as_in_yourdfpy(urdf: Path):
     assert robot.centers(q.reshape(2, 2, 3)).shape == (2, 2, len(robot.radii), 3)
 
 
-def test_a_changed_mesh_is_loaded_again(urdf: Path, tmp_path: Path):
-    import trimesh
-
-    from jcr.scene.robot import load_robot
-
-    shutil.copytree(urdf.parent, tmp_path / "robot")
-    copy = tmp_path / "robot" / urdf.name
-    before = load_robot(copy)
-    assert load_robot(copy) is before
-    trimesh.creation.icosphere(radius=30.0).export(copy.parent / "wedge.stl")
-    after = load_robot(copy)
-    assert after.radii.max() > 1.5 * before.radii[before.link == before.links.index("slide")].max()
-
-
 def test_the_arm_touches_the_ball_where_it_bends_into_it(scene: "SceneMap", urdf: Path):
     from jcr.scene.robot import load_robot
     from jcr.scene.scene_map import FREE, OCCUPIED, UNKNOWN

@@ -1,8 +1,7 @@
 """Table of export formats for calibration and map of a run."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
@@ -23,22 +22,45 @@ from jcr.options import checked_options
 from jcr.run_folder import RunFolder
 
 if TYPE_CHECKING:
-    from jcr.calibration.record import Calibration
     from jcr.cell.placement import CameraPlacement
     from jcr.export.views import PosedImages
-    from jcr.records import Intrinsics, PointCloud
-    from jcr.scene.scene_map import SceneMap
+    from jcr.records import Intrinsics
 
 
 @dataclass(frozen=True)
 class ExportFormat:
     """Row of the table."""
 
-    name: ExportName
+    name: str
     file: str
     """Default name in OUT/export; ends with / for a folder."""
     about: str
-    write: Callable[["Run", Path], None]
+    writer: str
+    """Module and function of this package, imported when it is called, because torch and pycolmap take seconds. Those
+    of `ros` return a text; the others take the path to write first."""
+    contents: str
+    """Attributes of `Run` that the writer takes."""
+
+
+_TABLE = """
+ros2 | hand_eye.launch.xml | static_transform_publisher line and launch file | ros.ros2_launch | mount others
+moveit | hand_eye.launch.py | launch file as MoveIt Calibration saves it | ros.moveit_launch | mount
+urdf | hand_eye.urdf | camera link and fixed joint | ros.urdf | mount others
+easy_handeye2 | hand_eye.calib | .calib for its publisher | ros.easy_handeye2 | mount path.stem
+camera_info | camera_info.yaml | intrinsics for camera_info_manager | ros.camera_info | mount
+ply | cloud.ply | points, colours, labels | views.write_ply | folder.cloud provenance
+glb | map.glb | mesh of the seen surface with colours | volume.write_glb | folder.scene provenance
+octomap | map.bt | occupied, free and unknown voxels | volume.write_octomap | folder.scene provenance options
+esdf | esdf.npz | voxels of signed distance | volume.write_esdf | folder.scene provenance options
+spheres | spheres.npz | spheres that cover what is solid | volume.write_spheres | folder.scene provenance options
+nerfstudio | nerfstudio/ | transforms.json, images and first points for a splat or NeRF | views.write_nerfstudio | \
+    views folder.cloud provenance options
+colmap | colmap/ | COLMAP model in the base frame, binary and text | views.write_colmap | views provenance options
+rerun | run.rrd | recording for the Rerun viewer | rrd.write_rrd | views folder.cloud folder.scene provenance
+"""
+FORMATS = tuple(
+    ExportFormat(*map(str.strip, row.split("|"))) for row in _TABLE.replace("\\\n", "").strip().splitlines()
+)
 
 
 def export_run(
@@ -72,41 +94,42 @@ def write_run(
         )
     if options.root_from_optical and not options.to_root:
         raise InputError("--root-from-optical: needs --to-root LINK, the link it is given in")
-    run = Run(out, options)
+    path = path or out / "export" / row.file
+    run = Run(out, options, path)
     if run.doubt is not None and not options.force:
         raise RejectedError(
             f"{out}: its calibration is rejected, and nothing was exported: {run.doubt}; to export it nevertheless, "
             "with this reason in the file, add --force"
         )
-    path = path or out / "export" / row.file
     if path.is_dir() and not row.file.endswith("/"):
         raise InputError(f"{path}: is a folder; name a file for {row.name}")
     before = path.read_bytes() if path.is_file() else None
-    row.write(run, path)
+    module, function = row.writer.split(".")
+    write: Any = getattr(import_module(f"jcr.export.{module}"), function)
+    values = [attrgetter(content)(run) for content in row.contents.split()]
+    values = [value() if callable(value) else value for value in values]
+    if module == "ros":
+        write_text(path, write(*values))
+    else:
+        write(path, *values)
     return run, row, path, before is not None and path.read_bytes() != before
 
 
 class Run:
     """Run folder with export options; only the data that a format needs are read."""
 
-    def __init__(self, out: Path, options: ExportOptions) -> None:
-        self.options, self.folder = options, RunFolder(out)
+    def __init__(self, out: Path, options: ExportOptions, path: Path) -> None:
+        self.options, self.folder, self.path = options, RunFolder(out), path
+        self.calibration = self.folder.calibration()
         if self.calibration.parent_from_camera is None:
             raise InputError(
-                f"{out}: found no calibration to export ({self.doubt}); run it on a fixed capture"
+                f"{out}: found no calibration to export ({self.calibration.doubt}); run it on a fixed capture"
             )
-
-    @cached_property
-    def calibration(self) -> "Calibration":
-        """calibration.json."""
-        return self.folder.calibration()
-
-    @property
-    def doubt(self) -> str | None:
+        self.camera = None if options.camera is None else self._camera(options.camera)
+        self.doubt = self.calibration.doubt
         """Reason for the rejection of the calibration, or of the chosen camera; None where it is accepted."""
-        if self.calibration.doubt is not None or self.options.camera is None:
-            return self.calibration.doubt
-        return self._camera(self.options.camera).doubt
+        if self.doubt is None and self.camera is not None:
+            self.doubt = self.camera.doubt
 
     @property
     def provenance(self) -> Provenance:
@@ -117,14 +140,21 @@ class Run:
     @property
     def mount(self) -> ros.CameraMount:
         """Mount of the exported camera, under the frame names of the options."""
-        options = self.options
-        if options.camera is not None:
-            mount = self._mount_of(self._camera(options.camera), options.child_frame)
+        options, found = self.options, self.calibration
+        if self.camera is not None:
+            mount = self._mount_of(self.camera, options.child_frame)
+        elif options.intrinsics == "estimated":
+            intrinsics = None if found.intrinsics is None else found.intrinsics.record()
+            matrix = np.array(found.parent_from_camera)
+            mount = self._named(found.mount, options.child_frame, matrix, self.doubt, intrinsics)
+        elif (kept := found.with_given_intrinsics) is None:
+            raise InputError(
+                f"--intrinsics given: {self.folder.path} has no transform for given intrinsics: the capture gave "
+                "none, or no others were estimated beside them; leave it out"
+            )
         else:
-            fixed = self.calibration.mount == "base"
-            parent_from_camera, intrinsics = self._pair
-            parent = options.base_frame if fixed else options.parent_frame
-            mount = self._named(parent_from_camera, parent, options.child_frame, self.doubt, intrinsics)
+            pair = np.array(kept.gripper_from_camera), self.doubt, kept.intrinsics.record()
+            mount = self._named(found.mount, options.child_frame, *pair)
         if options.to_root is None:
             return mount
         if options.root_from_optical is None:
@@ -139,33 +169,18 @@ class Run:
         return ros.on_root(mount, options.to_root, transform(rotation, np.array([x, y, z])))
 
     @property
-    def _pair(self) -> "tuple[Float[ndarray, '4 4'], Intrinsics | None]":
-        """parent_from_camera and the intrinsics that it belongs to: the estimated ones, or those of the capture."""
-        if self.options.intrinsics == "estimated":
-            found = self.calibration.intrinsics
-            return np.array(self.calibration.parent_from_camera), None if found is None else found.record()
-        kept = self.calibration.with_given_intrinsics
-        if kept is None:
-            raise InputError(
-                f"--intrinsics given: {self.folder.path} has no transform for given intrinsics: the capture gave "
-                "none, or no others were estimated beside them; leave it out"
-            )
-        return np.array(kept.gripper_from_camera), kept.intrinsics.record()
-
-    @property
     def others(self) -> list[ros.CameraMount]:
         """Accepted further cameras (with `force` also rejected ones) and arms; none where one camera is chosen."""
         cameras = self.folder.cameras()
-        if cameras is None or self.options.camera is not None:
+        if cameras is None or self.camera is not None:
             return []
         mounts = [
             self._mount_of(camera, f"{camera.name}_optical_frame")
             for camera in cameras.cameras
             if camera.parent_from_camera is not None and (camera.doubt is None or self.options.force)
         ]
-        base = self.options.base_frame
         return mounts + [
-            self._named(np.array(arm.base_from_other_base), base, f"{arm.name}_{base}")
+            self._named("base", f"{arm.name}_{self.options.base_frame}", np.array(arm.base_from_other_base))
             for arm in cameras.arms
         ]
 
@@ -181,42 +196,31 @@ class Run:
 
     def _mount_of(self, camera: "CameraPlacement", child: str) -> ros.CameraMount:
         """Return the mount of a further camera."""
-        parent = self.options.base_frame if camera.mount == "base" else self.options.parent_frame
         intrinsics = None if camera.intrinsics is None else camera.intrinsics.record()
-        return self._named(
-            np.array(camera.parent_from_camera), parent, child, camera.doubt, intrinsics, camera.arm
-        )
+        matrix = np.array(camera.parent_from_camera)
+        return self._named(camera.mount, child, matrix, camera.doubt, intrinsics, camera.arm)
 
     def _named(
         self,
-        parent_from_child: Float[ndarray, "4 4"],
-        parent: str,
+        on: str,
         child: str,
+        parent_from_child: Float[ndarray, "4 4"],
         doubt: str | None = None,
         intrinsics: "Intrinsics | None" = None,
         arm: str | None = None,
     ) -> ros.CameraMount:
-        """Return a mount; the frames of another arm have its name in front."""
+        """Return a mount on the base or the gripper; the frames of another arm have its name in front."""
         of_arm = "" if arm is None else f"{arm}_"
+        base, effector = of_arm + self.options.base_frame, of_arm + self.options.parent_frame
         return ros.CameraMount(
-            parent=of_arm + parent,
+            parent=base if on == "base" else effector,
             child=child,
             parent_from_child=parent_from_child,
-            base=of_arm + self.options.base_frame,
-            effector=of_arm + self.options.parent_frame,
+            base=base,
+            effector=effector,
             doubt=doubt,
             intrinsics=intrinsics,
         )
-
-    @property
-    def cloud(self) -> "PointCloud":
-        """cloud.ply."""
-        return self.folder.cloud()
-
-    @property
-    def scene(self) -> "SceneMap":
-        """map.safetensors."""
-        return self.folder.scene()
 
     @property
     def views(self) -> "PosedImages":
@@ -232,105 +236,3 @@ class Run:
         base_from_recon = self.calibration.base_from_recon.rigid
         capture = self.folder.capture_of(self.calibration)
         return posed_images(capture, self.folder.reconstruction(), base_from_recon, scale)
-
-
-def _written(name: str, *contents: str) -> Callable[[Run, Path], None]:
-    """Return the writer `name` (module.function of this package), given these contents and options of a run.
-
-    The module is imported when the writer is called, because torch and pycolmap take seconds.
-    """
-    module, function = name.split(".")
-
-    def write(run: Run, path: Path) -> None:
-        """Write a file or folder."""
-        values = [attrgetter(content)(run) for content in contents]
-        getattr(import_module(f"jcr.export.{module}"), function)(path, *values)
-
-    return write
-
-
-def _text(text: Callable[[Run, Path], str]) -> Callable[[Run, Path], None]:
-    """Return the writer of a text."""
-    return lambda run, path: write_text(path, text(run, path))
-
-
-FORMATS = (
-    ExportFormat(
-        "ros2",
-        "hand_eye.launch.xml",
-        "static_transform_publisher line and launch file",
-        _text(lambda run, path: ros.ros2_launch(run.mount, *run.others)),
-    ),
-    ExportFormat(
-        "moveit",
-        "hand_eye.launch.py",
-        "launch file as MoveIt Calibration saves it",
-        _text(lambda run, path: ros.moveit_launch(run.mount)),
-    ),
-    ExportFormat(
-        "urdf",
-        "hand_eye.urdf",
-        "camera link and fixed joint",
-        _text(lambda run, path: ros.urdf(run.mount, *run.others)),
-    ),
-    ExportFormat(
-        "easy_handeye2",
-        "hand_eye.calib",
-        ".calib for its publisher",
-        _text(lambda run, path: ros.easy_handeye2(run.mount, path.stem)),
-    ),
-    ExportFormat(
-        "camera_info",
-        "camera_info.yaml",
-        "intrinsics for camera_info_manager",
-        _text(lambda run, path: ros.camera_info(run.mount)),
-    ),
-    ExportFormat(
-        "ply", "cloud.ply", "points, colours, labels", _written("views.write_ply", "cloud", "provenance")
-    ),
-    ExportFormat(
-        "glb",
-        "map.glb",
-        "mesh of the seen surface with colours",
-        _written("volume.write_glb", "scene", "provenance"),
-    ),
-    ExportFormat(
-        "octomap",
-        "map.bt",
-        "occupied, free and unknown voxels",
-        _written("volume.write_octomap", "scene", "provenance", "options.voxel_size"),
-    ),
-    ExportFormat(
-        "esdf",
-        "esdf.npz",
-        "voxels of signed distance",
-        _written("volume.write_esdf", "scene", "provenance", "options.unknown", "options.voxel_size"),
-    ),
-    ExportFormat(
-        "spheres",
-        "spheres.npz",
-        "spheres that cover what is solid",
-        _written("volume.write_spheres", "scene", "provenance", "options.unknown", "options.excess"),
-    ),
-    ExportFormat(
-        "nerfstudio",
-        "nerfstudio/",
-        "transforms.json, images and first points for a splat or NeRF",
-        _written(
-            "views.write_nerfstudio",
-            *("views", "cloud", "provenance", "options.undistort", "options.link_images"),
-        ),
-    ),
-    ExportFormat(
-        "colmap",
-        "colmap/",
-        "COLMAP model in the base frame, binary and text",
-        _written("views.write_colmap", "views", "provenance", "options.undistort", "options.link_images"),
-    ),
-    ExportFormat(
-        "rerun",
-        "run.rrd",
-        "recording for the Rerun viewer",
-        _written("rrd.write_rrd", "views", "cloud", "scene", "provenance"),
-    ),
-)

@@ -4,7 +4,7 @@ Every text names its frames, its units, the intrinsics that belong to it, and th
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -96,7 +96,7 @@ def urdf_origin(parent_from_child: Float[ndarray, "4 4"]) -> str:
     return f'<origin xyz="{" ".join(map(_number, xyz))}" rpy="{" ".join(map(_number, rpy))}"/>'
 
 
-def ros2_launch(mount: CameraMount, *others: CameraMount) -> str:
+def ros2_launch(mount: CameraMount, others: Sequence[CameraMount] = ()) -> str:
     """Return a ROS 2 launch file (XML) that publishes the transform, and those of further cameras and arms."""
     nodes = []
     for k, one in enumerate((mount, *others)):
@@ -138,7 +138,7 @@ def generate_launch_description() -> LaunchDescription:
 '''
 
 
-def urdf(mount: CameraMount, *others: CameraMount) -> str:
+def urdf(mount: CameraMount, others: Sequence[CameraMount] = ()) -> str:
     """Return a URDF with one root: a fixed joint for each camera and further arm.
 
     Where cameras on a gripper and in the base are both present, a floating joint stands for the arm between them.

@@ -17,6 +17,7 @@ from PIL import Image
 from jcr.camera import pinhole_inside, project, undistort_image, unproject
 from jcr.capture.images import encode_png, read_image
 from jcr.errors import InputError
+from jcr.export.options import ExportOptions
 from jcr.export.provenance import Provenance
 from jcr.geometry import apply_similarity, inverse, scale_translation
 from jcr.records import COEFFICIENTS, Capture, Intrinsics, PointCloud, Reconstruction, Tracks
@@ -70,7 +71,7 @@ def write_ply(path: Path, cloud: PointCloud, provenance: Provenance) -> None:
 
 
 def write_nerfstudio(
-    folder: Path, views: PosedImages, cloud: PointCloud, provenance: Provenance, undistorted: bool, link: bool
+    folder: Path, views: PosedImages, cloud: PointCloud, provenance: Provenance, options: ExportOptions
 ) -> None:
     """Write transforms.json, images/ and points.ply (initial points of a splat) into a new folder.
 
@@ -78,7 +79,7 @@ def write_nerfstudio(
     the scene unless called with `--orientation-method none --center-method none --auto-scale-poses False`.
     """
     with _new_folder(folder) as made:
-        names, intrinsics = _place_images(made / "images", views, undistorted, link)
+        names, intrinsics = _place_images(made / "images", views, options)
         content = {
             **_nerfstudio_camera(intrinsics),
             "ply_file_path": "points.ply",
@@ -115,12 +116,10 @@ def _nerfstudio_camera(intrinsics: Intrinsics) -> dict[str, str | float]:
     }
 
 
-def write_colmap(
-    folder: Path, views: PosedImages, provenance: Provenance, undistorted: bool, link: bool
-) -> None:
+def write_colmap(folder: Path, views: PosedImages, provenance: Provenance, options: ExportOptions) -> None:
     """Write images/ and sparse/0, as binary and as text, with every track into a new folder."""
     with _new_folder(folder) as made:
-        names, intrinsics = _place_images(made / "images", views, undistorted, link)
+        names, intrinsics = _place_images(made / "images", views, options)
         model = _colmap_model(views, names, intrinsics)
         model.extract_colors_for_all_images(str(made / "images"))
         sparse = made / "sparse" / "0"
@@ -162,15 +161,13 @@ def _colmap_model(views: PosedImages, names: list[str], intrinsics: Intrinsics) 
     return model
 
 
-def _place_images(
-    folder: Path, views: PosedImages, undistorted: bool, link: bool
-) -> tuple[list[str], Intrinsics]:
+def _place_images(folder: Path, views: PosedImages, options: ExportOptions) -> tuple[list[str], Intrinsics]:
     """Copy, link or undistort the images into a new folder; return their names and the intrinsics that then hold."""
     folder.mkdir()
     names = [Path(image).name for image in views.images]
     if len(set(names)) < len(names):
         names = [image.replace("/", "_") for image in views.images]
-    if undistorted:
+    if options.undistort:
         names = [f"{Path(name).stem}.png" for name in names]
         pinhole = pinhole_inside(views.intrinsics, max(views.intrinsics.width, views.intrinsics.height))
         for image, name in zip(views.images, names, strict=True):
@@ -184,7 +181,7 @@ def _place_images(
         if is_rotated:  # some readers ignore the tag
             names[k] = f"{Path(name).stem}.png"
             (folder / names[k]).write_bytes(encode_png(read_image(source)))
-        elif link:
+        elif options.link_images:
             (folder / name).symlink_to(source)
         else:
             shutil.copyfile(source, folder / name)

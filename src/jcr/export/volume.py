@@ -4,7 +4,7 @@ The first three query the map itself, so that they answer as `SceneMap.check_sph
 """
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -12,26 +12,27 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.errors import InputError
+from jcr.export.options import ExportOptions
 from jcr.export.provenance import Provenance
 from jcr.extras import extra
 from jcr.files import write_bytes, written_whole
+from jcr.scene.robot import cover_with_spheres
 from jcr.scene.scene_map import FREE, OCCUPIED, SceneMap
-from jcr.scene.spheres import cover_with_spheres
 from jcr.scene.surface import surface_mesh
 
 MAX_VOXELS = 50_000_000
 _SIGN = "positive outside of what is solid, negative inside, metres (cuRobo wants the negative)"
 
 
-def write_octomap(path: Path, scene: SceneMap, provenance: Provenance, voxel: float | None = None) -> None:
-    """Write a binary OctoMap (.bt) with voxels of side `voxel` m, by default the map's cell.
+def write_octomap(path: Path, scene: SceneMap, provenance: Provenance, options: ExportOptions) -> None:
+    """Write a binary OctoMap (.bt) with voxels of side `voxel_size` m, by default the map's cell.
 
     A voxel is occupied when the sphere inscribed in it touches a seen surface, free when that sphere touches
     neither a surface nor anything unseen; all others are left out, which are unknown to OctoMap.
     Raises InputError without pyoctomap, and where the voxels would be too many.
     """
     octomap: Any = extra("pyoctomap", "planning", "an OctoMap")
-    voxel = _voxel(scene, voxel)
+    voxel = _voxel(scene, options.voxel_size)
     # OctoMap's voxels lie between whole multiples of their side; those that the workspace holds are asked.
     low, high = np.ceil(scene.box[0] / voxel - 1e-6), np.floor(scene.box[1] / voxel + 1e-6)
     centers = _centers(low * voxel, (high - low).astype(int), voxel).reshape(-1, 3)
@@ -45,21 +46,15 @@ def write_octomap(path: Path, scene: SceneMap, provenance: Provenance, voxel: fl
     write_bytes(path, first + b"\n" + comments.encode() + rest)
 
 
-def write_esdf(
-    path: Path,
-    scene: SceneMap,
-    provenance: Provenance,
-    unknown: Literal["occupied", "free"] | None = None,
-    voxel: float | None = None,
-) -> None:
-    """Write the signed distance at the centres of voxels of side `voxel` m, by default the map's cell, as .npz.
+def write_esdf(path: Path, scene: SceneMap, provenance: Provenance, options: ExportOptions) -> None:
+    """Write the signed distance at the centres of voxels of side `voxel_size` m, by default the map's cell, as .npz.
 
     Unseen space counts as occupied by default.
     `values` (nx,ny,nz) with x slowest, as cuRobo lays out its voxel tensor; `origin` (3,) the centre of the
     first voxel; `voxel_size`; `dims` (3,) the sides of the grid; `pose` (7,) its centre and quaternion w x y z,
     as cuRobo wants them; and as text `frame`, `unit`, `sign`, `unknown`.
     """
-    voxel, unknown = _voxel(scene, voxel), unknown or "occupied"
+    voxel, unknown = _voxel(scene, options.voxel_size), options.unknown or "occupied"
     count = np.floor((scene.box[1] - scene.box[0]) / voxel + 1e-6).astype(int)
     centers = _centers(scene.box[0], count, voxel)
     values = scene.query(centers.reshape(-1, 3), unknown).distance.reshape(count)
@@ -85,20 +80,14 @@ def _write_npz(path: Path, provenance: Provenance, **arrays: object) -> None:
         )
 
 
-def write_spheres(
-    path: Path,
-    scene: SceneMap,
-    provenance: Provenance,
-    unknown: Literal["occupied", "free"] | None = None,
-    excess: float | None = None,
-) -> None:
+def write_spheres(path: Path, scene: SceneMap, provenance: Provenance, options: ExportOptions) -> None:
     """Write spheres that hold solid space and reach at most `excess` m beyond it as .npz: `centers` (n,3), `radii` (n,).
 
     Unseen space counts as free by default. The default excess is two of the map's cells; space is sampled in steps of
     a quarter of it.
     """
-    unknown = unknown or "free"
-    excess = 2 * scene.cell if excess is None else excess
+    unknown = options.unknown or "free"
+    excess = 2 * scene.cell if options.excess is None else options.excess
     step = _voxel(scene, excess / 4)
     count = np.ceil((scene.box[1] - scene.box[0]) / step - 1e-6).astype(int)
     points = _centers(scene.box[0], count, step)

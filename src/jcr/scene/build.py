@@ -14,13 +14,11 @@ from threadpoolctl import threadpool_limits
 from jcr.errors import InputError
 from jcr.progress import Progress, silent
 from jcr.records import PointCloud
-from jcr.scene.carve import carve
 from jcr.scene.fields import Field, Fields, FieldShape, Lattice
 from jcr.scene.options import MapOptions
-from jcr.scene.rays import NEAR, Rays, workspace_box, workspace_rays
 from jcr.scene.scene_map import SceneMap
-from jcr.scene.seen import HIT, SeenGrid, dilate, halve, without_doubts
-from jcr.scene.train import RECIPES, Recipe, train
+from jcr.scene.seen import HIT, SeenGrid, carve, dilate, halve, without_doubts
+from jcr.scene.train import NEAR, RECIPES, train, workspace_box, workspace_rays
 
 
 def build_scene(
@@ -41,7 +39,9 @@ def build_scene(
             raise InputError(
                 "the cloud holds numbers that are not finite; remove those points and map the rest"
             )
-    box, cell = _workspace(cloud, options)
+    box = workspace_box(cloud, options.workspace)
+    cell = max(options.cell, float(np.prod(box[1] - box[0]) / options.max_cells) ** (1 / 3))
+    box[1] = box[0] + np.ceil((box[1] - box[0]) / cell - 1e-6) * cell
     rays = workspace_rays(cloud, values or {}, box, cell, device)
     report = progress or silent
 
@@ -58,7 +58,14 @@ def build_scene(
         seen = carve(*ends, box, cell / 2, cloud.cleared, device)
         carved = time.perf_counter()
         lattices = feature_lattices(seen) if recipe.grids else []
-        shapes = _field_shapes(rays, len(cloud.label_names), recipe)
+        # Occupancy in one network, all properties of surfaces in another.
+        heads = {name: target.shape[-1] for name, target in rays.targets.items() if name != "label"}
+        if "label" in rays.targets:
+            heads["label"] = len(cloud.label_names)
+        shapes = [
+            FieldShape(group, recipe.hidden, recipe.frequencies, grids)
+            for group, grids in (({"occupancy": 1}, recipe.grids), (heads, recipe.surface_grids))
+        ]
         generator = torch.Generator().manual_seed(options.map_seed)
         fields = Fields(shapes, seen.box, lattices, generator).to(device)
         steps = list(pool.map(fit, fields.of))
@@ -69,25 +76,6 @@ def build_scene(
             "training_s": f"{time.perf_counter() - carved:.3f}",
         }
     return SceneMap(fields, without_doubts(seen), cloud.label_names, history)
-
-
-def _workspace(cloud: PointCloud, options: MapOptions) -> tuple[Float[ndarray, "2 3"], float]:
-    """Return the box of the map, whole cells along every axis, and the side of a cell (m)."""
-    box = workspace_box(cloud, options.workspace)
-    cell = max(options.cell, float(np.prod(box[1] - box[0]) / options.max_cells) ** (1 / 3))
-    box[1] = box[0] + np.ceil((box[1] - box[0]) / cell - 1e-6) * cell
-    return box, cell
-
-
-def _field_shapes(rays: Rays, labels: int, recipe: Recipe) -> list[FieldShape]:
-    """Return the networks to train: occupancy in one, all properties of surfaces in another."""
-    heads = {name: target.shape[-1] for name, target in rays.targets.items() if name != "label"}
-    if "label" in rays.targets:
-        heads["label"] = labels
-    return [
-        FieldShape(group, recipe.hidden, recipe.frequencies, grids)
-        for group, grids in (({"occupancy": 1}, recipe.grids), (heads, recipe.surface_grids))
-    ]
 
 
 def feature_lattices(seen: SeenGrid) -> list[Lattice]:

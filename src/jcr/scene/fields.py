@@ -4,8 +4,10 @@
 are metres of the base frame; each encoding scales them by itself.
 """
 
+import itertools
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -252,3 +254,28 @@ class Fields(nn.Module):
         for shape, field in zip(self.shapes, self.of, strict=True):
             if name in shape.heads and isinstance(field.encoding, GridEncoding):
                 field.encoding.expand()
+
+
+CHUNK = {"cpu": 1 << 15, "cuda": 1 << 22}
+
+
+def in_chunks(ask: Callable[..., tuple[Tensor, ...]], *columns: Tensor) -> tuple[Tensor, ...]:
+    """Return what `ask` returns for the rows of `columns`, called piece by piece and joined.
+
+    Gradients are kept where a column wants them. Without them, each core takes pieces of its own.
+    """
+    wanted = any(column.requires_grad for column in columns)
+
+    def answer(piece: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        with torch.inference_mode(not wanted):
+            return ask(*piece)
+
+    device = columns[0].device.type
+    pieces = list(zip(*(column.split(CHUNK[device]) for column in columns), strict=True))
+    if wanted or len(pieces) == 1 or device != "cpu":
+        answers = [answer(piece) for piece in pieces]
+    else:
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+            answers = list(pool.map(answer, pieces))
+    with torch.inference_mode(not wanted):
+        return tuple(torch.cat(column) for column in itertools.zip_longest(*answers))

@@ -8,7 +8,7 @@ from torch.nn import functional as F
 
 from jcr.records import PointCloud
 from jcr.scene.fields import SinusoidalEncoding, linear
-from jcr.scene.rays import workspace_box
+from jcr.scene.train import workspace_box
 
 FREQUENCIES, HIDDEN, BATCH, RATE = 10, 256, 6144, 5e-3
 """Frequencies of NeRF's encoding of position; hidden units; points a step; learning rate of Adam."""

@@ -1,21 +1,18 @@
 """Spheres that cover the collision shapes of a robot's URDF, and their positions for joint values."""
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Integer
 from numpy import ndarray
 from scipy.ndimage import distance_transform_edt
 
 from jcr.capture.urdf_chain import joints_to, load_urdf
 from jcr.errors import InputError
 from jcr.geometry import apply, rotation_exp, transform
-from jcr.scene.spheres import cover_with_spheres
 
 if TYPE_CHECKING:
     import trimesh
@@ -25,22 +22,9 @@ VOXELS = 100_000
 """Largest number of voxels in the bounding box of a shape."""
 
 JointValues = Float[ndarray, "*batch dof"] | Mapping[str, Float[ndarray, "*batch"] | float]
-
-
-@dataclass(frozen=True, kw_only=True)
-class RobotJoint:
-    """Joint between two links, which are rows of `RobotSpheres.links`."""
-
-    parent: int
-    child: int
-    parent_from_joint: Float[ndarray, "4 4"]
-    axis: Float[ndarray, "3"]
-    slides: bool
-    column: int | None
-    """Column of the joint values; None for a fixed joint."""
-    factor: float
-    offset: float
-    """Value of the joint = factor · column + offset, for joints that mimic another one."""
+Joint = tuple[int, int, Float[ndarray, "4 4"], Float[ndarray, "3"], bool, int | None, float, float]
+"""Rows of parent and child link, parent_from_joint, axis, whether it slides, column of its joint values (None: fixed),
+and factor and offset of its value from the column's, for joints that mimic another one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +34,7 @@ class RobotSpheres:
     links: tuple[str, ...]
     joint_names: tuple[str, ...]
     """Joints that move, in the order of the URDF: the order of joint values."""
-    joints: tuple[RobotJoint, ...]
+    joints: tuple[Joint, ...]
     link: Int[ndarray, " s"]
     """Row of `links` that each sphere is fixed to."""
     centers_in_link: Float[ndarray, "s 3"]
@@ -58,8 +42,7 @@ class RobotSpheres:
 
     def without(self, names: tuple[str, ...]) -> "RobotSpheres":
         """Return the robot without the spheres of some links; raise InputError for a link that it does not have."""
-        unknown = set(names) - set(self.links)
-        if unknown:
+        if unknown := set(names) - set(self.links):
             raise InputError(f"links {sorted(unknown)}: the robot has only {', '.join(self.links)}")
         kept = ~np.isin(self.link, [self.links.index(name) for name in names])
         return replace(
@@ -72,27 +55,9 @@ class RobotSpheres:
         Values are in the order of `joint_names`, or a mapping from these names to values (…). Raises
         InputError for other names, another number of values, or one that is not finite.
         """
-        values = self._in_order(joint_values)
-        batch = values.shape[:-1]
-        root_from_link = np.broadcast_to(np.eye(4), (len(self.links), *batch, 4, 4)).copy()
-        for joint in self.joints:
-            pose = root_from_link[joint.parent] @ joint.parent_from_joint
-            if joint.column is not None:
-                along = (joint.factor * values[..., joint.column] + joint.offset)[..., None] * joint.axis
-                still = np.zeros(3)
-                pose = pose @ (
-                    transform(np.eye(3), along) if joint.slides else transform(rotation_exp(along), still)
-                )
-            root_from_link[joint.child] = pose
-        pose = np.moveaxis(root_from_link[self.link], 0, -3)
-        return (pose[..., :3, :3] @ self.centers_in_link[:, :, None])[..., 0] + pose[..., :3, 3]
-
-    def _in_order(self, joint_values: JointValues) -> Float[ndarray, "*batch dof"]:
-        """Return joint values in the order of `joint_names`; raise InputError for unusable ones."""
         names = ", ".join(self.joint_names)
         if isinstance(joint_values, Mapping):
-            wrong = set(joint_values) ^ set(self.joint_names)
-            if wrong:
+            if wrong := set(joint_values) ^ set(self.joint_names):
                 raise InputError(f"joints {sorted(wrong)}: missing or unknown; the robot's are {names}")
             columns = [np.asarray(joint_values[name], float) for name in self.joint_names]
             joint_values = np.stack(np.broadcast_arrays(*columns), -1)
@@ -103,36 +68,29 @@ class RobotSpheres:
             )
         if not np.isfinite(values).all():
             raise InputError("joint values: one is not finite; give radians, or metres where a joint slides")
-        return values
+        root_from_link = np.broadcast_to(np.eye(4), (len(self.links), *values.shape[:-1], 4, 4)).copy()
+        for parent, child, parent_from_joint, axis, slides, column, factor, offset in self.joints:
+            pose = root_from_link[parent] @ parent_from_joint
+            if column is not None:
+                along = (factor * values[..., column] + offset)[..., None] * axis
+                turned, moved = (np.eye(3), along) if slides else (rotation_exp(along), np.zeros(3))
+                pose = pose @ transform(turned, moved)
+            root_from_link[child] = pose
+        pose = np.moveaxis(root_from_link[self.link], 0, -3)
+        return (pose[..., :3, :3] @ self.centers_in_link[:, :, None])[..., 0] + pose[..., :3, 3]
 
 
 def load_robot(urdf: str | Path, excess: float = 0.01) -> RobotSpheres:
     """Load the robot of a URDF file, its collision shapes covered by spheres that stick out by about `excess` (m).
 
-    Boxes, cylinders, spheres and meshes; a link without collision shape has no spheres. The result is kept, so
-    that the robot of unchanged files is quick to load again. Raises InputError where the file or a mesh of it cannot be
-    read, or nothing is there to collide with.
+    Boxes, cylinders, spheres and meshes; a link without collision shape has no spheres. Raises InputError where the
+    file or a mesh of it cannot be read, or nothing is there to collide with.
     """
     path = Path(urdf)
     if not path.is_file():
         raise InputError(f"{path}: no such URDF file")
     if not excess > 0:
         raise InputError(f"excess {excess}: give metres above 0, e.g. 0.01")
-    return _load(path.resolve(), _times_ns(path.resolve()), excess)
-
-
-def _times_ns(path: Path) -> tuple[int, ...]:
-    """Return when the URDF file and each of its meshes that exists were changed."""
-    import yourdfpy
-
-    names = re.findall(r'filename\s*=\s*["\']([^"\']+)', path.read_text("utf-8", errors="replace"))
-    meshes = (Path(yourdfpy.filename_handler_magic(name, dir=path.parent)) for name in names)
-    return tuple(file.stat().st_mtime_ns for file in (path, *meshes) if file.is_file())
-
-
-@lru_cache(maxsize=8)
-def _load(path: Path, times_ns: tuple[int, ...], excess: float) -> RobotSpheres:
-    """Return the spheres of the robot in an existing file; `times_ns` tells changed files apart."""
     import yourdfpy
 
     tree = load_urdf(path)
@@ -174,7 +132,7 @@ def _load(path: Path, times_ns: tuple[int, ...], excess: float) -> RobotSpheres:
     )
 
 
-def _joints(robot: "yourdfpy.URDF", links: tuple[str, ...], path: Path) -> tuple[RobotJoint, ...]:
+def _joints(robot: "yourdfpy.URDF", links: tuple[str, ...], path: Path) -> tuple[Joint, ...]:
     """Return the joints of a robot, parents before children."""
     joints = []
     for joint in sorted(robot.robot.joints, key=lambda joint: len(joints_to(robot, joint.child))):
@@ -184,22 +142,18 @@ def _joints(robot: "yourdfpy.URDF", links: tuple[str, ...], path: Path) -> tuple
         if (mimic := joint.mimic) is not None:
             leader, offset = mimic.joint, mimic.offset or 0.0
             factor = 1.0 if mimic.multiplier is None else mimic.multiplier
-        moves = joint.type != "fixed"
-        if moves and leader not in robot.actuated_joint_names:
-            raise InputError(f"{path}: joint {joint.name} mimics {leader}, which is not an independent joint")
+        column = None
+        if joint.type != "fixed":
+            if leader not in robot.actuated_joint_names:
+                raise InputError(
+                    f"{path}: joint {joint.name} mimics {leader}, which is not an independent joint"
+                )
+            column = robot.actuated_joint_names.index(leader)
         axis = np.array([1.0, 0.0, 0.0] if joint.axis is None else joint.axis, float)
-        joints.append(
-            RobotJoint(
-                parent=links.index(joint.parent),
-                child=links.index(joint.child),
-                parent_from_joint=np.eye(4) if joint.origin is None else np.asarray(joint.origin, float),
-                axis=axis / np.linalg.norm(axis),
-                slides=joint.type == "prismatic",
-                column=robot.actuated_joint_names.index(leader) if moves else None,
-                factor=factor,
-                offset=offset,
-            )
-        )
+        parent_from_joint = np.eye(4) if joint.origin is None else np.asarray(joint.origin, float)
+        ends = links.index(joint.parent), links.index(joint.child)
+        slides = joint.type == "prismatic"
+        joints.append((*ends, parent_from_joint, axis / np.linalg.norm(axis), slides, column, factor, offset))
     return tuple(joints)
 
 
@@ -224,3 +178,29 @@ def spheres_of_shape(
     index, radii = cover_with_spheres(distance, pitch, excess)
     centers = apply(np.asarray(voxels.transform), index - 1.0)
     return apply(link_from_shape, centers), radii
+
+
+def cover_with_spheres(
+    distance: Float[ndarray, "x y z"], step: float, excess: float
+) -> tuple[Integer[ndarray, "k 3"], Float[ndarray, " k"]]:
+    """Return grid indices of centres and radii (m) of spheres that hold every voxel that may touch solid space.
+
+    `distance` is the signed distance (m) from solid space at the voxels' centres, `step` the voxels' side. A sphere
+    about c of radius excess - d(c) reaches at most `excess` beyond solid space, because d changes by no more than
+    the way gone; solid space lies in voxels with d at most half their diagonal. The deepest voxel that is not
+    covered becomes the next centre; a voxel is covered where its whole cube is.
+    """
+    half = 0.5 * np.sqrt(3.0) * step
+    left = distance <= half
+    candidates = np.argwhere(left)
+    candidates = candidates[np.argsort(distance[left], kind="stable")]
+    radii, chosen = excess - distance, []
+    for at in candidates:
+        if left[tuple(at)]:
+            reach = float(radii[tuple(at)] - half) / step
+            low, high = np.maximum(at - int(reach), 0), np.minimum(at + int(reach) + 1, left.shape)
+            x, y, z = np.ogrid[*map(slice, low - at, high - at)]
+            left[*map(slice, low, high)] &= x * x + y * y + z * z > reach * reach
+            chosen.append(at)
+    index = np.array(chosen, dtype=int).reshape(-1, 3)
+    return index, radii[tuple(index.T)].astype(np.float64)

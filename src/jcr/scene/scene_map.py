@@ -3,10 +3,12 @@
 import copy
 import json
 import threading
+from collections.abc import Callable
 from dataclasses import asdict
+from functools import cached_property
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -20,11 +22,9 @@ from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.geometry import apply, require_rigid
 from jcr.records.notebook import table
-from jcr.scene.chunks import in_chunks
 from jcr.scene.distance import DistanceGrid, distance_grid
-from jcr.scene.fields import Fields, FieldShape, Lattice
+from jcr.scene.fields import Fields, FieldShape, Lattice, in_chunks
 from jcr.scene.robot import JointValues, RobotSpheres, load_robot
-from jcr.scene.sample import Sample
 from jcr.scene.seen import CROSSED, HIT, SeenGrid, dilate, halve
 
 FREE, OCCUPIED, UNKNOWN = 0, 1, 2
@@ -33,6 +33,104 @@ FREE, OCCUPIED, UNKNOWN = 0, 1, 2
 Unknown = Literal["occupied", "free", "report"]
 FORMAT = "jcr.map/1"
 """Format of the file that `SceneMap.save` writes and map_file.py reads."""
+
+
+class Sample:
+    """Values of the map at n points, each computed when it is first used; arrays or tensors, as the points were."""
+
+    def __init__(
+        self, scene: "SceneMap", x_in_base: Float[Tensor, "n 3"], *, unknown: str, tensors: bool
+    ) -> None:
+        self._map, self._x, self._unknown_as, self._tensors = scene, x_in_base, unknown, tensors
+
+    @property
+    def occupancy(self) -> Any:
+        """Probability (n,) of solid space; in unseen space one half, or as `unknown` of the query chose."""
+        return self._occupancy_unknown[0]
+
+    @property
+    def unknown(self) -> Any:
+        """Mask (n,) of unseen points: no ray passed and no surface was seen, or outside of the workspace."""
+        return self._occupancy_unknown[1]
+
+    @property
+    def distance(self) -> Any:
+        """Metres (n,) to the nearest surface, negative inside; NaN outside of the workspace."""
+        return self._distance_gradient[0]
+
+    @property
+    def gradient(self) -> Any:
+        """Gradient (n,3) of the distance: points away from the nearest surface; NaN outside of the workspace."""
+        return self._distance_gradient[1]
+
+    @cached_property
+    def color(self) -> Any:
+        """RGB (n,3) in [0, 1] of the colour field, trained on surfaces; NaN outside of the workspace."""
+        return self._continuous("color", 0.0, 1.0)
+
+    @cached_property
+    def label(self) -> Any:
+        """Row (n,) of the map's `label_names`; 0 = none, also in unseen space."""
+        scene = self._map
+
+        def label(x: Tensor) -> tuple[Tensor]:
+            if "label" not in scene.properties:
+                return (torch.zeros(len(x), dtype=torch.int64, device=x.device),)
+            return (torch.where(scene.seen.at(x) > 0, scene.fields(x, ("label",))["label"].argmax(1), 0),)
+
+        return self._answers(label)[0]
+
+    @cached_property
+    def values(self) -> dict[str, Any]:
+        """Further continuous properties (n,d) that the map was trained with; NaN outside of the workspace."""
+        further = [name for name in self._map.properties if name not in ("occupancy", "color", "label")]
+        return {name: self._continuous(name, -np.inf, np.inf) for name in further}
+
+    @cached_property
+    def _occupancy_unknown(self) -> tuple[Any, ...]:
+        """Occupancy and unknown (n,)."""
+        unseen = {"occupied": 1.0, "free": 0.0, "report": 0.5}[self._unknown_as]
+
+        def occupancy_unknown(x: Tensor) -> tuple[Tensor, Tensor]:
+            state = self._map.seen.at(x)
+            # Most of a workspace is unseen, where the field need not be evaluated.
+            unknown = state == 0
+            occupancy = torch.where(unknown, unseen, 0.0)
+            (seen,) = (~unknown).nonzero(as_tuple=True)
+            if len(seen) == 0:
+                return occupancy, unknown
+            inner = self._map.fields(x[seen], ("occupancy",))["occupancy"][:, 0].sigmoid()
+            # A cell that was hit but not crossed lies behind the surface: it can be solid, never free.
+            known = ((state[seen] & CROSSED) != 0) | (inner >= 0.5)
+            occupancy = occupancy.index_put((seen,), torch.where(known, inner, unseen))
+            return occupancy, unknown.index_put((seen,), ~known)
+
+        return self._answers(occupancy_unknown)
+
+    @cached_property
+    def _distance_gradient(self) -> tuple[Any, ...]:
+        """Distance (n,) and gradient (n,3)."""
+        grid = self._map.distance_grid("occupied" if self._unknown_as == "occupied" else "free")
+
+        def distance_gradient(x: Tensor) -> tuple[Tensor, Tensor]:
+            answer = torch.where(self._map.seen.index(x)[1][:, None], grid.at(x), torch.nan)
+            return answer[:, 0], answer[:, 1:]
+
+        return self._answers(distance_gradient)
+
+    def _continuous(self, name: str, low: float, high: float) -> Any:
+        """Return a property between two bounds; NaN outside of the workspace."""
+
+        def continuous(x: Tensor) -> tuple[Tensor]:
+            value = self._map.fields(x, (name,))[name].clamp(low, high)
+            return (torch.where(self._map.seen.index(x)[1][:, None], value, torch.nan),)
+
+        return self._answers(continuous)[0]
+
+    def _answers(self, ask: Callable[[Tensor], tuple[Tensor, ...]]) -> tuple[Any, ...]:
+        """Return the answers at all points as tensors or arrays, as the points were."""
+        answers = in_chunks(ask, self._x)
+        return answers if self._tensors else tuple(answer.cpu().numpy() for answer in answers)
 
 
 class SceneMap:
@@ -102,8 +200,7 @@ class SceneMap:
         or (report) as one half and as no surface. Raises InputError on a wrong shape or a value that is not
         finite.
         """
-        _check_choice(unknown)
-        x, tensors = self._points(x_in_base, "points"), isinstance(x_in_base, Tensor)
+        x, tensors = self._points(x_in_base, "points", unknown), isinstance(x_in_base, Tensor)
         return Sample(self, x, unknown=unknown, tensors=tensors)
 
     def check_spheres(
@@ -118,12 +215,11 @@ class SceneMap:
         touches; with "free" only seen surfaces count; "report" answers FREE, OCCUPIED or UNKNOWN (0, 1, 2).
         Raises InputError on a wrong shape, a value that is not finite or a negative radius.
         """
-        _check_choice(unknown)
         centers = np.asarray(centers_in_base)
         if centers.ndim == 0 or centers.shape[-1] != 3:
             raise InputError(f"sphere centres: expected shape (…, 3) in metres, got {centers.shape}")
         batch = centers.shape[:-1]
-        x = self._points(centers.reshape(-1, 3), "sphere centres")
+        x = self._points(centers.reshape(-1, 3), "sphere centres", unknown)
         try:
             radius = np.broadcast_to(np.asarray(radii, np.float32), batch)
         except ValueError:
@@ -173,9 +269,9 @@ class SceneMap:
     ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
         """Test whether a robot touches something at joint values (…,dof); answers as `check_spheres`.
 
-        `robot` is a URDF file, or what `jcr.scene.robot.load_robot` made of it: spheres that cover the
-        collision shapes. Joint values (rad, m) are in the order of `RobotSpheres.joint_names` (as in the URDF),
-        or a mapping from these names. `base_from_robot` maps the URDF's root link to the map's base frame;
+        `robot` is a URDF file, which takes seconds to load, or what `jcr.load_robot` made of it: spheres
+        that cover the collision shapes. Joint values (rad, m) are in the order of `RobotSpheres.joint_names` (as in
+        the URDF), or a mapping from these names. `base_from_robot` maps the URDF's root link to the map's base frame;
         `ignore_links` names links that may touch, e.g. the one that stands on the table. The robot's own
         links are not checked against each other. Raises InputError as `load_robot` and
         `RobotSpheres.centers` do.
@@ -235,8 +331,10 @@ class SceneMap:
             closed=unknown == "occupied",
         )
 
-    def _points(self, x: ArrayLike | Tensor, what: str) -> Float[Tensor, "n 3"]:
-        """Return points on the map's device; raise InputError for a wrong shape or numbers that are not finite."""
+    def _points(self, x: ArrayLike | Tensor, what: str, unknown: str = "free") -> Float[Tensor, "n 3"]:
+        """Return points on the map's device; raise InputError for a wrong shape, numbers or choice of `unknown`."""
+        if unknown not in get_args(Unknown):
+            raise InputError(f"unknown={unknown!r}: choose occupied, free or report")
         x = x if isinstance(x, Tensor) else np.asarray(x)
         if x.ndim != 2 or x.shape[1] != 3:
             raise InputError(f"{what}: expected an array of shape (n, 3) in metres, got {tuple(np.shape(x))}")
@@ -292,9 +390,3 @@ def _worst(states: Bool[ndarray, "*batch k"] | UInt8[ndarray, "*batch k"], unkno
         surface, unseen = (states == OCCUPIED).any(-1), (states == UNKNOWN).any(-1)
         return np.where(surface, OCCUPIED, np.where(unseen, UNKNOWN, FREE)).astype(np.uint8)
     return np.asarray(states.any(-1))
-
-
-def _check_choice(unknown: str) -> None:
-    """Raise InputError for an unknown way to count unseen space."""
-    if unknown not in ("occupied", "free", "report"):
-        raise InputError(f"unknown={unknown!r}: choose occupied, free or report")

@@ -6,13 +6,25 @@ alone cannot represent this: trained on surfaces, it calls the inside of every o
 """
 
 from dataclasses import dataclass
+from typing import no_type_check
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Integer, UInt8
+from numpy import ndarray
 from torch import Tensor
+
+from jcr.compiled import compiled
 
 CROSSED, HIT = 1, 2
 """Bits of a cell's state; 0 = unseen."""
+RAY_END_M = 0.06
+"""Metres before each point in which its own ray is followed; farther off, the camera's depth image is asked."""
+CROSSINGS = 4
+"""Samples of such rays, two to a cell's side, that make a cell crossed: one ray through a corner does not show that
+the cell is empty, and one ray that ends too deep is no reason to call the inside of an object free."""
+PER_BIN = 2.0
+"""Points of an image in a bin of the depth image that is made of them."""
 
 
 @dataclass(frozen=True)
@@ -83,3 +95,123 @@ def halve(mask: Bool[Tensor, "nz ny nx"]) -> Bool[Tensor, "z y x"]:
         mask = mask.narrow(axis, 0, n).unflatten(axis, (n // 2, 2))
         mask = mask.select(axis + 1, 0) | mask.select(axis + 1, 1)
     return mask
+
+
+def carve(
+    points_in_base: Float[ndarray, "n 3"],
+    image: Integer[ndarray, " n"],
+    camera_centers_in_base: Float[ndarray, "m 3"],
+    box: Float[ndarray, "2 3"],
+    cell: float,
+    measured: Bool[ndarray, " n"],
+    device: str = "cpu",
+) -> SeenGrid:
+    """Return the seen grid of the rays from each point's camera to the point; the box is whole pairs of cells.
+
+    Rays of points that are not `measured` cross nothing, and end the crossing of those beside them.
+
+    Far from surfaces two cells at a time are judged at once, by their centre's depth before the nearest point in
+    its direction; the last centimetres of each ray are followed one by one, which keeps the grid sharp where it matters.
+    """
+    lower, block = box[0].astype(np.float32), np.float32(2 * cell)
+    crossed = np.zeros(np.rint((box[1] - box[0]) / (2 * cell)).astype(int)[::-1], bool)
+    for i, center in enumerate(camera_centers_in_base):
+        of_image = image == i
+        if measured[of_image].any():
+            seen_from = points_in_base[of_image] - center
+            nearest, rotation, corner, pitch = _depth_image(seen_from, measured[of_image])
+            start = rotation @ (lower + block / 2 - center)
+            _mark_before(
+                crossed, nearest, rotation.astype(np.float32), start.astype(np.float32), block, corner, pitch
+            )
+    state = crossed.repeat(2, 0).repeat(2, 1).repeat(2, 2).astype(np.uint8) * CROSSED
+    toward = camera_centers_in_base[image] - points_in_base
+    reach = np.linalg.norm(toward, axis=1)
+    numbers = (points_in_base - box[0], toward / reach[:, None], reach)
+    _follow(state, *(array.astype(np.float32) for array in numbers), measured, np.float32(cell))
+    lower, state = (torch.as_tensor(array, device=device) for array in (lower, state))
+    return SeenGrid(lower, cell, state)
+
+
+def _depth_image(
+    points: Float[ndarray, "n 3"], measured: Bool[ndarray, " n"]
+) -> tuple[Float[ndarray, "r c"], Float[ndarray, "3 3"], tuple[float, float], float]:
+    """Return the nearest depth in each bin of a pinhole image about the mean direction of a camera's measured points.
+
+    `points` are relative to the camera; with it the rotation to the image's frame, the image's corner and the bins'
+    side, both as tangents. An empty bin has depth 0 and frees nothing; points that are not measured only end what
+    others free.
+    """
+    points, assumed = points[measured], points[~measured]
+    axis = (points / np.linalg.norm(points, axis=1, keepdims=True)).mean(0)
+    axis /= np.linalg.norm(axis)
+    across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    across /= np.linalg.norm(across)
+    rotation = np.stack([across, np.cross(across, axis), axis])
+    x = points @ rotation.T
+    x = x[x[:, 2] > 0.1 * np.linalg.norm(points, axis=1)]
+    tangent = x[:, :2] / x[:, 2:]
+    corner = tangent.min(0)
+    width, height = tangent.max(0) - corner + 1e-6
+    pitch = float(np.sqrt(PER_BIN * width * height / max(len(x), 1)))
+    nearest = np.full((int(height / pitch) + 1, int(width / pitch) + 1), np.inf)
+    column, row = ((tangent - corner) / pitch).astype(int).T
+    np.minimum.at(nearest, (row, column), x[:, 2])
+    nearest[np.isinf(nearest)] = 0.0
+    x = assumed @ rotation.T
+    x = x[x[:, 2] > 0]
+    column, row = np.floor((x[:, :2] / x[:, 2:] - corner) / pitch).astype(int).T
+    inside = (column >= 0) & (row >= 0) & (column < nearest.shape[1]) & (row < nearest.shape[0])
+    np.minimum.at(nearest, (row[inside], column[inside]), x[inside, 2])
+    return nearest.astype(np.float32), rotation, (float(corner[0]), float(corner[1])), pitch
+
+
+@compiled
+@no_type_check
+def _mark_before(crossed, nearest, rotation, start, block, corner, pitch):
+    """Mark the blocks (z,y,x) that lie wholly before the nearest point there; `start` is the first block's centre."""
+    per_pitch, u0, v0 = np.float32(1 / pitch), np.float32(corner[0]), np.float32(corner[1])
+    rows, columns = nearest.shape
+    for z in range(crossed.shape[0]):
+        for y in range(crossed.shape[1]):
+            for x in range(crossed.shape[2]):
+                a, b, c = block * np.float32(x), block * np.float32(y), block * np.float32(z)
+                depth = start[2] + rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c
+                if depth <= 0 or crossed[z, y, x]:
+                    continue
+                u = (start[0] + rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c) / depth
+                v = (start[1] + rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c) / depth
+                u, v = (u - u0) * per_pitch, (v - v0) * per_pitch
+                if u >= 0 and v >= 0 and u < columns and v < rows:
+                    crossed[z, y, x] = depth + block < nearest[int(v), int(u)]
+
+
+@compiled
+@no_type_check
+def _follow(state, points, towards, reach, measured, cell):
+    """Mark the cells that enough rays cross shortly before their points, and those that points hit.
+
+    `points` are relative to the grid's lower corner, `towards` unit vectors to their cameras. Half a cell behind a point
+    is hit as well: a surface that lies just on a cell's far side has some thickness too.
+    """
+    samples = np.zeros(state.shape, np.uint8)
+    nz, ny, nx = state.shape
+    step, per_cell = cell / np.float32(2), np.float32(1) / cell
+    last = int(np.ceil(np.float32(RAY_END_M) / step)) - 1
+    for n in range(len(points)):
+        for k in range(-1, last + 1):
+            far = step * np.float32(k)
+            if k > 0 and (far >= reach[n] or not measured[n]):
+                break
+            x = (points[n, 0] + far * towards[n, 0]) * per_cell
+            y = (points[n, 1] + far * towards[n, 1]) * per_cell
+            z = (points[n, 2] + far * towards[n, 2]) * per_cell
+            if not (x >= 0 and y >= 0 and z >= 0 and x < nx and y < ny and z < nz):
+                continue
+            i, j, m = int(z), int(y), int(x)
+            if k <= 0:
+                state[i, j, m] |= HIT
+            elif samples[i, j, m] < CROSSINGS:
+                samples[i, j, m] += np.uint8(1)
+                if samples[i, j, m] == CROSSINGS:
+                    state[i, j, m] |= CROSSED

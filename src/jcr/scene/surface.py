@@ -8,7 +8,7 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 
 from jcr.errors import InputError
-from jcr.scene.chunks import in_chunks
+from jcr.scene.fields import in_chunks
 from jcr.scene.scene_map import SceneMap
 from jcr.scene.seen import HIT, SeenGrid, dilate
 
