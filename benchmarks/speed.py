@@ -92,7 +92,7 @@ def run() -> str:
 
 def _off(result: Path, capture: Path) -> tuple[float, float]:
     """Return the distance (mm, degrees) of a run's transform from the truth."""
-    from jcr.calibration.known_transform import read_hand_eye
+    from jcr.calibration.difference import read_hand_eye
 
     return apart(*(read_hand_eye(path).gripper_from_camera for path in (result, capture / "reference.json")))
 
@@ -183,7 +183,7 @@ def _growth() -> list[tuple[int, tuple[int, float], Spent]]:
 
 def reconstruct_first(folder: str, count: int, facts: str) -> None:
     """Reconstruct and calibrate the first images of a capture; write images registered and error in mm to `facts`."""
-    from jcr.calibration.known_transform import read_hand_eye
+    from jcr.calibration.difference import read_hand_eye
     from jcr.calibration.stage import calibrate
     from jcr.capture.read import read_capture
     from jcr.sfm.colmap import reconstruct_colmap

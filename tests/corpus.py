@@ -14,7 +14,7 @@ import yaml
 from PIL import Image
 
 import capture_writers as writers
-from jcr.calibration.known_transform import read_hand_eye
+from jcr.calibration.difference import read_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_poses
 from jcr.calibration.record import calibration_of, read_calibration, write_calibration

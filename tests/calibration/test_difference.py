@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from jcr.calibration.difference import difference
-from jcr.calibration.known_transform import StatedTransform
+from jcr.calibration.difference import StatedTransform, difference
 from jcr.geometry import retract, rotation_exp, transform
 
 X = transform(rotation_exp(np.array([0.3, -1.0, 0.4])), np.array([0.05, 0.02, 0.08]))
@@ -40,6 +39,6 @@ def test_the_cause_that_varies_along_the_difference_explains_it():
 
 
 def test_without_any_covariance_there_is_a_difference_and_no_verdict():
-    found = difference(StatedTransform(X, None, {}), StatedTransform(retract(X, np.full(6, 1e-3)), None, {}))
+    found = difference(StatedTransform(X), StatedTransform(retract(X, np.full(6, 1e-3))))
     assert found.p_value is None and found.sigmas is None
     assert np.linalg.norm(found.translation_m) == pytest.approx(1e-3 * np.sqrt(3))

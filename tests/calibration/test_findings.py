@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jcr.calibration.case import with_findings
 from jcr.calibration.poses import calibrate_poses
 from jcr.calibration.record import (
     calibration_of,
     read_calibration,
 )
 from jcr.calibration.stage import calibrate
-from jcr.calibration.verdict import with_findings
 from jcr.calibration.words import summary
 from jcr.errors import InputError
 from jcr.estimation.hand_eye import solve_hand_eye

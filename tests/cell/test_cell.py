@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jcr
-from jcr.calibration.checks.camera_adjustment import CameraAdjustment
+from jcr.calibration.checks.camera import CameraAdjustment
 from jcr.calibration.checks.effects import effects
 from jcr.calibration.stage import calibrate
 from jcr.camera import parameters, with_parameters

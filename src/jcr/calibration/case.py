@@ -10,6 +10,7 @@ from numpy import ndarray
 
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import RobotErrors, of_poses
+from jcr.estimation.hand_eye import judged
 from jcr.estimation.intrinsics_prior import (
     ESTIMATED,
     MEASURED,
@@ -21,7 +22,7 @@ from jcr.estimation.intrinsics_prior import (
 from jcr.estimation.point_uncertainty import scene_points, scene_uncertainty
 from jcr.estimation.problem import LinearPrior
 from jcr.estimation.solve import Solution
-from jcr.findings import Finding
+from jcr.findings import Finding, verdict_of
 from jcr.records import Capture, HandEye, Reconstruction, SceneUncertainty, Tracks
 
 MIN_OBSERVATIONS = 200
@@ -134,17 +135,31 @@ class Case:
             self.is_adjustable and not self.tracks.from_pointmaps and self.hand_eye.observability.observable
         )
 
+    def after(
+        self, findings: tuple[Finding, ...], hand_eye: HandEye | None = None, adjusted: Solution | None = None
+    ) -> "Case":
+        """Return the case after a check: findings, and the calibration and adjustment that replace its own."""
+        found = with_findings(hand_eye or self.hand_eye, findings)
+        return replace(self, hand_eye=found, adjusted=adjusted or self.adjusted)
 
-@dataclass(frozen=True)
-class CheckResult:
-    """Findings of a check, and the calibration that it replaces."""
 
-    findings: tuple[Finding, ...] = ()
-    """Strongest first."""
-    hand_eye: HandEye | None = None
-    """Calibration that takes the place of the case's; None: that stays."""
-    adjusted: Solution | None = None
-    """Adjustment that `hand_eye` is made of, where that is another one."""
+def with_findings(hand_eye: HandEye, findings: tuple[Finding, ...]) -> HandEye:
+    """Return a calibration with findings, and with their shifts in its covariance.
+
+    A finding rejects the calibration where its shift makes it too uncertain, or where it explains a rejection.
+    """
+    named: list[Finding] = []
+    for finding in findings:
+        if finding.shift is None:
+            named.append(finding)
+            continue
+        accepted = hand_eye.converged and verdict_of([*named, finding]) != "rejected"
+        hand_eye = hand_eye.with_finding(finding)
+        # More images, the remedy for a large covariance, do not help against a fault: that finding is left out.
+        if not accepted or not judged(hand_eye).converged:
+            finding = replace(finding, severity="rejects")
+        named.append(finding)
+    return hand_eye.with_findings(*named)
 
 
 def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:

@@ -1,6 +1,7 @@
 """Difference of two calibrations, tested against the covariances of both, with the causes that would explain it."""
 
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,9 +9,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
+from pydantic import BaseModel, ConfigDict, ValidationError
 
-from jcr.calibration.known_transform import StatedTransform, known_calibration, read_hand_eye
-from jcr.calibration.record import Calibration
+from jcr.arrays_json import Matrix, Spread3
+from jcr.calibration.record import Calibration, read_content, validated
+from jcr.capture.plain_files import first_fault
 from jcr.distributions import chi2
 from jcr.errors import InputError
 from jcr.geometry import require_rigid, step_between
@@ -35,13 +38,35 @@ class Difference:
     translation_m: Float[ndarray, "3"]
     rotation_vector: Float[ndarray, "3"]
     """rad: R_other = exp(r)·R."""
-    sigmas: Float[ndarray, "6"] | None
+    sigmas: Float[ndarray, "6"] | None = None
     """Size on each axis in standard deviations of the difference; None where neither states any."""
-    chi2: float | None
+    chi2: float | None = None
     """Squared Mahalanobis distance, of 6 degrees of freedom where errors of the two are independent."""
-    p_value: float | None
-    explained_by: dict[str, float]
+    p_value: float | None = None
+    explained_by: dict[str, float] = field(default_factory=dict)
     """Share of χ² by cause, largest first; the sum is 1. Empty where there is no difference."""
+
+
+@dataclass(frozen=True)
+class StatedTransform:
+    """Transform and covariance of a calibration, or of a reference."""
+
+    gripper_from_camera: Float[ndarray, "4 4"]
+    covariance: Float[ndarray, "6 6"] | None = None
+    """Covariance of the first six of COVARIANCE_ORDER; None where none is stated."""
+    parts: dict[str, Float[ndarray, "6 6"]] = field(default_factory=dict)
+    """Parts of the covariance, by cause; empty where none are stated."""
+    doubt: str | None = None
+    """Reason of the rejection; None where it is accepted, or has no verdict."""
+
+
+class _Reference(BaseModel):
+    """Fields of a file that somebody else wrote, such as reference.json."""
+
+    model_config = ConfigDict(allow_inf_nan=False)
+    gripper_from_camera: Matrix | None = None
+    std_mm: Spread3 | None = None
+    std_deg: Spread3 | None = None
 
 
 def compare(calibration: Comparable, other: Comparable) -> Difference:
@@ -51,20 +76,60 @@ def compare(calibration: Comparable, other: Comparable) -> Difference:
     a 4×4 gripper_from_camera. Raises InputError where one of them has no transform of a camera on the gripper,
     RejectedError where nothing was found.
     """
-    return difference(_known(calibration), _known(other))
+    return difference(_stated(calibration), _stated(other))
 
 
-def _known(one: Comparable) -> StatedTransform:
+def _stated(one: Comparable) -> StatedTransform:
     """Return transform and covariance of what `compare` takes."""
     if isinstance(one, str | Path):
         return read_hand_eye(Path(one))
     record = getattr(one, "calibration", one)
     if isinstance(record, Calibration):
-        return known_calibration(record)
+        return _of_calibration(record, "the calibration")
     matrix = np.asarray(one, float)
     if matrix.shape != (4, 4):
         raise InputError(f"a transform of shape {matrix.shape}; give a 4×4 gripper_from_camera")
-    return StatedTransform(require_rigid(matrix, "gripper_from_camera"), None, {})
+    return StatedTransform(require_rigid(matrix, "gripper_from_camera"))
+
+
+def read_hand_eye(path: Path) -> StatedTransform:
+    """Read gripper_from_camera, and its covariance where the file has one; raise InputError without a transform.
+
+    A reference.json may state `std_mm` and `std_deg`, along the axes of the gripper.
+    """
+    file = path
+    if path.is_dir():
+        names = ("calibration.json", "reference.json")
+        file = next((path / name for name in names if (path / name).is_file()), path / names[0])
+    if not file.is_file():
+        raise InputError(f"{path}: no calibration.json or reference.json there; name a run folder or a file")
+    content = read_content(file)
+    if "format" in content:
+        return _of_calibration(validated(content, file), str(file))
+    try:
+        found = _Reference.model_validate_json(json.dumps(content))
+    except ValidationError as error:
+        raise InputError(f"{file}: {first_fault(error)}; correct it there") from None
+    if found.gripper_from_camera is None:
+        raise InputError(f"{file}: has no gripper_from_camera; that calibration failed")
+    if found.std_mm is None or found.std_deg is None:
+        return StatedTransform(found.gripper_from_camera)
+    std = np.r_[np.array(found.std_mm) / 1e3, np.radians(found.std_deg)]
+    return StatedTransform(found.gripper_from_camera, np.diag(std**2))
+
+
+def _of_calibration(calibration: Calibration, name: str) -> StatedTransform:
+    """Return the transform of a calibration with its covariance and the parts of it; raise InputError without one."""
+    if calibration.parent_from_camera is None or calibration.uncertainty is None:
+        raise InputError(f"{name}: has no {calibration.mount}_from_camera; that calibration failed")
+    budget = calibration.uncertainty.budget
+    shares = {} if budget is None else {name: share for name, share in budget if share is not None}
+    return StatedTransform(
+        calibration.gripper_from_camera,
+        calibration.covariance[:6, :6],
+        {name: share.covariance[:6, :6] for name, share in shares.items() if share.covariance is not None},
+        calibration.doubt,
+    )
 
 
 def difference(ours: StatedTransform, other: StatedTransform) -> Difference:
@@ -83,18 +148,11 @@ def difference(ours: StatedTransform, other: StatedTransform) -> Difference:
         for name, part in (known.parts | {OTHER: rest}).items():
             parts[name] = parts.get(name, np.zeros((6, 6))) + part
     if not np.diag(together).all():  # neither states any, or both are said to be exact
-        return Difference(
-            translation_m=step[:3],
-            rotation_vector=step[3:],
-            sigmas=None,
-            chi2=None,
-            p_value=None,
-            explained_by={},
-        )
+        return Difference(translation_m=step[:3], rotation_vector=step[3:])
     std = np.sqrt(np.diag(together))
     weighed = np.linalg.solve(together / np.outer(std, std), step / std) / std
     squared = float(step @ weighed)
-    explained = {name: float(weighed @ part @ weighed) for name, part in parts.items()} if squared else {}
+    shares = {name: float(weighed @ part @ weighed) / squared for name, part in parts.items() if squared}
     return Difference(
         translation_m=step[:3],
         rotation_vector=step[3:],
@@ -102,8 +160,8 @@ def difference(ours: StatedTransform, other: StatedTransform) -> Difference:
         chi2=squared,
         p_value=float(chi2.sf(squared, 6)),
         explained_by={
-            name: part / squared
-            for name, part in sorted(explained.items(), key=lambda item: -item[1])
-            if name != OTHER or part > NOTHING * squared
+            name: share
+            for name, share in sorted(shares.items(), key=lambda item: -item[1])
+            if name != OTHER or share > NOTHING
         },
     )

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from jcr.calibration.case import with_findings
 from jcr.calibration.checks.effects import effects_of_fit, with_rejected_runs
 from jcr.calibration.conventions import better_reading, convention_finding
 from jcr.calibration.cues import height_cue
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised, assumptions_of_poses
 from jcr.calibration.robot_errors import RobotErrors, errors_of
-from jcr.calibration.verdict import with_findings
 from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.hand_eye import SCALE_STD, solve_hand_eye

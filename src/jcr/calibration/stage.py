@@ -13,7 +13,6 @@ from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised, assumptions_of
 from jcr.calibration.robot_errors import RobotErrors, robot_errors
-from jcr.calibration.verdict import with_checked
 from jcr.errors import RejectedError
 from jcr.estimation.hand_eye import SCALE_STD, Offset, solve_hand_eye
 from jcr.estimation.point_uncertainty import with_given_intrinsics
@@ -51,10 +50,10 @@ def checked(
 ) -> Case:
     """Return the case after fit, adjustment and checks, without advice; `robot` is of the registered images."""
     case = adjust_images(fit_poses(capture, reconstruction, options, robot))
-    for check in CHECKS:
-        if check.needs(case):
+    for check, is_needed in CHECKS:
+        if is_needed(case):
             try:
-                case = with_checked(case, check.run(case))
+                case = check(case)
             except np.linalg.LinAlgError:
                 # A rejected fit may be so wrong, points behind the cameras, that there is nothing to compute.
                 if case.hand_eye.converged:

@@ -11,14 +11,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from jcr.calibration.adjust import adjust_case
-from jcr.calibration.case import MIN_OBSERVATIONS, Case
-from jcr.calibration.checks.camera import of_fewer_points
-from jcr.calibration.checks.camera_adjustment import of_case
+from jcr.calibration.case import MIN_OBSERVATIONS, Case, with_findings
+from jcr.calibration.checks.camera import of_case, of_fewer_points
 from jcr.calibration.checks.effects import EFFECTS, effects, with_effects
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate
-from jcr.calibration.verdict import with_findings
 from jcr.cell.background import write_moving_parts
 from jcr.estimation.hand_eye import judged, solve_hand_eye
 from jcr.estimation.wrist import estimate_of

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.checks.camera import all_combinations
-from jcr.calibration.checks.camera_adjustment import CameraAdjustment
+from jcr.calibration.checks.camera import CameraAdjustment, all_combinations
 from jcr.calibration.checks.effects import as_adopted, effects
 from jcr.calibration.options import CalibrateOptions
 from jcr.capture.images import read_image

@@ -40,8 +40,7 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Print the difference, whether the reported errors explain it, and the causes that would."""
-    from jcr.calibration.difference import difference
-    from jcr.calibration.known_transform import read_hand_eye
+    from jcr.calibration.difference import difference, read_hand_eye
 
     known = {path: read_hand_eye(path) for path in (arguments.out, arguments.reference)}
     found = difference(known[arguments.out], known[arguments.reference])

@@ -368,15 +368,6 @@ def scales(finding: "Finding") -> str:
     return f"{' and '.join(names)} contradict each other by {100 * abs(off):.1f} ± {100 * std:.1f} %"
 
 
-def to_lengths(finding: "Finding") -> str:
-    named = finding.details
-    if "third" not in named:
-        return "measure both again"
-    wrong = named["one"] if named["agrees_with"] == named["other"] else named["other"]
-    right, third = (LENGTHS[str(named[name])] for name in ("agrees_with", "third"))
-    return f"check {LENGTHS[str(wrong)]}: {right} and {third} agree"
-
-
 def board_side(finding: "Finding") -> str:
     side, std = (1e3 * value for value in _value_and_std(finding))
     return f"by the robot's positions the sides of {finding.details['board']} are {with_std(side, std)} mm"
@@ -409,8 +400,6 @@ def board_moved(finding: "Finding") -> str:
 
 
 def to_size(finding: "Finding") -> str:
-    if "third" in finding.details:
-        return to_lengths(finding)
     measure = "measure its squares, and check that the gripper poses are in metres"
     return "" if finding.details.get("marker") else measure
 

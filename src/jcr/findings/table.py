@@ -184,12 +184,11 @@ class FindingKind(StrEnum):
     BOARD_SIZE = "board size contradicts the robot", Row("lengths", sentences.board_size, sentences.to_size,
         explains=MISFIT, means="the board is larger or smaller than given",
         evidence="share, positive: larger", help="measure its squares; poses in metres")
-    SCALES = "lengths contradict each other", Row("lengths", sentences.scales, sentences.to_lengths, explains=MISFIT,
+    SCALES = "lengths contradict each other", Row("lengths", sentences.scales, "measure both again",
+        explains=MISFIT,
         means="two of what the scale is known from (`details.one`, `details.other`: robot, board, known "
         "length, depth camera, network) differ by more than they may",
-        evidence="share, positive: the second is longer",
-        help="measure both again; where a third length (`details.third`) agrees with one of the two, check "
-        "the other")
+        evidence="share, positive: the second is longer")
     BOARD_SIDE = "side of a board", Row("lengths", sentences.board_side, sentences.to_board_side,
         means="what the robot's positions make of a board of unknown side", evidence="m",
         help="measure it, and give it")

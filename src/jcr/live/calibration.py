@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from jcr.calibration.case import Case, of_points
 from jcr.calibration.checks.capture import SAME
-from jcr.calibration.checks.views import STILL as MOVED
+from jcr.calibration.checks.capture import STILL as MOVED
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised, assumptions_of
 from jcr.calibration.robot_errors import RobotErrors, robot_errors

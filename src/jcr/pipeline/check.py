@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 
 from jcr.boards.proposal import proposed
 from jcr.calibration.case import Case
+from jcr.calibration.checks.capture import as_causes, view_findings
 from jcr.calibration.checks.left_out import left_out_poses
-from jcr.calibration.checks.views import as_causes, view_findings
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_poses, is_one
 from jcr.calibration.requirement import Proposals, assumptions_of, assumptions_of_poses

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from jcr.allocator import give_back
-from jcr.calibration.checks.views import as_causes, view_findings
+from jcr.calibration.checks.capture import as_causes, view_findings
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate

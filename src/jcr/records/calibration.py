@@ -304,24 +304,19 @@ class Estimate:
     def with_fault(
         self: AnyEstimate,
         covariance: Float[ndarray, "7 7"],
-        shifts: tuple[Float[ndarray, "7"], Float[ndarray, " q"]] | None = None,
     ) -> AnyEstimate:
-        """Return the estimate, as uncertain as a fault with this covariance makes it.
+        """Return the estimate, as uncertain as a fault with this covariance makes it."""
+        budget = None if self.budget is None else replace(self.budget, faults=self.budget.faults + covariance)
+        return replace(self, covariance=self.covariance + covariance, budget=budget)
 
-        `shifts` are those of COVARIANCE_ORDER and of camera.parameters together, where the intrinsics move with it.
-        """
-        budget, cross, known = self.budget, self.intrinsics_cross, self.intrinsics_covariance
-        if budget is not None:
-            budget = replace(budget, faults=budget.faults + covariance)
-        if shifts is not None and cross is not None and known is not None:
-            cross, known = cross + np.outer(*shifts), known + np.outer(shifts[1], shifts[1])
-        return replace(
-            self,
-            covariance=self.covariance + covariance,
-            budget=budget,
-            intrinsics_cross=cross,
-            intrinsics_covariance=known,
-        )
+    def with_finding(self: AnyEstimate, finding: Finding) -> AnyEstimate:
+        """Return the estimate, as uncertain as the shifts of a finding make transform and intrinsics."""
+        cross, known = self.intrinsics_cross, self.intrinsics_covariance
+        if finding.intrinsics_shift is not None and cross is not None and known is not None:
+            moved = np.array(finding.intrinsics_shift)
+            cross, known = cross + np.outer(finding.shift, moved), known + np.outer(moved, moved)
+        faulty = self.with_fault(finding.covariance)
+        return replace(faulty, intrinsics_cross=cross, intrinsics_covariance=known)
 
 
 @dataclass(frozen=True)

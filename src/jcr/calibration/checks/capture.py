@@ -1,19 +1,22 @@
-"""Checks of capture, arm and reconstruction: too few images used, pose convention, pieces, warnings."""
+"""Checks of capture, images, arm and reconstruction: too few images used, pose convention, pieces, views, warnings."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
-from jcr.calibration.case import MIN_IMAGES, Case, CheckResult
+from jcr.calibration.case import MIN_IMAGES, Case
 from jcr.calibration.conventions import better_reading, convention_finding
 from jcr.capture.checks import how_rotated
+from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image, show_one_view
 from jcr.capture.pairing import paired_by_name
 from jcr.estimation.closed_form import initial_estimate
 from jcr.estimation.equation import predict
 from jcr.estimation.observability import observability
 from jcr.estimation.robust import least_trimmed
 from jcr.findings import Finding, FindingKind
-from jcr.geometry import inverse, scale_translation, step_between
+from jcr.geometry import inverse, largest_motion, scale_translation, step_between
+from jcr.records import Capture
 
 SAME = (10e-3, float(np.radians(1.0)))
 """m, rad: nearer than this a gripper pose is that of the image."""
@@ -23,9 +26,13 @@ CONCENTRATED = 4
 """Estimates from the half of the images that agree best (Rousseeuw and Van Driessen 1999)."""
 MOST_IN_PIECES = 2 / 3
 """Smallest share of the images beside the largest piece that are in further pieces."""
+STILL = (20e-3, np.radians(5.0))
+"""m, rad: larger motions of the gripper are visible in the images of a wrist camera."""
+MANY = 1 / 4
+"""Share of blurred images from which they explain a rejection."""
 
 
-def check_registered(case: Case) -> CheckResult:
+def check_registered(case: Case) -> Case:
     """Report that too few images are used: all motions together would be observable, those of the used images are not.
 
     The motions are then not the cause, and other motions are no remedy. Where all registered images would do, their
@@ -34,21 +41,21 @@ def check_registered(case: Case) -> CheckResult:
     hand_eye, capture = case.hand_eye, case.capture
     unseen = hand_eye.observability.findings
     if len(case.used) == len(capture) or not unseen or observability(capture.base_from_gripper).findings:
-        return CheckResult()
+        return case
     contradicted = any(one.kind is FindingKind.FEW_AGREE for one in hand_eye.findings)
     if contradicted and not observability(case.base_from_gripper).findings:
         rest = tuple(one for one in hand_eye.findings if one not in unseen)
-        return CheckResult(hand_eye=replace(hand_eye, findings=rest))
+        return case.after((), replace(hand_eye, findings=rest))
     rejected = any(one.severity == "rejects" for one in hand_eye.findings)
     counts = {"value": float(len(case.used)), "of": float(len(capture))}
     few = Finding.of(FindingKind.FEW_USED, "rejects" if rejected else "warns", "reconstruction", **counts)
     findings = tuple(
         replace(one, concerns="reconstruction") if one in unseen else one for one in hand_eye.findings
     )
-    return CheckResult((few,), replace(hand_eye, findings=findings))
+    return case.after((few,), replace(hand_eye, findings=findings))
 
 
-def check_convention(case: Case) -> CheckResult:
+def check_convention(case: Case) -> Case:
     """Report the convention by which the gripper poses fit, where there is one.
 
     Degenerate motions fit another convention by chance, and are reported first.
@@ -62,12 +69,12 @@ def check_convention(case: Case) -> CheckResult:
     solved = fit if alone and fit.robot_noise.given is None else None
     found = better_reading(case.base_from_gripper, case.recon_from_camera, by_name, solved)
     if found is None:
-        return CheckResult()
+        return case
     observable = case.hand_eye.observability.observable
-    return CheckResult((convention_finding(found, "rejects" if observable else "warns"),))
+    return case.after((convention_finding(found, "rejects" if observable else "warns"),))
 
 
-def check_pieces(case: Case) -> CheckResult:
+def check_pieces(case: Case) -> Case:
     """Report a reconstruction in pieces: images that agree with their poses among themselves, not with the others.
 
     The transform of the images that agree shows base_from_recon of each image. Wrong poses scatter it, while each piece
@@ -75,7 +82,7 @@ def check_pieces(case: Case) -> CheckResult:
     """
     gripper, camera = case.base_from_gripper, case.recon_from_camera
     if case.hand_eye.converged or len(gripper) < LEAST_OF_PIECE + MIN_IMAGES:
-        return CheckResult()
+        return case
     agree, _ = least_trimmed(gripper, camera)
     for _ in range(CONCENTRATED):
         x, scale, z = initial_estimate(gripper[agree], camera[agree])
@@ -90,28 +97,50 @@ def check_pieces(case: Case) -> CheckResult:
     others = np.flatnonzero(~largest)
     in_pieces = near[np.ix_(others, others)].sum(1) >= LEAST_OF_PIECE
     if largest.sum() < MIN_IMAGES or in_pieces.sum() < max(LEAST_OF_PIECE, MOST_IN_PIECES * len(others)):
-        return CheckResult()
+        return case
     names = [case.names[row] for row in others[in_pieces]]
     counts = {"value": float(len(names)), "of": float(len(gripper))}
-    return CheckResult((Finding.of(FindingKind.PIECES, "rejects", "reconstruction", *names, **counts),))
+    return case.after((Finding.of(FindingKind.PIECES, "rejects", "reconstruction", *names, **counts),))
 
 
-def check_arm(case: Case) -> CheckResult:
-    """Report that the arm of the capture is not used."""
-    return CheckResult(() if case.robot.unused is None else (case.robot.unused,))
+def check_remarks(case: Case) -> Case:
+    """Report an arm that is not used, images that were rotated on reading, and the warnings of the back end."""
+    first = (case.robot.unused, how_rotated(case.capture))
+    texts = case.reconstruction.warnings
+    warnings = (Finding.of(FindingKind.RECONSTRUCTION, "warns", text=text) for text in texts)
+    return case.after((*filter(None, first), *warnings))
 
 
-def check_images(case: Case) -> CheckResult:
-    """Report that the images were rotated when they were read."""
-    rotated = how_rotated(case.capture)
-    return CheckResult(() if rotated is None else (rotated,))
-
-
-def check_reconstruction(case: Case) -> CheckResult:
-    """Report the warnings of the back end."""
-    return CheckResult(
-        tuple(
-            Finding.of(FindingKind.RECONSTRUCTION, "warns", text=text)
-            for text in case.reconstruction.warnings
+def view_findings(capture: Capture) -> tuple[Finding, ...]:
+    """Return the findings of the images alone: none for sharp images of several views."""
+    first = read_image(capture.folder / capture.images[0])
+    metres, radians = largest_motion(capture.base_from_gripper)
+    is_still = metres > STILL[0] or radians > STILL[1]
+    width = {}
+    for name in capture.images:
+        image = read_image(capture.folder / name)
+        width[name] = edge_width(image)
+        is_still = is_still and show_one_view(first, image)
+    findings = []
+    if is_still:
+        details = {"rotation": radians}
+        findings.append(Finding.of(FindingKind.STATIC_IMAGES, "rejects", "images", value=metres, **details))
+    blurred = tuple(name for name, share in width.items() if share > BLURRED_EDGE)
+    if blurred:
+        edge_px = max(*capture.image_size, EDGES_AT) * float(np.median([width[name] for name in blurred]))
+        findings.append(
+            Finding.of(
+                FindingKind.BLURRED, "warns", "images", *blurred, value=edge_px, of=float(len(capture))
+            )
         )
+    return tuple(findings)
+
+
+def as_causes(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Return findings of the images alone for a rejected capture; those that concern many images reject."""
+    return tuple(
+        replace(one, severity="rejects")
+        if one.kind is FindingKind.BLURRED and len(one.images) > MANY * float(one.details["of"])
+        else one
+        for one in findings
     )

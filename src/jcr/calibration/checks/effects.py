@@ -14,9 +14,10 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.calibration.adjust import adjust_case, refined_by
-from jcr.calibration.case import Case, CheckResult
+from jcr.calibration.case import Case
 from jcr.calibration.checks.camera import (
     LOG_P,
+    CameraAdjustment,
     CameraEffect,
     State,
     all_combinations,
@@ -27,9 +28,9 @@ from jcr.calibration.checks.camera import (
     is_far_off,
     is_material,
     log_p,
+    of_case,
     of_fewer_points,
 )
-from jcr.calibration.checks.camera_adjustment import CameraAdjustment, of_case
 from jcr.calibration.options import GRASPING
 from jcr.camera import parameters, with_thin_prism
 from jcr.estimation.components import most_likely
@@ -68,13 +69,13 @@ LARGE_MOTION = GRASPING[0] * 1e-3, float(np.radians(GRASPING[1]))
 requirement decides."""
 
 
-def check_effects(case: Case) -> CheckResult:
+def check_effects(case: Case) -> Case:
     """Return what the used images and gripper poses show against one camera on one straight arm, in any order."""
     longer = _with_rejected_runs(case)
     if case.adjusted is None or longer.adjusted is None or not case.shows_camera:
-        return CheckResult(_effects_of_poses(longer))
+        return case.after(_effects_of_poses(longer))
     state, findings = effects(of_case(of_fewer_points(longer)))
-    return CheckResult(findings) if longer is not case else _adopted(case, state, findings)
+    return case.after(findings) if longer is not case else _adopted(case, state, findings)
 
 
 def effects(imaged: CameraAdjustment) -> tuple[State, tuple[Finding, ...]]:
@@ -290,13 +291,13 @@ def _size_of_strain(test: Test) -> dict[str, Any]:
     }
 
 
-def _adopted(case: Case, state: State, findings: tuple[Finding, ...]) -> CheckResult:
+def _adopted(case: Case, state: State, findings: tuple[Finding, ...]) -> Case:
     """Return the calibration with the effects that its model can carry; one that is rejected stays."""
     adjusted, adopted = with_effects(case, state, findings)
     if adjusted is None:
-        return CheckResult(findings)
+        return case.after(findings)
     refined = judged(refined_by(case, adjusted))
-    return CheckResult(adopted, refined, adjusted) if refined.converged else CheckResult(findings)
+    return case.after(adopted, refined, adjusted) if refined.converged else case.after(findings)
 
 
 def with_effects(

@@ -1,28 +1,39 @@
-"""Comparison of known lengths with the robot's positions: boards, a known length, a depth camera, a network's metre.
+"""Boards, and comparison of known lengths with the robot: boards, a known length, a depth camera, a network's metre.
 
 Lengths that agree with the robot become priors of the mixed model. Where two lengths contradict each other, the scale
-stays the robot's, and a finding names both.
+stays the robot's, and a finding names both. The scale of depth cameras is off by a few percent, and their noise grows
+with the square of the distance (Khoshelham and Elberink, Sensors 2012).
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.calibration.adjust import refined_by
-from jcr.calibration.case import Case, CheckResult
-from jcr.calibration.checks.depth_camera import depth_check
+from jcr.calibration.case import Case
 from jcr.calibration.cues import CONTRADICTED, length_cue
+from jcr.capture.images import read_depth
 from jcr.estimation.equation import SCALE
 from jcr.estimation.hand_eye import judged
 from jcr.estimation.problem import LinearPrior
 from jcr.estimation.solve import Solution, size_of_boards, with_priors
 from jcr.findings import Finding, FindingKind
-from jcr.records import HandEye, LengthCheck, LengthName, ScaleCheck
+from jcr.geometry import apply, inverse
+from jcr.records import (
+    BoardFound,
+    Boards,
+    Capture,
+    DepthCheck,
+    HandEye,
+    LengthCheck,
+    LengthName,
+    Reconstruction,
+    ScaleCheck,
+)
 
 DEPTH_STD, NETWORK_STD = 0.02, 0.05
 """Relative standard deviations of the metre of depth cameras, off by a few percent, and of networks, by up to ten."""
@@ -40,74 +51,87 @@ EXACT = 0.015
 """Relative standard deviation up to which a length can reject a calibration."""
 WORTH = 10.0
 """Standard deviations of the robot's scale: a length less exact than that hardly moves it, and is compared alone."""
-Name = LengthName | Literal["robot"]
+MIN_IMAGES, MIN_FEATURES = 3, 60
+"""Fewest images and features at which depth is compared."""
+OUTSIDE = 0.3
+"""Relative difference from the common one beyond which a depth is that of another surface."""
+BINS = 8
+"""Bins of distance in which the noise of depth is measured."""
+NORMAL = 1.4826
+"""Standard deviations of a normal error in its median absolute deviation."""
 
 
 @dataclass(frozen=True)
 class Length:
     """Logarithm of a length by the robot's positions over its stated value, and its own standard deviation."""
 
-    name: Name
+    name: LengthName | Literal["robot"]
     off: float
     std: float
 
-    def agrees_with(self, other: "Length") -> bool:
-        """Return whether the difference of two lengths is usual."""
-        return abs(self.off - other.off) < AGREES * float(np.hypot(self.std, other.std))
 
-
-def check_lengths(case: Case) -> CheckResult:
+def check_lengths(case: Case) -> Case:
     """Estimate the scale with all known lengths, or report two that contradict each other."""
     hand_eye, lengths = _measured(case)
-    if not lengths:
-        return CheckResult(_from_robot_alone(case, hand_eye), hand_eye)
-    robot = Length("robot", 0.0, float(np.sqrt(hand_eye.covariance[6, 6])))
-    pair = contradiction([robot, *lengths]) if hand_eye.converged else None
-    is_made_of_images = hand_eye.converged and case.adjusted is not None and hand_eye.before is not None
+    converged, robot = hand_eye.converged, Length("robot", 0.0, float(np.sqrt(hand_eye.covariance[6, 6])))
+    pair = contradiction([robot, *lengths]) if lengths and converged else None
+    of_images = converged and case.adjusted is not None and hand_eye.before is not None
     weighed = [
         one
         for one in lengths
-        if is_made_of_images and pair is None and one.std < WORTH * robot.std and one.agrees_with(robot)
+        if of_images
+        and pair is None
+        and one.std < WORTH * robot.std
+        and abs(one.off) < AGREES * float(np.hypot(one.std, robot.std))
     ]
-    checks = tuple(
+    checks = (
         LengthCheck(
-            name=one.name,
+            name=name,
             robot_longer_percent=100 * float(np.expm1(one.off)),
             std_percent=100 * one.std,
             used=one in weighed,
         )
         for one in lengths
-        if one.name != "robot"
+        if (name := one.name) != "robot"
     )
-    hand_eye = replace(hand_eye, lengths=checks)
+    hand_eye = replace(hand_eye, lengths=tuple(checks))
+    compared = any(one.name != "network" for one in lengths) or bool(case.priors)
+    alone = not compared and case.reconstruction.metric_std is None
+    findings = (Finding.of(FindingKind.SCALE_FROM_ROBOT, "informs"),) * alone
     if pair is not None:
-        others = [one for one in (robot, *lengths) if one not in pair]
-        found = finding_of(*pair, others, hand_eye)
-        return CheckResult((found, *_from_robot_alone(case, hand_eye)), hand_eye)
+        return case.after((finding_of(*pair, hand_eye), *findings), hand_eye)
     fault = _fault(hand_eye, lengths)
     if weighed:
-        return _fused(case, hand_eye, weighed, fault)
-    if hand_eye.converged and fault.any():
+        return case.after(findings, *_fused(case, hand_eye, weighed, fault))
+    if converged and fault.any():
         hand_eye = judged(hand_eye.with_fault(fault))
-    return CheckResult(_from_robot_alone(case, hand_eye), hand_eye)
+    return case.after(findings, hand_eye)
 
 
 def _measured(case: Case) -> tuple[HandEye, list[Length]]:
     """Return the calibration with the measurements of lengths, and the lengths."""
     hand_eye, found = case.hand_eye, list[Length]()
     boards, adjusted = case.reconstruction.tracks.boards, case.adjusted
-    if adjusted is not None and boards is not None and hand_eye.before is not None:
-        found.extend(_of_boards(adjusted, boards.size_std))
+    if (
+        adjusted is not None
+        and adjusted.problem.boards is not None
+        and boards is not None
+        and boards.size_std is not None
+        and hand_eye.before is not None
+    ):
+        off, by_unknown = size_of_boards(adjusted)
+        together = float(by_unknown @ adjusted.covariance @ by_unknown)
+        of_images = max(together - float(adjusted.covariance[SCALE, SCALE].item()), 0.0)
+        found.append(Length("board", off, float(np.hypot(np.sqrt(of_images), boards.size_std))))
     if case.options.known_length is not None and not case.priors:
         image, *ends, length_mm = case.options.known_length
         ends_px = np.array(ends).reshape(2, 2)
         scale, std = length_cue(case.capture, case.reconstruction, image, ends_px, length_mm / 1e3)
         found.append(Length("known length", float(np.log(hand_eye.scale / scale)), std))
     if hand_eye.converged and (depth := depth_check(case.capture, case.reconstruction, hand_eye)) is not None:
-        off_std = np.hypot(
-            DEPTH_STD, np.sqrt(max((depth.std_percent / 100) ** 2 - hand_eye.covariance[6, 6], 0.0))
-        )
-        found.append(Length("depth camera", -float(np.log1p(depth.off_percent / 100)), float(off_std)))
+        of_depth = max((depth.std_percent / 100) ** 2 - hand_eye.covariance[6, 6], 0.0)
+        std = float(np.hypot(DEPTH_STD, np.sqrt(of_depth)))
+        found.append(Length("depth camera", -float(np.log1p(depth.off_percent / 100)), std))
         hand_eye = replace(hand_eye, depth=depth)
     # A unit with a stated standard deviation was used for the scale, and is no check of it.
     if case.reconstruction.is_metric and case.reconstruction.metric_std is None:
@@ -115,16 +139,6 @@ def _measured(case: Case) -> tuple[HandEye, list[Length]]:
         found.append(Length("network", float(np.log(hand_eye.scale)), NETWORK_STD))
         hand_eye = replace(hand_eye, network=_network_check(hand_eye))
     return hand_eye, found
-
-
-def _of_boards(adjusted: Solution, size_std: float | None) -> Iterator[Length]:
-    """Yield the size of the boards, where it is known and they were adjusted."""
-    if size_std is None or adjusted.problem.boards is None:
-        return
-    off, by_unknown = size_of_boards(adjusted)
-    together = float(by_unknown @ adjusted.covariance @ by_unknown)
-    of_images = max(together - float(adjusted.covariance[SCALE, SCALE].item()), 0.0)
-    yield Length("board", off, float(np.hypot(np.sqrt(of_images), size_std)))
 
 
 def _network_check(hand_eye: HandEye) -> ScaleCheck:
@@ -142,35 +156,25 @@ def contradiction(lengths: list[Length]) -> tuple[Length, Length] | None:
     return worst if sigmas(worst) > SIGMAS and abs(worst[0].off - worst[1].off) > LEAST else None
 
 
-def finding_of(one: Length, other: Length, others: list[Length], hand_eye: HandEye) -> Finding:
-    """Return the finding that two lengths contradict each other; the robot is the first where it is one of them.
-
-    Where an exact one of the `others` agrees with one of the two alone, the remaining one is wrong.
-    """
+def finding_of(one: Length, other: Length, hand_eye: HandEye) -> Finding:
+    """Return the finding that two lengths contradict each other; the robot is the first where it is one of them."""
     off, std = other.off - one.off, float(np.hypot(one.std, other.std))
-    if one.name == "robot" and other.name == "network":
+    of_robot = one.name == "robot"
+    if of_robot and other.name == "network":
         check = _network_check(hand_eye)
-        value, of_robot = check.off_percent / 100, check.std_percent / 100
-        return Finding.of(FindingKind.NETWORK_SCALE, "warns", "poses", value=value, std=of_robot)
-    agreeing = [
-        (third.name, right.name)
-        for third in others
-        for right, wrong in ((one, other), (other, one))
-        if third.std < EXACT and third.agrees_with(right) and not third.agrees_with(wrong)
-    ]
-    is_robot_doubted = one.name == "robot" and not any(right == "robot" for _, right in agreeing)
+        value, std = check.off_percent / 100, check.std_percent / 100
+        return Finding.of(FindingKind.NETWORK_SCALE, "warns", "poses", value=value, std=std)
     exact = max(one.std, other.std) < EXACT and abs(off) >= CONTRADICTED[1]
     found = Finding.of(
-        FindingKind.BOARD_SIZE if (one.name, other.name) == ("robot", "board") else FindingKind.SCALES,
-        "rejects" if exact and is_robot_doubted else "warns",
+        FindingKind.BOARD_SIZE if of_robot and other.name == "board" else FindingKind.SCALES,
+        "rejects" if exact and of_robot else "warns",
         "poses",
         value=float(np.expm1(off)),
         std=std,
         one=one.name,
         other=other.name,
-        **(dict(zip(("third", "agrees_with"), agreeing[0], strict=True)) if agreeing else {}),
     )
-    if not is_robot_doubted or other.std >= EXACT:
+    if not of_robot or other.std >= EXACT:
         return found
     return replace(found, shift=tuple(_shift(off, hand_eye).tolist()))
 
@@ -180,17 +184,9 @@ def _shift(off: float, hand_eye: HandEye) -> Float[ndarray, "7"]:
     return -off * np.r_[hand_eye.gripper_from_camera[:3, 3], np.zeros(3), 1.0]
 
 
-def _from_robot_alone(case: Case, hand_eye: HandEye) -> tuple[Finding, ...]:
-    """Return the finding that the scale comes from the robot alone, where nothing but a network was compared with it."""
-    compared = any(one.name != "network" for one in hand_eye.lengths)
-    if compared or case.priors or case.reconstruction.metric_std is not None:
-        return ()
-    return (Finding.of(FindingKind.SCALE_FROM_ROBOT, "informs"),)
-
-
 def _fault(hand_eye: HandEye, lengths: list[Length]) -> Float[ndarray, "7 7"]:
     """Return the covariance of the difference of the most exact length from the robot beyond their uncertainties."""
-    best = min(lengths, key=lambda one: one.std)
+    best = min(lengths, key=lambda one: one.std, default=Length("robot", 0.0, EXACT))
     beyond = best.off**2 - best.std**2 - float(hand_eye.covariance[6, 6])
     if best.std >= EXACT or beyond <= 0:
         return np.zeros((7, 7))
@@ -198,8 +194,10 @@ def _fault(hand_eye: HandEye, lengths: list[Length]) -> Float[ndarray, "7 7"]:
     return np.outer(shift, shift)
 
 
-def _fused(case: Case, hand_eye: HandEye, lengths: list[Length], fault: Float[ndarray, "7 7"]) -> CheckResult:
-    """Return the calibration with the lengths as priors of its scale."""
+def _fused(
+    case: Case, hand_eye: HandEye, lengths: list[Length], fault: Float[ndarray, "7 7"]
+) -> tuple[HandEye, Solution]:
+    """Return calibration and adjustment with the lengths as priors of the scale."""
     assert case.adjusted is not None
     log_scale, boards = float(np.log(case.adjusted.most_likely.scale)), case.reconstruction.tracks.boards
     by_scale = np.eye(case.adjusted.problem.unknowns)[SCALE.start]
@@ -212,24 +210,149 @@ def _fused(case: Case, hand_eye: HandEye, lengths: list[Length], fault: Float[nd
         else:
             known.append(LinearPrior(by_scale, log_scale - one.off, float(np.hypot(one.std, ROBOT_STD))))
     adjusted = with_priors(case.adjusted, known)
-    refined = refined_by(case, adjusted)
-    refined = refined.with_fault(fault)
+    refined = refined_by(case, adjusted).with_fault(fault)
     for one in hand_eye.findings:
-        if one.shift is not None:
-            of_camera = one.intrinsics_shift
-            shifts = None if of_camera is None else (np.array(one.shift), np.array(of_camera))
-            refined = refined.with_fault(one.covariance, shifts)
+        refined = refined.with_finding(one)
     depth = hand_eye.depth
     if depth is not None:
         # What is measured with depth images is in the metre that the map has.
         percent = 100 * ((1 + depth.off_percent / 100) * hand_eye.scale / refined.scale - 1)
         depth = replace(depth, off_percent=percent)
-    refined = replace(
-        refined,
-        findings=hand_eye.findings,
-        depth=depth,
-        network=hand_eye.network,
-        lengths=hand_eye.lengths,
-        board=hand_eye.board,
+    measured = {name: getattr(hand_eye, name) for name in ("findings", "network", "lengths", "board")}
+    return judged(replace(refined, depth=depth, **measured)), adjusted
+
+
+def check_boards(case: Case) -> Case:
+    """Report boards that were not found or that moved, and their size by the robot."""
+    boards = case.reconstruction.tracks.boards
+    assert boards is not None
+    findings = list[Finding]()
+    if not boards.bodies:
+        details = {"board": boards.spec} | ({"proposed": boards.proposed} if boards.proposed else {})
+        findings.append(
+            Finding(
+                kind=FindingKind.BOARD_NOT_FOUND, severity="warns", concerns="reconstruction", details=details
+            )
+        )
+    if boards.elsewhere:
+        elsewhere = [case.names[row] for row in boards.elsewhere]
+        findings.append(Finding.of(FindingKind.BOARD_MOVED, "warns", "images", *elsewhere, board=boards.spec))
+    hand_eye = case.hand_eye
+    if case.adjusted is None or case.adjusted.problem.boards is None:
+        return case.after(tuple(findings))
+    found = board_found(case.adjusted, boards)
+    if boards.size_std is None and hand_eye.before is not None:
+        side = 1e-3 * found.side_mm, 1e-3 * found.side_std_mm
+        findings.append(
+            Finding.of(FindingKind.BOARD_SIDE, "informs", value=side[0], std=side[1], board=boards.spec)
+        )
+    return case.after(tuple(findings), replace(hand_eye, board=found))
+
+
+def board_found(adjusted: Solution, boards: Boards) -> BoardFound:
+    """Return the boards as an adjustment has them."""
+    problem, state, shapes = adjusted.problem, adjusted.state, adjusted.problem.boards
+    assert shapes is not None and problem.observations is not None
+    size, by_unknown = size_of_boards(adjusted)
+    side_mm = 1e3 * boards.side * float(np.exp(size))
+    std = float(np.sqrt(by_unknown @ adjusted.covariance @ by_unknown))
+    of_corners = np.isin(problem.observations.point, shapes.point)
+    shape = state.camera_steps[problem.columns.boards]
+    bent = np.column_stack([shapes.x_in_body[:, :2], shapes.bend(shape)])
+    bent_mm = 1e3 * state.scale * np.exp(shape[0]) * bent
+    numbers = np.unique(shapes.body)
+    bends_mm = [float(np.ptp(bent_mm[shapes.body == k, 2])) for k in numbers]
+    most = shapes.body == numbers[int(np.argmax(bends_mm))]
+    rigs = state.world_from_rig[shapes.first_rig + numbers]
+    normals = rigs[:, :3, 2] @ state.z[0][:3, :3].T
+    points = apply(state.z[0], state.scale * state.points_in_world[shapes.point])
+    return BoardFound(
+        spec=boards.spec,
+        bodies=len(numbers),
+        images=len(np.unique(problem.observations.image[of_corners])),
+        corners=len(shapes.point),
+        side_mm=side_mm,
+        side_std_mm=side_mm * std,
+        stated_mm=None if boards.size_std is None else 1e3 * boards.side,
+        rms_px=float(np.sqrt((adjusted.images.view.residual_px[of_corners] ** 2).mean())),
+        bend_mm=max(bends_mm),
+        centres_in_base=tuple(_xyz(points[shapes.body == k].mean(0)) for k in numbers),
+        tilts_deg=tuple(np.degrees(np.arccos(np.abs(normals[:, 2]).clip(0, 1))).tolist()),
+        shape_mm=tuple(_xyz(one) for one in bent_mm[most].round(3)),
     )
-    return CheckResult(_from_robot_alone(case, refined), judged(refined), adjusted)
+
+
+def _xyz(x: Float[ndarray, "3"]) -> tuple[float, float, float]:
+    return float(x[0]), float(x[1]), float(x[2])
+
+
+def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye) -> DepthCheck | None:
+    """Return scale and noise of the depth images by the robot; None where too few features have a depth.
+
+    Raises InputError where a depth image cannot be read.
+    """
+    if capture.depths is None:
+        return None
+    measured, predicted, image = _pairs(capture, reconstruction, hand_eye.scale, capture.depths)
+    off = np.log(measured / predicted)
+    rows, count = np.unique(image, return_counts=True)
+    rows = rows[count >= MIN_FEATURES // 6]
+    if len(rows) < MIN_IMAGES or len(off) < MIN_FEATURES:
+        return None
+    # An image's features share what its pose is off by, so images are counted and not features.
+    medians = np.array([np.median(off[image == row]) for row in rows])
+    common = float(np.median(medians))
+    spread = NORMAL * float(np.median(np.abs(medians - common)))
+    std = np.hypot(1.2533 * spread / np.sqrt(len(rows)), np.sqrt(hand_eye.covariance[6, 6]))
+    same = np.abs(off - common) < OUTSIDE
+    depth = predicted[same]
+    noise_m, noise_per_m = _noise(depth, measured[same] / np.exp(common) - depth)
+    near, far = np.percentile(depth, [5, 95])
+    return DepthCheck(
+        off_percent=100 * float(np.expm1(common)),
+        std_percent=100 * float(std),
+        noise_m=noise_m,
+        noise_per_m=noise_per_m,
+        distances_m=(float(near), float(far)),
+        images=len(rows),
+        features=int(same.sum()),
+    )
+
+
+def _pairs(
+    capture: Capture, reconstruction: Reconstruction, scale: float, depths: tuple[str | None, ...]
+) -> tuple[Float[ndarray, " k"], Float[ndarray, " k"], Int[ndarray, " k"]]:
+    """Return measured depths (m), depths by the robot, and images of all features that have both."""
+    tracks = reconstruction.tracks
+    parts = []
+    for k, row in enumerate(reconstruction.image_index):
+        if row >= len(depths) or (name := depths[row]) is None:
+            continue
+        depth = read_depth(capture.folder / name, capture.image_size)
+        seen = np.flatnonzero(tracks.image == k)
+        u, v = np.rint(tracks.x_px[seen]).astype(int).T
+        inside = (u >= 1) & (v >= 1) & (u < depth.shape[1] - 1) & (v < depth.shape[0] - 1)
+        seen, u, v = seen[inside], u[inside], v[inside]
+        around = np.stack([depth[v + dv, u + du] for dv in (-1, 0, 1) for du in (-1, 0, 1)])
+        camera_from_recon = inverse(reconstruction.recon_from_camera[k])
+        x_in_camera = apply(camera_from_recon, tracks.points_in_recon[tracks.point[seen]])
+        # At the edge of a thing, colour and depth are of different ones.
+        whole = (around > 0).all(0) & (np.ptp(around, axis=0) < 0.03 * around[4]) & (x_in_camera[:, 2] > 0)
+        parts.append((around[4][whole].astype(float), scale * x_in_camera[whole, 2], np.full(whole.sum(), k)))
+    if not parts:
+        return np.zeros(0), np.zeros(0), np.zeros(0, int)
+    measured, predicted, image = map(np.concatenate, zip(*parts, strict=True))
+    return measured, predicted, image
+
+
+def _noise(depth: Float[ndarray, " k"], residual: Float[ndarray, " k"]) -> tuple[float, float]:
+    """Return a (m) and b (1/m) of sigma² = a² + (b z²)² by the spread of the residuals in bins of distance."""
+    from scipy.optimize import nnls  # few captures have a depth camera, and it takes 0.1 s
+
+    bins = np.array_split(np.argsort(depth), BINS)
+    z = np.array([np.median(depth[rows]) for rows in bins])
+    variance = np.array([(NORMAL * np.median(np.abs(residual[rows]))) ** 2 for rows in bins])
+    # Relative, for a variance that is estimated is as uncertain as it is large.
+    design = np.stack([np.ones(BINS), z**4], 1) / variance[:, None].clip(1e-12)
+    (constant, growing), _ = nnls(design, np.ones(BINS))
+    return float(np.sqrt(constant)), float(np.sqrt(growing))
