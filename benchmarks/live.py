@@ -25,8 +25,7 @@ from jcr.live.calibration import LiveCalibration
 from jcr.live.progress import Progress
 from jcr.pipeline.run import calibrate
 from jcr.records import Intrinsics
-from jcr.results import RunResult
-from jcr.run_folder import LIVE
+from jcr.run_folder import RunResult
 from simulation.arms import (
     EFFECTIVE_POSES,
     PRESETS,
@@ -218,7 +217,7 @@ def fed(folder: Path) -> Fed:
                 live.add(image, pose)
                 latency.append(time.process_time() - begun)
             finished, finish_s = _timed(live.finish)
-        shutil.copytree(out / "live", out / "bare", ignore=shutil.ignore_patterns(LIVE))
+        shutil.copytree(out / "live", out / "bare", ignore=shutil.ignore_patterns("result"))
         batch, at_once_s = _timed(lambda: calibrate(out / "bare", out / "batch"))
     sigmas = None
     if finished is not None and batch is not None:

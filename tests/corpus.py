@@ -45,7 +45,7 @@ from jcr.records import (
     Reconstruction,
     Tracks,
 )
-from jcr.run_folder import RunFolder
+from jcr.run_folder import RunResult
 from jcr.scene.cloud_ply import read_cloud, write_cloud
 from jcr.scene.map_file import load_map
 from jcr.scene.options import MapOptions
@@ -322,9 +322,9 @@ def runs(folder: Path, capture: Capture) -> dict[str, Target]:
     (folder / "reference.json").write_text(json.dumps(reference))
     (folder / "names.json").write_text(json.dumps({"1": "mug", "2": "box"}))
     readers: dict[str, tuple[Path, Read]] = {
-        "calibration.json": (run / "calibration.json", lambda file: RunFolder(run).calibration()),
+        "calibration.json": (run / "calibration.json", lambda file: RunResult(run).calibration),
         "compared calibration.json": (run / "calibration.json", lambda file: read_hand_eye(run)),
-        "run.json": (run / "run.json", lambda file: (RunFolder(run).capture(), RunFolder(run).options())),
+        "run.json": (run / "run.json", lambda file: RunResult(run).capture),
         "reference.json": (folder / "reference.json", read_hand_eye),
         "added/capture.json": (added / "capture.json", lambda file: read_added(added.parent, capture)),
         "names.json": (folder / "names.json", _read_names),
@@ -370,7 +370,7 @@ def sound_run(out: Path) -> Path:
     options["calibrate"] |= {"robot_noise": [0.1, 0.05], "known_length": ["0.png", 1.0, 2.0, 30.0, 4.0, 50.0]}
     state = {
         "capture": str(out / "capture"),
-        "reconstruct": "0",
+        "reconstruction": "0",
         "options": options,
         "attempts": [asdict(attempt)],
     }

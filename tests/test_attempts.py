@@ -235,8 +235,8 @@ def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
     present: set[str], tmp_path: Path, tabletop: Path, monkeypatch: pytest.MonkeyPatch
 ):
     from jcr.capture.read import read_capture
-    from jcr.pipeline.run import calibrate
-    from jcr.run_folder import RunFolder
+    from jcr.pipeline.run import RunOptions, calibrate
+    from jcr.run_folder import RunResult
 
     problem = hand_eye_problem(np.random.default_rng(3), 12)
     capture = replace(read_capture(tabletop), base_from_gripper=problem.base_from_gripper)
@@ -273,9 +273,9 @@ def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
         "attempt 2: direct registered 12 of 12 images, kept; reconstruct 400.00 s, calibrate 3.00 s"
     )
 
-    # The same again tries none: the account of how it was chosen stays, the times are those of now.
-    calibrate(capture, tmp_path)
-    again = RunFolder(tmp_path).calibration()
+    # With other options of the calibration none is tried again: the account of the selection stays, with new times.
+    calibrate(capture, tmp_path, RunOptions(calibrate=CalibrateOptions(require=(50.0, 9.0))))
+    again = RunResult(tmp_path).calibration
     assert made == ["colmap", "direct"]
     assert again.as_json()["attempts"] == content["attempts"]
     assert again.timings_s == {"reconstruct": 0.0, "calibrate": 3.0, "report": 0.0}
@@ -286,7 +286,7 @@ def test_where_nothing_is_found_each_attempt_reports_why(
 ):
     from jcr.capture.read import read_capture
     from jcr.pipeline.run import calibrate
-    from jcr.run_folder import RunFolder
+    from jcr.run_folder import RunResult
 
     def door(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
         raise RejectedError(f"{options.backend} saw nothing")
@@ -294,7 +294,7 @@ def test_where_nothing_is_found_each_attempt_reports_why(
     monkeypatch.setattr(selection, "reconstruct", door)
     with pytest.raises(RejectedError, match="direct saw nothing; back end colmap failed"):
         calibrate(read_capture(tabletop), tmp_path)
-    tried = RunFolder(tmp_path).calibration().attempts
+    tried = RunResult(tmp_path).calibration.attempts
     assert [(attempt.backend, attempt.images_registered, attempt.why_not) for attempt in tried] == [
         ("colmap", None, "colmap saw nothing"),
         ("direct", None, "direct saw nothing"),
@@ -309,7 +309,6 @@ def test_input_that_calibration_cannot_use_is_no_reason_for_another_back_end(
 ):
     from jcr.capture.read import read_capture
     from jcr.pipeline.run import RunOptions, calibrate
-    from jcr.run_folder import RunFolder
 
     problem = hand_eye_problem(np.random.default_rng(3), 12)
     capture, made = read_capture(tabletop), []
@@ -324,14 +323,6 @@ def test_input_that_calibration_cannot_use_is_no_reason_for_another_back_end(
     with pytest.raises(InputError, match="no surface was found"):
         calibrate(capture, tmp_path / "auto", RunOptions(calibrate=lost))
     assert made == ["colmap"]
-    # Where there is no choice, the reconstruction is kept before it is calibrated: corrected options find it there.
-    with pytest.raises(InputError, match="no surface was found"):
-        calibrate(capture, tmp_path / "colmap", RunOptions(calibrate=lost), backend="colmap")
-    kept = RunFolder(tmp_path / "colmap").reconstruction()
-    assert kept.backend == "colmap" and kept.pointmaps is not None
-    with pytest.raises(InputError, match="no surface was found"):
-        calibrate(capture, tmp_path / "colmap", RunOptions(calibrate=lost), backend="colmap")
-    assert made == ["colmap", "colmap"]
 
 
 def test_a_known_length_ends_on_surfaces_and_nothing_else_needs_depth_before_the_calibration(
@@ -356,11 +347,8 @@ def test_a_known_length_ends_on_surfaces_and_nothing_else_needs_depth_before_the
     capture = Capture(
         folder=Path(), images=names, base_from_gripper=problem.base_from_gripper, image_size=(640, 480)
     )
-    chosen = []
-    choice = selection.choose(
-        capture, ReconstructOptions(), CalibrateOptions(), None, lambda made: chosen.append(made)
-    )
-    assert not densified and chosen == [choice.reconstruction] and choice.reconstruction.pointmaps is None
+    choice = selection.choose(capture, ReconstructOptions(), CalibrateOptions())
+    assert not densified and choice.reconstruction.pointmaps is None
     for length, why in (("nowhere.png", "nowhere"), ("00.png", "no surface was found")):
         lost = CalibrateOptions(known_length=(length, 0.0, 0.0, 9.0, 9.0, 50.0))
         with pytest.raises(InputError, match=why):

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from jcr import reconstruct as backends
-from jcr import run_folder
 from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.reconstruct import (
@@ -23,6 +22,7 @@ from jcr.reconstruct import (
     with_cameras_of,
 )
 from jcr.records import Capture
+from jcr.run_folder import RunOptions, state_of
 
 
 @pytest.fixture
@@ -189,11 +189,11 @@ def test_a_changed_file_of_predictions_is_another_input(tmp_path: Path) -> None:
     for name in ("predictions", "cameras"):
         path = tmp_path / name
         path.write_text("one")
-        options = ReconstructOptions(**{name: path}).as_json()
-        before = run_folder.fingerprint(capture, options)
-        assert run_folder.fingerprint(capture, options) == before
+        options = RunOptions(reconstruct=ReconstructOptions(**{name: path}))
+        before = state_of(capture, options).reconstruction
+        assert state_of(capture, options).reconstruction == before
         path.write_text("another")
-        assert run_folder.fingerprint(capture, options) != before
+        assert state_of(capture, options).reconstruction != before
 
 
 def test_models_are_listed_with_licence_scale_and_what_is_present(capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,13 +11,11 @@ import numpy as np
 import pytest
 
 from corpus import sound_run
-from jcr.calibration.options import CalibrateOptions
 from jcr.cli import call, dispatch
 from jcr.errors import InputError
-from jcr.reconstruct import ReconstructOptions
+from jcr.pipeline.run import _is_complete, _write_complete
 from jcr.records import Capture, CellCamera
-from jcr.results import RunOptions
-from jcr.run_folder import MadeWith, RunFolder, locked, state_of
+from jcr.run_folder import RunOptions, RunResult, locked, state_of
 
 
 @pytest.fixture(scope="module")
@@ -50,13 +48,11 @@ def test_a_run_with_files_beside_its_images_is_complete_in_relative_folders(
         depths=("0.depth.png",),
         others=(other,),
     )
-    folder, options = RunFolder(Path("out")), RunOptions(map=None)
-    for name in ("reconstruction.npz", "report.html"):
-        (folder.path / name).touch()
-    folder.keep_complete(capture, options)
-    assert folder.is_complete(capture, options)
+    run, state = RunResult("out", capture=capture), state_of(capture, RunOptions(map=None))
+    _write_complete(state, run.out, capture)
+    assert _is_complete(run, state)
     Path("cell/fixed/0.png").write_bytes(b"another image")
-    assert not folder.is_complete(capture, options)
+    assert not _is_complete(run, state)
 
 
 Content = dict[str, Any]
@@ -79,7 +75,7 @@ STATES: dict[str, Callable[[Content], Any]] = {
     "capture of a million letters": lambda c: c.update(capture="x" * 1_000_000),
     "capture of a name too long": lambda c: c.update(capture="/tmp/" + "x" * 300),
     "capture gone": lambda c: c.update(capture="/nowhere"),
-    "no fingerprint": lambda c: c.pop("reconstruct"),
+    "no fingerprint": lambda c: c.pop("reconstruction"),
 }
 
 CALIBRATIONS: dict[str, Callable[[Content], Any]] = {
@@ -148,9 +144,8 @@ def test_a_capture_in_a_folder_whose_name_is_not_utf8_is_refused_before_any_work
     capture = Capture(
         folder=Path("caf\udce9"), images=("a.png",), base_from_gripper=np.eye(4)[None], image_size=(640, 480)
     )
-    made_with = MadeWith(reconstruct=ReconstructOptions(), calibrate=CalibrateOptions())
     with pytest.raises(InputError, match="not UTF-8; rename it"):
-        state_of(capture, made_with)
+        state_of(capture, RunOptions())
 
 
 def test_memory_that_ends_is_one_line(capsys):

@@ -9,7 +9,7 @@ import pytest
 from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.pipeline.touch import touch
-from jcr.run_folder import RunFolder
+from jcr.run_folder import RunResult
 
 pytestmark = pytest.mark.slow
 
@@ -20,9 +20,7 @@ def touched(done: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     from jcr.calibration.cues import surface_at
     from jcr.geometry import apply
 
-    folder = RunFolder(done)
-    calibration, reconstruction = folder.calibrated()
-    capture = folder.capture()
+    calibration, capture, reconstruction = RunResult(done).of_wrist_camera()
     rng = np.random.default_rng(0)
     true = np.array(json.loads((capture.folder / "reference.json").read_text())["gripper_from_camera"])
     lines = ["image, x_px, y_px, x_m, y_m, z_m"]

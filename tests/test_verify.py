@@ -11,7 +11,6 @@ import pytest
 
 import jcr
 from jcr.calibration.drift import drift
-from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import calibration_of, write_calibration
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
@@ -23,9 +22,9 @@ from jcr.estimation.solve import solve
 from jcr.estimation.systematic import arm_errors, posed, smooth_errors
 from jcr.estimation.wrist import pose_problem
 from jcr.geometry import inverse, rotation_exp, scale_translation, transform
-from jcr.reconstruct import ReconstructOptions
+from jcr.pipeline.run import _keep_reconstruction
 from jcr.records import Capture, Reconstruction, Tracks
-from jcr.run_folder import MadeWith, RunFolder, state_of
+from jcr.run_folder import RunOptions, state_of
 from jcr.sfm.register import register
 from simulation.problems import bent_problem
 from simulation.taken import with_robot_noise
@@ -185,9 +184,8 @@ def out(tmp_path_factory: pytest.TempPathFactory, capture: Capture, reconstructi
     hand_eye = calibrate(old, reconstruction)
     assert hand_eye.converged
     write_calibration(folder / "out/calibration.json", calibration_of(old, reconstruction, hand_eye, {}, "0"))
-    made_with = MadeWith(reconstruct=ReconstructOptions(), calibrate=CalibrateOptions())
-    state = state_of(jcr.read_capture(old.folder), made_with)
-    RunFolder(folder / "out").keep_reconstruction(reconstruction, state)
+    state = state_of(jcr.read_capture(old.folder), RunOptions())
+    _keep_reconstruction(folder / "out", reconstruction, state)
     return folder / "out"
 
 

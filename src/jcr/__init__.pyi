@@ -66,11 +66,9 @@ from .records import PosePairs as PosePairs
 from .records import Reconstruction as Reconstruction
 from .records import Requirement as Requirement
 from .records import RobotNoise as RobotNoise
-from .results import CalibrationResult as CalibrationResult
-from .results import RunOptions as RunOptions
-from .results import RunResult as RunResult
-from .results import SavedRun as SavedRun
-from .results import load_run as load_run
+from .run_folder import RunOptions as RunOptions
+from .run_folder import RunResult as RunResult
+from .run_folder import load_run as load_run
 from .scene.distance import DistanceGrid as DistanceGrid
 from .scene.map_file import load_map as load_map
 from .scene.options import CloudOptions as CloudOptions

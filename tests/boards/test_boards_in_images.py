@@ -11,7 +11,7 @@ from jcr.capture.images import encode_png, read_image
 from jcr.files import write_bytes
 from jcr.findings import FindingKind, sentence
 from jcr.geometry import inverse, rotation_exp, transform
-from jcr.results import RunResult
+from jcr.run_folder import RunResult
 from simulation.boards import with_chessboard
 from simulation.truth import read_truth
 

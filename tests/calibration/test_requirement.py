@@ -20,10 +20,10 @@ from jcr.errors import InputError
 from jcr.estimation.point_uncertainty import within_95
 from jcr.findings import Finding, FindingKind, sentence
 from jcr.geometry import inverse, scale_translation, step_between
-from jcr.pipeline import run, stages
+from jcr.pipeline import run
 from jcr.records import HandEye, PosePairs
 from jcr.report.html import poses_report_html
-from jcr.results import PosesResult, RunOptions
+from jcr.run_folder import RunOptions, RunResult
 from simulation.problems import HandEyeProblem, disturbed, hand_eye_problem
 
 DISAGREE = Finding(
@@ -45,13 +45,10 @@ def pairs(seed: int, count: int) -> tuple[PosePairs, np.ndarray]:
     return found, problem.gripper_from_camera
 
 
-def _poses_result(of: PosePairs, content: Calibration, hand_eye: HandEye) -> PosesResult:
-    return PosesResult(out=Path("out"), pairs=of, calibration=content, hand_eye=hand_eye, scale_is_one=False)
-
-
 def page(of: PosePairs, hand_eye: HandEye) -> tuple[Calibration, str]:
     content = calibration_of(of, of, hand_eye, {}, "0.0")
-    return content, poses_report_html(_poses_result(of, content, hand_eye))
+    result = RunResult("out", capture=of, calibration=content, hand_eye=hand_eye, reconstruction=of)
+    return content, poses_report_html(result)
 
 
 @pytest.mark.parametrize("spread", [(1, 1, 1), (3, 1, 0.1), (1, 0, 0), (10, 1, 1)])
@@ -157,7 +154,7 @@ def test_the_command_ends_with_3_where_what_was_asked_is_not_reached(capsys: pyt
     given, _ = pairs(12, 12)
     for asked in (None, (0.5, 0.1)):
         hand_eye = calibrate_poses(given, CalibrateOptions(require=asked))
-        result = _poses_result(given, page(given, hand_eye)[0], hand_eye)
+        result = RunResult("out", calibration=page(given, hand_eye)[0])
         show_calibration(result, VerboseOutput())
         status = show(result, VerboseOutput())
         said = capsys.readouterr()
@@ -226,7 +223,7 @@ def _first(given: PosePairs, count: int) -> tuple[np.ndarray, np.ndarray]:
 def test_options_that_cannot_be_are_refused_before_any_work(
     options: CalibrateOptions, message: str, tabletop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(stages, "choose", lambda *_: pytest.fail("images were reconstructed"))
+    monkeypatch.setattr(run, "choose", lambda *_: pytest.fail("images were reconstructed"))
     with pytest.raises(InputError, match=message):
         run.calibrate(read_capture(tabletop), tmp_path / "out", RunOptions(calibrate=options))
     assert not (tmp_path / "out").exists()

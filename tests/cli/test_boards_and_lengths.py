@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from in_process import run_jcr
-from jcr.pipeline import stages
+from jcr.pipeline import run
 
 FIRST = "images/00.jpg"
 
@@ -29,7 +29,7 @@ def test_a_board_or_a_length_that_cannot_be_is_refused_before_any_work(
     arguments: list[str],
     words: str,
 ):
-    monkeypatch.setattr(stages, "calibrated", lambda *_: pytest.fail("the capture was worked on"))
+    monkeypatch.setattr(run, "_calibrated", lambda *_: pytest.fail("the capture was worked on"))
     found = run_jcr("run", tabletop, tmp_path / "out", *arguments)
     assert found.returncode == 2 and words in found.stderr, found.stderr
     assert len(found.stderr.splitlines()) == 1 and not (tmp_path / "out" / "calibration.json").exists()

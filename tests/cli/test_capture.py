@@ -21,9 +21,9 @@ def result(name: str, reached_mm: float) -> Any:
         translation_mm=2.0, rotation_deg=0.3, asked=True, distance_mm=500.0, reached_mm=reached_mm, reached_deg=0.1
     )  # fmt: skip
     content = read_calibration(ROOT / "tests" / "calibrations" / f"{name}.json")
+    content = content.model_copy(update={"requirement": required})
     return SimpleNamespace(
         converged=content.converged,
-        hand_eye=SimpleNamespace(requirement=required),
         verdict=content.verdict,
         calibration=content,
         out=Path("captures/live/result"),

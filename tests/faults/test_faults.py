@@ -23,14 +23,13 @@ import pytest
 from PIL import Image
 
 import jcr
-from jcr import run_folder
 from jcr.calibration.record import read_calibration
 from jcr.capture.read import read_capture
 from jcr.cli import dispatch
 from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import forward_kinematics
 from jcr.pipeline import run, selection
-from jcr.run_folder import RunFolder
+from jcr.run_folder import RunResult
 from simulation.problems import hand_eye_problem
 
 SIZE = (96, 72)
@@ -557,13 +556,13 @@ def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(
     """Killed between the two files of another capture, the first capture's run would take the wrong one."""
     out = tmp_path / "out"
     shutil.copytree(done, out)
-    kept = RunFolder(done).reconstruction()
+    kept = RunResult(done).reconstruction
     monkeypatch.setattr(selection, "reconstruct", lambda *_: kept)
 
     def killed(*_) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run_folder, "write_reconstruction", killed)
+    monkeypatch.setattr(run, "write_reconstruction", killed)
     with pytest.raises(KeyboardInterrupt):
         run.calibrate(read_capture(sound), out, backend="colmap")
     assert not (out / "run.json").exists()

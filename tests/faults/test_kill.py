@@ -16,14 +16,14 @@ from safetensors.numpy import load_file
 from jcr.calibration.record import read_calibration
 from jcr.cli import dispatch, main
 from jcr.reconstruction_npz import read_reconstruction
-from jcr.run_folder import RunFolder
+from jcr.run_folder import RunResult
 from jcr.scene.cloud_ply import read_cloud
 from jcr.scene.map_file import load_map
 
 pytestmark = pytest.mark.slow
 
 KILLS = int(os.environ.get("JCR_TEST_KILLS", "2"))
-WRITES = 11
+WRITES = 10
 """Times that a run writes a file."""
 PROCESSES = multiprocessing.get_context("forkserver")
 # What a run imports is imported once: what is killed before it works has done nothing.
@@ -89,7 +89,7 @@ class Run:
 READERS = {
     "calibration.json": read_calibration,
     "reconstruction.npz": read_reconstruction,
-    "depth.npz": lambda path: RunFolder(path.parent).reconstruction(),
+    "depth.npz": lambda path: RunResult(path.parent).reconstruction,
     "cloud.ply": read_cloud,
     "map.safetensors": load_map,
     "run.json": lambda path: json.loads(path.read_text()),

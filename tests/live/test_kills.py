@@ -17,7 +17,6 @@ import jcr
 from jcr.capture.images import read_image
 from jcr.live.calibration import LiveCalibration
 from jcr.live.folder import LiveFolder
-from jcr.run_folder import LIVE
 
 pytestmark = pytest.mark.slow
 
@@ -66,7 +65,7 @@ def cpu_s(process: BaseProcess) -> float:
 
 
 def result(folder: Path) -> np.ndarray:
-    content = json.loads((folder / LIVE / "calibration.json").read_text())
+    content = json.loads((folder / "result" / "calibration.json").read_text())
     return np.append(content["gripper_from_camera"], content["uncertainty"]["covariance"])
 
 

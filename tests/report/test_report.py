@@ -48,8 +48,8 @@ from jcr.report.html import failed_report_html, report_html
 from jcr.report.images import MAGNIFIED, reprojections_px
 from jcr.report.motion import excitation_bars
 from jcr.report.sketch import sketch
-from jcr.results import RunResult
 from jcr.rounding import decimals_of, significant
+from jcr.run_folder import RunResult
 from jcr.scene.cloud import point_cloud
 from jcr.scene.options import MapOptions
 from jcr.scene.samples import sample_surface
@@ -386,7 +386,7 @@ def test_every_camera_of_the_cell_is_in_the_scene(run: RunResult):
     )
     content = CellPlacement(tuple(found), (arm,)).file("0.0")
     capture = replace(run.capture, others=others)
-    page = report_html(replace(run, capture=capture, cloud=None, scene=None, cameras=content))
+    page = report_html(run.with_parts(capture=capture, cloud=None, scene=None, cameras=content))
     scene = json.loads(Elements(page).scripts[0])
     drawn = {camera["name"]: np.array(camera["cameras"]) for camera in scene["others"]}
     assert {name: len(places) for name, places in drawn.items()} == {"top": 1, "second": 1, "other": 1}
@@ -416,15 +416,15 @@ def with_reconstruction(run: RunResult, reconstruction: Reconstruction) -> str:
     """Return the report of the calibration of another reconstruction, without a map."""
     hand_eye = calibrate(run.capture, reconstruction)
     content = calibration_of(run.capture, reconstruction, hand_eye, {}, "0.0")
-    found = replace(run, cloud=None, scene=None, reconstruction=reconstruction)
-    return report_html(replace(found, calibration=content, hand_eye=hand_eye))
+    found = run.with_parts(cloud=None, scene=None, reconstruction=reconstruction)
+    return report_html(found.with_parts(calibration=content, hand_eye=hand_eye))
 
 
 def test_a_rejected_calibration_is_not_recommended(run: RunResult):
     still = run.capture.base_from_gripper.copy()
     still[:, :3, :3] = np.eye(3)
     cameras = still @ run.hand_eye.gripper_from_camera
-    of_sliding = replace(run, capture=replace(run.capture, base_from_gripper=still))
+    of_sliding = run.with_parts(capture=replace(run.capture, base_from_gripper=still))
     page = with_reconstruction(
         of_sliding, replace(run.reconstruction, recon_from_camera=cameras[:UNREGISTERED])
     )
@@ -457,7 +457,7 @@ def test_reprojections_and_poses_to_add_are_those_of_the_run(run: RunResult, pag
 def test_poses_to_add_are_in_the_notation_of_the_robot(
     run: RunResult, convention: str | None, robot: str | None, as_written: str
 ):
-    of_robot = replace(run, capture=replace(run.capture, pose_convention=convention, robot=robot))
+    of_robot = run.with_parts(capture=replace(run.capture, pose_convention=convention, robot=robot))
     elements = Elements(report_html(of_robot))
     for k, pose in enumerate(run.hand_eye.next_poses, start=1):
         numbers = np.array([float(part) for part in elements.copied(f"pose {k}").split(",")])

@@ -20,7 +20,7 @@ from jcr.camera import project
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse
 from jcr.records import Capture
-from jcr.run_folder import RunFolder
+from jcr.run_folder import RunResult
 from jcr.viewer.robot import read_robot
 from simulation.truth import Truth, read_truth
 from waiting import until
@@ -57,7 +57,7 @@ def gantry(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def capture(done: Path) -> Capture:
     """The bundled capture with the joint values that bring the gantry's tool to each gripper pose."""
-    read = RunFolder(done).capture()
+    read = RunResult(done).capture
     poses = read.base_from_gripper
     angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler("ZYX")
     return replace(read, joints=np.hstack([poses[:, :3, 3], angles]))
@@ -71,8 +71,7 @@ def viewer(done: Path, capture: Capture, gantry: Path) -> "Iterator[Viewer]":
     server = open_server(0, "test")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "MAP_POINTS", 15_000)  # drawn without a graphics card
-        patch.setattr(RunFolder, "capture", lambda _: capture)
-        yield module.Viewer(server, RunFolder(done), gantry)
+        yield module.Viewer(server, RunResult(done, capture=capture), gantry)
     server.stop()
 
 

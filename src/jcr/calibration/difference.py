@@ -19,9 +19,9 @@ from jcr.errors import InputError
 from jcr.geometry import require_rigid, step_between
 
 if TYPE_CHECKING:
-    from jcr.results import CalibrationResult
+    from jcr.run_folder import RunResult
 
-    Comparable = CalibrationResult | Calibration | str | Path | ArrayLike
+    Comparable = RunResult | Calibration | str | Path | ArrayLike
 else:
     Comparable = object
 

@@ -40,6 +40,7 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Calibrate and print the result."""
+    from jcr.calibration.poses import is_one
     from jcr.calibration.words import labelled
     from jcr.pipeline.run import calibrate, calibrate_poses
     from jcr.progress import progress_bars
@@ -51,7 +52,11 @@ def main(arguments: Arguments) -> int:
         if isinstance(capture, PosePairs):
             found = calibrate_poses(capture, out, arguments.calibrate)
             show_calibration(found, arguments.output)
-            more = labelled("Scale", "1, as the marker's size says") if found.scale_is_one else ()
+            more = (
+                labelled("Scale", "1, as the marker's size says")
+                if found.converged and is_one(found.hand_eye)
+                else ()
+            )
             return show(found, arguments.output, *more)
         result = calibrated(lambda: calibrate(capture, out, options, progress=progress), out)
     show_calibration(result, arguments.output)

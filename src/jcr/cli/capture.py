@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from jcr.live.robot import States
     from jcr.live.server import Listen, LiveServer
     from jcr.live.session import Answer, LiveSession
-    from jcr.results import RunResult
+    from jcr.run_folder import RunResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +147,7 @@ def _conclude(
 
     out, images = arguments.out, len(folder.names)
     assert out is not None
-    required = None if result is None else result.hand_eye.requirement
+    required = None if result is None else result.calibration.requirement
     is_accepted = result is not None and result.converged
     lines = [] if result is None else summary(result.calibration).splitlines()
     command = f"jcr run {out} {Path('out') / out.resolve().name}" if is_accepted else f"jcr check {out}"

@@ -32,11 +32,11 @@ def main(arguments: Arguments) -> int:
     """Print the sizes; 3 when the calibration they rest on is rejected."""
     from jcr.errors import RejectedError
     from jcr.pipeline.run import measure
-    from jcr.run_folder import RunFolder
+    from jcr.run_folder import load_run
 
     measured = measure(arguments.out)
     arguments.output.result(table(measured), content(measured))
-    if (doubt := RunFolder(arguments.out).calibration().doubt) is not None:
+    if (doubt := load_run(arguments.out).doubt) is not None:
         raise RejectedError(f"sizes rejected: {doubt}")
     return 0
 

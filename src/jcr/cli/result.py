@@ -10,15 +10,13 @@ from jcr.cli.output import VerboseOutput
 
 if TYPE_CHECKING:
     from jcr.cell.placement import CameraPlacement
-    from jcr.results import PosesResult, RunResult, SavedRun
-
-    Result = RunResult | SavedRun | PosesResult
+    from jcr.run_folder import RunResult
 
 
-def calibrated(action: "Callable[[], Result]", out: Path) -> "Result":
+def calibrated(action: "Callable[[], RunResult]", out: Path) -> "RunResult":
     """Return the result of a run; where no back end found anything, what it left in `out`, which has the reason."""
     from jcr.pipeline.selection import NothingFoundError
-    from jcr.results import load_run
+    from jcr.run_folder import load_run
 
     try:
         return action()
@@ -26,18 +24,18 @@ def calibrated(action: "Callable[[], Result]", out: Path) -> "Result":
         return load_run(out)
 
 
-def show_calibration(result: "Result", output: VerboseOutput) -> None:
+def show_calibration(result: "RunResult", output: VerboseOutput) -> None:
     """Print the summary as soon as the calibration stands; with --json all comes at the end."""
     from jcr.calibration.words import MOST_LINES, summary
 
     if not output.json:
-        cameras = getattr(result, "cameras", None)
+        cameras = result.cameras
         others = 1 if cameras is None else 1 + len(cameras.cameras)  # a line of the caller, and the cameras
         sys.stdout.write(summary(result.calibration, MOST_LINES - others))
         sys.stdout.flush()
 
 
-def show(result: "Result", output: VerboseOutput, *more: str) -> int:
+def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
     """Print the lines after the summary, and return the exit status: 3 where it or a further camera is rejected.
 
     These are further cameras, `more` lines, the report and the next command; with --verbose the details; with --json
@@ -45,7 +43,7 @@ def show(result: "Result", output: VerboseOutput, *more: str) -> int:
     """
     from jcr.calibration.words import details, labelled
 
-    content, cameras = result.calibration, getattr(result, "cameras", None)
+    content, cameras = result.calibration, result.cameras
     placed = [] if cameras is None else cameras.cameras
     facts = content.as_json()
     if cameras is not None:
@@ -73,7 +71,7 @@ def _camera_in_words(camera: "CameraPlacement") -> str:
     )
 
 
-def _next(result: "Result") -> str:
+def _next(result: "RunResult") -> str:
     """Return the command that makes sense now."""
     if not result.converged:
         return "jcr docs troubleshooting"

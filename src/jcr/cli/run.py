@@ -19,8 +19,7 @@ from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
 if TYPE_CHECKING:
-    from jcr.cli.result import Result
-    from jcr.results import RunResult
+    from jcr.run_folder import RunResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,21 +56,14 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Run every stage and print the result."""
-    from jcr.pipeline.mapping import require_dense
-    from jcr.pipeline.run import finished, run
+    from jcr.pipeline.run import run
     from jcr.progress import progress_bars
 
     map_options = None if arguments.no_map else arguments.map
-    if map_options is not None:
-        require_dense(arguments.depth)  # before a recording is read
     options, out = run_options(arguments, map=map_options), arguments.out
     with progress_bars() as progress:
         found = source(arguments.capture, arguments.read, out, progress)
         capture = with_images(found, arguments.capture, "nothing to map; use `jcr calibrate`")
-        if (before := finished(capture, out, options)) is not None:
-            sys.stderr.write(f"unchanged: {out} is the run of this capture with these options\n")
-            show_calibration(before, arguments.output)
-            return show(before, arguments.output, *_map_lines(before, out, map_options is not None))
         shown = list[object]()
 
         def show_early(result: "RunResult") -> None:
@@ -80,17 +72,18 @@ def main(arguments: Arguments) -> int:
             shown.append(result)
 
         result = calibrated(lambda: run(capture, out, options, progress=progress, calibrated=show_early), out)
+    if result.is_unchanged:
+        sys.stderr.write(f"unchanged: {out} is the run of this capture with these options\n")
     if not shown:
         show_calibration(result, arguments.output)
     return show(result, arguments.output, *_map_lines(result, out, map_options is not None))
 
 
-def _map_lines(result: "Result", out: Path, is_wanted: bool) -> list[str]:
+def _map_lines(result: "RunResult", out: Path, is_wanted: bool) -> list[str]:
     """Return the line on the map: how to look at it, or why there is none where one was wanted."""
     from jcr.calibration.words import labelled
-    from jcr.run_folder import RunFolder
 
-    if RunFolder(out).has_map():
+    if (out / "map.safetensors").is_file():
         return labelled("Map", f"jcr view {shlex.quote(str(out))}")
     missing = [note for note in result.calibration.notes if note.startswith("no map was made")]
     return labelled("Map", *missing) if is_wanted else []

@@ -13,7 +13,7 @@ from jcr.capture.options import ReadOptions
 if TYPE_CHECKING:
     from jcr.progress import Progress
     from jcr.records import Capture, PosePairs
-    from jcr.results import RunOptions
+    from jcr.run_folder import RunOptions
 
 
 def _announce(path: Path) -> None:
@@ -36,7 +36,7 @@ def source(path: Path, options: ReadOptions, out: Path, progress: "Progress") ->
 
 def run_options(arguments: Any, **chosen: Any) -> "RunOptions":
     """Return the options of the stages among a command's arguments, `chosen` ones in their place."""
-    from jcr.results import RunOptions
+    from jcr.run_folder import RunOptions
 
     given = {
         one.name: getattr(arguments, one.name) for one in fields(RunOptions) if hasattr(arguments, one.name)

@@ -36,10 +36,9 @@ def main(arguments: Arguments) -> int:
     """Serve the page until Ctrl-C."""
     from jcr.extras import extra
     from jcr.progress import progress_bars
-    from jcr.run_folder import RunFolder
+    from jcr.run_folder import load_run
 
-    folder = RunFolder(arguments.out)
-    folder.calibration()  # raises at once where there is none
+    run = load_run(arguments.out)  # raises at once where there is none
     for package in ("viser", "torch"):
         extra(package, "view", "jcr view")
     from jcr.viewer.server import open_server
@@ -48,7 +47,7 @@ def main(arguments: Arguments) -> int:
     server = open_server(arguments.port, f"jcr · {arguments.out.resolve().name}")
     try:
         with progress_bars() as progress:
-            Viewer(server, folder, arguments.urdf, progress)
+            Viewer(server, run, arguments.urdf, progress)
         address = f"http://127.0.0.1:{server.get_port()}"
         arguments.output.result(f"{address} (Ctrl-C ends it)\n", {"address": address})
         threading.Event().wait()

@@ -19,12 +19,15 @@ from jcr.export.provenance import Provenance
 from jcr.files import write_text
 from jcr.geometry import transform
 from jcr.options import checked_options
-from jcr.run_folder import RunFolder
+from jcr.run_folder import CLOUD, RunResult
+from jcr.scene.cloud_ply import read_cloud
+from jcr.scene.map_file import load_map
 
 if TYPE_CHECKING:
     from jcr.cell.placement import CameraPlacement
     from jcr.export.views import PosedImages
-    from jcr.records import Intrinsics
+    from jcr.records import Intrinsics, PointCloud
+    from jcr.scene.scene_map import SceneMap
 
 
 @dataclass(frozen=True)
@@ -48,15 +51,15 @@ moveit | hand_eye.launch.py | launch file as MoveIt Calibration saves it | ros.m
 urdf | hand_eye.urdf | camera link and fixed joint | ros.urdf | mount others
 easy_handeye2 | hand_eye.calib | .calib for its publisher | ros.easy_handeye2 | mount path.stem
 camera_info | camera_info.yaml | intrinsics for camera_info_manager | ros.camera_info | mount
-ply | cloud.ply | points, colours, labels | views.write_ply | folder.cloud provenance
-glb | map.glb | mesh of the seen surface with colours | volume.write_glb | folder.scene provenance
-octomap | map.bt | occupied, free and unknown voxels | volume.write_octomap | folder.scene provenance options
-esdf | esdf.npz | voxels of signed distance | volume.write_esdf | folder.scene provenance options
-spheres | spheres.npz | spheres that cover what is solid | volume.write_spheres | folder.scene provenance options
+ply | cloud.ply | points, colours, labels | views.write_ply | cloud provenance
+glb | map.glb | mesh of the seen surface with colours | volume.write_glb | scene provenance
+octomap | map.bt | occupied, free and unknown voxels | volume.write_octomap | scene provenance options
+esdf | esdf.npz | voxels of signed distance | volume.write_esdf | scene provenance options
+spheres | spheres.npz | spheres that cover what is solid | volume.write_spheres | scene provenance options
 nerfstudio | nerfstudio/ | transforms.json, images and first points for a splat or NeRF | views.write_nerfstudio | \
-    views folder.cloud provenance options
+    views cloud provenance options
 colmap | colmap/ | COLMAP model in the base frame, binary and text | views.write_colmap | views provenance options
-rerun | run.rrd | recording for the Rerun viewer | rrd.write_rrd | views folder.cloud folder.scene provenance
+rerun | run.rrd | recording for the Rerun viewer | rrd.write_rrd | views cloud scene provenance
 """
 FORMATS = tuple(
     ExportFormat(*map(str.strip, row.split("|"))) for row in _TABLE.replace("\\\n", "").strip().splitlines()
@@ -119,8 +122,8 @@ class Run:
     """Run folder with export options; only the data that a format needs are read."""
 
     def __init__(self, out: Path, options: ExportOptions, path: Path) -> None:
-        self.options, self.folder, self.path = options, RunFolder(out), path
-        self.calibration = self.folder.calibration()
+        self.options, self.run, self.path = options, RunResult(out), path
+        self.calibration = self.run.calibration
         if self.calibration.parent_from_camera is None:
             raise InputError(
                 f"{out}: found no calibration to export ({self.calibration.doubt}); run it on a fixed capture"
@@ -149,7 +152,7 @@ class Run:
             mount = self._named(found.mount, options.child_frame, matrix, self.doubt, intrinsics)
         elif (kept := found.with_given_intrinsics) is None:
             raise InputError(
-                f"--intrinsics given: {self.folder.path} has no transform for given intrinsics: the capture gave "
+                f"--intrinsics given: {self.run.out} has no transform for given intrinsics: the capture gave "
                 "none, or no others were estimated beside them; leave it out"
             )
         else:
@@ -171,7 +174,7 @@ class Run:
     @property
     def others(self) -> list[ros.CameraMount]:
         """Accepted further cameras (with `force` also rejected ones) and arms; none where one camera is chosen."""
-        cameras = self.folder.cameras()
+        cameras = self.run.cameras
         if cameras is None or self.camera is not None:
             return []
         mounts = [
@@ -186,12 +189,12 @@ class Run:
 
     def _camera(self, name: str) -> "CameraPlacement":
         """Return a further camera by its name; raise InputError where it was not placed."""
-        cameras = self.folder.cameras()
+        cameras = self.run.cameras
         for camera in () if cameras is None else cameras.cameras:
             if camera.name == name and camera.parent_from_camera is not None:
                 return camera
         raise InputError(
-            f"--camera {name}: {self.folder.path} has placed no camera of that name; see its cameras.json"
+            f"--camera {name}: {self.run.out} has placed no camera of that name; see its cameras.json"
         )
 
     def _mount_of(self, camera: "CameraPlacement", child: str) -> ros.CameraMount:
@@ -223,16 +226,21 @@ class Run:
         )
 
     @property
+    def cloud(self) -> "PointCloud":
+        """Content of cloud.ply."""
+        return read_cloud(self.run.out / CLOUD)
+
+    @property
+    def scene(self) -> "SceneMap":
+        """Content of map.safetensors."""
+        return load_map(self.run.out)
+
+    @property
     def views(self) -> "PosedImages":
         """Registered images in the base frame."""
         from jcr.export.views import posed_images
 
         scale = self.calibration.scale
         assert scale is not None  # wherever there is a transform
-        if self.calibration.mount == "base":
-            raise InputError(
-                f"{self.folder.path}: a fixed camera watched the gripper: its images show no scene in the base frame"
-            )
-        base_from_recon = self.calibration.base_from_recon.rigid
-        capture = self.folder.capture_of(self.calibration)
-        return posed_images(capture, self.folder.reconstruction(), base_from_recon, scale)
+        calibration, capture, reconstruction = self.run.of_wrist_camera()
+        return posed_images(capture, reconstruction, calibration.base_from_recon.rigid, scale)

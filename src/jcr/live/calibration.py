@@ -39,7 +39,7 @@ from jcr.records import Capture, HandEye, Intrinsics, Reconstruction, Tracks
 from jcr.sfm.live_map import LiveMap
 
 if TYPE_CHECKING:
-    from jcr.results import RunResult
+    from jcr.run_folder import RunResult
 
 OBSERVATIONS = 300, 8000
 """Observations per image and in all that are used while images are taken; the calibration at the end uses all."""
@@ -161,12 +161,11 @@ class LiveCalibration:
         `out` is the run folder; None: the folder `result` of the capture. Raises as `jcr.calibrate` does.
         """
         from jcr.pipeline.run import calibrate
-        from jcr.results import RunOptions
-        from jcr.run_folder import LIVE
+        from jcr.run_folder import RunOptions
 
         with self._lock:
             options = RunOptions(calibrate=self._options)
-            return calibrate(self.live.folder, out or self.live.folder / LIVE, options)
+            return calibrate(self.live.folder, out or self.live.folder / "result", options)
 
     @one_blas_thread
     def update(self) -> Progress:

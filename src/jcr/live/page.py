@@ -151,9 +151,9 @@ def _verdict(state: SessionState, required: tuple[float, float]) -> tuple[str, s
 def _final_verdict(state: SessionState) -> tuple[str, str, list[str]]:
     """Return the verdict of the calibration at the end, with its reasons and warnings."""
     assert state.result is not None
-    verdict, hand_eye = state.result.verdict, state.result.hand_eye
-    found = [] if hand_eye.requirement is None else [reached_in_words(hand_eye.requirement)]
-    warnings = [sentence(one) for one in hand_eye.findings if one.severity != "informs"]
+    verdict, calibration = state.result.verdict, state.result.calibration
+    found = [] if calibration.requirement is None else [reached_in_words(calibration.requirement)]
+    warnings = [sentence(one) for one in calibration.findings if one.severity != "informs"]
     where = f"The calibration of all {len(state.images)} images is in {state.result.out}."
     return {"accepted": "good", "rejected": "bad"}.get(verdict, "fair"), verdict, [*found, *warnings, where]
 
@@ -201,7 +201,7 @@ def _tiles(state: SessionState, required: tuple[float, float]) -> list[Tile]:
 
 def _reached(state: SessionState) -> tuple[float, ...]:
     """Return the accuracy (mm, degrees), at the end that of all images; empty where there is none."""
-    found = None if state.result is None else state.result.hand_eye.requirement
+    found = None if state.result is None else state.result.calibration.requirement
     if found is not None:
         return found.reached_mm, found.reached_deg
     now = state.progress.now

@@ -26,7 +26,7 @@ from jcr.live.terminal import Action
 
 if TYPE_CHECKING:
     from jcr.live.calibration import LiveCalibration
-    from jcr.results import RunResult
+    from jcr.run_folder import RunResult
 
 SAME_PLACE = (0.005, np.radians(1.0))
 """m, rad: a second image from within this adds nothing."""
@@ -343,7 +343,7 @@ class LiveSession:
         self._report(progress)
         if self.options.until_accurate and progress.requirement_met:
             result = self.calibration.finish()
-            required = result.hand_eye.requirement
+            required = result.calibration.requirement
             if result.converged and required is not None and required.met:
                 self._show(is_over=True, result=result)
 

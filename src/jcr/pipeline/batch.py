@@ -23,10 +23,10 @@ from jcr.extras import extra
 from jcr.files import write_text
 from jcr.findings import Verdict, sentence, verdict_of
 from jcr.pipeline.batch_options import BatchOptions
-from jcr.pipeline.run import RunOptions, finished, run
+from jcr.pipeline.run import run
 from jcr.progress import Progress, silent
 from jcr.report.render import render
-from jcr.run_folder import CAPTURE, RunFolder, locked
+from jcr.run_folder import CAPTURE, RunOptions, load_run, locked
 
 RETRIES = 3
 """Number of times a task is started again whose Ray node died."""
@@ -109,13 +109,10 @@ def run_one(task: Task) -> Row:
             capture = read_capture(task.capture, task.read, into=task.out / CAPTURE)
         options = replace(task.run, map=None) if task.calibrate_only else task.run
         reason = ""
-        if (before := finished(capture, task.out, options)) is not None:
-            content = before.calibration
-        else:
-            try:
-                content = run(capture, task.out, options).calibration
-            except RejectedError as error:
-                content, reason = RunFolder(task.out).calibration(), str(error)
+        try:
+            content = run(capture, task.out, options).calibration
+        except RejectedError as error:
+            content, reason = load_run(task.out).calibration, str(error)
         row = replace(_row(task, content), seconds=round(time.perf_counter() - start, 2))
         named = next((sentence(one) for one in content.findings if one.severity != "informs"), "")
         return replace(row, reason=reason or named)

@@ -1,40 +1,76 @@
 """The stages in order, each timed, from a capture to a run folder that any of them can start again from.
 
-capture -> reconstruct -> calibrate -> densify -> map -> report
+capture -> reconstruct -> calibrate -> cameras -> densify -> map -> report
 """
 
+import json
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from jcr import __version__
+from jcr.allocator import give_back
+from jcr.boards.proposal import proposed_for
 from jcr.calibration.cues import check_known_length
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.poses import calibrate_poses as calibrate_poses_stage
-from jcr.calibration.poses import is_one
-from jcr.calibration.record import calibration_of
-from jcr.capture.added import read_added, with_images
+from jcr.calibration.record import Calibration, calibration_of, failed_calibration, write_calibration
+from jcr.calibration.words import log
+from jcr.capture.added import read_added, with_images, write_added
+from jcr.capture.formats.capture_json import kept
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
 from jcr.cell.added import camera_of, keep_camera, read_added_cameras
+from jcr.cell.carried import carried_scene, refined
+from jcr.cell.placement import FILE as CAMERAS
+from jcr.cell.placement import CamerasFile, write_cameras
+from jcr.depth.densify import densify
+from jcr.depth.depth_npz import is_made_from, write_depth
 from jcr.errors import InputError, RejectedError
 from jcr.extras import is_installed
+from jcr.files import write_text
+from jcr.findings import sentence
 from jcr.options import checked_options
-from jcr.pipeline import stages
-from jcr.pipeline.selection import NothingFoundError
+from jcr.pipeline.selection import NothingFoundError, again, choose, timings_of
 from jcr.progress import Progress, silent
 from jcr.reconstruct import BackendName, check_board
-from jcr.records import Capture, PosePairs
-from jcr.results import PosesResult, RunOptions, RunResult, SavedRun, load_run
-from jcr.run_folder import CAPTURE, REPORT, RunFolder, locked
+from jcr.reconstruction_npz import write_reconstruction
+from jcr.records import Capture, CellCamera, PosePairs, Reconstruction
+from jcr.run_folder import (
+    CALIBRATION,
+    CAPTURE,
+    CLOUD,
+    DEPTH,
+    LOG,
+    MAP,
+    RECONSTRUCTION,
+    REPORT,
+    STATE,
+    RunOptions,
+    RunResult,
+    State,
+    fingerprint_of_run,
+    locked,
+    state_of,
+)
+from jcr.scene.cloud_ply import read_cloud, write_cloud
+from jcr.scene.map_file import PACKAGES, require_packages
 from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
 if TYPE_CHECKING:
     from jcr.segments.measure import Measurement
+
+MOVING = "moving"
+"""Images of a fixed camera without what stands still; a carried thing is reconstructed from them."""
+Stage = Callable[[RunResult, RunOptions, Progress], tuple[RunResult, list[str]]]
+"""Function of the result so far; returns the result with its part, and notes."""
 
 
 def run(
@@ -49,76 +85,36 @@ def run(
     """Calibrate a capture, or what lies at its path, and write calibration, cloud, map and report to the folder `out`.
 
     `backend` (auto, or a name of `jcr models`) takes the place of that of `options`. Finished stages are reused from
-    `out` if capture and options are unchanged. Without torch there is no map, and a note says how to add it.
-    `calibrated` is called with the calibration before depth and map are made. Raises InputError if the input cannot be
-    used, and RejectedError if no camera poses are found; calibration.json then contains the reason.
+    `out` if capture and options are unchanged, and so is a whole run. Without torch there is no map, and a note says how
+    to add it. `calibrated` is called with the calibration before depth and map are made. Raises InputError if the input
+    cannot be used, and RejectedError if no camera poses are found; calibration.json then contains the reason.
     """
+    out, report = Path(out), progress or silent
     options = checked_options(options, RunOptions)
     check_options(options.calibrate)
     check_board(options.reconstruct)
-    capture = _capture_of(capture, Path(out))
+    capture = _capture_of(capture, out)
     check_known_length(capture, options.calibrate.known_length)
     options, missing = _possible(options.for_capture(capture, backend), capture)
-    with locked(Path(out)) as folder, ThreadPoolExecutor(1) as beside:
-        # Torch takes more than a second to import, the loops of depth as long to load, and COLMAP leaves a core idle.
-        importing = None if options.map is None else beside.submit(_why_no_map, options.estimates_depth)
-        capture = folder.keep_capture(capture)
-        added = None if options.map is None else read_added(folder.path, capture)
-        try:
-            result = stages.calibrated(capture, folder, options, progress or silent)
-        except NothingFoundError:
-            folder.keep_complete(capture, options)
-            raise
-        missing = missing if importing is None else importing.result()
-        if missing is not None:
-            options, added, result = replace(options, map=None), None, result.noted(missing)
+    with locked(out):
+        capture = kept(capture, out / CAPTURE)
+        state = state_of(capture, options)
+        before = RunResult(out, capture=capture, is_unchanged=True)
+        if _is_complete(before, state):
+            if before.parent_from_camera is None:
+                raise NothingFoundError(before.doubt)
+            return before
+        if options.map is not None:
+            # Torch takes more than a second to import, loops of depth as long to load; COLMAP leaves a core idle.
+            threading.Thread(target=_load_map_code, args=[options.estimates_depth], daemon=True).start()
+        added = None if options.map is None else read_added(out, capture)
+        result = _calibrated(RunResult(out, capture=capture, state=state, added=added), options, report)
+        result = _noted(result, missing)
         if calibrated is not None:
             calibrated(result)
-        result = _after_calibration(result, added, folder, options, progress or silent)
-        folder.keep_complete(result.capture, options)
+        result = _after_calibration(result, options, report)
+        _write_complete(result.state, out, result.capture)
         return result
-
-
-def finished(capture: Capture, out: str | Path, options: RunOptions) -> SavedRun | None:
-    """Return the run in the folder `out` if it was made from this capture with these options and nothing has changed."""
-    if not (Path(out) / REPORT).is_file():
-        return None
-    options, _ = _possible(options.for_capture(capture), capture)
-    with locked(Path(out)) as folder:
-        if not folder.is_complete(folder.keep_capture(capture), options):
-            return None
-    return load_run(out)
-
-
-def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, str | None]:
-    """Return the options, without the map where none can be made, and the package to install for it."""
-    # What a camera on the base sees moves with the gripper, not with the base.
-    if options.map is None or capture.mount == "base":
-        return replace(options, map=None), None
-    from jcr.pipeline.mapping import require_dense
-    from jcr.scene.map_file import PACKAGES
-
-    require_dense(options.depth)
-    if all(map(is_installed, PACKAGES)):
-        return options, None
-    return replace(options, map=None), _why_no_map()
-
-
-def _why_no_map(estimate_depth: bool = False) -> str | None:
-    """Return the package to install before a map can be made; None where all is imported and its loops are compiled."""
-    from jcr.scene.map_file import require_packages
-
-    if estimate_depth:
-        from jcr.depth.densify import compile_loops
-
-        compile_loops()
-    try:
-        require_packages("the map", ", then `jcr map`")
-    except InputError as error:
-        return f"no map was made: {error}"
-    import jcr.scene.build  # noqa: F401
-
-    return None
 
 
 def calibrate(
@@ -137,27 +133,21 @@ def calibrate(
     return run(capture, out, options, backend=backend, progress=progress)
 
 
-def calibrate_poses(
-    pairs: PosePairs, out: str | Path, options: CalibrateOptions | None = None
-) -> PosesResult:
+def calibrate_poses(pairs: PosePairs, out: str | Path, options: CalibrateOptions | None = None) -> RunResult:
     """Write calibration.json and report to the folder `out`, from camera poses that were given, without images."""
     from jcr.report.html import poses_report_html
 
-    with locked(Path(out)) as folder:
+    out = Path(out)
+    with locked(out):
         start = time.perf_counter()
         hand_eye = calibrate_poses_stage(pairs, options)
         timings = {"calibrate": round(time.perf_counter() - start, 3)}
         content = calibration_of(pairs, pairs, hand_eye, timings, __version__)
-        folder.forget_reconstruction()
-        folder.keep_calibration(content)
-        result = PosesResult(
-            out=folder.path,
-            pairs=pairs,
-            calibration=content,
-            hand_eye=hand_eye,
-            scale_is_one=hand_eye.converged and is_one(hand_eye),
-        )
-        folder.keep_report(poses_report_html(result, {"calibrate": asdict(options or CalibrateOptions())}))
+        _forget_reconstruction(out)
+        _keep_calibration(out, content)
+        result = RunResult(out, capture=pairs, calibration=content, hand_eye=hand_eye, reconstruction=pairs)
+        page = poses_report_html(result, {"calibrate": asdict(options or CalibrateOptions())})
+        write_text(out / REPORT, page)
         return result
 
 
@@ -176,23 +166,22 @@ def build_map(
     `add` are captures of further images, oldest first, read with the options `read`. They change the map but not the
     calibration, and are used in every later map of the folder. Dense depth is estimated if the folder has none.
     """
-    from jcr.pipeline.mapping import require_map
-
-    before = RunFolder(Path(out))
-    options = RunOptions.of(
-        before.options(),
+    before, report = RunResult(out), progress or silent
+    options = replace(
+        before.state.options,
+        depth=replace(before.state.options.depth, dense=True),
         cloud=checked_options(cloud, CloudOptions),
         map=checked_options(map, MapOptions),
         segment=checked_options(segment, SegmentOptions),
     )
-    require_map(options.depth)
-    capture = before.capture()
-    with locked(Path(out)) as folder:
-        added = read_added(folder.path, capture)
+    require_packages("the map", "; `jcr run` and `jcr calibrate` calibrate without it")
+    capture = before.capture
+    with locked(before.out):
+        added = read_added(before.out, capture)
         for path in add:
             added = with_images(added, Path(path), checked_options(read, ReadOptions))
-        result = stages.calibrated(capture, folder, options, progress or silent)
-        return _after_calibration(result, added, folder, options, progress or silent)
+        parts = RunResult(before.out, capture=capture, state=state_of(capture, options), added=added)
+        return _after_calibration(_calibrated(parts, options, report), options, report)
 
 
 def add_camera(
@@ -213,30 +202,24 @@ def add_camera(
     files = [Path(image) for image in ([images] if isinstance(images, str | Path) else images)]
     if not files:
         raise InputError(f"{name}: no images; give one or more that the camera took")
-    before, report = RunFolder(Path(out)), progress or silent
-    options, capture = RunOptions.of(before.options(), map=None), before.capture()
-    if (doubt := before.calibration().doubt) is not None:
+    before, report = RunResult(out), progress or silent
+    options, capture = replace(before.state.options, map=None), before.capture
+    if (doubt := before.calibration.doubt) is not None:
         raise RejectedError(
             f"{out}: its calibration is rejected, so no camera can be located with it: {doubt}"
         )
-    with locked(Path(out)) as folder:
-        added = read_added_cameras(folder.path, capture)
+    with locked(before.out):
+        added = read_added_cameras(before.out, capture)
         taken = [capture.camera_name, *(camera.name for camera in (*capture.others, *added))]
         file = None if intrinsics is None else Path(intrinsics)
         camera = camera_of(name, files, file, taken)
-        result = stages.calibrated(capture, folder, options, report)
-        located = stages.cameras(result, (*added, camera), folder, options, report)
-        assert located is not None
+        parts = RunResult(before.out, capture=capture, state=state_of(capture, options))
+        result = _calibrated(parts, options, report)
+        located = _place(result, (*capture.others, *added, camera), options, report)
         if (found := located.cameras[-1]).doubt is not None:
             raise RejectedError(f"{name}: {found.doubt}")
-        keep_camera(folder.path, capture, camera)
-        result = stages.located(result, folder, options, report)
-        if folder.has_map():
-            from jcr.pipeline.mapping import measured
-
-            cloud, scene = folder.cloud(), folder.scene()
-            result = replace(result, cloud=cloud, scene=scene, measured=measured(cloud, result.calibration))
-        return stages.reported(result, folder, options, report)
+        keep_camera(before.out, capture, camera)
+        return _after_calibration(result, options, report, with_map=True)
 
 
 def measure(out: str | Path) -> "Measurement":
@@ -244,10 +227,9 @@ def measure(out: str | Path) -> "Measurement":
 
     Raises InputError if there is no map, or if there is no support plane.
     """
-    from jcr.pipeline.mapping import measured
+    from jcr.segments.measure import measure_objects
 
-    folder = RunFolder(Path(out))
-    return measured(folder.cloud(), folder.calibration())
+    return measure_objects(read_cloud(Path(out) / CLOUD), RunResult(out).scale_std)
 
 
 def _capture_of(capture: Capture | str | Path, out: Path) -> Capture:
@@ -260,13 +242,249 @@ def _capture_of(capture: Capture | str | Path, out: Path) -> Capture:
         return read_capture(capture, into=out / CAPTURE)
 
 
+def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, str | None]:
+    """Return the options, without the map where none can be made, and a note on the package that it needs.
+
+    Raises InputError where a map is wanted, and the dense depth that it needs is not.
+    """
+    # What a camera on the base sees moves with the gripper, not with the base.
+    if options.map is None or capture.mount == "base":
+        return replace(options, map=None), None
+    if not options.depth.dense:
+        raise InputError("--no-dense: the map needs dense depth; leave it out, or add --no-map")
+    if all(map(is_installed, PACKAGES)):
+        return options, None
+    try:
+        require_packages("the map", ", then `jcr map`")
+    except InputError as error:
+        return replace(options, map=None), f"no map was made: {error}"
+    return options, None
+
+
+def _load_map_code(estimates_depth: bool) -> None:
+    """Import what a map needs; an error shows again where the map is made."""
+    with suppress(Exception):
+        if estimates_depth:
+            from jcr.depth.densify import compile_loops
+
+            compile_loops()
+        import jcr.scene.build  # noqa: F401
+
+
+def _is_complete(before: RunResult, state: State) -> bool:
+    """Test whether a run of the same input is finished, and its files were neither changed nor removed since."""
+    try:
+        found = before.state.run
+        return found is not None and found == fingerprint_of_run(before.out, before.capture, state)
+    except (InputError, OSError):
+        return False
+
+
+def _calibrated(result: RunResult, options: RunOptions, progress: Progress) -> RunResult:
+    """Calibrate the reconstruction that the folder has of the same input; without one, select one of the back ends.
+
+    Where the camera watches the gripper, what the gripper carries is the scene.
+    """
+    out, capture, state, own = result.out, result.capture, result.state, options.calibrate
+    watches, seen = capture.mount == "base", capture
+    if watches:
+        # The arm's kinematics are those of the reported poses, and not of their inverses.
+        seen, own = carried_scene(capture, out / MOVING), replace(own, robot=None)
+    before = _with_reconstruction_of(state, out, seen)
+    try:
+        if before is None:
+            kept = choose(seen, options.reconstruct, own, progress, options.depth)
+            state = state.model_copy(update={"attempts": kept.attempts})
+            _keep_reconstruction(out, kept.reconstruction, state)
+        else:
+            kept = again(seen, lambda: before.reconstruction, own, progress, options.depth)
+            state = state.model_copy(update={"attempts": before.state.attempts or kept.attempts})
+            _write_state(out, state)
+    except NothingFoundError as error:
+        if before is None:
+            _forget_reconstruction(out)
+        raise _failed(out, capture, options, state, error) from None
+    _keep_depth(out, kept.reconstruction, state)
+    reconstruction, hand_eye, timings = kept.reconstruction, kept.hand_eye, timings_of(kept.attempts)
+    if watches:
+        hand_eye = refined(capture, reconstruction, hand_eye, options.calibrate)
+    content = calibration_of(capture, reconstruction, hand_eye, timings, __version__, state.attempts)
+    if content.verdict == "rejected" or content.short is not None:
+        board = proposed_for(capture, options.reconstruct.board)
+        content = content if board is None else content.with_findings(board)
+    _keep_calibration(out, content)
+    return result.with_parts(
+        state=state, calibration=content, hand_eye=hand_eye, reconstruction=reconstruction
+    )
+
+
+def _with_reconstruction_of(state: State, out: Path, capture: Capture) -> RunResult | None:
+    """Return the earlier run of the folder whose reconstruction was made from the same input; None without one.
+
+    A state that cannot be read proves nothing: to make every stage again is always right.
+    """
+    before = RunResult(out, capture=capture)
+    try:
+        same = before.state.reconstruction == state.reconstruction and (out / RECONSTRUCTION).is_file()
+    except InputError:
+        return None
+    if same and not is_made_from(out / DEPTH, state.depth):
+        (out / DEPTH).unlink(missing_ok=True)
+    return before if same else None
+
+
+def _failed(
+    out: Path, capture: Capture, options: RunOptions, state: State, error: NothingFoundError
+) -> NothingFoundError:
+    """Return the error, with the --board that the images show, after its reason is written to the folder."""
+    from jcr.report.html import failed_report_html
+
+    board, tried = proposed_for(capture, options.reconstruct.board), error.attempts
+    content = failed_calibration(
+        capture, tried[-1].backend, error.findings, timings_of(tried), __version__, tried
+    )
+    content = content if board is None else content.with_findings(board)
+    _keep_calibration(out, content)
+    write_text(out / REPORT, failed_report_html(capture, content, _for_report(options)))
+    _write_complete(state, out, capture)
+    return error if board is None else NothingFoundError(error.with_more(sentence(board)), tried)
+
+
 def _after_calibration(
-    result: RunResult, added: Capture | None, folder: RunFolder, options: RunOptions, progress: Progress
+    result: RunResult, options: RunOptions, progress: Progress, with_map: bool = False
 ) -> RunResult:
-    """Run the stages after the calibration; `added` are images of the map alone, None without a map."""
+    """Run the stages after the calibration; `with_map`: the report has the map that is there already."""
+    stages: list[tuple[str, Stage]] = []
     if result.capture.mount != "base":
-        result = stages.located(result, folder, options, progress)
-    if added is not None:
-        result = stages.densified(result, folder, options, progress)
-        result = stages.mapped(result, added, folder, options, progress)
-    return stages.reported(result, folder, options, progress)
+        result = result.with_parts(others=_others(result))
+        (result.out / CAMERAS).unlink(missing_ok=True)
+        stages += [("cameras", _cameras)] if result.others else []
+    if options.map is not None:
+        stages += [("densify", _densify), ("map", _map)]
+    elif not with_map:
+        result = result.with_parts(cloud=None, scene=None, measured=None)
+    for name, stage in (*stages, ("report", _report)):
+        start = time.perf_counter()
+        result, notes = stage(result, options, progress)
+        give_back()
+        timings = result.calibration.timings_s | {name: round(time.perf_counter() - start, 3)}
+        content = result.calibration.model_copy(update={"timings_s": timings})
+        result = _noted(result.with_parts(calibration=content), *notes)
+    _write_calibration(result.out, result.calibration)
+    return result
+
+
+def _others(result: RunResult) -> tuple[CellCamera, ...]:
+    """Return the other cameras of the cell, those of the capture and those added to the run."""
+    return (*result.capture.others, *read_added_cameras(result.out, result.capture))
+
+
+def _place(
+    result: RunResult, cameras: Sequence[CellCamera], options: RunOptions, progress: Progress
+) -> CamerasFile:
+    """Return cameras of the cell as cameras.json has them."""
+    from jcr.cell.stage import place_cameras
+
+    parts = result.capture, cameras, result.reconstruction, result.hand_eye, options.calibrate
+    return place_cameras(*parts, progress).file(__version__)
+
+
+def _cameras(result: RunResult, options: RunOptions, progress: Progress) -> tuple[RunResult, list[str]]:
+    """Locate the other cameras of the cell."""
+    found = _place(result, result.others, options, progress)
+    write_cameras(result.out, found)
+    return result.with_parts(cameras=found), []
+
+
+def _densify(result: RunResult, options: RunOptions, progress: Progress) -> tuple[RunResult, list[str]]:
+    """Add the dense depth of the map: predicted, in the folder, or estimated now."""
+    reconstruction = densify(result.capture, result.reconstruction, options.depth, progress)
+    _keep_depth(result.out, reconstruction, result.state)
+    return result.with_parts(reconstruction=reconstruction), []
+
+
+def _map(result: RunResult, options: RunOptions, progress: Progress) -> tuple[RunResult, list[str]]:
+    """Add cloud, map and measured objects."""
+    from jcr.pipeline.mapping import make_map  # labels and sizes need half of SciPy, a calibration does not
+
+    result, notes = make_map(result, options, progress)
+    assert result.cloud is not None and result.scene is not None
+    write_cloud(result.out / CLOUD, result.cloud)
+    result.scene.save(result.out / MAP)
+    if len(result.added):
+        write_added(result.added, result.capture)
+    return result, notes
+
+
+def _report(result: RunResult, options: RunOptions, progress: Progress) -> tuple[RunResult, list[str]]:
+    """Write the report."""
+    from jcr.report.html import report_html
+
+    progress("report", 0.0)
+    write_text(result.out / REPORT, report_html(result, _for_report(options)))
+    progress("report", 1.0)
+    return result, []
+
+
+def _for_report(options: RunOptions) -> dict[str, Mapping[str, Any]]:
+    """Return the options of the stages up to the map, which has its own history."""
+    stages = {"reconstruct": options.reconstruct, "calibrate": options.calibrate, "densify": options.depth}
+    return {stage: asdict(own) for stage, own in stages.items()}
+
+
+def _noted(result: RunResult, *notes: str | None) -> RunResult:
+    """Return the result with more notes."""
+    every = [*result.calibration.notes, *filter(None, notes)]
+    return result.with_parts(calibration=result.calibration.model_copy(update={"notes": every}))
+
+
+def _write_state(out: Path, state: State) -> None:
+    """Write run.json."""
+    content = state.model_dump(mode="json", warnings=False)
+    write_text(out / STATE, json.dumps(content, indent=2) + "\n")
+
+
+def _write_complete(state: State, out: Path, capture: Capture) -> None:
+    """Note in run.json that all files of a run are there."""
+    _write_state(out, state.model_copy(update={"run": fingerprint_of_run(out, capture, state)}))
+
+
+def _forget_reconstruction(out: Path) -> None:
+    """Remove the reconstruction of another input; a kill between two files leaves none without its fingerprint."""
+    for name in (STATE, DEPTH, RECONSTRUCTION):
+        (out / name).unlink(missing_ok=True)
+
+
+def _keep_reconstruction(out: Path, reconstruction: Reconstruction, state: State) -> None:
+    """Write a reconstruction, then its fingerprint; pointmaps that were estimated become depth.npz."""
+    _forget_reconstruction(out)
+    pointmaps = reconstruction.pointmaps
+    predicted = pointmaps if pointmaps is not None and pointmaps.is_predicted else None
+    write_reconstruction(out / RECONSTRUCTION, replace(reconstruction, pointmaps=predicted))
+    _write_state(out, state)
+
+
+def _keep_depth(out: Path, reconstruction: Reconstruction, state: State) -> None:
+    """Write depth.npz, where the reconstruction has estimated pointmaps and they are not there already."""
+    pointmaps = reconstruction.pointmaps
+    if pointmaps is None or pointmaps.is_predicted or is_made_from(out / DEPTH, state.depth):
+        return
+    write_depth(out / DEPTH, reconstruction, state.depth)
+
+
+def _keep_calibration(out: Path, content: Calibration) -> None:
+    """Write calibration.json and log.txt; what was made from another one goes first, so that the two never mix."""
+    with suppress(InputError):
+        before = RunResult(out).calibration
+        same = before.mount == content.mount and before.scale == content.scale
+        if same and np.array_equal(before.parent_from_camera, content.parent_from_camera):  # pyright: ignore[reportArgumentType]
+            return _write_calibration(out, content)
+    for name in (CLOUD, MAP, REPORT, CAMERAS):
+        (out / name).unlink(missing_ok=True)
+    return _write_calibration(out, content)
+
+
+def _write_calibration(out: Path, content: Calibration) -> None:
+    """Write calibration.json and log.txt."""
+    write_calibration(out / CALIBRATION, content)
+    write_text(out / LOG, log(content))

@@ -12,7 +12,7 @@ from jcr.calibration.cues import surface_at
 from jcr.distributions import chi2
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, skew
-from jcr.run_folder import RunFolder
+from jcr.run_folder import RunResult
 
 COLUMNS = ("image", "x_px", "y_px", "x_m", "y_m", "z_m")
 LEAST = 3
@@ -57,9 +57,8 @@ def touch(out: str | Path, points: str | Path) -> TouchTest:
     share, and of each touch the robot's random and systematic errors. Raises InputError on fewer than three points, an
     image that is not in the run, or a pixel without a surface.
     """
-    folder, points = RunFolder(Path(out)), Path(points)
-    calibration, reconstruction = folder.calibrated()
-    capture = folder.capture_of(calibration)
+    points = Path(points)
+    calibration, capture, reconstruction = RunResult(out).of_wrist_camera()
     rows = _rows(points)
     x, base_from_recon = calibration.gripper_from_camera, calibration.base_from_recon
     scale = base_from_recon.scale

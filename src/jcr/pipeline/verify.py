@@ -28,7 +28,7 @@ from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.reconstruct import reconstruct
 from jcr.records import Capture, CellCamera, HandEye, PosePairs, Reconstruction
-from jcr.run_folder import MadeWith, RunFolder
+from jcr.run_folder import RunOptions, RunResult
 from jcr.sfm.register import register
 
 ROUNDING = 1e-9
@@ -128,9 +128,13 @@ def verify_run(
     if not 0 < options.alpha < 0.5:
         raise InputError(f"--alpha {options.alpha}: give a false-alarm rate between 0 and 0.5")
     new = _read(new)
-    folder = RunFolder(Path(out))
-    calibration, reconstruction = folder.calibrated()
-    capture = _calibrated_on(folder, calibration, new)
+    run = RunResult(out)
+    calibration, capture, reconstruction = run.of_wrist_camera()
+    if not calibration.converged:
+        raise InputError(
+            f"{out}: its calibration is rejected and cannot be tested; calibrate again (jcr run)"
+        )
+    _require_size(new.folder, new.image_size, capture.image_size)
     taken_then, taken_now = _images(capture.folder, capture.images), _images(new.folder, new.images)
     _require_new(taken_now, taken_then)
     report("find the old scene", 0.0)
@@ -142,11 +146,11 @@ def verify_run(
     report("find the old scene", 1.0)
     lost = [f"{name} shares {place} points with the calibrated scene"
             for name, place in zip(new.images, located, strict=True) if not isinstance(place, CameraPose)]  # fmt: skip
-    options_then = folder.options()
+    options_then = run.state.options
     if len(lost) < len(new):
         then = (calibration, capture, reconstruction, options_then.calibrate)
         found = _in_old_scene(then, new, located, lost, options)
-        return replace(found, others=_fixed_cameras(folder, then[1:], new, options, progress))
+        return replace(found, others=_fixed_cameras(run, then[1:], new, options, progress))
     if len(new) < MIN_TO_RECALIBRATE:
         raise RejectedError(
             f"cannot tell: {'; '.join(lost)}; take images of the scene that was calibrated on, or "
@@ -162,17 +166,6 @@ def _read(new: Capture | str | Path) -> Capture:
     if isinstance(found, PosePairs):
         raise InputError(f"{new}: gives poses and no images, which verify needs")
     return found
-
-
-def _calibrated_on(folder: RunFolder, calibration: Calibration, new: Capture) -> Capture:
-    """Return the capture of a run; raise InputError where new images cannot be compared with it."""
-    if not calibration.converged:
-        raise InputError(
-            f"{folder.path}: its calibration is rejected and cannot be tested; calibrate again (jcr run)"
-        )
-    capture = folder.capture_of(calibration)
-    _require_size(new.folder, new.image_size, capture.image_size)
-    return capture
 
 
 def _require_size(folder: Path, now: tuple[int, int], then: tuple[int, int]) -> None:
@@ -212,7 +205,7 @@ def _in_old_scene(
 
 
 def _fixed_cameras(
-    folder: RunFolder,
+    run: RunResult,
     calibrated: tuple[Capture, Reconstruction, CalibrateOptions],
     new: Capture,
     options: VerifyOptions,
@@ -224,8 +217,8 @@ def _fixed_cameras(
     RejectedError where the images share too few features with the scene.
     """
     capture, reconstruction, calibrate_options = calibrated
-    cameras = folder.cameras()
-    others = {camera.name: camera for camera in (*capture.others, *read_added_cameras(folder.path, capture))}
+    cameras = run.cameras
+    others = {camera.name: camera for camera in (*capture.others, *read_added_cameras(run.out, capture))}
     placed = {
         one.name: one.intrinsics.record()
         for one in ([] if cameras is None else cameras.cameras)
@@ -369,7 +362,7 @@ def _is_moved(offset: Float[ndarray, "6"], p_value: float, options: VerifyOption
 def _by_recalibration(
     calibration: Calibration,
     new: Capture,
-    options_then: MadeWith,
+    options_then: RunOptions,
     options: VerifyOptions,
     progress: Progress | None,
 ) -> Verification:

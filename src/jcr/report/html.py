@@ -21,8 +21,8 @@ from jcr.report.scene3d import scene_section
 from jcr.report.seen import seen_section
 from jcr.report.transform import transform_section
 from jcr.report.verdict import failure_section, head, notes_section
-from jcr.results import PosesResult, RunResult
 from jcr.rounding import significant
+from jcr.run_folder import RunResult
 from jcr.scene.samples import sample_surface
 
 SURFACE_POINTS = 80_000
@@ -88,7 +88,7 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
     return _page(about, origin(capture.folder), calibration, sections)
 
 
-def poses_report_html(result: PosesResult, options: StageOptions | None = None) -> str:
+def poses_report_html(result: RunResult, options: StageOptions | None = None) -> str:
     """Return the report of a calibration from given camera poses, without images."""
     calibration = result.calibration
     sections = [
@@ -99,7 +99,7 @@ def poses_report_html(result: PosesResult, options: StageOptions | None = None) 
         *notes_section(calibration),
         details_section(calibration, options or {}),
     ]
-    return _page("poses given, no images", result.pairs.source, calibration, sections)
+    return _page("poses given, no images", result.capture.source or result.out, calibration, sections)
 
 
 def failed_report_html(

@@ -16,8 +16,8 @@ from jcr.geometry import apply, inverse
 from jcr.records import Capture, ImageVerdict, Intrinsics, Reconstruction
 from jcr.report.raster import image_url
 from jcr.report.render import Section
-from jcr.results import RunResult
 from jcr.rounding import significant
+from jcr.run_folder import RunResult
 
 LARGEST, SMALLEST, PIXELS = 1024, 160, 6e6
 """Pixels across of the images, and of all together at most, which is about a megabyte; they open large."""

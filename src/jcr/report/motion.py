@@ -8,10 +8,10 @@ import numpy as np
 
 from jcr.capture.conventions import CONVENTIONS, OF_ARM, numbers_from_poses, units_of
 from jcr.estimation.observability import WEAK
-from jcr.records import Excitation, NextPose
+from jcr.records import Capture, Excitation, NextPose
 from jcr.report.render import Section
-from jcr.results import PosesResult, RunResult
 from jcr.rounding import significant
+from jcr.run_folder import RunResult
 
 ANY_CONVENTION = "quat-xyzw"
 MATRICES = {"franka": "the matrix by columns", "matrix": "the matrix by rows"}
@@ -27,7 +27,7 @@ Bar = tuple[str, float, float, str]
 """Name, begin and width (percent), and number."""
 
 
-def motion_section(result: RunResult | PosesResult) -> Section:
+def motion_section(result: RunResult) -> Section:
     """Return excitation of the seven directions, standard deviations of their parts, and the poses to add."""
     observed, uncertainty = result.calibration.observability, result.calibration.uncertainty
     found = result.hand_eye.excitation
@@ -64,7 +64,7 @@ def _spreads(name: str, std: Sequence[float], unit: str) -> Iterator[Bar]:
         yield f"{name} {axis}", 50 - half, 2 * half, f"±{significant(value)}{unit}"
 
 
-def _next_poses(result: RunResult | PosesResult) -> dict[str, Any] | None:
+def _next_poses(result: RunResult) -> dict[str, Any] | None:
     """Return the proposed gripper poses with their expected uncertainty, ready to copy; None without any."""
     if not (poses := result.hand_eye.next_poses):
         return None
@@ -72,15 +72,15 @@ def _next_poses(result: RunResult | PosesResult) -> dict[str, Any] | None:
     written = MATRICES.get(convention) or ", ".join(CONVENTIONS[convention].columns)
     near = [one.like for one in result.calibration.next_poses]
     return {
-        "in_the_3d_view": isinstance(result, RunResult),
+        "in_the_3d_view": isinstance(result.capture, Capture),
         "notation": f"{written} ({units_of(convention)}), as {convention} writes poses",
         "rows": [_next_pose(pose, like, convention) for pose, like in zip(poses, near, strict=True)],
     }
 
 
-def _convention(result: RunResult | PosesResult) -> str:
+def _convention(result: RunResult) -> str:
     """Return the pose convention of the capture's robot; a quaternion where it is unknown."""
-    if not isinstance(result, RunResult):
+    if not isinstance(result.capture, Capture):
         return ANY_CONVENTION
     capture = result.capture
     return capture.pose_convention or OF_ARM.get(capture.robot or "") or ANY_CONVENTION

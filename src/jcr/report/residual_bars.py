@@ -9,14 +9,14 @@ from jcr.geometry import step_between
 from jcr.records import HandEye
 from jcr.report.images import shown_names
 from jcr.report.render import Section
-from jcr.results import PosesResult, RunResult
 from jcr.rounding import significant
+from jcr.run_folder import RunResult
 
 NOTICEABLE = 1.05
 """Times the random noise, from which the noise with systematic errors is named beside it."""
 
 
-def residuals_section(result: RunResult | PosesResult) -> Section:
+def residuals_section(result: RunResult) -> Section:
     """Return residuals by image and of the whole fit, before and after bundle adjustment."""
     now, before = result.hand_eye, result.hand_eye.before
     fits = [now] if before is None else [now, before]

@@ -15,7 +15,7 @@ from jcr.records import CellCamera, Intrinsics
 from jcr.report.images import image_numbers, shown_names
 from jcr.report.raster import TRACK_COLOR, label_colors
 from jcr.report.render import Section
-from jcr.results import RunResult
+from jcr.run_folder import RunResult
 from jcr.scene.samples import SurfacePoints, point_size
 
 POINTS = 60_000

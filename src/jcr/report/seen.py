@@ -14,8 +14,8 @@ from jcr.estimation.point_uncertainty import point_covariance, within_95
 from jcr.report.figures import Figure, Shape
 from jcr.report.raster import image_url
 from jcr.report.render import Section
-from jcr.results import RunResult
 from jcr.rounding import significant
+from jcr.run_folder import RunResult
 
 ACROSS = 640
 """Pixels of the drawn image."""

@@ -20,7 +20,7 @@ from jcr.progress import Progress, silent
 from jcr.report.raster import TRACK_COLOR, label_colors
 from jcr.report.render import render
 from jcr.report.verdict import head
-from jcr.run_folder import RunFolder
+from jcr.run_folder import RunResult
 from jcr.scene.samples import Slice, level_slice, sample_surface
 from jcr.scene.scene_map import SceneMap, Unknown
 from jcr.viewer.robot import read_robot
@@ -50,17 +50,15 @@ class Viewer:
     def __init__(
         self,
         server: viser.ViserServer,
-        folder: RunFolder,
+        run: RunResult,
         urdf: Path | None = None,
         progress: Progress | None = None,
     ) -> None:
         """Fill the server; `urdf` replaces the one of the capture."""
         report = progress or silent
         self.server, self._lock = server, threading.Lock()
-        self.calibration, self.reconstruction = folder.calibrated()
-        self.capture, self.cloud, self.scene = folder.capture_of(self.calibration), None, None
-        if folder.has_map():
-            self.cloud, self.scene = folder.cloud(), folder.scene()
+        self.calibration, self.capture, self.reconstruction = run.of_wrist_camera()
+        self.cloud, self.scene = run.cloud, run.scene
         assert self.calibration.scale is not None  # wherever there is a transform
         base_from_recon, scale = self.calibration.base_from_recon.rigid, self.calibration.scale
         self.image_index = self.reconstruction.image_index
@@ -70,7 +68,7 @@ class Viewer:
         tracked = self.reconstruction.tracks.points_in_recon
         self.tracks_in_base = apply_similarity(base_from_recon, scale, tracked)
         server.scene.set_up_direction("+z")
-        server.gui.add_markdown(self._verdict(folder))
+        server.gui.add_markdown(self._verdict(run))
         report("view", 0.1)
         self._add_capture()
         self.robot = None
@@ -93,12 +91,12 @@ class Viewer:
         self._place_eye()
         report("view", 1.0)
 
-    def _verdict(self, folder: RunFolder) -> str:
+    def _verdict(self, run: RunResult) -> str:
         """Return the headline of the report, and the remedy for a missing map."""
         headline = head(self.calibration)[0].content
         lines = [f"**{headline['verdict']}:** {headline['reason']}."]
         if self.scene is None:
-            lines.append(f"No map yet: make one with `jcr map {folder.path}`.")
+            lines.append(f"No map yet: make one with `jcr map {run.out}`.")
         return "\n\n".join(lines)
 
     def _add_capture(self) -> None:
