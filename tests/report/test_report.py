@@ -99,6 +99,7 @@ def run(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
         reconstruction=reconstruction,
         cloud=cloud,
         scene=scene,
+        measured=None,
     )
 
 
