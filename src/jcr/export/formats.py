@@ -110,7 +110,6 @@ def write_run(
     module, function = row.writer.split(".")
     write: Any = getattr(import_module(f"jcr.export.{module}"), function)
     values = [attrgetter(content)(run) for content in row.contents.split()]
-    values = [value() if callable(value) else value for value in values]
     if module == "ros":
         write_text(path, write(*values))
     else:
