@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 import jcr
-from jcr.estimation.components import most_likely
 from jcr.estimation.equation import residuals
-from jcr.estimation.mixed_model import Equations
+from jcr.estimation.robot_noise import Equations, most_likely
 from jcr.estimation.robust import robust_fit
 from jcr.estimation.systematic import Region, arm_errors, smooth_errors
 from jcr.geometry import retract, rotation_exp, step_between, transform

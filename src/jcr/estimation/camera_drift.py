@@ -11,10 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.estimation.components import growth_scores, log_evidence, most_likely
 from jcr.estimation.equation import pose_by_pose
-from jcr.estimation.mixed_model import Equations, solve_equations
 from jcr.estimation.pose_equations import pose_equations, reported_poses
+from jcr.estimation.robot_noise import Equations, growth_scores, log_evidence, most_likely, solve_equations
 from jcr.estimation.wrist import Start, pose_problem
 from jcr.geometry import Poses, skew
 
@@ -94,4 +93,6 @@ def _evidence(
 ) -> float:
     """Return the log evidence of a model, the density of its priors of the sizes included."""
     found = solve_equations(equations, log_sizes)
-    return log_evidence(equations, float(found.log_posterior), information) - equations.log_prior_volume
+    return log_evidence(equations, float(found.log_posterior), information) - float(
+        np.log(equations.prior[1]).sum()
+    )

@@ -1,11 +1,11 @@
 """Unknowns averaged over the sizes of the errors, with a calibrated covariance and its causes.
 
-Cov = E[C] + Var[θ̂] over the sizes (components.py). A mixture has longer tails than a normal distribution of its
+Cov = E[C] + Var[θ̂] over the sizes (robot_noise.py). A mixture has longer tails than a normal distribution of its
 covariance. The covariance is therefore scaled until its 99 % ellipsoid holds 99 %: an accepted result that is many
 standard deviations off is the worst fault.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,9 +14,18 @@ from numpy import ndarray
 
 from jcr.distributions import chi2
 from jcr.estimation.cholesky import cholesky, lower
-from jcr.estimation.components import Information, Weighed, expected_information, over_sizes
 from jcr.estimation.equation import UNKNOWNS
-from jcr.estimation.mixed_model import Each, Equations, LinearSolution, LogSizes, solve_equations
+from jcr.estimation.robot_noise import (
+    Each,
+    Equations,
+    Information,
+    LinearSolution,
+    LogSizes,
+    Weighed,
+    expected_information,
+    over_sizes,
+    solve_equations,
+)
 from jcr.estimation.systematic import Region
 from jcr.records import Budget, RobotNoise
 
@@ -43,17 +52,14 @@ class Posterior:
 
 
 def posterior(
-    equations: Equations, log_sizes: LogSizes, information: Information, region: Region | None
+    equations: Equations, log_sizes: LogSizes, information: Information, region: Region
 ) -> Posterior:
-    """Return the unknowns averaged over the sizes about their mode.
-
-    `region` adds the change that other poses of the region would make.
-    """
+    """Return the unknowns averaged over the sizes about their mode, for other poses of the region."""
     found = over_sizes(equations, log_sizes, information)
     return _averaged(equations, log_sizes, found, lambda one, at: _elsewhere(equations, one, at, region))
 
 
-def expected_posterior(equations: Equations, noise: RobotNoise, region: Region | None) -> Posterior:
+def expected_posterior(equations: Equations, noise: RobotNoise, region: Region) -> Posterior:
     """Return the posterior to expect for a robot with this noise, before there are residuals: those of `equations` are
     0.
 
@@ -71,7 +77,7 @@ def expected_posterior(equations: Equations, noise: RobotNoise, region: Region |
     return _averaged(equations, mode, found, lambda _, sizes: _expected_elsewhere(equations, sizes, region))
 
 
-def expected_covariance_at(equations: Equations, noise: RobotNoise, region: Region | None) -> Square:
+def expected_covariance_at(equations: Equations, noise: RobotNoise, region: Region) -> Square:
     """Return the expected covariance where the sizes are known exactly, for comparisons."""
     mode = equations.log_sizes_of(noise)
     return solve_equations(equations, mode).covariance + _expected_elsewhere(equations, mode, region)
@@ -95,12 +101,8 @@ def _averaged(
     return Posterior(step, covariance, _budget(equations, mode, at_mode, covariance), mode)
 
 
-def _elsewhere(
-    equations: Equations, solution: LinearSolution, log_sizes: LogSizes, region: Region | None
-) -> Stack:
+def _elsewhere(equations: Equations, solution: LinearSolution, log_sizes: LogSizes, region: Region) -> Stack:
     """Return the covariance that systematic errors add because the result holds for the region, not for its poses."""
-    if region is None or equations.systematic is None:
-        return np.zeros_like(solution.information_root)
     part = equations.variances(log_sizes)[..., 2, None, None] * equations.systematic
     expected = (part @ solution.weighed_left[..., None])[..., 0]
     own = _blocks_of_poses(part)
@@ -111,10 +113,8 @@ def _elsewhere(
     return region.spread(own + expected[..., :, None] * expected[..., None, :])
 
 
-def _expected_elsewhere(equations: Equations, log_sizes: LogSizes, region: Region | None) -> Stack:
+def _expected_elsewhere(equations: Equations, log_sizes: LogSizes, region: Region) -> Stack:
     """Return `_elsewhere` before there are residuals, with systematic errors as large as expected."""
-    if region is None or equations.systematic is None:
-        return np.zeros((*log_sizes.shape[:-1], *equations.prior_information.shape))
     size = equations.variances(log_sizes)[..., 2, None, None, None]
     return region.spread(size * _blocks_of_poses(equations.systematic))
 
@@ -170,7 +170,7 @@ def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covari
     """Return the covariance of X and scale by its causes, which share the excess from averaging over sizes.
 
     The part of the intrinsics is the covariance that knowing them would remove; the rest is divided as if they were
-    known.
+    known. The images also have unobservable directions, and the rounding of their large numbers.
     """
     exact = replace(
         equations,
@@ -182,8 +182,7 @@ def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covari
     gain = solution.gain
     random = (gain * exact.random(log_sizes)) @ gain.T
     systematic = elsewhere[:UNKNOWNS, :UNKNOWNS]
-    if exact.systematic is not None:
-        systematic = systematic + exact.variances(log_sizes)[2] * gain @ exact.systematic @ gain.T
+    systematic = systematic + exact.variances(log_sizes)[2] * gain @ exact.systematic @ gain.T
     if exact.confirmed is not None:
         systematic = systematic + gain @ exact.confirmed @ gain.T
     # The part that neither robot nor cameras determine.
@@ -191,18 +190,10 @@ def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covari
     if exact.known is not None:
         images = images + gain @ exact.known @ gain.T
     intrinsics = solve_equations(equations, log_sizes).covariance[:UNKNOWNS, :UNKNOWNS] - solution.covariance
-    return budget_of((random, systematic, intrinsics, images), covariance)
-
-
-def budget_of(parts: Sequence[Float[ndarray, "_ _"]], covariance: Float[ndarray, "_ _"]) -> Budget:
-    """Return the covariance of X and scale by its causes: random and systematic robot errors, intrinsics, images.
-
-    The parts share the excess of the covariance over their sum.
-    """
-    parts = [part[:7, :7] for part in parts]
-    to_whole = _between(sum(parts[1:], parts[0]), covariance[:7, :7])
+    whole, parts = covariance[:7, :7], [part[:7, :7] for part in (random, systematic, intrinsics, images)]
+    to_whole = _between(sum(parts[1:], parts[0]), whole)
     random, systematic, intrinsics, _ = (to_whole @ part @ to_whole.T for part in parts)
-    images = covariance[:7, :7] - random - systematic - intrinsics
+    images = whole - random - systematic - intrinsics
     # With degenerate motions the numbers are so large that rounding leaves the products unsymmetric.
     random, systematic, intrinsics, images = (
         (part + part.T) / 2 for part in (random, systematic, intrinsics, images)
@@ -211,7 +202,6 @@ def budget_of(parts: Sequence[Float[ndarray, "_ _"]], covariance: Float[ndarray,
         robot_random=random,
         robot_systematic=systematic,
         intrinsics=intrinsics,
-        # This part contains unobservable directions, and the rounding of their large numbers.
         images=images,
         faults=np.zeros((7, 7)),
     )

@@ -13,9 +13,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.distributions import f as f_distribution
-from jcr.estimation.components import most_likely, over_sizes
 from jcr.estimation.equation import UNKNOWNS
-from jcr.estimation.mixed_model import Equations, LogSizes, solve_equations
+from jcr.estimation.robot_noise import Equations, LogSizes, most_likely, over_sizes, solve_equations
 from jcr.findings import FindingKind
 from jcr.records import RobotNoise
 

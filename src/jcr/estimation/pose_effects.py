@@ -6,11 +6,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.estimation.components import most_likely
 from jcr.estimation.hypotheses import Row
 from jcr.estimation.kinematics import Arm, Joints, error_jacobian
-from jcr.estimation.mixed_model import solve_equations
 from jcr.estimation.pose_equations import PoseEquations
+from jcr.estimation.robot_noise import most_likely, solve_equations
 from jcr.findings import FindingKind
 from jcr.geometry import Poses, skew
 from jcr.records import JointOffsets

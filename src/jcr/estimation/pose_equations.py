@@ -9,8 +9,8 @@ from scipy.linalg import block_diag
 
 from jcr.estimation.equation import SCALE, pose_by_pose, residuals, residuals_by_camera, weak_prior
 from jcr.estimation.image_equations import ImageEvidence
-from jcr.estimation.mixed_model import Equations
 from jcr.estimation.problem import Problem, State, columns_of_arm
+from jcr.estimation.robot_noise import Equations
 from jcr.estimation.systematic import Region
 
 

@@ -16,12 +16,12 @@ from jcr.estimation.covariance import expected_covariance_at
 from jcr.estimation.equation import Poses
 from jcr.estimation.image_equations import evidence
 from jcr.estimation.intrinsics_prior import Camera, camera_about
-from jcr.estimation.mixed_model import GIVEN_SHARE, TYPICAL
 from jcr.estimation.next_poses import assumed_camera, median_distance
 from jcr.estimation.pixel_noise import PixelNoise
 from jcr.estimation.point_uncertainty import in_use
 from jcr.estimation.pose_equations import pose_equations
 from jcr.estimation.problem import LinearPrior, scale_prior
+from jcr.estimation.robot_noise import GIVEN_SHARE, TYPICAL
 from jcr.estimation.solve import Solution, expected_solution
 from jcr.estimation.wrist import estimate_in, pose_problem, wrist_arm, wrist_problem
 from jcr.geometry import apply, inverse

@@ -20,9 +20,9 @@ from jcr.distributions import f as f_distribution
 from jcr.estimation.cholesky import cholesky, over
 from jcr.estimation.image_equations import ImageEvidence, evidence
 from jcr.estimation.intrinsics_prior import Camera
-from jcr.estimation.mixed_model import solve_equations
 from jcr.estimation.pose_equations import pose_equations
 from jcr.estimation.problem import OF_IMAGE, PRISM, Problem, State, with_free
+from jcr.estimation.robot_noise import solve_equations
 from jcr.estimation.solve import Solution
 from jcr.geometry import Transform
 from jcr.records import Intrinsics

@@ -1,22 +1,21 @@
 """Solution of an estimation problem: the sizes of all errors and a Gauss-Newton step of all unknowns, in turn.
 
 Without observations the unknowns are those of the arms. With observations, arms, cameras, rigs and points step
-together, and Anderson's acceleration (acceleration.py) shortens the way to the fixed point. The result is averaged
-over the sizes of the robot's errors (covariance.py).
+together. Weights of observations and sizes of errors are estimated from a state, and the state follows from them: each
+round leaves up to 0.8 of the distance of the last one. The next round therefore begins at the combination of the last
+rounds whose step would be smallest (Anderson, J. ACM 12, 1965; Walker and Ni, SIAM J. Numer. Anal. 49, 2011). The
+result is averaged over the sizes of the robot's errors (covariance.py).
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.estimation.acceleration import Acceleration
 from jcr.estimation.cholesky import cholesky, inverse_of, lower, over
-from jcr.estimation.components import Information, log_evidence, most_likely
 from jcr.estimation.covariance import expected_posterior, posterior
-from jcr.estimation.elimination import Normal
 from jcr.estimation.equation import SCALE, pose_by_pose, share_within_limits, weak_prior
 from jcr.estimation.image_equations import (
     SIZES_SETTLED,
@@ -30,7 +29,6 @@ from jcr.estimation.image_equations import (
     with_model_error_of,
     with_pixel_noise,
 )
-from jcr.estimation.mixed_model import Equations, LogSizes, left_out, solve_equations
 from jcr.estimation.model_error import expressed, polynomials_of
 from jcr.estimation.pose_equations import PoseEquations, pose_equations, reported_poses
 from jcr.estimation.problem import (
@@ -44,6 +42,15 @@ from jcr.estimation.problem import (
     with_free,
 )
 from jcr.estimation.projection import view_of
+from jcr.estimation.robot_noise import (
+    Equations,
+    Information,
+    LogSizes,
+    left_out,
+    log_evidence,
+    most_likely,
+    solve_equations,
+)
 from jcr.geometry import Transform, step_between
 from jcr.least_squares import one_blas_thread
 from jcr.records import Budget, ModelError, RobotNoise
@@ -58,6 +65,12 @@ ROUNDING = 1e-9
 """Relative increase of a cost that is rounding."""
 ARMS_SETTLED, NEARLY_SETTLED = 1e-14, 1e-6
 """Steps of the arms alone, in squared standard deviations, that end them: of a result, and of one to compare."""
+ROUNDS_BEFORE = 3
+"""Number of earlier rounds that the next one uses."""
+PARALLEL = 1e-2
+"""Rounds whose steps differ by less than this share of what others differ by add nothing."""
+FARTHEST = 5.0
+"""Largest distance of the combination from the end of a round, in lengths of the round's own step."""
 TINY_STEP = 1e-6
 """Step for derivatives by differences (m, rad, or standard deviations)."""
 
@@ -248,99 +261,80 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
     Return also whether they settled, the number of rounds, and the largest last step of an arm's unknown in standard
     deviations.
     """
-    state, acceleration, log_sizes, last_step = start, Acceleration(), start.robot_log_sizes, np.inf
+    state, log_sizes, last_step = start, start.robot_log_sizes, np.inf
+    ends, steps = list[ndarray](), list[ndarray]()
+    robots, fixed = problem.arm_unknowns, np.zeros(len(problem.free))
     for count in range(1, ROUNDS + 1):
         before, view = state.pixel_noise, view_of(problem, state)
         state = with_pixel_noise(problem, state, view)
         images, normal = linearised(problem, state, view)
         unresized, (images, resized) = state, with_model_error_of(images)
-        state = images.state
-        together = _JointStep.of(images, log_sizes)
-        change = np.inf if log_sizes is None else float(np.abs(together.log_sizes - log_sizes).max())
-        log_sizes = together.log_sizes
+        state, known_sizes = images.state, log_sizes
+        equations = pose_equations(problem, state, images).equations
+        log_sizes, _ = most_likely(equations, log_sizes, SIZES_SETTLED / 3)
+        state = replace(state, robot_log_sizes=log_sizes)
+        change = np.inf if known_sizes is None else float(np.abs(log_sizes - known_sizes).max())
+        arms, columns, std = _joint_step(images, equations, log_sizes)
+        last_step = float(np.abs(arms / std[:robots]).max())
         assert before is not None and state.pixel_noise is not None
-        repixeled = state.pixel_noise.change(before)
-        if max(change, resized, repixeled) < SIZES_SETTLED and together.size < STEP_SETTLED:
-            return replace(state, robot_log_sizes=log_sizes), images, True, count, together.size
-        moved, last_step = together.after(state, normal), together.size
-        if together.cost(moved) <= together.cost(state) * (1 + ROUNDING):
-            begun, ended = _coordinates(problem, start, unresized), _coordinates(problem, start, moved)
-            state = _state_at(
-                problem, start, moved, acceleration.next(begun, ended, together.weights(len(begun)))
-            )
+        change = max(change, resized, state.pixel_noise.change(before))
+        if change < SIZES_SETTLED and last_step < STEP_SETTLED:
+            return state, images, True, count, last_step
+        share = share_within_limits(arms)
+        moved = image_step(problem, state, share * columns)
+        moved = replace(moved, points_in_world=normal.stepped(state.points_in_world, share * columns))
+        moved = full_step(problem, moved, np.r_[share * arms, fixed])
+        # The cost has the weights and sizes of errors at the start of the step.
+        root = cholesky(replace(equations, known=None).covariance(log_sizes))
+        cost, moved_cost = (
+            float((lower(root, reported_poses(problem, one)[0].reshape(-1, 1)) ** 2).sum())
+            + cost_of_images(images, one)
+            for one in (state, moved)
+        )
+        if moved_cost <= cost * (1 + ROUNDING):
+            begin, end = _coordinates(problem, start, unresized), _coordinates(problem, start, moved)
+            ends, steps = [*ends[-ROUNDS_BEFORE:], end], [*steps[-ROUNDS_BEFORE:], end - begin]
+            judged = np.r_[:robots, robots + problem.free]
+            state = _state_at(problem, start, moved, _accelerated(ends, steps, judged, std))
         else:
-            state = together.damped(replace(state, robot_log_sizes=log_sizes))
-            acceleration.forget()
+            information = _rig_information(problem, state, root)
+            state = adjusted_images(problem, state, [information])[0]
+            state = _most_likely_arms(problem, state, evidence(problem, state), STEP_SETTLED**2)
+            ends, steps = [], []
     state = replace(state, robot_log_sizes=log_sizes)
     return state, evidence(problem, state), False, ROUNDS, last_step
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _JointStep:
-    """One Gauss-Newton step of arms, cameras, rigs and points together."""
+def _joint_step(
+    images: ImageEvidence, equations: Equations, log_sizes: LogSizes
+) -> tuple[Float[ndarray, " u"], Float[ndarray, " d"], Float[ndarray, " p"]]:
+    """Return the Gauss-Newton step of the arms and of the columns of the images, and the standard deviations of the
+    unknowns of the mixed model."""
+    problem, rigs = images.problem, images.rigs
+    solution, arms = solve_equations(equations, log_sizes), problem.arm_unknowns
+    step = solution.step
+    # The rigs step to the images' estimate given the cameras, and towards the reported poses by their weight.
+    by_rig = reported_poses(problem, images.state)[2]
+    pull = pose_by_pose(np.swapaxes(by_rig, 1, 2), solution.weighed_left[:, None])[:, 0]
+    columns = np.zeros(problem.columns.count)
+    columns[problem.free] = step[arms:]
+    columns[problem.by_arm] = -rigs.step - rigs.follow @ step[arms:] - rigs.covariance @ pull
+    return step[:arms], columns, np.sqrt(solution.covariance.diagonal())
 
-    images: ImageEvidence
-    log_sizes: LogSizes
-    """Most likely log sizes of the robot's errors."""
-    arms: Float[ndarray, " u"]
-    columns: Float[ndarray, " d"]
-    """Step of the columns of the images."""
-    std: Float[ndarray, " p"]
-    """Standard deviations of the unknowns of the mixed model."""
-    root: Float[ndarray, "s s"]
-    """Lower Cholesky factor of the covariance of the reported poses."""
 
-    @staticmethod
-    def of(images: ImageEvidence, log_sizes: LogSizes | None) -> "_JointStep":
-        """Return the step from the state of the evidence."""
-        problem, state, rigs = images.problem, images.state, images.rigs
-        equations = pose_equations(problem, state, images).equations
-        log_sizes, _ = most_likely(equations, log_sizes, SIZES_SETTLED / 3)
-        solution, arms = solve_equations(equations, log_sizes), problem.arm_unknowns
-        step = solution.step
-        # The rigs step to the images' estimate given the cameras, and towards the reported poses by their weight.
-        by_rig = reported_poses(problem, state)[2]
-        pull = pose_by_pose(np.swapaxes(by_rig, 1, 2), solution.weighed_left[:, None])[:, 0]
-        columns = np.zeros(problem.columns.count)
-        columns[problem.free] = step[arms:]
-        columns[problem.by_arm] = -rigs.step - rigs.follow @ step[arms:] - rigs.covariance @ pull
-        return _JointStep(
-            images=images,
-            log_sizes=log_sizes,
-            arms=step[:arms],
-            columns=columns,
-            std=np.sqrt(solution.covariance.diagonal()),
-            root=cholesky(replace(equations, known=None).covariance(log_sizes)),
-        )
-
-    @property
-    def size(self) -> float:
-        """Largest step of an arm's unknown, in standard deviations."""
-        return float(np.abs(self.arms / self.std[: len(self.arms)]).max())
-
-    def weights(self, count: int) -> Float[ndarray, " n"]:
-        """Return the weight of each of the `count` coordinates of a state: one over the standard deviation, or 0."""
-        problem, out = self.images.problem, np.zeros(count)
-        out[np.r_[: problem.arm_unknowns, problem.arm_unknowns + problem.free]] = 1 / self.std
-        return out
-
-    def after(self, state: State, normal: Normal) -> State:
-        """Return the state after the step; `normal` steps the points."""
-        share, problem = share_within_limits(self.arms), self.images.problem
-        moved = image_step(problem, state, share * self.columns)
-        moved = replace(moved, points_in_world=normal.stepped(state.points_in_world, share * self.columns))
-        return full_step(problem, moved, np.r_[share * self.arms, np.zeros(len(problem.free))])
-
-    def cost(self, state: State) -> float:
-        """Return the cost of a state, with the weights and sizes of errors at the start of the step."""
-        residual = reported_poses(self.images.problem, state)[0].reshape(-1, 1)
-        return float((lower(self.root, residual) ** 2).sum()) + cost_of_images(self.images, state)
-
-    def damped(self, state: State) -> State:
-        """Return the state after an adjustment of the images to the reported poses, then of the arms."""
-        problem = self.images.problem
-        state, _, _ = adjusted_images(problem, state, [_rig_information(problem, state, self.root)])
-        return _most_likely_arms(problem, state, evidence(problem, state), STEP_SETTLED**2)
+def _accelerated(
+    ends: list[ndarray], steps: list[ndarray], judged: Int[ndarray, " p"], std: Float[ndarray, " p"]
+) -> Float[ndarray, " n"]:
+    """Return the begin of the next round from the ends and steps of the last ones; unknowns that are not `judged`
+    follow the others."""
+    if len(steps) == 1:
+        return ends[-1]
+    step = steps[-1][judged] / std
+    by_round = np.diff([one[judged] for one in steps], axis=0).T / std[:, None]
+    share = np.linalg.lstsq(by_round, step, rcond=PARALLEL)[0]
+    beyond = np.diff(ends, axis=0).T @ share
+    far, most = float(np.linalg.norm(beyond[judged] / std)), FARTHEST * float(np.linalg.norm(step))
+    return ends[-1] - beyond * (most / far if far > most else 1.0)
 
 
 def _with_covariance(
@@ -369,13 +363,12 @@ def _with_covariance(
 
 
 def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | None, settled: float) -> State:
-    """Estimate the sizes of the robot's errors, then step the arms' unknowns until a step is below `settled` squared
-    standard deviations."""
-    arms, sizes = problem.arm_unknowns, state.robot_log_sizes
-    for count in range(STEPS):
+    """Step the arms' unknowns and the sizes of the robot's errors, until a step is below `settled` squared standard
+    deviations."""
+    arms = problem.arm_unknowns
+    for _ in range(STEPS):
         equations = pose_equations(problem, state, images).equations
-        if count < 2:
-            sizes, _ = most_likely(equations, sizes, SIZES_SETTLED / 3)
+        sizes, _ = most_likely(equations, state.robot_log_sizes, SIZES_SETTLED / 3)
         solution = solve_equations(equations, sizes)
         step = np.zeros(problem.unknowns)
         step[:arms] = share_within_limits(solution.step[:arms]) * solution.step[:arms]

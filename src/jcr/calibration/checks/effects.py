@@ -33,15 +33,14 @@ from jcr.calibration.checks.camera import (
 )
 from jcr.calibration.options import GRASPING
 from jcr.camera import parameters, with_thin_prism
-from jcr.estimation.components import most_likely
 from jcr.estimation.equation import SCALE, UNKNOWNS, columns_of_arm
 from jcr.estimation.hand_eye import judged, poses_agree
 from jcr.estimation.hypotheses import Row, Test, best_tests, explains_by_order
-from jcr.estimation.mixed_model import Equations, LogSizes, solve_equations
 from jcr.estimation.pose_effects import PLAUSIBLE, STRAINS, arm_rows, order_rows
 from jcr.estimation.pose_equations import pose_equations
 from jcr.estimation.problem import Problem
 from jcr.estimation.problem import State as ProblemState
+from jcr.estimation.robot_noise import Equations, LogSizes, most_likely, solve_equations
 from jcr.estimation.solve import Solution
 from jcr.estimation.systematic import Region
 from jcr.estimation.wrist import pose_problem

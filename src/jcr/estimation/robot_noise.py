@@ -1,0 +1,348 @@
+"""Mixed linear model of gripper poses: solution at given sizes of the errors, and estimates of these sizes.
+
+The residuals of n poses are r = −J θ + e + ε. The random part ε has σ_t² per axis of position and σ_r² per axis of
+rotation, the systematic part e has covariance σ_s² G (systematic.py), and what the cameras add is known. Restricted
+maximum likelihood estimates the three sizes (Searle, Casella and McCulloch, "Variance components", 1992, section 6.6),
+but few images determine them badly. A result is therefore averaged over the sizes with their posterior weights, on a
+grid about the mode (Rue, Martino and Chopin, J. R. Statist. Soc. B 71, 2009, section 3).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.estimation.cholesky import cholesky, inverse_of, log_root_determinant, lower, over, upper
+from jcr.estimation.systematic import REACH
+from jcr.records import RobotNoise
+
+NOISE_FLOOR = (2e-5, np.radians(0.002))
+"""Least noise (m, rad) beside the estimated one, so that a perfect fit does not claim a perfect robot."""
+TYPICAL = np.array([3e-4, np.radians(0.04), np.radians(0.1)])
+"""Middle of the weak priors of σ_t (m), σ_r (rad) and σ_s (rad) of an arm."""
+FACTOR_STD = np.log([10.0, 10.0, 3.0])
+"""Logarithms of the factors by which arms differ in these. Data sheets of industrial arms state 0.03 to 0.1° of
+systematic error, those of servo arms 1 to 2°."""
+TYPICAL_WALKS, WALK_FACTOR_STD = np.array([3e-4, 1e-3, 1e-3]), np.log(30.0)
+"""Growth of the errors of camera poses from one image to the next (m, rad, relative scale), and the factor by which it
+differs between sequences."""
+GIVEN_SHARE = 0.3
+"""Middle of the prior of a robot's noise beside a given one, as a share of the given one."""
+SHOWN = 1.1
+"""Factor on a given noise beyond which the noise counts as estimated from the residuals."""
+LEAST_BESIDE = 0.01
+"""Least errors beside the given noise, as a share of it: the logarithm of no error is not finite."""
+RATIO_STD = np.log(4.0)
+"""Standard deviation of log(σ_t / (REACH · σ_r)) over robots. With log 2 instead, three images of a robot whose
+rotations are six times better than its positions cover 80 to 90 %."""
+LEVELS = tuple(1.5 * np.arange(-4, 5))
+"""Distances from the mode at which the posterior is evaluated, in standard deviations of the log sizes; for a normal
+posterior the error of this sum is 3e-4."""
+FARTHEST, LESS_FAR = 21.0, 10.0
+"""Largest squared distance from the mode. Rare errors come from rare sizes: with 7 as the limit, three images covered
+81 % instead of 95 %, and two of 120 images that had not moved were called moved at p < 0.001."""
+MANY, TOO_MANY = 15, 80
+"""Numbers of poses from which the smaller limit is enough, and from which the mode alone is used."""
+AT_ONCE = 4e6
+"""Largest number of elements of an array of solutions that are computed together."""
+SETTLED = 1e-4
+"""Change of log sizes that no longer matters."""
+
+LogSizes = Float[ndarray, "*k c"]
+"""Logarithms of σ_t, σ_r, σ_s, and of the growths of the errors of camera poses."""
+Each = Float[ndarray, "*k"] | np.floating
+Covariance = Float[ndarray, "s s"]
+Information = Float[ndarray, "c c"]
+"""Expected information of the log sizes at their mode."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Equations:
+    """Linearised equations of the used poses; s = 6 times their number, p unknowns."""
+
+    residual: Float[ndarray, " s"]
+    """Steps (geometry.retract) from the reported to the predicted poses in turn: m, then rad; both in base axes."""
+    jacobian: Float[ndarray, "s p"]
+    prior_information: Float[ndarray, "p p"]
+    prior_gradient: Float[ndarray, " p"]
+    systematic: Covariance
+    """Covariance of the systematic part where σ_s is 1 rad."""
+    known: Covariance | None = None
+    """Covariance of the residuals by errors of the cameras."""
+    given: tuple[float, float] | None = None
+    """Lower bounds of σ_t and σ_r that the user gave (m, rad)."""
+    walks: tuple[Covariance, ...] = ()
+    """Covariances of errors of the camera poses that add up along the sequence, where their sizes are 1."""
+    confirmed: Covariance | None = None
+    """Covariance of errors that were confirmed, whatever the sizes of the others are."""
+
+    @property
+    def least(self) -> Float[ndarray, "2"]:
+        """Noise σ_t and σ_r that counts beside the estimated one."""
+        return np.array(self.given or NOISE_FLOOR)
+
+    @cached_property
+    def prior(self) -> tuple[Float[ndarray, " c"], Float[ndarray, " c"]]:
+        """Mean and standard deviation of the weak priors of the log sizes."""
+        typical, count = np.r_[TYPICAL, TYPICAL_WALKS], 3 + len(self.walks)
+        if self.given is not None:
+            typical[:2] = GIVEN_SHARE * self.least
+        return np.log(typical[:count]), np.r_[FACTOR_STD, np.full(3, WALK_FACTOR_STD)][:count]
+
+    @cached_property
+    def of_position(self) -> Float[ndarray, " s"]:
+        """1 for residuals of position, 0 for those of rotation."""
+        return np.tile(np.repeat([1.0, 0.0], 3), len(self.residual) // 6)
+
+    def variances(self, log_sizes: LogSizes) -> Float[ndarray, "*k c"]:
+        """Return σ_t², σ_r², σ_s² and the squared growth of the camera errors."""
+        variances = np.exp(2 * log_sizes)
+        variances[..., :2] += self.least**2
+        return variances
+
+    def log_sizes_of(self, noise: RobotNoise) -> Float[ndarray, "3"]:
+        """Return the log sizes of a noise, at least LEAST_BESIDE of the noise that counts in any case."""
+        squared = np.square([noise.translation, noise.rotation]) - self.least**2
+        beside = np.sqrt(np.maximum(squared, (LEAST_BESIDE * self.least) ** 2))
+        return np.log(np.r_[beside, max(noise.systematic, LEAST_BESIDE * float(self.least[1]))])
+
+    def random(self, log_sizes: LogSizes) -> Float[ndarray, "*k s"]:
+        """Return the variance of each residual's random part."""
+        variances = self.variances(log_sizes)
+        return variances[..., :1] * self.of_position + variances[..., 1:2] * (1 - self.of_position)
+
+    def noise(self, log_sizes: LogSizes) -> RobotNoise:
+        """Return the errors of the poses at these sizes."""
+        metres, radians, systematic = np.sqrt(self.variances(log_sizes)[:3]).tolist()
+        left = systematic * np.sqrt(np.diag(self.systematic).reshape(-1, 2, 3).mean((0, 2)))
+        shown = SHOWN * np.array(self.given or (0.0, 0.0))
+        return RobotNoise(
+            translation=metres,
+            rotation=radians,
+            estimated=bool((shown < (metres, radians)).any()),
+            given=self.given,
+            systematic=systematic,
+            systematic_left=(float(left[0]), float(left[1])),
+        )
+
+    def covariance(self, log_sizes: LogSizes) -> Float[ndarray, "*k s s"]:
+        """Return the covariance V of the residuals."""
+        covariance = self.random(log_sizes)[..., None] * np.eye(len(self.residual))
+        variances = self.variances(log_sizes)[..., 2:]
+        for k, part in enumerate((self.systematic, *self.walks)):
+            covariance += variances[..., k, None, None] * part
+        for part in (self.known, self.confirmed):
+            if part is not None:
+                covariance += part
+        return covariance
+
+    def log_prior(self, log_sizes: LogSizes) -> Each:
+        """Return the log density of the weak priors of the sizes, up to a constant."""
+        mean, std = self.prior
+        ratio = (log_sizes[..., 0] - log_sizes[..., 1] - np.log(REACH)) / RATIO_STD
+        return -((((log_sizes - mean) / std) ** 2).sum(-1) + ratio**2) / 2
+
+    def log_prior_slope(self, log_sizes: LogSizes) -> tuple[LogSizes, Information]:
+        """Return the gradient and the negative Hessian of `log_prior`."""
+        mean, std = self.prior
+        apart = np.zeros(len(std))
+        apart[:2] = 1 / RATIO_STD, -1 / RATIO_STD
+        ratio = (log_sizes[0] - log_sizes[1] - np.log(REACH)) / RATIO_STD
+        return (mean - log_sizes) / std**2 - ratio * apart, np.diag(std**-2.0) + np.outer(apart, apart)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearSolution:
+    """Unknowns at one value of the sizes, or at k values."""
+
+    log_posterior: Each
+    """Restricted log likelihood of the sizes with their prior; up to a constant that all sizes and all models of the
+    same residuals share."""
+    step: Float[ndarray, "*k p"]
+    root: Float[ndarray, "*k s s"]
+    """Lower Cholesky factor of V."""
+    information_root: Float[ndarray, "*k p p"]
+    """Lower Cholesky factor of JᵀV⁻¹J + prior."""
+    weighed: Float[ndarray, "*k s p"]
+    """V⁻¹J."""
+    weighed_left: Float[ndarray, "*k s"]
+    """Weighed remaining residuals V⁻¹(r + Jθ)."""
+
+    @property
+    def gain(self) -> Float[ndarray, "*k p s"]:
+        """Gain with which errors of the residuals pass into the unknowns, with the sign reversed: C JᵀV⁻¹."""
+        return over(self.information_root, np.swapaxes(self.weighed, -1, -2))
+
+    @property
+    def covariance(self) -> Float[ndarray, "*k p p"]:
+        """C of the unknowns."""
+        return over(self.information_root, np.eye(self.step.shape[-1]))
+
+    @cached_property
+    def weight(self) -> Covariance:
+        """V⁻¹, at one value of the sizes."""
+        return inverse_of(self.root)
+
+    @property
+    def projection(self) -> Covariance:
+        """P = V⁻¹ − V⁻¹J C JᵀV⁻¹, at one value of the sizes."""
+        return self.weight - self.weighed @ self.gain
+
+
+Weighed = list[tuple[Float[ndarray, " g"], Float[ndarray, "g c"], LinearSolution]]
+"""Posterior weights (their sum is 1) of log sizes about their mode, and the solutions at these, in groups."""
+
+
+def solve_equations(equations: Equations, log_sizes: LogSizes) -> LinearSolution:
+    """Return the generalised least-squares solution at given sizes."""
+    root = cholesky(equations.covariance(log_sizes))
+    whitened = lower(root, np.column_stack([equations.jacobian, equations.residual]))
+    jacobian, residual = whitened[..., :-1], whitened[..., -1:]
+    transposed = np.swapaxes(jacobian, -1, -2)
+    information_root = cholesky(transposed @ jacobian + equations.prior_information)
+    gradient = transposed @ residual + equations.prior_gradient[:, None]
+    step = -over(information_root, gradient)
+    squares = (residual**2).sum((-1, -2)) + (gradient * step).sum((-1, -2))
+    determinants = log_root_determinant(root) + log_root_determinant(information_root)
+    weighed = upper(root, whitened)
+    return LinearSolution(
+        log_posterior=-determinants - squares / 2 + equations.log_prior(log_sizes),
+        step=step[..., 0],
+        root=root,
+        information_root=information_root,
+        weighed=weighed[..., :-1],
+        weighed_left=weighed[..., -1] + (weighed[..., :-1] @ step)[..., 0],
+    )
+
+
+def left_out(
+    solution: LinearSolution, noise: tuple[float, float]
+) -> tuple[Float[ndarray, "m 6"], Float[ndarray, "m 6 6"]]:
+    """Return each pose's residual from a fit without it, P_ii⁻¹ (P r)_i, and its covariance P_ii⁻¹.
+
+    `noise` (m, rad) sets the units in which the matrices are inverted.
+    """
+    sigma, m = np.repeat(noise, 3), len(solution.root) // 6
+    own = solution.projection.reshape(m, 6, m, 6)[range(m), :, range(m)]
+    without = np.linalg.inv(sigma[:, None] * own * sigma + 1e-9 * np.eye(6))
+    found = sigma * np.einsum("mij,mj->mi", without, sigma * solution.weighed_left.reshape(m, 6))
+    return found, sigma[:, None] * without * sigma
+
+
+def most_likely(
+    equations: Equations,
+    start: LogSizes | None = None,
+    settled: float = SETTLED,
+) -> tuple[LogSizes, Information]:
+    """Return the log sizes at the mode of their posterior, to a last step `settled`, and their expected information.
+
+    Fisher scoring uses the curvature that the last step showed (BFGS, Nocedal and Wright, "Numerical optimization",
+    2006, eq. 6.19): where the expected information is half of the curvature, steps swing about the mode.
+    """
+    at = equations.prior[0] if start is None else start
+    value, gradient, information = _score(equations, at)
+    curvature = information
+    for _ in range(40):
+        step = np.linalg.solve(curvature, gradient)
+        step /= max(1.0, float(np.abs(step).max()))
+        while (scored := _score(equations, at + step))[0] < value and np.abs(step).max() > settled:
+            step = step / 2
+        if scored[0] < value:
+            break
+        gained, fell = scored[0] - value, gradient - scored[1]
+        at = at + step
+        value, gradient, information = scored
+        curvature = information
+        if step @ fell > 0:
+            along = information @ step
+            shown = np.outer(fell, fell) / (step @ fell)
+            curvature = information - np.outer(along, along) / (step @ along) + shown
+        if np.abs(step).max() < settled or gained < 1e-9:
+            break
+    return at, information
+
+
+def log_evidence(equations: Equations, log_posterior: float, information: Information) -> float:
+    """Return the log density of the residuals, averaged over unknowns and sizes, up to a common constant.
+
+    Laplace's method is used about the mode of the sizes, at which `log_posterior` and `information` are. The factor
+    (2π)^(−s/2) of s residuals is left out.
+    """
+    gradient = equations.prior_gradient
+    against_prior = gradient @ np.linalg.lstsq(equations.prior_information, gradient, rcond=None)[0]
+    return log_posterior - float(against_prior) / 2 - float(np.linalg.slogdet(information)[1]) / 2
+
+
+def growth_scores(
+    equations: Equations, log_sizes: LogSizes, parts: Sequence[Float[ndarray, "s s"]]
+) -> Float[ndarray, " k"]:
+    """Return the score test of further components at size 0, in standard deviations (Rao 1948)."""
+    solution = solve_equations(equations, log_sizes)
+    projection, left = solution.projection, solution.weighed_left
+    by = [projection @ part for part in parts]
+    pull = np.array([left @ part @ left - np.trace(one) for part, one in zip(parts, by, strict=True)])
+    return pull / np.sqrt([2 * (one * one.T).sum() for one in by])
+
+
+def over_sizes(
+    equations: Equations,
+    mode: LogSizes,
+    information: Information,
+    density: Callable[[LinearSolution], Each] = lambda solution: solution.log_posterior,
+) -> Weighed:
+    """Return a grid of log sizes about their mode with posterior weights and solutions.
+
+    `density` is the logarithm of the sizes' posterior, up to a constant. The steps along both directions of each axis of
+    the information are the standard deviation of the posterior there, which is skew: few images bound the sizes from
+    above rather than from below.
+    """
+    poses = len(equations.residual) // 6
+    sizes, log_volumes = mode[None], np.zeros(1)
+    if poses <= TOO_MANY:
+        values, vectors = np.linalg.eigh(information)
+        axes, probe = vectors / np.sqrt(values), 1.5
+        beside = mode + probe * np.concatenate([-axes.T, axes.T])
+        top, *others = (density(solve_equations(equations, at)) for at in (mode, *beside))
+        drop = np.maximum(2 * (top - np.array(others)), 1e-3)
+        shorter, longer = np.clip(probe / np.sqrt(drop), 0.3, 3.0).reshape(2, -1)
+        z = np.array(list(product(LEVELS, repeat=len(mode))))
+        z = z[(z**2).sum(1) < (FARTHEST if poses < MANY else LESS_FAR)]
+        lengths = np.where(z < 0, shorter, longer)
+        sizes, log_volumes = mode + (lengths * z) @ axes.T, np.log(lengths).sum(1)
+    together = max(1, int(AT_ONCE / len(equations.residual) ** 2))
+    groups = [sizes[at : at + together] for at in range(0, len(sizes), together)]
+    solutions = [solve_equations(equations, group) for group in groups]
+    log_weight = np.concatenate([density(each) for each in solutions]) + log_volumes
+    weight = np.exp(log_weight - log_weight.max())
+    shares = np.split(weight / weight.sum(), np.cumsum([len(group) for group in groups])[:-1])
+    return list(zip(shares, groups, solutions, strict=True))
+
+
+def expected_information(equations: Equations, log_sizes: LogSizes) -> Information:
+    """Return the expected information of the log sizes, including their prior."""
+    return _score(equations, log_sizes)[2]
+
+
+def _score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, Information]:
+    """Return the log posterior of the sizes, its gradient, and the expected information."""
+    solution = solve_equations(equations, log_sizes)
+    projection, left = solution.projection, solution.weighed_left
+    masks = np.stack([equations.of_position, 1 - equations.of_position])
+    parts = (equations.systematic, *equations.walks)
+    by = [projection @ part for part in parts]
+    beside = np.stack([masks @ (one * projection).sum(1) for one in by], axis=1)
+    own = np.array([[(one * other.T).sum() for other in by] for one in by])
+    pairs = np.block([[masks @ projection**2 @ masks.T, beside], [beside.T, own]])
+    squares = np.r_[masks @ left**2, [left @ part @ left for part in parts]]
+    traces = np.r_[masks @ np.diagonal(projection), [np.trace(one) for one in by]]
+    growth = np.exp(2 * log_sizes)
+    gradient, information = equations.log_prior_slope(log_sizes)
+    return (
+        float(solution.log_posterior),
+        gradient + growth * (squares - traces),
+        information + 2 * np.outer(growth, growth) * pairs,
+    )
