@@ -380,15 +380,22 @@ def findings_page() -> str:
     return "\n".join(parts) + "\n"
 
 
+def _blanked(template: str) -> str:
+    """Return a template with … for its fields, the inner ones first."""
+    while (shorter := re.sub(r"{[^{}]*}", "…", template)) != template:
+        template = shorter
+    return template
+
+
 def _about_kind(row: Row) -> Iterator[str]:
     if isinstance(row.message, str) and row.message != "{text}":
-        yield f"> {re.sub(r'{[^}]*}', '…', row.message)}\n"
+        yield f"> {_blanked(row.message)}\n"
     yield from (
         f"- **{name}**: {text}." for name, text in (("Means", row.means), ("`value`", row.evidence)) if text
     )
     advice = row.help or (row.remedy if isinstance(row.remedy, str) else "")
     if advice:
-        yield f"- **Remedy**: {re.sub(r'{[^}]*}', '…', advice)}."
+        yield f"- **Remedy**: {_blanked(advice)}."
     if row.explains:
         yield f"- **Explains**: {', '.join(f'`{name}`' for name in row.explains)}."
 

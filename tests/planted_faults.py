@@ -116,7 +116,7 @@ FAULTS = (
     ),
     PlantedFault(
         "calibration",
-        "src/jcr/calibration/verdict.py",
+        "src/jcr/calibration/case.py",
         "if not accepted or not judged(hand_eye).converged:",
         "if not accepted and not judged(hand_eye).converged:",
         ("tests/calibration/test_findings.py", "tests/calibration/test_faults.py"),

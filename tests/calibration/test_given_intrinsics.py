@@ -69,7 +69,7 @@ def test_a_true_intrinsics_is_never_named(images: int, motion: dict) -> None:
 def test_a_wrong_focal_length_is_named_with_the_right_one(factor: float, images: int) -> None:
     problem, hand_eye = calibrated(0, images, scaled(factor))
     found = re.match(
-        r"the images show a focal length of ([\d.]+) ± \S+ px where ([\d.]+) is given", said(hand_eye)
+        r"the images show focal lengths of \(([\d.]+), [\d.]+\) ± \S+ px where \(([\d.]+), ", said(hand_eye)
     )
     assert found is not None
     assert float(found[1]) == pytest.approx(INTRINSICS.fx, rel=0.01)

@@ -75,7 +75,7 @@ def test_a_board_of_30_mm_given_for_one_of_25_rejects_the_calibration_in_one_lin
     hand_eye, _ = calibrated(Sheet(stated_m=0.030))
     assert not hand_eye.converged
     (line,) = hand_eye.warnings
-    assert "16.6 ± 0.2 " in line and "% smaller than given; measure its squares" in line
+    assert "16.6 ± 0.2" in line and "% smaller than given; measure its squares" in line
 
 
 def test_the_side_of_a_board_of_unknown_size_is_stated_by_the_robot():
@@ -83,9 +83,6 @@ def test_the_side_of_a_board_of_unknown_size_is_stated_by_the_robot():
     side = of_kind(hand_eye, FindingKind.BOARD_SIDE)
     assert side.value is not None and side.std is not None
     assert side.value == pytest.approx(1.016 * 0.025, abs=3 * side.std) and side.std < 1e-4
-    assert "if they measure 25.5 mm" in sentence(side) or "if they measure 25 mm, give 0.025" in sentence(
-        side
-    )
     assert hand_eye.converged and hand_eye.lengths == ()
 
 

@@ -10,19 +10,17 @@ from dataclasses import dataclass, replace
 from itertools import permutations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from jcr.estimation.closed_form import closed_form, initial_estimate
+from jcr.estimation.closed_form import closed_form
 from jcr.estimation.equation import Poses
 from jcr.estimation.hand_eye import solve_hand_eye
 from jcr.estimation.robust import least_trimmed
-from jcr.estimation.solve import solve
-from jcr.estimation.wrist import pose_problem
 from jcr.findings import Finding, FindingKind, Severity
 from jcr.geometry import inverse, transform
-from jcr.records import HandEye, RobotNoise
+from jcr.records import HandEye
 
 SOLVED = 24
 """Largest number of readings that are solved in full, the most congruent ones."""
@@ -30,14 +28,10 @@ SAME_ANGLE = np.radians(0.1)
 """Difference of angles (rad) within which readings rank alike, so that usual mistakes are solved first."""
 FITS = 3.0
 """Misfit (mm) up to which poses need no other reading."""
-CONGRUENT = np.radians(1.5)
-"""Difference of angles (rad) up to which readings are solved."""
 BETTER = 3.0
 """Factor by which a reading must fit better than the poses as given."""
 ROUGHLY = 2.0
 """Factor to which a closed form shows the misfit of a reading."""
-ROTATION, ON_MULTIPLE = 2 * np.pi, 1.5
-"""Degrees: numbers that were taken as radians are known up to multiples of the one, and lie as near one as the other."""
 MIN_SHARE = 0.8
 """Smallest share of the images that agree under a reading."""
 INVERSES = "their inverses (gripper_from_base was given)"
@@ -97,13 +91,15 @@ class Reading:
         """Size of the noise, a degree counted as 5 mm."""
         return self.translation_mm + 5 * self.rotation_deg
 
+    @classmethod
+    def of(cls, name: str, solved: HandEye) -> "Reading":
+        """Return a reading with the misfit of its calibration."""
+        metres, radians = solved.robot_noise.together
+        return cls(name, 1e3 * metres, float(np.degrees(radians)), int(solved.inliers.sum()))
 
-@dataclass(frozen=True)
-class _Candidate:
-    name: str
-    base_from_gripper: Float[ndarray, "k 4 4"]
-    image: Int[ndarray, " k"]
-    """Row of the camera that each pose belongs to."""
+
+_Candidate = tuple[str, Float[ndarray, "k 4 4"], Int[ndarray, " k"]]
+"""Name of a reading, its gripper poses, and the rows of the cameras that they belong to."""
 
 
 def better_reading(
@@ -118,39 +114,31 @@ def better_reading(
     calibration of the poses as given, where there is one from the camera poses alone.
     """
     n = len(base_from_gripper)
-    candidates = list(_candidates(base_from_gripper))
-    every = np.arange(n)
+    given, *others = _candidates(base_from_gripper)
     for by_number, poses in (by_name or {}).items():
-        candidates.append(_Candidate(BY_NUMBER if by_number else BY_TEXT, poses, every))
-    given = candidates[0]
-    as_given = _solved(given, recon_from_camera) if solved is None else _reading(given, solved)
+        others.append((BY_NUMBER if by_number else BY_TEXT, poses, np.arange(n)))
+    as_given = _solved(given, recon_from_camera) if solved is None else Reading.of(given[0], solved)
     if as_given.misfit < FITS and as_given.used >= MIN_SHARE * n:
         return None
-    others = candidates[1:]
     camera_angle = _angles(recon_from_camera)
     gaps = np.array([_incongruence(candidate, camera_angle) for candidate in others])
     order = np.argsort(np.round(gaps / SAME_ANGLE), kind="stable")[:SOLVED]
     worth = [others[k] for k in order if gaps[k] < 2 * gaps.min() + SAME_ANGLE]
-    agree, errors = zip(*(_roughly(candidate, recon_from_camera) for candidate in worth), strict=True)
-    rough = np.array(errors)
+    rough = np.array([_rough_error(candidate, recon_from_camera) for candidate in worth])
     # Of a reading that may be named: shuffled poses fit no reading, and each would be solved in vain.
     enough = 1e-3 * ROUGHLY / BETTER * as_given.misfit
-    limit = min(enough, _roughly(given, recon_from_camera)[1] / ROUGHLY)
-    if not np.isfinite(rough.min()) or rough.min() > limit:
+    least = float(rough.min())
+    if not least <= min(enough, _rough_error(given, recon_from_camera) / ROUGHLY):
         return None
     readings = [
         _solved(candidate, recon_from_camera)
-        for candidate, images, error in zip(worth, agree, rough, strict=True)
-        if error <= min(ROUGHLY * rough.min(), enough)
-        and _least_misfit(candidate, recon_from_camera, images) * BETTER < as_given.misfit
+        for candidate, error in zip(worth, rough, strict=True)
+        if error <= min(ROUGHLY * least, enough)
     ]
-    if not readings:
-        return None
     least = min(reading.misfit for reading in readings)
     best = next(reading for reading in readings if reading.misfit < 1.05 * least + 0.01)
-    if best.used >= MIN_SHARE * (n - 2) and best.misfit * BETTER < as_given.misfit:
-        return best, as_given
-    return None
+    is_better = best.used >= MIN_SHARE * (n - 2) and best.misfit * BETTER < as_given.misfit
+    return (best, as_given) if is_better else None
 
 
 def convention_finding(found: tuple[Reading, Reading], severity: Severity = "rejects") -> Finding:
@@ -166,47 +154,25 @@ def convention_finding(found: tuple[Reading, Reading], severity: Severity = "rej
 
 
 def _solved(candidate: _Candidate, recon_from_camera: Poses) -> Reading:
-    return _reading(
-        candidate,
-        solve_hand_eye(candidate.base_from_gripper, recon_from_camera[candidate.image], in_sequence=False),
-    )
+    name, base_from_gripper, image = candidate
+    return Reading.of(name, solve_hand_eye(base_from_gripper, recon_from_camera[image], in_sequence=False))
 
 
-def _reading(candidate: _Candidate, solved: HandEye) -> Reading:
-    """Return a candidate with the misfit of its calibration."""
-    return Reading(candidate.name, *_mm_deg(solved.robot_noise), int(solved.inliers.sum()))
+def _rough_error(candidate: _Candidate, recon_from_camera: Poses) -> float:
+    """Return the error (m) of a closed form in the images that agree best, in a hundredth of the time of a fit.
 
-
-def _mm_deg(noise: RobotNoise) -> tuple[float, float]:
-    """Return random and systematic errors together, mm and degrees per axis."""
-    metres, radians = noise.together
-    return 1e3 * metres, float(np.degrees(radians))
-
-
-def _least_misfit(candidate: _Candidate, recon_from_camera: Poses, agree: Bool[ndarray, " k"]) -> float:
-    """Return the misfit of a candidate in the images that agree best, in a tenth of the time of a whole solution."""
-    gripper, camera = candidate.base_from_gripper[agree], recon_from_camera[candidate.image[agree]]
-    problem, state = pose_problem(gripper, camera, initial_estimate(gripper, camera))
-    fit = solve(problem, state, averaged=False)
-    return Reading(candidate.name, *_mm_deg(fit.noise), len(gripper)).misfit
-
-
-def _roughly(candidate: _Candidate, recon_from_camera: Poses) -> tuple[Bool[ndarray, " k"], float]:
-    """Return the images that agree best, and the error (m) that a closed form leaves in them.
-
-    It takes a hundredth of the time of a fit. The error is infinite where the scale is negative, as of mirrored poses.
+    It is infinite where the scale is negative, as of mirrored poses.
     """
-    camera = recon_from_camera[candidate.image]
-    agree, error = least_trimmed(candidate.base_from_gripper, camera)
-    _, scale, _ = closed_form(candidate.base_from_gripper, camera, agree.astype(float))
-    return agree, error if scale > 0 else np.inf
+    _, base_from_gripper, image = candidate
+    camera = recon_from_camera[image]
+    agree, error = least_trimmed(base_from_gripper, camera)
+    return error if closed_form(base_from_gripper, camera, agree.astype(float))[1] > 0 else np.inf
 
 
 def _incongruence(candidate: _Candidate, camera_angle: Float[ndarray, "n n"]) -> float:
     """Return the typical difference (rad) between the angles of gripper and camera motions."""
-    gap = np.abs(
-        _angles(candidate.base_from_gripper) - camera_angle[np.ix_(candidate.image, candidate.image)]
-    )
+    _, base_from_gripper, image = candidate
+    gap = np.abs(_angles(base_from_gripper) - camera_angle[np.ix_(image, image)])
     return float(np.quantile(gap[np.triu_indices(len(gap), 1)], 0.6))
 
 
@@ -220,21 +186,21 @@ def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
     """Yield the poses as given, then with one mistake each."""
     n = len(base_from_gripper)
     every = np.arange(n)
-    yield _Candidate("they are given", base_from_gripper, every)
-    yield _Candidate(INVERSES, inverse(base_from_gripper), every)
+    yield ("they are given", base_from_gripper, every)
+    yield (INVERSES, inverse(base_from_gripper), every)
     mirror = np.diag([1.0, -1.0, 1.0, 1.0])
-    yield _Candidate(MIRRORED, mirror @ base_from_gripper @ mirror, every)
-    yield _Candidate("listed in reverse order of the images", base_from_gripper[::-1], every)
+    yield (MIRRORED, mirror @ base_from_gripper @ mirror, every)
+    yield ("listed in reverse order of the images", base_from_gripper[::-1], every)
     for shift in range(1, min(2, n - 5) + 1):
         later, earlier = slice(shift, None), slice(n - shift)
         ahead = f"{shift} ahead of the images (image k has pose k + {shift})"
         behind = f"{shift} behind the images (image k has pose k − {shift})"
-        yield _Candidate(ahead, base_from_gripper[later], every[earlier])
-        yield _Candidate(behind, base_from_gripper[earlier], every[later])
+        yield (ahead, base_from_gripper[later], every[earlier])
+        yield (behind, base_from_gripper[earlier], every[later])
     rotation = Rotation.from_matrix(base_from_gripper[:, :3, :3])
 
     def with_rotation(name: str, read: Rotation) -> _Candidate:
-        return _Candidate(name, transform(read.as_matrix(), base_from_gripper[:, :3, 3]), every)
+        return (name, transform(read.as_matrix(), base_from_gripper[:, :3, 3]), every)
 
     x, y, z, w = rotation.as_quat().T
     yield with_rotation(WXYZ, Rotation.from_quat(np.stack([y, z, w, x], 1)))

@@ -26,6 +26,10 @@ TOO_FEW = (
     "gripper poses early or late",
 )
 """Kinds that follow, too, where too few of the images can be used."""
+ONE_PART = (
+    "calibrate the {count:.0f} images {longer:before=up to {images[0]}|after=from {images[1]} on} alone, and those of "
+    "the other part only where "
+)
 GROUPS = {
     "motion": "Motions, poses and accuracy",
     "camera": "The camera",
@@ -74,7 +78,8 @@ class FindingKind(StrEnum):
         return member
 
     # fmt: off
-    UNOBSERVABLE = "unobservable motion", Row("motion", sentences.unobservable_text, sentences.to_observe,
+    UNOBSERVABLE = "unobservable motion", Row("motion",
+        "{nearly:nearly unobservable|unobservable} from these motions: {direction}", "{concerns:motion={move}|}",
         means="the motions do not determine a direction of translation, rotation or scale",
         evidence="excitation of that direction, 0 to 0.06",
         help="other motions; `details.motion` says what these are like")
@@ -88,20 +93,26 @@ class FindingKind(StrEnum):
         "gripper poses and images disagree by {mm:.0f} mm and {deg:.1f}° per axis",
         "check the pairing, and how the poses are written (jcr docs captures)", evidence="m per axis")
     POSE_CONVENTION = "pose convention", Row("motion",
-        "the poses fit when read as {reading}: {fits}, instead of {given}", sentences.given_remedy,
+        "the poses fit when read as {reading}: {fits}, instead of {given}", "{remedy}",
         explains=MISFIT, evidence="m per axis, when read so",
         help="the option in `remedy`, or correct them at their source")
     NOISE_ABOVE_GIVEN = "noise above the given one", Row("motion",
         "gripper poses and images disagree by {mm:.2g} mm and {deg:.2g}° per axis, more than the given "
         "robot noise ({given_mm:.2g} mm, {given_rotation_deg:.2g}°): the larger is used",
         evidence="m per axis", help="none needed: the larger is used")
-    UNCERTAIN = "too uncertain", Row("motion", sentences.uncertain, sentences.to_be_sure,
+    UNCERTAIN = "too uncertain", Row("motion",
+        "the {part} is known to ±{part:translation={mm:.0f} mm|rotation={size_deg:.1f}°|scale={percent:.0f} %} only",
+        "add images, rotated by 20° or more about different axes{noise_unknown:, or give the robot's repeatability "
+        "(--robot-noise MM DEG)|}",
         means="translation, rotation or scale (`details.part`) is less certain than 20 mm, 3° or 5 %",
         evidence="1σ: m, rad, share", help="more images, rotated about different axes")
     LEAVE_ONE_OUT = "leave-one-out error", Row("motion",
         "the leave-one-out error ({mm:.1f} mm) is well above the fit's residual ({residual_mm:.1f} mm): "
         "too few images for this motion", "add some", evidence="m")
-    NOT_EXACT_ENOUGH = "requirement not met", Row("motion", sentences.not_exact_enough, sentences.to_be_exact,
+    NOT_EXACT_ENOUGH = "requirement not met", Row("motion", sentences.not_exact_enough,
+        "{concerns:images=add {more_images:.0f} more at the poses of next_poses|robot=most of it comes from systematic "
+        "robot errors: name the arm (--robot) or add its joint angles|none=a dozen more images would not be enough; "
+        "move closer to the scene, or use a better camera or robot}",
         means="not as exact as `--require` asks, which rejects, or as grasping needs, which warns",
         evidence="m, 95 % of errors are smaller", help="the images in `next_poses`; or the arm's name")
     FOCUS_BY_DISTANCE = "focal length changes with distance", Row("camera",
@@ -136,13 +147,15 @@ class FindingKind(StrEnum):
         "switch image stabilisation off, or fix the optics", explains=MISFIT,
         means="image-stabilised or loose optics",
         evidence="px, when gravity lies in the image; the chance `p`")
-    INTRINSICS = "intrinsics contradict the images", Row("camera", sentences.intrinsics, sentences.to_intrinsics,
+    INTRINSICS = "intrinsics contradict the images", Row("camera", sentences.intrinsics,
+        "{estimated:use the transform with the intrinsics of this calibration|calibrate the intrinsics again at this "
+        "resolution, or give no intrinsics (null) to have them estimated}",
         explains=MISFIT, help="calibrate them again at this resolution, or give none (null) to have them estimated",
         means="the given intrinsics are not those of the images; parameters in `details`",
         evidence="the chance `p`")
     SLIP = "camera moved on the gripper", Row("order",
         "the camera seems to have moved on the gripper by {mm:.1f} mm and {deg:.2f}° after {images[0]}",
-        sentences.one_part, explains=MISFIT, evidence="m; the chance `p`",
+        ONE_PART + "the camera still sits as then", explains=MISFIT, evidence="m; the chance `p`",
         help="calibrate the longer part alone")
     DRIFT = "camera drifts on the gripper", Row("order",
         "the camera seems to drift on the gripper by {mm:.1f} mm and {deg:.2f}° from the first image to "
@@ -150,7 +163,7 @@ class FindingKind(StrEnum):
         explains=MISFIT, evidence="m; the chance `p`")
     BASE_MOVED = "robot base moved against the scene", Row("order",
         "the robot's base and the scene moved against each other by {mm:.1f} mm and {deg:.2f}° after "
-        "{images[0]}", sentences.one_part, explains=MISFIT, evidence="m; the chance `p`",
+        "{images[0]}", ONE_PART + "base and scene still stand as then", explains=MISFIT, evidence="m; the chance `p`",
         help="calibrate the longer part alone; bolt the base")
     DELAY = "gripper poses early or late", Row("order",
         "the gripper poses look as if read {size:.3f} ± {std} of the time from one image to the next too "
@@ -181,21 +194,26 @@ class FindingKind(StrEnum):
         "stiffen its mount, and check the zero of the wrist's joints, which looks like it", explains=MISFIT,
         means="the gripper rotates with its tilt, as under its weight; the zero of a wrist joint that is "
         "off looks alike", evidence="rad, where it is level; the chance `p`")
-    BOARD_SIZE = "board size contradicts the robot", Row("lengths", sentences.board_size, sentences.to_size,
-        explains=MISFIT, means="the board is larger or smaller than given",
-        evidence="share, positive: larger", help="measure its squares; poses in metres")
-    SCALES = "lengths contradict each other", Row("lengths", sentences.scales, "measure both again",
+    BOARD_SIZE = "board size contradicts the robot", Row("lengths",
+        "by the robot's motion the {marker:marker|board} is {size_percent:.1f} ± {std_percent} % {way:larger|smaller} "
+        "than given",
+        "measure its squares, and check that the gripper poses are in metres", explains=MISFIT,
+        evidence="share, positive: larger")
+    SCALES = "lengths contradict each other", Row("lengths",
+        "{one} and {other} contradict each other by {size_percent:.1f} ± {std_percent} %",
+        "measure both again",
         explains=MISFIT,
         means="two of what the scale is known from (`details.one`, `details.other`: robot, board, known "
         "length, depth camera, network) differ by more than they may",
         evidence="share, positive: the second is longer")
-    BOARD_SIDE = "side of a board", Row("lengths", sentences.board_side, sentences.to_board_side,
-        means="what the robot's positions make of a board of unknown side", evidence="m",
-        help="measure it, and give it")
-    BOARD_MOVED = "board at several places", Row("lengths", sentences.board_moved,
-        "its corners there are left out; keep one board of a kind, and keep it still",
-        means="in `images` it is elsewhere: it was moved, or there are two of a kind")
-    BOARD_NOT_FOUND = "board not found", Row("lengths", sentences.board_not_found,
+    BOARD_SIDE = "side of a board", Row("lengths",
+        "by the robot's positions the sides of {board} are {value_std_mm} mm",
+        "measure one, and give it in --board: the scale is then known twice", evidence="m")
+    BOARD_MOVED = "board at several places", Row("lengths",
+        "in {images} {board} is at another place than in the other images: it was moved, or there are two",
+        "its corners there are left out; keep one board of a kind, and keep it still")
+    BOARD_NOT_FOUND = "board not found", Row("lengths",
+        "no two images show {board}: features alone are used{proposed:, but they seem to show $}",
         "check its kind and its numbers of squares or corners (jcr docs markers)",
         means="no two images show what `--board` names; `details.proposed` is what they seem to show")
     NETWORK_SCALE = "a network's metre contradicts the robot", Row("lengths", sentences.network_scale_of,
@@ -213,10 +231,11 @@ class FindingKind(StrEnum):
         "for a driver that gives the sensor's own images remove the tag (exiftool -Orientation= FILES) and "
         "calibrate again", evidence="the orientation, 2 to 8")
     BOARD_IN_VIEW = "board in view", Row("reconstruction", "a calibration board is in view",
-        sentences.board_lengths, help="`--board`, see [markers](../how-to/markers.md)")
-    RECONSTRUCTION = "reconstruction", Row("reconstruction", "{text}", sentences.given_remedy,
+        "try --board {board} with its SIDE in metres, or for tags of a ChArUco board "
+        "charuco:COLUMNSxROWS:SIDE:MARKER:DICTIONARY (jcr docs markers)")
+    RECONSTRUCTION = "reconstruction", Row("reconstruction", "{text}", "{remedy}",
         means="what a back end says to act on, in words", help="in its words")
-    NO_RECONSTRUCTION = "no reconstruction", Row("reconstruction", "{text}", sentences.given_remedy,
+    NO_RECONSTRUCTION = "no reconstruction", Row("reconstruction", "{text}", "{remedy}",
         means="no back end found camera poses", help="in its words")
     NOT_SETTLED = "adjustment not settled", Row("reconstruction",
         "the adjustment has not settled: its last round moved the result by {value:.2g} standard deviations",
@@ -250,10 +269,16 @@ class FindingKind(StrEnum):
         "it is {value:.2f} m from the gripper's frame",
         "check that it is on the gripper, and that the images are of the frames that they stand for",
         evidence="m")
-    IMAGE_MISSES = "image contradicts the camera's place", Row("cell", sentences.misses,
+    IMAGE_MISSES = "image contradicts the camera's place", Row("cell",
+        "{images[0]} misses the place that fits its images together by {value:.0f} px (median): {mount:base=it is not "
+        "fixed|gripper=it is not rigid on the gripper}, the scene changed, or the intrinsics are wrong",
         means="that image does not fit the place of the camera's others", evidence="px, median",
         help="tighten the mount, or leave the image out")
-    PLACE_UNCERTAIN = "camera's place too uncertain", Row("cell", sentences.place_uncertain, sentences.to_place,
+    PLACE_UNCERTAIN = "camera's place too uncertain", Row("cell",
+        "its place is known to ±{mm:.0f} mm and {deg:.1f}° only{focal_std_percent:, for its images do not show its "
+        "intrinsics (focal length ± $ %)}",
+        "{concerns:intrinsics=give them, or images with more of the scene, at other depths|images=let it see more of "
+        "the mapped scene, or add images to the wrist camera's capture}",
         means="a further camera is known worse than to 20 mm and 3°", evidence="m, 1σ of the worst axis",
         help="intrinsics, or more images")
     AT_ANOTHER_CAMERA = "camera stands where another was", Row("cell",
@@ -266,7 +291,7 @@ class FindingKind(StrEnum):
         "by {deg:.0f}°",
         "check that the camera is on the gripper and its stream is live, and take each image at its own pose",
         explains=(*MISFIT, *TOO_FEW), evidence="m, the gripper's motion")
-    BLURRED = "images blurred", Row("images", sentences.blurred,
+    BLURRED = "images blurred", Row("images", "{images} {images:is|are} blurred (edges {value:.0f} px wide)",
         "take them again at rest, in focus and with more light", explains=(*MISFIT, *TOO_FEW),
         means="the strongest edges of these `images` climb over more than 1/80 of the long side; rejects "
         "where a quarter of all are and the calibration is rejected", evidence="px, how wide the edges are")
@@ -285,7 +310,8 @@ class FindingKind(StrEnum):
     POSE_CONTRADICTS_IMAGE = "gripper pose contradicts its image", Row("single",
         "the gripper pose of {images[0]} is {mm:.0f} mm and {deg:.1f}° from where its image shows the "
         "gripper", "correct that pose, or drop the image", evidence="m")
-    NOT_REGISTERED = "image not registered", Row("single", sentences.not_registered,
+    NOT_REGISTERED = "image not registered", Row("single",
+        "{images} {images:is|are} not registered: {value:.0f} other images match, too little of each",
         "take such a view again, nearer to a pose that registered, with textured things in view",
         means="while a capture is taken (`jcr capture`): its camera is not in the reconstruction",
         evidence="other images that match it")
