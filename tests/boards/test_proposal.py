@@ -43,7 +43,6 @@ def test_a_board_is_recognised(printed: str, found: str):
     assert finding is not None
     text = sentence(finding)
     assert f"--board {found}" in text
-    assert ("charuco:COLUMNSxROWS:SIDE:MARKER:DICT_4X4_50" in text) == printed.startswith("charuco")
 
 
 @pytest.mark.slow

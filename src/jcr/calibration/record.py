@@ -48,7 +48,6 @@ from jcr.records import (
     COVARIANCE_ORDER,
     Attempt,
     BoardFound,
-    Budget,
     Capture,
     DepthCheck,
     Estimate,
@@ -115,20 +114,6 @@ class UncertaintyBudget(Part):
     faults: Share | None = None
     """Share of the findings."""
 
-    @classmethod
-    def of(cls, budget: Budget | None) -> "UncertaintyBudget | None":
-        """Return the parts of the covariance as shares; None where it was not divided."""
-        if budget is None:
-            return None
-        return cls(**{name: Share.of(part) for name, part in vars(budget).items()})
-
-    @property
-    def mostly_systematic(self) -> bool:
-        """Whether the robot's systematic errors are most of it."""
-        others = (self.robot_random, self.intrinsics, self.images, self.faults)
-        squares = sum(share.translation_mm**2 for share in others if share is not None)
-        return self.robot_systematic.translation_mm**2 >= squares
-
 
 def _sizes(found: Seen) -> Seen:
     if min(size for size in vars(found).values() if isinstance(size, float)) < 0:
@@ -158,14 +143,6 @@ class Joint(Part):
         if np.shape(self.covariance) != 2 * (len(self.order),):
             raise ValueError(f"a covariance that is not {len(self.order)} x {len(self.order)}")
         return self
-
-    @classmethod
-    def of(cls, estimate: Estimate) -> "Joint | None":
-        """Return the joint covariance; None where the intrinsics were not estimated."""
-        if estimate.intrinsics is None or estimate.intrinsics_cross is None:
-            return None
-        order = [*COVARIANCE_ORDER, *parameter_names(estimate.intrinsics)]
-        return cls.model_validate({"covariance": joint_covariance(estimate), "order": order})
 
 
 class ModelErrorJson(Part):
@@ -215,23 +192,28 @@ class Uncertainty(Part):
     @classmethod
     def of(cls, estimate: Estimate, in_use: InUse | None) -> "Uncertainty":
         """Return the uncertainty of an estimate, in general and at the working distance."""
-        std = np.sqrt(np.diag(estimate.covariance))
-        return cls(
-            translation_std_mm=(1e3 * std[:3]).tolist(),
-            rotation_std_deg=np.degrees(std[3:6]).tolist(),
-            scale_std_percent=float(100 * std[6]),
-            covariance=estimate.covariance,
-            order=list(COVARIANCE_ORDER),
-            worst=worst_direction(estimate.gripper_from_camera, estimate.covariance),
-            budget=UncertaintyBudget.of(estimate.budget),
-            seen=None if in_use is None else SeenAndCorners(**vars(in_use.seen), corners=in_use.corners),
-            scene_95_mm=None if in_use is None or in_use.scene is None else 1e3 * in_use.scene.within_95_m,
-            joint=Joint.of(estimate),
-            model_error=None
-            if estimate.model_error is None
-            else ModelErrorJson(**vars(estimate.model_error)),
-            scene=None if in_use is None or in_use.scene is None else SceneJson(**vars(in_use.scene)),
-        )
+        std, camera = np.sqrt(np.diag(estimate.covariance)), estimate.intrinsics
+        parts = {} if estimate.budget is None else vars(estimate.budget)
+        scene = None if in_use is None else in_use.scene
+        joint = None
+        if camera is not None and estimate.intrinsics_cross is not None:
+            order = [*COVARIANCE_ORDER, *parameter_names(camera)]
+            joint = Joint.model_validate({"covariance": joint_covariance(estimate), "order": order})
+        content = {
+            "translation_std_mm": 1e3 * std[:3],
+            "rotation_std_deg": np.degrees(std[3:6]),
+            "scale_std_percent": float(100 * std[6]),
+            "covariance": estimate.covariance,
+            "order": list(COVARIANCE_ORDER),
+            "worst": worst_direction(estimate.gripper_from_camera, estimate.covariance),
+            "budget": {name: Share.of(part) for name, part in parts.items()} or None,
+            "seen": in_use and SeenAndCorners(**vars(in_use.seen), corners=in_use.corners),
+            "scene_95_mm": None if scene is None else 1e3 * scene.within_95_m,
+            "joint": joint,
+            "model_error": estimate.model_error,
+            "scene": scene,
+        }
+        return cls.model_validate(content)
 
 
 class MotionObservability(Part):
@@ -429,14 +411,9 @@ class Calibration(Part):
     @property
     def covariance(self) -> Float[ndarray, "7 7"]:
         """Covariance in records.COVARIANCE_ORDER; RejectedError where nothing was found."""
-        return self._known_uncertainty.covariance
-
-    @property
-    def _known_uncertainty(self) -> Uncertainty:
-        """Uncertainty; RejectedError where nothing was found."""
         if self.uncertainty is None:
             raise RejectedError(f"no calibration was found: {self.doubt}")
-        return self.uncertainty
+        return self.uncertainty.covariance
 
     def _repr_html_(self) -> str:
         """Return a table for notebooks."""
@@ -444,8 +421,9 @@ class Calibration(Part):
 
     def as_html(self, note: str = "") -> str:
         """Return the transform with its standard deviations, the verdict and the warnings as a table, `note` below."""
-        uncertainty, matrix = self._known_uncertainty, self.parent_from_camera
-        assert matrix is not None
+        uncertainty, matrix = self.uncertainty, self.parent_from_camera
+        if uncertainty is None or matrix is None:
+            raise RejectedError(f"no calibration was found: {self.doubt}")
         degrees = np.degrees(rotation_log(matrix[:3, :3]))
         rows = [("", "translation", "rotation vector")] + [
             (
@@ -506,12 +484,6 @@ class Calibration(Part):
         """Return the calibration with more findings."""
         together = strongest_first((*self.findings, *findings))
         return self.model_copy(update=_derived(together, self.notes))
-
-    @property
-    def mostly_systematic(self) -> bool:
-        """Whether systematic robot errors are most of the uncertainty; more images of the same region leave them."""
-        budget = None if self.uncertainty is None else self.uncertainty.budget
-        return budget is not None and budget.mostly_systematic
 
     @property
     def images_used(self) -> int:
