@@ -5,7 +5,7 @@ import pytest
 
 from jcr.estimation.arms import arm_named
 from jcr.estimation.hand_eye import solve_hand_eye
-from jcr.estimation.pose_effects import joint_offsets
+from jcr.estimation.hypotheses import joint_offsets
 from jcr.estimation.pose_equations import pose_equations
 from jcr.estimation.systematic import arm_errors, posed
 from jcr.estimation.wrist import pose_problem

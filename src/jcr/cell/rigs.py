@@ -15,7 +15,7 @@ from jcr.cell.camera_views import CameraViews
 from jcr.cell.placement import CameraPlacement
 from jcr.distributions import chi2
 from jcr.estimation.hand_eye import solve_hand_eye
-from jcr.estimation.pose_effects import arm_rows
+from jcr.estimation.hypotheses import arm_rows
 from jcr.estimation.problem import ReportedPoses
 from jcr.estimation.systematic import smooth_errors
 from jcr.findings import Finding, FindingKind

@@ -1,6 +1,6 @@
 """Tests of additional effects on the camera and on the gripper poses, one after the other, until none is significant.
 
-Effects of both kinds compete (checks/camera.py, estimation/pose_effects.py). Of two significant ones that one is the
+Effects of both kinds compete (checks/camera.py, estimation/hypotheses.py). Of two significant ones that one is the
 cause beside which the other is no longer significant. What was found is free while the next is tested, and the
 calibration adopts the effects that its model can carry.
 """
@@ -35,8 +35,16 @@ from jcr.calibration.options import GRASPING
 from jcr.camera import parameters, with_thin_prism
 from jcr.estimation.equation import SCALE, UNKNOWNS, columns_of_arm
 from jcr.estimation.hand_eye import judged, poses_agree
-from jcr.estimation.hypotheses import Row, Test, best_tests, explains_by_order
-from jcr.estimation.pose_effects import PLAUSIBLE, STRAINS, arm_rows, order_rows
+from jcr.estimation.hypotheses import (
+    PLAUSIBLE,
+    STRAINS,
+    Row,
+    Test,
+    arm_rows,
+    best_tests,
+    explains_by_order,
+    order_rows,
+)
 from jcr.estimation.pose_equations import pose_equations
 from jcr.estimation.problem import Problem
 from jcr.estimation.problem import State as ProblemState

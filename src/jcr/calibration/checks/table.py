@@ -18,8 +18,8 @@ from jcr.calibration.checks.capture import (
 )
 from jcr.calibration.checks.effects import check_effects
 from jcr.calibration.checks.lengths import check_boards, check_lengths
+from jcr.estimation.hypotheses import joint_offsets
 from jcr.estimation.intrinsics_prior import MEASURED, camera_with_prior
-from jcr.estimation.pose_effects import joint_offsets
 from jcr.estimation.pose_equations import pose_equations
 from jcr.estimation.wrist import pose_problem
 from jcr.findings import Finding, FindingKind, is_explained
