@@ -25,12 +25,10 @@ from torch import Tensor
 
 from jcr.files import written_whole
 from jcr.geometry import inverse, transform
-from jcr.pointmaps.global_alignment.align import global_align
-from jcr.pointmaps.global_alignment.alignment import Alignment
-from jcr.pointmaps.global_alignment.depths import initial_depth
+from jcr.pointmaps.global_alignment.align import Alignment, global_align
 from jcr.pointmaps.global_alignment.initial_estimate import initial_state
 from jcr.pointmaps.global_alignment.observations import Problem, observe
-from jcr.pointmaps.global_alignment.pointmap_residuals import State
+from jcr.pointmaps.global_alignment.residuals import State, initial_depth
 from jcr.pointmaps.pairs import PairPredictions, read_pairs
 
 STEPS, LEARNING_RATE = 300, 0.01

@@ -75,4 +75,4 @@ def _match_all(
     """Match without gripper poses: all pairs, none judged."""
     pairs = all_pairs(len(matcher.x_px))
     geometries = matcher.geometries(pairs, np.zeros((len(pairs), 2)))
-    return Matched(geometries=geometries, gate=None, intrinsics=working)
+    return Matched(geometries=geometries, intrinsics=working)

@@ -48,8 +48,8 @@ from .pipeline.touch import touch as touch
 from .pipeline.verify import Verification as Verification
 from .pipeline.verify import VerifyOptions as VerifyOptions
 from .pipeline.verify import verify_run as verify_run
+from .pointmaps.global_alignment.align import Alignment as Alignment
 from .pointmaps.global_alignment.align import global_align as global_align
-from .pointmaps.global_alignment.alignment import Alignment as Alignment
 from .pointmaps.pairs import PairPredictions as PairPredictions
 from .reconstruct import ReconstructOptions as ReconstructOptions
 from .records import Budget as Budget

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from jcr.estimation.closed_form import motions
-from jcr.features.epipolar import translation_of_x
 from jcr.features.gate import Pair, judge, rolls
-from jcr.features.still import hidden, still_cells
+from jcr.features.pairs import translation_of_x
+from jcr.features.stage import hidden, still_cells
 from jcr.features.two_view import Reading, readings
-from jcr.geometry import inverse, rotation_angle, rotation_exp, transform
+from jcr.geometry import rotation_angle, rotation_exp, transform
 from simulation.problems import HandEyeProblem, hand_eye_problem
 
 N = 8
@@ -76,7 +76,7 @@ def problem_and_pairs(seed: int) -> tuple[HandEyeProblem, list[Pair]]:
         return v / np.linalg.norm(v)
 
     return problem, [
-        Pair(i, j, rows, (Reading(camera[i, j, :3, :3], unit(camera[i, j, :3, 3]), sure, 0.5),))
+        Pair((i, j), rows, (Reading(camera[i, j, :3, :3], unit(camera[i, j, :3, 3]), sure, 0.5),))
         for i in range(N)
         for j in range(i + 1, N)
     ]
@@ -90,7 +90,7 @@ def test_wrong_pairs_are_contradicted_and_right_ones_are_not(seed: int):
     for k in wrong:
         reading = pairs[k].readings[0]
         bad = Reading(rotation_exp(rng.normal(size=3)), reading.direction, reading.covariance, 0.5)
-        pairs[k] = Pair(pairs[k].i, pairs[k].j, pairs[k].rows, (bad,))
+        pairs[k] = Pair(pairs[k].key, pairs[k].rows, (bad,))
     gate = judge(pairs, motions(problem.base_from_gripper))
     assert gate.of_x is not None
     assert rotation_angle(gate.of_x.rotation.T @ problem.gripper_from_camera[:3, :3]) < 0.01
@@ -106,7 +106,7 @@ def test_the_second_reading_of_a_plane_is_tried():
     other = Reading(
         rotation_exp(np.array([0.5, 0.0, 0.0])) @ right.rotation, right.direction, right.covariance, 0.4
     )
-    pairs[3] = Pair(pairs[3].i, pairs[3].j, pairs[3].rows, (other, right))
+    pairs[3] = Pair(pairs[3].key, pairs[3].rows, (other, right))
     gate = judge(pairs, motions(problem.base_from_gripper))
     assert not gate.contradicted
     assert next(pair for pair in gate.confirmed if pair.key == pairs[3].key).readings[0] is right
@@ -135,15 +135,3 @@ def test_what_keeps_its_pixel_while_the_gripper_moves_is_hidden():
     moving = [rng.uniform(0, [640, 480], (300, 2)) for _ in range(6)]
     few = {key: rows[:300] for key, rows in raw.items()}
     assert not still_cells(moving, few, (640, 480), few).any()
-
-
-def test_predicted_epipolar_lines_go_through_the_matches():
-    problem, _ = problem_and_pairs(0)
-    camera = problem.base_from_gripper @ problem.gripper_from_camera
-    i_from_j = inverse(camera[0]) @ camera[1]
-    ray_i, ray_j = seen(i_from_j, False, np.random.default_rng(0), 0.0)
-    from jcr.features.two_view import sampson_px
-
-    length = np.linalg.norm(i_from_j[:3, 3])
-    off = sampson_px(i_from_j[:3, :3], i_from_j[:3, 3] / length, ray_i, ray_j, FOCAL)
-    assert np.abs(off).max() < 1e-6

@@ -63,7 +63,7 @@ def test_a_rotated_image_is_matched_when_it_is_rotated_back(roll: float, tableto
     import cv2
 
     from jcr.capture.images import read_image
-    from jcr.features.learned import LearnedFeatures
+    from jcr.features.xfeat import LearnedFeatures
 
     image = cv2.resize(read_image(sorted((tabletop / "images").iterdir())[0]), (320, 240))
     rotation = cv2.getRotationMatrix2D((159.5, 119.5), math.degrees(roll), 1.0)  # against y down, by -roll

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jcr.estimation.closed_form import motions
-from jcr.features.rotation import rotation_of_x
+from jcr.features.gate import rotation_of_x
 from jcr.geometry import inverse, rotation_angle, rotation_exp
 from simulation.problems import hand_eye_problem
 

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.camera import HALF_PIXEL, project
-from jcr.features.verify import matched
+from jcr.features.matchers import matched
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics
 from jcr.sfm.mapping import camera_of
@@ -38,12 +38,12 @@ def rows_of(right: int, seed: int) -> Int[ndarray, "400 2"]:
 @pytest.mark.parametrize("seed", range(3))
 def test_three_right_matches_of_ten_are_found_and_none_make_no_pair(seed: int):
     x_px, camera = keypoints(seed), camera_of(INTRINSICS, True)
-    found = matched(x_px, camera, 0, 1, rows_of(120, seed), 0, True)
+    found = matched(x_px, camera, (0, 1), rows_of(120, seed), 0, True)
     assert found is not None
     inside = np.asarray(found.inlier_matches)[:, 0]
     assert (inside < 120).sum() > 0.93 * 120
     assert (inside >= 120).sum() < 0.06 * 280, "only by chance near their epipolar line"
-    nothing = matched(x_px, camera, 0, 1, rows_of(0, seed), 0, True)
+    nothing = matched(x_px, camera, (0, 1), rows_of(0, seed), 0, True)
     assert nothing is None or len(nothing.inlier_matches) < 0.1 * 400
 
 
@@ -56,7 +56,7 @@ def test_what_no_geometry_explains_is_given_up_after_bounded_trials():
     for seed in range(4):
         rows = rows_of(0, seed)
         begun = time.process_time()
-        matched(x_px, camera, 0, 1, rows, 0, True)
+        matched(x_px, camera, (0, 1), rows, 0, True)
         ours.append(time.process_time() - begun)
         begun, both = time.process_time(), [x + HALF_PIXEL for x in x_px]
         pycolmap.estimate_two_view_geometry(camera, both[0], camera, both[1], rows.astype(np.uint32), options)

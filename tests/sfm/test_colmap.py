@@ -16,7 +16,7 @@ from jcr.capture.read import read_capture
 from jcr.depth.densify import densify, undistorted
 from jcr.depth.options import DepthOptions
 from jcr.errors import RejectedError
-from jcr.features.sift_features import SiftFeatures
+from jcr.features.sift import SiftFeatures
 from jcr.geometry import apply_similarity, fit_similarity, inverse, rotation_between_deg
 from jcr.progress import silent
 from jcr.records import Capture, Reconstruction

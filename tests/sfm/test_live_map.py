@@ -9,7 +9,7 @@ import pytest
 
 import jcr
 from jcr.capture.images import read_image
-from jcr.features import sift_features
+from jcr.features import sift
 from jcr.geometry import apply_similarity, fit_similarity
 from jcr.records import Capture
 from jcr.sfm.live_map import LiveMap
@@ -41,8 +41,8 @@ def test_images_that_come_leave_and_come_back_are_matched_once(
     tabletop: Path, monkeypatch: pytest.MonkeyPatch
 ):
     whole, matched = jcr.read_capture(tabletop), list[int]()
-    real = sift_features.matches
-    monkeypatch.setattr(sift_features, "matches", lambda *of: (matched.append(1), real(*of))[1])
+    real = sift.matches
+    monkeypatch.setattr(sift, "matches", lambda *of: (matched.append(1), real(*of))[1])
     live = LiveMap(whole)
 
     def update(rows: list[int], new: list[int]) -> Capture:

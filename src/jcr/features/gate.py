@@ -1,8 +1,9 @@
 """The robot's gate: which verified pairs of images the gripper poses confirm, and X's rotation from those.
 
-Whatever X is, the angle between two cameras is the angle between two grippers. A pair whose angle differs by more than
-its own uncertainty and the robot's allow is not believed; before that its other readings are tried. Once enough pairs
-agree, X's rotation is known, and the whole relative rotation must agree.
+Whatever X is, the angle between two cameras is the angle between two grippers (the screw congruence of Chen 1991). A
+pair whose angle differs by more than its own uncertainty and the robot's allow is not believed; before that its other
+readings are tried. Once enough pairs agree, X's rotation is known, and the whole relative rotation must agree,
+R_A R_X = R_X R_B.
 """
 
 import math
@@ -10,12 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from jcr.features.rotation import RotationOfX, rotation_of_x
+from jcr.estimation.closed_form import sine_axis
 from jcr.features.two_view import Reading
-from jcr.geometry import rotation_angle
+from jcr.geometry import nearest_rotation, rotation_angle, rotation_exp, rotation_log
 
 ROBOT_STD = math.radians(0.3)
 """Standard deviation of a reported gripper rotation; an industrial arm errs by 0.05°, a servo arm by 1°."""
@@ -32,6 +33,10 @@ UPRIGHT_ENOUGH = math.radians(15)
 """An image is rotated by multiples of 90° where that leaves no more than this, for it costs no resampling."""
 LEAST_PAIRS = 4
 """Least number of pairs that agree on X's rotation; three wrong ones can agree by chance."""
+MAX_HYPOTHESES = 3000
+LEAST_INFORMATION = 6.25e-3
+"""Least information of the pairs on a direction of X's rotation, per squared residual: less fixes nothing."""
+ROUNDS = 20
 
 
 Key = tuple[int, int]
@@ -42,17 +47,24 @@ Key = tuple[int, int]
 class Pair:
     """Matched keypoints of two images that one two-view geometry explains."""
 
-    i: int
-    j: int
+    key: Key
+    """Rows of the two images."""
     rows: Int[ndarray, "m 2"]
-    """Rows of the matched keypoints of i and j."""
+    """Rows of the matched keypoints of both."""
     readings: tuple[Reading, ...]
     """Best first; empty where none could be found."""
 
-    @property
-    def key(self) -> Key:
-        """Rows of the two images."""
-        return self.i, self.j
+
+@dataclass(frozen=True, kw_only=True)
+class RotationOfX:
+    """gripper_from_camera's rotation, how sure it is, and which pairs say so."""
+
+    rotation: Float[ndarray, "3 3"]
+    covariance: Float[ndarray, "3 3"]
+    """Covariance of a rotation vector in gripper axes, rad²."""
+    agreeing: Bool[ndarray, " p"]
+    sigma: float
+    """Robust size of the residuals of those that agree, rad."""
 
 
 @dataclass(frozen=True)
@@ -68,9 +80,16 @@ class Gate:
     """None while too few pairs agree."""
 
 
-def angle_tolerance(angle: float, std: float, systematic: float = SYSTEMATIC) -> float:
-    """Return the largest difference (rad) between a pair's angle and the gripper's."""
-    return SIGMAS * math.sqrt(std**2 + 2 * ROBOT_STD**2 + (systematic * angle) ** 2)
+def agreeing_readings(pair: Pair, angle: float, systematic: float) -> list[tuple[Reading, float]]:
+    """Return the readings whose angle is the gripper's, with the largest difference (rad) that each allows."""
+    found = []
+    for reading in pair.readings:
+        tolerance = SIGMAS * math.sqrt(
+            reading.angle_std() ** 2 + 2 * ROBOT_STD**2 + (systematic * angle) ** 2
+        )
+        if abs(float(rotation_angle(reading.rotation)) - angle) < tolerance:
+            found.append((reading, tolerance))
+    return found
 
 
 def judge(
@@ -84,38 +103,40 @@ def judge(
     First by angle alone; among those that pass, X's rotation is sought; with it, every reading of every pair is judged
     by its whole rotation. `known` is X's rotation where more pairs than these have spoken.
     """
-    undecided = tuple(pair for pair in pairs if not any(_sure(reading) for reading in pair.readings))
-    judged = [pair for pair in pairs if any(_sure(reading) for reading in pair.readings)]
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
-    passing: list[tuple[Pair, Reading, float]] = []
-    for pair in judged:
-        of_gripper = float(angle[pair.key])
-        for reading in filter(_sure, pair.readings):
-            tolerance = angle_tolerance(of_gripper, reading.angle_std(), systematic)
-            if abs(float(rotation_angle(reading.rotation)) - of_gripper) < tolerance:
-                passing.append((pair, reading, tolerance))
+    undecided, passing, judged = [], [], []
+    for pair in pairs:
+        if not any(reading.angle_std() < LARGEST_STD for reading in pair.readings):
+            undecided.append(pair)
+            continue
+        found = agreeing_readings(pair, float(angle[pair.key]), systematic)
+        sure = [(reading, allowed) for reading, allowed in found if reading.angle_std() < LARGEST_STD]
+        passing += [(pair.key, *one) for one in sure]
+        judged.append((pair, sure[0][0] if sure else None))
     of_x = _common_rotation(passing, motion) or known
-    if of_x is None:
-        passed = {pair.key: pair for pair, _, _ in passing}
-        best = {key: _led(pair, [r for p, r, _ in passing if p is pair][0]) for key, pair in passed.items()}
-        against = tuple(pair for pair in judged if pair.key not in best)
-        return Gate(tuple(best.values()), undecided, against, None)
     confirmed, contradicted = [], []
-    for pair in judged:
-        of_gripper = motion[pair.key][:3, :3]
-        gaps = [
-            float(rotation_angle((of_x.rotation @ r.rotation @ of_x.rotation.T).T @ of_gripper))
-            for r in pair.readings
-        ]
-        best = int(np.argmin(gaps))
-        if gaps[best] < rotation_tolerance(pair.readings[best], float(angle[pair.key]), of_x, systematic):
-            confirmed.append(_led(pair, pair.readings[best]))
-        else:
+    for pair, best in judged:
+        if of_x is not None:
+            gaps = [
+                float(
+                    rotation_angle(
+                        (of_x.rotation @ r.rotation @ of_x.rotation.T).T @ motion[pair.key][:3, :3]
+                    )
+                )
+                for r in pair.readings
+            ]
+            k = int(np.argmin(gaps))
+            allowed = _rotation_tolerance(pair.readings[k], float(angle[pair.key]), of_x, systematic)
+            best = pair.readings[k] if gaps[k] < allowed else None
+        if best is None:
             contradicted.append(pair)
-    return Gate(tuple(confirmed), undecided, tuple(contradicted), of_x)
+        else:
+            others = (reading for reading in pair.readings if reading is not best)
+            confirmed.append(replace(pair, readings=(best, *others)))
+    return Gate(tuple(confirmed), tuple(undecided), tuple(contradicted), of_x)
 
 
-def rotation_tolerance(reading: Reading, angle: float, of_x: RotationOfX, systematic: float) -> float:
+def _rotation_tolerance(reading: Reading, angle: float, of_x: RotationOfX, systematic: float) -> float:
     """Return the largest angle (rad) between a pair's rotation and the one that X predicts."""
     own = float(np.trace(reading.covariance[:3, :3]))
     of_mean = 4 * math.sin(min(angle, math.pi) / 2) ** 2 * float(np.trace(of_x.covariance))
@@ -123,41 +144,87 @@ def rotation_tolerance(reading: Reading, angle: float, of_x: RotationOfX, system
     return SIGMAS * math.sqrt(own + of_mean + robot + (systematic * angle) ** 2)
 
 
-def _sure(reading: Reading) -> bool:
-    return reading.angle_std() < LARGEST_STD
-
-
-def _led(pair: Pair, reading: Reading) -> Pair:
-    """Return the pair with one of its readings first."""
-    return replace(pair, readings=(reading, *(other for other in pair.readings if other is not reading)))
-
-
 def _common_rotation(
-    passing: Sequence[tuple[Pair, Reading, float]], motion: Float[ndarray, "n n 4 4"]
+    passing: Sequence[tuple[Key, Reading, float]], motion: Float[ndarray, "n n 4 4"]
 ) -> RotationOfX | None:
-    """X's rotation where enough pairs agree and the images that they join are more than a few."""
-    if len({pair.key for pair, _, _ in passing}) < LEAST_PAIRS:
+    """Return X's rotation where enough pairs agree on it."""
+    keys = [key for key, _, _ in passing]
+    if len(set(keys)) < LEAST_PAIRS:
         return None
-    gripper = np.stack([motion[pair.key][:3, :3] for pair, _, _ in passing])
+    gripper = np.stack([motion[key][:3, :3] for key in keys])
     camera = np.stack([reading.rotation for _, reading, _ in passing])
     # A wrong angle that passed by chance has an axis of its own; readings of one pair share its one vote.
-    tolerance = np.array([1.5 * tolerance for _, _, tolerance in passing])
-    found = rotation_of_x(gripper, camera, tolerance)
-    if found is None or found.std() > SURE_STD:
+    found = rotation_of_x(gripper, camera, np.array([1.5 * tolerance for _, _, tolerance in passing]))
+    if found is None or np.linalg.eigvalsh(found.covariance)[-1] > SURE_STD**2:
         return None
-    agreeing = {pair.key for (pair, _, _), agrees in zip(passing, found.agreeing, strict=True) if agrees}
+    agreeing = {key for key, agrees in zip(keys, found.agreeing, strict=True) if agrees}
     return found if len(agreeing) >= LEAST_PAIRS else None
 
 
-def base_from_camera_rotations(
-    base_from_gripper: Float[ndarray, "n 4 4"], of_x: RotationOfX
-) -> Float[ndarray, "n 3 3"]:
-    """Return the rotations base_from_camera of all images, shape (n, 3, 3)."""
-    return base_from_gripper[:, :3, :3] @ of_x.rotation
+def rotation_of_x(
+    gripper: Float[ndarray, "p 3 3"],
+    camera: Float[ndarray, "p 3 3"],
+    tolerance: Float[ndarray, " p"],
+) -> RotationOfX | None:
+    """Return R_X from relative rotations i_from_j of gripper and camera; None where no three pairs about two axes agree.
+
+    Hypotheses come from two pairs each, as in RANSAC; the best is refined on all pairs that agree with it. `tolerance`
+    (rad) is the largest disagreement of a sound pair.
+    """
+    axis_a, axis_b = sine_axis(gripper), sine_axis(camera)
+    first, second = np.triu_indices(len(gripper), 1)
+    across = np.linalg.norm(np.cross(axis_a[first], axis_a[second]), axis=1)
+    order = np.argsort(-across, kind="stable")
+    order = order[across[order] > 0.02]
+    if not len(order):
+        return None
+    if len(order) > MAX_HYPOTHESES:  # spread over good and less good: the best may all be of one wrong pair
+        order = order[np.linspace(0, len(order) - 1, MAX_HYPOTHESES).astype(int)]
+    a, b = (np.stack([of[first[order]], of[second[order]]], 2) for of in (axis_a, axis_b))
+    a, b = (np.concatenate([of, np.cross(of[..., 0], of[..., 1])[..., None]], 2) for of in (a, b))
+    hypotheses = nearest_rotation(a @ np.swapaxes(b, 1, 2))
+    score = np.concatenate(
+        [
+            np.maximum(1 - (_gap(few[:, None], gripper, camera) / tolerance) ** 2, 0).sum(1)
+            for few in np.array_split(hypotheses, len(hypotheses) // 256 + 1)
+        ]
+    )
+    x = hypotheses[int(score.argmax())]
+    information, agreeing = np.zeros((3, 3)), np.zeros(len(gripper), dtype=bool)
+    for _ in range(ROUNDS):
+        rotated = x @ camera @ x.T
+        residual = rotation_log(np.swapaxes(rotated, 1, 2) @ gripper)
+        size = np.linalg.norm(residual, axis=1)
+        agreeing = size < tolerance
+        if agreeing.sum() < 3:
+            return None
+        # rotated → exp(w) rotated exp(-w): the residual, in the axes after rotated, changes by (rotatedᵀ − I) w.
+        jacobian = np.swapaxes(rotated, 1, 2) - np.eye(3)
+        w = np.where(agreeing, 1 / (1 + (2 * size / tolerance) ** 2), 0.0)
+        information = np.einsum("p,pki,pkj->ij", w, jacobian, jacobian)
+        gradient = np.einsum("p,pki,pk->i", w, jacobian, residual)
+        step = np.linalg.solve(information + 1e-9 * np.eye(3), gradient)
+        x = nearest_rotation(rotation_exp(step) @ x)
+        if np.abs(step).max() < 1e-9:
+            break
+    if np.linalg.eigvalsh(information)[0] < LEAST_INFORMATION:
+        return None
+    gap = _gap(x, gripper, camera)
+    sigma = max(1.48 * float(np.median(gap[agreeing])) / np.sqrt(3), np.radians(0.02))
+    covariance = sigma**2 * np.linalg.inv(information)
+    return RotationOfX(rotation=x, covariance=covariance, agreeing=agreeing, sigma=sigma)
+
+
+def _gap(
+    x: Float[ndarray, "*batch 3 3"], gripper: Float[ndarray, "p 3 3"], camera: Float[ndarray, "p 3 3"]
+) -> Float[ndarray, "..."]:
+    """Return the angle (rad; batch by p) by which each pair contradicts R_X."""
+    trace = np.einsum("...ij,...ij->...", gripper @ x, x @ camera)
+    return np.arccos(np.clip((trace - 1) / 2, -1, 1))
 
 
 def rolls(base_from_camera: Float[ndarray, "n 3 3"]) -> Float[ndarray, " n"]:
-    """Angles (rad) by which images are to be rotated about the viewing axis so that none is rotated against another.
+    """Return angles (rad) to rotate images about the viewing axis by so that none is rotated against another.
 
     The twist of each camera about the mean viewing direction (swing-twist decomposition, Dobrowolski 2015).
     """
@@ -165,8 +232,7 @@ def rolls(base_from_camera: Float[ndarray, "n 3 3"]) -> Float[ndarray, " n"]:
     z = mean / max(float(np.linalg.norm(mean)), 1e-12)
     x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
     x /= np.linalg.norm(x)
-    base_from_mean = np.stack([x, np.cross(z, x), z], 1)
-    relative = base_from_mean.T @ base_from_camera
+    relative = np.stack([x, np.cross(z, x), z]) @ base_from_camera
     # Of a quaternion: 2 atan2(q_z, q_w), which is atan2 of twice these (Shepperd 1978).
     twist = np.arctan2(relative[:, 1, 0] - relative[:, 0, 1], relative[:, 0, 0] + relative[:, 1, 1])
     # Most images as they are, for rotating costs sharpness.

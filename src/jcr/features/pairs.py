@@ -3,15 +3,13 @@
 import math
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.camera import project
-from jcr.features.epipolar import scene_points, translation_of_x
 from jcr.features.gate import Gate, Key
-from jcr.features.verify import View
-from jcr.geometry import apply, inverse, motion_length, rotation_angle
-from jcr.records import Intrinsics
+from jcr.features.matchers import View
+from jcr.geometry import apply, inverse, motion_length, nearest_to_lines, rotation_angle, skew, transform
 
 FIRST_NEIGHBOURS, NEIGHBOURS = 4, 8
 """Numbers of partners of an image by the gripper's motion: to find X, and where these do not show it."""
@@ -26,6 +24,13 @@ LEAST_COMMON = 0.25
 """Least share of the scene in an image that the other must see, too."""
 SAME_VIEWPOINT = 5e-3, math.radians(1)
 """m, rad: images between which the gripper moved by less repeat one viewpoint, and show no parallax."""
+PRIOR_STD_M = 0.2
+"""Standard deviation of t_X around zero: a camera is mounted on the flange or near it."""
+ROBOT_STD_M = 2e-3
+LEAST_DIRECTION_STD = 0.01
+"""rad; of a two-view translation, which forward motion and plane scenes leave loose."""
+ROUNDS = 15
+POINTS_OF_PAIR = 60
 
 
 def all_pairs(n: int) -> list[Key]:
@@ -55,27 +60,65 @@ def seen_in_common(view: View, found: Gate, motion: Float[ndarray, "n n 4 4"]) -
     x = translation_of_x(found, motion)
     if x is None:
         return []
-    points = scene_points(view, found, motion, x)
+    first_from_camera = motion[0] @ x
+    points = _scene_points(view, found, first_from_camera)
     if len(points) < 20:
         return []
-    first_from_camera = motion[0] @ x
-    camera_from_first = inverse(first_from_camera)
-    inside = np.stack([_in_image(view.intrinsics, apply(pose, points)) for pose in camera_from_first])
-    counted = inside.astype(np.float32)  # of 200 images 10⁷ numbers
-    common = counted @ counted.T
-    share = common / np.maximum(inside.sum(1), 1)[:, None]
+    inside, size = [], [view.intrinsics.width - 0.5, view.intrinsics.height - 0.5]
+    for camera_from_first in inverse(first_from_camera):
+        x_in_camera = apply(camera_from_first, points)
+        shown = x_in_camera[:, 2] > 0
+        x_px = project(view.intrinsics, x_in_camera[shown])
+        shown[shown] = ((x_px > -0.5) & (x_px < size)).all(1)
+        inside.append(shown)
+    counted = np.array(inside, np.float32)  # of 200 images 10⁷ numbers
+    share = counted @ counted.T / np.maximum(counted.sum(1), 1)[:, None]
     toward = first_from_camera[:, :3, 2]
     between = np.arccos(np.clip(toward @ toward.T, -1, 1))
     score = np.where((between < WIDEST) & (share > LEAST_COMMON), share * np.cos(between), -np.inf)
     return _best(score, PARTNERS, viewpoints(motion))
 
 
-def _in_image(intrinsics: Intrinsics, x_in_camera: Float[ndarray, "p 3"]) -> Bool[ndarray, " p"]:
-    """Test which points an image shows."""
-    inside = x_in_camera[:, 2] > 0
-    x_px = project(intrinsics, x_in_camera[inside])
-    inside[inside] = ((x_px > -0.5) & (x_px < [intrinsics.width - 0.5, intrinsics.height - 0.5])).all(1)
-    return inside
+def translation_of_x(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> Float[ndarray, "4 4"] | None:
+    """Return gripper_from_camera from the confirmed pairs; None while its rotation is unknown.
+
+    d = R_X t_B is known but for its length, so d × ((R_A − I) t_X + t_A) = 0 is linear in t_X: no scale and no map are
+    needed.
+    """
+    if found.of_x is None or not found.confirmed:
+        return None
+    best = [pair.readings[0] for pair in found.confirmed]
+    gripper = np.stack([motion[pair.key] for pair in found.confirmed])
+    turn, moved = gripper[:, :3, :3] - np.eye(3), gripper[:, :3, 3]
+    cross = skew(np.stack([reading.direction for reading in best]) @ found.of_x.rotation.T)
+    loose = np.sqrt([max(np.trace(r.covariance[3:, 3:]) / 2, LEAST_DIRECTION_STD**2) for r in best])
+    a, b = cross @ turn, (cross @ moved[..., None])[..., 0]
+    t = np.zeros(3)
+    for _ in range(ROUNDS):
+        std = np.hypot(ROBOT_STD_M, loose * np.linalg.norm(turn @ t + moved, axis=1))
+        residual = np.linalg.norm(a @ t + b, axis=1) / std
+        weight = 1 / (1 + (residual / 3) ** 2) / std**2
+        information = np.einsum("p,pki,pkj->ij", weight, a, a) + np.eye(3) / PRIOR_STD_M**2
+        t = -np.linalg.solve(information, np.einsum("p,pki,pk->i", weight, a, b))
+    return transform(found.of_x.rotation, t)
+
+
+def _scene_points(
+    view: View, found: Gate, first_from_camera: Float[ndarray, "n 4 4"]
+) -> Float[ndarray, "p 3"]:
+    """Return points that confirmed pairs see with parallax, in the frame of the first gripper (m)."""
+    kept = [np.zeros((0, 3))]
+    for pair in found.confirmed:
+        rows = pair.rows[:: max(1, len(pair.rows) // POINTS_OF_PAIR)]
+        pose = first_from_camera[list(pair.key)]
+        ray = np.stack([view.rays[row][own] for row, own in zip(pair.key, rows.T, strict=True)], 1)
+        direction = np.einsum("bij,mbj->mbi", pose[:, :3, :3], np.insert(ray, 2, 1.0, axis=2))
+        direction /= np.linalg.norm(direction, axis=2, keepdims=True)
+        points = nearest_to_lines(pose[:, :3, 3], direction)
+        far = ((points[:, None] - pose[:, :3, 3]) * direction).sum(2)
+        parallax = np.linalg.norm(np.cross(direction[:, 0], direction[:, 1]), axis=1)
+        kept.append(points[(far > 0.02).all(1) & (parallax > np.sin(np.radians(1)))])
+    return np.concatenate(kept)
 
 
 def _best(score: Float[ndarray, "n n"], count: int, viewpoint: Int[ndarray, " n"]) -> list[Key]:

@@ -3,11 +3,18 @@
 Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004.
 """
 
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 from numpy import ndarray
 from PIL import Image
+
+from jcr.features.gate import Key
+from jcr.progress import Progress, steps
 
 KEYPOINTS = 2000
 """Largest number of keypoints of an image, by contrast."""
@@ -17,9 +24,6 @@ RATIO = 0.8
 """A match must be so much nearer than the second nearest (Lowe 2004)."""
 FARTHEST = 0.7
 """Distance of the unit descriptors of a match at most, as COLMAP's."""
-
-Sift = tuple[Float[ndarray, "k 2"], Float32[ndarray, "k 128"]]
-"""Keypoints (px; pixel centres are whole numbers) and their unit descriptors."""
 
 
 def grey_of(pixels: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[ndarray, "h2 w2"]:
@@ -31,7 +35,7 @@ def grey_of(pixels: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[nda
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def detect(grey: UInt8[ndarray, "h w"]) -> Sift:
+def detect(grey: UInt8[ndarray, "h w"]) -> tuple[Float[ndarray, "k 2"], Float32[ndarray, "k 128"]]:
     """Return keypoints (px; pixel centres are whole numbers) and unit descriptors."""
     # Without the precise upscaling every point is off by a quarter of a pixel.
     sift = cv2.SIFT.create(nfeatures=KEYPOINTS, contrastThreshold=CONTRAST, enable_precise_upscale=True)
@@ -53,12 +57,51 @@ def matches(
     row, best = np.arange(len(first)), cosine.argmax(1)
     largest = cosine[row, best]
     mutual = largest == cosine.max(0)[best]  # argmax along columns takes 2.4 times as long
-    nearest = _distance(largest)
     cosine[row, best] = -1.0
-    kept = np.flatnonzero(mutual & (nearest < FARTHEST) & (nearest < RATIO * _distance(cosine.max(1))))
+    # Distances of unit vectors.
+    nearest, next_nearest = (np.sqrt(np.maximum(2 - 2 * of, 0)) for of in (largest, cosine.max(1)))
+    kept = np.flatnonzero(mutual & (nearest < FARTHEST) & (nearest < RATIO * next_nearest))
     return kept, best[kept]
 
 
-def _distance(cosine: Float32[ndarray, " k"]) -> Float32[ndarray, " k"]:
-    """Return the distance of unit vectors with this cosine."""
-    return np.sqrt(np.maximum(2 - 2 * cosine, 0))
+class SiftFeatures:
+    """SIFT of a capture's images at a working size; how images are rotated against each other is no matter."""
+
+    minds_roll = False
+    every_pair = 24
+    farthest = FARTHEST
+
+    def __init__(
+        self,
+        images: Sequence[UInt8[ndarray, "h w 3"]],
+        size: tuple[int, int],
+        threads: int,
+        report: Progress,
+    ) -> None:
+        """Find the features of all images, some at once."""
+        self._size = size
+        with ThreadPoolExecutor(threads) as pool:
+            found = pool.map(lambda image: detect(grey_of(image, size)), images)
+            both = [one for _, one in zip(steps(report, "features", images), found, strict=True)]
+        self.x_px: list[Float[ndarray, "_ 2"]] = [x_px for x_px, _ in both]
+        """Keypoints of every image, in pixels of images of `size`."""
+        self.descriptors: list[Float32[ndarray, "_ 128"]] = [descriptors for _, descriptors in both]
+        """Descriptors of these keypoints, of unit length."""
+
+    def add(self, image: UInt8[ndarray, "h w 3"]) -> None:
+        """Find the features of one more image."""
+        x_px, descriptors = detect(grey_of(image, self._size))
+        self.x_px.append(x_px)
+        self.descriptors.append(descriptors)
+
+    def remove(self, row: int) -> None:
+        """Remove an image; the rows of later ones are one less."""
+        del self.x_px[row], self.descriptors[row]
+
+    def matches(
+        self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], coarse: bool = False
+    ) -> list[Int[ndarray, "_ 2"]]:
+        """Return rows of matching keypoints of each pair; SIFT uses neither the rotations (rad) nor `coarse`."""
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            found = pool.map(lambda key: matches(*(self.descriptors[row] for row in key)), pairs)
+            return [np.stack(rows, 1) for rows in found]

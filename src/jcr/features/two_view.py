@@ -38,12 +38,12 @@ class Reading:
 
     def angle_std(self) -> float:
         """Return the standard deviation of the angle of rotation, rad."""
-        rotation = self.covariance[:3, :3]
-        axis = np.linalg.norm(_axis(self.rotation))
-        if axis < 1e-3:
-            return float(np.sqrt(np.trace(rotation) / 3))
-        unit = _axis(self.rotation) / axis
-        return float(np.sqrt(max(unit @ rotation @ unit, 0.0)))
+        covariance = self.covariance[:3, :3]
+        if np.trace(self.rotation) > 2.999999:  # of no rotation the axis is any
+            return float(np.sqrt(np.trace(covariance) / 3))
+        values, vectors = np.linalg.eigh(self.rotation + self.rotation.T)
+        axis = vectors[:, int(np.argmax(values))]
+        return float(np.sqrt(max(axis @ covariance @ axis, 0.0)))
 
 
 def readings(
@@ -57,19 +57,39 @@ def readings(
 
     The matrices are of normalised coordinates, each where one was found.
     """
-    starts: list[tuple[ndarray, ndarray]] = []
-    if j_from_i_essential is not None:
-        starts += _of_essential(j_from_i_essential, ray_i, ray_j)
-    if j_from_i_homography is not None:
-        starts += _of_homography(j_from_i_homography, ray_i)
     found: list[Reading] = []
-    for rotation, direction in starts:
-        reading = _least_squares_motion(rotation, direction, ray_i, ray_j, focal_px)
+    for start in starting_motions(ray_i, ray_j, j_from_i_essential, j_from_i_homography):
+        reading = _least_squares_motion(*start, ray_i, ray_j, focal_px)
         if reading is None or reading.sigma_px > LARGEST_SIGMA_PX:
             continue
         if all(np.linalg.norm(other.rotation - reading.rotation) > 0.02 for other in found):
             found.append(reading)
     return sorted(found, key=lambda reading: reading.sigma_px)
+
+
+def starting_motions(
+    ray_i: Float[ndarray, "m 2"],
+    ray_j: Float[ndarray, "m 2"],
+    essential: Float[ndarray, "3 3"] | None,
+    homography: Float[ndarray, "3 3"] | None,
+) -> list[tuple[Float[ndarray, "3 3"], Float[ndarray, "3"]]]:
+    """Return i_from_j's rotation and direction by the matrices j from i.
+
+    Of an essential matrix's four decompositions the one counts that puts most points in front of both cameras; of a
+    homography's those whose plane lies in front of camera i at every match.
+    """
+    found = []
+    if essential is not None:
+        found.append(cv2.recoverPose(essential, ray_i, ray_j, np.eye(3), distanceThresh=1e6)[1:3])
+    if homography is not None:
+        count, rotations, translations, normals = cv2.decomposeHomographyMat(homography, np.eye(3))
+        found += [
+            (rotations[k], translations[k])
+            for k in range(count)
+            if np.mean(_homogeneous(ray_i) @ normals[k][:, 0] > 0) > 0.9
+            and np.linalg.norm(translations[k]) > 1e-6
+        ]
+    return [(rotation.T, _unit(-rotation.T @ translation[:, 0])) for rotation, translation in found]
 
 
 def sampson_px(
@@ -79,7 +99,7 @@ def sampson_px(
     ray_j: Float[ndarray, "m 2"],
     focal_px: float,
 ) -> Float[ndarray, " m"]:
-    """Signed distances of matches from their epipolar lines, both images together."""
+    """Return signed distances of matches from their epipolar lines, both images together."""
     essential = skew(direction) @ rotation  # x_i · E x_j = 0
     h_i, h_j = _homogeneous(ray_i), _homogeneous(ray_j)
     line_i, line_j = h_j @ essential.T, h_i @ essential
@@ -116,27 +136,6 @@ def _norm(line_i: Float[ndarray, "m 3"], line_j: Float[ndarray, "m 3"]) -> Float
     return np.maximum(np.sqrt((line_i[:, :2] ** 2).sum(1) + (line_j[:, :2] ** 2).sum(1)), 1e-12)
 
 
-def _of_essential(
-    j_from_i: Float[ndarray, "3 3"], ray_i: Float[ndarray, "m 2"], ray_j: Float[ndarray, "m 2"]
-) -> list[tuple[ndarray, ndarray]]:
-    """Return the one of four decompositions that puts most points in front of both cameras."""
-    _, rotation, translation, _ = cv2.recoverPose(j_from_i, ray_i, ray_j, np.eye(3), distanceThresh=1e6)[:4]
-    return [(rotation.T, _unit(-rotation.T @ translation[:, 0]))]
-
-
-def _of_homography(
-    j_from_i: Float[ndarray, "3 3"], ray_i: Float[ndarray, "m 2"]
-) -> list[tuple[ndarray, ndarray]]:
-    """Decompositions whose plane lies in front of camera i at every match; both where the camera did not move."""
-    count, rotations, translations, normals = cv2.decomposeHomographyMat(j_from_i, np.eye(3))
-    h_i = np.concatenate([ray_i, np.ones((len(ray_i), 1))], 1)
-    return [
-        (rotations[k].T, _unit(-rotations[k].T @ translations[k][:, 0]))
-        for k in range(count)
-        if np.mean(h_i @ normals[k][:, 0] > 0) > 0.9 and np.linalg.norm(translations[k]) > 1e-6
-    ]
-
-
 def _least_squares_motion(
     rotation: Float[ndarray, "3 3"],
     direction: Float[ndarray, "3"],
@@ -144,7 +143,7 @@ def _least_squares_motion(
     ray_j: Float[ndarray, "m 2"],
     focal_px: float,
 ) -> Reading | None:
-    """Gauss-Newton over five numbers under a Cauchy loss."""
+    """Refine a motion by Gauss-Newton over five numbers under a Cauchy loss."""
     if len(ray_i) < 8:
         return None
     damping, sigma, information = 1e-3, LEAST_SIGMA_PX, np.eye(5)
@@ -179,16 +178,10 @@ def _retracted(
 
 
 def _sideways(direction: Float[ndarray, "3"]) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]]:
-    """Two unit vectors across a direction and each other."""
+    """Return two unit vectors across a direction and each other."""
     across_with = skew(direction)
     one = _unit(across_with[:, int(np.argmin(np.abs(direction)))])
     return one, across_with @ one
-
-
-def _axis(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "3"]:
-    values, vectors = np.linalg.eigh(rotation + rotation.T)
-    angle = np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))
-    return vectors[:, int(np.argmax(values))] * min(angle, 1.0)
 
 
 def _unit(v: Float[ndarray, "3"]) -> Float[ndarray, "3"]:

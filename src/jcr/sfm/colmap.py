@@ -35,13 +35,7 @@ def reconstruct_colmap(
     cameras, is_known, warnings = starting_intrinsics(capture)
     try:
         sparse = structure_from_motion(
-            images,
-            cameras,
-            is_known,
-            options,
-            report,
-            capture.base_from_gripper,
-            capture.images,
+            images, cameras, is_known, options, report, capture.base_from_gripper, capture.images
         )
     except RejectedError as error:
         raise error.with_more(*warnings) from None
@@ -54,15 +48,14 @@ def reconstruct_colmap(
 def starting_intrinsics(capture: Capture) -> tuple[list[Intrinsics], bool, tuple[str, ...]]:
     """Return the initial intrinsics, tried in turn; whether they are given; and warnings about them."""
     given, warnings = usable_intrinsics(capture.intrinsics)
-    return [given] if given else _guessed_intrinsics(capture), given is not None, warnings
-
-
-def _guessed_intrinsics(capture: Capture) -> list[Intrinsics]:
-    """Return initial intrinsics: EXIF's 35 mm focal length if there is one, then usual ones."""
+    if given:
+        return [given], True, warnings
+    # EXIF's 35 mm focal length if there is one, then usual ones.
     width, height = capture.image_size
     with Image.open(capture.folder / capture.images[0]) as opened:
         exif = opened.getexif().get_ifd(ExifTags.IFD.Exif)
     focal_35mm = exif.get(ExifTags.Base.FocalLengthIn35mmFilm)
     focals = [focal_35mm / _FILM_DIAGONAL_MM * math.hypot(width, height)] if focal_35mm else []
     focals += [factor * max(width, height) for factor in _START_FOCALS]
-    return [Intrinsics(f, f, (width - 1) / 2, (height - 1) / 2, width, height) for f in focals]
+    guesses = [Intrinsics(f, f, (width - 1) / 2, (height - 1) / 2, width, height) for f in focals]
+    return guesses, False, warnings

@@ -14,14 +14,13 @@ from numpy import ndarray
 from jcr.capture.formats import colmap
 from jcr.capture.images import read_image
 from jcr.errors import InputError, RejectedError
-from jcr.features.matchers import Matcher
+from jcr.features.matchers import Matcher, write_matches
 from jcr.features.pairs import all_pairs
-from jcr.features.verify import write_geometries, write_keypoints
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 from jcr.sfm.mapping import enter, quiet_colmap, sift_features, tracks_of
+from jcr.sfm.missing_images import triangulated
 from jcr.sfm.options import ColmapOptions
-from jcr.sfm.pose_primed import triangulated
 
 MIN_POINTS = 50
 
@@ -100,7 +99,6 @@ def _triangulated(
         matcher = Matcher(found, np.ones(2), cameras[0], True, options.seed)
         report("matching", 0.0)
         pairs = all_pairs(len(images))
-        write_keypoints(database, matcher.x_px)
-        write_geometries(database, matcher.geometries(pairs, np.zeros((len(pairs), 2))))
+        write_matches(database, matcher.x_px, matcher.geometries(pairs, np.zeros((len(pairs), 2))))
         model = triangulated(database, cameras[0], dict(enumerate(recon_from_camera)))
         return tracks_of(model, range(1, len(images) + 1), (intrinsics.width, intrinsics.height))

@@ -23,15 +23,13 @@ from numpy import ndarray
 from jcr.allocator import give_back
 from jcr.camera import HALF_PIXEL, fold_distance_px, resized
 from jcr.errors import RejectedError
-from jcr.features.matchers import Matcher
-from jcr.features.sift import grey_of
-from jcr.features.sift_features import SiftFeatures
+from jcr.features.matchers import Matcher, write_matches
+from jcr.features.sift import SiftFeatures, grey_of
 from jcr.features.stage import Matched, match_with_robot
-from jcr.features.verify import write_geometries, write_keypoints
 from jcr.progress import Progress
 from jcr.records import Intrinsics, Reconstruction, Tracks
+from jcr.sfm.missing_images import poses_of, rows_of, with_missing_images
 from jcr.sfm.options import ColmapOptions
-from jcr.sfm.pose_primed import map_from_gripper_poses, poses_of, with_missing_images
 from jcr.sfm.track_refinement import align_tracks
 
 _MIN_REGISTERED = 3
@@ -40,8 +38,6 @@ _MANY, _GROWN = 40, 1.3
 _ENOUGH = 1e-6
 """Relative change of a cost that ends an adjustment: with COLMAP's 0 it takes three times as long, and cameras come out
 1e-5 of their distance elsewhere."""
-PRIMED_FROM = 40
-"""Number of images above which the gripper poses prime the map."""
 _ROUGHLY = 1e-3
 """Relative change of the cost that ends an adjustment before the last one."""
 _MOST_OBSERVATIONS = 60_000
@@ -69,43 +65,42 @@ def structure_from_motion(
     points, tried in turn, for a focal length and two radial coefficients. Raises RejectedError when fewer than three
     images register.
     """
-    seed = options.seed
     with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
         cameras = enter(database, len(images), all_intrinsics, known, options.working_size_px)
         matcher = matcher_of(options, images, cameras[0], known, report)
         matched = matched_pairs(
-            database, matcher, base_from_gripper, all_intrinsics[0], cameras, known, names, report
+            database, matcher, base_from_gripper, all_intrinsics[0], cameras, names, report
         )
         model = map_of_pairs(database, matcher, matched, cameras, base_from_gripper, report)
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise _not_registered(database, len(images), model)
-        _thin(model, seed)
+        _thin(model, options.seed)
         adjust_robustly(model, known, _ROUGHLY)
-        std_px = _align_observations(
-            model, images, all_intrinsics[0] if known else intrinsics_of(model.camera(1), all_intrinsics[0])
-        )
+        std_px = _align_observations(model, images, intrinsics_of(model.camera(1), all_intrinsics[0], known))
         adjust_robustly(model, fix_intrinsics=known)
-        intrinsics, notes = (
-            (all_intrinsics[0] if known else intrinsics_of(model.camera(1), all_intrinsics[0])),
-            list(matched.notes),
-        )
+        intrinsics, notes = intrinsics_of(model.camera(1), all_intrinsics[0], known), matched.notes
         if not known and fold_distance_px(intrinsics) is not None:
-            notes.append("the views do not determine the distortion: it is taken as zero")
+            notes += ("the views do not determine the distortion: it is taken as zero",)
             model.camera(1).params = [*model.camera(1).params[:3], 0.0, 0.0]
             adjust_robustly(model, fix_intrinsics=True)
-            intrinsics = intrinsics_of(model.camera(1), intrinsics)
+            intrinsics = intrinsics_of(model.camera(1), intrinsics, known)
     report("mapping", 1.0)
-    rows = sorted(image_id - 1 for image_id in model.reg_image_ids())
-    tracks = tracks_of(model, [row + 1 for row in rows], (intrinsics.width, intrinsics.height))
+    made = reconstruction_of(model, rows_of(model), intrinsics)
+    tracks = replace(made.tracks, std_px=std_px)
+    return replace(made, tracks=tracks, notes=notes, warnings=matched.warnings)
+
+
+def reconstruction_of(
+    model: pycolmap.Reconstruction, rows: Sequence[int], intrinsics: Intrinsics
+) -> Reconstruction:
+    """Return the cameras and tracks of a model's images at `rows`."""
     return Reconstruction(
         image_index=np.array(rows),
         recon_from_camera=poses_of(model, rows),
         intrinsics=intrinsics,
-        tracks=replace(tracks, std_px=std_px),
+        tracks=tracks_of(model, [row + 1 for row in rows], (intrinsics.width, intrinsics.height)),
         backend="colmap",
-        notes=tuple(notes),
-        warnings=matched.warnings,
     )
 
 
@@ -118,26 +113,20 @@ def map_of_pairs(
     report: Progress,
     begun: pycolmap.Reconstruction | None = None,
 ) -> pycolmap.Reconstruction | None:
-    """Return the map of the matched pairs: of many images primed by the gripper poses, else by COLMAP's mapper.
+    """Return the map of the matched pairs by COLMAP's mapper, then by the predicted cameras of the images it left out.
 
-    A map that is `begun` is continued with the images that it lacks and that match others. On twelve real captures of
-    8 to 24 images priming had one capture 2 mm farther from its reference and one with an image less; it saves time
-    where there are many images.
+    A map that is `begun` is continued with the images that it lacks and that match others.
     """
-    count, known, model = len(base_from_gripper), matcher.known, begun
-    matching = {row for key in matched.geometries for row in key}
+    count, model = len(base_from_gripper), begun
+    matching = len({row for key in matched.geometries for row in key})
 
     def adjust(made: pycolmap.Reconstruction, scale_px: float) -> None:
-        adjust_robustly(made, known, _ROUGHLY, scale_px)
+        adjust_robustly(made, matcher.known, _ROUGHLY, scale_px)
 
-    if begun is None and known and matched.gate is not None and count > PRIMED_FROM:
-        model = map_from_gripper_poses(
-            database, cameras[0], matched.gate, matched.geometries, base_from_gripper, adjust
-        )
-    if model is None or model.num_reg_images() < len(matching):
+    if model is None or model.num_reg_images() < matching:
         some = cameras if model is None else [model.camera(1)]
-        model = map_incrementally(database, count, some, known, matcher.seed, report, model)
-    if model is not None and model.num_reg_images() < len(matching):
+        model = map_incrementally(database, count, some, matcher.known, matcher.seed, report, model)
+    if model is not None and model.num_reg_images() < matching:
         model = with_missing_images(database, model, base_from_gripper, matcher, adjust)
     return model
 
@@ -181,7 +170,7 @@ def matcher_of(
     """Return the matcher of some kind of features; SIFT is found here, networks find theirs when they match."""
     if options.features == "sift":
         return Matcher(sift_features(images, camera, report), np.ones(2), camera, known, options.seed)
-    from jcr.features.learned import LearnedFeatures
+    from jcr.features.xfeat import LearnedFeatures
 
     height, width = images[0].shape[:2]
     scale = np.array([camera.width / width, camera.height / height])
@@ -207,7 +196,6 @@ def matched_pairs(
     base_from_gripper: Float[ndarray, "n 4 4"],
     intrinsics: Intrinsics,
     cameras: list[pycolmap.Camera],
-    known: bool,
     names: Sequence[str],
     report: Progress,
 ) -> Matched:
@@ -218,15 +206,13 @@ def matched_pairs(
         matcher,
         base_from_gripper,
         working,
-        known,
         names,
         (intrinsics.width, intrinsics.height),
         lambda fraction: report("matching", fraction),
     )
-    write_keypoints(database, matcher.x_px)
-    write_geometries(database, matched.geometries)
-    if not known and matched.intrinsics != working:
-        cameras.insert(0, camera_of(matched.intrinsics, known))
+    write_matches(database, matcher.x_px, matched.geometries)
+    if matched.intrinsics != working:
+        cameras.insert(0, camera_of(matched.intrinsics, matcher.known))
     report("matching", 1.0)
     return matched
 
@@ -248,15 +234,34 @@ def map_incrementally(
     pipeline = pipeline_options(known, seed)
     if n_images > _MANY:
         pipeline.ba_global_frames_ratio = pipeline.ba_global_points_ratio = _GROWN
-    mapper = pipeline.mapper
-    best, registered = None, 0
+    mapper, folder = pipeline.mapper, database.parent
+    best, registered, done = None, 0, 0
+    if begun is not None:
+        (folder / "begun").mkdir(exist_ok=True)
+        begun.write(folder / "begun")
+
+    def add(count: int) -> None:
+        nonlocal done
+        done += count
+        report("mapping", min(done / n_images, 1.0))  # COLMAP may begin again with another pair
+
     for init_inliers, init_angle_deg, inliers in ((100, 16.0, 30), (50, 8.0, 15)):
         mapper.init_min_num_inliers, mapper.init_min_tri_angle = init_inliers, init_angle_deg
         mapper.abs_pose_min_num_inliers = inliers
         for camera in cameras:
             with closing(pycolmap.Database.open(database)) as db:
                 db.update_camera(camera)
-            models = _models(database, n_images, pipeline, report, begun)
+            done = 0
+            add(0 if begun is None else begun.num_reg_images())
+            models = pycolmap.incremental_mapping(
+                database,
+                folder,
+                folder,
+                pipeline,
+                "" if begun is None else folder / "begun",
+                initial_image_pair_callback=lambda: add(2),
+                next_image_callback=lambda: add(1),
+            )
             for model in models.values():
                 if model.num_reg_images() > registered:
                     best, registered = model, model.num_reg_images()
@@ -282,37 +287,6 @@ def pipeline_options(known: bool, seed: int) -> pycolmap.IncrementalPipelineOpti
         pipeline.ba_refine_focal_length = pipeline.ba_refine_extra_params = False
         mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = False
     return pipeline
-
-
-def _models(
-    database: Path,
-    n_images: int,
-    pipeline: pycolmap.IncrementalPipelineOptions,
-    report: Progress,
-    begun: pycolmap.Reconstruction | None,
-) -> dict[int, pycolmap.Reconstruction]:
-    """Return COLMAP's models from one initial camera or from a model, and report the share of registered images."""
-    registered, folder = 0, database.parent
-    if begun is not None:
-        registered, folder = begun.num_reg_images(), database.parent / "begun"
-        folder.mkdir(exist_ok=True)
-        begun.write(folder)
-
-    def add(count: int) -> None:
-        nonlocal registered
-        registered += count
-        report("mapping", min(registered / n_images, 1.0))  # COLMAP may begin again with another pair
-
-    add(0)
-    return pycolmap.incremental_mapping(
-        database,
-        database.parent,
-        database.parent,
-        pipeline,
-        "" if begun is None else folder,
-        initial_image_pair_callback=lambda: add(2),
-        next_image_callback=lambda: add(1),
-    )
 
 
 def adjust_robustly(
@@ -356,10 +330,10 @@ def _align_observations(
 
     The standard deviation of each is returned in pixels of the original images, in the order of `tracks_of`.
     """
-    camera, image_ids = model.camera(1), sorted(model.reg_image_ids())
-    size = camera.width, camera.height
-    poses = poses_of(model, [image_id - 1 for image_id in image_ids])
-    greys = np.stack([grey_of(images[image_id - 1], size) for image_id in image_ids])
+    camera, rows = model.camera(1), rows_of(model)
+    size, image_ids = (camera.width, camera.height), [row + 1 for row in rows]
+    poses = poses_of(model, rows)
+    greys = np.stack([grey_of(images[row], size) for row in rows])
     aligned = align_tracks(greys, tracks_of(model, image_ids, size), poses, resized(intrinsics, *size))
     for (row, index, _), x_px in zip(_observations(model, image_ids), aligned.x_px, strict=True):
         model.image(image_ids[row]).point2D(index).xy = x_px + HALF_PIXEL
@@ -434,8 +408,10 @@ def camera_of(intrinsics: Intrinsics, known: bool) -> pycolmap.Camera:
     return camera
 
 
-def intrinsics_of(camera: pycolmap.Camera, like: Intrinsics) -> Intrinsics:
-    """Return the intrinsics of a camera that `camera_of` made without known ones, for images of the size of `like`."""
+def intrinsics_of(camera: pycolmap.Camera, like: Intrinsics, known: bool) -> Intrinsics:
+    """Return the intrinsics of a camera of `camera_of` for images of the size of `like`, which are the known ones."""
+    if known:
+        return like
     focal, cx, cy, k1, k2 = (float(p) for p in camera.params)
     distortion = (k1, k2, 0.0, 0.0, 0.0)
     centre = cx - HALF_PIXEL, cy - HALF_PIXEL

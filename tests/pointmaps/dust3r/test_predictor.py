@@ -1,7 +1,6 @@
 """Test the pair graphs, the file of pairs, and the prediction of pairs with little memory."""
 
 import dataclasses
-import logging
 import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -46,9 +45,9 @@ def images() -> PreparedImages:
 
 
 def predicted(loaded: "LoadedNetwork", images: PreparedImages) -> PairPredictions:
-    from jcr.pointmaps.dust3r.predictor import predict_pairs
+    from jcr.pointmaps.dust3r.dust3r import predict_pairs
 
-    return predict_pairs(loaded, images, NAMES, np.tile(np.eye(4), (4, 1, 1)))[0]
+    return predict_pairs(loaded, images, NAMES, complete_pairs(4))[0]
 
 
 def test_pair_graphs() -> None:
@@ -73,40 +72,28 @@ def test_each_pair_is_what_the_network_shows_of_its_two_images(
         np.testing.assert_allclose(pairs.conf2[e], view2.confidence[0], rtol=1e-4, atol=1e-5)
 
 
-def test_a_gpu_too_small_for_one_pair_hands_over_to_the_cpu_and_reports_it(
-    loaded: "LoadedNetwork",
-    images: PreparedImages,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+def test_a_batch_that_does_not_fit_is_halved_and_reported(
+    loaded: "LoadedNetwork", images: PreparedImages, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import torch
 
-    from jcr.pointmaps.dust3r import predictor
+    from jcr.pointmaps.dust3r import dust3r
     from jcr.pointmaps.dust3r.network import Dust3r
-    from jcr.pointmaps.dust3r.predictor import predict_pairs
 
-    monkeypatch.setattr(Dust3r, "device", torch.device("cuda"))
-    encode = predictor._Predictor._encode
-    tried = []
+    encode, largest = Dust3r.encode, 1
 
-    def encode_on_the_cpu_alone(self, rows):
-        if self.device.type == "cuda":
-            tried.append(len(rows))
+    def encode_few(self, images):
+        if len(images) > largest:
             raise torch.cuda.OutOfMemoryError("out of memory")
-        return encode(self, rows)
+        return encode(self, images)
 
-    monkeypatch.setattr(predictor._Predictor, "_encode", encode_on_the_cpu_alone)
-    monkeypatch.setitem(predictor.MAX_BATCH, "cuda", 4)
-    poses = np.tile(np.eye(4), (4, 1, 1))
-    with caplog.at_level(logging.WARNING):
-        pairs, notes = predict_pairs(loaded, images, NAMES, poses)
-    assert tried == [4, 2, 1]
-    assert [note.split(":")[1] for note in notes] == [
-        " going on with 2 pairs at a time",
-        " going on with 1 pairs at a time",
-        " going on, slowly, on the CPU",
-    ]
-    assert all(note in caplog.text for note in notes)
+    monkeypatch.setattr(Dust3r, "encode", encode_few)
+    monkeypatch.setitem(dust3r.MAX_BATCH, "cpu", 4)
+    pairs, notes = dust3r.predict_pairs(loaded, images, NAMES, complete_pairs(4))
+    assert [note.split(": ")[1] for note in notes] == ["2 pairs at a time", "1 pairs at a time"]
+    largest = 0
+    with pytest.raises(InputError, match="use --device cpu"):
+        dust3r.predict_pairs(loaded, images, NAMES, complete_pairs(4))
     monkeypatch.undo()
     undisturbed = predicted(loaded, images)
     np.testing.assert_allclose(pairs.pts3d, undisturbed.pts3d, rtol=1e-4, atol=1e-5)

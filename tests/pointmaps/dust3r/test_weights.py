@@ -279,8 +279,8 @@ def test_a_hub_id_comes_from_the_cache(
 def test_pairs_are_predicted_from_a_checkpoint_and_a_damaged_one_is_named(
     tmp_path: Path, linear: "Dust3r"
 ) -> None:
-    from jcr.pointmaps.dust3r.dust3r import reconstruct_dust3r
-    from jcr.pointmaps.dust3r.predictor import predict_pairs
+    from jcr.pointmaps.dust3r.dust3r import predict_pairs, reconstruct_dust3r
+    from jcr.pointmaps.dust3r.pair_graph import complete_pairs
     from jcr.pointmaps.grid import prepare_images
 
     rng = np.random.default_rng(0)
@@ -296,7 +296,7 @@ def test_pairs_are_predicted_from_a_checkpoint_and_a_damaged_one_is_named(
     )
     weights = write_pth(tmp_path / "weights.pth", linear, LINEAR_MODEL)
     images = prepare_images(capture)
-    pairs, notes = predict_pairs(load(weights), images, names, capture.base_from_gripper)
+    pairs, notes = predict_pairs(load(weights), images, names, complete_pairs(3))
     assert pairs.images == names and pairs.conf.shape == (6, 384, 512)
     assert pairs.intrinsics is not None and pairs.intrinsics.cx == pytest.approx(255.5)
     assert pairs.intrinsics.fx == pytest.approx(70 * 512 / 80)

@@ -1,17 +1,27 @@
-"""The DUSt3R and MASt3R back ends: pairwise pointmaps, global alignment, refinement."""
+"""The DUSt3R and MASt3R back ends: prediction of pairwise pointmaps, global alignment, refinement."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+import torch
+from jaxtyping import Int
+from numpy import ndarray
+
 from jcr.allocator import give_back
-from jcr.errors import RejectedError
+from jcr.errors import InputError, RejectedError
 from jcr.hub import Weights
-from jcr.pointmaps.dust3r.pair_graph import PairGraph
-from jcr.pointmaps.dust3r.predictor import predict_pairs
-from jcr.pointmaps.dust3r.weights import load_weights
-from jcr.pointmaps.grid import prepare_images
+from jcr.pointmaps.dust3r.network import Features
+from jcr.pointmaps.dust3r.pair_graph import PairGraph, pairs_of_graph
+from jcr.pointmaps.dust3r.weights import LoadedNetwork, load_weights
+from jcr.pointmaps.grid import PreparedImages, prepare_images
+from jcr.pointmaps.pairs import PairPredictions
 from jcr.pointmaps.reconstruction import align_pairs, reconstruct_pointmaps
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.records import Capture, Reconstruction
+
+MAX_BATCH = {"cpu": 1, "cuda": 16}
+"""Pairs at a time. More do not help a CPU, whose cores one pair of 768 tokens keeps busy."""
 
 
 def reconstruct_dust3r(
@@ -28,9 +38,8 @@ def reconstruct_dust3r(
     """
     loaded = load_weights(weights, device)
     images = prepare_images(capture)
-    predictions, notes = predict_pairs(
-        loaded, images, capture.images, capture.base_from_gripper, pair_graph, progress
-    )
+    edges = pairs_of_graph(pair_graph, capture.base_from_gripper)
+    predictions, notes = predict_pairs(loaded, images, capture.images, edges, progress)
     del loaded
     give_back()  # the network's memory
     notes = (weights.note, *notes)
@@ -40,3 +49,74 @@ def reconstruct_dust3r(
         return reconstruct_pointmaps(capture, images, maps, backend, progress)
     except RejectedError as error:  # the weights and their licence belong to a rejection, too
         raise error.with_more(*notes) from None
+
+
+def predict_pairs(
+    loaded: LoadedNetwork,
+    images: PreparedImages,
+    names: tuple[str, ...],
+    edges: Int[ndarray, "e 2"],
+    progress: Progress | None = None,
+) -> tuple[PairPredictions, tuple[str, ...]]:
+    """Predict the pointmaps of pairs: one encoder pass per image, one decoder pass per ordered pair; and notes.
+
+    Where CUDA runs out of memory the batch is halved. Raises InputError where the memory does not suffice for one pair.
+    """
+    network, report, notes = loaded.network, progress or silent, tuple[str, ...]()
+    batch, features = MAX_BATCH[network.device.type], dict[int, Features]()
+    height, width = images.colors.shape[1:3]
+    arrays = [np.empty((len(edges), height, width, *point), np.float32) for point in ((3,), ()) * 2]
+
+    def encode(rows: Int[ndarray, " b"]) -> None:
+        colors = torch.from_numpy(images.colors[rows]).to(network.device).permute(0, 3, 1, 2)
+        tokens, grid = network.encode((colors / 255 - 0.5) / 0.5)
+        features.update(
+            (row, Features(own[None], grid)) for row, own in zip(rows.tolist(), tokens, strict=True)
+        )
+
+    def decode(rows: Int[ndarray, " b"]) -> None:
+        first, second = (
+            Features(torch.cat([features[row].tokens for row in side]), features[side[0]].grid)
+            for side in edges[rows].T.tolist()
+        )
+        view1, view2 = network.decode(first, second)
+        for array, values in zip(arrays, (*view1, *view2), strict=True):
+            array[rows] = values.cpu().numpy()
+
+    def in_batches(stage: str, count: int, work: Callable[[Int[ndarray, " b"]], None]) -> None:
+        nonlocal batch, notes
+        done = 0
+        while done < count:
+            rows = np.arange(done, min(done + batch, count))
+            try:
+                with torch.inference_mode():
+                    work(rows)
+                done += len(rows)
+                report(stage, done / count)
+                continue
+            except torch.cuda.OutOfMemoryError:
+                batch //= 2
+            # Outside of the except clause, whose traceback keeps the tensors of the failed batch alive.
+            torch.cuda.empty_cache()
+            if batch == 0:
+                raise InputError(
+                    "out of memory with one pair of images; close other programs, or use --device cpu"
+                )
+            notes += (f"out of memory on the {network.device}: {batch} pairs at a time",)
+
+    in_batches("encode images", len(images.colors), encode)
+    in_batches("predict pairs", len(edges), decode)
+    pts3d, conf, pts3d_in_other_view, conf2 = arrays
+    predictions = PairPredictions(
+        edges=edges,
+        pts3d=pts3d,
+        conf=conf,
+        pts3d_in_other_view=pts3d_in_other_view,
+        conf2=conf2,
+        images=names,
+        colors=images.colors,
+        intrinsics=images.intrinsics,
+        grid=images.grid,
+        is_metric=loaded.is_metric,
+    )
+    return predictions, notes

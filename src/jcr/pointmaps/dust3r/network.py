@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
 PATCH = 16
@@ -32,8 +32,6 @@ class Features(NamedTuple):
     """Tokens of the encoder (b,n,c)."""
     grid: tuple[int, int]
     """Rows and columns of tokens."""
-    finest: tuple[Tensor | None, Tensor | None] = (None, None)
-    """Finest level of a DPT head (b,256,h/4,w/4) as first and as second view; None: computed for each pair."""
 
 
 class Pointmap(NamedTuple):
@@ -121,52 +119,40 @@ class Dust3r(nn.Module):
         """Return pointmaps of images in [-1, 1] whose height and width are multiples of 16, portrait included."""
         return self.decode(self.encode(image1), self.encode(image2))
 
-    def encode(self, images: Float[Tensor, "b 3 h w"], many_pairs: bool = False) -> Features:
-        """Return the features of images in [-1, 1]; each image is encoded once for all its pairs.
-
-        With `many_pairs` the heads' finest level is made here too, a fifth of a head's work, and kept.
-        """
+    def encode(self, images: Float[Tensor, "b 3 h w"]) -> Features:
+        """Return the features of images in [-1, 1]; each image is encoded once for all its pairs."""
         if images.shape[-2] % PATCH or images.shape[-1] % PATCH:
             raise ValueError(
                 f"images are {tuple(images.shape[-2:])}; height and width must be multiples of {PATCH}"
             )
         with self._autocast(images):
             grid = (images.shape[-2] // PATCH, images.shape[-1] // PATCH)
-            rotary = rotary_embedding(grid_positions(grid, images.device), self.head_dims[0], self.rope_base)
+            rotary = rotary_embedding(grid, self.head_dims[0], self.rope_base, images.device)
             # Under autocast the blocks compute in bfloat16 and add to tokens that stay float32.
             x = self.patch_embed(images).float()
             for block in self.enc_blocks:
                 x = block(x, rotary)
-            tokens = self.enc_norm(x)
-            if not many_pairs:
-                return Features(tokens, grid)
-            as_map = tokens.mT.unflatten(-1, grid)
-            finest = (self.downstream_head1.finest(as_map), self.downstream_head2.finest(as_map))
-            return Features(tokens, grid, finest)
+            return Features(self.enc_norm(x), grid)
 
     def decode(self, features1: Features, features2: Features) -> tuple[Pointmap, Pointmap]:
         """Return pointmaps of both images in the first camera's frame; (1, 2) does not give (2, 1)."""
         with self._autocast(features1.tokens):
-            layers1, layers2 = self.decoder_layers(features1, features2)
-            return (
-                self.downstream_head1(layers1, features1.grid, features1.finest[0]),
-                self.downstream_head2(layers2, features2.grid, features2.finest[1]),
+            rotary1, rotary2 = (
+                rotary_embedding(f.grid, self.head_dims[1], self.rope_base, f.tokens.device)
+                for f in (features1, features2)
             )
-
-    def decoder_layers(self, features1: Features, features2: Features) -> tuple[list[Tensor], list[Tensor]]:
-        """Return per view the encoder's tokens, then the tokens after each decoder block, the last ones normalised."""
-        rotary1, rotary2 = (
-            rotary_embedding(grid_positions(f.grid, f.tokens.device), self.head_dims[1], self.rope_base)
-            for f in (features1, features2)
-        )
-        x1, x2 = (self.decoder_embed(f.tokens).float() for f in (features1, features2))
-        layers1, layers2 = [features1.tokens], [features2.tokens]
-        for block1, block2 in zip(self.dec_blocks, self.dec_blocks2, strict=True):
-            x1, x2 = block1(x1, x2, rotary1, rotary2), block2(x2, x1, rotary2, rotary1)
-            layers1.append(x1)
-            layers2.append(x2)
-        layers1[-1], layers2[-1] = self.dec_norm(x1), self.dec_norm(x2)
-        return layers1, layers2
+            x1, x2 = (self.decoder_embed(f.tokens).float() for f in (features1, features2))
+            # The heads read the encoder's tokens and those after each decoder block, the last ones normalised.
+            layers1, layers2 = [features1.tokens], [features2.tokens]
+            for block1, block2 in zip(self.dec_blocks, self.dec_blocks2, strict=True):
+                x1, x2 = block1(x1, x2, rotary1, rotary2), block2(x2, x1, rotary2, rotary1)
+                layers1.append(x1)
+                layers2.append(x2)
+            layers1[-1], layers2[-1] = self.dec_norm(x1), self.dec_norm(x2)
+            return (
+                self.downstream_head1(layers1, features1.grid),
+                self.downstream_head2(layers2, features2.grid),
+            )
 
     @property
     def device(self) -> torch.device:
@@ -178,16 +164,10 @@ class Dust3r(nn.Module):
         return torch.autocast(like.device.type, torch.bfloat16, enabled=enabled)
 
 
-def grid_positions(grid: tuple[int, int], device: torch.device) -> Int[Tensor, "n 2"]:
-    """Return row and column of each token, row by row."""
-    rows, columns = (torch.arange(size, device=device) for size in grid)
-    return torch.cartesian_prod(rows, columns)
-
-
-def rotary_embedding(position: Int[Tensor, "n 2"], head_dim: int, base: float) -> Rotary:
+def rotary_embedding(grid: tuple[int, int], head_dim: int, base: float, device: torch.device) -> Rotary:
     """Return cosines and sines of position · base^(−2k/D), D = head_dim/2 (RoPE, Su et al. 2021, per axis)."""
-    per_axis = head_dim // 2
-    exponent = torch.arange(0, per_axis, 2, device=position.device).float() / per_axis
+    position = torch.cartesian_prod(*(torch.arange(size, device=device) for size in grid))
+    exponent = torch.arange(0, head_dim // 2, 2, device=device).float() / (head_dim // 2)
     angle = position[..., None] * base**-exponent
     return torch.stack([angle.cos(), angle.sin()])
 
@@ -302,10 +282,7 @@ class LinearHead(nn.Module):
         super().__init__()
         self.proj = nn.Linear(dec_dim, 4 * PATCH**2)
 
-    def finest(self, tokens: FeatureMap) -> None:
-        """Return None: no part of the output comes from one image alone."""
-
-    def forward(self, layers: list[Tensor], grid: tuple[int, int], finest: Tensor | None = None) -> Pointmap:
+    def forward(self, layers: list[Tensor], grid: tuple[int, int]) -> Pointmap:
         with torch.autocast(layers[-1].device.type, enabled=False):
             tokens = self.proj(layers[-1].float())
         return pointmap(F.pixel_shuffle(tokens.mT.unflatten(-1, grid), PATCH))
@@ -319,13 +296,8 @@ class DptHead(nn.Module):
         self.layers = (0, dec_depth // 2, 3 * dec_depth // 4, dec_depth)
         self.dpt = Dpt((enc_dim, dec_dim, dec_dim, dec_dim))
 
-    def finest(self, tokens: FeatureMap) -> Float[Tensor, "b 256 4*h 4*w"]:
-        """Return the finest level from the encoder's tokens, the only part that does not use the other image."""
-        return self.dpt.finest(tokens)
-
-    def forward(self, layers: list[Tensor], grid: tuple[int, int], finest: Tensor | None = None) -> Pointmap:
-        maps = [layers[layer].mT.unflatten(-1, grid) for layer in self.layers]
-        return pointmap(self.dpt(maps, finest))
+    def forward(self, layers: list[Tensor], grid: tuple[int, int]) -> Pointmap:
+        return pointmap(self.dpt([layers[layer].mT.unflatten(-1, grid) for layer in self.layers]))
 
 
 class Dpt(nn.Module):
@@ -335,19 +307,11 @@ class Dpt(nn.Module):
         super().__init__()
         pyramid = (96, 192, 384, 768)
         self.act_postprocess = nn.ModuleList(
-            nn.Sequential(nn.Conv2d(dim, out, 1), *resize)
-            for dim, out, resize in zip(
-                dims,
-                pyramid,
-                (
-                    [nn.ConvTranspose2d(96, 96, 4, 4)],
-                    [nn.ConvTranspose2d(192, 192, 2, 2)],
-                    [],
-                    [nn.Conv2d(768, 768, 3, 2, 1)],
-                ),
-                strict=True,
-            )
+            nn.Sequential(nn.Conv2d(dim, out, 1)) for dim, out in zip(dims, pyramid, strict=True)
         )
+        self.act_postprocess[0].append(nn.ConvTranspose2d(96, 96, 4, 4))
+        self.act_postprocess[1].append(nn.ConvTranspose2d(192, 192, 2, 2))
+        self.act_postprocess[3].append(nn.Conv2d(768, 768, 3, 2, 1))
         self.scratch = Scratch(pyramid, width)
         self.head = nn.Sequential(
             nn.Conv2d(width, width // 2, 3, 1, 1),
@@ -357,14 +321,8 @@ class Dpt(nn.Module):
             nn.Conv2d(128, 4, 1),
         )
 
-    def finest(self, x: FeatureMap) -> Float[Tensor, "b 256 4*h 4*w"]:
-        return self.scratch.refinenet1.resConfUnit1(self.scratch.layer1_rn(self.act_postprocess[0](x)))
-
-    def forward(self, maps: list[Tensor], finest: Tensor | None = None) -> Float[Tensor, "b 4 h w"]:
-        if finest is None:
-            finest = self.finest(maps[0])
-        coarser = [resize(x) for resize, x in zip(self.act_postprocess[1:], maps[1:], strict=True)]
-        x = self.head[:4](self.scratch(finest, coarser))
+    def forward(self, maps: list[Tensor]) -> Float[Tensor, "b 4 h w"]:
+        x = self.head[:4](self.scratch([f(x) for f, x in zip(self.act_postprocess, maps, strict=True)]))
         # bfloat16 keeps 8 bits, too few for a coordinate: the last map is made in float32.
         with torch.autocast(x.device.type, enabled=False):
             return self.head[4](x.float())
@@ -380,13 +338,13 @@ class Scratch(nn.Module):
         self.layer1_rn, self.layer2_rn, self.layer3_rn, self.layer4_rn = self.layer_rn
         self.refinenet1, self.refinenet2, self.refinenet3, self.refinenet4 = (Fusion(width) for _ in range(4))
 
-    def forward(self, finest: Tensor, coarser: list[Tensor]) -> FeatureMap:
-        level2, level3, level4 = (conv(x) for conv, x in zip(self.layer_rn[1:], coarser, strict=True))
+    def forward(self, levels: list[Tensor]) -> FeatureMap:
+        level1, level2, level3, level4 = (conv(x) for conv, x in zip(self.layer_rn, levels, strict=True))
         # With an odd grid the stride-2 level is a row or column too large.
         x = self.refinenet4(level4)[..., : level3.shape[-2], : level3.shape[-1]]
         x = self.refinenet3(x + self.refinenet3.resConfUnit1(level3))
         x = self.refinenet2(x + self.refinenet2.resConfUnit1(level2))
-        return self.refinenet1(x + finest)
+        return self.refinenet1(x + self.refinenet1.resConfUnit1(level1))
 
 
 class Fusion(nn.Module):

@@ -11,7 +11,8 @@ from jcr.features.pairs import NEIGHBOURS, near_pairs
 
 PairGraph = Literal["auto", "complete", "window", "robot"]
 """complete: all pairs; window: images near each other in the capture's order; robot: the nearest neighbours of every
-image by the gripper poses; auto: complete up to FEW_IMAGES images, robot beyond."""
+image by the gripper poses, and successive images, which join neighbourhoods that share no pair; auto: complete up to
+FEW_IMAGES images, robot beyond."""
 FEW_IMAGES = 12
 """Number of images up to which every pair is predicted (132)."""
 WINDOW = 3
@@ -19,37 +20,24 @@ WINDOW = 3
 
 
 def pairs_of_graph(graph: PairGraph, base_from_gripper: Float[ndarray, "n 4 4"]) -> Int[ndarray, "e 2"]:
-    """Return the ordered pairs of a graph."""
+    """Return the pairs of a graph in both orders."""
     count = len(base_from_gripper)
     if graph == "complete" or (graph == "auto" and count <= FEW_IMAGES):
         return complete_pairs(count)
     if graph == "window":
         return window_pairs(count, WINDOW)
-    return robot_pairs(base_from_gripper)
+    near = np.reshape(near_pairs(motions(base_from_gripper), NEIGHBOURS), (-1, 2))[:, ::-1]
+    successive = window_pairs(count, 1)[: count - 1]
+    edges = np.unique(np.concatenate([near, successive]), axis=0)
+    return np.concatenate([edges, edges[:, ::-1]])
 
 
 def complete_pairs(count: int) -> Int[ndarray, "e 2"]:
     """Return every pair in both orders: (i, j) with i > j first, then each reversed, as published."""
-    return _both_orders(np.tri(count, k=-1, dtype=bool))
+    return window_pairs(count, count)
 
 
 def window_pairs(count: int, size: int) -> Int[ndarray, "e 2"]:
     """Return the pairs of images at most `size` apart in the order of the capture, in both orders."""
-    return _both_orders(np.tri(count, k=-1, dtype=bool) & ~np.tri(count, k=-size - 1, dtype=bool))
-
-
-def robot_pairs(base_from_gripper: Float[ndarray, "n 4 4"]) -> Int[ndarray, "e 2"]:
-    """Return the pairs of nearest neighbours by the gripper poses, and successive images, in both orders.
-
-    Successive images join neighbourhoods that share no pair.
-    """
-    joined = np.eye(len(base_from_gripper), k=-1, dtype=bool)
-    for first, second in near_pairs(motions(base_from_gripper), NEIGHBOURS):
-        joined[second, first] = True
-    return _both_orders(joined)
-
-
-def _both_orders(joined: ndarray) -> Int[ndarray, "e2 2"]:
-    """Return the pairs of a lower triangle, then each reversed."""
-    edges = np.argwhere(joined)
+    edges = np.argwhere(np.tri(count, k=-1, dtype=bool) & ~np.tri(count, k=-size - 1, dtype=bool))
     return np.concatenate([edges, edges[:, ::-1]])

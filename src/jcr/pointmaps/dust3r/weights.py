@@ -40,7 +40,15 @@ def load_weights(weights: Weights, device: str = "cpu") -> LoadedNetwork:
     if not path.exists():
         raise InputError(f"{path}: no such weights; give a file, a folder or a hub id (jcr models)")
     if path.is_dir():
-        path = _file_in(path)
+        published = path / HUB_FILES[1]
+        files = (
+            [published]
+            if published.is_file()
+            else [f for f in sorted(path.iterdir()) if f.suffix in _READERS]
+        )
+        if len(files) != 1:
+            raise InputError(f"{path}: {len(files)} weights files in this folder; name the one to load")
+        (path,) = files
     if path.suffix not in _READERS:
         raise InputError(f"{path}: weights are .pth, .pt or .safetensors, not {path.suffix or 'this'}")
     config, state = _READERS[path.suffix](path)
@@ -56,35 +64,19 @@ def load_weights(weights: Weights, device: str = "cpu") -> LoadedNetwork:
     return LoadedNetwork(network, is_metric=bool(mast3r))
 
 
-def _file_in(folder: Path) -> Path:
-    """Return the only weights file of a folder."""
-    if (folder / HUB_FILES[1]).is_file():
-        return folder / HUB_FILES[1]
-    files = [path for path in sorted(folder.iterdir()) if path.suffix in _READERS]
-    if len(files) != 1:
-        raise InputError(f"{folder}: {len(files)} weights files in this folder; name the one to load")
-    return files[0]
-
-
 def _read_safetensors(path: Path) -> tuple[dict[str, object], dict[str, Tensor]]:
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
     config_path = path.parent / HUB_FILES[0]
+    if not config_path.is_file():
+        raise InputError(f"{config_path}: no such file; the weights' config.json belongs beside them")
     try:
-        config = json.loads(config_path.read_text("utf-8"))
-    except FileNotFoundError:
-        raise InputError(
-            f"{config_path}: no such file; the weights' config.json belongs beside them"
-        ) from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{config_path}: no readable JSON ({_line(error)}); fetch it again") from None
-    if not isinstance(config, dict):
-        raise InputError(f"{config_path}: no configuration of a network; fetch it again")
-    try:
-        return config, load_file(path)
+        return dict(json.loads(config_path.read_text("utf-8"))), load_file(path)
     except (SafetensorError, OSError) as error:
         raise InputError(f"{path}: damaged or no safetensors ({_line(error)}); fetch it again") from None
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{config_path}: no readable JSON ({_line(error)}); fetch it again") from None
 
 
 def _read_pth(path: Path) -> tuple[dict[str, object], dict[str, Tensor]]:
@@ -97,15 +89,7 @@ def _read_pth(path: Path) -> tuple[dict[str, object], dict[str, Tensor]]:
         ) from None
     try:
         return _parse_model(content["args"].model), dict(content["model"])
-    except (
-        KeyError,
-        TypeError,
-        AttributeError,
-        ValueError,
-        SyntaxError,
-        RecursionError,
-        MemoryError,
-    ) as error:
+    except Exception as error:  # the text of the model can make the parser raise anything
         raise InputError(
             f"{path}: no checkpoint of DUSt3R or MASt3R ({_line(error)}); it needs 'args' and 'model'"
         ) from None
@@ -133,30 +117,24 @@ def _parse_model(text: str) -> dict[str, object]:
 
 def _build(config: dict[str, object], state: dict[str, Tensor], path: Path) -> Dust3r:
     """Return the network of a configuration with its tensors, shared with the file that they are mapped from."""
-    config = dict(config)
-    for mast3r_only in ("two_confs", "desc_conf_mode", "desc_mode", "local_feat_dim"):
-        config.pop(mast3r_only, None)
+    mast3r_only = ("two_confs", "desc_conf_mode", "desc_mode", "local_feat_dim")
+    config = {key: value for key, value in config.items() if key not in mast3r_only}
     config["head_type"] = str(config.get("head_type", "linear")).removeprefix("catmlp+")
     config["output_mode"] = str(config.get("output_mode", "pts3d")).partition("+")[0]
     try:
         with torch.device("meta"):
-            network = Dust3r(**config)  # type: ignore[arg-type]
+            network = Dust3r(**config)
     except (TypeError, ValueError, ArithmeticError, RuntimeError) as error:
         raise InputError(f"{path}: its configuration is not of this network ({_line(error)})") from None
-    expected = network.state_dict()
     if not any(key.startswith("dec_blocks2.") for key in state):
-        state |= {
-            re.sub("^dec_blocks", "dec_blocks2", k): v
-            for k, v in state.items()
-            if k.startswith("dec_blocks.")
-        }
-    for level in range(4):
-        for key in expected:
-            if f".layer_rn.{level}." in key:
-                twin = key.replace(f".layer_rn.{level}.", f".layer{level + 1}_rn.")
-                present = state.get(twin, state.get(key))
-                if present is not None:
-                    state |= {key: present, twin: present}
+        first = {key: value for key, value in state.items() if key.startswith("dec_blocks.")}
+        state |= {re.sub("^dec_blocks", "dec_blocks2", key): value for key, value in first.items()}
+    # Checkpoints may hold a tensor with two names under one of them.
+    for key in network.state_dict():
+        twin = re.sub(r"\.layer_rn\.(\d)\.", lambda level: f".layer{int(level[1]) + 1}_rn.", key)
+        present = state.get(twin, state.get(key))
+        if present is not None and twin != key:
+            state |= {key: present, twin: present}
     try:
         network.load_state_dict({key: tensor.float() for key, tensor in state.items()}, assign=True)
     except (RuntimeError, AttributeError) as error:

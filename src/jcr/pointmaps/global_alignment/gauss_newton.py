@@ -1,14 +1,16 @@
-"""Global alignment by Gauss-Newton on a few thousand pixels per image, the depths eliminated.
+"""Global alignment by Gauss-Newton on a few thousand pixels per image.
 
 It minimises what eq. 1 of the paper does, with three changes. Residuals are weighted by what they prove to
-be worth (`pointmap_residuals`). The first view of a pair stands in its camera's own frame, as it was predicted,
+be worth (residuals.py). The first view of a pair stands in its camera's own frame, as it was predicted,
 so that its rays give the focal length. And a pair's pose P_e, free in eq. 1, is its first camera's but for an
 error whose spread is measured over all pairs: where the network places second views well, pairs tie cameras
 firmly.
+
+Depths are eliminated pixel by pixel (Schur complement; Triggs et al., "Bundle adjustment: a modern synthesis", 2000,
+section 6), and so are the rigid errors of the pairs' second views. The reduced system has the steps of the cameras, the
+log focal and the log pair scales, in this order.
 """
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,22 +19,19 @@ from numpy import ndarray
 from scipy.sparse import csr_array
 
 from jcr.errors import RejectedError
-from jcr.geometry import adjoint, inverse, retract, twist_from_step
+from jcr.geometry import adjoint, inverse, retract, skew, twist_from_step
 from jcr.least_squares import one_blas_thread
-from jcr.pointmaps.global_alignment.alignment import Alignment
-from jcr.pointmaps.global_alignment.depths import fused_depth
 from jcr.pointmaps.global_alignment.initial_estimate import initial_state
-from jcr.pointmaps.global_alignment.normal_equations import (
-    ImageEquations,
-    Layout,
-    PairTies,
-    ReducedEquations,
-    image_equations,
+from jcr.pointmaps.global_alignment.observations import ImageObservations, Problem
+from jcr.pointmaps.global_alignment.residuals import (
+    Noise,
+    Residuals,
+    State,
+    agreement,
+    fused_depth,
+    measure_noise,
+    residuals,
 )
-from jcr.pointmaps.global_alignment.observations import ImageObservations, Problem, observe
-from jcr.pointmaps.global_alignment.pointmap_residuals import Noise, State, measure_noise, residuals
-from jcr.pointmaps.pairs import PairPredictions
-from jcr.progress import Progress
 
 COARSE_PIXELS = 300
 """Pixels per image of the first stage, which comes within the noise at a seventh of the cost."""
@@ -47,12 +46,6 @@ GAUGE_WEIGHT = 1e3
 """Weight of the fixed sum of the log pair scales, over the information of the pointmaps on one of them."""
 NORMAL_SQUARE_MEDIAN = 0.455
 """Median of the square of a unit normal."""
-DEPTH_CHUNK = 4096
-"""Pixels at a time, so that the arrays of a chunk stay in the cache."""
-CONTRADICTION = 4.0
-"""A pair whose residual is this many times the median one is named to the user."""
-USELESS = 0.2
-"""Residual of the middle pair, relative to the distance, of pairs that do not belong together."""
 
 UNDETERMINED = "the pointmaps of the pairs have too little in common to be aligned"
 
@@ -73,144 +66,119 @@ class Solution:
     """Whether the last step was small enough."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class ImageEquations:
+    """Equations of one image without its depths and its pairs' errors, and what gives their steps.
+
+    Local unknowns are relative twists, pair scales and the focal. Twists are those of geometry.twist_from_step: points
+    of an image move with its camera, so that only the difference of the twists of image and observer shows.
+    """
+
+    hessian: Float[ndarray, "c c"]
+    gradient: Float[ndarray, " c"]
+    selection: csr_array
+    """Matrix from a step of all unknowns to the local unknowns."""
+    gain: Float[ndarray, "t c"]
+    offset: Float[ndarray, " t"]
+    """The pairs' errors (recon axes) step by gain · step + offset."""
+    axes: Float[ndarray, "n 6 6"]
+    """Adjoint of the observers: twists in recon axes to twists in theirs."""
+    error_variance: Float[ndarray, "n 6"]
+    """Variances of the pairs' errors where the cameras are given, in the observers' axes."""
+    depth_hessian: Float[ndarray, " m"]
+    depth_gradient: Float[ndarray, " m"]
+    coupling: Float[ndarray, "c m"]
+
+
 def solve(problem: Problem, pixels: int) -> Solution:
     """Estimate cameras, focal length, pair scales and the depths of about `pixels` pixels per image."""
-    images, edges = problem.observe_all(min(COARSE_PIXELS, pixels)), problem.predictions.edges
-    state, layout = initial_state(images, edges), Layout(len(images), len(edges))
+    images = problem.observe_all(min(COARSE_PIXELS, pixels))
+    state = initial_state(images, problem.predictions.edges)
     pair_spread = START_SPREAD * np.repeat([np.exp(np.median(np.concatenate(state.log_depth))), 1.0], 3)
-    coarse = gauss_newton(images, state, layout, pair_spread, COARSE_TOLERANCE)
+    coarse = gauss_newton(images, state, pair_spread, COARSE_TOLERANCE)
     images = problem.observe_all(pixels)
     depth = [fused_depth(o, coarse.state, noise)[0] for o, noise in zip(images, coarse.noise, strict=True)]
     state = replace(coarse.state, log_depth=[np.log(z) for z in depth])
-    return gauss_newton(images, state, layout, coarse.pair_spread, FINE_TOLERANCE)
+    return gauss_newton(images, state, coarse.pair_spread, FINE_TOLERANCE)
 
 
 @one_blas_thread
 def gauss_newton(
-    images: list[ImageObservations],
-    state: State,
-    layout: Layout,
-    pair_spread: Float[ndarray, "6"],
-    tolerance: float,
+    images: list[ImageObservations], state: State, pair_spread: Float[ndarray, "6"], tolerance: float
 ) -> Solution:
     """Iterate until no unknown moves by more than `tolerance` (rad, or relative).
 
     The weights, and the spread of the pairs' errors, are measured again in each iteration, and depths and pairs' errors
-    eliminated: neither is a problem for least_squares.py. Raises RejectedError where the pointmaps do not determine
-    the unknowns.
+    eliminated: neither is a problem for least_squares.py. The first camera and the product of the pair scales are fixed.
+    Raises RejectedError where the pointmaps do not determine the unknowns.
     """
+    focal = 6 * len(images)
     for iteration in range(1, ITERATIONS + 1):
-        noise, linearised = _linearised(images, state, layout, pair_spread)
-        step, normal = _step(linearised, layout)
-        state, variance = _after_step(images, state, layout, linearised, step)
+        misfit = [
+            residuals(o, state, log_depth) for o, log_depth in zip(images, state.log_depth, strict=True)
+        ]
+        noise = measure_noise(images, misfit)
+        try:
+            # The residuals of an image, which are most of the memory, go as its equations come.
+            equations = [
+                image_equations(o, misfit.pop(0), own, state, pair_spread)
+                for o, own in zip(images, noise, strict=True)
+            ]
+            hessian = sum(e.selection.T @ (e.selection.T @ e.hessian).T for e in equations)
+            gradient = sum(e.selection.T @ e.gradient for e in equations)
+            # A pair without weight keeps its scale.
+            scales = np.arange(focal + 1, len(gradient))
+            hessian[scales, scales] += 1e-9 * hessian.diagonal()[scales].max()
+            hessian[np.ix_(scales, scales)] += GAUGE_WEIGHT * hessian.diagonal()[scales].mean()
+            normal, step = hessian[6:, 6:], np.zeros(len(gradient))
+            step[6:] = -np.linalg.solve(normal, gradient[6:])
+            if not np.isfinite(step).all():
+                raise np.linalg.LinAlgError
+        except np.linalg.LinAlgError:
+            raise RejectedError(UNDETERMINED) from None
+        state, variance = _after_step(images, state, equations, step)
         pair_spread = _spread(state.pair_error, variance, pair_spread)
         settled = bool(np.abs(step).max() < tolerance)
         if settled or iteration == ITERATIONS:
+            covariance = np.zeros((focal, focal))
+            covariance[6:, 6:] = np.linalg.inv(normal)[: focal - 6, : focal - 6]
             return Solution(
                 state=state,
-                covariance=_camera_covariance(normal, layout),
+                covariance=covariance,
                 images=images,
                 noise=noise,
                 pair_spread=pair_spread,
                 settled=settled,
             )
-        del linearised  # or they would stay until the next ones are complete
+        del equations  # or they would stay until the next ones are complete
     raise AssertionError
-
-
-@dataclass(frozen=True)
-class _Linearised:
-    """The normal equations of one image's pointmaps at a state."""
-
-    equations: ImageEquations
-    ties: PairTies
-    reduced: ReducedEquations
-    selection: csr_array
-    """Matrix from a step of all unknowns to the local unknowns of these equations."""
-
-
-def _linearised(
-    images: list[ImageObservations], state: State, layout: Layout, pair_spread: Float[ndarray, "6"]
-) -> tuple[list[Noise], list[_Linearised]]:
-    """Return the noise of every image's pointmaps and the equations weighted by it.
-
-    Raises RejectedError where the equations are singular.
-    """
-    misfit = [residuals(o, state, log_depth) for o, log_depth in zip(images, state.log_depth, strict=True)]
-    noise = measure_noise(images, misfit)
-    observer_axes = adjoint(inverse(state.recon_from_camera))
-    to_twist = twist_from_step(state.recon_from_camera)
-    found = []
-    for o, own in zip(images, noise, strict=True):
-        # The residuals of an image, which are most of the memory, go as its equations come.
-        equations = image_equations(o, misfit.pop(0), own)
-        ties = PairTies(observer_axes[o.observers], state.pair_error[o.second_pairs], pair_spread)
-        try:
-            reduced = equations.reduced(ties)
-        except np.linalg.LinAlgError:
-            raise RejectedError(UNDETERMINED) from None
-        found.append(_Linearised(equations, ties, reduced, _selection(o, layout, to_twist)))
-    return noise, found
-
-
-def _step(
-    linearised: list[_Linearised], layout: Layout
-) -> tuple[Float[ndarray, " p"], Float[ndarray, "q q"]]:
-    """Solve for the step of all unknowns that are not eliminated, and return it with the normal matrix.
-
-    The first camera and the product of the pair scales are fixed (gauge): the matrix lacks the first camera, q = p - 6.
-    Raises RejectedError where the equations are singular.
-    """
-    hessian, gradient = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
-    for image in linearised:
-        hessian += image.selection.T @ (image.selection.T @ image.reduced.hessian).T
-        gradient += image.selection.T @ image.reduced.gradient
-    # A pair without weight keeps its scale.
-    scales = layout.scales
-    hessian[scales, scales] += 1e-9 * hessian.diagonal()[scales].max()
-    hessian[np.ix_(scales, scales)] += GAUGE_WEIGHT * hessian.diagonal()[scales].mean()
-    normal, step = hessian[6:, 6:], np.zeros(layout.size)
-    try:
-        step[6:] = -np.linalg.solve(normal, gradient[6:])
-    except np.linalg.LinAlgError:
-        raise RejectedError(UNDETERMINED) from None
-    if not np.isfinite(step).all():
-        raise RejectedError(UNDETERMINED)
-    return step, normal
-
-
-def _camera_covariance(normal: Float[ndarray, "q q"], layout: Layout) -> Float[ndarray, "r r"]:
-    """Return the covariance of the cameras' steps, r = 6n, zero for the first camera."""
-    size = 6 * layout.images
-    covariance = np.zeros((size, size))
-    covariance[6:, 6:] = np.linalg.inv(normal)[: size - 6, : size - 6]
-    return covariance
 
 
 def _after_step(
     images: list[ImageObservations],
     state: State,
-    layout: Layout,
-    linearised: list[_Linearised],
+    equations: list[ImageEquations],
     step: Float[ndarray, " p"],
 ) -> tuple[State, Float[ndarray, "e 6"]]:
     """Return the state after a step of the unknowns that are not eliminated, and the variances of the pairs' errors."""
-    log_depth, pair_error = [], np.zeros_like(state.pair_error)
-    variance = np.zeros_like(state.pair_error)
-    for o, before, image in zip(images, state.log_depth, linearised, strict=True):
-        local_step = image.selection @ step
-        pair_step = image.reduced.pair_step(local_step)
+    log_depth, pair_error = [], state.pair_error.copy()
+    variance = np.zeros_like(pair_error)
+    for o, before, e in zip(images, state.log_depth, equations, strict=True):
+        local_step = e.selection @ step
+        pair_step = e.gain @ local_step + e.offset
         # An error of a pair moves its view as a step of its observer does.
-        local_step[: pair_step.size] -= pair_step.ravel()
+        local_step[: pair_step.size] -= pair_step
         # A far step of a pixel without parallax must not take it behind or beyond the scene.
-        log_depth.append(before + np.clip(image.equations.depth_step(local_step), -0.5, 0.5))
-        ties = image.ties
-        pair_error[o.second_pairs] = ties.error + np.einsum("kij,kj->ki", ties.axes, pair_step)
-        variance[o.second_pairs] = image.reduced.error_variance
+        depth_step = -(e.depth_gradient + local_step.astype(np.float32) @ e.coupling) / e.depth_hessian
+        log_depth.append(before + np.clip(depth_step, -0.5, 0.5))
+        second_pairs = o.pair[: o.second_count]
+        pair_error[second_pairs] += np.einsum("kij,kj->ki", e.axes, pair_step.reshape(-1, 6))
+        variance[second_pairs] = e.error_variance
+    focal = 6 * len(images)
     after = State(
-        recon_from_camera=retract(state.recon_from_camera, step[: 6 * layout.images].reshape(-1, 6)),
-        log_focal=state.log_focal + float(step[layout.focal]),
-        log_pair_scale=state.log_pair_scale + step[layout.scales],
+        recon_from_camera=retract(state.recon_from_camera, step[:focal].reshape(-1, 6)),
+        log_focal=state.log_focal + float(step[focal]),
+        log_pair_scale=state.log_pair_scale + step[focal + 1 :],
         pair_error=pair_error,
         log_depth=log_depth,
     )
@@ -230,81 +198,118 @@ def _spread(
     return np.repeat(np.maximum(np.sqrt(squared / np.maximum(determined, 0.01)), LEAST_SPREAD), 3)
 
 
-def dense_alignment(problem: Problem, solution: Solution, progress: Progress | None = None) -> Alignment:
-    """Return the alignment of a solution in its own recon frame, with the depth of every pixel."""
-    predictions, state = problem.predictions, solution.state
-    count, (height, width) = predictions.image_count, predictions.conf.shape[1:]
-    depth = np.empty((count, height * width), np.float32)
-    confidence = np.empty_like(depth)
+def image_equations(
+    o: ImageObservations, r: Residuals, noise: Noise, state: State, pair_spread: Float[ndarray, "6"]
+) -> ImageEquations:
+    """Return the Gauss-Newton equations of one image's pointmaps with residuals `r` of spread `noise`.
 
-    def settle(k: int) -> None:
-        for start in range(0, height * width, DEPTH_CHUNK):
-            chunk = slice(start, start + DEPTH_CHUNK)
-            depth[k, chunk], confidence[k, chunk] = fused_depth(
-                observe(problem, k, chunk), state, solution.noise[k]
-            )
+    With v the change of a modelled point, the change of (across, along) has the squared norm
+    vᵀ (α I + β x̂ x̂ᵀ) v, α = w_across/|x|², β = w_along/|x|² − α; every block below is that form for two of
+    the directions an unknown moves the point in: twist (I, −[X]), depth (the arm), focal. Raises LinAlgError where the
+    errors of the pairs cannot be eliminated.
+    """
+    n, maps = o.second_count, len(o.pair)
+    # Of mean 1, so that the hessian is the information in the pointmaps.
+    robust = o.weight / np.maximum(o.weight.mean(), np.float32(1e-12)) * agreement(r, noise)
+    w_across = robust / (noise.across**2 * noise.across_inflation)[:, None]
+    w_along = robust / (noise.along**2 * noise.along_inflation)[:, None]
+    alpha = w_across / r.distance**2
+    beta = w_along / r.distance**2 - alpha
+    toward, arm, focal_arm = r.toward, r.depth_arm, r.focal_arm
+    arm_along, focal_along = (np.einsum("kcm,cm->km", toward, v) for v in (arm, focal_arm))
+    depth_pull = alpha[:, None] * arm + (beta * arm_along)[:, None] * toward
+    focal_pull = alpha[:, None] * focal_arm + (beta * focal_along)[:, None] * toward
+    scale_pull = -w_along / r.distance
+    residual_force = (w_along * r.along / r.distance)[:, None] * toward
+    residual_force -= (w_across / r.distance)[:, None] * r.across
+    screw = _moments(r.x_in_recon, toward[:n])
 
-    # numpy lets go of the interpreter during its loops, so threads share the cores.
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for done, _ in enumerate(pool.map(settle, range(count)), start=1):
-            if progress is not None:
-                progress("align pairs", done / count)
-    focal = float(np.exp(state.log_focal))
-    residual = _pair_residuals(predictions, solution)
-    return Alignment(
-        recon_from_camera=state.recon_from_camera,
-        focal_px=(focal, focal * problem.aspect),
-        principal_point_px=problem.principal_point_px,
-        depth=depth.reshape(count, height, width),
-        confidence=(np.exp(confidence) if problem.log_weight else confidence).reshape(count, height, width),
-        pair_scale=np.exp(state.log_pair_scale),
-        pair_residual=residual,
-        covariance=solution.covariance,
-        notes=_notes(predictions, residual),
-        warnings=_warnings(residual, solution.settled),
+    count = 6 * n
+    twists, scales = np.arange(count).reshape(n, 6), count + np.arange(maps)
+    blocks = twists[:, :, None], twists[:, None, :]
+    hessian = np.zeros((count + maps + 1,) * 2)
+    hessian[blocks] = (screw * beta[:n, None]) @ screw.transpose(0, 2, 1)
+    hessian[blocks] += _isotropic(alpha[:n], r.x_in_recon)
+    hessian[twists, scales[:n, None]] = np.einsum("km,kcm->kc", scale_pull[:n], screw)
+    hessian[twists, -1] = _moments(r.x_in_recon, focal_pull[:n]).sum(axis=2)
+    hessian[scales, scales] = w_along.sum(axis=1)
+    hessian[scales, -1] = np.einsum("km,km->k", scale_pull, focal_along)
+    hessian[-1, -1] = np.vdot(focal_pull.sum(axis=0), focal_arm)
+    hessian[scales[:n, None], twists] = hessian[twists, scales[:n, None]]
+    hessian[-1, :-1] = hessian[:-1, -1]
+    gradient = np.concatenate(
+        [
+            _moments(r.x_in_recon, residual_force[:n]).sum(axis=2).ravel(),
+            -(w_along * r.along).sum(axis=1),
+            [np.vdot(residual_force.sum(axis=0), focal_arm)],
+        ]
+    )
+    coupling = np.concatenate(
+        [
+            _moments(r.x_in_recon, depth_pull[:n]).reshape(count, arm.shape[1]),
+            scale_pull * arm_along,
+            (depth_pull.sum(axis=0) * focal_arm).sum(axis=0)[None],
+        ]
+    )
+    depth_gradient = (residual_force.sum(axis=0) * arm).sum(axis=0)
+    depth_hessian = (depth_pull.sum(axis=0) * arm).sum(axis=0)
+    # A pixel without weight keeps its depth.
+    depth_hessian += np.float32(1e-6) * depth_hessian.max() + np.float32(1e-30)
+    scaled = coupling / depth_hessian
+    hessian -= (scaled @ coupling.T).astype(np.float64)
+    gradient -= (scaled @ depth_gradient).astype(np.float64)
+
+    axes = adjoint(inverse(state.recon_from_camera[o.observer[:n]]))
+    tied = hessian[:count, :count].copy()
+    tied[blocks] += axes.transpose(0, 2, 1) @ (axes / pair_spread[:, None] ** 2)
+    covariance = np.linalg.inv(tied)
+    pull = np.einsum("kji,kj->ki", axes, state.pair_error[o.pair[:n]] / pair_spread**2)
+    gain, offset = covariance @ hessian[:count], covariance @ (gradient[:count] - pull.ravel())
+    return ImageEquations(
+        hessian=hessian - hessian[:, :count] @ gain,
+        gradient=gradient - hessian[:, :count] @ offset,
+        selection=_selection(o, state),
+        gain=gain,
+        offset=offset,
+        axes=axes,
+        error_variance=np.einsum("kij,kjl,kil->ki", axes, covariance[blocks], axes),
+        depth_hessian=depth_hessian,
+        depth_gradient=depth_gradient,
+        coupling=coupling,
     )
 
 
-def _pair_residuals(predictions: PairPredictions, solution: Solution) -> Float[ndarray, " e"]:
-    """Return the residual of each pair, the larger of its two views'."""
-    residual = np.zeros(len(predictions.edges))
-    for o, noise in zip(solution.images, solution.noise, strict=True):
-        np.maximum.at(residual, o.pair, np.sqrt(2 * noise.across**2 + noise.along**2))
-    return residual
+def _moments(x: Float[ndarray, "3 m"], force: Float[ndarray, "n 3 m"]) -> Float[ndarray, "n 6 m"]:
+    """Return (I, −[X])ᵀ applied to forces at points X: force and moment."""
+    out = np.empty((len(force), 6, x.shape[1]), np.float32)
+    out[:, :3] = force
+    for row, (a, b) in enumerate(((1, 2), (2, 0), (0, 1)), start=3):
+        out[:, row] = x[a] * force[:, b] - x[b] * force[:, a]
+    return out
 
 
-def _warnings(residual: Float[ndarray, " e"], settled: bool) -> tuple[str, ...]:
-    """Return warnings on an alignment that did not settle or whose pairs disagree."""
-    warnings, middle = [], float(np.median(residual))
-    if not settled:
-        warnings.append(f"the alignment had not settled after {ITERATIONS} iterations and may be wrong")
-    if middle > USELESS:
-        warnings.append(
-            f"the pairs disagree by {100 * middle:.0f} % of the distance; nothing can be built on them"
-        )
-    return tuple(warnings)
+def _isotropic(alpha: Float[ndarray, "n m"], x: Float[ndarray, "3 m"]) -> Float[ndarray, "n 6 6"]:
+    """Return Σ α (I, −[X])ᵀ (I, −[X]) over the pixels, from the weights' moments of X."""
+    products = (x[:, None] * x).reshape(9, -1)
+    moments = alpha @ np.concatenate([np.ones_like(x[:1]), x, products]).T
+    second = moments[:, 4:].reshape(-1, 3, 3)
+    out = np.zeros((len(alpha), 6, 6))
+    out[:, :3, :3] = moments[:, :1, None] * np.eye(3)
+    out[:, 3:, :3] = skew(moments[:, 1:4].astype(np.float64))
+    out[:, :3, 3:] = out[:, 3:, :3].transpose(0, 2, 1)
+    out[:, 3:, 3:] = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
+    return out
 
 
-def _notes(predictions: PairPredictions, residual: Float[ndarray, " e"]) -> tuple[str, ...]:
-    """Return a note that names the pairs that contradict the others."""
-    bad = np.flatnonzero(residual > CONTRADICTION * float(np.median(residual)))
-    if not len(bad):
-        return ()
-    names = predictions.names
-    pairs = ", ".join(f"{names[n]}-{names[m]}" for n, m in predictions.edges[bad[:5]])
-    more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
-    return (f"{len(bad)} of {len(residual)} pairs contradict the others and count little: {pairs}{more}",)
-
-
-def _selection(o: ImageObservations, layout: Layout, to_twist: Float[ndarray, "n 6 6"]) -> csr_array:
+def _selection(o: ImageObservations, state: State) -> csr_array:
     """Return the matrix from a step of all unknowns to the local unknowns of an image's equations."""
-    n, maps = o.second_count, len(o.pair)
+    n, maps, focal = o.second_count, len(o.pair), 6 * len(state.recon_from_camera)
+    observers, to_twist = o.observer[:n], twist_from_step(state.recon_from_camera)
     twists, scales = np.arange(6 * n).reshape(n, 6, 1), 6 * n + np.arange(maps)
-    blocks, block = (n, 6, 6), np.arange(6)
-    own, observers = 6 * o.image + block, 6 * o.observers[:, None, None] + block
-    rows = [np.broadcast_to(twists, blocks).ravel()] * 2 + [scales, [6 * n + maps]]
-    columns = [np.broadcast_to(of, blocks).ravel() for of in (own, observers)]
-    columns += [layout.scales[o.pair], [layout.focal]]
-    signs = [np.tile(to_twist[o.image].ravel(), n), -to_twist[o.observers].ravel(), np.ones(maps + 1)]
+    own, theirs = 6 * o.image + np.arange(6), 6 * observers[:, None, None] + np.arange(6)
+    rows = [np.broadcast_to(twists, (n, 6, 6)).ravel()] * 2 + [scales, [6 * n + maps]]
+    columns = [np.broadcast_to(of, (n, 6, 6)).ravel() for of in (own, theirs)]
+    columns += [focal + 1 + o.pair, [focal]]
+    signs = [np.tile(to_twist[o.image].ravel(), n), -to_twist[observers].ravel(), np.ones(maps + 1)]
     entries = np.concatenate(signs), (np.concatenate(rows), np.concatenate(columns))
-    return csr_array(entries, shape=(6 * n + maps + 1, layout.size))
+    return csr_array(entries, shape=(6 * n + maps + 1, focal + 1 + len(state.log_pair_scale)))

@@ -1,10 +1,9 @@
 """Pointmaps of all pairs at chosen pixels of one image, as arrays."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.errors import InputError
@@ -43,7 +42,7 @@ class Problem:
 
     def observe_all(self, count: int) -> "list[ImageObservations]":
         """Gather all pointmaps at about `count` pixels of every image."""
-        return [observe(self, k, pixels) for k, pixels in enumerate(choose_pixels(self, count))]
+        return [observe(self, k, pixels) for k, pixels in enumerate(_choose_pixels(self, count))]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +53,8 @@ class ImageObservations:
     """
 
     image: int
+    second_count: int
+    """Number of second views."""
     pixel_offset: Float[ndarray, "2 m"]
     """x, y minus the principal point, y divided by fy/fx: over fx they are the ray at unit depth."""
     cell: Float[ndarray, "m c"]
@@ -61,30 +62,14 @@ class ImageObservations:
     pair: Int[ndarray, " k"]
     observer: Int[ndarray, " k"]
     """The image in whose camera frame the pointmap is."""
-    second: Bool[ndarray, " k"]
     direction: Float[ndarray, "k 3 m"]
     """Unit vectors to the predicted points, in the observer's camera frame."""
     log_range: Float[ndarray, "k m"]
     """Log of the points' distance to the observer, in the pair's unit."""
     weight: Float[ndarray, "k m"]
 
-    @property
-    def second_count(self) -> int:
-        """Number of second views, which come first."""
-        return int(self.second.sum())
 
-    @property
-    def second_pairs(self) -> Int[ndarray, " n"]:
-        """Pairs of the second views."""
-        return self.pair[self.second]
-
-    @property
-    def observers(self) -> Int[ndarray, " n"]:
-        """Observers of the second views."""
-        return self.observer[self.second]
-
-
-def choose_pixels(problem: Problem, count: int) -> list[Int[ndarray, " _"]]:
+def _choose_pixels(problem: Problem, count: int) -> list[Int[ndarray, " _"]]:
     """Choose per image the most confident pixel of each of about `count` equal cells; return flat indices.
 
     Equal cells keep the whole field of view, which a plain ranking by confidence would give up. Cells without
@@ -94,18 +79,15 @@ def choose_pixels(problem: Problem, count: int) -> list[Int[ndarray, " _"]]:
     height, width = predictions.conf.shape[1:]
     side = np.sqrt(max(1.0, height * width / count))
     rows, columns = max(1, round(height / side)), max(1, round(width / side))
-    cell = (
-        (np.arange(height)[:, None] * rows // height) * columns + np.arange(width) * columns // width
-    ).ravel()
+    y, x = np.indices((height, width)).reshape(2, -1)
+    cell = y * rows // height * columns + x * columns // width
     by_cell = np.argsort(cell, kind="stable")
     starts = np.searchsorted(cell[by_cell], np.arange(rows * columns))
 
     total = np.zeros((predictions.image_count, height * width), np.float32)
-    for (first, second), conf, conf2 in zip(
-        predictions.edges, predictions.conf, predictions.conf2, strict=True
-    ):
-        total[first] += conf.ravel()
-        total[second] += conf2.ravel()
+    for edge, *confidences in zip(predictions.edges, predictions.conf, predictions.conf2, strict=True):
+        for image, confidence in zip(edge, confidences, strict=True):
+            total[image] += confidence.ravel()
     shown = np.bincount(predictions.edges.ravel(), minlength=len(total)).astype(np.float32)
     chosen = []
     for k, weight in enumerate(problem.weigh(total / shown[:, None])):
@@ -124,9 +106,8 @@ def observe(problem: Problem, image: int, pixels: Int[ndarray, " m"] | slice) ->
     """Gather the pointmaps of all pairs at `pixels` (flat indices) of one image."""
     predictions = problem.predictions
     height, width = predictions.conf.shape[1:]
-    as_second = np.flatnonzero(predictions.edges[:, 1] == image)
-    as_first = np.flatnonzero(predictions.edges[:, 0] == image)
-    sources: Sequence[tuple[ndarray, ndarray, ndarray]] = (
+    as_first, as_second = (np.flatnonzero(predictions.edges[:, side] == image) for side in (0, 1))
+    sources = (
         (as_second, predictions.pts3d_in_other_view, predictions.conf2),
         (as_first, predictions.pts3d, predictions.conf),
     )
@@ -135,20 +116,18 @@ def observe(problem: Problem, image: int, pixels: Int[ndarray, " m"] | slice) ->
     distance = np.sqrt(np.einsum("kcm,kcm->km", points, points))
     usable = distance > 1e-12
     distance[~usable] = 1.0
-    weight = problem.weigh(confidence)
-    flat = np.arange(height * width)[pixels]
-    y, x = np.divmod(flat, width)
+    y, x = np.divmod(np.arange(height * width)[pixels], width)
     cx, cy = problem.principal_point_px
     coarse = (y * CELL_SIDE // height) * CELL_SIDE + x * CELL_SIDE // width
     pair = np.concatenate([as_second, as_first])
     return ImageObservations(
         image=image,
+        second_count=len(as_second),
         pixel_offset=np.stack([x - cx, (y - cy) / problem.aspect]).astype(np.float32),
         cell=(coarse[:, None] == np.arange(CELL_SIDE**2)).astype(np.float32),
         pair=pair,
         observer=predictions.edges[pair, 0],
-        second=np.arange(len(pair)) < len(as_second),
         direction=points / distance[:, None],
         log_range=np.log(distance),
-        weight=np.where(usable, weight, np.float32(0.0)),
+        weight=np.where(usable, problem.weigh(confidence), np.float32(0.0)),
     )

@@ -1,4 +1,4 @@
-"""Residuals of pairwise pointmaps against a reconstruction, and their weights.
+"""Residuals of pairwise pointmaps against a reconstruction, their weights, and the depth that they give each pixel.
 
 A predicted point errs differently *across* its line of sight (where in the observer's image it appears) and
 *along* it (how far it is): networks know directions several times better than distances, and their errors in
@@ -12,7 +12,7 @@ per pointmap by their median, and per kind of view by how far neighbouring resid
 contradict the others get large variances and so little weight.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -25,6 +25,8 @@ ROBUST_WIDTH = 3.0
 """Standard deviations at which a residual's weight has fallen to a quarter (Geman-McClure)."""
 LEAST_NOISE = np.float32(1e-4)
 """Least standard deviation; far below it the rounding of float32 sums would count as evidence."""
+DEPTH_ITERATIONS = 2
+"""The initial median is within two per cent of the result."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,12 +72,11 @@ class Residuals:
     along: Float[ndarray, "k m"]
 
 
-def residuals(observations: ImageObservations, state: State, log_depth: Float[ndarray, " m"]) -> Residuals:
+def residuals(o: ImageObservations, state: State, log_depth: Float[ndarray, " m"]) -> Residuals:
     """Model one image's points at `log_depth` and compare them with every pointmap that shows them."""
-    o = observations
-    camera = state.recon_from_camera[o.image]
-    error = np.where(o.second[:, None], state.pair_error[o.pair], 0.0)
-    observer = state.recon_from_camera[o.observer]
+    camera, observer = state.recon_from_camera[o.image], state.recon_from_camera[o.observer]
+    error = state.pair_error[o.pair]
+    error[o.second_count :] = 0
     observer = retract(observer, (step_axes(observer[:, :3, :3]) @ error[..., None])[..., 0])
 
     depth = np.exp(log_depth).astype(np.float32)
@@ -114,34 +115,22 @@ def measure_noise(images: list[ImageObservations], misfit: list[Residuals]) -> l
     A spread is at least a third of the usual one of its kind, so that no pair outweighs all others by a lucky fit.
     """
     own = [_own_noise(o, r) for o, r in zip(images, misfit, strict=True)]
-    second = np.concatenate([o.second for o in images])
-    usual = np.ones((2, len(fields(Noise))), np.float32)
-    for column, part in enumerate(fields(Noise)):
-        values = np.concatenate([getattr(noise, part.name) for noise in own])
-        for kind in (0, 1):
-            if (second == kind).any():
-                usual[kind, column] = np.median(values[second == kind])
+    is_second = [np.arange(len(o.pair)) < o.second_count for o in images]
+    values, second = np.concatenate(own, axis=1), np.concatenate(is_second)
+    usual = {kind: np.median(values[:, second == kind], axis=1) for kind in set(second.tolist())}
     result = []
-    for o, noise in zip(images, own, strict=True):
-        across, along, across_inflation, along_inflation = usual[o.second.astype(int)].T
-        result.append(
-            Noise(
-                np.maximum(noise.across, across / 3),
-                np.maximum(noise.along, along / 3),
-                across_inflation,
-                along_inflation,
-            )
-        )
+    for noise, kinds in zip(own, is_second, strict=True):
+        of_kind = np.stack([usual[kind] for kind in kinds.tolist()], axis=1)
+        result.append(Noise(*np.maximum(noise[:2], of_kind[:2] / 3), *of_kind[2:]))
     return result
 
 
-def _own_noise(observations: ImageObservations, r: Residuals) -> Noise:
-    """Estimate the spread per pointmap from medians, and the inflation from the agreement within cells."""
+def _own_noise(o: ImageObservations, r: Residuals) -> Float[ndarray, "4 k"]:
+    """Estimate spreads per pointmap from medians, and inflations from the agreement within cells; fields of Noise."""
     across = np.maximum(np.sqrt(np.median(r.across_squared, axis=1) / 1.386), LEAST_NOISE)
     along = np.maximum(1.4826 * np.median(np.abs(r.along), axis=1), LEAST_NOISE)
-    weight = observations.weight * agreement(r, Noise(across, along, across, along))
-    across_inflation = _inflation(observations, weight, r.across)
-    return Noise(across, along, across_inflation, _inflation(observations, weight, r.along[:, None]))
+    weight = o.weight * agreement(r, Noise(across, along, across, along))
+    return np.stack([across, along, _inflation(o, weight, r.across), _inflation(o, weight, r.along[:, None])])
 
 
 def _inflation(
@@ -156,3 +145,40 @@ def _inflation(
     variance_of_means = np.einsum("kcg,kcg,kg->k", means, means, cell_total) / total
     per_cell = weight.shape[1] / CELL_SIDE**2
     return np.maximum(1.0, per_cell * variance_of_means / np.maximum(variance, 1e-30))
+
+
+def initial_depth(o: ImageObservations, state: State) -> Float[ndarray, " m"]:
+    """Return the median over the pairs of the predicted depth, of first views alone where the image has any."""
+    n, camera = o.second_count, state.recon_from_camera[o.image]
+    scale = np.exp(o.log_range + state.log_pair_scale[o.pair].astype(np.float32)[:, None])
+    if n < len(o.pair):
+        return np.maximum(np.median(scale[n:] * o.direction[n:, 2], axis=0), 1e-6)
+    observer = state.recon_from_camera[o.observer]
+    forward = (camera[:3, 2] @ observer[:, :3, :3]).astype(np.float32)
+    ahead = ((observer[:, :3, 3] - camera[:3, 3]) @ camera[:3, 2]).astype(np.float32)
+    depths = scale * np.einsum("kc,kcm->km", forward, o.direction) + ahead[:, None]
+    return np.maximum(np.median(depths, axis=0), 1e-6)
+
+
+def fused_depth(
+    o: ImageObservations, state: State, noise: Noise
+) -> tuple[Float[ndarray, " m"], Float[ndarray, " m"]]:
+    """Estimate the depth of the observed pixels by Gauss-Newton from `initial_depth`, and their mean weight.
+
+    Every pointmap is independent and counts by its agreement and its noise.
+    """
+    log_depth, weight = np.log(initial_depth(o, state)), o.weight
+    for _ in range(DEPTH_ITERATIONS):
+        r = residuals(o, state, log_depth)
+        weight = o.weight * agreement(r, noise)
+        over_distance = weight / r.distance
+        w_across, w_along = (over_distance / of[:, None] ** 2 for of in (noise.across, noise.along))
+        along_arm = np.einsum("kcm,cm->km", r.toward, r.depth_arm)
+        hessian = (w_along - w_across) / r.distance * along_arm**2
+        hessian += w_across / r.distance * (r.depth_arm**2).sum(axis=0)
+        gradient = w_along * r.along * along_arm - w_across * np.einsum("kcm,cm->km", r.across, r.depth_arm)
+        total = hessian.sum(axis=0)
+        total += np.float32(1e-6) * total.max() + np.float32(1e-30)
+        log_depth -= np.clip(gradient.sum(axis=0) / total, -0.3, 0.3)
+    share = noise.along**-2 / (noise.along**-2).sum()
+    return np.exp(log_depth), share @ weight

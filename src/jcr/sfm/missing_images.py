@@ -1,0 +1,165 @@
+"""Images that the mapper leaves out, registered where the gripper poses and the map's own X predict their cameras.
+
+Predicted cameras are some millimetres and tenths of a degree off: points are triangulated and adjusted in turn. Matching
+of whole images loses features that resemble others of the image; near a point's projection few compete with them, and
+more points of the map are searched there.
+"""
+
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial import KDTree
+
+from jcr.camera import HALF_PIXEL
+from jcr.estimation.robust import robust_fit
+from jcr.features.matchers import Matcher
+from jcr.geometry import inverse, transform
+
+PASSES = ((32.0, 1, 4.0), (8.0, 1, 1.0), (4.0, 5, 0.5))
+"""Largest reprojection error of a point (px), refinements of each triangulation, and scale (px) of the loss of the
+adjustment after it."""
+LEAST_POINTS = 15
+"""Least number of points of an image that images of the map see, too."""
+LEAST_MAPPED = 4
+"""Least number of mapped cameras from which others are predicted."""
+RADII_PX = (8.0, 4.0)
+"""Largest distances from a projection in turn; the camera is adjusted after each."""
+RATIO = 0.85
+"""Largest ratio of a descriptor's distances to the best and second best keypoint near the projection."""
+LARGEST_PX = 4.0
+"""Reprojection error above which an observation is a mismatch, as COLMAP's."""
+
+Adjust = Callable[[pycolmap.Reconstruction, float], None]
+"""Bundle adjustment of a model, free of the gripper poses, with the scale of the loss (px)."""
+Cameras = dict[int, Float[ndarray, "4 4"]]
+"""recon_from_camera by row of the image."""
+
+
+def rows_of(model: pycolmap.Reconstruction) -> list[int]:
+    """Return the rows of a model's images."""
+    return sorted(image_id - 1 for image_id in model.reg_image_ids())
+
+
+def poses_of(model: pycolmap.Reconstruction, rows: Sequence[int]) -> Float[ndarray, "m 4 4"]:
+    """Return recon_from_camera of mapped images."""
+    mapped = [model.image(row + 1).cam_from_world() for row in rows]
+    if not mapped:
+        return np.zeros((0, 4, 4))
+    return inverse(np.stack([transform(m.rotation.matrix(), m.translation) for m in mapped]))
+
+
+def with_missing_images(
+    database: Path,
+    model: pycolmap.Reconstruction,
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    matcher: Matcher,
+    adjust: Adjust,
+) -> pycolmap.Reconstruction:
+    """Return the model with the images that it lacks, where points confirm the cameras that its own X predicts."""
+    rows = rows_of(model)
+    poses = poses_of(model, rows)
+    if len(rows) < LEAST_MAPPED:
+        return model
+    fit = robust_fit(base_from_gripper[rows], poses)
+    agree, state = fit.problem.used, fit.state
+    assert agree is not None
+    if state.scale <= 0 or agree.sum() < LEAST_MAPPED - 1:
+        return model
+    predicted = inverse(state.z[0]) @ base_from_gripper @ state.x[0]
+    predicted[:, :3, 3] /= state.scale
+    larger, cameras = model, dict(enumerate(predicted)) | dict(zip(rows, poses, strict=True))
+    for largest_px, refinements, scale_px in PASSES:
+        larger = triangulated(database, larger.camera(1), cameras, largest_px, refinements)
+        tied = Counter[int]()
+        for point in larger.points3D.values():
+            seen_by = {element.image_id - 1 for element in point.track.elements}
+            if not seen_by.isdisjoint(rows):
+                tied.update(seen_by)
+        for row in cameras:
+            if tied[row] < LEAST_POINTS:
+                larger.deregister_frame(larger.image(row + 1).frame_id)
+        if larger.num_reg_images() <= len(rows):
+            return model
+        adjust(larger, scale_px)
+        cameras = dict(zip(rows_of(larger), poses_of(larger, rows_of(larger)), strict=True))
+    images = {row + 1 for row in cameras if row not in rows}
+    filters = pycolmap.ObservationManager(larger)
+    for radius_px in RADII_PX:
+        for image_id in sorted(images):
+            _complete(larger, image_id, matcher, radius_px)
+        filters.filter_points3D_in_images(LARGEST_PX, 0.0, images)
+        adjust(larger, PASSES[-1][2])
+        filters.filter_points3D_in_images(LARGEST_PX, 0.0, images)
+    return larger
+
+
+def triangulated(
+    database: Path,
+    camera: pycolmap.Camera,
+    recon_from_camera: Cameras,
+    largest_px: float = 4.0,
+    refinements: int = 5,
+) -> pycolmap.Reconstruction:
+    """Return a model of fixed cameras with points from all verified matches; the same, bit for bit, for the same input.
+
+    Points with a reprojection error above `largest_px` are left out.
+    """
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.ba_global_max_refinements = refinements
+    options.random_seed = options.triangulation.random_seed = 0
+    options.mapper.filter_max_reproj_error = largest_px
+    options.triangulation.merge_max_reproj_error = largest_px
+    options.triangulation.complete_max_reproj_error = largest_px
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera)
+    with closing(pycolmap.Database.open(database)) as db:
+        for row, pose in sorted(recon_from_camera.items()):
+            image = db.read_image(row + 1)
+            keypoints = [pycolmap.Point2D(xy) for xy in db.read_keypoints(row + 1)[:, :2]]
+            image.points2D = pycolmap.Point2DList(keypoints)
+            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(inverse(pose)[:3]))
+    with tempfile.TemporaryDirectory(prefix="jcr-points-") as folder:
+        return pycolmap.triangulate_points(
+            model, database, folder, Path(folder), refine_intrinsics=False, options=options
+        )
+
+
+def _complete(model: pycolmap.Reconstruction, image_id: int, matcher: Matcher, radius_px: float) -> None:
+    """Add the keypoints of one image that match points projected near them."""
+    image, x_px, descriptors = model.image(image_id), matcher.x_px, matcher.features.descriptors
+    observed = {keypoint.point3D_id for keypoint in image.points2D if keypoint.has_point3D()}
+    free = np.array([k for k, keypoint in enumerate(image.points2D) if not keypoint.has_point3D()], int)
+    point_ids = np.array(sorted(set(model.point3D_ids()) - observed), int)
+    if not len(free) or not len(point_ids):
+        return
+    pose = image.cam_from_world()
+    xyz = np.array([model.point3D(int(one)).xyz for one in point_ids])
+    x_in_camera = xyz @ pose.rotation.matrix().T + pose.translation
+    point_ids, x_in_camera = (part[x_in_camera[:, 2] > 0] for part in (point_ids, x_in_camera))
+    projected = np.reshape(model.camera(image.camera_id).img_from_cam(x_in_camera), (-1, 2))
+    near = KDTree(x_px[image_id - 1][free] + HALF_PIXEL).query_ball_point(projected, radius_px)
+    # The distances of each point's mean descriptor to the keypoints near its projection; a keypoint has one point.
+    candidates = []
+    for point_id, some in zip(point_ids.tolist(), near, strict=True):
+        if not len(some):
+            continue
+        track = model.point3D(point_id).track.elements
+        mean = sum(descriptors[element.image_id - 1][element.point2D_idx] for element in track)
+        cosine = descriptors[image_id - 1][free[some]] @ (mean / max(float(np.linalg.norm(mean)), 1e-9))
+        distance = np.sqrt(np.maximum(2 - 2 * cosine, 0))
+        first, second = np.sort(np.append(distance, np.inf))[:2]
+        candidates.append((first, second, int(free[some[int(distance.argmin())]]), point_id))
+    taken = set()
+    for first, second, keypoint, point_id in sorted(candidates):
+        if keypoint not in taken:
+            taken.add(keypoint)
+            if first < matcher.features.farthest and first < RATIO * second:
+                model.add_observation(point_id, pycolmap.TrackElement(image_id, keypoint))
