@@ -30,7 +30,7 @@ from jcr.geometry import (
     transform,
 )
 from jcr.pointmaps.dust3r.pair_graph import complete_pairs
-from jcr.pointmaps.global_alignment.align import Alignment, global_align
+from jcr.pointmaps.global_alignment.align import global_align
 from jcr.reconstruct import ReconstructOptions, reconstruct
 from simulation.capture import SimulateOptions, simulate
 from simulation.pairs import PairErrors, pairs_of_capture, synthetic_pairs, write_pairs
