@@ -144,7 +144,7 @@ def _complete(model: pycolmap.Reconstruction, image_id: int, matcher: Matcher, r
     xyz = np.array([model.point3D(int(one)).xyz for one in point_ids])
     x_in_camera = xyz @ pose.rotation.matrix().T + pose.translation
     point_ids, x_in_camera = (part[x_in_camera[:, 2] > 0] for part in (point_ids, x_in_camera))
-    projected = np.reshape(model.camera(image.camera_id).img_from_cam(x_in_camera), (-1, 2))
+    projected = np.asarray(model.camera(image.camera_id).img_from_cam(x_in_camera)).reshape(-1, 2)
     near = KDTree(x_px[image_id - 1][free] + HALF_PIXEL).query_ball_point(projected, radius_px)
     # The distances of each point's mean descriptor to the keypoints near its projection; a keypoint has one point.
     candidates = []

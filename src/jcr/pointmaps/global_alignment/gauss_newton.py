@@ -124,8 +124,8 @@ def gauss_newton(
                 image_equations(o, misfit.pop(0), own, state, pair_spread)
                 for o, own in zip(images, noise, strict=True)
             ]
-            hessian = sum(e.selection.T @ (e.selection.T @ e.hessian).T for e in equations)
-            gradient = sum(e.selection.T @ e.gradient for e in equations)
+            hessian = np.sum([e.selection.T @ (e.selection.T @ e.hessian).T for e in equations], axis=0)
+            gradient = np.sum([e.selection.T @ e.gradient for e in equations], axis=0)
             # A pair without weight keeps its scale.
             scales = np.arange(focal + 1, len(gradient))
             hessian[scales, scales] += 1e-9 * hessian.diagonal()[scales].max()

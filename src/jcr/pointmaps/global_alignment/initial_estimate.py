@@ -69,7 +69,7 @@ def _own_depth(o: ImageObservations, focal: float) -> tuple[Float[ndarray, " m"]
     if len(o.pair) > o.second_count:
         forward = np.maximum(o.direction[o.second_count :, 2], 1e-6).astype(np.float64)
         log_depth = o.log_range[o.second_count :] + np.log(forward)
-        shift = np.median(log_depth, axis=1)
+        shift, middle = np.median(log_depth, axis=1), log_depth[0]
         for _ in range(3):
             middle = np.median(log_depth - shift[:, None], axis=0)
             shift = np.median(log_depth - middle, axis=1)
@@ -98,7 +98,7 @@ def _similarities(
     x = np.concatenate([o.pixel_offset / focal, np.ones_like(o.pixel_offset[:1])]) * depth
     scale = np.exp(o.log_range[:n] - unit[:, None])
     y, weight = o.direction[:n] * scale[:, None], o.weight[:n].astype(np.float64)
-    robust = weight
+    robust, middle, pose, ratio = weight, np.zeros((n, 1)), np.zeros((n, 4, 4)), np.ones(n)
     for _ in range(6):
         pose, ratio = fit_similarity(np.swapaxes(y, 1, 2), x.T, robust)
         transformed = ratio[:, None, None] * (pose[:, :3, :3] @ x) + pose[:, :3, 3:]
