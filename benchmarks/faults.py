@@ -28,8 +28,7 @@ from jcr.records import HandEye
 from simulation import image_faults as make
 from simulation.faults import Faults, FaultyCapture, faulty_capture, reconstructed
 from simulation.image_faults import IMAGES as FEW_IMAGES
-from simulation.image_faults import ImageFault
-from simulation.rendered import rendered
+from simulation.image_faults import ImageFault, rendered
 
 IMAGES, SCENES = 12, 5
 """Images of a capture of observations, and rendered scenes."""

@@ -38,10 +38,10 @@ from simulation.arms import (
     view_size,
     views,
 )
+from simulation.capture import pinhole
 from simulation.poses import looking_at
 from simulation.render import render
 from simulation.scenes import Scene, make_scene, moved
-from simulation.taken import pinhole
 
 REQUIRE = (2.0, 0.3)
 """mm, degrees: 95 % of errors of a seen point, and of directions there."""

@@ -37,9 +37,16 @@ from jcr.segments.labels import read_labels
 from jcr.segments.measure import ObjectSize, measure_objects
 from jcr.segments.tabletop import label_tabletop
 from simulation.capture import SimulateOptions, simulate
-from simulation.scenes import make_scene
-from simulation.surface import solid_labels, surface_in_workspace, true_surface
-from simulation.truth import TrueObject, Truth, read_truth, true_depth, true_labels
+from simulation.scenes import make_scene, solid_labels
+from simulation.truth import (
+    TrueObject,
+    Truth,
+    read_truth,
+    surface_in_workspace,
+    true_depth,
+    true_labels,
+    true_surface,
+)
 
 VIEWS, POINTS = 12, 200_000
 QUERIES, SPHERES, FCL_SPHERES = 2_000_000, 1_000_000, 20_000

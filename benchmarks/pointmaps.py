@@ -14,8 +14,7 @@ from jcr.pipeline.run import run as run_all
 from jcr.reconstruct import ReconstructOptions
 from simulation.capture import SimulateOptions, simulate
 from simulation.pairs import pairs_of_capture, write_pairs
-from simulation.surface import surface_in_workspace
-from simulation.truth import read_truth
+from simulation.truth import read_truth, surface_in_workspace
 
 IMAGES, NOISES = (3, 5, 10), ((0.0, 0.0), (0.5, 0.1))
 """Numbers of images, and robot pose noise in mm and degrees per axis."""

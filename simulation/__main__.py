@@ -9,8 +9,7 @@ import tyro
 
 from jcr.errors import InputError
 from jcr.progress import progress_bars
-from simulation.capture import simulate
-from simulation.options import SimulateOptions
+from simulation.capture import SimulateOptions, simulate
 
 
 @dataclass(frozen=True)
@@ -18,8 +17,8 @@ class Arguments:
     """A capture of a simulated tabletop, rendered with MuJoCo, with the ground truth beside it.
 
     OUT holds capture.json and images/ as any capture does, reference.json (the true hand-eye transform; for a robot
-    with errors the effective one, and the physical one beside it) and truth/ (scene.json: heights, boxes, poses;
-    robot.json: the robot's errors; depth and labels per image).
+    with errors the effective one, and the physical one and the errors beside it) and truth/ (scene.json: heights, boxes,
+    poses; depth and labels per image).
 
     examples:
       python -m simulation captures/simulated

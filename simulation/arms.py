@@ -18,7 +18,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.estimation.inverse_kinematics import inverse_kinematics, reach_toward
+from jcr.estimation.inverse_kinematics import reach_toward
 from jcr.estimation.kinematics import (
     LINK_ERRORS,
     Arm,
@@ -32,7 +32,7 @@ from jcr.estimation.kinematics import (
 )
 from jcr.estimation.mounting import Fit, fit_known_scale
 from jcr.geometry import inverse, rotation_exp, skew, transform
-from simulation.poses import Pattern, gripper_poses, random_hand_eye
+from simulation.poses import gripper_poses, random_hand_eye
 
 EFFECTIVE_POSES = 120
 """Poses to which the effective hand-eye transform is fitted."""
@@ -261,31 +261,6 @@ def _shows(
         & (ratio > NEAREST)
         & (ratio < FARTHEST)
     )
-
-
-def patterned(
-    arm: Arm,
-    pattern: Pattern,
-    count: int,
-    target_in_base: Float[ndarray, "3"],
-    gripper_from_camera: Float[ndarray, "4 4"],
-    rng: np.random.Generator,
-) -> Joints:
-    """Joint angles (n,dof) of a pattern of views about a target; InputError where the arm does not reach them all.
-
-    The pattern `varied` is fitted to the arm (`views`); the others, each hiding something, must be exact.
-    """
-    if pattern == "varied":
-        return views(arm, count, gripper_from_camera, rng, target_in_base)
-    posture = inverse_kinematics(
-        arm, gripper_poses(pattern, count, target_in_base, gripper_from_camera, rng), np.eye(4)
-    )
-    if not posture.fits:
-        raise InputError(
-            f"--pattern {pattern}: a {arm.name} does not reach all of its views (up to "
-            f"{1e3 * posture.misfit_m.max():.0f} mm off); choose a larger arm, another --seed, or varied"
-        )
-    return posture.joints
 
 
 def effective_about(

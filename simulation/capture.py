@@ -1,40 +1,89 @@
-"""Simulated captures: images of a wrist camera on its way over a scene, of further cameras, and the ground truth."""
+"""Simulated captures: images of a wrist camera on its way over a scene, of fixed cameras, and the ground truth."""
 
 import json
-from dataclasses import asdict, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
+import cv2
 import numpy as np
-from jaxtyping import Float, UInt16
+import tyro
+from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from jcr.capture.formats import capture_json
 from jcr.capture.images import encode_png
 from jcr.errors import InputError
-from jcr.estimation.arms import arm_named
+from jcr.estimation.arms import CHOICES, RobotName, arm_named
 from jcr.files import write_bytes, write_text
+from jcr.geometry import retract
 from jcr.progress import Progress, silent, steps
-from jcr.records import Capture, CellCamera, Mount
-from simulation.arms import EFFECTIVE_POSES, BentArm, ErrorSizes, bend, table_center
-from simulation.motion import (
-    Motion,
-    base_across_table,
-    base_from_other_base,
-    carried_motion,
-    fixed_camera,
-    motion_over_table,
-    second_on_wrist,
-)
-from simulation.objects import carried_package
-from simulation.options import SimulateOptions
+from jcr.records import Capture, CellCamera, Intrinsics
+from simulation.arms import EFFECTIVE_POSES, ErrorSizes, bend
+from simulation.motion import fixed_camera, motion_over_table
+from simulation.poses import Pattern
 from simulation.render import render
-from simulation.scenes import Scene, make_scene, moved
-from simulation.taken import image_suffix, pinhole, stated_intrinsics, with_robot_noise, write_image
-from simulation.truth import Truth, write_pixels, write_robot, write_truth
+from simulation.scenes import SceneName, make_scene, moved
+from simulation.truth import Truth, write_pixels, write_truth
 
-AHEAD, AWAY = 0.06, 0.55
-"""m: from the gripper's frame to the bottom of a carried package, and from the camera that watches it."""
+_WIDTH, _HEIGHT = 640, 480
+_RANGES = {"images": (1, 1000), "vignetting": (0, 1), "fixed_cameras": (0, 20)} | dict.fromkeys(
+    ("joint_offsets", "link_errors", "gear_errors", "sag", "seed", "noise", "blur", "intrinsics_error"),
+    (0, np.inf),
+)
+"""Least and largest value of the options."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulateOptions:
+    """Scene, motion, camera and errors of a simulated capture."""
+
+    scene: SceneName = "tabletop"
+    """Objects and table: a mix on wood; 8 or 7 items on a plain light table; 7 on a plain dark one; tape,
+    box, mug and toolbox for measuring."""
+    images: int = 12
+    """Number of images; fewer images of the pattern `varied` are the first ones of more (`two` has 2)."""
+    pattern: Pattern = "varied"
+    """Path of a gripper without an arm. All but `varied` leave part of the calibration unobservable: an orbit at one
+    radius, pure translation, a turntable, xyz + yaw (SCARA), rotating about a tool point or about the camera's centre,
+    two images."""
+    robot: Annotated[RobotName | None, tyro.conf.arg(metavar=CHOICES)] = None
+    """Arm that carries the camera, the table before it. capture.json then has its joint angles, and gripper poses by
+    its nominal kinematics (unset: a gripper without an arm)."""
+    joint_offsets: float = 0.0
+    """Sigma of the offsets of the robot's joints, in degrees. With this and the next three, reference.json has the
+    effective hand-eye transform, and the physical one and the errors beside it."""
+    link_errors: float = 0.0
+    """Sigma of the translations of the robot's joint axes, in mm; of their rotations, 0.19 degrees per mm."""
+    gear_errors: float = 0.0
+    """Sigma of eccentric gears or encoders, in degrees: amplitudes of sine and cosine of each joint's angle."""
+    sag: float = 0.0
+    """Sigma of the deflection of each joint under gravity, in degrees with the arm stretched out."""
+    seed: int = 0
+    """Objects, layout, textures, lamp, intrinsics, hand-eye and poses all follow from it."""
+    texture: bool = True
+    """Print and grain on the surfaces; without, each has one uniform colour, with nothing for features."""
+    robot_noise: tuple[float, float] = (0.0, 0.0)
+    """Sigma per axis, in mm and degrees, of Gaussian errors of the gripper poses in capture.json; the images
+    show the true ones."""
+    unknown_intrinsics: bool = False
+    """Leave the intrinsics out of capture.json. (Known or not, the camera is a pinhole without distortion.)"""
+    intrinsics_error: float = 0.0
+    """Sigma of the errors of the intrinsics in capture.json, in percent: of the focal length (fx and fy alike), and of
+    the image's width for each coordinate of the principal point. The images show the true ones."""
+    noise: float = 0.0
+    """Sigma of the pixel noise, in grey levels of 255."""
+    blur: float = 0.0
+    """Sigma of the blur, in pixels."""
+    vignetting: float = 0.0
+    """Share of light lost in the corners, 0 to 1."""
+    jpeg_quality: int | Literal["lossless"] = 90
+    """1 to 100, or lossless: PNG."""
+    fixed_cameras: int = 0
+    """Number of cameras that stand beside the table and see the scene, an image each."""
+    truth: Literal["full", "scene"] = "full"
+    """Write truth/ with depth and labels of every image, or with scene.json alone."""
 
 
 def simulate(out: Path, options: SimulateOptions | None = None, progress: Progress = silent) -> Path:
@@ -45,59 +94,25 @@ def simulate(out: Path, options: SimulateOptions | None = None, progress: Progre
     an OpenGL library is missing.
     """
     _check(out, options := options or SimulateOptions())
-    if options.eye_to_hand:
-        return _simulate_eye_to_hand(out, options, progress)
-    scene = make_scene(options.scene, options.seed, options.table)
+    scene = make_scene(options.scene, options.seed)
     # One stream of random numbers a matter: a change in one must not disturb the others.
-    errors, path, elsewhere, camera, noise, intrinsics = (
-        np.random.default_rng([options.seed, stream]) for stream in (8, 4, 9, 5, 6, 10)
+    errors, path, elsewhere, camera, noise, intrinsics, further = (
+        np.random.default_rng([options.seed, stream]) for stream in (8, 4, 9, 5, 6, 10, 14)
     )
-    bent = _bent_arm(options, errors)
-    motion = motion_over_table(
-        bent, options.pattern, options.images, scene.table_center_in_base, (path, elsewhere)
-    )
+    bent = None
+    if options.robot is not None:
+        sizes = ErrorSizes(
+            joint_offset=np.radians(options.joint_offsets),
+            link=1e-3 * options.link_errors,
+            sag=np.radians(options.sag),
+            gear=np.radians(options.gear_errors),
+        )
+        bent = bend(arm_named(options.robot), sizes, errors)
+    middle = scene.table_center_in_base
+    motion = motion_over_table(bent, options.pattern, options.images, middle, (path, elsewhere))
     scene = moved(scene, motion.target_in_base) if bent else scene
-    truth = _truth(out, scene, options, motion, camera)
-    depths = _write_images(scene, truth, options, progress)
-    write_truth(truth)
-    if bent is not None and motion.joints is not None:
-        write_robot(truth, bent, motion.joints)
-    others, of_others = _add_cameras(out, options, scene, motion)
-    write_text(out / "reference.json", json.dumps(_reference(motion) | of_others, indent=1) + "\n")
-    capture = Capture(
-        folder=out,
-        images=truth.images,
-        base_from_gripper=with_robot_noise(motion.reported, *options.robot_noise, noise),
-        image_size=(truth.intrinsics.width, truth.intrinsics.height),
-        intrinsics=stated_intrinsics(truth.intrinsics, options, intrinsics),
-        joints=motion.joints,
-        robot=options.robot,
-        depths=depths,
-        others=others,
-    )
-    # Last: a folder with a capture.json is a complete capture.
-    capture_json.write(out, capture, source={"program": "python -m simulation", "options": asdict(options)})
-    return out
-
-
-def _bent_arm(options: SimulateOptions, rng: np.random.Generator) -> BentArm | None:
-    """Draw the arm with systematic errors of the sizes that the options give; None without an arm."""
-    if options.robot is None:
-        return None
-    sizes = ErrorSizes(
-        joint_offset=np.radians(options.joint_offsets),
-        link=1e-3 * options.link_errors,
-        sag=np.radians(options.sag),
-        gear=np.radians(options.gear_errors),
-    )
-    return bend(arm_named(options.robot), sizes, rng)
-
-
-def _truth(
-    out: Path, scene: Scene, options: SimulateOptions, motion: Motion, rng: np.random.Generator
-) -> Truth:
-    suffix = image_suffix(options)
-    return Truth(
+    suffix = "png" if options.jpeg_quality == "lossless" else "jpg"
+    truth = Truth(
         folder=out,
         scene=scene.name,
         seed=options.seed,
@@ -105,160 +120,139 @@ def _truth(
         gripper_from_camera=motion.physical,
         base_from_gripper=motion.base_from_gripper,
         base_from_camera=motion.base_from_gripper @ motion.physical,
-        intrinsics=pinhole(rng),
+        intrinsics=pinhole(camera),
         labels=scene.labels,
         table_height=scene.table_height,
         workspace_in_base=scene.workspace_in_base,
         objects=scene.true_objects,
     )
-
-
-def _write_images(
-    scene: Scene, truth: Truth, options: SimulateOptions, progress: Progress
-) -> tuple[str, ...] | None:
-    """Write what the camera sees, and with the full truth its depth and labels; the names of the depth images that a
-    depth camera measures, or None without one."""
-    with_truth = options.truth == "full" or options.depth is not None
-    views = render(scene, truth.intrinsics, truth.base_from_camera, options.texture, with_truth=with_truth)
-    depths = tuple(f"depth/{k:02d}.png" for k in range(len(truth.images)))
-    for k, view in zip(steps(progress, "render", range(len(truth.images))), views, strict=True):
-        write_image(truth.folder / truth.images[k], view.image, options, [7, k])
-        if options.truth == "full" and view.depth is not None and view.label is not None:
+    is_full = options.truth == "full"
+    shown = render(scene, truth.intrinsics, truth.base_from_camera, options.texture, with_truth=is_full)
+    for k, view in zip(steps(progress, "render", range(len(truth.images))), shown, strict=True):
+        _write_image(out / truth.images[k], view.image, options, [7, k])
+        if view.depth is not None and view.label is not None:
             write_pixels(truth, k, view.depth, view.label)
-        if view.depth is not None and options.depth is not None:
-            measured = _measured(view.depth, options.depth, np.random.default_rng([options.seed, 8, k]))
-            write_bytes(truth.folder / depths[k], encode_png(measured))
-    return None if options.depth is None else depths
-
-
-def _reference(motion: Motion) -> dict[str, object]:
-    """Return the hand-eye transform of reference.json, and how it was found."""
-    if motion.bent is None:
-        return {"gripper_from_camera": motion.physical.tolist(), "how": "simulated, exact"}
-    return {
+    write_truth(truth)
+    reference: dict[str, object] = {
         "gripper_from_camera": motion.effective.tolist(),
-        "physical_gripper_from_camera": motion.physical.tolist(),
-        "how": f"simulated: best for {EFFECTIVE_POSES} or more other reported poses of these views, exact cameras",
+        "how": "simulated, exact",
     }
-
-
-def _measured(
-    depth: Float[ndarray, "h w"], wrong: tuple[float, float], draw: np.random.Generator
-) -> UInt16[ndarray, "h w"]:
-    """Return depth (mm) as a depth camera of that scale error and noise measures it; 0 where it sees none."""
-    percent, noise_mm = wrong
-    edge = np.ptp([np.roll(depth, step, axis) for step in (-1, 1) for axis in (0, 1)], axis=0) > 0.03 * depth
-    noisy = (1 + percent / 100) * depth + 1e-3 * noise_mm * depth**2 * draw.normal(size=depth.shape)
-    return np.where(edge | (depth <= 0), 0, 1e3 * noisy).round().clip(0, 65535).astype(np.uint16)
-
-
-def _add_cameras(
-    out: Path, options: SimulateOptions, scene: Scene, own: Motion
-) -> tuple[tuple[CellCamera, ...], dict[str, Any]]:
-    """Write images of the further cameras that the options ask for; return them and their part of reference.json.
-
-    Both are empty without further cameras. `own` is the motion of the capture's own camera.
-    """
-    rng = np.random.default_rng([options.seed, 14])
-    cameras: list[CellCamera] = []
-    true: dict[str, Any] = {}
-    arms: dict[str, Any] = {}
-
-    def add(name: str, mount: Mount, places: Float[ndarray, "n 4 4"], **of_mount: Any) -> None:
-        camera = pinhole(rng)
-        images = tuple(f"{name}/{k:02d}.{image_suffix(options)}" for k in range(len(places)))
-        for k, view in enumerate(render(scene, camera, places, options.texture, with_truth=False)):
-            write_image(out / images[k], view.image, options, [15, k, *name.encode()])
-        size, stated = (camera.width, camera.height), stated_intrinsics(camera, options, rng)
-        cameras.append(
-            CellCamera(name=name, mount=mount, images=images, image_size=size, intrinsics=stated, **of_mount)
-        )
-
-    middle = scene.table_center_in_base
+    if bent is not None:
+        how = f"simulated: best for {EFFECTIVE_POSES} or more other reported poses of these views, exact cameras"
+        reference |= {
+            "how": how,
+            "physical_gripper_from_camera": motion.physical.tolist(),
+            "errors": bent.named_errors(),
+        }
+    others = []
     for k in range(options.fixed_cameras):
-        place = fixed_camera(middle, 0.55, rng)
-        add(f"fixed{k}", "base", place[None])
-        true[f"fixed{k}"] = {"base_from_camera": (own.base_from_true_base @ place).tolist()}
-    if options.wrist_cameras > 1:
-        beside = second_on_wrist(rng)
-        places = own.base_from_gripper @ own.physical @ beside
-        add("second", "gripper", places, frame=np.arange(len(places)))
-        true["second"] = {"gripper_from_camera": (own.effective @ beside).tolist()}
-    if options.arms > 1:
-        other = motion_over_table(_bent_arm(options, rng), "varied", options.images, middle, (rng, rng))
-        base_from_other = base_across_table(middle, other.target_in_base, rng)
-        reported = with_robot_noise(other.reported, *options.robot_noise, rng)
-        places = base_from_other @ other.base_from_gripper @ other.physical
-        add("other_wrist", "gripper", places, arm="other", base_from_gripper=reported)
-        true["other_wrist"] = {"gripper_from_camera": other.effective.tolist()}
-        between = base_from_other_base(own, other, base_from_other)
-        arms["other"] = {"base_from_other_base": between.tolist()}
-    return tuple(cameras), {"cameras": true, "arms": arms} if cameras else {}
-
-
-def _simulate_eye_to_hand(out: Path, options: SimulateOptions, progress: Progress) -> Path:
-    """Write a capture whose camera stands fixed and watches a package in the gripper, before the scene."""
-    rng = np.random.default_rng([options.seed, 16])
-    scene = make_scene(options.scene, options.seed, options.table)
-    bent = _bent_arm(options, rng)
-    scene = scene if bent is None else moved(scene, table_center(bent.arm))
-    above = scene.table_center_in_base + [0.0, 0.0, 0.4]
-    motion = carried_motion(bent, options.images, above, AHEAD, AWAY, rng)
-    camera, package = pinhole(rng), carried_package(rng)
-    images = tuple(f"images/{k:02d}.{image_suffix(options)}" for k in range(options.images))
-    for k, gripper in steps(progress, "render", list(enumerate(motion.base_from_gripper))):
-        carried = replace(package, base_from_object=gripper @ motion.gripper_from_object)
-        shown = replace(scene, objects=(*scene.objects, carried))
-        (view,) = render(shown, camera, motion.base_from_camera[None], options.texture, with_truth=False)
-        write_image(out / images[k], view.image, options, [7, k])
-    reference = {
-        "base_from_camera": motion.effective[0].tolist(),
-        "gripper_from_object": motion.effective[1].tolist(),
-        "how": "simulated: the pair by which reported poses best predict what the camera sees",
-    }
+        name, place, own = (
+            f"fixed{k}",
+            fixed_camera(scene.table_center_in_base, 0.55, further),
+            pinhole(further),
+        )
+        image = f"{name}/00.{suffix}"
+        (view,) = render(scene, own, place[None], options.texture, with_truth=False)
+        _write_image(out / image, view.image, options, [15, 0, *name.encode()])
+        size, stated = (own.width, own.height), _stated_intrinsics(own, options, further)
+        others.append(
+            CellCamera(name=name, mount="base", images=(image,), image_size=size, intrinsics=stated)
+        )
+        true = {name: {"base_from_camera": (motion.base_from_true_base @ place).tolist()}}
+        reference = {"cameras": {}, "arms": {}} | reference
+        reference["cameras"] |= true  # type: ignore[operator]
     write_text(out / "reference.json", json.dumps(reference, indent=1) + "\n")
     capture = Capture(
         folder=out,
-        images=images,
-        base_from_gripper=with_robot_noise(motion.reported, *options.robot_noise, rng),
-        image_size=(camera.width, camera.height),
-        intrinsics=stated_intrinsics(camera, options, rng),
+        images=truth.images,
+        base_from_gripper=with_robot_noise(motion.reported, *options.robot_noise, noise),
+        image_size=(truth.intrinsics.width, truth.intrinsics.height),
+        intrinsics=_stated_intrinsics(truth.intrinsics, options, intrinsics),
         joints=motion.joints,
         robot=options.robot,
-        camera_name="front",
-        mount="base",
+        others=tuple(others),
     )
-    capture_json.write(out, capture)
+    # Last: a folder with a capture.json is a complete capture.
+    capture_json.write(out, capture, source={"program": "python -m simulation", "options": asdict(options)})
     return out
+
+
+def pinhole(rng: np.random.Generator) -> Intrinsics:
+    """Draw intrinsics of 40° to 48° vertical field of view, as webcams and the colour side of depth cameras have.
+
+    MuJoCo's image spans [-½, W-½] when pixel (0, 0) is the centre of a pixel, so its middle is (W-1)/2.
+    """
+    focal_px = float(0.5 * _HEIGHT / np.tan(0.5 * np.radians(rng.uniform(40, 48))))
+    return Intrinsics(focal_px, focal_px, (_WIDTH - 1) / 2, (_HEIGHT - 1) / 2, _WIDTH, _HEIGHT)
+
+
+def with_robot_noise(
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    translation_mm: float,
+    rotation_deg: float,
+    rng: np.random.Generator,
+) -> Float[ndarray, "n 4 4"]:
+    """Return the reported poses: each pose after a step of independent Gaussians in every axis."""
+    sizes = np.repeat([1e-3 * translation_mm, np.radians(rotation_deg)], 3)
+    return retract(base_from_gripper, sizes * rng.normal(size=(len(base_from_gripper), 6)))
+
+
+def _stated_intrinsics(
+    camera: Intrinsics, options: SimulateOptions, rng: np.random.Generator
+) -> Intrinsics | None:
+    """Return the intrinsics of capture.json with the errors of the options, or None where it gives none."""
+    if options.unknown_intrinsics:
+        return None
+    focal, x, y = 0.01 * options.intrinsics_error * rng.normal(size=3)
+    return replace(
+        camera,
+        fx=camera.fx * (1 + focal),
+        fy=camera.fy * (1 + focal),
+        cx=camera.cx + x * camera.width,
+        cy=camera.cy + y * camera.width,
+    )
+
+
+def _write_image(
+    path: Path, pixels: UInt8[ndarray, "h w 3"], options: SimulateOptions, stream: Sequence[int]
+) -> None:
+    """Write the image of a cheaper camera: blurred, darker towards the corners, with noise drawn from `stream`."""
+    light = pixels.astype(np.float32)
+    if options.blur:
+        light = cv2.GaussianBlur(light, (0, 0), options.blur)
+    if options.vignetting:
+        height, width = pixels.shape[:2]
+        x, y = np.linspace(-1, 1, width), np.linspace(-1, 1, height)[:, None]
+        light *= (1 - options.vignetting * 0.5 * (x * x + y * y))[..., None]
+    if options.noise:
+        light += np.random.default_rng([options.seed, *stream]).normal(0, options.noise, pixels.shape)
+    image = np.clip(light + 0.5, 0, 255).astype(np.uint8)
+    quality = options.jpeg_quality
+    write_bytes(path, encode_png(image) if quality == "lossless" else encode_jpeg(image, quality))
+
+
+def encode_jpeg(image: UInt8[ndarray, "h w 3"], quality: int) -> bytes:
+    """Encode RGB as JPEG of a quality from 1 to 100."""
+    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def _check(out: Path, options: SimulateOptions) -> None:
     """Raise InputError for options out of range or that exclude each other, and for a folder that is not new."""
-    errors = {name: getattr(options, name) for name in ("joint_offsets", "link_errors", "gear_errors", "sag")}
-    not_negative = errors | {
-        name: getattr(options, name) for name in ("seed", "noise", "blur", "intrinsics_error")
-    }
-    not_negative["robot_noise"] = min(options.robot_noise)
-    ranges = {name: (0, np.inf) for name in not_negative} | {
-        "images": (1, 1000),
-        "vignetting": (0, 1),
-        "fixed_cameras": (0, 20),
-        "wrist_cameras": (1, 2),
-        "arms": (1, 2),
-    }
+    values = {name: (getattr(options, name), *limits) for name, limits in _RANGES.items()}
+    values["robot_noise"] = min(options.robot_noise), 0, np.inf
     if options.jpeg_quality != "lossless":
-        ranges["jpeg_quality"] = (1, 100)
-    for name, (low, high) in ranges.items():
-        value = not_negative.get(name, getattr(options, name))
+        values["jpeg_quality"] = options.jpeg_quality, 1, 100
+    for name, (value, low, high) in values.items():
         if not low <= value <= high:
             upper = "or more" if np.isinf(high) else f"to {high}"
             raise InputError(f"--{name.replace('_', '-')} {value}: give {low} {upper}")
-    bent = next((f"--{name.replace('_', '-')} {size:g}" for name, size in errors.items() if size), None)
+    of_arm = ("joint_offsets", "link_errors", "gear_errors", "sag")
+    bent = next((f"--{name.replace('_', '-')}" for name in of_arm if getattr(options, name)), None)
     if bent and options.robot is None:
         raise InputError(f"{bent}: errors of an arm; name it with --robot")
+    if options.robot is not None and options.pattern != "varied":
+        raise InputError(f"--pattern {options.pattern}: not for an arm; leave --robot out")
     if options.intrinsics_error and options.unknown_intrinsics:
         raise InputError("--intrinsics-error and --unknown-intrinsics exclude each other; leave one out")
-    if options.eye_to_hand and (options.fixed_cameras or options.wrist_cameras > 1 or options.arms > 1):
-        raise InputError("--eye-to-hand has one camera; leave the further ones out")
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise InputError(f"{out}: exists already and is no empty folder; name a new one, or remove it first")

@@ -24,15 +24,9 @@ from jcr.geometry import (
     transform,
 )
 from jcr.records import Intrinsics
-from simulation.arms import PRESETS, PresetName, bend
-from simulation.motion import (
-    base_across_table,
-    base_from_other_base,
-    carried_motion,
-    fixed_camera,
-    motion_over_table,
-    second_on_wrist,
-)
+from simulation.arms import EFFECTIVE_POSES, PRESETS, PresetName, about_posture, bend, effective_fit
+from simulation.motion import fixed_camera, motion_over_table
+from simulation.poses import looking_at, random_hand_eye
 from simulation.problems import INTRINSICS, disturbed, shown_points
 
 Kind = Literal["fixed", "wrists", "arms", "carried"]
@@ -40,8 +34,9 @@ FIXED_CAMERA = Intrinsics(905.0, 903.0, 645.0, 355.0, 1280, 720, (0.06, -0.1, 5e
 TABLE = np.array([[-0.25, -0.25, 0.0], [0.25, 0.25, 0.12]])
 """Box about the middle of the table (m) in which points lie."""
 BOX = np.array([0.16, 0.12, 0.1])
-"""Sides (m) of the object in the gripper, whose middle is BOX_AHEAD before the gripper's frame."""
-BOX_AHEAD = 0.12
+"""Sides (m) of the object in the gripper."""
+BOX_AHEAD, CAMERA_AWAY = 0.12, 0.75
+"""m: from the gripper's frame to the middle of the box, and from a fixed camera to what it shows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,14 +84,22 @@ def cell_problem(
     bent = bend(arm_named("ur5e"), PRESETS[preset].sizes, rng)
     white = PRESETS[preset].white
     if kind == "carried":
-        motion = carried_motion(bent, count, np.zeros(3), BOX_AHEAD, 0.75, rng)
-        cell.add_arm(
-            inverse(motion.base_from_gripper @ motion.gripper_from_object) @ motion.base_from_camera,
-            disturbed(motion.reported, white, rng),
-            (motion.base_from_camera, motion.gripper_from_object),
-            FIXED_CAMERA,
-        )
-        cell.truth = dict(zip(("base_from_camera", "gripper_from_object"), motion.effective, strict=True))
+        gripper_from_object = random_hand_eye(rng)
+        gripper_from_object[:3, 3] = BOX_AHEAD * bent.arm.forward
+        joints = about_posture(bent.arm, bent.arm.rest, count, rng)
+        carried = bent.true(joints) @ gripper_from_object
+        middle, side = carried[:, :3, 3].mean(0), rng.uniform(0.3, 1.2) * rng.choice([-1, 1])
+        away = CAMERA_AWAY * np.array([np.cos(side), np.sin(side), 0.5]) / np.hypot(1, 0.5)
+        base_from_camera = looking_at(middle + away, middle, rng)
+        elsewhere = about_posture(bent.arm, bent.arm.rest, EFFECTIVE_POSES, rng)
+        pair = base_from_camera, gripper_from_object
+        fit = effective_fit(bent, elsewhere, pair, exchanged=True)
+        reported = disturbed(bent.reported(joints), white, rng)
+        cell.add_arm(inverse(carried) @ base_from_camera, reported, pair, FIXED_CAMERA)
+        cell.truth = {
+            "base_from_camera": fit.gripper_from_camera,
+            "gripper_from_object": fit.base_from_recon,
+        }
         x_in_object, normal = _box(points, rng)
         return _seen(cell, x_in_object, normal, noise_px, rng)
     own = motion_over_table(bent, "varied", count, np.zeros(3), (rng, rng))
@@ -109,19 +112,21 @@ def cell_problem(
     )
     cell.truth["gripper_from_camera"] = own.effective
     if kind == "wrists":
-        mount = second_on_wrist(rng)
+        mount = transform(rotation_exp(0.05 * rng.normal(size=3)), np.array([0.06, 0.0, 0.0]))
         cell.mounts.append(mount)
         cell.cameras.append(FIXED_CAMERA)
         cell.images += [(k, 1) for k in range(count)]
         cell.truth["gripper_from_second"] = own.effective @ mount
     elif kind == "fixed":
-        place = fixed_camera(target, 0.75, rng)
+        place = fixed_camera(target, CAMERA_AWAY, rng)
         cell.add_camera(place[None], FIXED_CAMERA)
         cell.truth["base_from_camera"] = own.base_from_true_base @ place
     else:
         second = bend(arm_named("ur5e"), PRESETS[preset].sizes, rng)
         other = motion_over_table(second, "varied", count, np.zeros(3), (rng, rng))
-        base_from_other = base_across_table(target, other.target_in_base, rng)
+        # The second arm is across the table.
+        rotation = rotation_exp(np.array([0.0, 0.0, np.pi + rng.uniform(-0.4, 0.4)]))
+        base_from_other = transform(rotation, target - rotation @ other.target_in_base)
         cell.add_arm(
             base_from_other @ other.base_from_gripper @ other.physical,
             disturbed(other.reported, white, rng),
@@ -129,7 +134,8 @@ def cell_problem(
             FIXED_CAMERA,
         )
         cell.truth["gripper_from_second"] = other.effective
-        cell.truth["base1_from_base2"] = base_from_other_base(own, other, base_from_other)
+        between = own.base_from_true_base @ base_from_other @ inverse(other.base_from_true_base)
+        cell.truth["base1_from_base2"] = between
     x_in_base = target + rng.uniform(TABLE[0], TABLE[1], (points, 3))
     return _seen(cell, x_in_base, None, noise_px, rng)
 

@@ -92,11 +92,6 @@ def package(rng: np.random.Generator) -> Parts:
     return _package(rng, rng.uniform((0.12, 0.09, 0.05), (0.17, 0.13, 0.08)))
 
 
-def carried_package(rng: np.random.Generator) -> TableObject:
-    """Make a larger printed package, which a gripper carries before a fixed camera."""
-    return TableObject("carried", _package(rng, rng.uniform((0.16, 0.11, 0.19), (0.2, 0.14, 0.23))))
-
-
 def book(rng: np.random.Generator) -> Parts:
     """Make a closed book, lying, whose pages show on three sides."""
     x, y, z = rng.uniform((0.12, 0.17, 0.018), (0.15, 0.21, 0.035))

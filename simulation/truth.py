@@ -1,4 +1,4 @@
-"""Ground truth of a simulated capture, in files beside it."""
+"""Ground truth of a simulated capture, in files beside it, and the surface that its images show."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -6,14 +6,16 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
+from PIL import Image
 
+from jcr.camera import rays
 from jcr.capture.images import encode_png
 from jcr.files import write_bytes, write_text
+from jcr.geometry import apply
 from jcr.intrinsics_json import IntrinsicsJson
 from jcr.records import Intrinsics
-from simulation.arms import BentArm
 
 DEPTH_UNIT_M = 1e-4
 """Metres per count of the 16-bit depth images."""
@@ -69,19 +71,6 @@ def write_truth(truth: Truth) -> None:
     )
 
 
-def write_robot(truth: Truth, bent: BentArm, joints: Float[ndarray, "n dof"]) -> None:
-    """Write truth/robot.json: the errors of the arm that carried the camera, by name in m and rad."""
-    content = {
-        "format": "jcr.robot_truth/1",
-        "robot": bent.arm.name,
-        "joints": joints.tolist(),
-        "errors": bent.named_errors(),
-        "reported_base_from_gripper": bent.reported(joints).tolist(),
-        "base_from_gripper": truth.base_from_gripper.tolist(),
-    }
-    write_text(truth.folder / "truth" / "robot.json", json.dumps(content, indent=1) + "\n")
-
-
 def write_pixels(
     truth: Truth, image: int, depth: Float[ndarray, "h w"], label: UInt8[ndarray, "h w"]
 ) -> None:
@@ -123,3 +112,34 @@ def _pixels(truth: Truth, kind: str, image: int) -> ndarray:
     if pixels is None:
         raise FileNotFoundError(f"{path}: simulate the capture again with --truth full")
     return pixels
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Points at all pixels of a simulated capture, and the truth about each."""
+
+    x_in_base: Float[ndarray, "n 3"]
+    color: UInt8[ndarray, "n 3"]
+    label: Int[ndarray, " n"]
+    image: Int[ndarray, " n"]
+
+
+def true_surface(truth: Truth) -> Surface:
+    """Return the surface that the images show; it needs the depth that `--truth scene` leaves out."""
+    parts = []
+    for k, base_from_camera in enumerate(truth.base_from_camera):
+        depth = true_depth(truth, k)
+        shown = depth > 0
+        with Image.open(truth.folder / truth.images[k]) as image:
+            color = np.asarray(image)[shown]
+        x_in_base = apply(base_from_camera, depth[shown][:, None] * rays(truth.intrinsics)[shown])
+        label = true_labels(truth, k)[shown].astype(np.int64)
+        parts.append((x_in_base, color, label, np.full(len(label), k)))
+    return Surface(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def surface_in_workspace(truth: Truth) -> Surface:
+    """Return the surface of table and objects in the workspace that the images show."""
+    surface, (low, high) = true_surface(truth), truth.workspace_in_base
+    there = (surface.label > 0) & ((surface.x_in_base >= low) & (surface.x_in_base <= high)).all(1)
+    return Surface(*(one[there] for one in vars(surface).values()))

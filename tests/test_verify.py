@@ -26,8 +26,8 @@ from jcr.pipeline.run import _keep_reconstruction
 from jcr.records import Capture, Reconstruction, Tracks
 from jcr.run_folder import RunOptions, state_of
 from jcr.sfm.register import register
+from simulation.capture import with_robot_noise
 from simulation.problems import bent_problem
-from simulation.taken import with_robot_noise
 
 pytestmark = pytest.mark.slow
 

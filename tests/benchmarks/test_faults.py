@@ -12,9 +12,8 @@ from jcr.geometry import inverse, step_between
 from jcr.records import Intrinsics
 from simulation import image_faults as make
 from simulation.faults import Faults, optics_of
-from simulation.image_faults import IMAGES, ImageFault, draw
+from simulation.image_faults import FOCAL_PX, IMAGES, POSES, SIZE, WIDE, ImageFault, Rendered, draw
 from simulation.poses import gripper_poses, random_hand_eye
-from simulation.rendered import FOCAL_PX, POSES, SIZE, WIDE, Rendered
 
 
 def scene() -> Rendered:

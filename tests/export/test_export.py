@@ -32,8 +32,7 @@ from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics, PointCloud, Tracks
 from jcr.scene.cloud_ply import read_cloud
 from places import ROOT
-from simulation.scenes import make_scene
-from simulation.surface import solid_labels
+from simulation.scenes import make_scene, solid_labels
 from simulation.truth import read_truth
 
 if TYPE_CHECKING:

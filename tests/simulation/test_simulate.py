@@ -18,8 +18,7 @@ from simulation.capture import SimulateOptions, simulate
 from simulation.poses import gripper_poses, random_hand_eye
 from simulation.render import render
 from simulation.scenes import RECIPES, make_scene
-from simulation.surface import surface_in_workspace
-from simulation.truth import read_truth, true_depth, true_labels
+from simulation.truth import read_truth, surface_in_workspace, true_depth, true_labels
 
 CAMERA = Intrinsics(610.0, 610.0, 319.5, 239.5, 640, 480)
 
