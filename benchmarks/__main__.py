@@ -46,7 +46,10 @@ COMMANDS = {"align": "benchmarks.adam", "fetch-captures": "benchmarks.real_captu
 """Modules of what is no bench, with arguments of its own."""
 CLAIM = "> "
 """Prefix of the lines of a page that state its result in a sentence."""
-BenchName = str if TYPE_CHECKING else Literal[("all", *sorted(BENCHES))]
+if TYPE_CHECKING:
+    BenchName = str
+else:
+    BenchName = Literal[("all", *sorted(BENCHES))]
 
 
 @dataclass(frozen=True)

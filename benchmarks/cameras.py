@@ -151,12 +151,13 @@ def _withheld(folder: Path) -> Iterator[tuple[list[str], tuple[float, float] | N
     capture = read_capture(folder)
     apart = list(range(2, len(capture), WITHHELD))
     rest = of_rows(capture, [row for row in range(len(capture)) if row not in apart])
+    hand_eye = reconstruction = None
     try:
         reconstruction = reconstruct(rest, ReconstructOptions(backend="colmap"))
         hand_eye = calibrate(rest, reconstruction)
     except RejectedError:
-        hand_eye = None
-    if hand_eye is None or not hand_eye.converged:
+        pass
+    if reconstruction is None or hand_eye is None or not hand_eye.converged:
         yield [folder.name, "rejected", "0", *["–"] * 4], None
         return
     cameras = [

@@ -68,7 +68,7 @@ class RobotRow(NamedTuple):
     """Results of one solver for arms with errors of one size, against the effective transform."""
 
     preset: PresetName
-    count: int
+    images: int
     known: str
     mm: float
     """Median error."""
@@ -164,7 +164,7 @@ class SeenRow(NamedTuple):
     """Errors of seen points over all captures of a robot, a number of images and a knowledge of the intrinsics."""
 
     preset: PresetName
-    count: int
+    images: int
     known: str
     within_95: float
     """Share of seen points whose error is below what 95 % are stated to be below."""

@@ -217,7 +217,8 @@ def _distance(tree: KDTree, x: Float[ndarray, "n 3"]) -> Float[ndarray, " n"]:
 def _speed(scene: SceneMap, folder: Path) -> list[str]:
     """Return the claim and the table of times."""
     draw = np.random.default_rng(0)
-    x = draw.uniform(*scene.box, (QUERIES, 3)).astype(np.float32)
+    low, high = scene.box
+    x = draw.uniform(low, high, (QUERIES, 3)).astype(np.float32)
     centers, radii = x[:SPHERES], draw.uniform(0.01, 0.05, SPHERES).astype(np.float32)
     seen = np.resize(x[~scene.query(x).unknown], x.shape)
     anywhere = _median_seconds(lambda: scene.query(x).occupancy)

@@ -14,12 +14,10 @@ from numpy import ndarray
 import jcr
 from jcr.capture.images import read_image
 from jcr.live import arms
-from jcr.live.cameras import Frame, open_camera
+from jcr.live.cameras import Frame, ImageSummary, frame_at_rest, open_camera
 from jcr.live.folder import LiveFolder
-from jcr.live.robot import MOVED_ON, RobotState, next_rest, pose_of_numbers
+from jcr.live.robot import MOVED_ON, RobotState, next_rest, pose_of_numbers, typed_poses
 from jcr.live.session import LiveSession, SessionOptions
-from jcr.live.stillness import ImageSummary, frame_at_rest
-from jcr.live.terminal import typed_poses
 from scripted_capture import RATE, Scripted, poses, still, take_all, video
 from simulation.ur import SimulatedUr
 

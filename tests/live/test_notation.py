@@ -10,7 +10,7 @@ from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import forward_kinematics
 from jcr.geometry import inverse, rotation_angle, rotation_exp, transform
 from jcr.live.notation import Notation, joints_at, pose_lines
-from jcr.live.terminal import typed_poses
+from jcr.live.robot import typed_poses
 
 POSES = transform(
     rotation_exp(np.random.default_rng(0).normal(size=(6, 3))),

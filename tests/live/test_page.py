@@ -81,7 +81,7 @@ def test_the_page_shows_each_state(capture: tuple[LiveSession, Scripted], tablet
         wrong = parts(page)["parts"]
         assert "verdict fair" in wrong["head"] and "The gripper pose of images/003.png" in wrong["head"]
         assert wrong["images"].count('class="rejected"') == 1
-        assert "Retake or remove image 4." in wrong["head"]
+        assert "(retake 4, or remove 4)" in wrong["head"]
         assert any(
             "(retake 4, or remove 4)" in line for line in progress_lines(live.state.progress, Notation())
         )

@@ -14,10 +14,10 @@ from numpy import ndarray
 import jcr
 from jcr.live.cameras import Frame
 from jcr.live.folder import LiveFolder
-from jcr.live.robot import MOVED_ON, RobotState, next_rest
+from jcr.live.robot import MOVED_ON, RobotState, command_of, next_rest, without_commands
 from jcr.live.session import Answer
-from jcr.live.terminal import command_of, without_commands
 from scripted_capture import a_capture, still, still_frames, take_all
+from waiting import until
 
 Step = int | tuple
 """An image to take, or a command with its arguments."""
@@ -171,6 +171,7 @@ def test_a_program_that_sends_poses_is_answered_with_the_calibration(tmp_path: P
             answers.append(session.take(RobotState(0.0, poses[at[0]]), waits=True))
 
     session.run(source)
+    until(lambda: len(answers) == 4)
     assert [answer["done"] for answer in answers] == [False, False, False, True]
     assert [answer["image"] for answer in answers] == [f"images/00{k}.png" for k in range(4)]
     assert [len(answer["images"]) for answer in answers] == [1, 2, 3, 4]

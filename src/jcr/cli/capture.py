@@ -174,7 +174,7 @@ def _source(
     arguments: Arguments, session: "LiveSession", states: "States | None", server: "LiveServer"
 ) -> "Callable[[], None]":
     """Return the function that requests images where `--poses` says; read typed commands."""
-    from jcr.live.terminal import HELP, typed_poses, without_commands
+    from jcr.live.robot import HELP, typed_poses, without_commands
 
     lines = without_commands(sys.stdin, session.press)
     if sys.stdin.isatty():

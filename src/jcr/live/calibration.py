@@ -1,8 +1,8 @@
 """Calibration that is updated after each image of a capture, with its accuracy, findings and the next gripper pose."""
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,7 +17,7 @@ from jcr.calibration.checks.capture import SAME
 from jcr.calibration.checks.capture import STILL as MOVED
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised, assumptions_of
-from jcr.calibration.robot_errors import RobotErrors, robot_errors
+from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import checked
 from jcr.capture.camera_info import IntrinsicsEntry
 from jcr.capture.checks import read_rigid
@@ -30,12 +30,12 @@ from jcr.estimation.prediction import FEWEST
 from jcr.findings import Finding, FindingKind, strongest_first
 from jcr.geometry import apply, largest_motion
 from jcr.least_squares import one_blas_thread
+from jcr.live.cameras import ImageSummary
 from jcr.live.folder import LiveFolder
 from jcr.live.next_pose import Attempts, Reach, propose, propose_before_calibration
 from jcr.live.progress import Accuracy, Progress
-from jcr.live.stillness import ImageSummary
 from jcr.options import checked_options
-from jcr.records import Capture, HandEye, Intrinsics, Reconstruction, Tracks
+from jcr.records import Capture, HandEye, Intrinsics, Tracks
 from jcr.sfm.live_map import LiveMap
 
 if TYPE_CHECKING:
@@ -88,8 +88,8 @@ class LiveCalibration:
         name = self._options.robot or folder.robot
         self._reach = Reach(None if name is None else arm_named(name), reach)
         self._map: LiveMap | None = None
-        self._mapped: list[str] = []
-        self._of_image: dict[str, tuple[Finding, ...]] = {}
+        self._mapped: tuple[str, ...] = ()
+        self._of_image: dict[str, list[Finding]] = {}
         self._history: tuple[Accuracy, ...] = ()
         self._refused: list[Float[ndarray, "4 4"]] = []
         self._next_pose: Callable[[], dict[str, Any]] = dict
@@ -146,7 +146,10 @@ class LiveCalibration:
     def remove(self, index: int) -> Progress:
         """Remove the image at `index` from the capture, and calibrate without it."""
         with self._lock:
-            self.live.remove(self._name(index))
+            names = self.live.names
+            if not -len(names) <= index < len(names):
+                raise InputError(f"there is no image at index {index}; the capture has {len(names)}")
+            self.live.remove(names[index])
             return self.update()
 
     def undo(self) -> Progress:
@@ -171,16 +174,18 @@ class LiveCalibration:
     def update(self) -> Progress:
         """Calibrate the images that the folder holds, after some were added or removed there."""
         with self._lock:
-            capture = self.live.capture()
-            names, before = [] if capture is None else list(capture.images), len(self._mapped)
-            new = [name for name in names if name not in self._mapped]
-            self._of_image = {name: found for name, found in self._of_image.items() if name in names}
+            capture, before = self.live.capture(), self._mapped
+            self._mapped = () if capture is None else capture.images
+            new = [name for name in self._mapped if name not in before]
+            images = {name: read_image(self.live.folder / name) for name in new}
+            known = {name: self._of_image[name] for name in self._mapped if name in self._of_image}
+            self._of_image = known | {name: self._about(name, image) for name, image in images.items()}
             if capture is None:
                 self._map = None
             else:
-                self._extend(capture, new)
-            self._mapped = names
-            added = new[-1] if new and before <= len(names) else None
+                self._map = self._map or LiveMap(capture)
+                self._map.update(capture, images)
+            added = new[-1] if new and len(before) <= len(self._mapped) else None
             self._refused.clear()
             self.progress = self._calibrated(capture, added)
             return self.progress
@@ -199,18 +204,8 @@ class LiveCalibration:
             self.live.close()
             self._opened.close()
 
-    def _name(self, index: int) -> str:
-        """Return the name of an image; raise InputError where the capture has no such image."""
-        names = self.live.names
-        if not -len(names) <= index < len(names):
-            raise InputError(f"there is no image at index {index}; the capture has {len(names)}")
-        return names[index]
-
     def _refuse_repeated(
-        self,
-        image: UInt8[ndarray, "h w 3"],
-        base_from_gripper: Float[ndarray, "4 4"],
-        number: str,
+        self, image: UInt8[ndarray, "h w 3"], base_from_gripper: Float[ndarray, "4 4"], number: str
     ) -> None:
         """Raise InputError where an image repeats another."""
         new = ImageSummary.of(image)
@@ -227,14 +222,7 @@ class LiveCalibration:
                 f"{np.degrees(radians):.0f}°; check that the camera's stream is live"
             )
 
-    def _extend(self, capture: Capture, new: Sequence[str]) -> None:
-        """Map the images of a capture, of which these are new."""
-        images = {name: read_image(capture.folder / name) for name in new}
-        self._of_image |= {name: self._image_findings(name, image) for name, image in images.items()}
-        self._map = self._map or LiveMap(capture)
-        self._map.update(capture, images)
-
-    def _image_findings(self, name: str, image: UInt8[ndarray, "h w 3"]) -> tuple[Finding, ...]:
+    def _about(self, name: str, image: UInt8[ndarray, "h w 3"]) -> list[Finding]:
         """Return the findings about an image by itself and its time."""
         found = []
         if (width := edge_width(image)) > BLURRED_EDGE:
@@ -242,40 +230,61 @@ class LiveCalibration:
             found.append(Finding.of(FindingKind.BLURRED, "warns", "images", name, value=edge_px))
         if (back := self.live.seconds_back(name)) is not None:
             found.append(Finding.of(FindingKind.CLOCK_JUMPS, "warns", "poses", name, value=back))
-        return tuple(found)
+        return found
 
     def _calibrated(self, capture: Capture | None, added: str | None) -> Progress:
         """Return the state of the mapped images, calibrated where enough of them registered."""
-        names = tuple(self._mapped)
+        names, self._next_pose = self._mapped, dict
+        state = Progress(images=names, added=added, history=self._history)
         if capture is None or self._map is None:
-            self._next_pose = dict
-            return Progress(images=names, added=added, history=self._history)
+            return state
         made = self._map.reconstruction()
         rows = np.zeros(0, int) if made is None else made.image_index
+        state = replace(state, registered=tuple(names[row] for row in rows))
         robot = robot_errors(capture, self._options)
         # A model that contradicts the poses gives wrong joint angles.
         reach = self._reach if robot.unused is None else replace(self._reach, arm=None)
         of_images = [finding for name in names for finding in self._of_image[name]]
-        of_images += self._not_registered(names)
-        state = Progress(
-            images=names, added=added, registered=tuple(names[row] for row in rows), history=self._history
-        )
+        outside = set(range(len(names))) - set(self._map.registered) if len(names) >= FEWEST else ()
+        for row in sorted(outside):
+            matches = float(self._map.matched_with(row))
+            finding = Finding.of(FindingKind.NOT_REGISTERED, "warns", "images", names[row], value=matches)
+            of_images.append(finding)
 
         def attempts() -> Attempts:
             """Return the attempts with the gripper poses refused until now."""
             return Attempts(capture, rows, tuple(self._refused))
 
-        calibrated = None
+        case = None
         if made is not None and len(rows) >= FEWEST:
-            calibrated = self._calibrate(capture, made, robot.of(rows))
-        if calibrated is None:
+            most = min(OBSERVATIONS[0] * len(rows), OBSERVATIONS[1])
+            some = replace(made, tracks=_longest(made.tracks, most))
+            with suppress(RejectedError):
+                case = checked(capture, some, self._options, robot.of(rows))
+        if case is None:
             self._next_pose = lambda: propose_before_calibration(attempts(), reach)
             unused = () if robot.unused is None else (robot.unused,)
-            findings = strongest_first([*of_images, *unused, *_too_few(len(names))])
+            findings = strongest_first([*of_images, *unused, _too_few(len(names))])
             return replace(state, findings=findings, **self._next_pose())
-        case, hand_eye = calibrated
-        self._remember(len(names), hand_eye)
         of_rows, assumptions = robot.of(rows), assumptions_of(case)
+        hand_eye = advised(
+            case.hand_eye,
+            case.base_from_gripper,
+            self._options,
+            of_rows,
+            assumptions,
+            case.scene_uncertainty,
+        )
+        required = hand_eye.requirement
+        assert required is not None
+        reached = Accuracy(
+            images=len(names),
+            translation_mm=float(required.reached_mm),
+            rotation_deg=float(required.reached_deg),
+            accepted=hand_eye.converged,
+        )
+        # Entries of more images belong to other images.
+        self._history = (*(one for one in self._history if one.images < len(names)), reached)
         self._next_pose = lambda: propose(case, hand_eye, of_rows, assumptions, reach, attempts())
         return replace(
             state,
@@ -285,50 +294,6 @@ class LiveCalibration:
             points_in_base=_points(case, hand_eye),
             **self._next_pose(),
         )
-
-    def _calibrate(
-        self, capture: Capture, made: Reconstruction, robot: RobotErrors
-    ) -> tuple[Case, HandEye] | None:
-        """Return the checked calibration of a reconstruction, `robot` of its images; None where none exists."""
-        most = min(OBSERVATIONS[0] * len(made.image_index), OBSERVATIONS[1])
-        made = replace(made, tracks=_longest(made.tracks, most))
-        try:
-            case = checked(capture, made, self._options, robot)
-        except RejectedError:
-            return None
-        return case, advised(
-            case.hand_eye,
-            case.base_from_gripper,
-            self._options,
-            robot,
-            assumptions_of(case),
-            case.scene_uncertainty,
-        )
-
-    def _not_registered(self, names: tuple[str, ...]) -> list[Finding]:
-        """Return a finding for each image outside the map, where there are enough images for a map."""
-        if self._map is None or len(names) < FEWEST:
-            return []
-        inside = set(self._map.registered)
-        return [
-            Finding.of(
-                FindingKind.NOT_REGISTERED, "warns", "images", name, value=float(self._map.matched_with(row))
-            )
-            for row, name in enumerate(names)
-            if row not in inside
-        ]
-
-    def _remember(self, images: int, hand_eye: HandEye) -> None:
-        """Note the accuracy with this number of images; entries of more images belong to other images."""
-        required = hand_eye.requirement
-        assert required is not None
-        reached = Accuracy(
-            images=images,
-            translation_mm=float(required.reached_mm),
-            rotation_deg=float(required.reached_deg),
-            accepted=hand_eye.converged,
-        )
-        self._history = (*(one for one in self._history if one.images < images), reached)
 
 
 def checked_image(
@@ -380,12 +345,12 @@ def _longest(tracks: Tracks, most: int) -> Tracks:
     return of_points(tracks, chosen)
 
 
-def _too_few(images: int) -> list[Finding]:
+def _too_few(images: int) -> Finding:
     """Return the reason why there is no calibration."""
     if images < FEW:
-        return [Finding.of(FindingKind.FEW_IMAGES, "informs", "images", value=float(images))]
+        return Finding.of(FindingKind.FEW_IMAGES, "informs", "images", value=float(images))
     text, remedy = "fewer than three images are registered", "let the views overlap more"
-    return [Finding.of(FindingKind.NO_RECONSTRUCTION, "rejects", "reconstruction", text=text, remedy=remedy)]
+    return Finding.of(FindingKind.NO_RECONSTRUCTION, "rejects", "reconstruction", text=text, remedy=remedy)
 
 
 def _contradicting(case: Case, hand_eye: HandEye) -> list[Finding]:

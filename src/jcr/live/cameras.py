@@ -3,17 +3,20 @@
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import cv2
-from jaxtyping import UInt8, UInt16
+import numpy as np
+from jaxtyping import Float32, UInt8, UInt16
 from numpy import ndarray
 
 from jcr.capture.camera_info import IntrinsicsEntry
+from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault
 from jcr.errors import InputError
 
 TIMEOUT_S = 10.0
@@ -57,34 +60,29 @@ class Camera:
     """Intrinsics, where the camera's maker stored them in it."""
 
 
-class NewestFrame:
-    """Newest frame of a source, kept by a thread that empties the driver's buffer."""
+class Frames:
+    """Frames of a device or stream, read by a thread that empties the driver's buffer, or of a recording in order."""
 
-    def __init__(self, read: Callable[[], Frame | None], name: str) -> None:
-        """Start the thread; `read` waits for the next frame and returns None at the end."""
+    def __init__(self, read: Callable[[], Frame | None], name: str | None) -> None:
+        """Read by `read`, which waits for the next frame and returns None at the end; `name`: None for a recording."""
         self._read, self._name = read, name
         self._arrived, self._stop = threading.Condition(), threading.Event()
         self._frame: Frame | None = None
         self._thread = threading.Thread(target=self._watch, daemon=True)
-        self._thread.start()
-
-    def _watch(self) -> None:
-        """Read frames until the source ends."""
-        while not self._stop.is_set():
-            frame = self._read()
-            with self._arrived:
-                if frame is not None:
-                    self._frame = frame
-                self._arrived.notify_all()
-            if frame is None:
-                return
+        if name is not None:
+            self._thread.start()
 
     def latest(self) -> Frame | None:
-        """Return the newest frame."""
+        """Return the newest frame of a device or stream, or the one of a recording that was read last."""
         return self._frame
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield frames that were taken after they were requested; raise InputError when the camera falls silent."""
+        """Yield frames; raise InputError when a device or stream falls silent."""
+        if self._name is None:
+            for frame in iter(self._read, None):
+                self._frame = frame
+                yield frame
+            return
         while True:
             asked = time.monotonic()
 
@@ -104,26 +102,19 @@ class NewestFrame:
     def close(self) -> None:
         """Stop reading."""
         self._stop.set()
-        self._thread.join(TIMEOUT_S)
+        if self._name is not None:
+            self._thread.join(TIMEOUT_S)
 
-
-class RecordedFrames:
-    """Frames of a recording, one after the other."""
-
-    def __init__(self, frames: Iterator[Frame]) -> None:
-        """Read from `frames` as they are requested."""
-        self._frames = frames
-        self._frame: Frame | None = None
-
-    def latest(self) -> Frame | None:
-        """Return the frame that was read last."""
-        return self._frame
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames."""
-        for frame in self._frames:
-            self._frame = frame
-            yield frame
+    def _watch(self) -> None:
+        """Read frames until the source ends."""
+        while not self._stop.is_set():
+            frame = self._read()
+            with self._arrived:
+                if frame is not None:
+                    self._frame = frame
+                self._arrived.notify_all()
+            if frame is None:
+                return
 
 
 @contextmanager
@@ -139,41 +130,44 @@ def open_camera(source: str, options: CameraOptions | None = None) -> Iterator[C
         with open_realsense(source.partition(":")[2], options) as camera:
             yield camera
         return
-    # OpenCV and FFmpeg write warnings of their own to stderr; the error that we raise is all a user needs.
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    device: int | str = int(source) if source.isdigit() else source
-    is_file = not source.isdigit() and "://" not in source
+    is_device = source.isdigit()
+    is_file = not is_device and "://" not in source
     if is_file and not Path(source).is_file():
         raise InputError(f"--camera {source}: no such video file; name a file, a device number or a stream")
-    try:
-        video = _video(device)
+    # OpenCV and FFmpeg write warnings of their own to stderr; the error that we raise is all a user needs.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    with ExitStack() as stack:
+        before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        stack.callback(cv2.utils.logging.setLogLevel, before)
+        limit_ms = int(1e3 * TIMEOUT_S)
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit_ms]
+        video = (
+            cv2.VideoCapture(int(source)) if is_device else cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
+        )
+        stack.callback(video.release)
         if not video.isOpened():
             raise InputError(
                 f"--camera {source}: cannot be opened; look which devices there are (v4l2-ctl --list-devices), "
                 "whether another program holds it, or whether the stream's address is right"
             )
-        try:
-            if isinstance(device, int):
-                apply_options(video, options, source)
-            elif options != CameraOptions():
-                raise InputError(
-                    f"--camera {source}: size, exposure and focus can be set for a device number or realsense; set "
-                    "them in the camera, and leave the options out"
-                )
-            if is_file:
-                recorded = RecordedFrames(_recorded_frames(video))
-                yield Camera(recorded, recorded.latest)
-            else:
-                newest = NewestFrame(lambda: _read(video), source)
-                try:
-                    yield Camera(newest, newest.latest)
-                finally:
-                    newest.close()
-        finally:
-            video.release()
-    finally:
-        cv2.utils.logging.setLogLevel(before)
+        if is_device:
+            apply_options(video, options, source)
+        elif options != CameraOptions():
+            raise InputError(
+                f"--camera {source}: size, exposure and focus can be set for a device number or realsense; set "
+                "them in the camera, and leave the options out"
+            )
+        rate, numbers = video.get(cv2.CAP_PROP_FPS) or 30.0, count()
+
+        def read() -> Frame | None:
+            """Return the next frame, stamped when reading began, of a file by its frame rate; None at the end."""
+            time_s = next(numbers) / rate if is_file else time.monotonic()
+            good, pixels = video.read()
+            return Frame(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), time_s) if good else None
+
+        frames = Frames(read, None if is_file else source)
+        stack.callback(frames.close)
+        yield Camera(frames, frames.latest)
 
 
 def apply_options(video: Any, options: CameraOptions, source: str) -> None:
@@ -195,40 +189,89 @@ def apply_options(video: Any, options: CameraOptions, source: str) -> None:
     video.set(cv2.CAP_PROP_AUTOFOCUS, 0)
     if options.exposure is not None:
         video.set(cv2.CAP_PROP_AUTO_EXPOSURE, V4L2_MANUAL_EXPOSURE)
-        _fix(video, cv2.CAP_PROP_EXPOSURE, options.exposure, "--exposure", source)
-    if options.focus is not None:
-        _fix(video, cv2.CAP_PROP_FOCUS, options.focus, "--focus", source)
+    wanted = (
+        (cv2.CAP_PROP_EXPOSURE, options.exposure, "--exposure"),
+        (cv2.CAP_PROP_FOCUS, options.focus, "--focus"),
+    )
+    for prop, value, option in wanted:
+        if value is None:
+            continue
+        if not video.set(prop, value) or abs(video.get(prop) - value) > 0.01 * abs(value) + 1.0:
+            raise InputError(
+                f"{option} {value:g}: camera {source} stays at {video.get(prop):g}; give a value that "
+                "v4l2-ctl --list-ctrls allows, or leave the option out"
+            )
 
 
-def _fix(video: Any, prop: int, value: float, option: str, source: str) -> None:
-    """Set a property; raise InputError where its value differs after that."""
-    if not video.set(prop, value) or abs(video.get(prop) - value) > 0.01 * abs(value) + 1.0:
-        raise InputError(
-            f"{option} {value:g}: camera {source} stays at {video.get(prop):g}; give a value that "
-            "v4l2-ctl --list-ctrls allows, or leave the option out"
+# Choice of an image that can be kept: at rest, sharp, exposed, and different from the images taken elsewhere.
+
+REST_S = 0.2
+"""Time between two images that are compared for motion."""
+STILL = 2.5
+"""Mean grey levels by which images at rest differ on a 160 px wide grid: pixel noise of sigma 10 gives 1.9,
+a shift of one pixel in 640 of a textured tabletop 3."""
+GRID_PX = 160
+
+
+@dataclass(frozen=True, eq=False)
+class ImageSummary:
+    """Coarse grey levels and sharpness of an image, with which later images are compared."""
+
+    grid: Float32[ndarray, "gh gw"]
+    """Grey levels without their mean, coarse enough for a sensor's noise to vanish."""
+    sharpness: float
+
+    @staticmethod
+    def of(image: UInt8[ndarray, "h w 3"]) -> "ImageSummary":
+        """Return the summary of an RGB image."""
+        size = GRID_PX, max(1, round(GRID_PX * image.shape[0] / image.shape[1]))
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        coarse = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        return ImageSummary(coarse - coarse.mean(), brightness_and_sharpness(image)[1])
+
+    def is_like(self, other: "ImageSummary") -> bool:
+        """Test whether two images show the same view but for noise."""
+        return self.grid.shape == other.grid.shape and bool(np.abs(self.grid - other.grid).mean() < STILL)
+
+
+def frame_at_rest(frames: Iterator[Frame], kept: Sequence[ImageSummary], patience_s: float) -> Frame | str:
+    """Return the first frame at rest that can be kept, or after `patience_s` the reason why none could.
+
+    The images `kept` were taken from elsewhere, so this one must differ. Raises StopIteration at the end of a video
+    file.
+    """
+    earlier = next(frames)
+    end = earlier.time_s + patience_s
+    while True:
+        frame = next(frames)
+        if frame.time_s < earlier.time_s:
+            # The clock was set back: time is counted from here.
+            earlier, end = frame, frame.time_s + patience_s
+        if frame.time_s - earlier.time_s < REST_S:
+            continue
+        fault = _fault(earlier, frame, kept)
+        if fault is None:
+            return frame
+        if frame.time_s > end:
+            return fault
+        earlier = frame
+
+
+def _fault(earlier: Frame, frame: Frame, kept: Sequence[ImageSummary]) -> str | None:
+    """Return the reason why a frame cannot be kept; None where it can be."""
+    if earlier.image.shape != frame.image.shape:
+        return "the size of the camera's images changes; fix it with --camera-size"
+    now = ImageSummary.of(frame.image)
+    usual = float(np.median([one.sharpness for one in kept])) if kept else 0.0
+    if not now.is_like(ImageSummary.of(earlier.image)):
+        return "the image is not still; wait until the arm and everything in view is at rest"
+    if (fault := exposure_fault(brightness_and_sharpness(frame.image)[0])) is not None:
+        return f"the image is {fault}; change light or exposure"
+    if now.sharpness < BLURRED * usual:
+        return f"the image is blurred ({100 * now.sharpness / usual:.0f} % of the usual sharpness)"
+    # Images of another size are refused where they are kept.
+    if any(now.is_like(one) for one in kept):
+        return (
+            "the gripper moved but the image did not change; is the stream frozen, or is it another camera?"
         )
-
-
-def _video(device: int | str) -> cv2.VideoCapture:
-    """Open a device, stream or file with OpenCV, with limits of time."""
-    if isinstance(device, int):
-        return cv2.VideoCapture(device)
-    limit_ms = int(1e3 * TIMEOUT_S)
-    limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit_ms]
-    return cv2.VideoCapture(device, cv2.CAP_FFMPEG, limits)
-
-
-def _read(video: cv2.VideoCapture) -> Frame | None:
-    """Return the next frame of a device or stream, stamped when reading began; None at its end."""
-    began = time.monotonic()
-    good, pixels = video.read()
-    return Frame(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), began) if good else None
-
-
-def _recorded_frames(video: cv2.VideoCapture) -> Iterator[Frame]:
-    """Yield the frames of a file, stamped by its frame rate."""
-    rate = video.get(cv2.CAP_PROP_FPS) or 30.0
-    number = 0
-    while (read := video.read())[0]:
-        yield Frame(cv2.cvtColor(read[1], cv2.COLOR_BGR2RGB), number / rate)
-        number += 1
+    return None

@@ -22,7 +22,7 @@ from jcr.capture.plain_files import contained, validated
 from jcr.errors import InputError
 from jcr.estimation.arms import ROBOT_NAMES
 from jcr.files import remove_unfinished, write_bytes, write_text
-from jcr.live.stillness import ImageSummary
+from jcr.live.cameras import ImageSummary
 from jcr.records import Capture
 
 IMAGES = "images"
@@ -59,7 +59,10 @@ class LiveFolder:
         self._summaries: dict[str, ImageSummary] = {}
         self._before_session = frozenset(self.names)
         self._ever = {one.image: one for one in self.images}
-        self._next_number = self._first_free_number()
+        # Above the numbers of all image files, files that no capture.json names included.
+        files = [*self.names, *(f"{IMAGES}/{file.name}" for file in (folder / IMAGES).glob("*.png"))]
+        numbers = [int(match[1]) for name in files if (match := re.match(r"images/(\d+)\.", name))]
+        self._next_number = max(numbers, default=-1) + 1
 
     @property
     def names(self) -> list[str]:
@@ -129,11 +132,11 @@ class LiveFolder:
     def undo(self) -> bool:
         """Take back the last change of this session; return whether there was one."""
         with self.lock:
-            if not self._earlier:
-                return False
-            self._write(self._earlier[-1])
-            self.images = self._earlier.pop()
-            return True
+            if self._earlier:
+                self._write(self._earlier[-1])
+                self.images = self._earlier.pop()
+                return True
+            return False
 
     def close(self) -> None:
         """Delete the files of images that this session removed; no change can be undone after that."""
@@ -146,14 +149,14 @@ class LiveFolder:
 
         Images of an earlier session may have had another clock.
         """
-        images = self.images
-        row = next((k for k, one in enumerate(images) if one.image == name), 0)
-        if row == 0:
-            return None
+        images, row = self.images, self.names.index(name)
         before, now = images[row - 1], images[row]
-        if now.time_s is None or before.time_s is None:
-            return None
-        if (before.image in self._before_session) != (name in self._before_session):
+        is_known = now.time_s is not None and before.time_s is not None
+        if (
+            row == 0
+            or not is_known
+            or (before.image in self._before_session) != (name in self._before_session)
+        ):
             return None
         return before.time_s - now.time_s if now.time_s <= before.time_s else None
 
@@ -164,13 +167,12 @@ class LiveFolder:
 
     def _capture_of(self, images: tuple[FrameEntry, ...], size: tuple[int, int]) -> Capture:
         """Return images as a capture; raise InputError where capture.json contradicts them."""
-        stated = stated_fields(self._content, images, size, self.folder / FILE)
         return Capture(
             folder=self.folder,
             images=tuple(one.image for one in images),
             base_from_gripper=np.stack([one.base_from_gripper for one in images]),
             image_size=size,
-            **stated,
+            **stated_fields(self._content, images, size, self.folder / FILE),
         )
 
     def _change(self, images: tuple[FrameEntry, ...]) -> None:
@@ -183,16 +185,9 @@ class LiveFolder:
         """Write capture.json with these images."""
         some_joints = None if all(one.joints is not None for one in images) else {"joints"}
         frames = [one.model_dump(mode="json", exclude_none=True, exclude=some_joints) for one in images]
-        content = self._content.model_copy(update={"frames": frames})
-        write_text(self.folder / FILE, content.as_text())
+        write_text(self.folder / FILE, self._content.model_copy(update={"frames": frames}).as_text())
 
     def _delete(self, one: FrameEntry) -> None:
         """Delete the files of an image."""
         for file in filter(None, (one.image, one.depth)):
             contained(self.folder, file, str(self.folder)).unlink(missing_ok=True)
-
-    def _first_free_number(self) -> int:
-        """Return a number above those of all image files, files that no capture.json names included."""
-        names = [*self.names, *(f"{IMAGES}/{file.name}" for file in (self.folder / IMAGES).glob("*.png"))]
-        numbers = [int(match[1]) for name in names if (match := re.match(r"images/(\d+)\.", name))]
-        return max(numbers, default=-1) + 1

@@ -89,9 +89,10 @@ def propose_before_calibration(
     poses = capture.base_from_gripper[there]
     camera = typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
     assumptions = assumed(poses, camera)
-    if hand_eye is not None and _is_aimed(hand_eye):
-        x = hand_eye.gripper_from_camera
-        assumptions = replace(assumptions, gripper_from_camera=x, distance_m=median_distance(poses @ x))
+    if hand_eye is not None:
+        std, x = np.sqrt(np.diag(hand_eye.covariance)), hand_eye.gripper_from_camera
+        if std[:3].max() < AIMED[0] and std[3:6].max() < AIMED[1]:
+            assumptions = replace(assumptions, gripper_from_camera=x, distance_m=median_distance(poses @ x))
     return _best(assumptions, poses, errors_of(poses), attempts, there, reach, is_limited_by_rotation=True)
 
 
@@ -107,23 +108,16 @@ def propose(
     if not hand_eye.is_sound:
         return propose_before_calibration(attempts, reach, hand_eye)
     used, required = case.used, hand_eye.requirement
-    rows = case.reconstruction.image_index[used]
-    if not hand_eye.next_poses:
-        return _best(assumptions, case.base_from_gripper[used], robot.of(used), attempts, rows, reach, False)
-    pose = hand_eye.next_poses[0]
-    limited = required is not None and required.reached_deg > required.rotation_deg
-    first = pose.base_from_gripper[None]
-    is_free = reach.arm is None and reach.box is None and (not limited or attempts.is_apart(first)[0])
-    if is_free and attempts.is_likely(first, hand_eye.gripper_from_camera)[0]:
-        return {"next_pose": pose, "next_like": attempts.capture.images[rows[pose.like]]}
-    poses = case.base_from_gripper[used]
+    rows, poses = case.reconstruction.image_index[used], case.base_from_gripper[used]
+    limited = False
+    if hand_eye.next_poses:
+        pose = hand_eye.next_poses[0]
+        limited = required is not None and required.reached_deg > required.rotation_deg
+        first = pose.base_from_gripper[None]
+        is_free = reach.arm is None and reach.box is None and (not limited or attempts.is_apart(first)[0])
+        if is_free and attempts.is_likely(first, hand_eye.gripper_from_camera)[0]:
+            return {"next_pose": pose, "next_like": attempts.capture.images[rows[pose.like]]}
     return _best(assumptions, poses, robot.of(used), attempts, rows, reach, limited)
-
-
-def _is_aimed(hand_eye: HandEye) -> bool:
-    """Test whether a rejected calibration is exact enough to aim cameras by."""
-    std = np.sqrt(np.diag(hand_eye.covariance))
-    return bool(std[:3].max() < AIMED[0] and std[3:6].max() < AIMED[1])
 
 
 def _least_rotation(added: Float[ndarray, "c 4 4"], known: Float[ndarray, "k 4 4"]) -> Float[ndarray, " c"]:
@@ -156,9 +150,9 @@ def _best(
     count = 1 if reach.arm is None else PROPOSALS
     proposals = Proposals.of(assumptions, poses, robot, count, reach.box, is_likely=is_wanted)
     recorded = None if capture.joints is None else capture.joints[rows]
-    for k, pose in enumerate(proposals.added if reach.arm is not None else ()):
-        if reach.arm is not None and (joints := joints_at(reach.arm, poses, recorded, pose)) is not None:
-            proposals = replace(proposals, added=proposals.added[k : k + 1])
+    for pose in () if reach.arm is None else proposals.added:
+        if (joints := joints_at(reach.arm, poses, recorded, pose)) is not None:
+            proposals = replace(proposals, added=pose[None])
             break
     best = proposals.next_poses(1)[0]
     return {"next_pose": best, "next_joints": joints, "next_like": capture.images[rows[best.like]]}

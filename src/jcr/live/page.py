@@ -15,7 +15,15 @@ from jcr.capture.images import read_image
 from jcr.findings import sentence
 from jcr.findings.sentences import reached_in_words
 from jcr.live.notation import Notation
-from jcr.live.progress import FIRST_ADVICE, Progress, faults, next_lines, next_sentence, number_of
+from jcr.live.progress import (
+    FIRST_ADVICE,
+    Progress,
+    accuracy_line,
+    faults,
+    finding_lines,
+    next_lines,
+    next_sentence,
+)
 from jcr.live.session import LiveSession, SessionState
 from jcr.records import Intrinsics
 from jcr.report.figures import Figure, course_figure
@@ -38,13 +46,9 @@ FEW_FEATURES = 150
 
 def whole_page(session: LiveSession) -> str:
     """Return the page as a browser loads it; its script requests the parts after that."""
-    checks = [
-        ("cameras", "cameras", True),
-        ("grippers", "grippers", True),
-        ("grid", "base and grid", True),
-        ("next", "next pose (green)", True),
-        ("tracks", "points of the scene (red)", True),
-    ]
+    names = ("cameras", "grippers", "grid", "next", "tracks")
+    shown = ("cameras", "grippers", "base and grid", "next pose (green)", "points of the scene (red)")
+    checks = [(name, label, True) for name, label in zip(names, shown, strict=True)]
     view = {"layers": [], "checks": checks, "through": [], "labels": [], "data": _scene(session.state)}
     content = {"folder": str(session.folder.folder), "scene": Section("view", view)}
     return render("live.html", content, PACKAGE)
@@ -74,18 +78,21 @@ def page_content(
     first.
     """
     progress = state.progress
-    kind, headline, lines = _verdict(state, required)
+    kind, *lines = _verdict(state)
     has_next = _is_proposed(state)
+    # The lines of a program would repeat the pose.
+    lines_of_next = next_lines(progress, notation) if has_next else []
+    headline, *below = (line[:1].upper() + line[1:] for line in lines)
     return {
         "kind": kind,
-        "headline": _capitalised(headline),
-        "lines": [_capitalised(line) for line in lines],
+        "headline": headline,
+        "lines": below,
         "is_over": state.is_over,
         "has_report": has_report,
         "can_undo": state.can_undo,
         "tiles": _tiles(state, required),
         "next_pose": next_sentence(progress) if has_next else "",
-        "next_lines": _next_lines(progress, notation) if has_next else [],
+        "next_lines": [line for line in lines_of_next if not line.startswith(("URScript", "joints, rad"))],
         "courses": _courses(progress, required),
         "images": _cards(state)[::-1],
     }
@@ -97,13 +104,6 @@ def _is_proposed(state: SessionState) -> bool:
     return progress.next_pose is not None and not state.is_over and not progress.requirement_met
 
 
-def _next_lines(progress: Progress, notation: Notation) -> list[str]:
-    """Return the next pose as a person enters it; the lines of a program would repeat the pose."""
-    return [
-        line for line in next_lines(progress, notation) if not line.startswith(("URScript", "joints, rad"))
-    ]
-
-
 def _cards(state: SessionState) -> list[dict[str, Any]]:
     """Return the images of the list: number in commands, file, finding about it, and whether it is registered."""
     progress = state.progress
@@ -112,84 +112,55 @@ def _cards(state: SessionState) -> list[dict[str, Any]]:
     registered = dict.fromkeys(progress.images, "not registered")
     registered |= dict.fromkeys(progress.registered, "registered")
     return [
-        {
-            "number": number,
-            "name": name,
-            "fault": against.get(name, ""),
-            "state": registered.get(name, "new"),
-        }
+        {"number": number, "name": name, "fault": against.get(name, ""), "state": registered.get(name, "new")}
         for number, name in enumerate(state.names, 1)
     ]
 
 
-def _verdict(state: SessionState, required: tuple[float, float]) -> tuple[str, str, list[str]]:
-    """Return the kind, the headline and the lines below it."""
-    progress, count = state.progress, len(state.images)
-    if state.result is not None:
-        return _final_verdict(state)
+def _verdict(state: SessionState) -> list[str]:
+    """Return the kind of the verdict, its headline and the lines below it."""
+    progress, result, count = state.progress, state.result, len(state.images)
+    wrong = faults(progress)
+    if result is not None:
+        required = result.calibration.requirement
+        found = [] if required is None else [reached_in_words(required)]
+        found += [sentence(one) for one in result.calibration.findings if one.severity != "informs"]
+        kind = {"accepted": "good", "rejected": "bad"}.get(result.verdict, "fair")
+        where = f"The calibration of all {count} images is in {result.out}."
+        return [kind, result.verdict, *found, where]
+    if state.is_refusal:
+        return ["bad", state.event, *(sentence(one) for one in wrong)]
     if state.event:
-        lines = [sentence(one) for one in faults(progress)] if state.is_refusal else []
-        return "bad" if state.is_refusal else "", state.event, lines
+        return ["", state.event]
     if not count:
         first = "Move the arm so that the camera sees textured things at different heights, and let it rest."
-        return "", "No image yet", [first]
+        return ["", "No image yet", first]
     if not progress.images:
-        return "", f"{count} images", ["They are being calibrated."]
-    if wrong := faults(progress):
-        is_bad = any(one.severity == "rejects" for one in wrong)
-        number = number_of(wrong[0], state.names)
-        commands = [] if number is None else [f"Retake or remove image {number}."]
-        first, *more = (sentence(one) for one in wrong)
-        if progress.requirement_met and not is_bad:
-            return "good", "Requirement met, press Finish", [first, *commands, *more]
-        return "bad" if is_bad else "fair", first, [*commands, *more]
-    if progress.now is None:
-        return "", f"{count} images", ["A calibration needs three images that register.", FIRST_ADVICE + "."]
-    return _accuracy_verdict(progress, required)
-
-
-def _final_verdict(state: SessionState) -> tuple[str, str, list[str]]:
-    """Return the verdict of the calibration at the end, with its reasons and warnings."""
-    assert state.result is not None
-    verdict, calibration = state.result.verdict, state.result.calibration
-    found = [] if calibration.requirement is None else [reached_in_words(calibration.requirement)]
-    warnings = [sentence(one) for one in calibration.findings if one.severity != "informs"]
-    where = f"The calibration of all {len(state.images)} images is in {state.result.out}."
-    return {"accepted": "good", "rejected": "bad"}.get(verdict, "fair"), verdict, [*found, *warnings, where]
-
-
-def _accuracy_verdict(progress: Progress, required: tuple[float, float]) -> tuple[str, str, list[str]]:
-    """Return the verdict of a calibration without findings."""
-    assert progress.now is not None
+        return ["", f"{count} images", "They are being calibrated."]
+    lines = finding_lines(progress)
+    if any(one.severity == "rejects" for one in wrong):
+        return ["bad", *lines]
     if progress.requirement_met:
-        lines = ["The leave-one-out error confirms it. More images are possible."]
-        return "good", "Requirement met, press Finish", lines
-    mm, deg = progress.now.translation_mm, progress.now.rotation_deg
-    if mm > required[0] or deg > required[1]:
-        return "", "Not accurate enough yet: go on to the next pose", []
-    if progress.leave_one_out is None:
-        return "", "Accurate by its own estimate: more images are needed to confirm it", []
-    return "fair", "Accurate by its own estimate, which the leave-one-out error exceeds", []
-
-
-def _capitalised(words: str) -> str:
-    """Return a sentence with a capital first letter."""
-    return words[:1].upper() + words[1:]
+        return ["good", "Requirement met, press Finish", *lines]
+    if wrong:
+        return ["fair", *lines]
+    return ["", f"{count} images", accuracy_line(progress), *([FIRST_ADVICE] if progress.now is None else [])]
 
 
 def _tiles(state: SessionState, required: tuple[float, float]) -> list[Tile]:
-    """Return the accuracies beside what is required, and the number of registered images."""
+    """Return the accuracies beside what is required, at the end those of all images, and the registered images."""
     if not state.images:
         return []
+    found = None if state.result is None else state.result.calibration.requirement
+    reached, now = (), state.progress.now
+    if found is not None:
+        reached = found.reached_mm, found.reached_deg
+    elif now is not None:
+        reached = now.translation_mm, now.rotation_deg
+    names, units = ("Point uncertainty, 95 %", "Direction, 95 %"), (" mm", "°")
     tiles: list[Tile] = [
         (name, f"± {significant(value)}{unit}", f"required {limit:g}{unit}", True)
-        for name, value, limit, unit in zip(
-            ("Point uncertainty, 95 %", "Direction, 95 %"),
-            _reached(state),
-            required,
-            (" mm", "°"),
-            strict=False,
-        )
+        for name, value, limit, unit in zip(names, reached, required, units, strict=False)
     ]
     count = f"{len(state.progress.registered)} of {len(state.images)}"
     tiles.append(("Images registered", count, "", False))
@@ -199,25 +170,17 @@ def _tiles(state: SessionState, required: tuple[float, float]) -> list[Tile]:
     return tiles
 
 
-def _reached(state: SessionState) -> tuple[float, ...]:
-    """Return the accuracy (mm, degrees), at the end that of all images; empty where there is none."""
-    found = None if state.result is None else state.result.calibration.requirement
-    if found is not None:
-        return found.reached_mm, found.reached_deg
-    now = state.progress.now
-    return () if now is None else (now.translation_mm, now.rotation_deg)
-
-
 def _courses(progress: Progress, required: tuple[float, float]) -> list[Figure]:
     """Return figures of the accuracy after each image."""
     if len(history := progress.history) < 2:
         return []
-    count = [one.images for one in history]
-    curves = [
-        ("Point uncertainty (mm)", [one.translation_mm for one in history], required[0], " mm"),
-        ("Direction (°)", [one.rotation_deg for one in history], required[1], "°"),
+    count, mm, deg = zip(
+        *((one.images, one.translation_mm, one.rotation_deg) for one in history), strict=True
+    )
+    return [
+        course_figure("Point uncertainty (mm)", list(count), list(mm), required[0], " mm"),
+        course_figure("Direction (°)", list(count), list(deg), required[1], "°"),
     ]
-    return [course_figure(title, count, values, goal, unit) for title, values, goal, unit in curves]
 
 
 def _scene(state: SessionState) -> dict[str, Any]:
@@ -237,11 +200,8 @@ def _scene(state: SessionState) -> dict[str, Any]:
     ]
     points = np.zeros((0, 3)) if progress.points_in_base is None else progress.points_in_base
     colors = np.tile(np.array(TRACK_COLOR, np.uint8), (len(points), 1))
-    next_poses = (
-        [progress.next_pose.base_from_gripper]
-        if progress.next_pose is not None and _is_proposed(state)
-        else []
-    )
+    proposed = progress.next_pose if _is_proposed(state) else None
+    next_poses = [] if proposed is None else [proposed.base_from_gripper]
     intrinsics = (found.intrinsics if found is not None else None) or ANY_CAMERA
     poses = [*(one.base_from_gripper for one in state.images), *next_poses]
     shown_in_base = np.array([np.zeros(3), *(pose[:3, 3] for pose in poses)])

@@ -1,6 +1,5 @@
 """State of a calibration after each image of its capture, as a record, as text and as an answer for a program."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +14,7 @@ from jcr.rounding import significant
 
 CONFIRMING_IMAGES = 8
 """Least number of used images with which the leave-one-out error can confirm an accuracy."""
+REQUIREMENT_MET = "requirement met: finish, or go on"
 FIRST_ADVICE = "rotate the wrist by 20° or more, and move, between images"
 
 
@@ -84,8 +84,14 @@ class Progress:
 
     def __str__(self) -> str:
         """Return two lines: the accuracy beside what is required, and what to do next."""
-        images = f"{len(self.registered)} of {len(self.images)} images registered"
-        return f"{images}: {_accuracy(self)}\n{_advice(self)}"
+        wrong = faults(self)
+        if wrong:
+            advice = sentence(wrong[0])
+        elif self.requirement_met:
+            advice = REQUIREMENT_MET
+        else:
+            advice = FIRST_ADVICE if self.next_pose is None else f"next pose: {next_sentence(self)}"
+        return f"{accuracy_line(self)}\n{advice}"
 
     def as_json(self) -> dict[str, Any]:
         """Return the state for a program, as values of JSON."""
@@ -98,13 +104,8 @@ class Progress:
             "verdict": None if self.hand_eye is None else self.hand_eye.verdict,
             "history": [vars(one) for one in self.history],
             "findings": [
-                {
-                    "kind": one.kind.value,
-                    "severity": one.severity,
-                    "images": list(one.images),
-                    "text": text(one),
-                    "remedy": remedy(one),
-                }
+                {"kind": one.kind.value, "severity": one.severity, "images": list(one.images)}
+                | {"text": text(one), "remedy": remedy(one)}
                 for one in self.findings
             ],
             "leave_one_out": None if error is None else [error.translation_mm, error.rotation_deg],
@@ -126,28 +127,30 @@ def faults(state: Progress) -> list[Finding]:
     return sorted(found, key=lambda one: one.images != (state.added,))
 
 
-def number_of(finding: Finding, images: Sequence[str]) -> int | None:
-    """Return the number by which commands name the one image of a finding; None of any other finding."""
-    if len(finding.images) != 1 or finding.images[0] not in images:
-        return None
-    return images.index(finding.images[0]) + 1
+def finding_lines(state: Progress) -> list[str]:
+    """Return each fault in a sentence, with the commands for its image; these count images from 1."""
+    lines = []
+    for one in faults(state):
+        number = (
+            state.images.index(one.images[0]) + 1 if one.images and one.images[0] in state.images else None
+        )
+        commands = f" (retake {number}, or remove {number})" if number and len(one.images) == 1 else ""
+        lines.append(f"{sentence(one)}{commands}")
+    return lines
 
 
 def progress_lines(state: Progress, notation: Notation) -> list[str]:
     """Return the state as lines of the terminal, the next pose in the notation of the arm."""
     if state.hand_eye is None and len(state.images) <= 1:
         return [FIRST_ADVICE]
-    lines = [str(state).split("\n")[0]]
+    lines = [accuracy_line(state)]
     if (error := state.leave_one_out) is not None:
         lines.append(
             f"  leave-one-out error {significant(error.translation_mm)} mm and {significant(error.rotation_deg)}°"
         )
-    for one in faults(state):
-        number = number_of(one, state.images)
-        commands = "" if number is None else f" (retake {number}, or remove {number})"
-        lines.append(f"  {sentence(one)}{commands}")
+    lines += [f"  {line}" for line in finding_lines(state)]
     if state.requirement_met:
-        return [*lines, "requirement met: finish, or go on"]
+        return [*lines, REQUIREMENT_MET]
     if state.next_pose is not None:
         lines += [f"next: {next_sentence(state)}", *(f"  {line}" for line in next_lines(state, notation))]
     return lines
@@ -172,10 +175,11 @@ def next_lines(state: Progress, notation: Notation) -> list[str]:
     return lines
 
 
-def _accuracy(state: Progress) -> str:
-    """Return the accuracy beside what is required."""
+def accuracy_line(state: Progress) -> str:
+    """Return the number of registered images, and the accuracy beside what is required."""
+    images = f"{len(state.registered)} of {len(state.images)} images registered"
     if state.now is None or state.hand_eye is None:
-        return "no calibration yet"
+        return f"{images}: no calibration yet"
     verdict = "" if state.hand_eye.is_sound else ", rejected"
     required, limits = state.hand_eye.requirement, ""
     if required is not None:
@@ -185,13 +189,6 @@ def _accuracy(state: Progress) -> str:
         met = "met" if state.requirement_met else reached if required.met else "not met"
         limits = f"; required {required.translation_mm:g} mm and {required.rotation_deg:g}°: {met}"
     mm, deg = significant(state.now.translation_mm), significant(state.now.rotation_deg)
-    return f"± {mm} mm and {deg}° (95 % of errors of a point at the working distance){verdict}{limits}"
-
-
-def _advice(state: Progress) -> str:
-    """Return what to do next, in one line."""
-    if found := faults(state):
-        return sentence(found[0])
-    if state.requirement_met:
-        return "requirement met: finish, or go on"
-    return FIRST_ADVICE if state.next_pose is None else f"next pose: {next_sentence(state)}"
+    return (
+        f"{images}: ± {mm} mm and {deg}° (95 % of errors of a point at the working distance){verdict}{limits}"
+    )

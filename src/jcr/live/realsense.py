@@ -13,7 +13,7 @@ import numpy as np
 from jcr.capture.camera_info import IntrinsicsEntry
 from jcr.errors import InputError
 from jcr.extras import extra
-from jcr.live.cameras import TIMEOUT_S, Camera, CameraOptions, Frame, NewestFrame, RecordedFrames
+from jcr.live.cameras import TIMEOUT_S, Camera, CameraOptions, Frame, Frames
 
 REALSENSE = "realsense"
 """Name for `--camera`, followed by `:SERIAL` or `:FILE` where needed."""
@@ -32,48 +32,38 @@ def open_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
     """
     name = REALSENSE + (f":{serial}" if serial else "")
     rs = extra("pyrealsense2", "realsense", f"--camera {name}")
-    pipeline, is_file = rs.pipeline(), serial.endswith((".bag", ".db3"))
+    pipeline, config, is_file = rs.pipeline(), rs.config(), serial.endswith((".bag", ".db3"))
+    if is_file:
+        if not Path(serial).is_file():
+            raise InputError(f"--camera {name}: no such recording; name a .bag, or a serial number")
+        rs.config.enable_device_from_file(config, serial, repeat_playback=False)
+    else:
+        if serial:
+            config.enable_device(serial)
+        config.enable_stream(rs.stream.color, *(options.camera_size or SIZE), rs.format.rgb8)
+        config.enable_stream(rs.stream.depth)
     try:
-        profile = pipeline.start(_config(rs, serial, is_file, options))
+        profile = pipeline.start(config)
     except RuntimeError as error:
         raise InputError(
             f"--camera {name}: {' '.join(str(error).split())}; see what rs-enumerate-devices lists, and whether another "
             "program holds the camera"
         ) from None
+    frames = None
     try:
         if is_file:
             profile.get_device().as_playback().set_real_time(False)
         else:
             _apply_options(rs, profile, options)
-        read = _reader(rs, pipeline, profile, is_file)
         stored = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
-        source = RecordedFrames(iter(read, None)) if is_file else NewestFrame(read, name)
-        try:
-            yield Camera(source, source.latest, intrinsics_of_realsense(rs, stored))
-        finally:
-            if isinstance(source, NewestFrame):
-                source.close()
+        read = _reader(rs, pipeline, profile, is_file)
+        frames = Frames(read, None if is_file else name)
+        yield Camera(frames, frames.latest, intrinsics_of_realsense(rs, stored))
     finally:
+        if frames is not None:
+            frames.close()
         with suppress(RuntimeError):
             pipeline.stop()
-
-
-def _config(rs: ModuleType, serial: str, is_file: bool, options: CameraOptions) -> Any:
-    """Return the configuration of a recording, or of colour and depth of a camera (any for an empty serial number)."""
-    config = rs.config()
-    if is_file:
-        if not Path(serial).is_file():
-            raise InputError(
-                f"--camera {REALSENSE}:{serial}: no such recording; name a .bag, or a serial number"
-            )
-        rs.config.enable_device_from_file(config, serial, repeat_playback=False)
-        return config
-    if serial:
-        config.enable_device(serial)
-    width, height = options.camera_size or SIZE
-    config.enable_stream(rs.stream.color, width, height, rs.format.rgb8)
-    config.enable_stream(rs.stream.depth)
-    return config
 
 
 def _reader(rs: ModuleType, pipeline: Any, profile: Any, is_file: bool) -> Callable[[], Frame | None]:

@@ -13,6 +13,7 @@ import secrets
 import sys
 import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -25,9 +26,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from jcr.errors import InputError
 from jcr.live.page import camera_image, image_card, page_parts, whole_page
-from jcr.live.robot import RobotState, pose_of_numbers
+from jcr.live.robot import Action, RobotState, pose_of_numbers
 from jcr.live.session import LiveSession
-from jcr.live.terminal import Action
 
 LOOPBACK = "127.0.0.1"
 TIMEOUT_S = 10.0
@@ -36,11 +36,19 @@ MAX_COMMAND, MAX_SAMPLE = 1000, 65_536
 """Largest body in bytes."""
 OPEN_S, LAST_S = 4.0, 30.0
 """Time since its last request in which a page counts as open, and longest time in which it can fetch the result."""
+HTML = "text/html; charset=utf-8"
 POLICY = (
     "default-src 'none'; img-src 'self' blob: data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 """Content security policy of the page, and of the report that it opens."""
+HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": POLICY,
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
 
 
 @dataclass(frozen=True)
@@ -62,7 +70,10 @@ class Listen:
             raise InputError(
                 "--token: has characters that an address cannot have; use letters, digits, - and _"
             )
-        if _is_any_address(self.host):
+        is_any_host = self.host == ""
+        with suppress(ValueError):
+            is_any_host |= ipaddress.ip_address(self.host).is_unspecified
+        if is_any_host:
             raise InputError(
                 f"{self.option} {self.host}:{self.port}: names no host; give the address of this machine that the "
                 "robot uses"
@@ -147,15 +158,12 @@ class LiveServer:
     def __exit__(self, *error: object) -> None:
         """Let an open page fetch the last state and send the last answers, then stop."""
         end = time.monotonic() + LAST_S
-        while time.monotonic() < end and self._page_is_behind():
+        while time.monotonic() < end and (
+            time.monotonic() - self._page_s < OPEN_S and self._page_version < self.session.state.version
+        ):
             time.sleep(0.05)
         self._server.shutdown()
         self._server.server_close()
-
-    def _page_is_behind(self) -> bool:
-        """Test whether an open page does not have the last state."""
-        is_open = time.monotonic() - self._page_s < OPEN_S
-        return is_open and self._page_version < self.session.state.version
 
 
 class _HttpServer(ThreadingHTTPServer):
@@ -175,67 +183,75 @@ class _Handler(BaseHTTPRequestHandler):
 
     timeout = TIMEOUT_S
     server_version, sys_version = "jcr", ""
-
-    @property
-    def _owner(self) -> LiveServer:
-        """Server that received the request."""
-        assert isinstance(self.server, _HttpServer)
-        return self.server.owner
+    server: _HttpServer  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def do_GET(self) -> None:
         """Answer a request of the page."""
-        path = self._path()
-        if path is None:
+        if (path := self._path()) is None:
             return
         path, _, query = path.partition("?")
-        session, name = self._owner.session, path.removeprefix("image/")
+        owner, session = self.server.owner, self.server.owner.session
+        name, state = path.removeprefix("image/"), session.state
         if path == "":
-            self._send(whole_page(session).encode(), "text/html; charset=utf-8")
+            self._send(whole_page(session).encode(), HTML)
         elif path == "state":
-            self._send_state(query.removeprefix("version="))
+            # Only the version where the page has the state.
+            has_it = query.removeprefix("version=") == str(state.version)
+            owner.page_has(state.version if has_it else -1)
+            has_report = owner.report is not None
+            self._send_json({"version": state.version} if has_it else page_parts(session, state, has_report))
+        elif path == "now.jpg" and (frame := session.camera.latest()) is not None:
+            jpeg, features = camera_image(frame.image)
+            self._send(jpeg, "image/jpeg", features=features)
         elif path == "now.jpg":
-            self._send_camera_image()
-        elif path == "report.html" and (report := self._owner.report) is not None:
-            self._send(report.read_bytes(), "text/html; charset=utf-8")
-        elif name != path and name in session.state.names:
+            self._send(status=204)
+        elif path == "report.html" and (report := owner.report) is not None:
+            self._send(report.read_bytes(), HTML)
+        elif name != path and name in state.names:
             self._send(image_card(session.folder.folder / name), "image/jpeg")
         else:
-            self._send(b"", "text/plain", 404)
+            self._send(status=404)
 
     def do_POST(self) -> None:
         """Obey a command of the page, or take a sample."""
         if self.path == "/sample":
-            self._send_json(*self._sampled())
+            answer, status = self._sampled()
+            self._send_json(
+                {"accepted": False, "reason": answer} if isinstance(answer, str) else answer, status
+            )
             return
-        path = self._path()
-        if path is None:
+        if (path := self._path()) is None:
             return
         is_json = self.headers.get("Content-Type", "") == "application/json"
         if not self._is_own_origin(self.headers.get("Origin")) or not is_json:
-            self._send(b"", "text/plain", 403)
-        elif path != "press" or (command := self._command()) is None:
-            self._send(b"", "text/plain", 400)
+            self._send(status=403)
+            return
+        try:
+            command = _Command.model_validate_json(self._body(MAX_COMMAND) or b"")
+        except ValidationError:
+            command = None
+        if path != "press" or command is None:
+            self._send(status=400)
         else:
-            self._owner.session.press(*command)
-            self._send(b"", "text/plain", 204)
+            self.server.owner.session.press(command.action, command.number)
+            self._send(status=204)
 
-    def _sampled(self) -> tuple[dict[str, Any], int]:
-        """Take an image at the pose in the body; return answer and status when it is calibrated or refused."""
-        owner, origin = self._owner, self.headers.get("Origin")
+    def _sampled(self) -> tuple[dict[str, Any] | str, int]:
+        """Take an image at the pose in the body; return the answer, or the reason of a refusal, and the status."""
+        owner, origin = self.server.owner, self.headers.get("Origin")
         key = self.headers.get("Authorization", "").removeprefix("Bearer ").strip()
         if self.headers.get("Host") not in owner.hosts or not self._is_key(key):
-            return _refusal("no or a wrong key; send the header Authorization: Bearer KEY"), 403
+            return "no or a wrong key; send the header Authorization: Bearer KEY", 403
         if origin is not None and not self._is_own_origin(origin):
-            return _refusal("a sample from another web site"), 403
+            return "a sample from another web site", 403
         if not owner.takes_samples:
-            return _refusal("the poses of this capture come from elsewhere (--poses)"), 409
-        body = self._body(MAX_SAMPLE)
-        if body is None:
-            return _refusal(f"no Content-Length, or more than {MAX_SAMPLE} bytes"), 400
+            return "the poses of this capture come from elsewhere (--poses)", 409
+        if (body := self._body(MAX_SAMPLE)) is None:
+            return f"no Content-Length, or more than {MAX_SAMPLE} bytes", 400
         try:
             pose = sample_pose(body)
         except InputError as error:
-            return _refusal(str(error)), 400
+            return str(error), 400
         if pose is None:
             owner.session.end()
             return {"accepted": True, "done": True}, 200
@@ -247,77 +263,40 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _is_own_origin(self, origin: str | None) -> bool:
         """Test whether a browser's request comes from the page."""
-        return origin in [f"http://{host}" for host in self._owner.hosts]
+        return origin in [f"http://{host}" for host in self.server.owner.hosts]
 
     def _path(self) -> str | None:
         """Return the path behind the key; None, after an answer, where host or key are wrong."""
-        if self.headers.get("Host") not in self._owner.hosts:
-            self._send(b"", "text/plain", 403)
-            return None
         key, slash, path = self.path.removeprefix("/").partition("/")
-        if not slash or not self._is_key(key):
-            self._send(b"", "text/plain", 404)
-            return None
-        return path
+        if self.headers.get("Host") not in self.server.owner.hosts:
+            self._send(status=403)
+        elif not slash or not self._is_key(key):
+            self._send(status=404)
+        else:
+            return path
+        return None
 
     def _is_key(self, given: str) -> bool:
         """Compare a key in constant time."""
-        return hmac.compare_digest(given.encode(), self._owner.key.encode())
+        return hmac.compare_digest(given.encode(), self.server.owner.key.encode())
 
     def _body(self, most: int) -> bytes | None:
         """Return the body; None where its length is not stated or above `most`."""
         length = self.headers.get("Content-Length", "")
-        if not length.isdecimal() or int(length) > most:
-            return None
-        return self.rfile.read(int(length))
-
-    def _command(self) -> tuple[Action, int | None] | None:
-        """Return the command in the body; None where there is no valid one."""
-        try:
-            command = _Command.model_validate_json(self._body(MAX_COMMAND) or b"")
-        except ValidationError:
-            return None
-        return command.action, command.number
-
-    def _send_state(self, version: str) -> None:
-        """Send the state; only its version where the page has it."""
-        owner = self._owner
-        state = owner.session.state
-        if version == str(state.version):
-            owner.page_has(state.version)
-            self._send_json({"version": state.version})
-            return
-        owner.page_has(-1)
-        self._send_json(page_parts(owner.session, state, owner.report is not None))
-
-    def _send_camera_image(self) -> None:
-        """Send the newest image of the camera with its features."""
-        frame = self._owner.session.camera.latest()
-        if frame is None:
-            self._send(b"", "text/plain", 204)
-        else:
-            jpeg, features = camera_image(frame.image)
-            self._send(jpeg, "image/jpeg", features=features)
+        return self.rfile.read(int(length)) if length.isdecimal() and int(length) <= most else None
 
     def _send_json(self, content: dict[str, Any], status: int = 200) -> None:
         """Send a response of JSON."""
         self._send(json.dumps(content).encode() + b"\n", "application/json", status)
 
-    def _send(self, body: bytes, kind: str, status: int = 200, features: str | None = None) -> None:
+    def _send(
+        self, body: bytes = b"", kind: str = "text/plain", status: int = 200, features: str | None = None
+    ) -> None:
         """Send a response with the headers that keep other sites out."""
         self.send_response(status)
-        headers = {
-            "Content-Type": kind,
-            "Content-Length": str(len(body)),
-            "Cache-Control": "no-store",
-            "Content-Security-Policy": POLICY,
-            "Cross-Origin-Resource-Policy": "same-origin",
-            "Referrer-Policy": "no-referrer",
-            "X-Content-Type-Options": "nosniff",
-        }
-        if features is not None:
-            headers["X-Features"] = features
-        for name, value in headers.items():
+        of_camera = {} if features is None else {"X-Features": features}
+        own = {"Content-Type": kind, "Content-Length": str(len(body))} | of_camera
+        for name, value in (own | HEADERS).items():
             self.send_header(name, value)
         self.end_headers()
         self.wfile.write(body)
@@ -346,16 +325,3 @@ def sample_pose(body: bytes) -> Float[ndarray, "4 4"] | None:
     except (TypeError, ValueError, OverflowError):
         raise InputError("base_from_gripper: not numbers; send 4 rows of 4 in metres") from None
     return pose_of_numbers(numbers, "base_from_gripper")
-
-
-def _refusal(reason: str) -> dict[str, Any]:
-    """Return the answer to a sample that is not taken."""
-    return {"accepted": False, "reason": reason}
-
-
-def _is_any_address(host: str) -> bool:
-    """Test whether a host stands for all addresses of this machine."""
-    try:
-        return ipaddress.ip_address(host).is_unspecified
-    except ValueError:
-        return host == ""

@@ -17,12 +17,10 @@ from numpy import ndarray
 
 from jcr.capture.formats.capture_json import FrameEntry
 from jcr.errors import InputError, RejectedError
-from jcr.live.cameras import Camera, Frame
+from jcr.live.cameras import Camera, Frame, frame_at_rest
 from jcr.live.notation import Notation
 from jcr.live.progress import Progress, progress_lines
-from jcr.live.robot import MOVED_ON, REST, TRY_AGAIN, RobotState, States, is_farther, next_rest
-from jcr.live.stillness import frame_at_rest
-from jcr.live.terminal import Action
+from jcr.live.robot import MOVED_ON, REST, TRY_AGAIN, Action, RobotState, States, is_farther, next_rest
 
 if TYPE_CHECKING:
     from jcr.live.calibration import LiveCalibration
@@ -137,22 +135,37 @@ class LiveSession:
         `source` calls `take` in a thread of its own; None where requests come from elsewhere. Raises the error of the
         source or the camera.
         """
+
+        def request() -> None:
+            """Run the source; its end is the end of the capture."""
+            try:
+                source()  # pyright: ignore[reportOptionalCall]
+            except Exception as error:
+                self.end(error)
+            else:
+                self.end()
+
         self._follow()
         self._show(is_over=len(self.folder.names) >= self.options.most)
         if source is not None:
-            threading.Thread(target=self._request, args=(source,), daemon=True).start()
+            threading.Thread(target=request, daemon=True).start()
+        longest_s, abandon = INTERRUPTED_S, True
         try:
             with self._changed:
                 self._changed.wait_for(lambda: self.state.is_over)
-            self._stop_worker(LONGEST_S, abandon=self._error is not None)
-        except BaseException:
-            self._stop_worker(INTERRUPTED_S, abandon=True)
-            raise
+            longest_s, abandon = LONGEST_S, self._error is not None
+        finally:
+            # Wait until all images are calibrated, or where the capture was abandoned the present ones.
+            self.end()
+            self._worker.shutdown(wait=False, cancel_futures=abandon)
+            wait([self._following], longest_s)
         if self._error is not None:
             raise self._error
 
-    def end(self) -> None:
-        """Take no more images."""
+    def end(self, error: Exception | None = None) -> None:
+        """Take no more images; `error` is raised by `run`."""
+        if not self.state.is_over:
+            self._error = error
         self._show(self.state.event, is_over=True)
 
     def watch(self, states: States) -> None:
@@ -191,17 +204,17 @@ class LiveSession:
             number = len(names) if number is None else number
             if action == "finish":
                 self._show(is_over=True)
-            elif action == "take":
-                self._take_now()
+            elif action == "undo" and not self.folder.undo():
+                self._refuse("refused: nothing to undo")
             elif action == "undo":
-                self._undo()
-            elif not 1 <= number <= len(names):
+                self._changed_by(f"undone: {len(self.folder.names)} images")
+            elif action in ("retake", "remove") and not 1 <= number <= len(names):
                 self._refuse(f"refused: there is no image {number}")
-            else:
+            elif action != "take":
                 self.folder.remove(names[number - 1])
-                self._follow_removal(f"removed {names[number - 1]}")
-                if action == "retake":
-                    self._take_now()
+                self._changed_by(f"removed {names[number - 1]}")
+            if action == "take" or (action == "retake" and 1 <= number <= len(names)):
+                self._take_now()
 
     def finish(self) -> "RunResult | None":
         """Return the calibration of all images; None, with a line that says why, where there is none."""
@@ -253,40 +266,31 @@ class LiveSession:
         try:
             found = frame_at_rest(self._frames, kept, self.options.patience)
         except InputError as error:
-            self._fail(error)
+            self.end(error)
             raise
         if isinstance(found, str):
             raise InputError(found)
-        if current is not None:
-            try:
-                has_moved = is_farther(pose, current().base_from_gripper, REST)
-            except (InputError, StopIteration) as error:
-                raise InputError(f"the pose cannot be read after the image: {error}") from None
-            if has_moved:
-                raise InputError("the arm moved while the image was taken; let it rest")
+        if current is None:
+            return found
+        try:
+            has_moved = is_farther(pose, current().base_from_gripper, REST)
+        except (InputError, StopIteration) as error:
+            raise InputError(f"the pose cannot be read after the image: {error}") from None
+        if has_moved:
+            raise InputError("the arm moved while the image was taken; let it rest")
         return found
 
     def _take_now(self) -> None:
         """Take an image where the gripper is now."""
-        if self._gripper is None:
-            self._refuse("refused: give the pose at which the gripper rests; the image is taken then")
-            return
         try:
-            state = self._gripper()
+            if self._gripper is None:
+                raise InputError("give the pose at which the gripper rests; the image is taken then")
+            self.take(self._gripper(), current=self._gripper)
         except InputError as error:
             self._refuse(f"refused: {error}")
-            return
-        self.take(state, current=self._gripper)
 
-    def _undo(self) -> None:
-        """Take back the last change."""
-        if self.folder.undo():
-            self._follow_removal(f"undone: {len(self.folder.names)} images")
-        else:
-            self._refuse("refused: nothing to undo")
-
-    def _follow_removal(self, event: str) -> None:
-        """Calibrate the images that are left."""
+    def _changed_by(self, event: str) -> None:
+        """Show and tell a removal or its undoing, and let the calibration follow."""
         self._show(event)
         self._follow()
         self._tell({"images": self.folder.names}, [event])
@@ -296,37 +300,23 @@ class LiveSession:
         self._show(why, is_refusal=True)
         self._tell(answer or {"accepted": False, "reason": why.removeprefix("refused: ")}, [why])
 
-    def _request(self, source: Callable[[], None]) -> None:
-        """Run the source of requests; its end is the end of the capture."""
-        try:
-            source()
-        except Exception as error:
-            self._fail(error)
-        else:
-            self.end()
-
-    def _fail(self, error: Exception) -> None:
-        """End the session with an error."""
-        if not self.state.is_over:
-            self._error = error
-        self.end()
-
     def _follow(self, refused: Float[ndarray, "4 4"] | None = None) -> None:
         """Let the worker calibrate the images where they changed, and propose a pose away from a refused one."""
         with suppress(RuntimeError):  # The worker has ended, with the session.
             self._following = self._worker.submit(self._calibrate, refused)
 
-    def _stop_worker(self, longest_s: float, abandon: bool) -> None:
-        """Wait until the worker has calibrated all images, or with `abandon` the present ones."""
-        self.end()
-        self._worker.shutdown(wait=False, cancel_futures=abandon)
-        wait([self._following], longest_s)
-
     def _calibrate(self, refused: Float[ndarray, "4 4"] | None) -> None:
         """Calibrate the images where they changed, and propose another pose, in the worker's thread."""
         try:
             if tuple(self.folder.names) != self._calibrated:
-                self._update()
+                progress = self.calibration.update()
+                self._calibrated = progress.images
+                self._report(progress)
+                if self.options.until_accurate and progress.requirement_met:
+                    result = self.calibration.finish()
+                    required = result.calibration.requirement
+                    if result.converged and required is not None and required.met:
+                        self._show(is_over=True, result=result)
             if refused is not None:
                 self._report(self.calibration.propose_elsewhere(refused))
         except (InputError, RejectedError) as error:
@@ -334,18 +324,7 @@ class LiveSession:
         except OSError as error:
             self._refuse(f"no calibration: {error.filename or self.folder.folder}: {error.strerror}")
         except Exception as error:
-            self._fail(error)
-
-    def _update(self) -> None:
-        """Calibrate the images, and end the capture where that is accurate enough."""
-        progress = self.calibration.update()
-        self._calibrated = progress.images
-        self._report(progress)
-        if self.options.until_accurate and progress.requirement_met:
-            result = self.calibration.finish()
-            required = result.calibration.requirement
-            if result.converged and required is not None and required.met:
-                self._show(is_over=True, result=result)
+            self.end(error)
 
     def _report(self, progress: Progress) -> None:
         """Show and tell a state of the calibration."""
