@@ -110,10 +110,7 @@ def _accuracy(truth: Truth) -> tuple[list[str], SceneMap]:
         "against the surface that the images show, at 10 mm and 5 mm; colour and labels where the map knows that "
         "surface.",
         "",
-        *table(
-            f"poses | preset | training | {' | '.join(ours)} | colour PSNR | label mIoU | unknown",
-            rows,
-        ),
+        *table(f"poses | preset | training | {' | '.join(ours)} | colour PSNR | label mIoU | unknown", rows),
         "",
     ]
     return lines, scenes[exact, "default"]

@@ -16,13 +16,7 @@ from jcr.estimation.arms import arm_named
 from jcr.estimation.observations import Observations
 from jcr.estimation.problem import ReportedPoses
 from jcr.estimation.systematic import smooth_errors
-from jcr.geometry import (
-    apply_similarity,
-    inverse,
-    rotation_exp,
-    scale_translation,
-    transform,
-)
+from jcr.geometry import apply_similarity, inverse, rotation_exp, scale_translation, transform
 from jcr.records import Intrinsics
 from simulation.arms import EFFECTIVE_POSES, PRESETS, PresetName, about_posture, bend, effective_fit
 from simulation.motion import fixed_camera, motion_over_table
@@ -96,10 +90,7 @@ def cell_problem(
         fit = effective_fit(bent, elsewhere, pair, exchanged=True)
         reported = disturbed(bent.reported(joints), white, rng)
         cell.add_arm(inverse(carried) @ base_from_camera, reported, pair, FIXED_CAMERA)
-        cell.truth = {
-            "base_from_camera": fit.gripper_from_camera,
-            "gripper_from_object": fit.base_from_recon,
-        }
+        cell.truth = {"base_from_camera": fit.gripper_from_camera, "gripper_from_object": fit.base_from_recon}
         x_in_object, normal = _box(points, rng)
         return _seen(cell, x_in_object, normal, noise_px, rng)
     own = motion_over_table(bent, "varied", count, np.zeros(3), (rng, rng))
@@ -205,12 +196,7 @@ def _seen(
         kind=cell.kind,
         reported=tuple(cell.reported),
         observations=Observations(
-            rig=rig_of,
-            camera=camera_of,
-            image=image,
-            x_px=x_px,
-            point=point,
-            std_px=np.ones(len(point)),
+            rig=rig_of, camera=camera_of, image=image, x_px=x_px, point=point, std_px=np.ones(len(point))
         ),
         world_from_rig=scale_translation(world_from_base @ rigs, 1 / scale),
         rig_from_camera=scale_translation(np.stack(cell.mounts), 1 / scale),

@@ -102,11 +102,7 @@ class Chromium:
 
     def js(self, expression: str) -> Any:
         answer = self.call(
-            "Runtime.evaluate",
-            expression=expression,
-            awaitPromise=True,
-            returnByValue=True,
-            userGesture=True,
+            "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True, userGesture=True
         )
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")

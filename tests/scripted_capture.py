@@ -101,9 +101,9 @@ class Scripted:
         self.finished += 1
         requirement = a_hand_eye(True).requirement
         blurred = Finding.of(FindingKind.BLURRED, "warns", "images", "images/000.png", value=5.0)
-        hand_eye = SimpleNamespace(requirement=requirement, findings=(blurred,) if self.warns else ())
+        found = SimpleNamespace(requirement=requirement, findings=(blurred,) if self.warns else ())
         return SimpleNamespace(
-            converged=True, hand_eye=hand_eye, verdict="accepted", out=self.live.folder / "result"
+            converged=True, calibration=found, verdict="accepted", out=self.live.folder / "result"
         )
 
     def close(self) -> None:

@@ -74,8 +74,7 @@ def test_the_papers_grid_search_finds_the_answer_within_its_grid_and_only_there(
     problem = hand_eye_problem(np.random.default_rng(5), 8)
     for scale, found_there in ((2.0, True), (5.0, False)):
         x, found = grid_search(
-            problem.base_from_gripper,
-            scale_translation(problem.recon_from_camera, problem.scale / scale),
+            problem.base_from_gripper, scale_translation(problem.recon_from_camera, problem.scale / scale)
         )
         assert rotation_between_deg(x[:3, :3], problem.gripper_from_camera[:3, :3]) < 1e-5
         assert (abs(found - scale) < 3 / 20_000) == found_there

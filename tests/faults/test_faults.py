@@ -100,16 +100,6 @@ def case(tmp_path: Path, sound: Path, done: Path) -> Case:
 Plant = Callable[[Case], list[str]]
 
 
-def image(change: Callable[[Path], Any]) -> Plant:
-    """A fault of the first image."""
-
-    def plant(case: Case) -> list[str]:
-        change(case.first)
-        return case.calibrate
-
-    return plant
-
-
 def written(change: Callable[[Case], Any]) -> Plant:
     """A fault of the capture."""
 
@@ -118,6 +108,17 @@ def written(change: Callable[[Case], Any]) -> Plant:
         return case.calibrate
 
     return plant
+
+
+def image(change: Callable[[Path], Any]) -> Plant:
+    """A fault of the first image."""
+    return written(lambda case: change(case.first))
+
+
+def text(content: str | bytes) -> Plant:
+    """Another capture.json."""
+    data = content if isinstance(content, bytes) else content.encode()
+    return written(lambda case: (case.capture / "capture.json").write_bytes(data))
 
 
 def posed(change: Callable[[np.ndarray], np.ndarray], only: int | None = None) -> Plant:
@@ -150,13 +151,6 @@ def bomb(path: Path) -> None:
 def animated(path: Path) -> None:
     frames = [Image.new("RGB", SIZE, color) for color in ("red", "green")]
     frames[0].save(path, format="GIF", save_all=True, append_images=frames[1:])
-
-
-def rotated(degrees: float) -> Callable[[np.ndarray], np.ndarray]:
-    def change(pose: np.ndarray) -> np.ndarray:
-        return pose @ np.diag([degrees, degrees, degrees, 1.0])
-
-    return change
 
 
 def big_json(case: Case) -> None:
@@ -239,27 +233,26 @@ class Evil:
         return Path.touch, (self.file,)
 
 
-def executed(beside: Path) -> Path:
+def executed(file: Path) -> Path:
     """What code in a file would leave beside that file."""
-    return beside.with_name("executed")
+    return file.with_name("executed")
 
 
-def weights(change: Callable[[Path], Any]) -> Plant:
-    def plant(case: Case) -> list[str]:
-        file = case.capture.parent / "weights.pth"
-        change(file)
-        return [*case.calibrate, "--backend", "dust3r", "--weights", str(file)]
+def beside(name: str, *options: str) -> Callable[[Callable[[Path], Any]], Plant]:
+    """A fault of a file beside the capture, named after these options."""
 
-    return plant
+    def of(change: Callable[[Path], Any]) -> Plant:
+        def plant(case: Case) -> list[str]:
+            change(case.capture.parent / name)
+            return [*case.calibrate, *options, str(case.capture.parent / name)]
+
+        return plant
+
+    return of
 
 
-def predictions(change: Callable[[Path], Any]) -> Plant:
-    def plant(case: Case) -> list[str]:
-        file = case.capture.parent / "pairs.npz"
-        change(file)
-        return [*case.calibrate, "--predictions", str(file)]
-
-    return plant
+weights = beside("weights.pth", "--backend", "dust3r", "--weights")
+predictions = beside("pairs.npz", "--predictions")
 
 
 def pickled_weights(path: Path) -> None:
@@ -306,22 +299,9 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
         3,
         "registered 0 of 6",  # read as it should be: the other images are noise
     ),
-    "CMYK image": (
-        by_colmap(image(lambda p: Image.new("CMYK", SIZE, (9, 99, 9, 0)).save(p, format="TIFF"))),
-        3,
-        "registered 0 of 6",
-    ),
     "animated image": (image(animated), 2, "holds 2 images"),
-    "100-megapixel image": (
-        image(lambda p: Image.new("1", (10_000, 10_000)).save(p)),
-        2,
-        "million pixels",
-    ),
-    "image of fractions": (
-        image(lambda p: Image.new("F", SIZE, 0.5).save(p, format="TIFF")),
-        2,
-        "fractions",
-    ),
+    "100-megapixel image": (image(lambda p: Image.new("1", (10_000, 10_000)).save(p)), 2, "million pixels"),
+    "image of fractions": (image(lambda p: Image.new("F", SIZE, 0.5).save(p, format="TIFF")), 2, "fractions"),
     "32-bit image": (
         image(lambda p: Image.new("I", SIZE, 1 << 20).save(p, format="TIFF")),
         2,
@@ -333,21 +313,7 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
         2,
         "same image",
     ),
-    "all images equal": (
-        written(lambda c: [shutil.copy(c.first, c.first.with_name(f"{k}.png")) for k in range(1, COUNT)]),
-        2,
-        "same image",
-    ),
-    "one black image": (
-        by_colmap(image(lambda p: Image.new("RGB", SIZE).save(p))),
-        3,
-        "registered 0 of 6",
-    ),
-    "one image of another size": (
-        image(lambda p: Image.new("RGB", (48, 36)).save(p)),
-        2,
-        "96x72|48x36",
-    ),
+    "one image of another size": (image(lambda p: Image.new("RGB", (48, 36)).save(p)), 2, "96x72|48x36"),
     "missing image": (image(Path.unlink), 2, "no such image"),
     "image that is a folder": (image(lambda p: (p.unlink(), p.mkdir())), 2, "a folder, a pipe"),
     "image that is a pipe": (image(lambda p: (p.unlink(), os.mkfifo(p))), 2, "a folder, a pipe"),
@@ -361,7 +327,7 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
     "NaN in a pose": (posed(lambda p: p * np.nan, only=2), 2, "NaN or infinity"),
     "infinity in a pose": (posed(lambda p: p + np.inf, only=2), 2, "NaN or infinity"),
     "reflected pose": (posed(lambda p: p @ np.diag([1, 1, -1, 1]), only=2), 2, "reflection"),
-    "scaled pose": (posed(rotated(2.0), only=2), 2, "scaled by 2"),
+    "scaled pose": (posed(lambda p: p @ np.diag([2.0, 2.0, 2.0, 1.0]), only=2), 2, "scaled by 2"),
     "transposed pose": (posed(lambda p: p.T, only=2), 2, "transposed"),
     "poses in millimetres": (
         posed(lambda p: np.vstack([np.column_stack([p[:3, :3], 1e3 * p[:3, 3]]), p[3:]])),
@@ -375,28 +341,12 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
     ),
     "two frames": (written(lambda c: c.edit(lambda j: j.update(frames=j["frames"][:2]))), 2, "at least 3"),
     # capture.json.
-    "no JSON": (written(lambda c: (c.capture / "capture.json").write_text("frames: []")), 2, "not JSON"),
-    "one key twice": (
-        written(lambda c: (c.capture / "capture.json").write_text('{"frames": [], "frames": []}')),
-        2,
-        "appears twice",
-    ),
+    "no JSON": (text("frames: []"), 2, "not JSON"),
+    "one key twice": (text('{"frames": [], "frames": []}'), 2, "appears twice"),
     "10 MB of JSON": (written(big_json), 2, "MB|at least 3"),
-    "deep nesting": (
-        written(lambda c: (c.capture / "capture.json").write_text("[" * 200_000)),
-        2,
-        "nested too deeply",
-    ),
-    "not UTF-8": (
-        written(lambda c: (c.capture / "capture.json").write_bytes(b'{"frames": "\xff\xfe"}')),
-        2,
-        "not UTF-8",
-    ),
-    "a number of 5000 digits": (
-        written(lambda c: (c.capture / "capture.json").write_text(f'{{"frames": [{"9" * 5000}]}}')),
-        2,
-        "4300 digits",
-    ),
+    "deep nesting": (text("[" * 200_000), 2, "nested too deeply"),
+    "not UTF-8": (text(b'{"frames": "\xff\xfe"}'), 2, "not UTF-8"),
+    "a number of 5000 digits": (text(f'{{"frames": [{"9" * 5000}]}}'), 2, "4300 digits"),
     "NUL in a path": (image_named("images/0\0.png"), 2, "no path inside"),
     "half a surrogate in a path": (image_named("images/\ud800.png"), 2, "no path inside"),
     "a name of 300 letters": (image_named("images/" + "x" * 300), 2, "no path inside"),
@@ -431,16 +381,8 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
     # Weights and predictions.
     "weights that are a pickle with code": (weights(pickled_weights), 2, "weights.pth"),
     "weights that are torch's pickle with code": (weights(torch_pickled_weights), 2, "weights.pth"),
-    "truncated weights": (
-        weights(lambda p: (saved_weights(p, (999,)), cut(p))),
-        2,
-        "weights.pth",
-    ),
-    "weights of another network": (
-        weights(lambda p: saved_weights(p, (3, 3))),
-        2,
-        "weights.pth",
-    ),
+    "truncated weights": (weights(lambda p: (saved_weights(p, (999,)), cut(p))), 2, "weights.pth"),
+    "weights of another network": (weights(lambda p: saved_weights(p, (3, 3))), 2, "weights.pth"),
     "no such kind of board": (lambda c: [*c.calibrate, "--board", "chess:9x6:0.025"], 2, "--board"),
     "no such weights": (weights(lambda p: None), 2, "weights.pth"),
     "predictions that are a pickle with code": (predictions(pickled_predictions), 2, "pairs.npz"),
@@ -458,29 +400,22 @@ def state(folder: Path) -> dict[str, str]:
     }
 
 
-OF_ONE_SAMPLE = (
-    "zero-byte image",
-    "truncated image",
-    "text file named .png",
-    "animated image",
-    "100-megapixel image",
-    "image of fractions",
-    "32-bit image",
-    "decompression bomb",
-    "one image under two names",
-    "one image of another size",
-    "missing image",
-    "NaN in a pose",
-    "infinity in a pose",
-    "reflected pose",
-    "scaled pose",
-    "transposed pose",
-    "missing pose",
-)
+OF_ONE_SAMPLE = {
+    *("zero-byte image", "truncated image", "text file named .png", "animated image", "100-megapixel image"),
+    *(
+        "image of fractions",
+        "32-bit image",
+        "decompression bomb",
+        "one image under two names",
+        "missing image",
+    ),
+    *("one image of another size", "NaN in a pose", "infinity in a pose", "reflected pose", "scaled pose"),
+    *("transposed pose", "missing pose"),
+}
 """Faults of one sample, which is left out with a note that names it."""
 
 
-@pytest.mark.parametrize("fault", OF_ONE_SAMPLE)
+@pytest.mark.parametrize("fault", sorted(OF_ONE_SAMPLE))
 def test_a_sample_that_cannot_be_used_is_left_out_and_named(case: Case, fault: str):
     plant, _, words = FAULTS[fault]
     plant(case)

@@ -274,10 +274,7 @@ def test_the_node_broadcasts_the_transform_where_it_is_accepted_alone(
         measured = SimpleNamespace(header=message.header, encoding="32FC1", data=depth, **shape)
         node.subscriptions_made["/depth"](measured)
 
-    film = threading.Thread(
-        target=played.film,
-        args=(push, over),
-    )
+    film = threading.Thread(target=played.film, args=(push, over))
     film.start()
     try:
         assert node.services["~/start"](None, Message()).success

@@ -11,14 +11,7 @@ from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.estimation.kinematics import forward_kinematics
 from jcr.estimation.mounting import fit_known_scale
 from jcr.geometry import apply, inverse, rotation_angle, rotation_log
-from simulation.arms import (
-    PRESETS,
-    BentArm,
-    error_names,
-    hand_eye_on,
-    table_center,
-    views,
-)
+from simulation.arms import PRESETS, BentArm, error_names, hand_eye_on, table_center, views
 from simulation.capture import SimulateOptions, simulate
 from simulation.problems import bent_problem
 from simulation.truth import read_truth, true_depth, true_labels

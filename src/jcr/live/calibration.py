@@ -268,12 +268,7 @@ class LiveCalibration:
             return replace(state, findings=findings, **self._next_pose())
         of_rows, assumptions = robot.of(rows), assumptions_of(case)
         hand_eye = advised(
-            case.hand_eye,
-            case.base_from_gripper,
-            self._options,
-            of_rows,
-            assumptions,
-            case.scene_uncertainty,
+            case.hand_eye, case.base_from_gripper, self._options, of_rows, assumptions, case.scene_uncertainty
         )
         required = hand_eye.requirement
         assert required is not None

@@ -232,11 +232,7 @@ class LiveSession:
         try:
             frame = self._frame(state, current)
             name = self.calibration.keep(
-                frame.image,
-                state.base_from_gripper,
-                state.joints,
-                frame.time_s,
-                frame.depth_mm,
+                frame.image, state.base_from_gripper, state.joints, frame.time_s, frame.depth_mm
             )
         except StopIteration:
             self.end()
