@@ -21,11 +21,10 @@ import jcr
 from jcr.calibration.record import Calibration
 from jcr.cell.placement import CamerasFile
 from jcr.cli import COMMANDS, dispatch
-from jcr.cli.models import SCALES
+from jcr.cli.prepare import SCALES, pages
 from jcr.depth.depth_npz import About as DepthAbout
 from jcr.findings import FindingKind
 from jcr.findings.table import GROUPS, Row
-from jcr.pages import pages
 from jcr.reconstruct import BACKENDS
 from jcr.reconstruction_npz import About
 from jcr.run_folder import State

@@ -26,7 +26,7 @@ from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_source
 from jcr.capture.urdf_chain import read_chain
-from jcr.cli.query import read_points
+from jcr.cli.use import read_points
 from jcr.depth.densify import pointmaps_of
 from jcr.depth.depth_npz import read_depth, write_depth
 from jcr.geometry import inverse

@@ -15,7 +15,7 @@ from jcr.capture.options import ReadOptions
 from jcr.cli import dispatch
 from jcr.pipeline import batch as module
 from jcr.pipeline.batch import Row, Task, batch, run_one
-from jcr.pipeline.batch_options import BatchOptions
+from jcr.pipeline.options import BatchOptions
 from jcr.pipeline.run import RunOptions
 
 pytestmark = pytest.mark.slow

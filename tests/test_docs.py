@@ -19,12 +19,12 @@ from benchmarks.__main__ import Arguments as BenchArguments
 from jcr.capture.camera_info import IntrinsicsEntry
 from jcr.capture.cell_cameras import CameraEntry
 from jcr.capture.formats.capture_json import CaptureFile, FrameEntry
-from jcr.cli import COMMANDS, dispatch
+from jcr.cli import COMMANDS, command, dispatch
+from jcr.cli.prepare import page as page_named
+from jcr.cli.prepare import pages
 from jcr.cli.usage import parsed
 from jcr.errors import InputError
 from jcr.findings import FindingKind
-from jcr.pages import page as page_named
-from jcr.pages import pages
 from places import ROOT
 from simulation.__main__ import Arguments as SimulationArguments
 
@@ -64,7 +64,7 @@ def understand(line: str, is_complete: bool) -> None:
     if program == "jcr" and name not in COMMANDS:
         raise InputError("no such command")
     if is_complete and program == "jcr":
-        parsed(import_module(f"jcr.cli.{name.replace('-', '_')}").Arguments, f"jcr {name}", rest)
+        parsed(command(name), f"jcr {name}", rest)
     elif is_complete:
         tyro.cli(MODULES[rest[0]], args=rest[1:])
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from corpus import sound_run
-from jcr.cli import call, dispatch
+from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.pipeline.run import _is_complete, _write_complete
 from jcr.records import Capture, CellCamera
@@ -148,11 +148,12 @@ def test_a_capture_in_a_folder_whose_name_is_not_utf8_is_refused_before_any_work
         state_of(capture, RunOptions())
 
 
-def test_memory_that_ends_is_one_line(capsys):
-    def load() -> ModuleType:
+def test_memory_that_ends_is_one_line(capsys, monkeypatch: pytest.MonkeyPatch):
+    def load(name: str) -> ModuleType:
         raise MemoryError("Unable to allocate 5.62 MiB")
 
-    assert call(load, "jcr run", []) == 2
+    monkeypatch.setattr("jcr.cli.command", load)
+    assert dispatch(["run"]) == 2
     said = capsys.readouterr().err
     assert said.startswith("error: out of memory (Unable to allocate 5.62 MiB); ") and said.count("\n") == 1
 

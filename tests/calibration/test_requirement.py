@@ -15,7 +15,7 @@ from jcr.calibration.words import summary
 from jcr.capture.read import read_capture
 from jcr.cli import dispatch
 from jcr.cli.output import VerboseOutput
-from jcr.cli.result import show, show_calibration
+from jcr.cli.run import show, show_calibration
 from jcr.errors import InputError
 from jcr.estimation.point_uncertainty import within_95
 from jcr.findings import Finding, FindingKind, sentence

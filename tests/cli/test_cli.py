@@ -13,7 +13,7 @@ import pytest
 
 import jcr
 from in_process import run_jcr
-from jcr.cli.query import read_points
+from jcr.cli.use import read_points
 from jcr.errors import InputError
 from jcr.scene.cloud_ply import read_cloud
 from jcr.scene.options import MapOptions

@@ -103,11 +103,11 @@ def test_what_was_written_before_an_error_is_not_lost() -> None:
 import sys
 import jcr.cli as cli
 
-def dispatch(arguments):
+def dispatched(arguments):
     sys.stdout.write("half of a table")
     raise cli.InputError("row 3 is wrong")
 
-cli.dispatch = dispatch
+cli._dispatched = dispatched
 cli.main([])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

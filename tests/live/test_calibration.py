@@ -82,7 +82,7 @@ def test_a_requirement_that_holds_is_confirmed_by_the_leave_one_out_error(grown)
 
 
 @pytest.mark.slow
-def test_the_end_is_the_batch_calibration(grown, done: Path, tmp_path: Path):
+def test_the_end_is_the_batch_calibration(grown, done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     folder = shutil.copytree(grown[0], tmp_path / "capture")
     with closing(LiveCalibration(folder)) as live:
         result = live.finish()
@@ -91,6 +91,12 @@ def test_the_end_is_the_batch_calibration(grown, done: Path, tmp_path: Path):
     # The files round.
     assert np.allclose(result.gripper_from_camera, batch.gripper_from_camera, rtol=0, atol=1e-7)
     assert np.allclose(result.covariance, batch.covariance, rtol=1e-4, atol=0)
+    # A run of the same folder begins with that reconstruction.
+    with monkeypatch.context() as patched:
+        patched.setattr("jcr.pipeline.run.choose", lambda *_: pytest.fail("made again"))
+        run = jcr.calibrate(folder, tmp_path / "run")
+    assert np.allclose(run.gripper_from_camera, result.gripper_from_camera, rtol=0, atol=1e-9)
+    assert (tmp_path / "run" / "reconstruction.npz").is_file()
 
 
 @pytest.mark.slow

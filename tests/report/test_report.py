@@ -27,7 +27,7 @@ from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
 from jcr.cell.placement import ArmPlacement, CameraPlacement, CellPlacement, ImageUse, TransformUncertainty
 from jcr.cli.output import VerboseOutput
-from jcr.cli.result import show
+from jcr.cli.run import show
 from jcr.errors import RejectedError
 from jcr.estimation.observability import excitation
 from jcr.findings import no_reconstruction

@@ -12,7 +12,7 @@ import pytest
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.cli.measure import table as sizes_table
+from jcr.cli.use import sizes_table
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import (

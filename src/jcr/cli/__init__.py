@@ -1,9 +1,9 @@
-"""The command line: one module a command, imported only when that command is asked for.
+"""The command line: one class a command, whose module is imported only when that command is asked for.
 
-A command's module has a frozen dataclass `Arguments`, whose docstring is the help (with examples) and whose
-field docstrings are the help of its options, and a function `main(Arguments) -> int` that gives the exit
-status: 0 done, 2 the user's input is wrong, 3 rejected, 1 a bug. Each has an `output` (output.py): with
---json its result is one JSON object on stdout, with --quiet nothing but errors and warnings comes on stderr.
+The docstring of a command's class is the help (with examples), the docstrings of its fields are the help of its options,
+and `main` returns the exit status: 0 done, 2 the user's input is wrong, 3 rejected, 1 a bug. Each has an `output`
+(output.py): with --json its result is one JSON object on stdout, with --quiet nothing but errors and warnings comes on
+stderr.
 """
 
 import atexit
@@ -14,8 +14,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from types import ModuleType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from jcr.allocator import MORE_MEMORY, require_address_space
 from jcr.cli.output import Quiet
@@ -23,34 +22,38 @@ from jcr.errors import InputError, RejectedError, did_you_mean, printable
 
 GROUPS = {
     "calibrate": {
-        "run": "everything: reconstruct, calibrate, map, report",
-        "calibrate": "reconstruct and calibrate only: calibration.json",
-        "add-camera": "locate a fixed camera from its images of a run's scene",
-        "batch": "run many captures, on this machine or a Ray cluster",
+        "run": ("everything: reconstruct, calibrate, map, report", "run.Run"),
+        "calibrate": ("reconstruct and calibrate only: calibration.json", "run.Calibrate"),
+        "add-camera": ("locate a fixed camera from its images of a run's scene", "run.AddCamera"),
+        "batch": ("run many captures, on this machine or a Ray cluster", "run.Batch"),
     },
     "use": {
-        "export": "export to ROS, MoveIt, OctoMap, cuRobo, COLMAP, nerfstudio, …",
-        "query": "query the map at points: occupancy, distance, colour, label",
-        "measure": "measure the support plane and the objects on it",
-        "view": "show a run in 3D, in the browser",
-        "map": "build or rebuild the map of a run",
+        "export": ("export to ROS, MoveIt, OctoMap, cuRobo, COLMAP, nerfstudio, …", "use.Export"),
+        "query": ("query the map at points: occupancy, distance, colour, label", "use.Query"),
+        "measure": ("measure the support plane and the objects on it", "use.Measure"),
+        "view": ("show a run in 3D, in the browser", "use.View"),
+        "map": ("build or rebuild the map of a run", "use.Map"),
     },
     "check": {
-        "check": "check a capture before any heavy work",
-        "verify": "has the camera moved? test a calibration with a few new images",
-        "compare": "compare two calibrations: do their uncertainties explain the difference?",
-        "touch": "touch test: compare points touched with the robot's tip with the map",
+        "check": ("check a capture before any heavy work", "check.Check"),
+        "verify": ("has the camera moved? test a calibration with a few new images", "check.Verify"),
+        "compare": (
+            "compare two calibrations: do their uncertainties explain the difference?",
+            "check.Compare",
+        ),
+        "touch": ("touch test: compare points touched with the robot's tip with the map", "check.Touch"),
     },
     "prepare": {
-        "capture": "take a capture live, with advice on the next pose",
-        "board": "draw a calibration board to print, if you want one",
+        "capture": ("take a capture live, with advice on the next pose", "capture.Capture"),
+        "board": ("draw a calibration board to print, if you want one", "prepare.Board"),
     },
     "more": {
-        "models": "list back ends with their licences; download weights",
-        "docs": "print the pages of the manual",
+        "models": ("list back ends with their licences; download weights", "prepare.Models"),
+        "docs": ("print the pages of the manual", "prepare.Docs"),
     },
 }
-COMMANDS = {name: about for group in GROUPS.values() for name, about in group.items()}
+"""Commands by their group: what each does, and module and class of its arguments."""
+COMMANDS = {name: about for group in GROUPS.values() for name, (about, _) in group.items()}
 
 _OVERVIEW = """\
 usage: jcr COMMAND [ARGUMENTS]
@@ -96,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     _open_closed_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # of an ASCII terminal, which has no ±
-    _end(_guarded(lambda: dispatch(sys.argv[1:] if arguments is None else arguments)))
+    _end(dispatch(sys.argv[1:] if arguments is None else arguments))
 
 
 def _end(status: int) -> NoReturn:
@@ -133,9 +136,17 @@ def _open_closed_streams() -> None:
 
 
 def dispatch(arguments: Sequence[str]) -> int:
-    """Run one command line and return its exit status."""
+    """Run one command line and return its exit status; print an error as one line on stderr."""
+    return _guarded(lambda: _dispatched(arguments))
+
+
+def _dispatched(arguments: Sequence[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
-        sys.stdout.write(_OVERVIEW.format(commands="\n\n".join(_listed(group) for group in GROUPS)))
+        groups = (
+            "\n".join([f"{group}:", *(f"  {name:<10} {about}" for name, (about, _) in commands.items())])
+            for group, commands in GROUPS.items()
+        )
+        sys.stdout.write(_OVERVIEW.format(commands="\n\n".join(groups)))
         return 0
     name, rest = arguments[0], arguments[1:]
     if name == "--version":
@@ -143,35 +154,34 @@ def dispatch(arguments: Sequence[str]) -> int:
 
         sys.stdout.write(f"jcr {__version__}\n")
         return 0
-    if name == "--tyro-write-completion":
-        return _guarded(lambda: _completion(arguments))
-    if name not in COMMANDS:
+    if name != "--tyro-write-completion" and name not in COMMANDS:
         like = did_you_mean(name, COMMANDS)
-        return _fail(
-            2, f"{name!r} is not a jcr command{like}; choose from {', '.join(COMMANDS)} (jcr --help)"
+        raise InputError(
+            f"{name!r} is not a jcr command{like}; choose from {', '.join(COMMANDS)} (jcr --help)"
         )
-    return call(lambda: import_module(_module_of(name)), f"jcr {name}", rest)
+    from jcr.cli.usage import parsed, write_completion
+
+    if name == "--tyro-write-completion":
+        write_completion({name: command(name) for name in COMMANDS}, arguments)
+        return 0
+    try:
+        record = parsed(command(name), f"jcr {name}", rest)
+    except SystemExit as end:  # after --help
+        return int(end.code or 0)
+    require_address_space()
+    with contextlib.ExitStack() as silence:
+        if record.output.quiet:
+            nowhere = silence.enter_context(open(os.devnull, "wb"))
+            quiet = silence.enter_context(Quiet(nowhere, sys.stderr))
+            silence.enter_context(contextlib.redirect_stderr(quiet))
+        return record.main()
 
 
-def _completion(arguments: Sequence[str]) -> int:
-    from jcr.cli.usage import write_completion
-
-    write_completion({name: import_module(_module_of(name)).Arguments for name in COMMANDS}, arguments)
-    return 0
-
-
-def _module_of(command: str) -> str:
-    return f"jcr.cli.{command.replace('-', '_')}"
-
-
-def _listed(group: str) -> str:
-    """Return the commands of a group below its name."""
-    return "\n".join([f"{group}:", *(f"  {name:<10} {about}" for name, about in GROUPS[group].items())])
-
-
-def call(load: Callable[[], ModuleType], program: str, arguments: Sequence[str]) -> int:
-    """Run the command whose module `load` imports; return its exit status and print an error as one line on stderr."""
-    return _guarded(lambda: _call(load(), program, arguments))
+def command(name: str) -> Any:
+    """Return the class of a command's arguments."""
+    (place,) = (group[name][1] for group in GROUPS.values() if name in group)
+    module, kind = place.split(".")
+    return getattr(import_module(f"jcr.cli.{module}"), kind)
 
 
 def _guarded(action: Callable[[], int]) -> int:
@@ -215,22 +225,6 @@ def _interrupted(error: BaseException | None) -> bool:
             return True
         error = error.__cause__ or error.__context__
     return False
-
-
-def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
-    from jcr.cli.usage import parsed
-
-    try:
-        record = parsed(command.Arguments, program, arguments)
-    except SystemExit as end:  # after --help
-        return int(end.code or 0)
-    require_address_space()
-    with contextlib.ExitStack() as silence:
-        if record.output.quiet:
-            nowhere = silence.enter_context(open(os.devnull, "wb"))
-            quiet = silence.enter_context(Quiet(nowhere, sys.stderr))
-            silence.enter_context(contextlib.redirect_stderr(quiet))
-        return command.main(record)
 
 
 def _fail(status: int, message: str) -> int:

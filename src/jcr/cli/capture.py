@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments:
+class Capture:
     """Take a capture live, with a camera and the gripper poses of a robot, and see what is still missing.
 
     An image is taken when the arm rests, and kept if it is sharp and nothing moves. The calibration is made meanwhile:
@@ -79,21 +79,20 @@ class Arguments:
     session: SessionOptions = field(default_factory=SessionOptions)
     output: Output = field(default_factory=Output)
 
+    def main(self) -> int:
+        """Take a capture, or list the arms."""
+        if self.robot == "list":
+            arms = [arm_named(name) for name in ROBOT_NAMES]
+            lines = [f"{arm.name:<8}{arm.dof} joints, reach {arm.reach:.2f} m" for arm in arms]
+            facts = {"robots": [{"name": arm.name, "joints": arm.dof, "reach_m": arm.reach} for arm in arms]}
+            self.output.result("\n".join(lines) + "\n", facts)
+            return 0
+        if self.out is None:
+            raise InputError("OUT: required, and not given (jcr capture --help)")
+        return _take(self, self.out, self.robot)
 
-def main(arguments: Arguments) -> int:
-    """Take a capture, or list the arms."""
-    if arguments.robot == "list":
-        arms = [arm_named(name) for name in ROBOT_NAMES]
-        lines = [f"{arm.name:<8}{arm.dof} joints, reach {arm.reach:.2f} m" for arm in arms]
-        facts = {"robots": [{"name": arm.name, "joints": arm.dof, "reach_m": arm.reach} for arm in arms]}
-        arguments.output.result("\n".join(lines) + "\n", facts)
-        return 0
-    if arguments.out is None:
-        raise InputError("OUT: required, and not given (jcr capture --help)")
-    return _take(arguments, arguments.out, arguments.robot)
 
-
-def _take(arguments: Arguments, out: Path, robot: RobotName | None) -> int:
+def _take(arguments: Capture, out: Path, robot: RobotName | None) -> int:
     """Take images until there are enough, or the calibration is as accurate as required; calibrate all of them."""
     from jcr.live.arms import states_of
     from jcr.live.calibration import LiveCalibration
@@ -136,7 +135,7 @@ def _take(arguments: Arguments, out: Path, robot: RobotName | None) -> int:
 
 
 def _conclude(
-    arguments: Arguments,
+    arguments: Capture,
     folder: "LiveFolder",
     answers: "list[Answer]",
     result: "RunResult | None",
@@ -171,7 +170,7 @@ def _print(text: str) -> None:
 
 
 def _source(
-    arguments: Arguments, session: "LiveSession", states: "States | None", server: "LiveServer"
+    arguments: Capture, session: "LiveSession", states: "States | None", server: "LiveServer"
 ) -> "Callable[[], None]":
     """Return the function that requests images where `--poses` says; read typed commands."""
     from jcr.live.robot import HELP, typed_poses, without_commands
@@ -198,7 +197,7 @@ def _take_all(session: "LiveSession", poses: "Iterator[Any]") -> None:
         session.take(RobotState(time.monotonic(), pose))
 
 
-def _listen(arguments: Arguments) -> "Listen":
+def _listen(arguments: Capture) -> "Listen":
     """Return the address of the server; raise InputError where it is open to others without a token."""
     from jcr.live.arms import address_of
     from jcr.live.server import Listen
@@ -211,7 +210,7 @@ def _listen(arguments: Arguments) -> "Listen":
     return listen
 
 
-def _notation(arguments: Arguments, folder: "LiveFolder") -> "Notation":
+def _notation(arguments: Capture, folder: "LiveFolder") -> "Notation":
     """Return the notation of printed poses: that of the options, else that of the arm."""
     from jcr.live.arms import NOTATIONS
     from jcr.live.notation import Notation

@@ -1,4 +1,4 @@
-"""`jcr check`: checks a capture before any heavy work."""
+"""Commands that test a capture or a calibration: check, verify, compare and touch."""
 
 import shlex
 from dataclasses import dataclass, field
@@ -9,16 +9,24 @@ import numpy as np
 import tyro
 
 from jcr.capture.options import ReadOptions
-from jcr.cli.output import VerboseOutput
-from jcr.cli.source import looked_at
+from jcr.cli.output import Output, VerboseOutput
+from jcr.cli.run import looked_at, with_images
+from jcr.errors import InputError
+from jcr.pipeline.options import VerifyOptions
+from jcr.progress import progress_bars
 
 if TYPE_CHECKING:
+    from jcr.calibration.difference import Difference
     from jcr.pipeline.check import Examination
+    from jcr.pipeline.verify import Verification
     from jcr.records import Capture, PosePairs
+
+UNLIKELY = 1e-3
+"""Largest p-value of a difference that the reported errors do not explain."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments:
+class Check:
     """Check a capture: files, units, motion, observability, pose convention, and which poses to add.
 
     The exit status is 3 if its calibration would be rejected; the message has the reason and the remedy.
@@ -51,85 +59,67 @@ class Arguments:
     """Seed of the registration and of the proposals."""
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
+    def main(self) -> int:
+        """Examine the capture and print the verdict."""
+        from jcr.calibration.options import CalibrateOptions, check_options
+        from jcr.pipeline.check import check_capture, read_and_compare
 
-def main(arguments: Arguments) -> int:
-    """Examine the capture and print the verdict."""
-    from jcr.calibration.options import CalibrateOptions, check_options
-    from jcr.errors import InputError
-    from jcr.pipeline.check import check_capture, read_and_compare
-    from jcr.progress import progress_bars
-
-    if arguments.suggest < 0:
-        raise InputError(f"--suggest {arguments.suggest}: give how many poses to propose, 0 or more")
-    options = CalibrateOptions(robot_noise=arguments.robot_noise)
-    check_options(options)
-    with (
-        progress_bars() as progress,
-        looked_at(arguments.capture, arguments.read, progress, read_and_compare) as capture,
-    ):
-        found = check_capture(
-            capture,
-            arguments.suggest,
-            not arguments.poses_only,
-            options.robot_noise_m_rad,
-            None if arguments.reach is None else np.array(arguments.reach).reshape(2, 3),
-            arguments.seed,
-            progress,
-            arguments.thorough,
-        )
-        facts = _as_json(capture, found)
-        arguments.output.result("" if arguments.output.json else _as_text(arguments, capture, found), facts)
-    return 3 if found.verdict == "rejected" else 0
+        if self.suggest < 0:
+            raise InputError(f"--suggest {self.suggest}: give how many poses to propose, 0 or more")
+        options = CalibrateOptions(robot_noise=self.robot_noise)
+        check_options(options)
+        with (
+            progress_bars() as progress,
+            looked_at(self.capture, self.read, progress, read_and_compare) as capture,
+        ):
+            found = check_capture(
+                capture,
+                self.suggest,
+                not self.poses_only,
+                options.robot_noise_m_rad,
+                None if self.reach is None else np.array(self.reach).reshape(2, 3),
+                self.seed,
+                progress,
+                self.thorough,
+            )
+            text = "" if self.output.json else _check_text(self, capture, found)
+            self.output.result(text, _check_facts(capture, found))
+        return 3 if found.verdict == "rejected" else 0
 
 
-def _as_text(arguments: Arguments, capture: "Capture | PosePairs", found: "Examination") -> str:
+def _check_text(command: Check, capture: "Capture | PosePairs", found: "Examination") -> str:
     """Return the verdict with its cause and remedy, or with what a calibration is expected to reach."""
     from jcr.calibration.words import MOST_LINES, actions, labelled, verdict_in_words
     from jcr.findings import sentence
+    from jcr.records import PosePairs
+    from jcr.rounding import significant
 
-    is_rejected = found.verdict == "rejected"
+    if isinstance(capture, PosePairs):
+        about = f"{len(capture)} samples with the poses of gripper and camera, no images"
+    else:
+        width, height = capture.image_size
+        intrinsics = "given" if capture.intrinsics is not None else "unknown, to be estimated"
+        about = f"{len(capture)} images of {width}x{height}, intrinsics {intrinsics}"
+    is_rejected, closing = found.verdict == "rejected", "jcr docs troubleshooting"
     outcome = "a calibration would be rejected" if is_rejected else "good to calibrate"
-    lines = [f"{verdict_in_words(found.findings)}: {outcome}. {_as_read(capture)}"]
-    rotation = np.degrees(found.largest_rotation_rad)
-    motion = f"up to {1e3 * found.largest_move_m:.0f} mm and {rotation:.0f}° between two poses"
+    lines = [f"{verdict_in_words(found.findings)}: {outcome}. {about}"]
     if not is_rejected:
+        rotation = np.degrees(found.largest_rotation_rad)
+        motion = f"up to {1e3 * found.largest_move_m:.0f} mm and {rotation:.0f}° between two poses"
         lines += [*labelled("Motion", motion), *_expected(len(capture), found)]
-    closing = labelled("Next", "jcr docs troubleshooting")
-    if not is_rejected:
-        closing = labelled(
-            "Next", shlex.join(["jcr", "run", str(arguments.capture), f"out/{arguments.capture.stem}"])
-        )
+        closing = shlex.join(["jcr", "run", str(command.capture), f"out/{command.capture.stem}"])
     notes = [line for note in found.notes for line in labelled("Note", note)]
     acting = actions(found.findings, MOST_LINES - len(lines) - 1)
     room = MOST_LINES - len(lines) - len(acting) - 1
-    if arguments.output.verbose:
+    if command.output.verbose:
         acting += [f"{one.severity}: {sentence(one)}" for one in found.findings]
-    lines += [*acting, *(notes if arguments.output.verbose else notes[:room])]
-    return "\n".join([*lines, *_suggested(capture, found), *closing]) + "\n"
-
-
-def _suggested(capture: "Capture | PosePairs", found: "Examination") -> list[str]:
-    """Return the proposed gripper poses, each with the accuracy expected once it is added."""
-    from jcr.calibration.words import labelled
-    from jcr.rounding import significant
-
-    lines = []
+    lines += [*acting, *(notes if command.output.verbose else notes[:room])]
     for k, pose in enumerate(found.suggestions, start=1):
         matrix = np.array2string(pose.base_from_gripper, precision=4, suppress_small=True).splitlines()
         then = f"{significant(pose.within_95_mm)} mm, {significant(pose.rotation_95_deg)}°"
         near = f"{1e3 * pose.moved_m:.0f} mm, {np.degrees(pose.rotation_rad):.0f}° from {capture.images[pose.like]}"
         lines += labelled(f"Add pose {k}", f"{near}; then {then} (95 %); base_from_gripper:", *matrix)
-    return lines
-
-
-def _as_read(capture: "Capture | PosePairs") -> str:
-    from jcr.records import PosePairs
-
-    if isinstance(capture, PosePairs):
-        return f"{len(capture)} samples with the poses of gripper and camera, no images"
-    width, height = capture.image_size
-    intrinsics = "given" if capture.intrinsics is not None else "unknown, to be estimated"
-    return f"{len(capture)} images of {width}x{height}, intrinsics {intrinsics}"
+    return "\n".join([*lines, *labelled("Next", closing)]) + "\n"
 
 
 def _expected(images: int, found: "Examination") -> list[str]:
@@ -160,44 +150,234 @@ def _expected(images: int, found: "Examination") -> list[str]:
     return lines
 
 
-def _as_json(capture: "Capture | PosePairs", found: "Examination") -> dict[str, Any]:
+def _check_facts(capture: "Capture | PosePairs", found: "Examination") -> dict[str, Any]:
+    """Return the result of the check for JSON."""
     from jcr.calibration.findings_json import as_json
+    from jcr.calibration.record import mm_and_deg
     from jcr.findings import warnings_of
 
     noise = None if found.hand_eye is None else found.hand_eye.robot_noise
+    sharpness = found.sharpness.tolist() or [None] * len(capture)
+    names = "base_from_gripper", "expected_std", "within_95_mm", "rotation_95_deg"
     return {
         "verdict": found.verdict,
         "images": [
-            {"image": name, "sharpness": float(found.sharpness[k]) if len(found.sharpness) else None}
-            for k, name in enumerate(capture.images)
+            {"image": name, "sharpness": own} for name, own in zip(capture.images, sharpness, strict=True)
         ],
         "largest_move_mm": 1e3 * found.largest_move_m,
         "largest_turn_deg": float(np.degrees(found.largest_rotation_rad)),
         "observability": {
-            "observable": found.observability.observable,
-            "unobservable": list(found.observability.unobservable),
-            "advice": list(found.observability.advice),
+            name: getattr(found.observability, name) for name in ("observable", "unobservable", "advice")
         },
-        "expected_std": None if found.expected_std is None else found.expected_std.tolist(),
+        "expected_std": None if found.expected is None else found.expected.std,
         "expected_seen": None if found.expected is None else vars(found.expected.in_use.seen),
         "expected_images": [capture.images[row] for row in found.counted],
-        "robot_noise": None
-        if noise is None
-        else {
-            "translation_mm": 1e3 * noise.translation,
-            "rotation_deg": float(np.degrees(noise.rotation)),
-        },
+        "robot_noise": None if noise is None else mm_and_deg(noise.translation, noise.rotation),
         "suggestions": [
-            {
-                "base_from_gripper": pose.base_from_gripper.tolist(),
-                "expected_std": pose.expected_std.tolist(),
-                "within_95_mm": pose.within_95_mm,
-                "rotation_95_deg": pose.rotation_95_deg,
-                "like": capture.images[pose.like],
-            }
+            {name: getattr(pose, name) for name in names} | {"like": capture.images[pose.like]}
             for pose in found.suggestions
         ],
         "findings": [as_json(one) for one in found.findings],
-        "warnings": list(warnings_of(found.findings)),
-        "notes": list(found.notes),
+        "warnings": warnings_of(found.findings),
+        "notes": found.notes,
     }
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Compare two calibrations: their difference in mm and degrees, and whether their covariances explain it.
+
+    Each is a run folder, a calibration.json, or any JSON with a `gripper_from_camera` (a capture's reference.json, or
+    the folder that holds one; with `std_mm` and `std_deg` if its errors are known). With --verbose: χ², the squared
+    difference in units of both covariances, and p, the probability of a larger one if nothing else is wrong. For two
+    calibrations of one arm p is too large, because they share systematic errors. The exit status is 3 if one of the
+    two is rejected, or if the reported errors do not explain the difference.
+
+    examples:
+      jcr compare out/tabletop examples/tabletop
+      jcr compare out/today out/yesterday --json
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """The calibration to compare."""
+    reference: Annotated[Path, tyro.conf.Positional]
+    """The calibration to compare it with."""
+    output: VerboseOutput = field(default_factory=VerboseOutput)
+
+    def main(self) -> int:
+        """Print the difference, whether the reported errors explain it, and the causes that would."""
+        from jcr.calibration.difference import difference
+        from jcr.calibration.known_transform import read_hand_eye
+        from jcr.calibration.words import labelled
+
+        known = {path: read_hand_eye(path) for path in (self.out, self.reference)}
+        found = difference(known[self.out], known[self.reference])
+        rejected = {str(path): one.doubt for path, one in known.items() if one.doubt is not None}
+        facts: dict[str, object] = {
+            "translation_mm": 1e3 * float(np.linalg.norm(found.translation_m)),
+            "rotation_deg": float(np.degrees(np.linalg.norm(found.rotation_vector))),
+            "translation_xyz_mm": 1e3 * found.translation_m,
+            "rejected": rejected,
+        }
+        if found.sigmas is not None:
+            facts |= {"sigmas": found.sigmas, "chi2": found.chi2, "p": found.p_value}
+            facts["explained_by"] = found.explained_by
+        is_contradiction = found.p_value is not None and found.p_value < UNLIKELY
+        verdict = "REJECTED" if is_contradiction or rejected else "ACCEPTED"
+        explained, *lines = _difference_lines(found, is_contradiction)
+        if self.output.verbose and found.sigmas is not None:
+            lines.append(f"χ² {found.chi2:.1f} of 6, p = {found.p_value:.2g}")
+        lines += [line for path, why in rejected.items() for line in labelled("Rejected", f"{path}: {why}")]
+        apart = f"{facts['translation_mm']:.3f} mm, {facts['rotation_deg']:.4f}° apart"
+        self.output.result("\n".join([f"{verdict}: {apart}{explained}", *lines]) + "\n", facts)
+        return 3 if verdict == "REJECTED" else 0
+
+
+def _difference_lines(found: "Difference", is_contradiction: bool) -> list[str]:
+    """Return the end of the verdict's line, and the lines on the difference and its causes."""
+    from jcr.calibration.words import labelled
+
+    offset = " ".join(f"{1e3 * value:.3f}" for value in found.translation_m) + " mm (gripper axes)"
+    if found.sigmas is None:
+        return ["; neither file states its errors", *labelled("Difference", offset)]
+    offset += f"; at most {found.sigmas.max():.1f} of the reported standard deviations on any axis"
+    lines = ["; the reported errors explain it"]
+    if is_contradiction:
+        remedy = "find out what moved between the two, or which error they do not report"
+        lines = ["; more than the reported errors explain", *labelled("Remedy", remedy)]
+    lines += labelled("Difference", offset)
+    shares = [f"{name.replace('_', ' ')} {100 * share:.0f} %" for name, share in found.explained_by.items()]
+    return [*lines, *(labelled("Causes", f"would be {', '.join(shares)}") if len(shares) > 1 else ())]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verify:
+    """Test a calibration with new images: has the camera moved on the gripper since?
+
+    OUT is the run folder of the calibration; its capture must still be at its old path. CAPTURE is a capture in any
+    format with one or more new images of the same scene (two or three distinguish a moved camera from a moved table),
+    or with five or more images of another scene. Fixed cameras of the run that CAPTURE names in `cameras` are tested
+    too. The exit status is 3 if something has moved, or if the images cannot decide.
+
+    examples:
+      jcr verify out/table captures/this-morning
+      jcr verify out/table captures/this-morning --tolerance 1 0.1 --json
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder of the run that calibrated the camera."""
+    capture: Annotated[Path, tyro.conf.Positional]
+    """The new images and their poses: a capture folder, or another format (jcr docs captures)."""
+    read: ReadOptions = field(default_factory=ReadOptions)
+    verify: VerifyOptions = field(default_factory=VerifyOptions)
+    output: VerboseOutput = field(default_factory=VerboseOutput)
+
+    def main(self) -> int:
+        """Verify and print what to do."""
+        from jcr.pipeline.verify import verify_run
+
+        with (
+            progress_bars() as progress,
+            looked_at(self.capture, self.read, progress, at_least=1) as new,
+        ):
+            capture = with_images(new, self.capture, "which verify needs")
+            found = verify_run(self.out, capture, self.verify, progress)
+        cameras = (found, *found.others)
+        facts = _drift_facts(found) | {"cameras": {one.fixed: _drift_facts(one) for one in found.others}}
+        lines = [line for one in cameras for line in _drift_lines(one, self.output.verbose)]
+        self.output.result("\n".join(lines) + "\n", facts)
+        return 3 if any(one.moved for one in cameras) else 0
+
+
+def _drift_lines(found: "Verification", verbose: bool) -> list[str]:
+    """Return the verdict on one camera, the remedy, the drift with its standard deviation, and warnings."""
+    from jcr.calibration.words import labelled
+
+    drift = f"{1e3 * found.drift_m:.2f} mm, {np.degrees(found.drift_rad):.3f}° from the calibration"
+    mm, mm_std = (" ".join(f"{1e3 * value:.2f}" for value in part[:3]) for part in (found.offset, found.std))
+    deg, deg_std = (
+        " ".join(f"{np.degrees(value):.3f}" for value in part[3:]) for part in (found.offset, found.std)
+    )
+    parent = "gripper" if found.fixed is None else "base"
+    noticed = f"{1e3 * found.detectable[0]:.1f} mm or {np.degrees(found.detectable[1]):.2f}°"
+    lines = [
+        f"{found.verdict.upper()}: {found.finding}, {drift}",
+        *(labelled("Remedy", found.advice) if found.moved else ()),
+        *labelled("Drift", f"{mm} ± {mm_std} mm, {deg} ± {deg_std}° (1σ, {parent} axes)"),
+        *labelled("Images", f"{len(found.images)}, {found.how}; 9 of 10 drifts of {noticed} are noticed"),
+        *(line for note in found.notes for line in labelled("WARNING", note)),
+    ]
+    return [*lines, f"p = {found.p_value:.2g}"] if verbose else lines
+
+
+def _drift_facts(found: "Verification") -> dict[str, object]:
+    """Return the result on one camera for JSON."""
+    return {
+        "verdict": found.verdict,
+        "moved": found.moved,
+        "cause": found.cause if found.moved else None,
+        "drift_mm": 1e3 * found.offset[:3],
+        "drift_deg": np.degrees(found.offset[3:]),
+        "drift_std_mm": 1e3 * found.std[:3],
+        "drift_std_deg": np.degrees(found.std[3:]),
+        "p_value": found.p_value,
+        "detectable_mm": 1e3 * found.detectable[0],
+        "detectable_deg": float(np.degrees(found.detectable[1])),
+        "images": found.images,
+        "notes": found.notes,
+        "how": found.how,
+    }
+
+
+@dataclass(frozen=True)
+class Touch:
+    """Measure the error in task space: touch points with a calibrated tip and compare them with the map.
+
+    OUT is the folder of a run, POINTS a CSV with one line per point: image, x_px, y_px (the pixel of an image of the
+    run that shows the point) and x_m, y_m, z_m (the tip in the base frame when it touches the point). report.html shows
+    the pixel under the pointer in an image that is opened large, and a click copies it as image,x_px,y_px. Use three or
+    more points, spread over the scene; corners and printed marks are best. The exit status is 3 if the errors are larger
+    than the reported uncertainty explains.
+
+    examples:
+      jcr touch out/table touched.csv
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run."""
+    points: Annotated[Path, tyro.conf.Positional]
+    """The touched points, .csv."""
+    output: Output = field(default_factory=Output)
+
+    def main(self) -> int:
+        """Print the verdict, then each error beside what was expected."""
+        from jcr.calibration.words import labelled
+        from jcr.pipeline.touch import touch
+
+        found = touch(self.out, self.points)
+        is_larger = found.p_value < UNLIKELY
+        mean, rms, expected = 1e3 * found.common, 1e3 * found.rms, 1e3 * found.expected
+        verdict = "REJECTED: larger than" if is_larger else "ACCEPTED: within"
+        lines = [f"{verdict} the reported uncertainty: {rms:.2f} mm (rms), {expected:.2f} mm expected"]
+        if is_larger:
+            remedy = (
+                "check the tip's calibration (a constant error), then calibrate the camera again (jcr run)"
+            )
+            lines += labelled("Remedy", remedy)
+        lines += labelled("Mean", " ".join(f"{value:+.2f}" for value in mean) + " mm")
+        points = []
+        for image, error, std in zip(found.images, 1e3 * found.error, 1e3 * found.std, strict=True):
+            points.append({"image": image, "error_mm": error, "std_mm": std})
+            errors, stds = (
+                " ".join(f"{value:{sign}.2f}" for value in part) for part, sign in ((error, "+"), (std, ""))
+            )
+            lines.append(f"{image}: {errors} mm (± {stds})")
+        facts = {
+            "rms_mm": rms,
+            "expected_mm": expected,
+            "p": found.p_value,
+            "mean_mm": mean,
+            "points": points,
+        }
+        self.output.result("\n".join(lines) + "\n", facts)
+        return 3 if is_larger else 0

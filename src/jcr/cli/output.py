@@ -18,8 +18,10 @@ class Output:
     """Print only errors and warnings on stderr: no progress, no notes."""
 
     def result(self, text: str, facts: Mapping[str, object]) -> None:
-        """Print the result at once: `facts` with --json, else the text for people."""
-        sys.stdout.write(json.dumps(facts) + "\n" if self.json else text)
+        """Print the result at once: `facts`, arrays as lists, with --json, else the text for people."""
+        sys.stdout.write(
+            json.dumps(facts, default=lambda array: array.tolist()) + "\n" if self.json else text
+        )
         sys.stdout.flush()
 
 
@@ -29,13 +31,6 @@ class VerboseOutput(Output):
 
     verbose: bool = False
     """Print the details as well: what uncertainty comes from, images left out, notes, p-values."""
-
-
-def plain(record: object) -> dict[str, Any]:
-    """Return the fields of a record for JSON, its arrays as lists."""
-    return {
-        name: value.tolist() if hasattr(value, "tolist") else value for name, value in vars(record).items()
-    }
 
 
 class Quiet(io.TextIOWrapper):

@@ -1,29 +1,79 @@
-"""`jcr run`: everything, from a capture to a calibrated camera and a map."""
+"""Commands that calibrate: run, calibrate, batch and add-camera."""
 
+import re
 import shlex
 import sys
-from dataclasses import dataclass, field
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
-from jcr.cli.output import VerboseOutput
-from jcr.cli.result import calibrated, show, show_calibration
-from jcr.cli.source import run_options, source, with_images
+from jcr.cli.output import Output, VerboseOutput
 from jcr.depth.options import DepthOptions
+from jcr.errors import InputError, RejectedError
+from jcr.pipeline.options import BatchOptions
+from jcr.progress import progress_bars
 from jcr.reconstruct import ReconstructOptions
 from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
 if TYPE_CHECKING:
-    from jcr.run_folder import RunResult
+    from jcr.cell.placement import CameraPlacement
+    from jcr.pipeline.batch import Row
+    from jcr.progress import Progress
+    from jcr.records import Capture, PosePairs
+    from jcr.run_folder import RunOptions, RunResult
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments:
+class Calibrate:
+    """Calibrate a capture, without dense depth and map: calibration.json, report.html and log.txt.
+
+    CAPTURE may also be a samples file of easy_handeye2 or MoveIt Calibration, whose marker poses need no images.
+
+    examples:
+      jcr calibrate examples/tabletop out/tabletop
+      jcr calibrate captures/table out/table --backend colmap --seed 1 --json
+      jcr calibrate samples.yaml out/marker
+    """
+
+    capture: Annotated[Path, tyro.conf.Positional]
+    """Folder of the capture, or another format (jcr docs captures)."""
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder for the results."""
+    output: VerboseOutput = field(default_factory=VerboseOutput)
+    calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
+    reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
+    read: ReadOptions = field(default_factory=ReadOptions)
+    depth: DepthOptions = field(default_factory=DepthOptions)
+
+    def main(self) -> int:
+        """Calibrate and print the result."""
+        from jcr.calibration.poses import is_one
+        from jcr.calibration.words import labelled
+        from jcr.pipeline.run import calibrate_poses
+        from jcr.records import PosePairs
+
+        with progress_bars() as progress:
+            capture = _source(self, progress)
+            if isinstance(capture, PosePairs):
+                result, is_marker = calibrate_poses(capture, self.out, self.calibrate), True
+                show_calibration(result, self.output)
+            else:
+                result, is_marker = _run(self, capture, run_options(self, map=None), progress), False
+        if is_marker and result.converged and is_one(result.hand_eye):
+            return show(result, self.output, *labelled("Scale", "1, as the marker's size says"))
+        return show(result, self.output)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run(Calibrate):
     """Reconstruct, calibrate, map and report a capture.
 
     CAPTURE is a folder with capture.json and images, or any format that `jcr docs captures` lists: images and a table
@@ -38,52 +88,240 @@ class Arguments:
       jcr run scan.mcap out/scan --base-frame base_link --gripper-frame tool0 --frames 12
     """
 
-    capture: Annotated[Path, tyro.conf.Positional]
-    """Folder of the capture, or another format (jcr docs captures)."""
-    out: Annotated[Path, tyro.conf.Positional]
-    """Folder for the results."""
-    output: VerboseOutput = field(default_factory=VerboseOutput)
-    calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
-    reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
-    read: ReadOptions = field(default_factory=ReadOptions)
-    depth: DepthOptions = field(default_factory=DepthOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
     segment: SegmentOptions = field(default_factory=SegmentOptions)
     no_map: bool = False
     """Calibration and report only: no dense depth, cloud or map; so without torch, too."""
 
+    def main(self) -> int:
+        """Run every stage and print the result."""
+        from jcr.calibration.words import labelled
 
-def main(arguments: Arguments) -> int:
-    """Run every stage and print the result."""
+        options = run_options(self, map=None if self.no_map else self.map)
+        with progress_bars() as progress:
+            found = _source(self, progress)
+            capture = with_images(found, self.capture, "nothing to map; use `jcr calibrate`")
+            result = _run(self, capture, options, progress)
+        lines = [note for note in result.calibration.notes if note.startswith("no map was made")]
+        if (self.out / "map.safetensors").is_file():
+            lines = [f"jcr view {shlex.quote(str(self.out))}"]
+        elif self.no_map:
+            lines = []
+        return show(result, self.output, *labelled("Map", *lines))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Batch:
+    """Run many captures, each into its own folder in OUT, and rank them in OUT/summary.csv and .html.
+
+    A capture that fails does not stop the others. The same command again runs only what is missing or has changed. The
+    exit status is 3 if any capture failed or was rejected.
+
+    examples:
+      jcr batch captures/* out/all
+      jcr batch captures/* out/all --processes 4 --calibrate-only
+      jcr batch /shared/captures/* /shared/out --ray auto --gpus-per-task 0.25
+    """
+
+    paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURES... OUT")]
+    """Folders of the captures, then the folder for the results."""
+    output: Output = field(default_factory=Output)
+    calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
+    reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
+    read: ReadOptions = field(default_factory=ReadOptions)
+    batch: BatchOptions = field(default_factory=BatchOptions)
+    depth: DepthOptions = field(default_factory=DepthOptions)
+    cloud: CloudOptions = field(default_factory=CloudOptions)
+    map: MapOptions = field(default_factory=MapOptions)
+
+    def main(self) -> int:
+        """Run all and print the table."""
+        from jcr.pipeline.batch import batch, is_accepted
+
+        if len(self.paths) < 2:
+            raise InputError("batch: name one capture or more, then the folder for the results")
+        *captures, out = self.paths
+        with progress_bars() as progress:
+            rows = batch(captures, out, run_options(self), self.batch, progress, self.read)
+        table, summary = "".join(map(_line, enumerate(rows, start=1))), out / "summary.html"
+        self.output.result(f"{table}table: {summary}\n", {"captures": [asdict(row) for row in rows]})
+        if doubtful := sum(not is_accepted(row) for row in rows):
+            raise RejectedError(f"{doubtful} of {len(rows)} captures failed or are rejected; see {summary}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class AddCamera:
+    """Locate a fixed camera (base_from_camera) from its images of the scene of a run.
+
+    OUT is the run folder; the capture of the run must still be at its old path. No marker is needed: the images are
+    matched with those of the wrist camera. One image is enough. Without intrinsics the focal length is estimated too,
+    and the output names it if the image does not determine it. The camera becomes part of the run (OUT/cameras.json, the
+    report, `jcr export`). If it cannot be located, nothing is written and the exit status is 3.
+
+    examples:
+      jcr add-camera out/table overhead.png --intrinsics overhead.json
+      jcr add-camera out/table left/0.png left/1.png --name left
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run."""
+    images: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGES...")]
+    """Images of one fixed camera, all of the same size."""
+    name: str | None = None
+    """Name of the camera; by default the file name of the first image."""
+    intrinsics: Path | None = None
+    """JSON with fx, fy, cx, cy and distortion as in capture.json, in pixels of these images; unset: estimated."""
+    output: Output = field(default_factory=Output)
+
+    def main(self) -> int:
+        """Locate the camera and print its pose."""
+        from jcr.cell.placement import in_words
+        from jcr.pipeline.run import add_camera
+
+        if not self.images:
+            raise InputError("no image; name one or more of the camera to place")
+        name = self.name or re.sub(r"^[^A-Za-z]+|[^A-Za-z0-9_]+", "_", self.images[0].stem).strip("_")
+        with progress_bars() as progress:
+            result = add_camera(self.out, name or "camera", self.images, self.intrinsics, progress=progress)
+        assert result.cameras is not None
+        mine = result.cameras.model_copy(update={"cameras": result.cameras.cameras[-1:], "arms": []})
+        self.output.result("\n".join(in_words(mine)) + "\n", mine.as_json()["cameras"][0])
+        return 0
+
+
+def run_options(arguments: Any, **chosen: Any) -> "RunOptions":
+    """Return the options of the stages among a command's arguments, `chosen` ones in their place."""
+    from jcr.run_folder import RunOptions
+
+    given = {
+        one.name: getattr(arguments, one.name) for one in fields(RunOptions) if hasattr(arguments, one.name)
+    }
+    return RunOptions(**given | chosen)
+
+
+def _announce(path: Path) -> None:
+    """Report that the command has started, before the packages that read images are imported."""
+    if sys.stderr.isatty() and path.exists():
+        sys.stderr.write(f"reading {path}\n")
+        sys.stderr.flush()
+
+
+def _source(command: Calibrate, progress: "Progress") -> "Capture | PosePairs":
+    """Read the capture of a command; the frames of a recording are put in the run folder."""
+    _announce(command.capture)
+    from jcr.capture.read import read_source
+    from jcr.run_folder import CAPTURE, locked
+
+    with locked(command.out):
+        return read_source(command.capture, command.read, into=command.out / CAPTURE, progress=progress)
+
+
+@contextmanager
+def looked_at(
+    path: Path,
+    options: ReadOptions,
+    progress: "Progress",
+    read: Callable[..., Any] | None = None,
+    **more: Any,
+) -> "Iterator[Capture | PosePairs]":
+    """Read what lies at a path with `read`, by default read_source; the frames of a recording vanish afterwards."""
+    _announce(path)
+    from jcr.capture.read import read_source
+
+    with tempfile.TemporaryDirectory(prefix="jcr-capture-") as scratch:
+        yield (read or read_source)(path, options, into=scratch, progress=progress, **more)
+
+
+def with_images(found: "Capture | PosePairs", path: Path, needed: str) -> "Capture":
+    """Return the capture; raise InputError, which ends with `needed`, where there are poses alone."""
+    from jcr.records import PosePairs
+
+    if isinstance(found, PosePairs):
+        raise InputError(f"{path}: gives poses and no images, {needed}")
+    return found
+
+
+def _run(command: Calibrate, capture: "Capture", options: "RunOptions", progress: "Progress") -> "RunResult":
+    """Run a capture, and print the calibration as soon as it stands.
+
+    Where no back end found anything, calibration.json has the reason.
+    """
     from jcr.pipeline.run import run
-    from jcr.progress import progress_bars
+    from jcr.pipeline.selection import NothingFoundError
+    from jcr.run_folder import load_run
 
-    map_options = None if arguments.no_map else arguments.map
-    options, out = run_options(arguments, map=map_options), arguments.out
-    with progress_bars() as progress:
-        found = source(arguments.capture, arguments.read, out, progress)
-        capture = with_images(found, arguments.capture, "nothing to map; use `jcr calibrate`")
-        shown = list[object]()
+    out, shown = command.out, list[object]()
 
-        def show_early(result: "RunResult") -> None:
-            """Print the calibration before depth and map are made."""
-            show_calibration(result, arguments.output)
-            shown.append(result)
+    def show_early(result: "RunResult") -> None:
+        """Print the calibration before depth and map are made."""
+        show_calibration(result, command.output)
+        shown.append(result)
 
-        result = calibrated(lambda: run(capture, out, options, progress=progress, calibrated=show_early), out)
+    try:
+        result = run(capture, out, options, progress=progress, calibrated=show_early)
+    except NothingFoundError:
+        result = load_run(out)
     if result.is_unchanged:
         sys.stderr.write(f"unchanged: {out} is the run of this capture with these options\n")
     if not shown:
-        show_calibration(result, arguments.output)
-    return show(result, arguments.output, *_map_lines(result, out, map_options is not None))
+        show_calibration(result, command.output)
+    return result
 
 
-def _map_lines(result: "RunResult", out: Path, is_wanted: bool) -> list[str]:
-    """Return the line on the map: how to look at it, or why there is none where one was wanted."""
-    from jcr.calibration.words import labelled
+def show_calibration(result: "RunResult", output: VerboseOutput) -> None:
+    """Print the summary as soon as the calibration stands; with --json all comes at the end."""
+    from jcr.calibration.words import MOST_LINES, summary
 
-    if (out / "map.safetensors").is_file():
-        return labelled("Map", f"jcr view {shlex.quote(str(out))}")
-    missing = [note for note in result.calibration.notes if note.startswith("no map was made")]
-    return labelled("Map", *missing) if is_wanted else []
+    if not output.json:
+        others = 0 if result.cameras is None else len(result.cameras.cameras)
+        sys.stdout.write(summary(result.calibration, MOST_LINES - others - 1))  # a line of the caller
+        sys.stdout.flush()
+
+
+def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
+    """Print the lines after the summary, and return the exit status: 3 where it or a further camera is rejected.
+
+    These are further cameras, `more` lines, the report and the next command; with --verbose the details; with --json
+    everything at once.
+    """
+    from jcr.calibration.words import details, labelled
+
+    content, cameras, out = result.calibration, result.cameras, result.out
+    placed = [] if cameras is None else cameras.cameras
+    facts = content.as_json()
+    if cameras is not None:
+        facts |= {name: cameras.as_json()[name] for name in ("cameras", "arms")}
+    following = (
+        f"jcr export {shlex.quote(str(out))} ros2" if content.converged else "jcr docs troubleshooting"
+    )
+    lines = [line for camera in placed for line in labelled("Camera", _camera_in_words(camera))]
+    lines += [*more, *labelled("Report", str(out / "report.html")), *labelled("Next", following)]
+    if output.verbose:
+        lines += ["", *details(content), *(line for camera in placed for line in camera.in_words)]
+    output.result("\n".join(lines) + "\n", facts)
+    return 0 if content.converged and all(camera.converged for camera in placed) else 3
+
+
+def _camera_in_words(camera: "CameraPlacement") -> str:
+    """Return the verdict on a further camera, with its uncertainty or the reason, in one line."""
+    from jcr.rounding import significant
+
+    if camera.doubt is not None or camera.uncertainty is None:
+        return f"{camera.name}: REJECTED: {camera.doubt}"
+    stds = camera.uncertainty.translation_std_mm, camera.uncertainty.rotation_std_deg
+    mm, deg = (significant(max(std)) for std in stds)
+    return (
+        f"{camera.name}: {camera.verdict.upper()}, {camera.mount}_from_camera ±{mm} mm, {deg}° (1σ, worst axis; "
+        "cameras.json)"
+    )
+
+
+def _line(ranked: "tuple[int, Row]") -> str:
+    """Return the line of a row of a batch."""
+    rank, row = ranked
+    std = "" if row.offset_std_mm is None else f"± {row.offset_std_mm:.2f} mm, {row.turn_std_deg:.3f}°"
+    used = f"{row.used:3d}/{row.images:<3d}"
+    line = f"{rank:3d}  {Path(row.out).name:<24} {row.status:<22} {used} {std}  {row.reason}"
+    return line.rstrip() + "\n"

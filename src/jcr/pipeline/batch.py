@@ -22,7 +22,7 @@ from jcr.errors import InputError, RejectedError
 from jcr.extras import extra
 from jcr.files import write_text
 from jcr.findings import Verdict, sentence, verdict_of
-from jcr.pipeline.batch_options import BatchOptions
+from jcr.pipeline.options import BatchOptions
 from jcr.pipeline.run import run
 from jcr.progress import Progress, silent
 from jcr.report.render import render

@@ -69,6 +69,8 @@ if TYPE_CHECKING:
 
 MOVING = "moving"
 """Images of a fixed camera without what stands still; a carried thing is reconstructed from them."""
+LIVE = "result"
+"""Run folder of all images, in the folder of a capture that was calibrated while it was taken."""
 Stage = Callable[[RunResult, RunOptions, Progress], tuple[RunResult, list[str]]]
 """Function of the result so far; returns the result with its part, and notes."""
 
@@ -300,6 +302,8 @@ def _calibrated(result: RunResult, options: RunOptions, progress: Progress) -> R
             kept = again(seen, lambda: before.reconstruction, own, progress, options.depth)
             state = state.model_copy(update={"attempts": before.state.attempts or kept.attempts})
             _write_state(out, state)
+            if before.out != out:
+                _keep_reconstruction(out, kept.reconstruction, state)
     except NothingFoundError as error:
         if before is None:
             _forget_reconstruction(out)
@@ -319,18 +323,18 @@ def _calibrated(result: RunResult, options: RunOptions, progress: Progress) -> R
 
 
 def _with_reconstruction_of(state: State, out: Path, capture: Capture) -> RunResult | None:
-    """Return the earlier run of the folder whose reconstruction was made from the same input; None without one.
+    """Return the earlier run of the folder, or of `jcr capture`, whose reconstruction was made from the same input.
 
     A state that cannot be read proves nothing: to make every stage again is always right.
     """
-    before = RunResult(out, capture=capture)
-    try:
-        same = before.state.reconstruction == state.reconstruction and (out / RECONSTRUCTION).is_file()
-    except InputError:
-        return None
-    if same and not is_made_from(out / DEPTH, state.depth):
-        (out / DEPTH).unlink(missing_ok=True)
-    return before if same else None
+    for folder in (out, capture.folder / LIVE):
+        before = RunResult(folder, capture=capture)
+        with suppress(InputError):
+            if before.state.reconstruction == state.reconstruction and (folder / RECONSTRUCTION).is_file():
+                if folder == out and not is_made_from(out / DEPTH, state.depth):
+                    (out / DEPTH).unlink(missing_ok=True)
+                return before
+    return None
 
 
 def _failed(

@@ -1,4 +1,4 @@
-"""Options of a batch, apart from its stages, so that help of the command line loads fast."""
+"""Options of batch and verify, apart from their modules, so that help of the command line loads fast."""
 
 from dataclasses import dataclass
 
@@ -18,3 +18,13 @@ class BatchOptions:
     """Cores that a capture takes, with --ray."""
     gpus_per_task: float = 0.0
     """GPUs that a capture takes, with --ray; 0.25 lets four share one."""
+
+
+@dataclass(frozen=True)
+class VerifyOptions:
+    """Options of the test for a moved camera."""
+
+    alpha: float = 1e-3
+    """False-alarm rate: the probability of reporting a movement when nothing has moved."""
+    tolerance: tuple[float, float] = (0.5, 0.05)
+    """MM DEG: drifts smaller than both raise no alarm, however significant."""

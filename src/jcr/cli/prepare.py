@@ -1,0 +1,205 @@
+"""Commands around a calibration: board, models and docs."""
+
+import sys
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, files
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from jcr.cli.output import Output
+from jcr.errors import InputError, did_you_mean
+from jcr.extras import DISTRIBUTION
+from jcr.files import write_bytes
+from jcr.hub import HUB_ID, download
+from jcr.reconstruct import BACKENDS, Backend, weights_command
+
+CHECKOUT = Path(__file__).parents[3] / "docs"
+SECTIONS = ("tutorials", "how-to", "reference", "explanation", "results")
+"""Folders of pages. Those of results are named with their folder, as other pages have the same names."""
+SCALES = {True: "metres", False: "arbitrary", None: "your file's is_metric"}
+
+
+@dataclass(frozen=True)
+class Board:
+    """Write a ChArUco board or chessboard at its exact size, with rulers to check the printer.
+
+    Print it at 100 %, measure the rulers, and calibrate with the --board that the sheet names.
+
+    examples:
+      jcr board board.pdf
+      jcr board a3.pdf charuco:9x6:0.040:0.030:DICT_5X5_100 --paper a3
+      jcr board board.pdf chessboard:9x6:0.025
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """PDF to write."""
+    board: Annotated[str, tyro.conf.Positional] = "charuco:8x5:0.030:0.022:DICT_4X4_50"
+    """charuco:SQUARES:SQUARE:MARKER:DICTIONARY or chessboard:INNER-CORNERS:SQUARE, lengths in metres."""
+    paper: Literal["a4", "a3", "a2", "letter"] = "a4"
+    """Paper, the long side across."""
+    output: Output = field(default_factory=Output)
+
+    def main(self) -> int:
+        """Write the sheet and print the option that it is used with."""
+        from jcr.boards.sheet import board_sheet
+
+        if self.out.suffix.lower() != ".pdf":
+            raise InputError(f"jcr board {self.out}: writes a PDF; name a file that ends in .pdf")
+        write_bytes(self.out, board_sheet(self.board, self.paper).as_pdf())
+        self.output.result(
+            f"{self.out}: print at 100 % on {self.paper}, measure the rulers, then calibrate with "
+            f"--board {self.board}\n",
+            {"file": str(self.out), "board": self.board, "paper": self.paper},
+        )
+        return 0
+
+
+@dataclass(frozen=True)
+class Docs:
+    """Print a page of the manual, or list the pages.
+
+    examples:
+      jcr docs
+      jcr docs captures
+      jcr docs results/speed
+    """
+
+    name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PAGE]")] = None
+    """Page to print; none: list them."""
+    output: Output = field(default_factory=Output)
+
+    def main(self) -> int:
+        """Print a page, or the names and titles of all."""
+        if self.name is not None:
+            text = page(self.name)
+            self.output.result(text, {"page": self.name, "markdown": text})
+            return 0
+        titles = {name: title(path) for name, path in pages().items()}
+        text = "".join(f"{name:<22} {heading}\n" for name, heading in titles.items())
+        self.output.result(text, {"pages": titles})
+        return 0
+
+
+def pages() -> dict[str, Path]:
+    """Return the file of each page by its name, as `jcr docs` takes it; empty where no page was installed."""
+    if (CHECKOUT / "conf.py").is_file():
+        found = sorted(CHECKOUT.rglob("*.md"))
+    else:
+        try:
+            installed = [file for file in files(DISTRIBUTION) or [] if file.suffix == ".md"]
+        except PackageNotFoundError:  # run from source files alone
+            installed = []
+        found = sorted(Path(str(file.locate())) for file in installed if f"doc/{DISTRIBUTION}/" in str(file))
+    order = {section: number for number, section in enumerate(SECTIONS)}
+    found = [
+        path for path in found if path.parent.name in order and path.name not in ("index.md", "README.md")
+    ]
+    found.sort(key=lambda path: order[path.parent.name])
+    return {_name(path): path for path in found}
+
+
+def _name(path: Path) -> str:
+    return f"results/{path.stem}" if path.parent.name == "results" else path.stem
+
+
+def page(name: str) -> str:
+    """Return the Markdown of a page by its name (`captures`, `results/speed`); raise InputError without such a page."""
+    found = pages()
+    if name not in found:
+        there = ", ".join(other for other in found if "/" not in other) or "none on this machine"
+        raise InputError(f"jcr docs {name}: no such page{did_you_mean(name, found)}; there are: {there}")
+    return found[name].read_text(encoding="utf-8")
+
+
+def title(path: Path) -> str:
+    """Return the first heading of a page."""
+    with path.open(encoding="utf-8") as lines:
+        return next((line[2:].strip() for line in lines if line.startswith("# ")), path.stem)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Models:
+    """List the back ends with their licences, and what is installed on this machine; or download weights.
+
+    Those that `--backend auto` may try come first, in its order. Listing downloads nothing.
+
+    examples:
+      jcr models
+      jcr models get da3-small
+      jcr models get dust3r --accept-licence
+      jcr models --json
+    """
+
+    action: Annotated[Literal["list", "get"], tyro.conf.Positional] = "list"
+    """list; or get: download the weights of a back end."""
+    name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[NAME]")] = None
+    """For get: the back end whose weights are downloaded, or a hub id for --weights or --sam-weights."""
+    accept_licence: bool = False
+    """For get: accept a non-commercial licence, which is asked for otherwise."""
+    revision: str | None = None
+    """For get: another commit of the weights than the one this release was written for; give its folder to --weights."""
+    output: Output = field(default_factory=Output)
+
+    def main(self) -> int:
+        """Print the list, or get weights."""
+        if self.action == "get":
+            return self._get()
+        if self.name is not None or self.accept_licence or self.revision is not None:
+            raise InputError(
+                "jcr models: a name, --accept-licence and --revision are for jcr models get NAME"
+            )
+        lines, facts = [], []
+        for row in BACKENDS.values():
+            missing = [] if row.is_installed() else [row.install]
+            missing += [] if row.has_weights() else [f"jcr models get {row.name}"]
+            present, scale = f"no: {'; '.join(missing)}" if missing else "yes", SCALES[row.metric]
+            size = f", {row.parameters} M parameters" if row.parameters else ""
+            size += f", {row.download_gb:g} GB" if row.download_gb else ""
+            limited = not row.commercial and "non-commercial" not in row.licence
+            lines += [
+                f"{row.name:<12} {row.hub_id or 'no weights needed'}{size}",
+                f"{'':<12} licence: {row.licence}{' (not for commercial use)' * limited}",
+                f"{'':<12} scale: {scale}; here: {present}",
+                *([f"{'':<12} accuracy: {row.accuracy}"] if row.accuracy else []),
+            ]
+            fact = {"backend": row.name, "weights": row.hub_id, "scale": scale, "present": present}
+            fact |= {
+                name: getattr(row, name) for name in ("licence", "commercial", "accuracy", "download_gb")
+            }
+            facts.append(fact | {"parameters_m": row.parameters})
+        self.output.result("\n".join(lines) + "\n", {"models": facts})
+        return 0
+
+    def _get(self) -> int:
+        """Download the weights of a back end, or of a hub id, check them, and put them where runs look for them."""
+        with_weights = [row.name for row in BACKENDS.values() if row.hub_id]
+        name = self.name
+        row = BACKENDS.get(name or "")
+        if name is None or not (HUB_ID.fullmatch(name) or name in with_weights):
+            named = "name one" if name is None else f"{name} has none to get"
+            raise InputError(
+                f"jcr models get: {named}; there are {', '.join(with_weights)}, and hub ids OWNER/NAME"
+            )
+        hub_id, revision = (row.hub_id, row.revision) if row else (name, None)
+        if row and not (row.commercial or row.has_weights() or self.accept_licence or _accepts(row)):
+            raise InputError(
+                f"jcr models get {name}: its licence is {row.licence}; accept it with --accept-licence, or take da3"
+            )
+        folder = download(hub_id, self.revision or revision, self.output.quiet)
+        text = f"{hub_id}: revision {folder.name[:12]}, checked, in {folder}\n"
+        if row and not row.is_installed():
+            text += f"its package is missing: {row.install}\n"
+        facts = {"backend": row.name if row else None, "weights": hub_id, "revision": folder.name}
+        self.output.result(text, facts | {"folder": str(folder)})
+        return 0
+
+
+def _accepts(row: Backend) -> bool:
+    """Whether the user accepts a licence; False where nobody can be asked."""
+    if not sys.stdin.isatty():
+        return False
+    sys.stderr.write(f"{weights_command(row)}.\nIts licence: {row.licence}\nDo you accept it? [y/N] ")
+    sys.stderr.flush()
+    return sys.stdin.readline().strip().lower() in ("y", "yes")

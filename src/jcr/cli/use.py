@@ -1,0 +1,328 @@
+"""Commands that use a run: map, export, query, measure and view."""
+
+import io
+import sys
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.capture.options import ReadOptions
+from jcr.cli.output import Output, warn
+from jcr.errors import InputError, RejectedError
+from jcr.export.options import ExportName, ExportOptions
+from jcr.files import write_bytes, write_text
+from jcr.progress import progress_bars
+from jcr.scene.options import CloudOptions, MapOptions
+from jcr.segments.options import SegmentOptions
+
+if TYPE_CHECKING:
+    from jcr.segments.measure import Measurement
+
+_COLUMNS = "x,y,z,occupancy,unknown,distance,gradient_x,gradient_y,gradient_z,red,green,blue,label"
+_FORMATS = "%.6f,%.6f,%.6f,%.4f,%d,%.5f,%.4f,%.4f,%.4f,%d,%d,%d,%d"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Map:
+    """(Re)build cloud, map and report of a run with other options, or with further images.
+
+    examples:
+      jcr map out/tabletop --preset paper
+      jcr map out/tabletop --segments labels
+      jcr map out/tabletop --workspace 0.2 -0.4 -0.05 0.9 0.4 0.6
+      jcr map out/tabletop --add captures/later
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run."""
+    add: Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(metavar="CAPTURE")] = ()
+    """A capture of new images, in any format; repeat for more, oldest first. The calibration is not changed. What a new
+    image sees through is removed from the map; a new object needs two new images. They are kept for every later map of
+    the run (OUT/added)."""
+    read: ReadOptions = field(default_factory=ReadOptions)
+    cloud: CloudOptions = field(default_factory=CloudOptions)
+    map: MapOptions = field(default_factory=MapOptions)
+    segment: SegmentOptions = field(default_factory=SegmentOptions)
+    output: Output = field(default_factory=Output)
+
+    def main(self) -> int:
+        """Build the map and print its path."""
+        from jcr.pipeline.run import build_map
+
+        options = self.cloud, self.map, self.segment
+        with progress_bars() as progress:
+            build_map(self.out, *options, add=self.add, read=self.read, progress=progress)
+        files = {"map": str(self.out / "map.safetensors"), "report": str(self.out / "report.html")}
+        self.output.result("".join(f"{name}: {file}\n" for name, file in files.items()), files)
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write a run's calibration or map in another tool's format; without FORMAT, list the formats.
+
+    Every file names its frames and units. Map, images and cameras are in the robot's base frame, in metres. A
+    calibration that is rejected is exported with --force alone; the exit status is 3 without it.
+
+    examples:
+      jcr export out/table ros2 --parent-frame tool0 --child-frame camera_color_optical_frame
+      jcr export out/table urdf --to-root camera_link
+      jcr export out/table octomap table.bt --voxel-size 0.02
+      jcr export out/table nerfstudio splat/ --undistort
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run."""
+    format: Annotated[
+        ExportName | None,
+        tyro.conf.Positional,
+        tyro.conf.arg(
+            help=f"{', '.join(get_args(ExportName))}; without it, all are listed with their contents."
+        ),
+    ] = None
+    path: Annotated[Path | None, tyro.conf.Positional] = None
+    """File or (nerfstudio, colmap) new folder to write; by default in OUT/export."""
+    export: ExportOptions = field(default_factory=ExportOptions)
+    output: Output = field(default_factory=Output)
+
+    def main(self) -> int:
+        """Write the file and print its path; 3 where the calibration is rejected, and nothing was written."""
+        from jcr.export.formats import FORMATS, write_run
+        from jcr.export.ros import static_transform_publisher
+
+        if self.format is None:
+            formats = {row.name: row.about for row in FORMATS}
+            lines = "".join(f"{name:<14} {about}\n" for name, about in formats.items())
+            self.output.result(f"{lines}for one: jcr export {self.out} FORMAT\n", {"formats": formats})
+            return 0
+        run, row, path, replaced = write_run(self.out, self.format, self.path, self.export)
+        sys.stderr.write(f"wrote {path}: {row.about}\n")
+        if replaced:
+            warn(f"{path}: replaced a file with other content; name another PATH to keep both")
+        line, facts = "", {"file": str(path), "format": row.name, "about": row.about}
+        if row.name == "ros2":
+            mount = run.mount
+            line = static_transform_publisher(mount.parent, mount.child, mount.parent_from_child)
+            facts["line"] = line
+        self.output.result(line and line + "\n", facts)
+        if run.doubt is not None:
+            warn(f"the calibration is rejected, as the file says too: {run.doubt}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Query:
+    """Query the map of a run at points: occupancy, unknown, distance, its gradient, colour and label.
+
+    Points are in metres, in the robot's base frame. Distances are NaN outside of the mapped workspace.
+
+    examples:
+      jcr query out/table points.csv
+      jcr query out/table cloud.ply --write answers.npy
+      jcr query out/table points.npy --unknown occupied --json
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run, with its map.safetensors."""
+    points: Annotated[Path, tyro.conf.Positional]
+    """.csv (three columns, header line optional), .npy of shape (n, 3), or .ply."""
+    write: Path | None = None
+    """File to write, .csv or .npy (a structured array); by default points.answers.csv beside the points, or none with
+    --json, which prints the answers."""
+    unknown: Literal["occupied", "free", "report"] = "report"
+    """State of unseen space: solid, empty, or occupancy 0.5."""
+    output: Output = field(default_factory=Output)
+
+    def main(self) -> int:
+        """Answer for every point, in the order of the input."""
+        from jcr.scene.map_file import load_map
+
+        scene = load_map(self.out)
+        x_in_base = read_points(self.points)
+        sample = scene.query(x_in_base, self.unknown)
+        # Eight-bit colours, as the points had them; outside of the workspace there is none.
+        colors = np.nan_to_num(sample.color * 255).round().astype(np.uint8).T
+        columns = [*x_in_base.T, sample.occupancy, sample.unknown, sample.distance, *sample.gradient.T]
+        columns += [*colors, sample.label]
+        count = np.bincount(sample.label, minlength=len(scene.label_names))
+        labels = [f"{name} {n}" for name, n in zip(scene.label_names[1:], count[1:], strict=False) if n]
+        unseen = f"{100 * float(np.mean(sample.unknown)):.0f} % of them unseen" if len(x_in_base) else "none"
+        summary = f"{len(x_in_base)} points, {unseen}{'; by label: ' * bool(labels)}{', '.join(labels)}\n"
+        answers: dict[str, object] = {"label_names": list(scene.label_names)}
+        if self.output.json:
+            answers |= dict(zip(_COLUMNS.split(","), map(_finite, columns), strict=True))
+        if self.write or not self.output.json:
+            path = self.write or self.points.with_suffix(".answers.csv")
+            _write(path, np.rec.fromarrays(columns, names=_COLUMNS))  # pyright: ignore[reportArgumentType]
+            summary = f"wrote {path}: {summary}"
+        self.output.result(summary, answers)
+        return 0
+
+
+def _write(path: Path, rows: "np.recarray[Any, Any]") -> None:
+    """Write the answers as .npy or .csv."""
+    if path.suffix == ".npy":
+        buffer = io.BytesIO()
+        np.save(buffer, np.asarray(rows))
+        write_bytes(path, buffer.getvalue())
+    elif path.suffix == ".csv":
+        write_text(path, "\n".join([_COLUMNS, *(_FORMATS % tuple(row) for row in rows.tolist())]) + "\n")
+    else:
+        raise InputError(f"{path}: answers are written as .csv or .npy")
+
+
+def read_points(path: Path) -> Float[ndarray, "n 3"]:
+    """Points (n,3) in metres from .csv, .npy or .ply; raises InputError where the file is none of these."""
+    from jcr.capture.plain_files import read_npy
+
+    if not path.is_file():
+        raise InputError(f"{path}: no such file of points (.csv, .npy or .ply)")
+    try:
+        if path.suffix == ".npy":
+            points = read_npy(path)
+        elif path.suffix == ".ply":
+            import trimesh
+
+            points = np.asarray(trimesh.load(path).vertices)  # pyright: ignore[reportAttributeAccessIssue]
+        elif path.suffix == ".csv":
+            points = _read_csv(path)
+        else:
+            raise InputError(f"{path}: points are read from .csv, .npy or .ply")
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{path}: cannot be read as points ({error}); give x, y, z in metres") from error
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
+        raise InputError(
+            f"{path}: expected points of shape (n, 3) in metres, got {points.shape} {points.dtype}"
+        )
+    points = points.astype(np.float64)
+    if not (finite := np.isfinite(points).all(1)).all():
+        raise InputError(f"{path}: point {finite.argmin() + 1} is not finite; remove it")
+    return points
+
+
+def _read_csv(path: Path) -> ndarray:
+    """Read rows of numbers, without a header line and comments."""
+    text = path.read_text("utf-8").splitlines()
+    lines = [line for line in text if line.strip() and not line.startswith("#")]
+    if not lines:
+        return np.zeros((0, 3))
+    try:
+        [float(word) for word in lines[0].split(",")]
+    except ValueError:
+        lines = lines[1:]
+    return np.array([[float(word) for word in line.split(",")] for line in lines]).reshape(len(lines), -1)
+
+
+def _finite(column: ndarray) -> list:
+    """Return the column for JSON, with None in place of NaN."""
+    if column.dtype.kind != "f":
+        return column.tolist()
+    return [None if np.isnan(value) else round(float(value), 6) for value in column]
+
+
+@dataclass(frozen=True)
+class Measure:
+    """Measure the support plane, and the height, footprint and box of each object on it, with 1 sigma.
+
+    OUT is the folder of a run. `jcr map --segments` selects how the scene is divided into objects.
+
+    examples:
+      jcr measure out/tabletop
+      jcr measure out/tabletop --json > sizes.json
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run."""
+    output: Output = field(default_factory=Output)
+
+    def main(self) -> int:
+        """Print the sizes; 3 when the calibration they rest on is rejected."""
+        from jcr.pipeline.run import measure
+        from jcr.run_folder import load_run
+
+        measured = measure(self.out)
+        # Metres, base frame, one sigma; `on_plane` is a flag for each point of the cloud.
+        support = {name: value for name, value in vars(measured.support).items() if name != "on_plane"}
+        facts = {"support": support, "objects": [vars(size) for size in measured.objects]}
+        self.output.result(sizes_table(measured), facts)
+        if (doubt := load_run(self.out).doubt) is not None:
+            raise RejectedError(f"sizes rejected: {doubt}")
+        return 0
+
+
+def sizes_table(measured: "Measurement") -> str:
+    """Return a line for the plane and a line for each object, in millimetres."""
+    support = measured.support
+    x, y, z = support.base_from_support[:3, 2]
+    lines = [
+        f"support plane through z = {support.base_from_support[2, 3]:.4f} m, normal {x:.4f} {y:.4f} {z:.4f}, "
+        f"its points within {1e3 * support.noise:.1f} mm (1 σ)"
+    ]
+    if not measured.objects:
+        return lines[0] + "\nnothing stands on it\n"
+    width = max(6, *(len(size.name) for size in measured.objects))
+    columns = f"{'height (mm)':>14}  {'length (mm)':>14}  {'width (mm)':>14}  centre x, y (m), ± 1 σ"
+    lines.append(f"{'object':<{width}}  {columns}")
+    for size in measured.objects:
+        length, across, height = (
+            f"{1e3 * value:.1f} ± {1e3 * std:.1f}"
+            for value, std in zip(size.box_size, size.box_std, strict=True)
+        )
+        height = height if size.top_seen else f"≥ {1e3 * size.height:.1f}"
+        x, y = size.base_from_box[:2, 3]
+        lines.append(f"{size.name:<{width}}  {height:>14}  {length:>14}  {across:>14}  {x:.3f}, {y:.3f}")
+    return "\n".join(lines) + "\n"
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """Show a run in the browser: points, cameras, grippers, robot, the map's layers, a sphere to drag.
+
+    The page is served until Ctrl-C, and only to this machine; from another one use
+    ssh -L 8080:127.0.0.1:8080. Needs viser: pip install 'jcr-handeye[view]'.
+
+    examples:
+      jcr view out/table
+      jcr view out/table --urdf arm.urdf --port 9000
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run."""
+    urdf: Path | None = None
+    """The robot, shown at the capture's joint values of each image; unset: the capture's URDF. Its root link is the
+    base of the gripper poses."""
+    port: int = 8080
+    """Port of 127.0.0.1 to listen on; 0 selects a free one."""
+    output: Output = field(default_factory=Output)
+
+    def main(self) -> int:
+        """Serve the page until Ctrl-C."""
+        from jcr.extras import extra
+        from jcr.run_folder import load_run
+
+        run = load_run(self.out)  # raises at once where there is none
+        for package in ("viser", "torch"):
+            extra(package, "view", "jcr view")
+        from jcr.viewer.server import open_server
+        from jcr.viewer.viewer import Viewer
+
+        server = open_server(self.port, f"jcr · {self.out.resolve().name}")
+        try:
+            with progress_bars() as progress:
+                Viewer(server, run, self.urdf, progress)
+            address = f"http://127.0.0.1:{server.get_port()}"
+            self.output.result(f"{address} (Ctrl-C ends it)\n", {"address": address})
+            threading.Event().wait()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            server.stop()
+        return 0
