@@ -206,8 +206,7 @@ class Compare:
 
     def main(self) -> int:
         """Print the difference, whether the reported errors explain it, and the causes that would."""
-        from jcr.calibration.difference import difference
-        from jcr.calibration.known_transform import read_hand_eye
+        from jcr.calibration.difference import difference, read_hand_eye
         from jcr.calibration.words import labelled
 
         known = {path: read_hand_eye(path) for path in (self.out, self.reference)}

@@ -10,8 +10,8 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from jcr.boards.proposal import proposed
+from jcr.calibration.checks.capture import as_causes, view_findings
 from jcr.calibration.checks.left_out import left_out_poses
-from jcr.calibration.checks.views import as_causes, view_findings
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_poses, is_one
 from jcr.calibration.requirement import Proposals, assumptions_of, assumptions_of_poses
@@ -133,10 +133,8 @@ def check_capture(
     rows = counted if len(counted) >= FEWEST else np.arange(len(capture))
     gripper, hand_eye, assumptions = given[rows], shown.hand_eye, shown.assumptions
     x = None if assumptions is None else assumptions.gripper_from_camera
-    if hand_eye is not None and shown.registered is not None:
-        seen = hand_eye.observability
-    else:
-        seen = observability(gripper, x)
+    whole = None if shown.registered is None else hand_eye
+    seen = observability(gripper, x) if whole is None else whole.observability
     found = [*shown.findings, *(() if hand_eye is not None else seen.findings)]
     found += [] if robot.unused is None else [robot.unused]
     found += as_causes(views) if verdict_of(found) == "rejected" else views
