@@ -156,8 +156,7 @@ def captures(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, T
         found[name] = Target(file, source(file))
     place = folder / "colmap"
     writers.write_colmap(place, capture, cameras)
-    for name in ("cameras.bin", "images.bin"):
-        found[name] = Target(place / "sparse" / "0" / name, source(place))
+    found["cameras.bin"] = Target(place / "sparse" / "0" / "cameras.bin", source(place))
     (folder / "sample.json").write_text(json.dumps({"base_from_gripper": np.eye(4).tolist()}))
     found["sample.json"] = Target(folder / "sample.json", lambda file: sample_pose(file.read_bytes()))
     return found

@@ -12,11 +12,10 @@ import pytest
 import capture_writers as writers
 import jcr
 from in_process import run_jcr
-from jcr.capture.best_frames import best_frames
 from jcr.capture.images import encode_png, read_depth
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import NEVER, pose_track
-from jcr.capture.recording import Recording, capture_of_recording
+from jcr.capture.recording import Recording, best_frames, capture_of_recording
 from jcr.capture.ros_image import depth_of, image_of
 from jcr.files import write_bytes
 from jcr.geometry import rotation_exp, transform

@@ -1,8 +1,6 @@
 """LeRobot data sets, v2.1 and v3.0: the right images with the right poses, out of AV1 videos."""
 
-import fcntl
 import json
-import os
 import shutil
 from dataclasses import replace
 from importlib.util import find_spec
@@ -194,17 +192,6 @@ def test_an_edited_set_or_camera_info_is_read_again(tmp_path: Path, small: Path,
     writers.write_camera_info(replace(bundled, intrinsics=replace(intrinsics, fx=170.0)), tmp_path)
     again = jcr.read_capture(path, options, into=into)
     assert again.intrinsics is not None and again.intrinsics.fx == 170.0
-
-
-def test_a_second_extraction_into_the_same_folder_is_refused(tmp_path: Path, small: Path):
-    into = tmp_path / "frames"
-    into.mkdir()
-    lock = os.open(into, os.O_RDONLY)
-    fcntl.flock(lock, fcntl.LOCK_EX)
-    with pytest.raises(jcr.InputError, match="another jcr extracts a recording there"):
-        jcr.read_capture(small, ReadOptions(frames=4), into=into)
-    os.close(lock)
-    assert len(jcr.read_capture(small, ReadOptions(frames=4), into=into)) == 4
 
 
 def test_states_of_different_lengths_are_one_line(tmp_path: Path, small: Path):

@@ -69,7 +69,7 @@ def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
 
 NAMES = [
     "about.json", "added/capture.json", "arm.urdf", "calibration.json", "camera_info.yaml", "cameras.bin",
-    "capture.json", "cloud.ply", "compared calibration.json", "depth.npz", "episode.parquet", "images.bin",
+    "capture.json", "cloud.ply", "compared calibration.json", "depth.npz", "episode.parquet",
     "info.json v2.1", "info.json v3.0", "map.safetensors", "metadata.yaml", "names.json", "pairs.npz", "picture.bmp",
     "picture.gif", "picture.jpg", "picture.png", "picture.tif", "picture.webp", "points.csv", "points.npy",
     "points.ply", "poses.csv", "poses.json", "poses.npy", "poses.tsv", "poses.txt", "reconstruction.npz",

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from decimal import Decimal
 from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING
@@ -12,7 +13,7 @@ from numpy import ndarray
 
 from jcr.capture.conventions import tolerated
 from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import contained, first_few, shown
+from jcr.capture.plain_files import first_few, shown
 from jcr.capture.pose_track import pose_track
 from jcr.errors import InputError
 
@@ -78,28 +79,30 @@ def stamp_ns(text: str, where: str) -> int:
 
     Exact: a float holds 16 of the 19 digits that nanoseconds since 1970 have.
     """
-    try:
+    with suppress(ArithmeticError, ValueError):  # of Decimal each has its own name
         value = Decimal(text)
-        size = abs(value)
-        if not size < 10**20:
-            raise ValueError
-        unit_ns = 10**9 if size < 10**11 else 10**6 if size < 10**14 else 10**3 if size < 10**17 else 1
-        if not -_LATEST_NS <= (stamp := int(value * unit_ns)) <= _LATEST_NS:
-            raise ValueError
-        return stamp
-    except (ArithmeticError, ValueError):  # of Decimal each has its own name
-        raise InputError(f"{where}: {shown(text)} is not a time stamp; give seconds or nanoseconds") from None
+        if (size := abs(value)) < 10**20:
+            unit_ns = 10**9 if size < 10**11 else 10**6 if size < 10**14 else 10**3 if size < 10**17 else 1
+            if abs(stamp := int(value * unit_ns)) <= _LATEST_NS:
+                return stamp
+    raise InputError(f"{where}: {shown(text)} is not a time stamp; give seconds or nanoseconds")
 
 
 def _paired_by_name(folder: Path, file: Path, table: "PoseTable") -> Paired:
-    """Pair rows with the images that they name."""
+    """Pair rows with the images that they name, of tools that write other folders, slashes and endings."""
     assert table.images is not None
-    located = _located(folder, table.images, file)
-    named = set(located)
-    here = [name for name in image_names(folder) if name not in named]
-    left_out = (
-        f"{len(here)} images have no pose in {file.name} and are left out: {first_few(here)}" if here else ""
-    )
+    own: dict[str, list[str]] = {}
+    for image in image_names(folder):
+        for key in {Path(image).name.casefold(), Path(image).stem.casefold()}:
+            own.setdefault(key, []).append(image)
+    located = []
+    for name in table.images:
+        plain = PureWindowsPath(name).name  # which takes both kinds of slashes
+        like = own.get(plain.casefold()) or own.get(Path(plain).stem.casefold()) or []
+        places = (name, f"images/{name}", *(like if len(like) == 1 else ()))
+        located.append(next((place for place in places if (folder / place).is_file()), name))
+    here = [name for name in image_names(folder) if name not in set(located)]
+    left_out = f"{len(here)} images have no pose in {file.name} and are left out: {first_few(here)}"
     absent = [name for name in located if not (folder / name).is_file()]
     if len(absent) > tolerated(len(located)):
         raise InputError(
@@ -107,12 +110,11 @@ def _paired_by_name(folder: Path, file: Path, table: "PoseTable") -> Paired:
             f"them or drop their rows{' (' + left_out + ')' if here else ''}"
         )
     pairs = zip(table.images, located, strict=True)
-    other = [(name, found) for name, found in pairs if found not in (name, f"images/{name}")]
-    notes = [left_out] if here else []
-    if other:
-        found = " is ".join(other[0])
-        notes.insert(0, f"{len(other)} names in {file.name} are not those of files: {found}, and so on")
-    return located, table.base_from_gripper, table.faults, tuple(notes)
+    other = [f"{name} is {found}" for name, found in pairs if found not in (name, f"images/{name}")]
+    notes = (
+        [f"{len(other)} names in {file.name} are not those of files: {other[0]}, and so on"] if other else []
+    )
+    return located, table.base_from_gripper, table.faults, (*notes, *([left_out] if here else []))
 
 
 def _paired_by_time(
@@ -132,26 +134,3 @@ def _paired_by_time(
     why = f"no pose within {options.max_gap_ms:.0f} ms around it; drop the image or raise --max-gap-ms"
     notes = (f"poses interpolated at the {len(taken)} images' time stamps",)
     return taken, poses, {k: f"{file}: {taken[k]}: {why}" for k in stale}, notes
-
-
-def _located(folder: Path, names: Sequence[str], file: Path) -> list[str]:
-    """Return the images of the folder that the names mean, of tools that write other folders, slashes and endings.
-
-    A name that more than one image has decides nothing.
-    """
-    own: dict[str, list[str]] = {}
-    for image in image_names(folder):
-        for key in {Path(image).name.casefold(), Path(image).stem.casefold()}:
-            own.setdefault(key, []).append(image)
-    found = []
-    for name in names:
-        plain = PureWindowsPath(name).name  # which takes both kinds of slashes
-        like = own.get(plain.casefold()) or own.get(Path(plain).stem.casefold()) or []
-        if (folder / "images" / name).is_file() and not (folder / name).is_file():
-            found.append(f"images/{name}")
-        elif len(like) == 1 and not (folder / name).is_file():
-            found.append(like[0])
-        else:
-            contained(folder, name, str(file))
-            found.append(name)
-    return found

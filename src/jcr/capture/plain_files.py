@@ -15,8 +15,8 @@ from jcr.files import read_bytes, require_file
 
 LONGEST = 255
 """Bytes of the longest file name that file systems take."""
-MAX_YAML = 4_000_000
-"""Characters of the longest YAML file: a longer one takes long to read, and is no capture."""
+MAX_YAML, MAX_JSON = 4_000_000, 32_000_000
+"""Characters of the longest files: a longer one takes long to read, and is no capture."""
 NAMED = 10
 """Names that a message lists; of more it gives the number."""
 LONGEST_SHOWN = 80
@@ -49,23 +49,16 @@ def read_yaml(file: Path) -> Any:
     except ImportError:
         from yaml import SafeLoader
 
-    text = read_text(file)
-    if len(text) > MAX_YAML:
-        raise InputError(
-            f"{file}: {len(text) / 1e6:.0f} MB of YAML; {MAX_YAML // 1_000_000} MB at most, which hold 1000 samples"
-        )
+    text = _bounded(file, MAX_YAML)
     try:
         documents = [one for one in yaml.load_all(text, Loader=SafeLoader) if one is not None]
         return documents[0] if len(documents) == 1 else documents or None
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
+        # Besides what is no YAML: dates and characters that are none, thousands of digits or brackets.
         mark = getattr(error, "problem_mark", None)
         place = f" at line {mark.line + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or "cannot be parsed"
+        problem = getattr(error, "problem", None) or error
         raise InputError(f"{file}: not YAML{place}: {problem}; correct it there") from None
-    except RecursionError:
-        raise InputError(f"{file}: nested too deeply; write it plainly") from None
-    except (ValueError, OverflowError) as error:  # dates and characters that are none, thousands of digits
-        raise InputError(f"{file}: a value that cannot be ({error}); correct it there") from None
 
 
 def read_json(file: Path) -> Any:
@@ -79,17 +72,24 @@ def read_json(file: Path) -> Any:
         return content
 
     try:
-        return json.loads(read_text(file), object_pairs_hook=unique)
+        return json.loads(_bounded(file, MAX_JSON), object_pairs_hook=unique)
     except json.JSONDecodeError as error:
         raise InputError(
             f"{file}: not JSON at line {error.lineno}, column {error.colno}: {error.msg}; correct it there"
         ) from None
-    except ValueError as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{file}: a number that is none ({error}); correct it there") from None
-    except RecursionError:
-        raise InputError(f"{file}: nested too deeply to be a capture; write it as the README shows") from None
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:  # a number of thousands of digits
+        raise InputError(
+            f"{file}: a number that is none, or nested too deeply ({error}); correct it"
+        ) from None
+
+
+def _bounded(file: Path, most: int) -> str:
+    """Return the text of a file; raise InputError where it is longer than any capture's."""
+    if len(text := read_text(file)) > most:
+        raise InputError(f"{file}: {len(text) / 1e6:.0f} MB; {most // 1_000_000} MB at most")
+    return text
 
 
 def shown(value: object) -> str:

@@ -1,11 +1,8 @@
 """Reading of captures: the format is recognised by its files, and each format has its own reader."""
 
-import fcntl
 import hashlib
 import json
-import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -115,43 +112,17 @@ def _inverted(found: Any, options: ReadOptions) -> Any:
 
 def _extracted(path: Path, options: ReadOptions, into: Path, form: Format, progress: Progress) -> Capture:
     """Return the capture of a recording in the folder `into`; read again where its files or the options changed."""
-    made_from, file = _made_from(path, options), into / capture_json.FILE
-    with _locked(into):
-        before = capture_json.read_content(file).model_extra if file.is_file() else None
-        if before is None or before.get("made_from") != made_from:
-            capture = _inverted(form.read(path, options, into, progress), options)
-            capture_json.write(into, capture, notes=capture.notes, made_from=made_from)
-        extra = capture_json.read_content(file).model_extra or {}
-        return replace(capture_json.read(into), notes=tuple(extra["notes"]))
-
-
-def _made_from(path: Path, options: ReadOptions) -> list[Any]:
-    """Return the path, a digest over names, sizes and times of all files that are read, and the options."""
     sources = [path, *filter(None, (options.urdf, options.camera_info))]
     files = [file for one in sources for file in ([one] if one.is_file() else sorted(one.rglob("*")))]
     states = [
         (str(file), (state := file.stat()).st_size, state.st_mtime_ns) for file in files if file.is_file()
     ]
     digest = hashlib.sha256(json.dumps(states).encode()).hexdigest()
-    return [str(path.resolve()), digest, json.loads(json.dumps(asdict(options), default=str))]
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Lock a folder, made where there is none, against a second extraction; an empty one is removed again."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = os.open(folder, os.O_RDONLY)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another folder") from None
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    except BlockingIOError:
-        raise InputError(
-            f"{folder}: another jcr extracts a recording there; wait for it or choose another"
-        ) from None
-    finally:
-        os.close(lock)
-        with suppress(OSError):
-            folder.rmdir()
+    made_from = [str(path.resolve()), digest, json.loads(json.dumps(asdict(options), default=str))]
+    file = into / capture_json.FILE
+    before = capture_json.read_content(file).model_extra if file.is_file() else None
+    if before is None or before.get("made_from") != made_from:
+        capture = _inverted(form.read(path, options, into, progress), options)
+        capture_json.write(into, capture, notes=capture.notes, made_from=made_from)
+    extra = capture_json.read_content(file).model_extra or {}
+    return replace(capture_json.read(into), notes=tuple(extra["notes"]))

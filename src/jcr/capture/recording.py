@@ -1,4 +1,4 @@
-"""Extraction of the best frames of a recording into a capture folder."""
+"""Extraction of the best frames of a recording: the arm at rest, sharp images, the least uncertain calibration."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -8,19 +8,31 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8, UInt16
 from numpy import ndarray
 
-from jcr.capture.best_frames import best_frames
 from jcr.capture.checks import checked_capture
-from jcr.capture.images import DEPTH, encode_png, sharpness
-from jcr.capture.options import ReadOptions
+from jcr.capture.images import BLURRED, DEPTH, encode_png, sharpness
+from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.errors import InputError
+from jcr.estimation.equation import ASSUMED_NOISE, expected_covariance
+from jcr.estimation.next_poses import choose, pose_information, total_uncertainty
 from jcr.files import write_bytes
+from jcr.geometry import inverse, motion_length
 from jcr.progress import Progress
 from jcr.records import Capture, Intrinsics
 
-Picture = tuple[int, bytes | UInt8[ndarray, "h w 3"], str]
-"""Row of a frame, its encoded file's bytes or RGB pixels, and the file's ending."""
+STILL = 0.005
+"""Speed of an arm at rest, m/s, rotation counted at ARM: a tenth of a pixel in 20 ms, half a metre away."""
+LOOKS = 5
+"""Number of frames of one stop that are compared for sharpness."""
+SAME_VIEW = 0.005
+"""Smallest distance between two views, m, rotation counted at ARM; the sharpest of nearer frames is kept."""
+WEAK = 1e-6
+"""Information (1/m², 1/rad²) about each unknown before any view, which keeps its covariance finite."""
 BESIDE_ALL_POSES_NS = 1e15
 """Gap (ns) beyond which the frame is before the first pose or after the last."""
+Picture = tuple[int, bytes | UInt8[ndarray, "h w 3"], str]
+"""Row of a frame, its encoded file's bytes or RGB pixels, and the file's ending."""
+Rows = Int[ndarray, " _"]
+Poses = Float[ndarray, "n 4 4"]
 
 
 def chosen_name(names: Sequence[str], asked: str | None, usual: Sequence[str], what: str, option: str) -> str:
@@ -41,12 +53,12 @@ class Recording:
     options: ReadOptions
     names: Sequence[str]
     """Names of the frames' files, without their endings."""
-    base_from_gripper: Float[ndarray, "n 4 4"]
+    base_from_gripper: Poses
     speed: Float[ndarray, " n"]
     """Speed of the gripper, m/s, rotation counted as in jcr.geometry.motion_length."""
     gap_ns: Int[ndarray, " n"]
     """Time between the two poses around each frame; 0 where none is interpolated."""
-    images_of_rows: Callable[[Int[ndarray, " k"]], Iterator[Picture]]
+    images_of_rows: Callable[[Rows], Iterator[Picture]]
     """Images of ascending rows, one by one."""
     intrinsics_of_size: Callable[[tuple[int, int]], Intrinsics | None]
     """Intrinsics of images of a size (width, height)."""
@@ -55,81 +67,38 @@ class Recording:
     depth_at: Callable[[int], UInt16[ndarray, "h w"] | None] | None = None
     """Depth (mm) aligned with the frame of a row."""
 
-    @property
-    def fresh(self) -> Bool[ndarray, " n"]:
-        """Frames whose pose is not interpolated over more than `options.max_gap_ms`."""
-        return self.gap_ns <= 1e6 * self.options.max_gap_ms
-
 
 def capture_of_recording(recording: Recording, into: Path, report: Progress) -> Capture:
     """Extract the best frames of a recording into the folder `into`.
 
     Raises InputError when the poses of all frames are stale, or when too few frames are still and sharp.
     """
-    fresh, source = recording.fresh, str(recording.source)
-    notes = _stale(recording)
-    rows, remarks = best_frames(
-        recording.base_from_gripper,
-        recording.speed,
-        fresh,
-        lambda rows: _sharpness(recording, rows, report),
-        recording.options.frames,
-    )
-    images, depths = _written(recording, rows, into, report)
-    capture, kept = checked_capture(into, images, recording.base_from_gripper[rows], source)
-    rows, depths = rows[kept], [depths[k] for k in kept]
-    if recording.joints is not None:
-        capture = replace(capture, joints=recording.joints[rows], urdf=recording.options.urdf)
-    if any(depths):
-        capture = replace(capture, depths=tuple(depths))
-    return replace(
-        capture,
-        intrinsics=recording.intrinsics_of_size(capture.image_size),
-        notes=(f"{len(rows)} of {len(fresh)} frames chosen", *notes, *remarks, *capture.notes),
-    )
-
-
-def _stale(recording: Recording) -> list[str]:
-    """Return a note on the frames whose pose is stale; InputError where all are."""
-    fresh, gap_ns, limit_ms = recording.fresh, recording.gap_ns, recording.options.max_gap_ms
-    if fresh.all():
-        return []
+    options, gap_ns = recording.options, recording.gap_ns
+    fresh, limit = gap_ns <= 1e6 * options.max_gap_ms, f"{options.max_gap_ms:.0f} ms"
     if not fresh.any():
-        gap = gap_ns.min()
-        far = (
-            "no image lies between two poses"
-            if gap > BESIDE_ALL_POSES_NS
-            else f"those around an image are {gap / 1e6:.0f} ms apart"
-        )
+        far = f"those around an image are {gap_ns.min() / 1e6:.0f} ms apart"
+        far = "no image lies between two poses" if gap_ns.min() > BESIDE_ALL_POSES_NS else far
         raise InputError(
-            f"{recording.source}: every pose is stale (over {limit_ms:.0f} ms): {far}; check the clocks, or raise "
-            "--max-gap-ms"
+            f"{recording.source}: every pose is stale (over {limit}): {far}; check the clocks, or raise --max-gap-ms"
         )
     worst = gap_ns[gap_ns < BESIDE_ALL_POSES_NS].max(initial=0) / 1e6
-    return [
-        f"{int((~fresh).sum())} of {len(fresh)} images have no pose within {limit_ms:.0f} ms (gaps up to "
-        f"{worst:.0f} ms): left out"
-    ]
+    stale = f"{int((~fresh).sum())} of {len(fresh)} images have no pose within {limit} (gaps up to {worst:.0f} ms): "
 
+    def sharpness_of(rows: Rows) -> Float[ndarray, " k"]:
+        values = []
+        for k, (_, image, _) in enumerate(recording.images_of_rows(rows)):
+            values.append(sharpness(image))
+            report("frames", 0.1 + 0.7 * k / len(rows))
+        if len(values) < len(rows):
+            raise InputError(
+                f"{recording.source}: {len(rows) - len(values)} of {len(rows)} images that it lists are not where its "
+                "index says; it is damaged: repair it (`mcap recover`, `ros2 bag reindex`) or record again"
+            )
+        return np.array(values)
 
-def _sharpness(recording: Recording, rows: Int[ndarray, " k"], report: Progress) -> Float[ndarray, " k"]:
-    """Return the sharpness of the images of these rows."""
-    values = []
-    for k, (_, image, _) in enumerate(recording.images_of_rows(rows)):
-        values.append(sharpness(image))
-        report("frames", 0.1 + 0.7 * k / len(rows))
-    if len(values) < len(rows):
-        raise InputError(
-            f"{recording.source}: {len(rows) - len(values)} of {len(rows)} images that it lists are not where its "
-            "index says; it is damaged: repair it (`mcap recover`, `ros2 bag reindex`) or record again"
-        )
-    return np.array(values)
-
-
-def _written(
-    recording: Recording, rows: Int[ndarray, " k"], into: Path, report: Progress
-) -> tuple[list[str], list[str | None]]:
-    """Write the images of these rows and their depth; return the files, None for a missing depth."""
+    rows, remarks = best_frames(
+        recording.base_from_gripper, recording.speed, fresh, sharpness_of, options.frames
+    )
     images, depths = list[str](), list[str | None]()
     for k, (row, image, ending) in enumerate(recording.images_of_rows(rows)):
         name = recording.names[row]
@@ -140,4 +109,79 @@ def _written(
         if depth is not None:
             write_bytes(into / f"{DEPTH}/{name}.png", encode_png(depth))
         report("frames", 0.8 + 0.2 * (k + 1) / len(rows))
-    return images, depths
+    capture, kept = checked_capture(into, images, recording.base_from_gripper[rows], str(recording.source))
+    notes = (f"{len(kept)} of {len(fresh)} frames chosen", *([] if fresh.all() else [f"{stale}left out"]))
+    return replace(
+        capture,
+        joints=None if recording.joints is None else recording.joints[rows[kept]],
+        urdf=None if recording.joints is None else options.urdf,
+        depths=tuple(depths[k] for k in kept) if any(depths[k] for k in kept) else None,
+        intrinsics=recording.intrinsics_of_size(capture.image_size),
+        notes=(*notes, *remarks, *capture.notes),
+    )
+
+
+def best_frames(
+    base_from_gripper: Poses,
+    speed: Float[ndarray, " n"],
+    usable: Bool[ndarray, " n"],
+    sharpness_of: Callable[[Rows], Float[ndarray, " k"]],
+    count: int,
+) -> tuple[Rows, tuple[str, ...]]:
+    """Return the rows of the best `count` frames in order of time, and remarks on the choice.
+
+    `speed` is in m/s with rotation counted at ARM; `sharpness_of` is called once, with ascending rows. A stop gives one
+    frame at most; where there are too few stops, the slowest frames between them are added. Raises InputError when
+    fewer than three frames are left.
+    """
+    moments = [
+        run[np.linspace(0, len(run) - 1, LOOKS + 2).astype(int)[1:-1]]
+        for run in _runs(usable & (speed < STILL))
+    ]
+    if len(moments) < count:  # the slowest frame of each of about 4 · count equal pieces of the rest
+        moving = _runs(usable & (speed >= STILL))
+        piece = max(sum(map(len, moving)) // (4 * count), 1)
+        parts = [part for run in moving for part in np.array_split(run, max(len(run) // piece, 1))]
+        moments += [part[[speed[part].argmin()]] for part in parts]
+    rows = np.unique(np.concatenate([*moments, np.zeros(0, int)]))
+    sharp = np.zeros(len(speed))
+    sharp[rows] = sharpness_of(rows)
+    sharpest = np.array([moment[sharp[moment].argmax()] for moment in moments], dtype=int)
+    least = BLURRED * np.median(sharp[sharpest]) if len(sharpest) else 0.0
+    clear = sharpest[sharp[sharpest] >= least]
+    views = clear[:0]
+    for row in clear[np.argsort(-sharp[clear], kind="stable")]:  # without those near a better one
+        motion = inverse(base_from_gripper[views]) @ base_from_gripper[row]
+        if (np.asarray(motion_length(motion)) > SAME_VIEW).all():
+            views = np.append(views, row)
+    if len(views) < MIN_FRAMES:
+        raise InputError(
+            f"{len(views)} different views are still and sharp among {len(speed)} frames; at least {MIN_FRAMES} are "
+            "needed: record again with a pause at each of a dozen views"
+        )
+    information = pose_information(base_from_gripper[views], np.eye(4), ASSUMED_NOISE)
+    frames, known = np.zeros(0, int), WEAK * np.eye(13)
+    for of_kind in (speed[views] < STILL, speed[views] >= STILL):  # frames at rest come first
+        gain, before = information[of_kind], known
+
+        def uncertainty_of(rows: Rows, gain: ndarray = gain, before: ndarray = before) -> float:
+            return total_uncertainty(expected_covariance(before + gain[rows].sum(0)))
+
+        chosen = np.array(choose(count - len(frames), len(gain), uncertainty_of), dtype=int)
+        frames, known = np.append(frames, views[of_kind][chosen]), known + gain.sum(0)
+    notes = []
+    if len(clear) < len(sharpest):
+        notes.append(f"{len(sharpest) - len(clear)} moments of the recording are blurred and were left out")
+    at_rest = int((speed[views] < STILL).sum())
+    if at_rest < count and (fastest := float(speed[frames].max())) >= STILL:
+        notes.append(
+            f"the arm stands still at {at_rest} different views where {count} frames are wanted; the others were "
+            f"taken at up to {1e3 * fastest:.0f} mm/s: pause for half a second at each view"
+        )
+    return np.sort(frames), tuple(notes)
+
+
+def _runs(mask: Bool[ndarray, " n"]) -> list[Rows]:
+    """Return the unbroken runs of rows where `mask` holds."""
+    rows = np.flatnonzero(mask)
+    return [run for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(run)]

@@ -14,7 +14,7 @@ from jcr.capture.cell_cameras import cameras_as_json, with_cameras
 from jcr.capture.checks import RigidMatrix, checked_capture, require_frames
 from jcr.capture.conventions import CONVENTIONS
 from jcr.capture.formats import Format
-from jcr.capture.options import MAX_FRAMES, ReadOptions
+from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_json, shown, validated
 from jcr.errors import InputError
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
@@ -22,8 +22,6 @@ from jcr.files import write_new
 from jcr.records import Capture
 
 FILE, URDF = "capture.json", "robot.urdf"
-MAX_BYTES = 32_000_000
-"""Size of the largest capture.json: a larger one takes long to read, and is no capture."""
 MOST_ROTATION = 6 * np.pi + 0.01
 """Largest joint angle, rad: no joint rotates farther to either side."""
 
@@ -72,10 +70,6 @@ def read_content(file: Path) -> CaptureFile:
     """Read a capture.json; raise InputError where the file is none."""
     if not file.is_file():
         raise InputError(f"{file.parent}: holds no capture.json; name a capture folder")
-    if (size := file.stat().st_size) > MAX_BYTES:
-        raise InputError(
-            f"{file}: {size / 1e6:.0f} MB; {MAX_BYTES // 1_000_000} MB at most, which hold {MAX_FRAMES} frames"
-        )
     content = read_json(file)
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
         raise InputError(f'{file}: has no list "frames"; expected {{"frames": [...], "intrinsics": ...}}')

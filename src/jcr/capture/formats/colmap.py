@@ -3,7 +3,7 @@
 COLMAP has the centre of the top-left pixel at (0.5, 0.5) and stores camera from world.
 """
 
-import struct
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -52,30 +52,28 @@ def read(path: Path, options: ReadOptions) -> Capture:
     if folder is None:
         raise InputError(f"{path}: holds no COLMAP model (cameras.bin or .txt, images, points3D)")
     root = next((parent for parent in (path, *folder.parents[:3]) if (parent / "images").is_dir()), path)
-    model = read_model(folder)
-    names, _ = _posed(model, folder)
-    located = []
+    names, _ = read_cameras(folder)
+    name_of = dict[str, str]()
+    """Names in the model of the images' files."""
     for name in names:
         beside = f"images/{name}"
-        located.append(beside if contained(root, beside, str(folder)).is_file() else name)
+        name_of[beside if contained(root, beside, str(folder)).is_file() else name] = name
     whole = table.read(root, options)
-    rows = [k for k, name in enumerate(whole.images) if name in located]
+    rows = [k for k, name in enumerate(whole.images) if name in name_of]
     if not rows:
+        first = next(iter(name_of))
         raise InputError(
-            f"{whole.source}: lists none of the model's images; it lists {whole.images[0]}, the model {located[0]}"
+            f"{whole.source}: lists none of the model's images; it lists {whole.images[0]}, the model {first}"
         )
-    images = tuple(whole.images[k] for k in rows)
-    notes = whole.notes
-    if unknown := len(located) - len(rows):
-        notes = (f"{unknown} of {len(located)} images of the model have no gripper pose: left out", *notes)
+    images, notes = tuple(whole.images[k] for k in rows), whole.notes
+    if unknown := len(name_of) - len(rows):
+        notes = (f"{unknown} of {len(name_of)} images of the model have no gripper pose: left out", *notes)
     return replace(
         whole,
         images=images,
         base_from_gripper=whole.base_from_gripper[rows],
         depths=None if whole.depths is None else tuple(whole.depths[k] for k in rows),
-        intrinsics=_common_intrinsics(
-            model, {names[located.index(name)] for name in images}, folder, whole.image_size
-        ),
+        intrinsics=read_intrinsics(folder, whole.image_size, {name_of[name] for name in images}),
         source=folder,
         cameras=folder,
         notes=notes,
@@ -83,17 +81,9 @@ def read(path: Path, options: ReadOptions) -> Capture:
 
 
 def read_model(folder: Path) -> "pycolmap.Reconstruction":
-    """Read a model; InputError when it cannot be read."""
+    """Read a model; raise InputError where it cannot be read."""
     import pycolmap
 
-    for name, check in (("images.bin", _check_images), ("points3D.bin", _check_points)):
-        if (folder / name).is_file():
-            try:
-                check((folder / name).read_bytes())
-            except (struct.error, ValueError):
-                raise InputError(
-                    f"{folder / name}: cut short or damaged; export the COLMAP model again"
-                ) from None
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     try:
@@ -105,38 +95,9 @@ def read_model(folder: Path) -> "pycolmap.Reconstruction":
         pycolmap.logging.minloglevel = before
 
 
-def _check_images(data: bytes) -> None:
-    """Raise where counts lead past the end: COLMAP would read on for minutes. Layout: colmap.github.io/format."""
-    (count,), at = struct.unpack_from("<Q", data), 8
-    for _ in range(count):
-        name = at + 64  # after its number, a rotation, a translation, the camera's number
-        at = data.index(b"\0", name) + 1
-        data[name:at].decode()
-        at += 8 + 24 * struct.unpack_from("<Q", data, at)[0]
-    _check_end(data, at)
-
-
-def _check_points(data: bytes) -> None:
-    """Raise where the counts of points and their tracks lead past the end."""
-    (count,), at = struct.unpack_from("<Q", data), 8
-    for _ in range(count):
-        at += 51 + 8 * struct.unpack_from("<Q", data, at + 43)[0]
-    _check_end(data, at)
-
-
-def _check_end(data: bytes, at: int) -> None:
-    """Raise where the counts of a file do not lead to its end."""
-    if at != len(data):
-        raise ValueError("counts do not lead to the end")
-
-
 def read_cameras(folder: Path) -> tuple[list[str], Float[ndarray, "n 4 4"]]:
     """Read the names of the registered images, in order, and their recon_from_camera (n,4,4)."""
-    return _posed(read_model(folder), folder)
-
-
-def _posed(model: "pycolmap.Reconstruction", folder: Path) -> tuple[list[str], Float[ndarray, "n 4 4"]]:
-    """Return the names of the registered images, in order, and their recon_from_camera (n,4,4)."""
+    model = read_model(folder)
     images = sorted((model.image(k) for k in model.reg_image_ids()), key=lambda image: image.name)
     if not images:
         raise InputError(f"{folder}: the COLMAP model has no registered image")
@@ -145,49 +106,34 @@ def _posed(model: "pycolmap.Reconstruction", folder: Path) -> tuple[list[str], F
     return [image.name for image in images], inverse(np.stack(camera_from_recon))
 
 
-def read_intrinsics(folder: Path, size: tuple[int, int]) -> Intrinsics:
-    """Read the intrinsics of all images of the given size; InputError when there are several, or unknown ones."""
+def read_intrinsics(folder: Path, size: tuple[int, int], names: Collection[str] | None = None) -> Intrinsics:
+    """Read the intrinsics that the registered images (of these names) of a size (px) share.
+
+    Raises InputError where they differ, are of another size, or of a model that jcr does not know.
+    """
     model = read_model(folder)
-    return _common_intrinsics(model, set(_posed(model, folder)[0]), folder, size)
-
-
-def _common_intrinsics(
-    model: "pycolmap.Reconstruction", names: set[str], folder: Path, size: tuple[int, int]
-) -> Intrinsics:
-    """Return the intrinsics that the images of the names share; InputError where they differ."""
-    images = [image for k in model.reg_image_ids() if (image := model.image(k)).name in names]
-    cameras = [model.camera(image.camera_id) for image in images]
-    kinds = {
-        (camera.model.name, camera.width, camera.height, *map(float, camera.params)) for camera in cameras
-    }
-    if len(kinds) > 1:
+    images = [model.image(k) for k in model.reg_image_ids()]
+    cameras = [model.camera(one.camera_id) for one in images if names is None or one.name in names]
+    kinds = {(one.model.name, one.width, one.height, *map(float, one.params)) for one in cameras}
+    if len(kinds) != 1:
         raise InputError(
             f"{folder}: {len(kinds)} different cameras; reconstruct with a single camera (--ImageReader.single_camera)"
         )
-    return _intrinsics(cameras[0], folder, size)
-
-
-def _intrinsics(camera: "pycolmap.Camera", folder: Path, size: tuple[int, int]) -> Intrinsics:
-    """Return the intrinsics of a camera of a model; InputError for another size or an unknown model."""
-    name, width, height, params = camera.model.name, camera.width, camera.height, [*map(float, camera.params)]
+    ((name, width, height, *params),) = kinds
     if name not in _COEFFICIENTS:
         raise InputError(
             f"{folder}: camera model {name}, which jcr does not know; run colmap image_undistorter"
         )
-    two_focals = name in ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
-    focals, rest = (params[:2], params[2:]) if two_focals else (params[:1] * 2, params[1:])
-    value = dict(zip(_COEFFICIENTS[name], rest[2:], strict=True))
-    model: DistortionModel = "fisheye" if "FISHEYE" in name else "rational" if any(rest[7:]) else "pinhole"
-    entry = {
-        "fx": focals[0],
-        "fy": focals[1],
-        "cx": rest[0] - HALF_PIXEL,
-        "cy": rest[1] - HALF_PIXEL,
-        "distortion": [value.get(key, 0.0) for key in COEFFICIENTS[model]],
-        "model": model,
-        "width": width,
-        "height": height,
-    }
+    if len(params) == 3 + len(_COEFFICIENTS[name]):  # one focal length
+        params = [params[0], *params]
+    fx, fy, cx, cy, *rest = params
+    value = dict(zip(_COEFFICIENTS[name], rest, strict=True))
+    distortion: DistortionModel = (
+        "fisheye" if "FISHEYE" in name else "rational" if any(rest[5:]) else "pinhole"
+    )
+    entry = {"fx": fx, "fy": fy, "cx": cx - HALF_PIXEL, "cy": cy - HALF_PIXEL, "model": distortion}
+    entry |= {"distortion": [value.get(key, 0.0) for key in COEFFICIENTS[distortion]]}
+    entry |= {"width": width, "height": height}
     return validated(IntrinsicsEntry, entry, str(folder)).record(size, f"{folder}: cameras")
 
 
