@@ -314,7 +314,7 @@ def test_joints_and_the_robot_are_kept_and_written_again(capture: Path, tmp_path
     [
         (
             lambda c: set_joints(c, [*JOINTS[:2], None, None]),
-            r"frame 2 .*: no joints, others have 6; give them for all",
+            r"frame 2 .*: no joint angles, others have 6; give them for all",
         ),
         (lambda c: set_joints(c, [[90.0] * 6] * 4), r"up to 90 rad; these look like degrees"),
         (lambda c: (set_joints(c, JOINTS), c.update(robot="panda")), r"6 joints, but a panda has 7"),
@@ -333,7 +333,7 @@ def test_joints_that_cannot_be_are_refused_in_one_line(capture: Path, change, me
 @pytest.mark.parametrize(
     ("row", "words"),
     [
-        (None, r"frame 3 .*: no joints, others have 6; give them for all"),
+        (None, r"frame 3 .*: no joint angles, others have 6; give them for all"),
         (JOINTS[3][:5], r"frame 3 .*: 5 joint angles, others have 6"),
         ([float("nan")] * 6, r"frame 3 .*: joints.0: Input should be a finite number"),
         ("0 1 2", r"frame 3 .*: joints: Input should be a valid list"),

@@ -7,8 +7,8 @@ import pytest
 
 import jcr
 from capture_writers import LIMIT, URDF, arm_poses
-from jcr.capture.joints import JointTrack, read_arm
 from jcr.capture.options import ReadOptions
+from jcr.capture.urdf_chain import JointTrack, read_arm
 
 MIMIC = URDF.replace(
     f'<axis xyz="1 0 0"/>{LIMIT}</joint>',

@@ -1,13 +1,17 @@
-"""Interpolation of a moving frame at the stamps of images."""
+"""Poses of a moving frame at the stamps of images: interpolation of samples, and the tree of ROS's tf."""
 
+from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial.transform import Rotation, Slerp
 
+from jcr.errors import InputError
 from jcr.geometry import inverse, motion_length, transform
 
 Stamps = Int[ndarray, " n"]
@@ -52,8 +56,7 @@ def bracket(
     before = np.clip(np.searchsorted(sample_ns, stamp_ns, side="right") - 1, 0, max(last - 1, 0))
     width = sample_ns[np.minimum(before + 1, last)] - sample_ns[before]
     share = np.clip((stamp_ns - sample_ns[before]) / np.maximum(width, 1), 0.0, 1.0)
-    exact = (share == 0) | (share == 1)
-    gap = np.where(exact, 0, width)
+    gap = np.where((share == 0) | (share == 1), 0, width)
     outside = (stamp_ns < sample_ns[0]) | (stamp_ns > sample_ns[last])
     return before, share, np.where(outside, NEVER, gap)
 
@@ -61,5 +64,73 @@ def bracket(
 def speed(poses_at: PosesAt, stamp_ns: Stamps) -> Float[ndarray, " n"]:
     """Return the speed (m/s) of the frame, rotation counted at ARM; at the ends of the recording from one side."""
     start, end = poses_at(stamp_ns - SPEED_OVER_NS), poses_at(stamp_ns + SPEED_OVER_NS)
-    motion = inverse(start[0]) @ end[0]
-    return np.asarray(motion_length(motion)) / (2e-9 * SPEED_OVER_NS)
+    return np.asarray(motion_length(inverse(start[0]) @ end[0])) / (2e-9 * SPEED_OVER_NS)
+
+
+class TfTree:
+    """Transforms of /tf and /tf_static in plain arrays: an hour of a robot has a few million."""
+
+    def __init__(self) -> None:
+        """Start without frames."""
+        self._parent: dict[str, str] = {}
+        self._static: set[str] = set()
+        self._samples: dict[str, tuple[array[int], array[float]]] = {}
+        """Stamps (ns), and x, y, z, qx, qy, qz, qw of parent_from_child, of each child."""
+
+    def add(self, transforms: list[Any], static: bool) -> None:
+        """Add the transforms of one message; a frame has one parent, the last that was given."""
+        for stamped in transforms:
+            child, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")
+            if self._parent.get(child) != parent:
+                self._parent[child], self._samples[child] = parent, (array("q"), array("d"))
+            stamp, t, q = stamped.header.stamp, stamped.transform.translation, stamped.transform.rotation
+            stamps, numbers = self._samples[child]
+            stamps.append(stamp.sec * 10**9 + stamp.nanosec)
+            numbers.extend((t.x, t.y, t.z, q.x, q.y, q.z, q.w))
+            if static:
+                self._static.add(child)
+
+    def poses_at(self, base: str | None, gripper: str | None, source: Path) -> PosesAt:
+        """Return a function from stamps to gripper poses in the base; InputError where no transforms join the two."""
+        frames, chains = sorted(self._parent.keys() | set(self._parent.values())), list[list[str]]()
+        for option, frame in (("--base-frame", base), ("--gripper-frame", gripper)):
+            if frame is None or frame not in frames:
+                given = "is not given" if frame is None else f"{frame} is not in the bag"
+                raise InputError(
+                    f"{source}: {option} {given}; the frames of its tf are {', '.join(frames) or 'none'}"
+                )
+            chains.append([frame])
+            while chains[-1][-1] in self._parent and len(chains[-1]) <= len(self._parent):
+                chains[-1].append(self._parent[chains[-1][-1]])
+        up, down = chains
+        if up[-1] != down[-1]:
+            raise InputError(
+                f"{source}: no transforms join {base} (below {up[-1]}) and {gripper} (below {down[-1]})"
+            )
+        joint = next(frame for frame in up if frame in down)
+        edges = [[self._edge(frame, source) for frame in chain[: chain.index(joint)]] for chain in (up, down)]
+
+        def poses_at(stamp_ns: Stamps) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
+            gap, products = np.zeros(len(stamp_ns), np.int64), []
+            for of_chain in edges:
+                poses = np.tile(np.eye(4), (len(stamp_ns), 1, 1))
+                for track, static in of_chain:
+                    if static:
+                        poses = track.a_from_b[-1] @ poses
+                        continue
+                    parent_from_child, edge_gap = track.at(stamp_ns)
+                    poses, gap = parent_from_child @ poses, np.maximum(gap, edge_gap)
+                products.append(poses)
+            return inverse(products[0]) @ products[1], gap
+
+        return poses_at
+
+    def _edge(self, child: str, source: Path) -> tuple[PoseTrack, bool]:
+        """Return the samples of parent_from_child of a frame, and whether it is static."""
+        stamps, numbers = (np.frombuffer(values, values.typecode) for values in self._samples[child])
+        numbers = numbers.reshape(-1, 7)
+        if not np.isfinite(numbers).all() or (np.linalg.norm(numbers[:, 3:], axis=1) < 0.5).any():
+            text = "holds a transform that is none; record again"
+            raise InputError(f"{source}: tf from {self._parent[child]} to {child}: {text}")
+        poses = transform(Rotation.from_quat(numbers[:, 3:]).as_matrix(), numbers[:, :3])
+        return pose_track(stamps, poses), child in self._static

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,11 @@ from numpy import ndarray
 
 from jcr.capture.camera_info import intrinsics_of_ros, read_camera_info
 from jcr.capture.formats import Format
-from jcr.capture.joints import JointTrack, read_arm
 from jcr.capture.options import ReadOptions
-from jcr.capture.pose_track import speed
+from jcr.capture.pose_track import TfTree, speed
 from jcr.capture.recording import Picture, Recording, capture_of_recording, chosen_name
 from jcr.capture.ros_image import depth_of, image_of
-from jcr.capture.tf_tree import TfTree
+from jcr.capture.urdf_chain import JointTrack, read_arm
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.progress import Progress
@@ -45,7 +43,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     poses are stale.
     """
     with _opened(path) as reader:
-        bag = _Bag.scanned(reader, options, path, report)
+        bag = _Bag(reader, path, options, report)
         stamps, order = np.unique(bag.stamp_ns, return_index=True)
         log_ns = np.array(bag.log_ns)[order]
         track = None if options.urdf is None else _joint_track(bag.joint_states, options, path)
@@ -61,71 +59,49 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
             gap_ns=gap_ns,
             images_of_rows=lambda rows: bag.pictures(rows, stamps, log_ns),
             intrinsics_of_size=lambda size: bag.intrinsics(options, size),
-            joints=None if track is None else track.angles(stamps),
+            joints=None if track is None else track.arm.angles(track.between(stamps)[0]),
             depth_at=(lambda row: bag.depth_near(int(stamps[row]), int(log_ns[row]))) if bag.depth else None,
         )
         return capture_of_recording(recording, into, report)
 
 
-@dataclass(kw_only=True)
 class _Bag:
     """Open bag, and the content of one pass over its messages other than images."""
 
-    reader: Any
-    path: Path
-    topic: str
-    """Topic of the camera's images."""
-    stamp_ns: list[int] = field(default_factory=list)
-    """Stamps of the images."""
-    log_ns: list[int] = field(default_factory=list)
-    """Times at which the images were recorded."""
-    camera_info: Any = None
-    """First CameraInfo message."""
-    tree: TfTree = field(default_factory=TfTree)
-    joint_states: list[tuple[int, list[str], Any]] = field(default_factory=list)
-    """Stamp (ns), names and positions of each message."""
-
-    @staticmethod
-    def scanned(reader: Any, options: ReadOptions, path: Path, report: Progress) -> "_Bag":
-        """Return the bag after a pass over transforms, joint states, CameraInfo and the stamps of the images."""
-        bag = _Bag(reader=reader, path=path, topic=_camera_topic(reader, options, path))
-        infos = [f"{bag.topic.rsplit('/', k)[0]}/camera_info" for k in (1, 2)]
+    def __init__(self, reader: Any, path: Path, options: ReadOptions, report: Progress) -> None:
+        """Read transforms, joint states, CameraInfo and the stamps of the images."""
+        self.reader, self.path, self.tree = reader, path, TfTree()
+        self.stamp_ns, self.log_ns = list[int](), list[int]()
+        """Stamps of the images, and the times at which they were recorded."""
+        self.joint_states = list[tuple[int, list[str], Any]]()
+        """Stamp (ns), names and positions of each message."""
+        self.camera_info: Any = None
+        self.topic = topic = _camera_topic(reader, options, path)
+        self.images = [c for c in reader.connections if c.topic == topic]
+        self.depth = [c for c in reader.connections if c.msgtype in IMAGES and ALIGNED in c.topic]
+        """Connections of depth that has the pixels of the images."""
+        infos = [f"{topic.rsplit('/', k)[0]}/camera_info" for k in (1, 2)]
         info = [c for name in infos for c in reader.connections if c.topic == name and c.msgtype == INFO][:1]
         span = max(reader.end_time - reader.start_time, 1)
-        wanted = [*bag.images, *info, *_pose_connections(reader, options, path)]
-        for connection, at, message in bag.messages(wanted):
+        wanted = [*self.images, *info, *_pose_connections(reader, options, path)]
+        for connection, at, message in self.messages(wanted):
+            kind = connection.msgtype
             try:
-                bag._add(connection, at, message)
+                if kind in TF:
+                    self.tree.add(message.transforms, static=connection.topic.endswith("tf_static"))
+                elif kind == JOINTS:
+                    self.joint_states.append((_stamp(message, at), message.name, message.position))
+                elif kind == INFO:
+                    self.camera_info = self.camera_info or message
+                else:
+                    self.stamp_ns.append(_stamp(message, at))
+                    self.log_ns.append(at)
             except AttributeError as error:
-                raise InputError(
-                    f"{path}: its {connection.msgtype} is not the one of ROS ({error}); record the standard message"
-                ) from None
+                text = f"its {kind} is not the one of ROS ({error}); record the standard message"
+                raise InputError(f"{path}: {text}") from None
             report("frames", 0.1 * (at - reader.start_time) / span)
-        if not bag.stamp_ns:
-            raise InputError(f"{path}: topic {bag.topic} has no images; choose another with --camera-topic")
-        return bag
-
-    def _add(self, connection: Any, at: int, message: Any) -> None:
-        """Add the content of a message that was recorded at a time (ns)."""
-        if connection.msgtype in TF:
-            self.tree.add(message.transforms, static=connection.topic.endswith("tf_static"))
-        elif connection.msgtype == JOINTS:
-            self.joint_states.append((_stamp(message, at), message.name, message.position))
-        elif connection.msgtype == INFO:
-            self.camera_info = self.camera_info or message
-        else:
-            self.stamp_ns.append(_stamp(message, at))
-            self.log_ns.append(at)
-
-    @property
-    def images(self) -> list[Any]:
-        """Connections of the camera's images."""
-        return [c for c in self.reader.connections if c.topic == self.topic]
-
-    @property
-    def depth(self) -> list[Any]:
-        """Connections of depth that has the pixels of the images."""
-        return [c for c in self.reader.connections if c.msgtype in IMAGES and ALIGNED in c.topic]
+        if not self.stamp_ns:
+            raise InputError(f"{path}: topic {topic} has no images; choose another with --camera-topic")
 
     def messages(self, connections: list[Any], **span: int) -> Iterator[tuple[Any, int, Any]]:
         """Yield connection, time of recording (ns) and content of messages; raise InputError where one is damaged."""

@@ -1,7 +1,7 @@
 """The capture folder: `capture.json` and the images that it names."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -99,10 +99,8 @@ def read(path: Path, options: ReadOptions | None = None) -> Capture:
     dof = next((len(frame.joints) for frame in frames.values() if frame.joints), 0)
     for row, frame in frames.items():
         if (angles := len(frame.joints or ())) != dof:
-            what = "no joints" if not angles else f"{angles} joint angles"
-            faults[row] = (
-                f"{file}: frame {row} ({images[row]}): {what}, others have {dof}; give them for all or for none"
-            )
+            what = f"{angles or 'no'} joint angles, others have {dof}; give them for all or for none"
+            faults[row] = f"{file}: frame {row} ({images[row]}): {what}"
     poses = np.full((count, 4, 4), np.nan)
     for row in frames.keys() - faults.keys():
         poses[row] = frames[row].base_from_gripper
@@ -133,9 +131,8 @@ def stated_fields(
         known = ", ".join(ROBOT_NAMES)
         robot, notes = None, (f"robot {shown(robot)} is not one of {known}: its kinematics are not used",)
     if robot is not None and joints is not None and joints.shape[1] != (dof := arm_named(robot).dof):
-        raise InputError(
-            f"{file}: frames have {joints.shape[1]} joints, but a {robot} has {dof}; correct either"
-        )
+        text = f"frames have {joints.shape[1]} joints, but a {robot} has {dof}; correct either"
+        raise InputError(f"{file}: {text}")
     urdf = None if content.urdf is None else _inside(file.parent, content.urdf, f"{file}: urdf")
     depths = tuple(frame.depth for frame in frames)
     convention = content.pose_convention
@@ -153,41 +150,33 @@ def stated_fields(
 
 def write(folder: Path, capture: Capture, **remarks: Any) -> None:
     """Write capture.json for images that lie in `folder` already; `remarks` are keys that readers ignore."""
-    optional: Mapping[str, Sequence[Any]] = {
-        "joints": [] if capture.joints is None else capture.joints.tolist(),
-        "depth": capture.depths or [],
-    }
     frames = []
     for row, (name, pose) in enumerate(zip(capture.images, capture.base_from_gripper, strict=True)):
-        more = {key: values[row] for key, values in optional.items() if values and values[row] is not None}
+        more: dict[str, Any] = {} if capture.joints is None else {"joints": capture.joints[row].tolist()}
+        if capture.depths is not None and capture.depths[row] is not None:
+            more["depth"] = capture.depths[row]
         frames.append(FrameEntry.model_validate({"image": name, "base_from_gripper": pose} | more))
-    given = capture.intrinsics
-    stated: dict[str, Any] = {
-        "frames": frames,
-        "intrinsics": None if given is None else IntrinsicsEntry.of(given),
+    given, std, urdf = capture.intrinsics, capture.intrinsics_std, capture.urdf
+    if urdf is not None and urdf.resolve() != (folder / URDF).resolve():
+        write_new(folder / URDF, urdf.read_bytes())  # a capture is complete in its folder
+    optional = {
+        "intrinsics_std": None if std is None else StdEntry.of(std),
+        "pose_convention": capture.pose_convention,
+        "robot": capture.robot,
+        "urdf": None if urdf is None else URDF,
+        "cameras": cameras_as_json(capture) or None,
     }
-    if capture.intrinsics_std is not None:
-        stated["intrinsics_std"] = StdEntry.of(capture.intrinsics_std)
-    stated |= {
-        key: value for key in ("pose_convention", "robot") if (value := getattr(capture, key)) is not None
-    }
-    if capture.urdf is not None:
-        # Beside the images, whatever it was called: a capture is complete in its folder.
-        if capture.urdf.resolve() != (folder / URDF).resolve():
-            write_new(folder / URDF, capture.urdf.read_bytes())
-        stated["urdf"] = URDF
-    if cameras := cameras_as_json(capture):
-        stated["cameras"] = cameras
-    write_new(folder / FILE, CaptureFile(**stated, **remarks).as_text().encode())
+    stated = {key: value for key, value in optional.items() if value is not None} | remarks
+    intrinsics = None if given is None else IntrinsicsEntry.of(given)
+    write_new(folder / FILE, CaptureFile(frames=frames, intrinsics=intrinsics, **stated).as_text().encode())
 
 
 def origin(folder: Path) -> Path:
     """Return the table or recording whose frames were copied into a capture folder, or the folder itself."""
-    content = read_json(folder / FILE) if (folder / FILE).is_file() else {}
-    content = content if isinstance(content, dict) else {}
-    made_from = content.get("made_from")
-    source = made_from[0] if isinstance(made_from, list) and made_from else None
-    return Path(source) if isinstance(source, str) and source else folder.resolve()
+    try:
+        return Path(read_json(folder / FILE)["made_from"][0])
+    except (InputError, KeyError, IndexError, TypeError):
+        return folder.resolve()
 
 
 def kept(capture: Capture, folder: Path) -> Capture:
@@ -221,10 +210,10 @@ def _image_name(content: CaptureFile, row: int, file: Path) -> str:
 
 def _is_capture(path: Path) -> bool:
     """Return whether a path is a folder with a capture.json, or a JSON file with frames."""
-    if path.suffix.lower() != ".json" or not path.is_file():
-        return (path / FILE).is_file()
-    content = {} if path.name == FILE else read_json(path)
-    return path.name == FILE or (isinstance(content, dict) and "frames" in content)
+    if path.name == FILE or path.suffix.lower() != ".json" or not path.is_file():
+        return (path if path.name == FILE else path / FILE).is_file()
+    content = read_json(path)
+    return isinstance(content, dict) and "frames" in content
 
 
 FORMAT = Format(name="capture", about="a folder with capture.json", recognises=_is_capture, read=read)

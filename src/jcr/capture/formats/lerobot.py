@@ -14,11 +14,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from jcr.capture.camera_info import read_camera_info
 from jcr.capture.conventions import CONVENTIONS, poses_from_numbers
 from jcr.capture.formats import Format
-from jcr.capture.joints import read_arm
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_json, validated
 from jcr.capture.pose_track import pose_track, speed
 from jcr.capture.recording import Picture, Recording, capture_of_recording, chosen_name
+from jcr.capture.urdf_chain import read_arm
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.progress import Progress
@@ -87,9 +87,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
         cameras, options.camera_topic, cameras, f"{path}: the wrist camera", "--camera-topic"
     )
     states = [key for key, feature in features.items() if feature.dtype.startswith("float")]
-    usual = [key for key in (CARTESIAN, STATE) if key in states and not (key == CARTESIAN and options.urdf)][
-        :1
-    ]
+    usual = [key for key in ((STATE,) if options.urdf else (CARTESIAN, STATE)) if key in states][:1]
     key = chosen_name(states, options.joint_topic, usual, f"{path}: the robot's state", "--joint-topic")
     episodes = [read_episode(path, info, camera, key, index) for index in options.episode]
     if len({episode.state.shape[1] for episode in episodes}) > 1:
@@ -98,12 +96,14 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     poses, joints = _poses(state, key, features[key], options, path)
     ends = np.cumsum([len(episode.time_s) for episode in episodes])
     rows = np.split(np.arange(ends[-1]), ends[:-1])
+    stamps = [np.round(1e9 * episode.time_s).astype(np.int64) for episode in episodes]
+    pieces = zip(stamps, rows, strict=True)
     recording = Recording(
         source=path,
         options=options,
         names=[f"episode_{e.index:06d}_frame_{k:06d}" for e in episodes for k in range(len(e.time_s))],
         base_from_gripper=poses,
-        speed=np.concatenate([_speed(e, poses[part]) for e, part in zip(episodes, rows, strict=True)]),
+        speed=np.concatenate([speed(pose_track(at, poses[part]).at, at) for at, part in pieces]),
         gap_ns=np.zeros(len(state), np.int64),  # a row is one instant
         images_of_rows=lambda wanted: _images(episodes, rows, wanted, camera, info.fps),
         intrinsics_of_size=lambda size: (
@@ -182,35 +182,28 @@ def _file(path: Path, template: str, fields: dict[str, Any]) -> Path:
 def _images(
     episodes: list[Episode], rows: list[Int[ndarray, " _"]], wanted: Int[ndarray, " k"], key: str, fps: float
 ) -> Iterator[Picture]:
-    """Yield the images of the wanted rows among the frames of all episodes."""
+    """Yield the images of the wanted rows among the frames of all episodes, out of their videos or tables."""
     for episode, part in zip(episodes, rows, strict=True):
         mine = wanted[np.isin(wanted, part)]
         if len(mine) == 0:
             continue
         local = mine - part[0]
-        if episode.video is None:
-            for row, file in zip(mine.tolist(), _embedded(episode, key, local), strict=True):
-                yield row, file, ".jpg" if file.startswith(b"\xff\xd8") else ".png"
+        if episode.video is not None:
+            times = episode.video_start_s + episode.time_s[local]
+            frames = _video_frames(episode.video, times, 0.5 / fps)
+            yield from ((row, rgb, ".png") for row, rgb in zip(mine.tolist(), frames, strict=True))
             continue
-        times = episode.video_start_s + episode.time_s[local]
-        frames = _video_frames(episode.video, times, 0.5 / fps)
-        for row, rgb in zip(mine.tolist(), frames, strict=True):
-            yield row, rgb, ".png"
-
-
-def _embedded(episode: Episode, camera: str, rows: Int[ndarray, " k"]) -> Iterator[bytes]:
-    """Yield the image files that an episode's table holds in the given rows."""
-    frames = episode.frame[rows].tolist()
-    found = _read_table(episode.table, ["frame_index", camera], episode.index, frames)
-    images = dict(zip(found["frame_index"], found[camera], strict=True))
-    for frame in frames:
-        image = images[frame]
-        if not isinstance(image, dict) or not image.get("bytes"):
-            raise InputError(
-                f"{episode.table}: holds no {camera} of frame {frame}; write the data set again with its images "
-                "embedded"
-            )
-        yield image["bytes"]
+        numbers = episode.frame[local].tolist()
+        found = _read_table(episode.table, ["frame_index", key], episode.index, numbers)
+        images = dict(zip(found["frame_index"], found[key], strict=True))
+        for row, number in zip(mine.tolist(), numbers, strict=True):
+            file = images[number].get("bytes") if isinstance(images[number], dict) else None
+            if not file:
+                raise InputError(
+                    f"{episode.table}: holds no {key} of frame {number}; write the data set again with its images "
+                    "embedded"
+                )
+            yield row, file, ".jpg" if file.startswith(b"\xff\xd8") else ".png"
 
 
 def _video_frames(
@@ -263,12 +256,6 @@ def _poses(
         raise InputError(f"{where}: {state.shape[1]} numbers, a pose of this convention has {len(names)}")
     numbers = state[:, [names.index(name) for name in wanted]]
     return poses_from_numbers(numbers, convention, options.pose_units, where), None
-
-
-def _speed(episode: Episode, poses: Float[ndarray, "n 4 4"]) -> Float[ndarray, " n"]:
-    """Return the speed (m/s) of the gripper at each row of an episode."""
-    stamps = np.round(1e9 * episode.time_s).astype(np.int64)
-    return speed(pose_track(stamps, poses).at, stamps)
 
 
 FORMAT = Format(
