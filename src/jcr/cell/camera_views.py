@@ -1,19 +1,47 @@
-"""Images of a further camera that are registered in the reconstruction, and the rigs that they belong to."""
+"""Images of a further camera: their registration in the reconstruction of the capture's own camera, and their rigs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import usable_intrinsics
-from jcr.cell.localise import count, distance
 from jcr.cell.placement import CameraPlacement
 from jcr.findings import Concerns, Finding, FindingKind
 from jcr.records import CellCamera, Intrinsics
-from jcr.sfm.register import Registration
+from jcr.sfm.register import GATE_PX, KnownImages, Registration, features, registration, shared_points
+
+FOCAL_OF_WIDTH = 0.9
+"""Initial focal length of a camera without given intrinsics, in widths of the image."""
+CLEARLY_MORE = 1.1
+"""Factor of the points that agree with given intrinsics, from which RANSAC alone does not explain more."""
+
+
+def localise(known: KnownImages, image: UInt8[ndarray, "h w 3"], camera: CellCamera) -> Registration | int:
+    """Return the registration of an image, or the number of points that it shares where these are too few.
+
+    A focal length is estimated where none is given, or where another one explains clearly more points: wrong intrinsics
+    leave the points that agree with a wrong pose.
+    """
+    given, _ = usable_intrinsics(camera.intrinsics)
+    width, height = camera.image_size
+    focal = FOCAL_OF_WIDTH * max(width, height)
+    start = given or Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
+    gate_px = 2 * GATE_PX * max(1.0, start.width / 1600)
+    shared = shared_points(known, features(image, start))
+    free = registration(shared, start, "free", gate_px)
+    if given is None:
+        return free
+    found = registration(shared, start, "given", gate_px)
+    return free if _count(free) > CLEARLY_MORE * _count(found) else found
+
+
+def _count(found: Registration | int) -> int:
+    """Return the number of shared points."""
+    return len(found.x_px) if isinstance(found, Registration) else found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,19 +90,13 @@ class CameraViews:
     @property
     def counts(self) -> list[int]:
         """Number of shared points of each image."""
-        return [count(one) for one in self.found]
-
-    @property
-    def distance(self) -> float:
-        """Median distance of the scene (recon units)."""
-        return float(np.median([distance(one) for one in self.registered.values()]))
+        return [_count(one) for one in self.found]
 
     @property
     def intrinsics(self) -> Intrinsics:
         """Given intrinsics, or those of the image with most points."""
         intrinsics, _ = usable_intrinsics(self.camera.intrinsics)
-        best = max(self.registered.values(), key=count)
-        return intrinsics or best.pose.camera
+        return intrinsics or max(self.registered.values(), key=_count).pose.camera
 
     def reason(self, image: int) -> str | None:
         """Return the reason why an image is not used; None for one that is."""

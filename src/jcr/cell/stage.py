@@ -18,28 +18,30 @@ from jcr.calibration.checks.effects import as_adopted, effects
 from jcr.calibration.options import CalibrateOptions
 from jcr.capture.images import read_image
 from jcr.cell.added import camera_of
-from jcr.cell.camera_views import CameraViews
+from jcr.cell.camera_views import CameraViews, localise
 from jcr.cell.images import CellImages, cell_images
-from jcr.cell.localise import localise
-from jcr.cell.place_checks import contradicting_image, crowded_points, far_from_gripper, place_uncertain
-from jcr.cell.placement import (
-    ArmPlacement,
-    CameraPlacement,
-    CellPlacement,
-    ImageUse,
-    TransformUncertainty,
-)
+from jcr.cell.placement import ArmPlacement, CameraPlacement, CellPlacement, ImageUse, TransformUncertainty
 from jcr.cell.rigs import Rigs
+from jcr.estimation.hand_eye import MAX_STD
 from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.problem import State
 from jcr.estimation.solve import Solution
 from jcr.findings import Finding, FindingKind
-from jcr.geometry import inverse, scale_translation
+from jcr.geometry import apply, inverse, scale_translation
 from jcr.intrinsics_json import IntrinsicsAndStd
 from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress, silent, steps
 from jcr.records import Capture, CellCamera, HandEye, Intrinsics, Reconstruction
 from jcr.sfm.register import KnownImages, Registration
+
+CONTRADICTS = 5.0
+"""Factor of the median reprojection error of all images of the cell from which an image contradicts a pose."""
+LEAST_PX = 1.0
+"""Smallest median reprojection error (px) that contradicts a pose, for images up to 1600 px wide."""
+LEAST_SPREAD = 0.05
+"""Smallest share of the image's area that the points should span; crowded points determine a pose badly."""
+FAR_FROM_GRIPPER = 0.5
+"""Distance (m) from the gripper's frame beyond which a camera is likely to be mounted elsewhere."""
 
 
 def place_camera(
@@ -217,21 +219,37 @@ def _placement(
     intrinsics, std = problem.intrinsics(answer.state)[c], np.sqrt(np.diag(answer.intrinsics_covariance(c)))
 
     def uncertain() -> Finding | None:
-        return place_uncertain(covariance, intrinsics, float(std[0]), camera.intrinsics is not None)
+        """Return the finding of a pose that is too uncertain; for unknown intrinsics with that of the focal length."""
+        metres, radians = np.sqrt(np.diag(covariance)).reshape(2, 3).max(1).tolist()
+        if metres <= MAX_STD[0] and radians <= MAX_STD[1]:
+            return None
+        if camera.intrinsics is not None:
+            return Finding.of(
+                FindingKind.PLACE_UNCERTAIN, "rejects", "images", value=metres, rotation=radians
+            )
+        more = {"rotation": radians, "focal_std": float(std[0]) / intrinsics.fx}
+        return Finding.of(FindingKind.PLACE_UNCERTAIN, "rejects", "intrinsics", value=metres, **more)
 
-    # An image that contradicts the pose also makes it uncertain.
-    checked = (
-        contradicting_image(images, member, float(np.median(of_all))) or uncertain(),
-        *member.findings,
-        crowded_points(member),
-        far_from_gripper(transform, camera.mount),
-    )
-    findings = [finding for finding in checked if finding is not None]
+    findings = list(member.findings)
+    worst = max(images, key=lambda image: image.reprojection_px or 0.0)
+    limit_px = max(CONTRADICTS * float(np.median(of_all)), LEAST_PX * max(1.0, camera.image_size[0] / 1600))
+    if (most_px := worst.reprojection_px or 0.0) > limit_px:  # which also makes the pose uncertain
+        details = {"value": most_px, "mount": camera.mount}
+        findings.insert(0, Finding.of(FindingKind.IMAGE_MISSES, "rejects", "mount", worst.image, **details))
+    elif (found := uncertain()) is not None:
+        findings.insert(0, found)
+    registered = list(member.registered.values())
+    if (widest := max(map(_spread, registered))) < LEAST_SPREAD:
+        findings.append(Finding.of(FindingKind.POINTS_CROWDED, "warns", "images", value=widest))
+    away = float(np.linalg.norm(transform[:3, 3]))
+    if camera.mount == "gripper" and away > FAR_FROM_GRIPPER:
+        findings.append(Finding.of(FindingKind.FAR_FROM_GRIPPER, "warns", "mount", value=away))
     for fault in faults:
         covariance = covariance + fault.covariance[:6, :6]
         rejected = any(one.severity == "rejects" for one in findings)
         findings.append(replace(fault, severity="rejects") if rejected or uncertain() else fault)
-    distance_m = member.distance * answer.state.scale
+    depths = [apply(inverse(one.pose.a_from_camera), one.points_in_recon)[:, 2] for one in registered]
+    distance_m = answer.state.scale * float(np.median([np.median(depth) for depth in depths]))
     return CameraPlacement.of(
         camera,
         images,
@@ -240,6 +258,12 @@ def _placement(
         TransformUncertainty.of(covariance, transform, distance_m),
         IntrinsicsAndStd.of(intrinsics, std),
     )
+
+
+def _spread(found: Registration) -> float:
+    """Return the share of the image's area that the standard deviations of its points span."""
+    sides = 4 * np.sqrt(np.linalg.eigvalsh(np.cov(found.x_px.T)))
+    return float(sides.prod() / (found.pose.camera.width * found.pose.camera.height))
 
 
 def _by_faults(
