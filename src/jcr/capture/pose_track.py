@@ -127,8 +127,8 @@ class TfTree:
 
     def _edge(self, child: str, source: Path) -> tuple[PoseTrack, bool]:
         """Return the samples of parent_from_child of a frame, and whether it is static."""
-        stamps, numbers = (np.frombuffer(values, values.typecode) for values in self._samples[child])
-        numbers = numbers.reshape(-1, 7)
+        of_stamps, of_numbers = self._samples[child]
+        stamps, numbers = np.frombuffer(of_stamps, np.int64), np.frombuffer(of_numbers).reshape(-1, 7)
         if not np.isfinite(numbers).all() or (np.linalg.norm(numbers[:, 3:], axis=1) < 0.5).any():
             text = "holds a transform that is none; record again"
             raise InputError(f"{source}: tf from {self._parent[child]} to {child}: {text}")
