@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.real import run as run_real
 from jcr.boards.detection import boards
 from jcr.boards.marker import reconstruct_marker
 from jcr.calibration.stage import calibrate
@@ -18,7 +17,6 @@ from jcr.capture.read import read_capture
 from jcr.cli import dispatch
 from jcr.depth.densify import densify
 from jcr.errors import InputError
-from jcr.findings import FindingKind
 from jcr.geometry import rotation_between_deg
 from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Intrinsics
@@ -150,14 +148,6 @@ def test_calibrates_from_every_kind_of_board(tmp_path, spec):
     assert abs(hand_eye.scale - 1) < 0.005
 
 
-def test_an_unknown_intrinsics_comes_from_the_board(tmp_path):
-    capture, gripper_from_camera = capture_of(tmp_path / "capture", charuco, known_intrinsics=False)
-    reconstruction = reconstruct_marker(capture, "charuco:7x6:0.030:0.022:DICT_4X4_50")
-    assert abs(reconstruction.intrinsics.fx / INTRINSICS.fx - 1) < 0.01
-    hand_eye = calibrate(capture, reconstruction)
-    assert np.linalg.norm(hand_eye.gripper_from_camera - gripper_from_camera) < 0.01
-
-
 @pytest.mark.parametrize(
     ("spec", "legacy", "read_as"),
     [
@@ -262,26 +252,9 @@ def test_real_boards_reproduce_their_references(name, spec, limit_mm, limit_deg,
     assert hand_eye.converged == accepted
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="the real captures are not beside this checkout")
-def test_a_sheet_of_paper_tells_the_size_that_the_robot_asks_for():
-    """The sheet of franka_plain_background has sides of 11.388 and 8.056 squares: A4, with squares of 26.07 mm."""
-    capture = read_capture(DATA / "franka_plain_background")
-    hand_eye = calibrate(capture, reconstruct_marker(capture, "chessboard:9x6:0.02607"))
-    # Nothing is found against it; 95 % of errors stay below 5.05 mm, where 5 mm are needed to grasp.
-    kinds = {found.kind for found in hand_eye.findings if found.severity != "informs"}
-    assert hand_eye.converged and kinds <= {FindingKind.NOT_EXACT_ENOUGH}
-
-
-def test_the_table_of_real_captures_holds_each_against_its_reference(tmp_path):
-    capture_of(tmp_path / "bench", charuco, count=5)
-    table = run_real(tmp_path, ["bench=charuco:7x6:0.030:0.022:DICT_4X4_50"])
-    rows = [
-        line.split("|") for line in table.splitlines() if line.startswith("| bench | images alone (colmap)")
-    ]
-    rows += [line.split("|") for line in table.splitlines() if "DICT_4X4_50` |" in line]
-    off = np.array([[float(row[5]), float(row[6])] for row in rows])
-    assert len(off) == 2 and (off < [3.0, 2.0]).all(), "rms mm and joint standard deviations"
-    with pytest.raises(InputError, match="other: no such capture"):
-        run_real(tmp_path, ["other=chessboard:8x5:0.025"])
-    with pytest.raises(InputError, match=r"no folder below it holds a capture\.json"):
-        run_real(tmp_path / "bench", [])
+def test_an_unknown_intrinsics_comes_from_the_board(tmp_path):
+    capture, gripper_from_camera = capture_of(tmp_path / "capture", charuco, known_intrinsics=False)
+    reconstruction = reconstruct_marker(capture, "charuco:7x6:0.030:0.022:DICT_4X4_50")
+    assert abs(reconstruction.intrinsics.fx / INTRINSICS.fx - 1) < 0.01
+    hand_eye = calibrate(capture, reconstruction)
+    assert np.linalg.norm(hand_eye.gripper_from_camera - gripper_from_camera) < 0.01

@@ -1,17 +1,14 @@
 """Intrinsics models through every reader and writer that knows them."""
 
-import json
-from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import yaml
 
 import jcr
 from jcr.capture import camera_info
-from jcr.capture.formats import capture_json, colmap
+from jcr.capture.formats import colmap
 from jcr.capture.plain_files import validated
 from jcr.export import ros
 from jcr.intrinsics_json import IntrinsicsAndStd
@@ -85,37 +82,3 @@ def test_a_capture_names_the_models_that_there_are():
     fisheye = validated(entry, intrinsics | {"model": "fisheye", "distortion": [0.0] * 5}, "capture.json")
     with pytest.raises(jcr.InputError, match="5 numbers, not the 4 of a fisheye model, k1,k2,k3,k4"):
         fisheye.record(SIZE, "capture.json")
-
-
-def through(intrinsics: Intrinsics, image: np.ndarray, original: Intrinsics) -> np.ndarray:
-    """The image that a camera with another intrinsics takes from the same place."""
-    from jcr.camera import project, unproject
-
-    u, v = np.meshgrid(np.arange(intrinsics.width), np.arange(intrinsics.height))
-    x_px = project(original, unproject(intrinsics, np.stack([u, v], -1).astype(float))).astype(np.float32)
-    return cv2.remap(image, x_px[..., 0], x_px[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("model", ["rational", "fisheye"])
-def test_a_capture_through_another_intrinsics_gives_the_same_calibration(
-    model: str, tabletop: Path, tmp_path: Path
-):
-    whole = jcr.read_capture(tabletop)
-    capture = replace(whole, images=whole.images[:8], base_from_gripper=whole.base_from_gripper[:8])
-    original = capture.intrinsics
-    assert original is not None
-    distortion = {"rational": RATIONAL.distortion, "fisheye": FISHEYE.distortion}[model]
-    intrinsics = Intrinsics(520.0, 520.0, 322.0, 239.0, *SIZE, distortion, model)
-    for name in capture.images:
-        image = through(intrinsics, cv2.imread(str(tabletop / name)), original)
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        cv2.imwrite(str(tmp_path / name), image)
-    capture_json.write(tmp_path, replace(capture, intrinsics=intrinsics))
-    result = jcr.calibrate(jcr.read_capture(tmp_path), tmp_path / "out", backend="colmap")
-    truth = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
-    off = np.linalg.inv(truth) @ result.hand_eye.gripper_from_camera
-    assert result.converged and result.hand_eye.intrinsics is not None
-    assert result.hand_eye.intrinsics.model == model
-    assert np.linalg.norm(off[:3, 3]) < 1e-3
-    assert np.degrees(np.arccos((np.trace(off[:3, :3]) - 1) / 2)) < 0.1

@@ -128,17 +128,6 @@ def test_joint_states_in_degrees_go_through_the_urdf(tmp_path: Path, tabletop: P
         jcr.read_capture(path, into=tmp_path / "more")
 
 
-def test_frames_of_several_episodes_are_joined(tmp_path: Path, tabletop: Path, problem: HandEyeProblem):
-    states = writers.rows_as("rpy", problem.base_from_gripper)
-    episodes = [
-        (pictured(tabletop, 6), walked(states[:6])),
-        (pictured(tabletop, 6, first=6), walked(states[6:])),
-    ]
-    path = writers.write_lerobot(tmp_path / "set", episodes, "v3.0", DROID, XYZRPY, codec="libx264")
-    got = jcr.read_capture(path, ReadOptions(episode=(0, 1), frames=12), into=tmp_path / "frames")
-    assert_paired(got, problem.base_from_gripper)
-
-
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory, tabletop: Path, problem: HandEyeProblem) -> Path:
     states = writers.rows_as("rpy", problem.base_from_gripper)[:4]
@@ -192,21 +181,6 @@ def test_an_edited_set_or_camera_info_is_read_again(tmp_path: Path, small: Path,
     writers.write_camera_info(replace(bundled, intrinsics=replace(intrinsics, fx=170.0)), tmp_path)
     again = jcr.read_capture(path, options, into=into)
     assert again.intrinsics is not None and again.intrinsics.fx == 170.0
-
-
-def test_states_of_different_lengths_are_one_line(tmp_path: Path, small: Path):
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    path = shutil.copytree(small, tmp_path / "set")
-    file = next(path.rglob("data/**/*.parquet"))
-    table = pq.read_table(file)
-    states = table[DROID].to_pylist()
-    states[3] = states[3][:4]
-    pq.write_table(table.set_column(table.column_names.index(DROID), DROID, pa.array(states)), file)
-    with pytest.raises(jcr.InputError, match="rows of different lengths") as caught:
-        jcr.read_capture(path, into=tmp_path / "frames")
-    assert "\n" not in str(caught.value)
 
 
 def test_damaged_sets_are_one_line(tmp_path: Path, small: Path, tabletop: Path):

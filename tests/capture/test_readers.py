@@ -16,7 +16,7 @@ import capture_writers as writers
 import jcr
 from in_process import run_jcr
 from jcr.capture.conventions import CONVENTIONS, poses_from_numbers
-from jcr.capture.formats import capture_json, colmap
+from jcr.capture.formats import colmap
 from jcr.capture.formats.table import PoseTable, read_pose_table
 from jcr.capture.options import ReadOptions
 from jcr.capture.pairing import stamp_ns
@@ -266,17 +266,6 @@ def test_an_image_without_a_pose_near_its_time_and_a_damaged_sample_are_left_out
     assert np.allclose(got.base_from_gripper, capture.base_from_gripper[kept], atol=1e-6)
 
 
-def test_a_run_keeps_what_it_read_so_that_it_can_go_on(tmp_path: Path, capture: Capture):
-    source = tmp_path / "source"
-    got = jcr.read_capture(writers.write_table(source, capture))
-    there = capture_json.kept(got, tmp_path / "kept")
-    shutil.rmtree(source)
-    again = jcr.read_capture(tmp_path / "kept")
-    assert_same(again, capture)
-    # To the last bit: a reconstruction is taken up again only where nothing changed.
-    assert (again.base_from_gripper == there.base_from_gripper).all() and again.images == there.images
-
-
 def edit_line(file: Path, number: int, change) -> None:
     lines = file.read_text().splitlines()
     lines[number] = change(lines[number])
@@ -498,13 +487,6 @@ def test_counts_that_differ_are_named(tmp_path: Path, capture: Capture):
     np.save(tmp_path / "poses.npy", np.zeros((4, 0, 4)))
     with pytest.raises(jcr.InputError, match="no table of numbers"):
         jcr.read_capture(tmp_path)
-
-
-def test_numbers_without_names_ask_for_their_convention(tmp_path: Path, capture: Capture):
-    writers.write_table(tmp_path, capture, "ur", header=None)
-    with pytest.raises(jcr.InputError, match="6 columns of numbers without names; .*--pose-convention"):
-        jcr.read_capture(tmp_path)
-    assert_same(jcr.read_capture(tmp_path, ReadOptions(pose_convention="ur")), capture)
 
 
 def test_faults_of_samples_are_named(tmp_path: Path, problem: HandEyeProblem):

@@ -16,14 +16,12 @@ from jcr.calibration.stage import calibrate
 from jcr.camera import parameters, with_parameters
 from jcr.capture.added import read_added
 from jcr.capture.formats.capture_json import read, write
-from jcr.cell.added import camera_of, read_added_cameras
+from jcr.cell.added import read_added_cameras
 from jcr.cell.images import CellImages
 from jcr.cell.placement import CameraPlacement, CellPlacement, read_cameras, write_cameras
 from jcr.cell.stage import place_cameras
-from jcr.estimation.image_equations import evidence, with_pixel_noise
 from jcr.estimation.intrinsics_prior import FIXED, Camera, camera_with_prior
-from jcr.estimation.problem import Problem, State, similarities, with_observations
-from jcr.estimation.projection import view_of
+from jcr.estimation.problem import Problem, State, with_observations
 from jcr.estimation.solve import Solution, solve
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
@@ -128,24 +126,6 @@ def test_the_frame_of_the_images_does_not_matter():
     assert np.allclose(np.sqrt(np.diag(of_other)), std, rtol=0.02)
 
 
-def test_images_alone_leave_one_similarity_open():
-    problem = cell_problem("wrists", "white", COUNT, seed=2, points=100)
-    cameras = [
-        replace(camera_with_prior(camera, FIXED), mount_free=k > 0)
-        for k, camera in enumerate(problem.cameras)
-    ]
-    images, state = with_observations(*cell_of(problem, cameras), problem.observations)
-    found = evidence(images, with_pixel_noise(images, state, view_of(images, state)))
-    unseen = np.linalg.qr(similarities(images, state))[0]
-    assert unseen.shape[1] == 7
-    # Along it there is what keeps the world in place, alike in all directions, and nothing else.
-    along = unseen.T @ found.information @ unseen
-    fixed = along[0, 0]
-    assert np.allclose(along, fixed * np.eye(7), rtol=1e-6, atol=1e-6 * fixed)
-    values = np.linalg.eigvalsh(found.information - fixed * unseen @ unseen.T)
-    assert (np.abs(values) > 1e-8 * values[-1]).sum() == len(values) - 7
-
-
 @pytest.fixture(scope="module")
 def calibrated(tabletop: Path) -> tuple[Capture, Reconstruction, HandEye]:
     """The first images of the bundled capture, as a structure from motion without error would give them."""
@@ -240,17 +220,6 @@ def test_given_intrinsics_that_a_camera_s_image_contradicts_are_named_and_not_us
     assert np.abs(error / np.sqrt(np.diag(camera.covariance))).max() < 3
     assert np.linalg.norm(error[:3]) < 0.004
     assert camera.intrinsics is not None and camera.intrinsics.fx == pytest.approx(true.fx, rel=0.01)
-
-
-@pytest.mark.slow
-def test_exact_intrinsics_are_kept_for_a_camera_that_is_fixed_against_itself(tabletop: Path, calibrated):
-    old, reconstruction, hand_eye = calibrated
-    capture = jcr.read_capture(tabletop)
-    assert capture.intrinsics is not None
-    given = replace(capture.intrinsics, fx=1.02 * capture.intrinsics.fx, fy=1.02 * capture.intrinsics.fy)
-    exact = replace(fixed(capture, capture.images[11]), intrinsics=given, intrinsics_std=np.zeros(9))
-    (camera,) = place_cameras(old, [exact], reconstruction, hand_eye).cameras
-    assert camera.findings == [] and camera.intrinsics is not None and camera.intrinsics.record() == given
 
 
 @pytest.mark.slow
@@ -446,16 +415,6 @@ def test_cameras_that_cannot_be_are_refused_in_one_line(
     with pytest.raises(jcr.InputError, match=message) as refusal:
         read(folder)
     assert "\n" not in str(refusal.value)
-
-
-def test_images_of_two_sizes_are_not_one_camera(folder: Path):
-    with pytest.raises(jcr.InputError, match="take all with one camera"):
-        camera_of("a", [folder / "0.png", folder / "7.png"], None, ())
-    with pytest.raises(jcr.InputError, match="choose another"):
-        camera_of("a", [folder / "0.png"], None, ("a",))
-    for name in ("../a", "", "a/b", "1"):  # it becomes the name of a folder
-        with pytest.raises(jcr.InputError, match="begins with a letter"):
-            camera_of(name, [folder / "0.png"], None, ())
 
 
 @pytest.mark.parametrize("name", ["added/capture.json", "cameras/cameras.json", "cameras.json"])
