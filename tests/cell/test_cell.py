@@ -95,26 +95,6 @@ def test_the_truth_lies_within_what_is_said_of_the_error(kind: Kind, preset):
     assert np.sqrt(np.diag(covariance)[:3]).max() < 0.012
 
 
-@pytest.mark.slow
-def test_exact_robots_and_images_give_the_exact_answer():
-    for kind, (name, of) in WANTED.items():
-        problem = cell_problem(kind, "white", COUNT, seed=4, noise_px=1e-4, points=120)
-        exact = replace(problem, reported=truly(problem))
-        answer = adjusted(exact, intrinsics_off=False)
-        found = of(answer.state)
-        assert np.abs(step_between(found, problem.truth[name])).max() < 2e-5, kind
-
-
-def truly(problem: CellProblem) -> tuple[np.ndarray, ...]:
-    """What an arm would report that is exact."""
-    poses = []
-    for k, (x, z) in enumerate(problem.starts):
-        rigs = scale_translation(problem.world_from_rig[COUNT * k : COUNT * k + COUNT], problem.scale)
-        there = z @ rigs @ inverse(x)
-        poses.append(inverse(there) if problem.kind == "carried" else there)
-    return tuple(poses)
-
-
 def test_the_frame_of_the_images_does_not_matter():
     problem = cell_problem("fixed", "typical", COUNT, seed=6, points=150)
     elsewhere = transform(rotation_exp(np.array([0.4, -1.0, 0.3])), np.array([3.0, -2.0, 1.0]))
