@@ -1,20 +1,13 @@
-"""Simulated captures with a printed sheet: flat or bent without images, and boards drawn into rendered images."""
+"""Simulated captures with a printed sheet, flat or bent, without images."""
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
-from numpy import ndarray
 
 from jcr.camera import project
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.records import Boards, Body, Intrinsics
+from jcr.records import Boards, Body
 from simulation.faults import INTRINSICS, FaultyCapture
-
-SQUARE_PX, SAMPLES = 40, 3
-"""Pixels of a square of the printed pattern, and samples along the side of a pixel of the drawn image."""
-PAPER, INK = 240, 25
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,29 +60,3 @@ def with_sheet(found: FaultyCapture, rng: np.random.Generator, sheet: Sheet) -> 
         boards=boards,
     )
     return replace(found, tracks=with_corners)
-
-
-def with_chessboard(
-    image: UInt8[ndarray, "h w 3"],
-    camera_from_board: Float[ndarray, "4 4"],
-    intrinsics: Intrinsics,
-    corners: tuple[int, int],
-    side_m: float,
-) -> UInt8[ndarray, "h w 3"]:
-    """Draw a chessboard in front of all else, its first inner corner at the origin of its frame."""
-    across, down = np.array(corners) + 1
-    is_black = np.add.outer(np.arange(down), np.arange(across)) % 2 == 0
-    squares = np.where(is_black, INK, PAPER).astype(np.uint8).repeat(SQUARE_PX, 0).repeat(SQUARE_PX, 1)
-    printed = np.pad(squares, SQUARE_PX, constant_values=PAPER)
-    height, width = printed.shape
-    ends = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
-    in_board = np.column_stack([(ends / SQUARE_PX - 2) * side_m, np.zeros(4)])
-    seen = SAMPLES * (project(intrinsics, apply(camera_from_board, in_board)) + 0.5) - 0.5
-    warp = cv2.getPerspectiveTransform((ends - 0.5).astype(np.float32), seen.astype(np.float32))
-    sampled = SAMPLES * intrinsics.width, SAMPLES * intrinsics.height
-    board, covered = (
-        cv2.resize(cv2.warpPerspective(one, warp, sampled), image.shape[1::-1], interpolation=cv2.INTER_AREA)
-        for one in (printed, np.full_like(printed, 255))
-    )
-    share = covered[..., None] / 255
-    return np.rint((1 - share) * image + board[..., None].astype(float)).clip(0, 255).astype(np.uint8)

@@ -96,16 +96,13 @@ def _at_one_place(
     seen: _Seen, cameras: Float[ndarray, "m 4 4"], intrinsics: Intrinsics
 ) -> Int[ndarray, " a"]:
     """Return the largest set of images that agree on the body's position; empty where no two do."""
-    images = seen.images
-    pairs = list(combinations(images.tolist(), 2))
+    images, best = seen.images, np.zeros(0, int)
+    pairs = np.array(list(combinations(images.tolist(), 2)), int).reshape(-1, 2)
     if len(pairs) > MOST_PAIRS:
-        chosen = np.random.default_rng(0).permutation(len(pairs))[:MOST_PAIRS]
-        pairs = [pairs[k] for k in chosen]
-    best = np.zeros(0, int)
+        pairs = pairs[np.random.default_rng(0).permutation(len(pairs))[:MOST_PAIRS]]
     for pair in pairs:
-        agreeing = _agreeing(seen, np.array(pair), cameras, intrinsics)
-        if len(agreeing) > len(best):
-            best = agreeing
+        agreeing = _agreeing(seen, pair, cameras, intrinsics)
+        best = agreeing if len(agreeing) > len(best) else best
         if len(best) == len(images):
             return best
     return _agreeing(seen, best, cameras, intrinsics) if len(best) else best

@@ -66,16 +66,16 @@ def boards(spec: str) -> list[Board]:
     if MARKER in parts:
         return [one for ratio in RATIOS for one in boards(spec.replace(MARKER, f"{ratio:g}"))]
     try:
-        if kind == "charuco" and len(parts) == 4:
-            return _charuco(spec, _count(parts[0]), _length(parts[1]), _length(parts[2]), _tags(parts[3]))
-        if kind == "chessboard" and len(parts) == 2:
-            return [Board(spec, _chessboard(_count(parts[0]), _length(parts[1])))]
-        if kind == "circles" and len(parts) == 2:
-            return [Board(spec, _circles(_count(parts[0]), _length(parts[1])))]
-        if kind == "aruco" and len(parts) == 2:
-            return [Board(spec, _single_tags(_length(parts[0]), _tags(parts[1])))]
-        if kind == "apriltag" and len(parts) == 2:
-            return [Board(spec, _single_tags(_length(parts[0]), _tags(f"DICT_APRILTAG_{parts[1]}")))]
+        match kind, parts:
+            case "charuco", [count, square, marker, tags]:
+                return _charuco(spec, _count(count), _length(square), _length(marker), _tags(tags))
+            case "chessboard", [count, square]:
+                return [Board(spec, _chessboard(_count(count), _length(square)))]
+            case "circles", [count, spacing]:
+                return [Board(spec, _circles(_count(count), _length(spacing)))]
+            case (("aruco" | "apriltag"), [side, tags]):
+                name = tags if kind == "aruco" else f"DICT_APRILTAG_{tags}"
+                return [Board(spec, _single_tags(_length(side), _tags(name)))]
     except ValueError as error:
         raise InputError(f"--board {spec}: {error}") from None
     raise InputError(f"--board {spec}: no such board; write it as {'; '.join(KINDS)}")
@@ -199,26 +199,22 @@ def _circles(count: tuple[int, int], spacing: float) -> Callable[[UInt8[ndarray,
     x_in_board[:, 0] = 2 * x_in_board[:, 0] + x_in_board[:, 1] % 2
     x_in_board *= spacing
     blobs = cv2.SimpleBlobDetector.Params()
-    blobs.minArea, blobs.maxArea = 20.0, 1e5
-    blobs.minDistBetweenBlobs = 4.0
+    blobs.minArea, blobs.maxArea, blobs.minDistBetweenBlobs = 20.0, 1e5, 4.0
     finder = cv2.SimpleBlobDetector.create(blobs)
 
     def detect(grey: UInt8[ndarray, "h w"]) -> list[Sighting]:
         flags = cv2.CALIB_CB_ASYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING
         found, centers = cv2.findCirclesGrid(grey, count, flags=flags, blobDetector=finder)
-        if not found:
-            return []
-        return [
-            Sighting(0, tuple(range(across * down)), x_in_board, centers.reshape(-1, 2).astype(np.float64))
-        ]
+        x_px = centers.reshape(-1, 2).astype(np.float64) if found else None
+        return [] if x_px is None else [Sighting(0, tuple(range(across * down)), x_in_board, x_px)]
 
     return detect
 
 
 def _grid(across: int, down: int) -> Float[ndarray, "k 3"]:
-    return np.stack([*np.meshgrid(np.arange(across), np.arange(down)), np.zeros((down, across))], -1).reshape(
-        -1, 3
-    )
+    """Return the points of a grid, row by row, one apart, z = 0."""
+    row, column = np.indices((down, across)).reshape(2, -1).astype(float)
+    return np.column_stack([column, row, 0 * row])
 
 
 def _single_tags(

@@ -5,7 +5,6 @@ Poses of planes come from estimation/absolute_pose.py.
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -31,12 +30,8 @@ FEWEST_FOR_INTRINSICS = 4
 """Fewest images of a board that determine intrinsics."""
 
 
-@dataclass(frozen=True)
-class Pose:
-    """Pose of one body in one image."""
-
-    camera_from_body: Float[ndarray, "4 4"]
-    rms_px: float
+Pose = tuple[float, Float[ndarray, "4 4"]]
+"""Distance of a body's points from where they were seen, px rms, and camera_from_body."""
 
 
 def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | None = None) -> Reconstruction:
@@ -57,10 +52,11 @@ def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | Non
     notes += intrinsics_notes
     if (fold_px := fold_distance_px(intrinsics)) is not None:
         centre, limit_px = np.array([intrinsics.cx, intrinsics.cy]), WITHIN_FOLD * fold_px
-        seen = [
-            [s for s in sightings if np.linalg.norm(s.x_px - centre, axis=1).max() < limit_px]
-            for sightings in seen
-        ]
+
+        def within(s: Sighting) -> bool:
+            return bool(np.linalg.norm(s.x_px - centre, axis=1).max() < limit_px)
+
+        seen = [list(filter(within, sightings)) for sightings in seen]
         notes.append(f"the distortion folds over at {fold_px:.0f} px from the centre: nothing beyond is used")
     poses = [{s.body: pose for s in sightings if (pose := pose_of_body(s, intrinsics))} for sightings in seen]
     recon_from_camera, recon_from_body = locate_cameras_and_bodies(poses)
@@ -104,22 +100,15 @@ def _intrinsics(
             "check the board's kind and size, or give the intrinsics",
         )
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_ASPECT_RATIO
+    x_in_body, x_px = ([np.float32(getattr(s, name)) for s in shown] for name in ("x_in_body", "x_px"))
     rms_px, matrix, distortion, _, _, std, *_ = cv2.calibrateCameraExtended(
-        [s.x_in_body.astype(np.float32) for s in shown],
-        [s.x_px.astype(np.float32) for s in shown],
-        capture.image_size,
-        np.eye(3),
-        np.zeros(5),
-        flags=flags,
+        x_in_body, x_px, capture.image_size, np.eye(3), np.zeros(5), flags=flags
     )
-    (fx, _, cx), (_, fy, cy) = matrix[0], matrix[1]
-    k1, k2 = (float(k) for k in distortion.ravel()[:2])
-    intrinsics = Intrinsics(
-        float(fx), float(fy), float(cx), float(cy), *capture.image_size, (k1, k2, 0.0, 0.0, 0.0)
+    fx, fy, cx, cy, k1, k2 = (
+        float(v) for v in (*matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *distortion.ravel()[:2])
     )
-    return intrinsics, [
-        f"the intrinsics come from the board: f = {fx:.1f} ± {std[0, 0]:.1f} px, {rms_px:.2f} px rms"
-    ]
+    note = f"the intrinsics come from the board: f = {fx:.1f} ± {std[0, 0]:.1f} px, {rms_px:.2f} px rms"
+    return Intrinsics(fx, fy, cx, cy, *capture.image_size, (k1, k2, 0.0, 0.0, 0.0)), [note]
 
 
 def pose_of_body(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:
@@ -133,7 +122,7 @@ def pose_of_body(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:
     pose = inverse(found.a_from_camera)
     residual_px = project(intrinsics, apply(pose, x)) - sighting.x_px
     rms_px = float(np.sqrt((residual_px**2).sum(1).mean()))
-    return Pose(pose, rms_px) if rms_px < WORST_PX else None
+    return (rms_px, pose) if rms_px < WORST_PX else None
 
 
 def locate_cameras_and_bodies(
@@ -145,23 +134,16 @@ def locate_cameras_and_bodies(
     """
     counts = Counter(body for bodies in poses for body in bodies)
     cameras: dict[int, Float[ndarray, "4 4"]] = {}
-    if not counts:
-        return cameras, {}
-    placed = {max(sorted(counts), key=counts.__getitem__): np.eye(4)}
-    while True:
-        new = [
-            row for row, bodies in enumerate(poses) if row not in cameras and bodies.keys() & placed.keys()
-        ]
-        if not new:
-            return cameras, placed
+    placed = {max(sorted(counts), key=counts.__getitem__): np.eye(4)} if counts else {}
+    while new := [k for k, bodies in enumerate(poses) if k not in cameras and bodies.keys() & placed.keys()]:
         for row in new:
-            body = min(poses[row].keys() & placed.keys(), key=lambda b: poses[row][b].rms_px)
-            cameras[row] = placed[body] @ inverse(poses[row][body].camera_from_body)
+            body = min(poses[row].keys() & placed.keys(), key=lambda b: poses[row][b][0])
+            cameras[row] = placed[body] @ inverse(poses[row][body][1])
         for body in counts.keys() - placed.keys():
-            seers = [row for row in cameras if body in poses[row]]
-            if seers:
-                row = min(seers, key=lambda r: poses[r][body].rms_px)
-                placed[body] = cameras[row] @ poses[row][body].camera_from_body
+            if seers := [row for row in cameras if body in poses[row]]:
+                row = min(seers, key=lambda r: poses[r][body][0])
+                placed[body] = cameras[row] @ poses[row][body][1]
+    return cameras, placed
 
 
 def adjust_bodies(
@@ -184,13 +166,9 @@ def adjust_bodies(
             from_camera = in_recon - poses[row, :3, 3]
             x_in_camera = from_camera @ poses[row, :3, :3]
             in_image = by_point(intrinsics, x_in_camera) @ poses[row, :3, :3].T
-            jacobian = np.zeros((len(arm), 2, 6 * len(poses)))
-            jacobian[:, :, 6 * row : 6 * row + 6] = np.concatenate(
-                [-in_image, in_image @ skew(from_camera)], axis=2
-            )
-            jacobian[:, :, 6 * place : 6 * place + 6] = np.concatenate(
-                [in_image, -in_image @ skew(arm)], axis=2
-            )
+            jacobian = np.zeros((len(arm), 2, len(poses), 6))
+            jacobian[:, :, row] = np.concatenate([-in_image, in_image @ skew(from_camera)], axis=2)
+            jacobian[:, :, place] = np.concatenate([in_image, -in_image @ skew(arm)], axis=2)
             residuals.append((project(intrinsics, x_in_camera) - s.x_px).reshape(-1, 1))
             jacobians.append(jacobian.reshape(-1, 1, 6 * len(poses)))
         first_body = slice(6 * count, 6 * count + 6)

@@ -117,17 +117,15 @@ class CameraPlacement(Part):
         intrinsics: IntrinsicsAndStd | None = None,
     ) -> "CameraPlacement":
         """Return the placement of a camera with its findings."""
-        key = "base_from_camera" if camera.mount == "base" else "gripper_from_camera"
-        return cls(
-            name=camera.name,
-            mount=camera.mount,
-            arm=camera.arm,
-            uncertainty=uncertainty,
-            intrinsics=intrinsics,
-            pictures=list(images),
-            **derived(strongest_first(findings)),
-            **{} if parent_from_camera is None else {key: parent_from_camera.tolist()},
-        )
+        content: dict[str, Any] = {
+            "uncertainty": uncertainty,
+            "intrinsics": intrinsics,
+            "pictures": list(images),
+        }
+        if parent_from_camera is not None:
+            content[f"{camera.mount}_from_camera"] = parent_from_camera.tolist()
+        content |= derived(strongest_first(findings))
+        return cls(name=camera.name, mount=camera.mount, arm=camera.arm, **content)
 
     @classmethod
     def rejected(
@@ -139,16 +137,12 @@ class CameraPlacement(Part):
     ) -> "CameraPlacement":
         """Return a camera that was not placed, with the shared points of each image and why it was not used."""
         n = len(camera.images)
-        uses = zip(camera.images, counts or [0] * n, reasons or [None] * n, strict=True)
+        unused = {"used": False, "reprojection_px": None}
         images = [
-            ImageUse(
-                image=image,
-                used=False,
-                points=count,
-                reprojection_px=None,
-                reason=reason or "the camera was not placed",
+            ImageUse(image=image, points=count, reason=reason or "the camera was not placed", **unused)
+            for image, count, reason in zip(
+                camera.images, counts or [0] * n, reasons or [None] * n, strict=True
             )
-            for image, count, reason in uses
         ]
         return cls.of(camera, images, why)
 
@@ -189,12 +183,12 @@ class CameraPlacement(Part):
         name = "base_from_camera" if self.mount == "base" else f"gripper_from_camera{arm}"
         used = [image for image in self.images if image.used]
         points = sum(image.points for image in used)
-        rejected = ["rejected: " if self.doubt else "", *[""] * len(self.warnings)]
+        first = "rejected: " if self.doubt else ""
         return [
             f"{self.name}: {name} ({len(used)} of {len(self.images)} images, {points} points)",
             *_rows(self.parent_from_camera),
             f"  {self.uncertainty.in_words}",
-            *(f"  {first}{text}" for first, text in zip(rejected, self.warnings, strict=False)),
+            *(f"  {'' if k else first}{text}" for k, text in enumerate(self.warnings)),
             *(f"  not used: {image.image}: {image.reason}" for image in self.images if not image.used),
         ]
 
@@ -228,10 +222,8 @@ class CamerasFile(Part):
         """
         parent_from_camera = found.parent_from_camera
         used = [k for k, image in enumerate(found.images) if image.used]
-        if parent_from_camera is None:
-            return []
-        if camera.mount == "base":
-            return [parent_from_camera for _ in used]
+        if parent_from_camera is None or camera.mount == "base":
+            return [] if parent_from_camera is None else [parent_from_camera] * len(used)
         if camera.base_from_gripper is not None:
             base = next(np.array(arm.base_from_other_base) for arm in self.arms if arm.name == camera.arm)
             return [base @ camera.base_from_gripper[k] @ parent_from_camera for k in used]

@@ -67,18 +67,13 @@ class Rigs:
         middle = places[int(squared.sum(1).argmin())]
         rig = np.full(len(seen.found), -1)
         rig[seen.rows] = len(self.poses)
-        self.poses.append(middle)
-        return replace(seen, rig=rig, findings=self._at_own_camera(middle))
-
-    def _at_own_camera(self, place: Float[ndarray, "4 4"]) -> tuple[Finding, ...]:
-        """Return the finding of a camera that coincides with a pose of the capture's own camera."""
-        metres, radians = _apart(np.stack(self.poses[: len(self._rows)]), place)
+        metres, radians = _apart(np.stack(self.poses[: len(self._rows)]), middle)
         near = np.flatnonzero((metres < AT_A_FRAME[0]) & (radians < AT_A_FRAME[1]))
         images = [self._capture.images[self._rows[row]] for row in near[:1]]
-        own = self._capture.camera_name
-        return tuple(
-            Finding.of(FindingKind.AT_ANOTHER_CAMERA, "warns", "mount", one, camera=own) for one in images
-        )
+        own = {"camera": self._capture.camera_name}
+        at_own = [Finding.of(FindingKind.AT_ANOTHER_CAMERA, "warns", "mount", one, **own) for one in images]
+        self.poses.append(middle)
+        return replace(seen, rig=rig, findings=tuple(at_own))
 
     def _on_same_gripper(self, seen: CameraViews) -> CameraViews | CameraPlacement:
         assert seen.camera.frame is not None
