@@ -67,14 +67,8 @@ def cell_of(
 
 
 WANTED = {
-    "fixed": (
-        "base_from_camera",
-        lambda p: p.z[0] @ scale_translation(p.world_from_rig[COUNT], p.scale),
-    ),
-    "wrists": (
-        "gripper_from_second",
-        lambda p: p.x[0] @ scale_translation(p.rig_from_camera[1], p.scale),
-    ),
+    "fixed": ("base_from_camera", lambda p: p.z[0] @ scale_translation(p.world_from_rig[COUNT], p.scale)),
+    "wrists": ("gripper_from_second", lambda p: p.x[0] @ scale_translation(p.rig_from_camera[1], p.scale)),
     "arms": ("base1_from_base2", lambda p: p.z[0] @ inverse(p.z[1])),
     "carried": ("base_from_camera", lambda p: p.x[0]),
 }
