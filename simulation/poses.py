@@ -3,7 +3,6 @@
 A pattern is made of camera poses, since what must be in view is the table; the gripper follows from them.
 """
 
-from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -11,7 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from jcr.geometry import inverse, rotation_exp, transform
+from jcr.geometry import apply, inverse, rotation_exp, transform
 
 Pattern = Literal["varied", "orbit", "translation", "one-axis", "planar", "pivot", "camera-centre", "two"]
 Cameras = Float[ndarray, "n 4 4"]
@@ -65,8 +64,52 @@ def gripper_poses(
     rng: np.random.Generator,
 ) -> Cameras:
     """Draw base_from_gripper (n,4,4) of the pattern about a target; `two` has 2 poses whatever `count`."""
-    base_from_camera = _PATTERNS[pattern](count, target_in_base, gripper_from_camera, rng)
-    return base_from_camera @ inverse(gripper_from_camera)
+    count, target = 2 if pattern == "two" else count, target_in_base
+    camera_from_gripper = inverse(gripper_from_camera)
+
+    def first(elevation_deg: float, distance: float, roll_deg: float) -> Float[ndarray, "4 4"]:
+        """Draw the first view from the side of the robot, rolled by up to `roll_deg`."""
+        roll = rng.uniform(-roll_deg, roll_deg)
+        return _look_at(target[None], *np.array([[180.0], [elevation_deg], [distance], [roll]]))[0]
+
+    def facing(rotation: Float[ndarray, "n 3 3"], spread: float) -> Cameras:
+        """Draw cameras of given rotations, whose optical axes meet points on the table about the target."""
+        aside = rng.uniform(-spread, spread, (count, 2))
+        aim = target + np.column_stack([aside, rng.uniform(0, 0.05, count)])
+        return transform(rotation, aim - rng.uniform(0.42, 0.68, count)[:, None] * rotation[..., 2])
+
+    def yaws(size_deg: float, scatter_deg: float) -> Float[ndarray, " n"]:
+        """Draw even angles (rad) with a scatter."""
+        even = np.linspace(-size_deg, size_deg, count)
+        return np.radians(even + rng.uniform(-scatter_deg, scatter_deg, count))
+
+    if pattern in ("varied", "two"):
+        # Row by row, so that fewer images are the first ones of more.
+        jitter = rng.uniform(-1, 1, (count, 7))
+        views = _VIEWS[np.arange(count) % len(_VIEWS)] + jitter[:, :4] * (12, 4, 0.04, 15)
+        cameras = _look_at(target + jitter[:, 4:] * (0.04, 0.04, 0.025) + (0.0, 0.0, 0.025), *views.T)
+    elif pattern == "orbit":
+        azimuth = 180 + np.linspace(-100, 100, count) + rng.uniform(-5, 5, count)
+        elevation, roll = rng.uniform(45, 75, count), rng.uniform(-40, 40, count)
+        cameras = _look_at(np.tile(target, (count, 1)), azimuth, elevation, np.full(count, 0.5), roll)
+    elif pattern == "one-axis":
+        angles, about_target = yaws(80, 4), transform(np.eye(3), target)
+        rotated = transform(rotation_exp(angles[:, None] * [0.0, 0.0, 1.0]), np.zeros(3))
+        cameras = about_target @ rotated @ inverse(about_target) @ first(52.0, 0.55, 15)
+    elif pattern == "translation":
+        cameras = facing(np.tile(first(65.0, 0.55, 20)[:3, :3], (count, 1, 1)), 0.12)
+    elif pattern == "planar":
+        turned = rotation_exp(rng.permutation(yaws(70, 5))[:, None] * [0.0, 0.0, 1.0])
+        cameras = facing(turned @ np.diag([1.0, -1.0, -1.0]) @ gripper_from_camera[:3, :3], 0.08)
+    elif pattern == "pivot":
+        start = first(75.0, 0.5, 20)
+        about_tool = transform(np.eye(3), apply(start @ camera_from_gripper, np.array([0.0, 0.0, 0.2])))
+        tilted = transform(_tilts(count, 20.0, 60.0, rng), np.zeros(3))
+        cameras = about_tool @ tilted @ inverse(about_tool) @ start
+    else:
+        start = first(75.0, 0.6, 20)
+        cameras = transform(_tilts(count, 12.0, 60.0, rng) @ start[:3, :3], start[:3, 3])
+    return cameras @ camera_from_gripper
 
 
 def _look_at(
@@ -89,74 +132,6 @@ def _look_at(
     return transform(upright @ roll, target + distance[:, None] * away)
 
 
-def _facing(
-    target: Float[ndarray, "n 3"], rotation: Float[ndarray, "n 3 3"], distance: Float[ndarray, "n"]
-) -> Cameras:
-    """Return base_from_camera (n,4,4) with given rotations, whose optical axes meet the targets."""
-    return transform(rotation, target - distance[:, None] * rotation[..., 2])
-
-
-def _aims(
-    count: int, target: Float[ndarray, "3"], spread: float, rng: np.random.Generator
-) -> Float[ndarray, "n 3"]:
-    """Draw points on the table about `target` to look at."""
-    return target + np.column_stack([rng.uniform(-spread, spread, (count, 2)), rng.uniform(0, 0.05, count)])
-
-
-def _varied(count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator) -> Cameras:
-    # Row by row, so that fewer images are the first ones of more.
-    jitter = rng.uniform(-1, 1, (count, 7))
-    views = _VIEWS[np.arange(count) % len(_VIEWS)] + jitter[:, :4] * (12, 4, 0.04, 15)
-    aim = target + jitter[:, 4:] * (0.04, 0.04, 0.025) + (0.0, 0.0, 0.025)
-    return _look_at(aim, *views.T)
-
-
-def _orbit(count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator) -> Cameras:
-    azimuth = 180 + np.linspace(-100, 100, count) + rng.uniform(-5, 5, count)
-    elevation, roll = rng.uniform(45, 75, count), rng.uniform(-40, 40, count)
-    return _look_at(np.tile(target, (count, 1)), azimuth, elevation, np.full(count, 0.5), roll)
-
-
-def _one_axis(count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator) -> Cameras:
-    angles = np.radians(np.linspace(-80, 80, count) + rng.uniform(-4, 4, count))
-    start = _look_at(target[None], *np.array([[180.0], [52.0], [0.55], [rng.uniform(-15, 15)]]))[0]
-    about_target = transform(np.eye(3), target)
-    rotated = transform(rotation_exp(angles[:, None] * [0.0, 0.0, 1.0]), np.zeros(3))
-    return about_target @ rotated @ inverse(about_target) @ start
-
-
-def _translation(
-    count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator
-) -> Cameras:
-    start = _look_at(target[None], *np.array([[180.0], [65.0], [0.55], [rng.uniform(-20, 20)]]))
-    rotation = np.tile(start[:, :3, :3], (count, 1, 1))
-    return _facing(_aims(count, target, 0.12, rng), rotation, rng.uniform(0.42, 0.68, count))
-
-
-def _planar(count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator) -> Cameras:
-    down = np.diag([1.0, -1.0, -1.0])
-    yaw = np.radians(np.linspace(-70, 70, count) + rng.uniform(-5, 5, count))
-    rotation = (
-        rotation_exp(rng.permutation(yaw)[:, None] * [0.0, 0.0, 1.0]) @ down @ gripper_from_camera[:3, :3]
-    )
-    return _facing(_aims(count, target, 0.08, rng), rotation, rng.uniform(0.42, 0.68, count))
-
-
-def _pivot(count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator) -> Cameras:
-    start = _look_at(target[None], *np.array([[180.0], [75.0], [0.5], [rng.uniform(-20, 20)]]))[0]
-    tool_in_gripper = np.array([0.0, 0.0, 0.2])
-    base_from_gripper = start @ inverse(gripper_from_camera)
-    about_tool = transform(np.eye(3), base_from_gripper[:3, :3] @ tool_in_gripper + base_from_gripper[:3, 3])
-    return about_tool @ transform(_tilts(count, 20.0, 60.0, rng), np.zeros(3)) @ inverse(about_tool) @ start
-
-
-def _camera_centre(
-    count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator
-) -> Cameras:
-    start = _look_at(target[None], *np.array([[180.0], [75.0], [0.6], [rng.uniform(-20, 20)]]))[0]
-    return transform(_tilts(count, 12.0, 60.0, rng) @ start[:3, :3], start[:3, 3])
-
-
 def _tilts(count: int, tilt_deg: float, yaw_deg: float, rng: np.random.Generator) -> Float[ndarray, "n 3 3"]:
     """Draw rotations about level axes all around by up to `tilt_deg`, after yaw by up to `yaw_deg`."""
     toward = 2 * np.pi * (np.arange(count) + rng.uniform(0, 1)) / count
@@ -164,15 +139,3 @@ def _tilts(count: int, tilt_deg: float, yaw_deg: float, rng: np.random.Generator
     yaw = np.radians(rng.uniform(-yaw_deg, yaw_deg, count))
     level = np.stack([np.cos(toward), np.sin(toward), 0 * toward], -1)
     return rotation_exp(tilt[:, None] * level) @ rotation_exp(yaw[:, None] * [0.0, 0.0, 1.0])
-
-
-_PATTERNS: dict[Pattern, Callable[[int, ndarray, ndarray, np.random.Generator], Cameras]] = {
-    "varied": _varied,
-    "orbit": _orbit,
-    "translation": _translation,
-    "one-axis": _one_axis,
-    "planar": _planar,
-    "pivot": _pivot,
-    "camera-centre": _camera_centre,
-    "two": lambda _, *others: _varied(2, *others),
-}

@@ -78,12 +78,3 @@ def test_the_papers_grid_search_finds_the_answer_within_its_grid_and_only_there(
         )
         assert rotation_between_deg(x[:3, :3], problem.gripper_from_camera[:3, :3]) < 1e-5
         assert (abs(found - scale) < 3 / 20_000) == found_there
-
-
-@pytest.mark.slow
-def test_coverage_of_arms_with_known_joints_a_known_model_and_nothing_known():
-    from benchmarks.coverage import PEER, SOLVERS, measure_robots
-
-    rows = measure_robots(("ur5e",), ("poor",), (8,), draws=2)
-    assert [row.known for row in rows] == [*SOLVERS, PEER]
-    assert all(row.beyond_5 == 0 and row.accepted == 1 for row in rows[:3])

@@ -66,12 +66,3 @@ def test_every_recipe_names_a_commit_a_licence_and_what_it_makes():
     assert len(known) == 14
     for name, recipe in known.items():
         assert len(recipe.commit) == 40 and len(recipe.sha256) == 64 and recipe.licence, name
-
-
-def test_recipes_make_the_captures_that_tests_use(real_captures: Path):
-    for name, recipe in recipes().items():
-        capture = read_capture(real_captures / name)
-        assert recipe.intrinsics == [] or capture.intrinsics is not None, name
-        if capture.intrinsics is not None:
-            k = capture.intrinsics
-            assert recipe.intrinsics[:4] == [k.fx, k.fy, k.cx, k.cy], name

@@ -151,16 +151,6 @@ def test_requests_and_commands_of_several_threads_come_one_after_the_other(tmp_p
     assert all("where images/000.png" in one["reason"] for one in answers if not one["accepted"])
 
 
-def test_a_program_whose_pose_is_refused_is_answered_with_another_next_pose(tmp_path: Path, tabletop: Path):
-    """Else it would be sent to the same place for ever."""
-    poses = list(jcr.read_capture(tabletop).base_from_gripper)
-    session, _ = a_capture(tmp_path / "c", still_frames(lambda: still(tabletop, 0)), patience=0.5)
-    kept, refused = take_all(session, poses[:2], waits=True)
-    assert kept["accepted"] and not refused["accepted"] and "did not change" in refused["reason"]
-    # The scripted calibration proposes joints by which the refused pose is known.
-    assert kept["next_joints"] is None and np.allclose(refused["next_joints"], poses[1][:3, 3])
-
-
 def test_a_program_that_sends_poses_is_answered_with_the_calibration(tmp_path: Path, tabletop: Path):
     poses, at = list(jcr.read_capture(tabletop).base_from_gripper), [0]
     session, _ = a_capture(tmp_path / "c", still_frames(lambda: still(tabletop, at[0])), images=4)
