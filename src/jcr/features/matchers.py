@@ -119,8 +119,8 @@ class Matcher:
         depends = key, id(geometry), view.intrinsics
         if depends not in self._pairs:
             rows = np.asarray(geometry.inlier_matches, dtype=int).reshape(-1, 2)
-            rays = (view.rays[row][own] for row, own in zip(key, rows.T, strict=True))
-            found = readings(*rays, view.intrinsics.fx, *matrices(geometry, view.intrinsics))
+            ray_i, ray_j = (view.rays[row][own] for row, own in zip(key, rows.T, strict=True))
+            found = readings(ray_i, ray_j, view.intrinsics.fx, *matrices(geometry, view.intrinsics))
             self._pairs[depends] = Pair(key, rows, tuple(found)), geometry
         return self._pairs[depends][0]
 

@@ -161,12 +161,13 @@ class _Search:
 
     def _without_still(self, key: Key, geometry: pycolmap.TwoViewGeometry) -> pycolmap.TwoViewGeometry | None:
         """Return the geometry, verified again without matches in parts that do not move."""
-        if self.still is None:
+        still = self.still
+        if still is None:
             return geometry
 
         def moves(rows: Int[ndarray, "m 2"]) -> Bool[ndarray, " m"]:
             of_pair = zip(key, rows.T, strict=True)
-            dark = [hidden(self.view.x_px[image][own], self.still) for image, own in of_pair]
+            dark = [hidden(self.view.x_px[image][own], still) for image, own in of_pair]
             return ~(dark[0] | dark[1])
 
         if moves(np.asarray(geometry.inlier_matches, dtype=int).reshape(-1, 2)).all():
@@ -215,8 +216,8 @@ class _Search:
             agreeing = 0.0
             for of_gripper, geometry, x_px in known:
                 essential, homography = matrices(geometry, intrinsics)
-                rays = (unproject(intrinsics, x)[:, :2] for x in x_px)
-                found = starting_motions(*rays, essential if homography is None else None, homography)
+                ray_i, ray_j = (unproject(intrinsics, x)[:, :2] for x in x_px)
+                found = starting_motions(ray_i, ray_j, essential if homography is None else None, homography)
                 if found:
                     gap = np.abs(
                         rotation_angle(np.stack([rotation for rotation, _ in found])) - of_gripper

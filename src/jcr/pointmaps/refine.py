@@ -1,25 +1,26 @@
 """Refinement of predicted cameras and depth: photometric matches between the images, then bundle adjustment.
 
-The robot's poses are not used. Each view's depth is multiplied by a smooth factor that fits the adjusted points.
-Matching and adjustment are repeated, for better cameras predict better where to match.
+A pointmap predicts the position of each pixel of a view in another view to a few pixels. The other view is warped by
+this prediction, which removes rotation, scale and slant; the remaining optical flow (Lucas and Kanade, 1981; OpenCV's
+pyramid) is accurate to a fraction of a pixel of the camera's own images, independent of the network's resolution and
+predictions. The robot's poses are not used. Each view's depth is multiplied by a smooth factor that fits the adjusted
+points. Matching and adjustment are repeated, for better cameras predict better where to match.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 
-from jcr.camera import unproject
-from jcr.estimation.image_equations import ImageEvidence, adjust_images
+from jcr.camera import rays, unproject
+from jcr.estimation.image_equations import adjust_images
 from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, camera_with_prior
 from jcr.estimation.observations import Observations
 from jcr.estimation.wrist import image_problem
-from jcr.geometry import inverse
+from jcr.geometry import apply, inverse
 from jcr.pointmaps.grid import ImageGrid, PreparedImages, read_colors
-from jcr.pointmaps.photometric_matches import Geometry, Matches, photometric_matches
 from jcr.pointmaps.posed import PosedPointmaps
 from jcr.records import Capture, Intrinsics, Tracks
 
@@ -35,6 +36,22 @@ LARGEST_PX = 4.0
 """Reprojection error beyond which a match is left out, in units of the median."""
 BEND_STD = 0.03
 """Prior standard deviation of the logarithm of a depth correction's uneven part."""
+WINDOW = (21, 21)
+LEVELS = 3
+"""Levels of the pyramid above the image; the largest displacement is about 60 pixels."""
+WIDEST_DEG = 70.0
+"""Largest angle between two views that are compared."""
+LARGEST_RETURN_PX = 0.5
+"""Largest distance between a keypoint and its position after the flow there and back."""
+LEAST_CORRELATION = 0.8
+"""Least normalised correlation of the patches around both ends."""
+PATCH_RADIUS = 5
+STEP_RADIUS, LARGEST_STEP = 5, 0.04
+"""Pixels around a keypoint within which depth must not change by more than this share."""
+LARGEST_STD_PX = 0.1
+"""Largest standard deviation of a match in the least determined direction of its window."""
+LARGEST_GAP = 0.15
+"""Largest difference of a point's depth from the other view's own depth, in logarithms."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,50 +83,48 @@ def refine(
     camera, poses = work.grid_intrinsics(pinhole), maps.recon_from_camera
     depth = _depth_on(work, maps)
     factor = np.ones(maps.confidence.shape, np.float32)
-    at_depth, at_map = _coordinates(work, work), _coordinates(maps.grid, work)
-    adjusted = None
+    at_depth, at_map = (
+        _basis(*np.moveaxis(_pixels_on(grid, work), -1, 0), work.size) for grid in (work, maps.grid)
+    )
+    tracks, error_px = None, np.inf
     for _ in range(ROUNDS):
-        geometry = Geometry(camera, poses, depth)
-        tracks = _tracks(photometric_matches(gray, geometry, KEYPOINTS // len(gray)), geometry)
+        tracks = _match(gray, camera, poses, depth)
         if np.bincount(tracks.image, minlength=len(gray)).min() < LEAST_MATCHES:
             return None
-        adjusted = adjust_matches(tracks, geometry, fixed=images.pinhole is not None)
-        if len(adjusted.tracks.image) == 0:
+        tracks, error_px, poses, camera = _adjust(tracks, camera, poses, fixed=images.pinhole is not None)
+        if len(tracks.image) == 0:
             return None
-        poses, camera = adjusted.shown.state.world_from_rig, adjusted.shown.view.cameras[0]
-        change = depth_changes(adjusted.tracks, poses, depth)
-        depth = depth * np.stack([np.exp(at_depth @ c) for c in change]).astype(np.float32)
-        factor = factor * np.stack([np.exp(at_map @ c) for c in change]).astype(np.float32)
-    assert adjusted is not None
-    original_px = replace(images, grid=work).original_px(adjusted.tracks.x_px)
+        change = _depth_changes(tracks, poses, depth)
+        depth = depth * np.exp(np.einsum("hwc,nc->nhw", at_depth, change)).astype(np.float32)
+        factor = factor * np.exp(np.einsum("hwc,nc->nhw", at_map, change)).astype(np.float32)
+    assert tracks is not None
     return Refinement(
         recon_from_camera=poses,
         depth_factor=factor,
-        tracks=replace(adjusted.tracks, x_px=original_px),
+        tracks=replace(tracks, x_px=replace(images, grid=work).original_px(tracks.x_px)),
         pinhole=pinhole if images.pinhole is not None else work.original_intrinsics(camera),
-        error_px=adjusted.error_px / float(work.scale.mean()),
+        error_px=error_px / float(work.scale.mean()),
     )
 
 
-@dataclass(frozen=True)
-class _Adjustment:
-    """Bundle adjustment of the matches, in pixels of the working grid."""
+def _pixels_on(grid: ImageGrid, other: ImageGrid) -> Float[ndarray, "h w 2"]:
+    """Return the pixels of a grid in another grid of the same images."""
+    v, u = np.mgrid[: grid.size[1], : grid.size[0]]
+    return other.grid_from_original(grid.original_from_grid(np.stack([u, v], -1).astype(np.float64)))
 
-    shown: ImageEvidence
-    tracks: Tracks
-    """Tracks without outliers; empty where most points lie behind their cameras."""
-    error_px: float
-    """Median reprojection error of the tracks."""
+
+def _basis(x_px: ndarray, y_px: ndarray, size: tuple[int, int]) -> ndarray:
+    """Return 1, x, y, x², xy, y² of pixels of an image (width, height), scaled to -1 … 1."""
+    x, y = 2 * x_px / (size[0] - 1) - 1, 2 * y_px / (size[1] - 1) - 1
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
 
 
 def _depth_on(grid: ImageGrid, maps: PosedPointmaps) -> Float[ndarray, "n h w"]:
     """Return the predicted depth at the pixels of another grid of the same images; 0 where no depth is known."""
-    v, u = np.mgrid[: grid.size[1], : grid.size[0]]
-    there = maps.grid.grid_from_original(grid.original_from_grid(np.stack([u, v], -1).astype(np.float64)))
-    x, y = (there[..., axis].astype(np.float32) for axis in range(2))
+    there = _pixels_on(grid, maps.grid)
     # The grid's outermost half pixels are still inside the image.
-    x, y = np.clip(x, 0, maps.grid.size[0] - 1), np.clip(y, 0, maps.grid.size[1] - 1)
-    inside = (np.abs(x - there[..., 0]) <= 0.5) & (np.abs(y - there[..., 1]) <= 0.5)
+    x, y = np.moveaxis(np.clip(there, 0, np.array(maps.grid.size) - 1).astype(np.float32), -1, 0)
+    inside = (np.abs(np.stack([x, y], -1) - there) <= 0.5).all(-1)
     depths = []
     for points, confidence in zip(maps.x_in_camera, maps.confidence, strict=True):
         known = cv2.remap((confidence > 0).astype(np.float32), x, y, cv2.INTER_LINEAR) > 0.99
@@ -117,39 +132,148 @@ def _depth_on(grid: ImageGrid, maps: PosedPointmaps) -> Float[ndarray, "n h w"]:
     return np.stack(depths).astype(np.float32)
 
 
-def _coordinates(grid: ImageGrid, work: ImageGrid) -> Float[ndarray, "h w 6"]:
-    """Return the quadratic basis of the working grid's coordinates at the pixels of a grid."""
-    v, u = np.mgrid[: grid.size[1], : grid.size[0]]
-    on_work = work.grid_from_original(grid.original_from_grid(np.stack([u, v], -1).astype(np.float64)))
-    return _basis(on_work[..., 0] / (work.size[0] - 1), on_work[..., 1] / (work.size[1] - 1))
-
-
-def _tracks(matches: Matches, geometry: Geometry) -> Tracks:
-    """Return tracks of keypoints and their matches, the points at the depth of their first view."""
-    used, row = np.unique(matches.point, return_inverse=True)
-    first, x_px = matches.start[used, 0].astype(int), matches.start[used, 1:].astype(np.float64)
-    column, line = np.rint(x_px).astype(int).T
-    x_in_camera = geometry.depth[first, line, column, None] * unproject(geometry.pinhole, x_px)
-    rotation, center = geometry.recon_from_camera[first, :3, :3], geometry.recon_from_camera[first, :3, 3]
+def _match(
+    gray: UInt8[ndarray, "n h w"],
+    camera: Intrinsics,
+    poses: Float[ndarray, "n 4 4"],
+    depth: Float[ndarray, "n h w"],
+) -> Tracks:
+    """Match corners of each view in the other views; the points are at the depth of their first view."""
+    axis = poses[:, :3, 2]
+    apart_deg = np.degrees(np.arccos(np.clip(axis @ axis.T, -1, 1)))
+    image, x_px, point = [np.zeros(0, int)], [np.zeros((0, 2))], [np.zeros(0, int)]
+    points, total = [np.zeros((0, 3))], 0
+    for n, start in enumerate(gray):
+        smooth = (_smooth_surface(depth[n]) & _textured_both_ways(start)).astype(np.uint8)
+        corners = cv2.goodFeaturesToTrack(
+            start, KEYPOINTS // len(gray), 0.005, camera.width / 80, mask=smooth
+        )
+        if corners is None:
+            continue
+        corners = corners[:, 0]
+        x_in_recon = apply(poses[n], depth[n][..., None] * rays(camera))
+        of_view, matched = [], np.zeros(len(corners), bool)
+        for m, pose in enumerate(poses):
+            if m != n and apart_deg[n, m] <= WIDEST_DEG:
+                x_in_end = apply(inverse(pose), x_in_recon)
+                z = np.where((depth[n] > 0) & (x_in_end[..., 2] > 1e-9), x_in_end[..., 2], np.nan)
+                good, there = _locate_corners(start, gray[m], corners, x_in_end, z, camera, depth[m])
+                of_view.append((m, good, there))
+                matched |= good
+        row = np.cumsum(matched) - 1 + total
+        own_px = corners[matched].astype(np.float64)
+        column, line = np.rint(own_px).astype(int).T
+        points.append(apply(poses[n], depth[n, line, column, None] * unproject(camera, own_px)))
+        for m, which, there in [(n, matched, corners), *of_view]:
+            image.append(np.full(which.sum(), m))
+            x_px.append(there[which])
+            point.append(row[which])
+        total += int(matched.sum())
     return Tracks(
-        image=np.concatenate([first, matches.view]),
-        x_px=np.concatenate([x_px, matches.x_px]),
-        point=np.concatenate([np.arange(len(used)), row]),
-        points_in_recon=np.einsum("kij,kj->ki", rotation, x_in_camera) + center,
+        image=np.concatenate(image),
+        x_px=np.concatenate(x_px).astype(np.float64),
+        point=np.concatenate(point),
+        points_in_recon=np.concatenate(points),
     )
 
 
-def adjust_matches(tracks: Tracks, geometry: Geometry, fixed: bool) -> _Adjustment:
+def _smooth_surface(depth: Float[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
+    """Return the mask of pixels with known depth and no depth step around them, which outlines have."""
+    window = np.ones((2 * STEP_RADIUS + 1,) * 2, np.uint8)
+    nearest, farthest = cv2.erode(depth, window), cv2.dilate(depth, window)
+    return (nearest > 0) & (farthest < (1 + LARGEST_STEP) * nearest)
+
+
+def _textured_both_ways(gray: UInt8[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
+    """Return the mask of pixels whose window determines the flow in all directions, unlike a straight edge.
+
+    The variance of the flow is the noise's over the smaller eigenvalue of the gradients' summed products (the
+    structure tensor), whose share of noise is taken off.
+    """
+    image = gray.astype(np.float32)
+    by_x, by_y = (cv2.Sobel(image, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1)))
+    # A Laplacian of white noise has 6 times its deviation (Immerkær, 1996).
+    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+    noise = max(float(np.median(np.abs(cv2.filter2D(image, -1, kernel)))) / 0.6745 / 6, 0.5)
+    xx, xy, yy = (
+        cv2.boxFilter(a * b, -1, WINDOW, normalize=False)
+        for a, b in ((by_x, by_x), (by_x, by_y), (by_y, by_y))
+    )
+    least = (xx + yy) / 2 - np.sqrt((xx - yy) ** 2 / 4 + xy**2)
+    # Sobel's weights of white noise: 12 of the 64 parts.
+    least -= noise**2 * 12 / 64 * WINDOW[0] * WINDOW[1]
+    return least > 2 * (noise / LARGEST_STD_PX) ** 2
+
+
+def _locate_corners(
+    start: UInt8[ndarray, "h w"],
+    end: UInt8[ndarray, "h w"],
+    corners: Float[ndarray, "k 2"],
+    x_in_end: Float[ndarray, "h w 3"],
+    z: Float[ndarray, "h w"],
+    camera: Intrinsics,
+    end_depth: Float[ndarray, "h w"],
+) -> tuple[Bool[ndarray, " k"], Float[ndarray, "k 2"]]:
+    """Locate corners of `start` in `end`; return the mask of those found and all positions.
+
+    `x_in_end` are the points of the pixels of `start` in the camera frame of `end`, and `z` their depth, NaN if unknown.
+    """
+    with np.errstate(invalid="ignore"):
+        u, v = camera.fx * x_in_end[..., 0] / z + camera.cx, camera.fy * x_in_end[..., 1] / z + camera.cy
+    inside = (u >= 0) & (u <= camera.width - 1) & (v >= 0) & (v <= camera.height - 1)
+    if inside.mean() < 0.02:
+        return np.zeros(len(corners), bool), corners
+    # Far outside, where nothing is, instead of NaN, which remap does not know.
+    u, v = (np.where(np.isfinite(of), of, -1e4).astype(np.float32) for of in (u, v))
+    drawn = cv2.remap(end, u, v, cv2.INTER_LINEAR)
+    moved, found = _flow(start, drawn, corners)
+    back, returned = _flow(drawn, start, moved)
+    good = (found[:, 0] > 0) & (returned[:, 0] > 0)
+    good &= np.linalg.norm(back - corners, axis=1) < LARGEST_RETURN_PX
+    there = np.stack([_sampled(u, moved), _sampled(v, moved)], axis=-1)
+    good &= (there >= 1).all(1) & (there <= [camera.width - 2, camera.height - 2]).all(1)
+    good &= _sampled(inside, moved) > 0.99
+    own = _sampled(end_depth, np.clip(there, 0, [camera.width - 1, camera.height - 1]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        good &= (own <= 0) | (np.abs(np.log(_sampled(np.nan_to_num(z), moved) / own)) < LARGEST_GAP)
+    patches = []
+    for image, at in ((start, corners), (drawn, moved)):
+        y, x = np.mgrid[-PATCH_RADIUS : PATCH_RADIUS + 1, -PATCH_RADIUS : PATCH_RADIUS + 1].reshape(2, -1)
+        patch = _sampled(image, at[:, None] + np.stack([x, y], -1))
+        patch -= patch.mean(1, keepdims=True)
+        patches.append(patch / np.maximum(np.linalg.norm(patch, axis=1, keepdims=True), 1e-5))
+    return good & ((patches[0] * patches[1]).sum(1) > LEAST_CORRELATION), there
+
+
+def _flow(
+    one: UInt8[ndarray, "h w"], other: UInt8[ndarray, "h w"], at: Float[ndarray, "k 2"]
+) -> tuple[Float[ndarray, "k 2"], UInt8[ndarray, "k 1"]]:
+    """Track points of one image in another that looks nearly like it; return positions and status."""
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+        one, other, at, at.copy(), winSize=WINDOW, maxLevel=LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
+    )
+    return moved, found
+
+
+def _sampled(values: ndarray, x_px: Float[ndarray, "*k 2"]) -> Float[ndarray, "*k"]:
+    """Sample an image between pixels, linearly."""
+    x = x_px.astype(np.float32).reshape(len(x_px), -1, 2)
+    out = cv2.remap(values.astype(np.float32), x[..., 0], x[..., 1], cv2.INTER_LINEAR)
+    return out.reshape(x_px.shape[:-1])
+
+
+def _adjust(
+    tracks: Tracks, camera: Intrinsics, poses: Float[ndarray, "n 4 4"], fixed: bool
+) -> tuple[Tracks, float, Float[ndarray, "n 4 4"], Intrinsics]:
     """Adjust cameras and points, and the focal length unless it is fixed.
 
-    Matches far from their points are left out of the tracks, and points that then have fewer than two views.
+    Returns the tracks, their median reprojection error (px), the camera poses and the camera. Matches far from their
+    points are left out of the tracks, and points that then have fewer than two views; no track is left where most points
+    lie behind their cameras.
     """
-    images, camera = len(geometry.recon_from_camera), geometry.pinhole
     prior = camera_with_prior(camera, FIXED if fixed else {"f": ESTIMATED["f"]})
-    observations = Observations.of_one_camera(tracks, images)
-    shown = adjust_images(
-        *image_problem(geometry.recon_from_camera, prior, observations, tracks.points_in_recon)
-    )
+    observations = Observations.of_one_camera(tracks, len(poses))
+    shown = adjust_images(*image_problem(poses, prior, observations, tracks.points_in_recon))
     seen, points = shown.problem.observations, shown.state.points_in_world
     assert seen is not None
     error = np.linalg.norm(shown.view.residual_px, axis=1)
@@ -158,12 +282,13 @@ def adjust_matches(tracks: Tracks, geometry: Geometry, fixed: bool) -> _Adjustme
     good &= (np.bincount(seen.point[good], minlength=len(points)) >= 2)[seen.point]
     kept, point = np.unique(seen.point[good], return_inverse=True)
     inliers = Tracks(image=seen.image[good], x_px=seen.x_px[good], point=point, points_in_recon=points[kept])
-    return _Adjustment(shown, inliers, float(np.median(error[good])) if good.any() else np.inf)
+    error_px = float(np.median(error[good])) if good.any() else np.inf
+    return inliers, error_px, shown.state.world_from_rig, shown.view.cameras[0]
 
 
-def depth_changes(
+def _depth_changes(
     tracks: Tracks, recon_from_camera: Float[ndarray, "n 4 4"], depth: Float[ndarray, "n h w"]
-) -> Sequence[Float[ndarray, "6"]]:
+) -> Float[ndarray, "n 6"]:
     """Fit per view a quadratic in the image's coordinates to the logarithm of the factor that corrects its depth.
 
     `depth` is on the grid of the pixels of `tracks`, 0 where no depth is known. The fit is robust, with a prior on all
@@ -172,26 +297,21 @@ def depth_changes(
     camera_from_recon = inverse(recon_from_camera)[tracks.image]
     z = np.einsum("kj,kj->k", camera_from_recon[:, 2, :3], tracks.points_in_recon[tracks.point])
     z += camera_from_recon[:, 2, 3]
-    column, row = np.clip(np.rint(tracks.x_px).astype(int), 0, [depth.shape[2] - 1, depth.shape[1] - 1]).T
+    size = depth.shape[2], depth.shape[1]
+    column, row = np.clip(np.rint(tracks.x_px).astype(int), 0, np.array(size) - 1).T
     own = depth[tracks.image, row, column]
-    found = []
-    for view in range(len(depth)):
+    found = np.zeros((len(depth), 6))
+    for view, coefficients in enumerate(found):
         mine = (tracks.image == view) & (own > 0) & (z > 0)
-        design = _basis(column[mine] / (depth.shape[2] - 1), row[mine] / (depth.shape[1] - 1))
-        target = np.log(z[mine] / own[mine])
-        coefficients = np.array([np.median(target) if mine.any() else 0.0, *np.zeros(5)])
-        for _ in range(10 if mine.any() else 0):
+        if not mine.any():
+            continue
+        design, target = _basis(column[mine], row[mine], size), np.log(z[mine] / own[mine])
+        coefficients[0] = np.median(target)
+        for _ in range(10):
             off = target - design @ coefficients
             sigma = 1.4826 * np.median(np.abs(off)) + 1e-4
             weight = 1 / (1 + (off / (2 * sigma)) ** 2) / sigma**2
-            normal = design.T @ (weight[:, None] * design)
+            normal = design.T @ (weight[:, None] * design) + 1e-9 * np.eye(6)
             normal[1:, 1:] += np.eye(5) / BEND_STD**2
-            coefficients = np.linalg.solve(normal + 1e-9 * np.eye(6), design.T @ (weight * target))
-        found.append(coefficients)
+            coefficients[:] = np.linalg.solve(normal, design.T @ (weight * target))
     return found
-
-
-def _basis(x: ndarray, y: ndarray) -> ndarray:
-    """Return 1, x, y, x², xy, y² of coordinates 0 … 1, centred."""
-    x, y = 2 * x - 1, 2 * y - 1
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)

@@ -306,12 +306,12 @@ class Dpt(nn.Module):
     def __init__(self, dims: Sequence[int], width: int = 256) -> None:
         super().__init__()
         pyramid = (96, 192, 384, 768)
+        larger = ([nn.ConvTranspose2d(96, 96, 4, 4)], [nn.ConvTranspose2d(192, 192, 2, 2)])
+        resizes = (*larger, [], [nn.Conv2d(768, 768, 3, 2, 1)])
         self.act_postprocess = nn.ModuleList(
-            nn.Sequential(nn.Conv2d(dim, out, 1)) for dim, out in zip(dims, pyramid, strict=True)
+            nn.Sequential(nn.Conv2d(dim, out, 1), *resize)
+            for dim, out, resize in zip(dims, pyramid, resizes, strict=True)
         )
-        self.act_postprocess[0].append(nn.ConvTranspose2d(96, 96, 4, 4))
-        self.act_postprocess[1].append(nn.ConvTranspose2d(192, 192, 2, 2))
-        self.act_postprocess[3].append(nn.Conv2d(768, 768, 3, 2, 1))
         self.scratch = Scratch(pyramid, width)
         self.head = nn.Sequential(
             nn.Conv2d(width, width // 2, 3, 1, 1),
