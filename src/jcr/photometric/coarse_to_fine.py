@@ -38,23 +38,15 @@ class Stage:
     """Difference of colours (0 to 1) that counts half."""
 
 
-@dataclass(frozen=True)
-class Found:
-    """Cameras on the robot's poses, and how badly the colours fit."""
-
-    cameras: Cameras
-    cost: float
-
-
 def axes_meet(base_from_camera: Float[ndarray, "*batch n 4 4"]) -> Float[ndarray, "*batch 3"]:
     """Return the point nearest to all optical axes."""
     return nearest_to_lines(base_from_camera[..., :3, 3], base_from_camera[..., :3, 2])
 
 
-def with_cost(level: Level, cameras: Cameras, stage: Stage) -> Found:
-    """Return the cameras with the cost of their colour differences, at the best depth of each point."""
+def cost_of(level: Level, cameras: Cameras, stage: Stage) -> float:
+    """Return the cost of the cameras' colour differences, at the best depth of each point."""
     host, x_px = strongest(level, _per_image(level, stage))
-    return Found(cameras, on_rays(level, cameras, host, x_px, _depths(cameras), stage.sigma, AGREED)[1])
+    return on_rays(level, cameras, host, x_px, _depths(cameras), stage.sigma, AGREED)[1]
 
 
 def _per_image(level: Level, stage: Stage) -> int:
@@ -96,13 +88,13 @@ def align_photometrically(
         points, cost = on_rays(level, cameras, host, x_px, _depths(cameras), stage.sigma, AGREED)
         if cost > SETTLED * before:
             break
-        cameras, points = after_descent(level, cameras, points, stage.sigma, directions)
+        cameras, points = _after_descent(level, cameras, points, stage.sigma, directions)
         before = cost
     assert points is not None
     return cameras, points
 
 
-def after_descent(
+def _after_descent(
     level: Level, cameras: Cameras, points: Points, sigma: float, directions: Float[ndarray, "p q"]
 ) -> tuple[Cameras, Points]:
     """Take a few steps of Levenberg and Marquardt; the cameras move together where there are 7 parameters.
@@ -125,7 +117,7 @@ def after_descent(
                 break
             damping *= 6
         else:
-            return cameras, points
+            break
         settled = best - cost < 3e-4 * best
         (cameras, points), best, damping = tried, cost, damping / 6
         if settled:

@@ -1,12 +1,10 @@
 """Direct alignment: wrist cameras by photometric alignment, on plain tables too, where features find nothing to match.
 
-The robot's poses leave one unknown for all cameras, the hand-eye transform (and the focal length, if the
-intrinsics are not
-known). That is little enough to find it from nothing: the cameras look at a common place, which tells their
-viewing direction in the gripper's frame, and rotations about it and tilts are tried all around, on images 15
-pixels high.
-From there coarse to fine, with a depth for each of a few thousand pixels; in the end every camera moves by itself, so
-that what disagrees with the robot's motion shows.
+The robot's poses leave one unknown for all cameras, the hand-eye transform (and the focal length, if the intrinsics are
+not known). That is little enough to find it from nothing: the cameras look at a common place, which tells their viewing
+direction in the gripper's frame, and rotations about it and tilts are tried all around, on images 15 pixels high. From
+there coarse to fine, with a depth for each of a few thousand pixels; in the end every camera moves by itself, so that
+what disagrees with the robot's motion shows.
 
 Pointmaps are matched near edges; plain surfaces between them are filled with planes (jcr/depth/priors.py).
 The page `plain-tables` describes when, and with what errors.
@@ -77,16 +75,16 @@ def reconstruct_direct(capture: Capture, progress: Progress | None = None) -> Re
     report = progress or silent
     images = [read_image(capture.folder / name) for name in capture.images]
     given, warnings = usable_intrinsics(capture.intrinsics)
-    notes: tuple[str, ...] = ()
+    notes = ()
     width, height = capture.image_size
     focal = GUESSED_FOCAL * max(width, height)
     intrinsics = given or Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
     levels = pyramid(images, intrinsics)
     known = given is not None
     found = search(levels, capture.base_from_gripper, known, report)
-    factor = exposure_gains(levels[FREED[0].height], found.cameras)
+    factor = exposure_gains(levels[FREED[0].height], found)
     levels = {height: level.times(factor) for height, level in levels.items()}
-    rows, cameras = images_that_fit(levels[FREED[0].height], found.cameras, known)
+    rows, cameras = images_that_fit(levels[FREED[0].height], found, known)
     if len(rows) < len(capture):
         names = ", ".join(name for k, name in enumerate(capture.images) if k not in rows)
         notes = (f"direct alignment: left out, for they fit nowhere near their poses: {names}",)

@@ -9,14 +9,7 @@ from numpy import ndarray
 
 from jcr.errors import RejectedError
 from jcr.geometry import inverse, rotation_between_deg, rotation_exp, transform
-from jcr.photometric.coarse_to_fine import (
-    Found,
-    Stage,
-    align_photometrically,
-    axes_meet,
-    tied_directions,
-    with_cost,
-)
+from jcr.photometric.coarse_to_fine import Stage, align_photometrically, axes_meet, cost_of, tied_directions
 from jcr.photometric.residuals import Cameras, Level, strongest
 from jcr.progress import Progress
 
@@ -42,34 +35,38 @@ def search(
     base_from_gripper: Float[ndarray, "n 4 4"],
     intrinsics_known: bool,
     report: Progress,
-) -> Found:
-    """Return the hand-eye transform of best agreement of colours; raise RejectedError where another one is as good."""
+) -> Cameras:
+    """Return the cameras by the hand-eye transform of best agreement of colours.
+
+    Raises RejectedError where another one is as good.
+    """
     if not len(strongest(levels[COARSEST.height], COARSEST.per_image)[0]):
         raise RejectedError(
             "direct alignment: the images show one colour and no edges", "put different objects in view"
         )
     directions = tied_directions(intrinsics_known)
+
+    def refined(
+        found: list[tuple[float, Cameras]], stage: Stage, judge: Stage, begin: float, share: float
+    ) -> list[tuple[float, Cameras]]:
+        """Align cameras at a stage and return them with their costs at the next one."""
+        made = []
+        for k, (_, cameras) in enumerate(found):
+            report("direct alignment", begin + share * k / len(found))
+            cameras, _ = align_photometrically(levels[stage.height], cameras, stage, directions)
+            made.append((cost_of(levels[judge.height], cameras, judge), cameras))
+        return made
+
     screen = replace(COARSEST, per_image=SCREENED_POINTS)
-
-    def screened(x: Float[ndarray, "4 4"]) -> Found:
-        return with_cost(levels[screen.height], Cameras(base_from_gripper @ x), screen)
-
-    ranked = _best_first([screened(x) for x in starting_hand_eyes(base_from_gripper)])[:KEPT]
-    coarse = []
-    for k, start in enumerate(ranked):
-        report("direct alignment", 0.1 + 0.4 * k / len(ranked))
-        cameras, _ = align_photometrically(levels[COARSEST.height], start.cameras, COARSEST, directions)
-        coarse.append(with_cost(levels[COARSE.height], cameras, COARSE))
-    fine = []
-    for k, start in enumerate(different(coarse)[:KEPT_BASINS]):
-        report("direct alignment", 0.5 + 0.2 * k / KEPT_BASINS)
-        cameras, _ = align_photometrically(levels[COARSE.height], start.cameras, COARSE, directions)
-        fine.append(with_cost(levels[JUDGE.height], cameras, JUDGE))
-    best, *rivals = different(fine)
-    if rivals and best.cost > CLEARLY_BETTER * rivals[0].cost:
+    starts = [Cameras(base_from_gripper @ x) for x in starting_hand_eyes(base_from_gripper)]
+    ranked = [(cost_of(levels[screen.height], cameras, screen), cameras) for cameras in starts]
+    ranked = sorted(ranked, key=lambda each: each[0])[:KEPT]
+    coarse = refined(ranked, COARSEST, COARSE, 0.1, 0.4)
+    (cost, best), *rivals = _different(refined(_different(coarse)[:KEPT_BASINS], COARSE, JUDGE, 0.5, 0.2))
+    if rivals and cost > CLEARLY_BETTER * rivals[0][0]:
         raise RejectedError(
-            f"direct alignment: cameras at different places explain the images alike (cost {best.cost:.3f} and "
-            f"{rivals[0].cost:.3f})",
+            f"direct alignment: cameras at different places explain the images alike (cost {cost:.3f} and "
+            f"{rivals[0][0]:.3f})",
             "take more images, from more sides, of more and different objects",
         )
     return best
@@ -97,21 +94,14 @@ def starting_hand_eyes(base_from_gripper: Float[ndarray, "n 4 4"]) -> Float[ndar
     return transform(rotations.reshape(-1, 3, 3), np.zeros(3))
 
 
-def _best_first(found: Sequence[Found]) -> list[Found]:
-    return sorted(found, key=lambda each: each.cost)
-
-
-def different(found: Sequence[Found]) -> list[Found]:
-    """Return the best of each group of equal results, best first."""
-    kept: list[Found] = []
-    for each in _best_first(found):
-        if all(not _same(each.cameras, other.cameras) for other in kept):
-            kept.append(each)
+def _different(found: Sequence[tuple[float, Cameras]]) -> list[tuple[float, Cameras]]:
+    """Return the best of each group of equal results, best first, with their costs."""
+    kept: list[tuple[float, Cameras]] = []
+    for cost, cameras in sorted(found, key=lambda each: each[0]):
+        gaps = [inverse(cameras.base_from_camera[0]) @ other.base_from_camera[0] for _, other in kept]
+        if not any(
+            np.linalg.norm(gap[:3, 3]) < SAME_M and rotation_between_deg(np.eye(3), gap[:3, :3]) < SAME_DEG
+            for gap in gaps
+        ):
+            kept.append((cost, cameras))
     return kept
-
-
-def _same(one: Cameras, other: Cameras) -> bool:
-    gap = inverse(one.base_from_camera[0]) @ other.base_from_camera[0]
-    return bool(
-        np.linalg.norm(gap[:3, 3]) < SAME_M and rotation_between_deg(np.eye(3), gap[:3, :3]) < SAME_DEG
-    )
