@@ -23,7 +23,7 @@ from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate, fit_poses
 from jcr.camera import parameters, with_parameters
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
-from jcr.estimation.hand_eye import solve_hand_eye
+from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.estimation.intrinsics_prior import ESTIMATED, camera_with_prior
 from jcr.estimation.point_uncertainty import point_covariance, within_95
 from jcr.estimation.prediction import predict
@@ -46,12 +46,12 @@ FACTOR = 2.0
 """Ratio of predicted and reported uncertainty that counts as agreement."""
 WHITE, PEER = "white noise alone", "OpenCV Park, scale given"
 SOLVERS: dict[str, Callable[[BentProblem], HandEye]] = {
-    "joints known": lambda p: solve_hand_eye(
+    "joints known": lambda p: fit_hand_eye(
         p.base_from_gripper, p.recon_from_camera, joints=p.joints, robot=p.bent.arm
     ),
-    "robot given": lambda p: solve_hand_eye(p.base_from_gripper, p.recon_from_camera, robot=p.bent.arm),
-    "nothing known": lambda p: solve_hand_eye(p.base_from_gripper, p.recon_from_camera),
-    WHITE: lambda p: solve_hand_eye(
+    "robot given": lambda p: fit_hand_eye(p.base_from_gripper, p.recon_from_camera, robot=p.bent.arm),
+    "nothing known": lambda p: fit_hand_eye(p.base_from_gripper, p.recon_from_camera),
+    WHITE: lambda p: fit_hand_eye(
         p.base_from_gripper, p.recon_from_camera, systematic=np.zeros((6 * len(p.joints), 6 * len(p.joints)))
     ),
 }
@@ -198,7 +198,7 @@ def _seen_row(preset: PresetName, count: int, known: Knowledge, draws: int) -> S
         tracks = observed(problem, rng, POINTS, PIXEL_STD, known.camera)
         if len(tracks.image) < 100 * count:
             continue
-        solved = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+        solved = fit_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
         fit = solved.gripper_from_camera, solved.scale, solved.base_from_recon
         start = known.start(rng)
         free = camera_with_prior(start) if known.is_given else camera_with_prior(start, ESTIMATED)

@@ -21,7 +21,7 @@ from benchmarks.faults import IMAGES, OBSERVED, calibrated
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.estimation.arms import arm_named
-from jcr.estimation.hand_eye import solve_hand_eye
+from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.geometry import step_between
 from jcr.reconstruction_npz import read_reconstruction
 from jcr.records import HandEye
@@ -173,7 +173,7 @@ def _with_sheet(sheet: Sheet) -> HandEye:
 def _arm(arm: str, preset: Any, count: int) -> HandEye:
     """Return the calibration of poses of an arm with systematic errors, its joint angles known."""
     problem = bent_problem(arm_named(arm), preset, count, 0)
-    return solve_hand_eye(
+    return fit_hand_eye(
         problem.base_from_gripper, problem.recon_from_camera, joints=problem.joints, robot=problem.bent.arm
     )
 
@@ -185,7 +185,7 @@ def _weighed_poses() -> HandEye:
     gripper = problem.base_from_gripper.copy()
     gripper[3, :3, 3] += 0.1
     variance = np.tile(np.repeat([1e-3 / problem.scale, 2e-3], 3), 14) ** 2
-    return solve_hand_eye(gripper, problem.recon_from_camera, camera_covariance=np.diag(variance))
+    return fit_hand_eye(gripper, problem.recon_from_camera, camera_covariance=np.diag(variance))
 
 
 if __name__ == "__main__":

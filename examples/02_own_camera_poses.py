@@ -45,7 +45,7 @@ print(f"gripper_from_camera (m):\n{solve.gripper_from_camera.round(4)}")
 print(f"scale: {solve.scale:.4f} m per unit ± {100 * sigma[6]:.2f} %")
 print(f"one sigma: {1e3 * sigma[:3].max():.2f} mm, {np.degrees(sigma[3:6].max()):.3f}°")
 print(f"off the truth: {1e3 * off_m:.2f} mm, {off_deg:.3f}°")
-print(f"used: {solve.inliers.sum()} of {len(solve.inliers)} poses")
+print(f"used: {solve.images_used} of {len(solve.images)} poses")
 
 # An arm that only slides and never turns its wrist: the answer names the unobservable part, and the remedy.
 sliding, recon_from_camera, _ = simulated(transforms(np.zeros((10, 3)), positions))

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy import ndarray
 
-import jcr
 from jcr.capture.images import read_image
+from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import rotation_exp, transform
 from jcr.live.cameras import Camera, Frame
@@ -31,7 +31,7 @@ def a_hand_eye(met: bool) -> HandEye:
     """Return an accepted calibration that meets its requirement, or does not."""
     rng = np.random.default_rng(0)
     poses = transform(rotation_exp(0.5 * rng.normal(size=(10, 3))), 0.2 * rng.normal(size=(10, 3)))
-    found = jcr.solve_hand_eye(poses, poses @ transform(np.eye(3), np.array([0.05, 0.0, 0.1])))
+    found = fit_hand_eye(poses, poses @ transform(np.eye(3), np.array([0.05, 0.0, 0.1])))
     required = Requirement(
         translation_mm=REQUIRED[0],
         rotation_deg=REQUIRED[1],

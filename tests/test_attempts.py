@@ -16,7 +16,7 @@ from jcr.calibration.checks import capture as capture_checks
 from jcr.calibration.options import CalibrateOptions
 from jcr.cli import dispatch
 from jcr.errors import InputError, RejectedError
-from jcr.estimation.hand_eye import solve_hand_eye
+from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import rotation_exp, transform
 from jcr.pipeline import selection
@@ -157,7 +157,7 @@ def test_of_two_that_are_rejected_the_one_that_shows_the_cause_is_kept(
     """Whatever its leave-one-out error, which a cause makes large."""
     present.add("mast3r")
     problem = hand_eye_problem(np.random.default_rng(0), 8, robot_noise=(2e-4, 5e-4))
-    sound = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    sound = fit_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     uncertain = Finding(
         kind=FindingKind.UNCERTAIN,
         severity="rejects",

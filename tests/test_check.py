@@ -16,7 +16,7 @@ from conftest import shrunk_capture
 from jcr.calibration.checks.left_out import left_out_poses
 from jcr.capture.images import BLURRED_EDGE, edge_width, read_image
 from jcr.cli import dispatch
-from jcr.estimation.hand_eye import solve_hand_eye
+from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.findings import FindingKind
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 from simulation.problems import hand_eye_problem
@@ -90,7 +90,7 @@ def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():
         ),
         backend="given",
     )
-    hand_eye = solve_hand_eye(gripper, problem.recon_from_camera)
+    hand_eye = fit_hand_eye(gripper, problem.recon_from_camera)
     assert hand_eye.converged and not hand_eye.inliers[[3, 5, 8]].any()
     found = left_out_poses(
         Capture(folder=Path(), images=names, base_from_gripper=gripper, image_size=(640, 480)), made, hand_eye
@@ -101,7 +101,7 @@ def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():
     ]
     assert found[1].value == pytest.approx(0.08 * np.sqrt(3), rel=0.05)
     right = problem.base_from_gripper
-    of_right = solve_hand_eye(right, problem.recon_from_camera)
+    of_right = fit_hand_eye(right, problem.recon_from_camera)
     assert not left_out_poses(
         Capture(folder=Path(), images=names, base_from_gripper=right, image_size=(640, 480)),
         made,

@@ -41,6 +41,8 @@ def _rigid(rows: list[list[float]]) -> Float[ndarray, "4 4"]:
 
 LEAST_EIGENVALUE = 1e-14
 """Least eigenvalue of a correlation matrix: below it the errors depend on each other, or digits were lost."""
+NOTHING = 1e-27
+"""Standard deviation below which an error of a part is rounding."""
 LOST_DIGITS = 1e-3
 """By which an eigenvalue of a part may be below 0: of motions that show little, the last digits are not exact."""
 
@@ -48,6 +50,7 @@ LOST_DIGITS = 1e-3
 def _part(rows: list[list[float]]) -> Float[ndarray, "n n"]:
     matrix = np.array(rows)
     std = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    std[std < NOTHING] = 0.0
     largest = np.outer(std, std)  # Cauchy-Schwarz
     if (np.diag(matrix) < 0).any() or not (np.abs(matrix) <= (1 + LOST_DIGITS) * largest + 1e-30).all():
         raise ValueError("no covariance: two errors vary together more than each by itself")

@@ -16,7 +16,7 @@ from jcr.capture.images import encode_png, read_depth
 from jcr.capture.read import read_capture
 from jcr.depth.measured import with_measured_depth
 from jcr.errors import InputError
-from jcr.estimation.hand_eye import solve_hand_eye
+from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.files import write_bytes
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import (
@@ -66,7 +66,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, Reconst
     base_from_recon = transform(rotation_exp(np.array([0.3, -2.0, 0.5])), np.array([0.4, 0.2, -0.7]))
     cameras = inverse(base_from_recon) @ base_from_camera
     cameras[:, :3, 3] /= SCALE
-    return capture, _reconstruction(cameras, true, draw), solve_hand_eye(gripper, cameras), true
+    return capture, _reconstruction(cameras, true, draw), fit_hand_eye(gripper, cameras), true
 
 
 def _reconstruction(cameras: np.ndarray, true: np.ndarray, draw: np.random.Generator) -> Reconstruction:

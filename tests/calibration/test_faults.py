@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from benchmarks.faults import calibrated, outcome
-from jcr.calibration.checks.camera import is_material
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_poses
 from jcr.calibration.record import calibration_of
@@ -16,7 +15,7 @@ from jcr.calibration.stage import calibrate
 from jcr.camera import project, unproject
 from jcr.cell.carried import exchanged, refined
 from jcr.estimation.arms import RobotName, arm_named
-from jcr.findings import Finding, FindingKind, kinds_of, sentence
+from jcr.findings import FindingKind, kinds_of, sentence
 from jcr.geometry import apply, inverse, step_between
 from jcr.records import Capture, PosePairs, Reconstruction
 from simulation.arms import PresetName
@@ -255,21 +254,5 @@ def test_positions_that_are_all_too_long_are_said_to_be_beyond_what_images_show_
     assert alone in file.notes
     # Simulated observations are metric as the scene is; the robot's positions are not.
     metric = calibrate(capture, replace(reconstruction, is_metric=True, metric_std=0.002))
-    assert "4.8 ± 0.2 % larger than given" in metric.warnings[0]
+    assert "4.8 ± 0.2" in metric.warnings[0] and "larger than given" in metric.warnings[0]
     assert alone not in calibration_of(capture, reconstruction, metric, {}, "").notes
-
-
-def test_what_differs_from_image_to_image_is_a_fault_where_it_is_surely_larger_than_its_noise():
-    """Of 200 images a scatter of 1.4 standard deviations has a chance of 1e-7 if the noise is exactly as estimated."""
-    std = np.full(6, 1e-5)
-    found = Finding(
-        kind=FindingKind.FOCUS_BY_IMAGE,
-        severity="warns",
-        concerns="images",
-        value=4.8e-4,
-        std=3.4e-4,
-        shift=(1e-4,) * 7,
-    )
-    assert not is_material(found, std)
-    assert is_material(replace(found, value=1e-2), std)
-    assert is_material(replace(found, kind=FindingKind.FOCUS_BY_DISTANCE), std)

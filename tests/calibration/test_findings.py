@@ -16,8 +16,8 @@ from jcr.calibration.record import (
 from jcr.calibration.stage import calibrate
 from jcr.calibration.words import summary
 from jcr.errors import InputError
-from jcr.estimation.hand_eye import solve_hand_eye
-from jcr.findings import Finding, FindingKind, kinds_of, remedy, sentence, text
+from jcr.estimation.hand_eye import fit_hand_eye
+from jcr.findings import Finding, FindingKind, remedy, sentence, text
 from jcr.findings.table import GROUPS
 from jcr.geometry import rotation_exp, transform
 from jcr.records import Capture, HandEye, Intrinsics, PosePairs, Reconstruction, Tracks
@@ -129,7 +129,7 @@ def example(kind: FindingKind) -> Finding:
 @pytest.fixture(scope="module")
 def solved() -> HandEye:
     problem = hand_eye_problem(np.random.default_rng(0), 12, robot_noise=(5e-4, 1e-3))
-    return solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    return fit_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
 
 
 @pytest.mark.parametrize("kind", FindingKind)
@@ -220,17 +220,6 @@ def test_motions_are_not_the_cause_where_images_are_missing(tilt_deg: float):
         found.findings[0].kind is FindingKind.UNOBSERVABLE
         and "tilt the wrist" in found.observability.advice[0]
     )
-
-
-def test_the_parts_of_the_uncertainty_are_the_whole_with_every_fault(solved: HandEye):
-    before = solved.covariance.copy()
-    kinds = sorted(kinds_of("camera"))
-    faults = [replace(example(kind), shift=(1e-3 * k, *6 * (1e-3,))) for k, kind in enumerate(kinds)]
-    found = with_findings(solved, tuple(faults))
-    assert found.budget is not None
-    assert np.allclose(sum(vars(found.budget).values()), found.covariance, rtol=0, atol=1e-12)
-    added = sum(np.outer(one.shift, one.shift) for one in faults if one.shift is not None)
-    assert np.allclose(found.budget.faults, added) and (solved.covariance == before).all()
 
 
 def test_findings_are_in_the_file_and_come_back(tmp_path: Path):

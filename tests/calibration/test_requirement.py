@@ -123,7 +123,7 @@ def test_the_images_that_are_missing_are_counted_and_proposed():
     content, html = page(given, hand_eye)
     assert content.short is not None and content.verdict == "rejected" and not hand_eye.converged
     show = sentence(content.short)
-    assert f"add {required.more_images} image" in show
+    assert f"add {required.more_images} more" in show
     assert "\nRemedy      add " in summary(content) and "; expected " in summary(content)
     assert 'class="verdict bad"' in html and "Rejected:" in html
     assert Calibration.model_validate_json(json.dumps(content.as_json()), strict=True) == content

@@ -16,7 +16,8 @@ from jcr.calibration.stage import calibrate
 from jcr.camera import parameters, with_parameters
 from jcr.capture.added import read_added
 from jcr.capture.formats.capture_json import read, write
-from jcr.cell.added import read_added_cameras
+from jcr.cell.added import camera_of, read_added_cameras
+from jcr.cell.carried import carried_scene, refined
 from jcr.cell.images import CellImages
 from jcr.cell.placement import CameraPlacement, CellPlacement, read_cameras, write_cameras
 from jcr.cell.stage import place_cameras
@@ -26,6 +27,7 @@ from jcr.estimation.solve import Solution, solve
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.records import Capture, CellCamera, HandEye, Reconstruction, Tracks
+from jcr.sfm.colmap import reconstruct_colmap
 from simulation.cells import CellProblem, Kind, cell_problem
 
 COUNT = 8
@@ -147,7 +149,8 @@ def test_a_image_of_the_scene_places_a_fixed_camera(tabletop: Path, calibrated, 
     old, reconstruction, hand_eye = calibrated
     capture = jcr.read_capture(tabletop)
     image, intrinsics = tabletop / capture.images[10], capture.intrinsics if known else None
-    camera = jcr.place_camera(old, hand_eye, reconstruction, [image], intrinsics)
+    added = replace(camera_of("camera", [image], None, (old.camera_name,)), intrinsics=intrinsics)
+    camera = place_cameras(old, [added], reconstruction, hand_eye).cameras[0]
     x = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
     assert camera.converged and camera.parent_from_camera is not None and camera.covariance is not None
     error = step_between(camera.parent_from_camera, capture.base_from_gripper[10] @ x)
@@ -157,13 +160,15 @@ def test_a_image_of_the_scene_places_a_fixed_camera(tabletop: Path, calibrated, 
 
 
 @pytest.mark.slow
-def test_a_fixed_camera_is_calibrated_by_what_the_gripper_carries(tabletop: Path):
+def test_a_fixed_camera_is_calibrated_by_what_the_gripper_carries(tabletop: Path, tmp_path: Path):
     """With poses exchanged, a wrist camera before a table is a fixed camera before a table that the gripper carries."""
     capture = jcr.read_capture(tabletop)
     carried = replace(
         capture, base_from_gripper=inverse(capture.base_from_gripper), mount="base", joints=None, robot=None
     )
-    found, made = jcr.eye_to_hand(carried)
+    seen = carried_scene(carried, tmp_path)
+    made = reconstruct_colmap(seen)
+    found = refined(carried, made, calibrate(seen, made))
     x = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
     error = step_between(found.gripper_from_camera, x)
     assert found.converged and len(made.image_index) == len(capture)

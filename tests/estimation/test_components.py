@@ -5,6 +5,7 @@ import pytest
 
 import jcr
 from jcr.estimation.equation import residuals
+from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.estimation.robot_noise import Equations, most_likely
 from jcr.estimation.robust import robust_fit
 from jcr.estimation.systematic import Region, arm_errors, smooth_errors
@@ -100,9 +101,9 @@ def test_a_named_arm_whose_joints_are_known_is_used_and_budgeted():
 
     problem = bent_problem(arm_named("panda"), "typical", 12, 1)
     poses = problem.base_from_gripper, problem.recon_from_camera
-    known = jcr.solve_hand_eye(*poses, joints=problem.joints, robot="panda")
-    named = jcr.solve_hand_eye(*poses, robot="panda")
-    nothing = jcr.solve_hand_eye(*poses)
+    known = fit_hand_eye(*poses, joints=problem.joints, robot="panda")
+    named = fit_hand_eye(*poses, robot="panda")
+    nothing = fit_hand_eye(*poses)
     for solved in (known, named, nothing):
         parts = solved.budget
         assert parts is not None and solved.converged
@@ -117,9 +118,7 @@ def test_a_named_arm_whose_joints_are_known_is_used_and_budgeted():
     assert all(np.abs(one - other).max() > 1e-6 for one in answers for other in answers if one is not other)
     # Another order is the same problem.
     order = np.random.default_rng(0).permutation(12)
-    again = jcr.solve_hand_eye(
-        *(stack[order] for stack in poses), joints=problem.joints[order], robot="panda"
-    )
+    again = fit_hand_eye(*(stack[order] for stack in poses), joints=problem.joints[order], robot="panda")
     assert np.allclose(again.gripper_from_camera, known.gripper_from_camera, atol=1e-7)
 
 
@@ -137,4 +136,4 @@ def test_a_named_arm_whose_joints_are_known_is_used_and_budgeted():
 def test_poses_and_angles_that_are_not_of_the_robot_are_an_input_error(joints, robot, words):
     problem = hand_eye_problem(np.random.default_rng(2), 8)
     with pytest.raises(jcr.InputError, match=words):
-        jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera, joints=joints, robot=robot)
+        fit_hand_eye(problem.base_from_gripper, problem.recon_from_camera, joints=joints, robot=robot)

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.coverage import BENT, WAYS, measure_seen
 from jcr.camera import parameters, unproject, with_parameters
-from jcr.estimation.hand_eye import solve_hand_eye
+from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.estimation.intrinsics_prior import ESTIMATED, camera_with_prior
 from jcr.estimation.point_uncertainty import (
     in_use,
@@ -32,7 +32,7 @@ DISTANCE_M = 0.45
 
 def adjusted(problem: HandEyeProblem, seed: int) -> tuple[Solution, Tracks, HandEye]:
     tracks = observed(problem, np.random.default_rng([seed, 1]), 300, 0.3)
-    start = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    start = fit_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     found = adjust_wrist(
         problem.base_from_gripper,
         (start.gripper_from_camera, start.scale, start.base_from_recon),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy import ndarray
 
-import jcr
+from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.live.next_pose import AIMED, ELSEWHERE_M, Attempts, Reach, propose_before_calibration
 from jcr.records import Capture, HandEye
@@ -32,7 +32,7 @@ def seen() -> tuple[Capture, HandEye]:
         base_from_gripper=poses,
         image_size=(640, 480),
     )
-    return capture, jcr.solve_hand_eye(poses, cameras)
+    return capture, fit_hand_eye(poses, cameras)
 
 
 def next_pose(attempts: Attempts, hand_eye: HandEye | None) -> ndarray:

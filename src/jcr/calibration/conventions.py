@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from jcr.estimation.closed_form import closed_form
 from jcr.estimation.equation import Poses
-from jcr.estimation.hand_eye import solve_hand_eye
+from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.estimation.robust import least_trimmed
 from jcr.findings import Finding, FindingKind, Severity
 from jcr.geometry import inverse, transform
@@ -155,7 +155,7 @@ def convention_finding(found: tuple[Reading, Reading], severity: Severity = "rej
 
 def _solved(candidate: _Candidate, recon_from_camera: Poses) -> Reading:
     name, base_from_gripper, image = candidate
-    return Reading.of(name, solve_hand_eye(base_from_gripper, recon_from_camera[image], in_sequence=False))
+    return Reading.of(name, fit_hand_eye(base_from_gripper, recon_from_camera[image], in_sequence=False))
 
 
 def _rough_error(candidate: _Candidate, recon_from_camera: Poses) -> float:

@@ -10,7 +10,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
-from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    PlainSerializer,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
 
 from jcr.arrays_json import (
     Covariance7,
@@ -24,7 +32,6 @@ from jcr.arrays_json import (
     Spread3,
     Square,
 )
-from jcr.calibration.findings_json import FindingJson, derived, require_one_verdict
 from jcr.camera import parameter_names
 from jcr.capture.plain_files import first_fault, read_json, shown
 from jcr.errors import InputError, RejectedError
@@ -39,6 +46,8 @@ from jcr.findings import (
     sentence,
     strongest_first,
     text,
+    verdict_of,
+    warnings_of,
     without_consequences,
 )
 from jcr.findings.sentences import worst_direction
@@ -76,6 +85,44 @@ NAMES = {
     "base": ("base_from_camera", "gripper_from_object"),
 }
 """Keys of the file for the camera and for the reconstruction, by what the camera is mounted on."""
+
+
+def as_json(finding: Finding) -> dict[str, Any]:
+    """Return a finding as files have it: its fields, its text and its remedy."""
+    return vars(finding) | {"text": text(finding), "remedy": remedy(finding)}
+
+
+def _without_words(value: Any) -> Any:
+    if not isinstance(value, dict):
+        return value
+    numbers = {name: part for name, part in value.items() if name not in ("text", "remedy")}
+    try:
+        # As JSON again: there, and not among Python's values, a dict may stand for a record and a list for a tuple.
+        return _FINDING.validate_json(json.dumps(numbers), strict=True)
+    except ValidationError as error:
+        raise ValueError(first_fault(error)) from None
+
+
+_FINDING = TypeAdapter(Finding)
+FindingJson = Annotated[Finding, BeforeValidator(_without_words), PlainSerializer(as_json)]
+"""Finding with its text and remedy, which are for people and made again when it is read."""
+
+
+def derived(findings: Sequence[Finding]) -> dict[str, Any]:
+    """Return the fields of a file that hold findings, strongest first."""
+    verdict = verdict_of(findings)
+    return {
+        "findings": list(findings),
+        "verdict": verdict,
+        "converged": verdict != "rejected",
+        "warnings": list(warnings_of(findings)),
+    }
+
+
+def require_one_verdict(findings: Sequence[Finding], verdict: Verdict, converged: bool) -> None:
+    """Raise ValueError where the verdict contradicts the findings."""
+    if verdict != verdict_of(findings) or converged is (verdict == "rejected"):
+        raise ValueError("converged, verdict and findings contradict one another")
 
 
 def mm_and_deg(metres: float, radians: float) -> dict[str, float]:

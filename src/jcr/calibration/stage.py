@@ -14,7 +14,7 @@ from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised, assumptions_of
 from jcr.calibration.robot_errors import RobotErrors, robot_errors
 from jcr.errors import RejectedError
-from jcr.estimation.hand_eye import SCALE_STD, Offset, solve_hand_eye
+from jcr.estimation.hand_eye import SCALE_STD, Offset, fit_hand_eye
 from jcr.estimation.point_uncertainty import with_given_intrinsics
 from jcr.estimation.problem import offset_prior, scale_prior
 from jcr.least_squares import one_blas_thread
@@ -107,7 +107,7 @@ def _solved(
     offset: Offset | None = None,
 ) -> HandEye:
     evidence = reconstruction.evidence
-    return solve_hand_eye(
+    return fit_hand_eye(
         gripper,
         reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera,
         robot_noise=options.robot_noise_m_rad,

@@ -8,7 +8,6 @@ errors where they are (estimation/pose_equations.py).
 
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from jcr.calibration.adjust import adjust_case
 from jcr.calibration.case import MIN_OBSERVATIONS, Case, with_findings
@@ -16,15 +15,12 @@ from jcr.calibration.checks.camera import of_case, of_fewer_points
 from jcr.calibration.checks.effects import EFFECTS, effects, with_effects
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
-from jcr.calibration.stage import calibrate
 from jcr.cell.background import write_moving_parts
-from jcr.estimation.hand_eye import judged, solve_hand_eye
+from jcr.estimation.hand_eye import fit_hand_eye, judged
 from jcr.estimation.wrist import estimate_of
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import inverse
-from jcr.progress import Progress
 from jcr.records import Capture, HandEye, Reconstruction
-from jcr.sfm.colmap import reconstruct_colmap
 
 
 def exchanged(capture: Capture) -> Capture:
@@ -50,23 +46,6 @@ def carried_scene(capture: Capture, moving: Path) -> Capture:
     """
     write_moving_parts(capture.folder, capture.images, moving)
     return replace(exchanged(capture), folder=moving)
-
-
-def eye_to_hand(
-    capture: Capture, options: CalibrateOptions | None = None, progress: Progress | None = None
-) -> tuple[HandEye, Reconstruction]:
-    """Calibrate a fixed camera from images of an object that the gripper carries, by COLMAP.
-
-    Return the calibration, whose `gripper_from_camera` is base_from_camera, and the reconstruction of the object. Raises
-    RejectedError where the images cannot be reconstructed.
-    """
-    options = options or CalibrateOptions()
-    with TemporaryDirectory() as folder:
-        seen = carried_scene(capture, Path(folder))
-        made = reconstruct_colmap(seen, progress=progress)
-        # The arm's kinematics are those of the reported poses, and not of their inverses.
-        found = calibrate(seen, made, replace(options, robot=None))
-        return refined(capture, made, found, options), made
 
 
 def refined(
@@ -110,7 +89,7 @@ def refined(
 def _explained(capture: Capture, reconstruction: Reconstruction, found: HandEye) -> HandEye:
     """Return a failed calibration, with the reason where the camera is on the gripper."""
     rows = reconstruction.image_index
-    on_gripper = solve_hand_eye(
+    on_gripper = fit_hand_eye(
         capture.base_from_gripper[rows], reconstruction.recon_from_camera, in_sequence=False
     )
     if not on_gripper.converged:

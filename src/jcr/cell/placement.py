@@ -12,7 +12,7 @@ from numpy import ndarray
 from pydantic import Field, ValidationError, model_validator
 
 from jcr.arrays_json import Covariance6, Matrix, Part, Spread, Spread3
-from jcr.calibration.findings_json import FindingJson, derived, require_one_verdict
+from jcr.calibration.record import FindingJson, derived, require_one_verdict
 from jcr.capture.plain_files import first_fault, read_json
 from jcr.errors import InputError
 from jcr.files import write_text

@@ -14,7 +14,7 @@ from jcr.calibration.robot_errors import robot_errors
 from jcr.cell.camera_views import CameraViews
 from jcr.cell.placement import CameraPlacement
 from jcr.distributions import chi2
-from jcr.estimation.hand_eye import solve_hand_eye
+from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.estimation.hypotheses import arm_rows
 from jcr.estimation.problem import ReportedPoses
 from jcr.estimation.systematic import smooth_errors
@@ -119,7 +119,7 @@ class Rigs:
             return seen.refused(FindingKind.FEW_LOCALISED, "images", **counts)
         places, gripper = seen.places, seen.camera.base_from_gripper[seen.rows]
         std = max(float(np.sqrt(self._hand_eye.covariance[6, 6])), 1e-4)
-        found = solve_hand_eye(gripper, places, scale=1.0, scale_std=std, in_sequence=False)
+        found = fit_hand_eye(gripper, places, scale=1.0, scale_std=std, in_sequence=False)
         if not found.converged:
             return seen.not_placed(*found.findings)
         rig = np.full(len(seen.found), -1)

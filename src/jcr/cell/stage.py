@@ -7,7 +7,6 @@ others rests on the same images.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +16,6 @@ from jcr.calibration.checks.camera import CameraAdjustment, all_combinations
 from jcr.calibration.checks.effects import as_adopted, effects
 from jcr.calibration.options import CalibrateOptions
 from jcr.capture.images import read_image
-from jcr.cell.added import camera_of
 from jcr.cell.camera_views import CameraViews, localise
 from jcr.cell.images import CellImages, cell_images
 from jcr.cell.placement import ArmPlacement, CameraPlacement, CellPlacement, ImageUse, TransformUncertainty
@@ -31,7 +29,7 @@ from jcr.geometry import apply, inverse, scale_translation
 from jcr.intrinsics_json import IntrinsicsAndStd
 from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress, silent, steps
-from jcr.records import Capture, CellCamera, HandEye, Intrinsics, Reconstruction
+from jcr.records import Capture, CellCamera, HandEye, Reconstruction
 from jcr.sfm.register import KnownImages, Registration
 
 CONTRADICTS = 5.0
@@ -42,23 +40,6 @@ LEAST_SPREAD = 0.05
 """Smallest share of the image's area that the points should span; crowded points determine a pose badly."""
 FAR_FROM_GRIPPER = 0.5
 """Distance (m) from the gripper's frame beyond which a camera is likely to be mounted elsewhere."""
-
-
-def place_camera(
-    capture: Capture,
-    calibration: HandEye,
-    reconstruction: Reconstruction,
-    images: Sequence[str | Path],
-    intrinsics: Intrinsics | None = None,
-) -> CameraPlacement:
-    """Place a fixed camera by its images of the scene of a calibrated capture.
-
-    `reconstruction` is the one that the calibration was made from; unknown intrinsics are estimated. Raises InputError
-    for files that are not images of one camera. A camera that cannot be placed is returned with the reason.
-    """
-    camera = camera_of("camera", [Path(image) for image in images], None, (capture.camera_name,))
-    camera = replace(camera, intrinsics=intrinsics)
-    return place_cameras(capture, [camera], reconstruction, calibration).cameras[0]
 
 
 @one_blas_thread

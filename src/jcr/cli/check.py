@@ -152,8 +152,7 @@ def _expected(images: int, found: "Examination") -> list[str]:
 
 def _check_facts(capture: "Capture | PosePairs", found: "Examination") -> dict[str, Any]:
     """Return the result of the check for JSON."""
-    from jcr.calibration.findings_json import as_json
-    from jcr.calibration.record import mm_and_deg
+    from jcr.calibration.record import as_json, mm_and_deg
     from jcr.findings import warnings_of
 
     noise = None if found.hand_eye is None else found.hand_eye.robot_noise

@@ -43,7 +43,7 @@ Offset = tuple[Float[ndarray, "3"], float, float]
 
 
 @one_blas_thread
-def solve_hand_eye(  # noqa: PLR0913 (published; each is a fact about the capture)
+def fit_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
     base_from_gripper: ArrayLike,
     recon_from_camera: ArrayLike,
     *,
@@ -57,27 +57,10 @@ def solve_hand_eye(  # noqa: PLR0913 (published; each is a fact about the captur
     systematic: Float[ndarray, "r r"] | None = None,
     in_sequence: bool = True,
 ) -> HandEye:
-    """Return the hand-eye calibration with unknown scale from camera poses of your own.
+    """Return the fit of the hand-eye transform to gripper and camera poses (n,4,4), with the findings of its numbers.
 
-    Takes two stacks (n,4,4), n ≥ 2, taken at the same instants and in the same order: gripper poses in the base frame
-    (m) and camera poses in any frame and unit. `robot_noise` is a lower bound on the noise of the gripper poses (1
-    sigma per axis: m, rad); the residuals may show more. `camera_covariance` (6n,6n), as records.CameraEvidence
-    defines it, is needed if the camera poses are not exact compared with the gripper poses.
-
-    `robot` names the arm (jcr.estimation.arms.ROBOT_NAMES) and `joints` (n,dof) are its angles (rad), starting at the
-    base: they determine how joint offsets and link errors affect the poses. With `robot` only, the angles are computed
-    from the poses; with neither, systematic errors are assumed to vary smoothly over the poses. `systematic` is their
-    covariance, if it is known already (systematic.py).
-
-    `scale` (metres per unit of the camera poses, 1 if these are metric) is known to `scale_std` (relative); without it
-    the scale is estimated. `offset` is an axis of the gripper frame, the position of the camera along it (m), and its
-    standard deviation (m), for motions that do not determine it.
-
-    `in_sequence`: the camera poses may have been found one after the other, as by visual odometry or SLAM. Errors that
-    add up along their order are then tested and included.
-
-    Raises InputError for shapes, values or counts that cannot be poses, and for poses or angles that do not fit the
-    robot. Degenerate motion raises nothing; it is in the result (`observability`, `converged`).
+    The arguments are those of `jcr.solve_hand_eye`; `systematic` is the covariance of the systematic errors of the poses
+    at 1 rad, if it is known already (systematic.py).
     """
     gripper, camera = _checked_pairs(base_from_gripper, recon_from_camera)
     priors, n = _checked_priors(offset, scale, scale_std), len(gripper)

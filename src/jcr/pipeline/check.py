@@ -23,7 +23,7 @@ from jcr.capture.images import brightness_and_sharpness, exposure_fault, read_im
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture, read_source
 from jcr.errors import InputError, RejectedError
-from jcr.estimation.hand_eye import SCALE_STD, solve_hand_eye
+from jcr.estimation.hand_eye import SCALE_STD, fit_hand_eye
 from jcr.estimation.observability import observability
 from jcr.estimation.prediction import FEWEST, Assumptions, Prediction, assumed, typical_camera
 from jcr.findings import (
@@ -278,7 +278,7 @@ def _best_fit(read: list[tuple[Capture, ReadOptions]], progress: Progress | None
     fits = []
     for capture, options in read:
         gripper = capture.base_from_gripper[rows][found.image_index]
-        noise = solve_hand_eye(gripper, found.recon_from_camera, in_sequence=False).robot_noise
+        noise = fit_hand_eye(gripper, found.recon_from_camera, in_sequence=False).robot_noise
         off = f"{1e3 * noise.translation:.2g} mm and {np.degrees(noise.rotation):.2g}°"
         fits.append((float(noise.translation + ARM * noise.rotation), off, capture, options))
     (best, off, capture, options), *others = sorted(fits, key=lambda fit: fit[0])
