@@ -79,15 +79,13 @@ class Arguments:
 
     examples:
       python -m benchmarks fetch-captures captures
-      python -m benchmarks fetch-captures captures --only floor_carton --clones floor_carton=/src/robot_cal_tools
+      python -m benchmarks fetch-captures captures --only floor_carton
     """
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder for the captures."""
     only: tuple[str, ...] = ()
     """Names of the captures to build (unset: all)."""
-    clones: tuple[str, ...] = ()
-    """NAME=PATH of repositories that are on this machine already."""
 
 
 def recipes(path: Path = RECIPES) -> dict[str, Recipe]:
@@ -99,12 +97,11 @@ def main(words: Sequence[str]) -> int:
     """Build the captures, report each on stderr, and return 1 if one failed, else 0."""
     arguments = tyro.cli(Arguments, prog="python -m benchmarks fetch-captures", args=words)
     known, failed = recipes(), 0
-    clones = dict(text.split("=", 1) for text in arguments.clones)
-    if unknown := {*arguments.only, *clones} - known.keys():
+    if unknown := set(arguments.only) - known.keys():
         raise InputError(f"{', '.join(sorted(unknown))}: no such capture; there are {', '.join(known)}")
     for name in arguments.only or known:
         try:
-            build(known[name], arguments.out / name, clones.get(name))
+            build(known[name], arguments.out / name)
         except InputError as error:
             failed += 1
             sys.stderr.write(f"{name}: {error}\n")
@@ -119,7 +116,13 @@ def build(recipe: Recipe, out: Path, clone: str | None = None) -> Path:
     Raises InputError where the repository cannot be had, or its content is not that of the recipe.
     """
     with tempfile.TemporaryDirectory() as folder:
-        files = _files(recipe, clone or _fetched(recipe, Path(folder)))
+        if clone is None:
+            # The commit of the recipe without files, which git adds when they are read.
+            clone = folder
+            _git(clone, "init", "--quiet", "--bare")
+            _git(clone, "remote", "add", "origin", recipe.repository)
+            _git(clone, "fetch", "--quiet", "--depth=1", "--filter=blob:none", "origin", recipe.commit)
+        files = _files(recipe, clone)
     images = _chosen(_matching(files, recipe.images), recipe.use_images)
     poses = _poses(recipe, files)
     if len(images) != len(poses):
@@ -136,12 +139,16 @@ def build(recipe: Recipe, out: Path, clone: str | None = None) -> Path:
         write_bytes(out / "images" / name, files[image])
     with Image.open(io.BytesIO(files[images[0]])) as image:
         size = image.size
+    intrinsics = None
+    if recipe.intrinsics:
+        fx, fy, cx, cy, *distortion = recipe.intrinsics
+        intrinsics = Intrinsics(fx, fy, cx, cy, *size, coefficients_of(distortion or [0.0] * 5))
     capture = Capture(
         folder=out,
         images=tuple(f"images/{name}" for name in names),
         base_from_gripper=poses,
         image_size=size,
-        intrinsics=_intrinsics(recipe.intrinsics, size),
+        intrinsics=intrinsics,
     )
     source = {"repository": recipe.repository, "commit": recipe.commit, "licence": recipe.licence}
     capture_json.write(out, capture, source=source | {"board": recipe.board})
@@ -152,14 +159,6 @@ def digest(images: Sequence[bytes], poses: Float[ndarray, "n 4 4"]) -> str:
     """Return the SHA-256 of image files and of poses rounded to 1e-6."""
     text = json.dumps((np.round(poses, 6) + 0.0).tolist()).encode()
     return hashlib.sha256(b"".join([*images, text])).hexdigest()
-
-
-def _fetched(recipe: Recipe, folder: Path) -> str:
-    """Fetch the commit of a recipe without files, which git adds when they are read."""
-    _git(str(folder), "init", "--quiet", "--bare")
-    _git(str(folder), "remote", "add", "origin", recipe.repository)
-    _git(str(folder), "fetch", "--quiet", "--depth=1", "--filter=blob:none", "origin", recipe.commit)
-    return str(folder)
 
 
 def _files(recipe: Recipe, repository: str) -> dict[str, bytes]:
@@ -229,11 +228,3 @@ def _doubles(content: bytes, first: int, step: int, count: int, position: int) -
         pose[:3, :3] = values[start : start + 9].reshape(3, 3).T
         pose[:3, 3] = values[start + position : start + position + 3]
     return poses.reshape(-1, 16).tolist()
-
-
-def _intrinsics(numbers: Sequence[float], size: tuple[int, int]) -> Intrinsics | None:
-    """Return stored intrinsics."""
-    if not numbers:
-        return None
-    fx, fy, cx, cy, *distortion = numbers
-    return Intrinsics(fx, fy, cx, cy, *size, coefficients_of(distortion or [0.0] * 5))

@@ -151,12 +151,9 @@ class LiveFolder:
         """
         images, row = self.images, self.names.index(name)
         before, now = images[row - 1], images[row]
-        is_known = now.time_s is not None and before.time_s is not None
-        if (
-            row == 0
-            or not is_known
-            or (before.image in self._before_session) != (name in self._before_session)
-        ):
+        if row == 0 or now.time_s is None or before.time_s is None:
+            return None
+        if (before.image in self._before_session) != (name in self._before_session):
             return None
         return before.time_s - now.time_s if now.time_s <= before.time_s else None
 

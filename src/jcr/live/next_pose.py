@@ -150,8 +150,8 @@ def _best(
     count = 1 if reach.arm is None else PROPOSALS
     proposals = Proposals.of(assumptions, poses, robot, count, reach.box, is_likely=is_wanted)
     recorded = None if capture.joints is None else capture.joints[rows]
-    for pose in () if reach.arm is None else proposals.added:
-        if (joints := joints_at(reach.arm, poses, recorded, pose)) is not None:
+    for pose in proposals.added if reach.arm is not None else ():
+        if reach.arm is not None and (joints := joints_at(reach.arm, poses, recorded, pose)) is not None:
             proposals = replace(proposals, added=pose[None])
             break
     best = proposals.next_poses(1)[0]
