@@ -17,8 +17,8 @@ from numpy import ndarray
 from jcr.capture.images import encode_png
 from jcr.errors import InputError
 from jcr.extras import extra
+from jcr.geometry import transform
 from jcr.records import Intrinsics
-from simulation.objects import Part
 from simulation.scenes import Scene
 
 _SUPERSAMPLING = 2
@@ -118,93 +118,57 @@ def to_mjcf(
     Untextured: every part in its one colour. The camera, of vertical field of view `fovy` rad, is rendered
     into a `buffer` of width by height pixels.
     """
-    width, height = buffer
-    root = xml.Element("mujoco", model=scene.name)
-    xml.SubElement(root, "statistic", center=_text(scene.table_center_in_base), extent="0.8")
-    visual = xml.SubElement(root, "visual")
-    xml.SubElement(visual, "global", offwidth=str(width), offheight=str(height))
-    xml.SubElement(visual, "quality", shadowsize="2048", offsamples="0")
+    center = scene.table_center_in_base
     # All light is the lamps': a head light would move with the camera and wash the shading out.
-    xml.SubElement(visual, "headlight", ambient="0.5 0.5 0.5", diffuse="0 0 0", specular="0 0 0")
-    xml.SubElement(visual, "map", znear="0.02", zfar="12", shadowscale="0.5")
-    assets = xml.SubElement(root, "asset")
-    xml.SubElement(
-        assets,
-        "texture",
-        type="skybox",
-        builtin="gradient",
-        rgb1=".62 .64 .66",
-        rgb2=".40 .41 .42",
-        width="32",
-        height="192",
-    )
-    world = xml.SubElement(root, "worldbody")
-    _add_lamps(world, scene)
-    xml.SubElement(world, "camera", name=CAMERA, fovy=repr(float(np.degrees(fovy))))
-    floor = scene.table_center_in_base - [0, 0, _FLOOR_BELOW_TABLE]
-    xml.SubElement(world, "geom", type="box", size="3 3 .01", pos=_text(floor), rgba=".36 .36 .37 1")
-    files: dict[str, bytes] = {}
-    table_frame = np.eye(4)
-    table_frame[:3, 3] = scene.table_center_in_base
-    _add_body(assets, world, files, 1, table_frame, scene.table, textured)
-    for label, thing in enumerate(scene.objects, start=2):
-        _add_body(assets, world, files, label, thing.base_from_object, thing.parts, textured)
-    return xml.tostring(root, encoding="unicode"), files
-
-
-def _add_lamps(world: xml.Element, scene: Scene) -> None:
-    """Add one lamp as a ring of weak ones: MuJoCo's shadows are hard, their sum is soft."""
+    root = xml.fromstring(f"""
+        <mujoco model="{scene.name}">
+        <statistic center="{_text(center)}" extent="0.8"/>
+        <visual>
+        <global offwidth="{buffer[0]}" offheight="{buffer[1]}"/>
+        <quality shadowsize="2048" offsamples="0"/>
+        <headlight ambient="0.5 0.5 0.5" diffuse="0 0 0" specular="0 0 0"/>
+        <map znear="0.02" zfar="12" shadowscale="0.5"/>
+        </visual>
+        <asset><texture type="skybox" builtin="gradient" rgb1=".62 .64 .66" rgb2=".40 .41 .42" width="32" height="192"/>
+        </asset>
+        <worldbody/>
+        </mujoco>""")
+    assets, world = root[2], root[3]
+    # One lamp is a ring of weak ones: MuJoCo's shadows are hard, their sum is soft.
     for angle in 2 * np.pi * np.arange(_LAMPS) / _LAMPS:
         at = scene.light_in_base + 0.12 * np.array([np.cos(angle), np.sin(angle), 0.0])
-        xml.SubElement(
-            world,
-            "light",
-            pos=_text(at),
-            dir=_text(scene.table_center_in_base - at),
-            diffuse=_text(np.full(3, 0.6 / _LAMPS)),
-            specular=_text(np.full(3, 0.3 / _LAMPS)),
-            ambient="0 0 0",
-            cutoff="40",
-            exponent="1",
-            castshadow="true",
-        )
-
-
-def _add_body(
-    assets: xml.Element,
-    world: xml.Element,
-    files: dict[str, bytes],
-    label: int,
-    base_from_body: ndarray,
-    parts: Iterable[Part],
-    textured: bool,
-) -> None:
-    body = xml.SubElement(
-        world, "body", pos=_text(base_from_body[:3, 3]), xyaxes=_text(base_from_body[:3, :2].T)
-    )
-    for k, part in enumerate(parts):
-        name = f"{LABEL_PREFIX}{label}-{k}"
-        xml.SubElement(
-            assets,
-            "mesh",
-            name=name,
-            vertex=_text(part.mesh.vertices),
-            # MuJoCo counts v from the first row of the image, that is from its top.
-            texcoord=_text(part.mesh.uv * [1, -1] + [0, 1]),
-            face=_text(part.mesh.faces),
-            # Parts are open sheets, which have no volume.
-            inertia="shell",
-        )
-        material = xml.SubElement(assets, "material", name=name, specular=f"{part.shine}", shininess="0.4")
-        if textured and part.texture is not None:
-            files[f"{name}.png"] = encode_png(part.texture)
-            xml.SubElement(assets, "texture", name=name, type="2d", file=f"{name}.png")
-            material.set("texture", name)
-        else:
-            material.set("rgba", _text((*part.color, 1.0)))
-        xml.SubElement(
-            body, "geom", name=name, type="mesh", mesh=name, material=name, contype="0", conaffinity="0"
-        )
+        shine = {"diffuse": _text(np.full(3, 0.6 / _LAMPS)), "specular": _text(np.full(3, 0.3 / _LAMPS))}
+        fixed = {"ambient": "0 0 0", "cutoff": "40", "exponent": "1", "castshadow": "true"}
+        xml.SubElement(world, "light", pos=_text(at), dir=_text(center - at), **shine, **fixed)
+    xml.SubElement(world, "camera", name=CAMERA, fovy=repr(float(np.degrees(fovy))))
+    floor = _text(center - [0, 0, _FLOOR_BELOW_TABLE])
+    xml.SubElement(world, "geom", type="box", size="3 3 .01", pos=floor, rgba=".36 .36 .37 1")
+    files: dict[str, bytes] = {}
+    bodies = [(transform(np.eye(3), center), scene.table)]
+    bodies += [(thing.base_from_object, thing.parts) for thing in scene.objects]
+    for label, (base_from_body, parts) in enumerate(bodies, start=1):
+        axes = _text(base_from_body[:3, :2].T)
+        body = xml.SubElement(world, "body", pos=_text(base_from_body[:3, 3]), xyaxes=axes)
+        for k, part in enumerate(parts):
+            name = f"{LABEL_PREFIX}{label}-{k}"
+            # MuJoCo counts v from the first row of the image, that is from its top. Parts are open sheets, which have
+            # no volume.
+            vertex, face = _text(part.mesh.vertices), _text(part.mesh.faces)
+            texcoord = _text(part.mesh.uv * [1, -1] + [0, 1])
+            xml.SubElement(
+                assets, "mesh", name=name, vertex=vertex, texcoord=texcoord, face=face, inertia="shell"
+            )
+            shine = {"specular": f"{part.shine}", "shininess": "0.4"}
+            material = xml.SubElement(assets, "material", name=name, **shine)
+            if textured and part.texture is not None:
+                files[f"{name}.png"] = encode_png(part.texture)
+                xml.SubElement(assets, "texture", name=name, type="2d", file=f"{name}.png")
+                material.set("texture", name)
+            else:
+                material.set("rgba", _text((*part.color, 1.0)))
+            of_mesh = {"mesh": name, "material": name, "contype": "0", "conaffinity": "0"}
+            xml.SubElement(body, "geom", name=name, type="mesh", **of_mesh)
+    return xml.tostring(root, encoding="unicode"), files
 
 
 def _text(numbers) -> str:
