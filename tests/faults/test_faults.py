@@ -486,12 +486,12 @@ def test_a_failed_run_leaves_no_map_of_an_earlier_one(tmp_path: Path, sound: Pat
 
 
 def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(
-    tmp_path: Path, done: Path, sound: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, small_done: Path, sound: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Killed between the two files of another capture, the first capture's run would take the wrong one."""
     out = tmp_path / "out"
-    shutil.copytree(done, out)
-    kept = RunResult(done).reconstruction
+    shutil.copytree(small_done, out)
+    kept = RunResult(small_done).reconstruction
     monkeypatch.setattr(selection, "reconstruct", lambda *_: kept)
 
     def killed(*_) -> None:
