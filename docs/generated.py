@@ -26,7 +26,6 @@ from jcr.depth.depth_npz import About as DepthAbout
 from jcr.findings import FindingKind
 from jcr.findings.table import GROUPS, Row
 from jcr.reconstruct import BACKENDS
-from jcr.reconstruction_npz import About
 from jcr.run_folder import State
 
 REFERENCE = Path(__file__).parent / "reference"
@@ -39,13 +38,10 @@ FORMATS = {
     ),
     "cameras.json": (CamerasFile, "Further cameras and arms of the cell, where there are some."),
     "run.json": (State, "The state of a run folder: capture, options, fingerprint of the reconstruction."),
-    "reconstruction.npz": (
-        About,
-        "The array `about` in it, as JSON; other arrays have the names of [Reconstruction](api.md#jcrreconstruction).",
-    ),
     "depth.npz": (
         DepthAbout,
-        "The array `about` in it, as JSON; other arrays have the names of [Pointmaps](api.md#jcrpointmaps).",
+        "The array `about` in it, as JSON; other arrays have the names of [Pointmaps](api.md#jcrpointmaps). "
+        "In reconstruction.npz, `about` is a [Reconstruction](api.md#jcrreconstruction) with the names of its arrays.",
     ),
 }
 """Files of a run folder that a pydantic model in the source describes."""

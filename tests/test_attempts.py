@@ -343,10 +343,7 @@ def test_a_known_length_ends_on_surfaces_and_nothing_else_needs_depth_before_the
         lambda _, options, __: reconstruction(options.backend, answers[options.backend]),
     )
     monkeypatch.setattr(selection, "densify", deeper)
-    names = tuple(f"{k:02d}.png" for k in range(8))
-    capture = Capture(
-        folder=Path(), images=names, base_from_gripper=problem.base_from_gripper, image_size=(640, 480)
-    )
+    capture = capture_of(problem)
     choice = selection.choose(capture, ReconstructOptions(), CalibrateOptions())
     assert not densified and choice.reconstruction.pointmaps is None
     for length, why in (("nowhere.png", "nowhere"), ("00.png", "no surface was found")):

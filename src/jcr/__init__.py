@@ -19,12 +19,25 @@ Transforms are 4×4 and named a_from_b, points x_in_a; metres and radians, pixel
 Lists are taken for arrays, and dicts for options. help(jcr.run) describes one name; `jcr docs` lists the manual.
 """
 
+import ctypes
+import sys
+import warnings
+from contextlib import suppress
 from importlib.util import find_spec
 from typing import Any
 
 import lazy_loader
 
-from jcr import deflate  # noqa: F401
+# The library of pycolmap 4.1 and later exports a deflate of its own. On Linux a libz that is loaded after pycolmap calls
+# parts of that one, and the next PNG or zip archive that anybody in the process writes (Pillow, OpenCV, Python's own
+# zlib) aborts the process; reading is not concerned. So the system's zlib is loaded first.
+if "pycolmap" in sys.modules:
+    warnings.warn(
+        "pycolmap was imported before jcr: import jcr first, or writing PNG files may abort Python",
+        stacklevel=2,
+    )
+with suppress(OSError):  # other systems have no library of this name, nor the conflict
+    ctypes.CDLL("libz.so.1")
 
 # SciPy and COLMAP take seconds to import: the stub __init__.pyi names the modules, each imported when it is first used.
 _attribute, _, __all__ = lazy_loader.attach_stub(__name__, __file__)

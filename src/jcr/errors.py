@@ -1,4 +1,4 @@
-"""The two things that can be wrong and are no bug: the user's input, and a rejected answer."""
+"""Errors that are no bug: input that cannot be used, and a rejected result."""
 
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
@@ -10,21 +10,23 @@ def printable(text: str) -> str:
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """ "; did you mean …?" where one of the known words is like it; else nothing."""
+    """Return a question for the known word that is like this one; empty where none is."""
     like = get_close_matches(word.lower(), known, n=1)
     return f"; did you mean {like[0]}?" if like else ""
 
 
 class InputError(ValueError):
-    """The user's input cannot be used; the message says what, where and how to fix it (exit status 2)."""
+    """Input that cannot be used; the message says what, where and how to fix it (exit status 2)."""
 
     def __init__(self, message: str) -> None:
         super().__init__(printable(message))
 
 
 class RejectedError(RuntimeError):
-    """The input is sound but the result is rejected: the reason, what would help, and what else is worth saying (exit
-    status 3). `despite_texture`: the images show features enough, so that their lack is not the reason."""
+    """Rejection of the result of sound input: reason, remedies, and further sentences (exit status 3).
+
+    `despite_texture`: the images show features enough, so that their lack is not the reason.
+    """
 
     def __init__(
         self, what: str, *remedies: str, also: Sequence[str] = (), despite_texture: bool = False

@@ -6,7 +6,7 @@ A back end of this package is a file and a row here. Another package adds rows b
 
 import logging
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -21,7 +21,7 @@ from jcr.extras import extra, install, is_installed, xfeat_is_installed
 from jcr.features.order import order_by_pose
 from jcr.hub import HUB_ID, Weights, cached_files
 from jcr.progress import Progress
-from jcr.records import Boards, CameraEvidence, Capture, Reconstruction
+from jcr.records import CameraEvidence, Capture, Reconstruction
 
 CC_BY_NC_SA = "CC BY-NC-SA 4.0, non-commercial use only (https://creativecommons.org/licenses/by-nc-sa/4.0/)"
 INSTALL_DA3 = "pip install omegaconf addict einops && pip install --no-deps depth-anything-3"
@@ -30,8 +30,6 @@ GROUP = "jcr.backends"
 """Group of the entry points of back ends from other packages."""
 MARKER = "marker"
 """Name of the back end that uses the board and nothing else."""
-PATHS = ("predictions", "cameras")
-"""Options that name files."""
 
 logger = logging.getLogger(__name__)
 
@@ -317,16 +315,6 @@ class ReconstructOptions:
     """Pairs of images that dust3r and mast3r process: all, near in order, or near by the gripper poses; auto: all of
     up to 12 images, else robot."""
 
-    def with_absolute_paths(self) -> "ReconstructOptions":
-        """Return the options with absolute paths."""
-        paths = {name: path.resolve() for name in PATHS if isinstance(path := getattr(self, name), Path)}
-        return replace(self, **paths)
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the fields as JSON values, paths as absolute text."""
-        values = asdict(self.with_absolute_paths())
-        return {name: str(x) if isinstance(x, Path) else x for name, x in values.items()}
-
 
 def check_board(options: ReconstructOptions) -> None:
     """Raise InputError, before any work, for a --board that names none."""
@@ -374,6 +362,9 @@ def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Re
     rows = np.argsort(image_index)
     row_of = np.argsort(rows)
     tracks, evidence = reconstruction.tracks, reconstruction.evidence
+    boards = tracks.boards
+    if boards is not None:
+        boards = replace(boards, elsewhere=tuple(sorted(row_of[list(boards.elsewhere)].tolist())))
     if evidence is not None:
         numbers = (6 * rows[:, None] + np.arange(6)).ravel()
         evidence = CameraEvidence(
@@ -384,16 +375,9 @@ def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Re
         image_index=image_index[rows],
         recon_from_camera=reconstruction.recon_from_camera[rows],
         pointmaps=None if reconstruction.pointmaps is None else reconstruction.pointmaps.of_rows(rows),
-        tracks=replace(tracks, image=row_of[tracks.image], boards=_in_order(tracks.boards, row_of)),
+        tracks=replace(tracks, image=row_of[tracks.image], boards=boards),
         evidence=evidence,
     )
-
-
-def _in_order(boards: Boards | None, row_of: Int[ndarray, " m"]) -> Boards | None:
-    """Return the boards with rows renumbered by `row_of`."""
-    if boards is None:
-        return None
-    return replace(boards, elsewhere=tuple(sorted(row_of[list(boards.elsewhere)].tolist())))
 
 
 def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
@@ -517,9 +501,8 @@ def weights_command(row: Backend) -> str:
 def _given_options(options: ReconstructOptions) -> dict[str, Any]:
     """Return the options that not every back end uses and that differ from their defaults."""
     own = {name for row in BACKENDS.values() for name in row.options}
-    values = {field.name: getattr(options, field.name) for field in fields(options) if field.name in own}
-    unset = {field.name: field.default for field in fields(options)}
-    return {name: value for name, value in values.items() if value != unset[name]}
+    unset = {field.name: field.default for field in fields(options) if field.name in own}
+    return {name: value for name in unset if (value := getattr(options, name)) != unset[name]}
 
 
 def _flag(name: str) -> str:

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,104 +15,64 @@ from jcr.capture.plain_files import first_fault, shown
 from jcr.errors import InputError
 from jcr.files import require_file, written_whole
 from jcr.geometry import require_rigid
-from jcr.intrinsics_json import IntrinsicsJson, Positive
-from jcr.records import Boards, Body, CameraEvidence, Pointmaps, Reconstruction, Tracks
+from jcr.intrinsics_json import IntrinsicsJson
+from jcr.records import Reconstruction
 
-FORMAT = "jcr.reconstruction/8"
+FORMAT = "jcr.reconstruction/9"
 """Changes with what the file holds."""
-OF_TRACKS = ("image", "x_px", "point", "points_in_recon", "std_px")
-OF_POINTMAPS = ("points_in_recon", "confidence", "colors", "reason", "depth_std")
-
-
-class BoardsJson(BaseModel):
-    """Fields of records.Boards that are no arrays."""
-
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-    spec: str
-    side: Positive
-    size_std: Positive | None
-    numbers: list[int]
-    """Numbers of the bodies."""
-    elsewhere: list[int]
-    proposed: str | None
+ARRAY = "array"
+"""Key of the JSON that names an array of the file."""
 
 
 class About(BaseModel):
-    """Fields of a reconstruction that are no arrays."""
+    """Content of the file: its JSON, with the arrays in place of their names."""
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
     format: str
-    backend: str
-    is_metric: bool
-    metric_std: Positive | None
-    notes: list[str]
-    warnings: list[str]
-    intrinsics: IntrinsicsJson
-    pointmap_intrinsics: IntrinsicsJson | None = None
-    boards: BoardsJson | None = None
-    predicted_focal: tuple[float, float] | None = None
+    reconstruction: Reconstruction
 
 
 def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
     """Write the record whole or not at all."""
-    pointmaps, tracks, evidence = reconstruction.pointmaps, reconstruction.tracks, reconstruction.evidence
-    about = {
-        "format": FORMAT,
-        "backend": reconstruction.backend,
-        "is_metric": reconstruction.is_metric,
-        "metric_std": reconstruction.metric_std,
-        "notes": list(reconstruction.notes),
-        "warnings": list(reconstruction.warnings),
-        "intrinsics": asdict(reconstruction.intrinsics),
-        "pointmap_intrinsics": None if pointmaps is None else asdict(pointmaps.intrinsics),
-        "boards": None if tracks.boards is None else _about_boards(tracks.boards),
-        "predicted_focal": reconstruction.predicted_focal,
-    }
-    arrays = {
-        "image_index": reconstruction.image_index,
-        "recon_from_camera": reconstruction.recon_from_camera,
-        "tracks_from_pointmaps": np.array(tracks.from_pointmaps),
-        "tracks_from_board": np.array(tracks.from_board),
-    }
-    arrays |= {f"track_{name}": array for name in OF_TRACKS if (array := getattr(tracks, name)) is not None}
-    if tracks.boards is not None and (bodies := tracks.boards.bodies):
-        arrays |= {
-            "board_body": np.repeat(np.arange(len(bodies)), [len(body.point) for body in bodies]),
-            "board_point": np.concatenate([body.point for body in bodies]),
-            "board_x_in_body": np.concatenate([body.x_in_body for body in bodies]),
+    arrays: dict[str, np.ndarray] = {}
+    content = _named(reconstruction, "", arrays)
+    write_npz(path, {"format": FORMAT, "reconstruction": content}, arrays)
+
+
+def _named(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
+    """Return a value as JSON, with the names of its arrays, which are put into `arrays`."""
+    if isinstance(value, np.ndarray):
+        arrays[name] = value
+        return {ARRAY: name}
+    prefix = name and f"{name}."
+    if is_dataclass(value):
+        return {
+            own.name: _named(getattr(value, own.name), prefix + own.name, arrays) for own in fields(value)
         }
-    if evidence is not None:
-        arrays |= {
-            "evidence_recon_from_camera": evidence.recon_from_camera,
-            "evidence_covariance": evidence.covariance,
-        }
-    if pointmaps is not None:
-        arrays |= arrays_of(pointmaps)
-    write_npz(path, about, arrays)
+    if isinstance(value, tuple):
+        return [_named(one, f"{prefix}{k}", arrays) for k, one in enumerate(value)]
+    return value
 
 
-def arrays_of(pointmaps: Pointmaps) -> dict[str, np.ndarray]:
-    """Return the arrays of pointmaps by their names in a file; `pointmaps_in` reads them."""
-    return {name: array for name in OF_POINTMAPS if (array := getattr(pointmaps, name)) is not None}
+def _filled(value: Any, file: Mapping[str, np.ndarray]) -> Any:
+    """Return the JSON of `_named` with the arrays of the file; raise KeyError or ValueError where one is not whole."""
+    if isinstance(value, list):
+        return tuple(_filled(one, file) for one in value)
+    if not isinstance(value, dict):
+        return value
+    if value.keys() != {ARRAY}:
+        return {name: _filled(one, file) for name, one in value.items()}
+    array = file[value[ARRAY]]
+    check_arrays({value[ARRAY]: (array, array.shape)})
+    return array
 
 
-def pointmaps_in(file: Mapping[str, np.ndarray], intrinsics: IntrinsicsJson, images: int) -> Pointmaps:
-    """Return the pointmaps of this many images in a file; raise KeyError or ValueError where they are not whole."""
-    found = Pointmaps(
-        intrinsics=intrinsics.record(),
-        points_in_recon=file["points_in_recon"],
-        confidence=file["confidence"],
-        colors=file["colors"],
-        reason=file.get("reason"),
-        depth_std=file.get("depth_std"),
-    )
-    size = images, found.intrinsics.height, found.intrinsics.width
-    shapes = {
-        name: (array, (*size, 3) if name in ("points_in_recon", "colors") else size)
-        for name, array in arrays_of(found).items()
-    }
-    check_arrays(shapes)
-    return found
+def read_reconstruction(path: Path) -> Reconstruction:
+    """Read a reconstruction.npz; raise InputError where it is damaged or of another format."""
+    with read_npz(path, FORMAT) as (text, file):
+        found = About.model_validate(_filled(json.loads(text), file)).reconstruction
+        _check(found)
+        return found
 
 
 def write_npz(path: Path, about: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
@@ -148,77 +108,8 @@ def read_npz(path: Path, expected: str) -> Iterator[tuple[str, Mapping[str, np.n
         raise InputError(f"{path}: damaged ({error}); delete it and run again") from None
 
 
-def read_reconstruction(path: Path) -> Reconstruction:
-    """Read a reconstruction.npz; raise InputError where it is damaged or of a newer format."""
-    with read_npz(path, FORMAT) as (text, file):
-        about = About.model_validate_json(text, strict=True)
-        found = Reconstruction(
-            image_index=file["image_index"],
-            recon_from_camera=file["recon_from_camera"],
-            intrinsics=about.intrinsics.record(),
-            tracks=Tracks(
-                **{name: file[f"track_{name}"] for name in OF_TRACKS if name != "std_px"},
-                from_pointmaps=bool(file["tracks_from_pointmaps"]),
-                from_board=bool(file["tracks_from_board"]),
-                std_px=file.get("track_std_px"),
-                boards=None if about.boards is None else _boards(file, about.boards),
-            ),
-            backend=about.backend,
-            pointmaps=_pointmaps(file, about),
-            is_metric=about.is_metric,
-            metric_std=about.metric_std,
-            notes=tuple(about.notes),
-            warnings=tuple(about.warnings),
-            evidence=_evidence(file),
-            predicted_focal=about.predicted_focal,
-        )
-        _check(found)
-    return found
-
-
-def _about_boards(boards: Boards) -> dict[str, Any]:
-    return {
-        "spec": boards.spec,
-        "side": boards.side,
-        "size_std": boards.size_std,
-        "numbers": [body.number for body in boards.bodies],
-        "elsewhere": list(boards.elsewhere),
-        "proposed": boards.proposed,
-    }
-
-
-def _boards(file: Mapping[str, np.ndarray], about: BoardsJson) -> Boards:
-    """KeyError or ValueError where its arrays are not whole."""
-    bodies = []
-    for k, number in enumerate(about.numbers):
-        own = file["board_body"] == k
-        point, x_in_body = file["board_point"][own], file["board_x_in_body"][own]
-        check_arrays({"board_point": (point, (len(point),)), "board_x_in_body": (x_in_body, (len(point), 3))})
-        bodies.append(Body(number, point, x_in_body))
-    return Boards(
-        spec=about.spec,
-        side=about.side,
-        size_std=about.size_std,
-        bodies=tuple(bodies),
-        elsewhere=tuple(about.elsewhere),
-        proposed=about.proposed,
-    )
-
-
-def _pointmaps(file: Mapping[str, np.ndarray], about: About) -> Pointmaps | None:
-    if about.pointmap_intrinsics is None:
-        return None
-    return pointmaps_in(file, about.pointmap_intrinsics, len(file["image_index"]))
-
-
-def _evidence(file: Mapping[str, np.ndarray]) -> CameraEvidence | None:
-    if "evidence_covariance" not in file:
-        return None
-    return CameraEvidence(file["evidence_recon_from_camera"], file["evidence_covariance"])
-
-
 def check_arrays(shapes: Mapping[str, tuple[np.ndarray, tuple[int, ...]]]) -> None:
-    """ValueError where an array, by name, has another shape than it should, or is not finite."""
+    """Raise ValueError where an array, by name, has another shape than it should, or is not finite."""
     for name, (array, shape) in shapes.items():
         if array.shape != shape:
             raise ValueError(f"{name} has shape {array.shape}, not {shape}")
@@ -227,36 +118,42 @@ def check_arrays(shapes: Mapping[str, tuple[np.ndarray, tuple[int, ...]]]) -> No
 
 
 def _check(found: Reconstruction) -> None:
-    """ValueError where the arrays do not belong together, or hold what cannot be."""
-    m, tracks, evidence = len(found.image_index), found.tracks, found.evidence
-    k, p = len(tracks.image), len(tracks.points_in_recon)
-    shapes = {
-        "recon_from_camera": (found.recon_from_camera, (m, 4, 4)),
-        "image_index": (found.image_index, (m,)),
-        "track_image": (tracks.image, (k,)),
-        "track_x_px": (tracks.x_px, (k, 2)),
-        "track_point": (tracks.point, (k,)),
-        "track_points_in_recon": (tracks.points_in_recon, (p, 3)),
-    }
+    """Raise ValueError where the arrays do not belong together, or hold what cannot be."""
+    m, tracks, evidence, maps = len(found.image_index), found.tracks, found.evidence, found.pointmaps
+    k, p, boards = len(tracks.image), len(tracks.points_in_recon), tracks.boards
+    shapes = {"cameras": (found.recon_from_camera, (m, 4, 4)), "x_px": (tracks.x_px, (k, 2))}
+    rows = [("image_index", found.image_index, np.inf), ("tracks.image", tracks.image, m)]
+    shapes["tracks.point"], cameras = (tracks.point, (k,)), [*found.recon_from_camera]
+    positive = [found.metric_std or 1.0]
     if tracks.std_px is not None:
-        shapes["track_std_px"] = tracks.std_px, (k,)
-        if (tracks.std_px <= 0).any():
-            raise ValueError("track_std_px holds what is not positive")
+        shapes["std_px"] = tracks.std_px, (k,)
+        positive += tracks.std_px.tolist()
+    if boards is not None:
+        positive += [boards.side, boards.size_std or 1.0]
+        rows.append(("boards.elsewhere", np.array(boards.elsewhere, int), m))
+        for body in boards.bodies:
+            shapes[f"body {body.number}"] = body.x_in_body, (len(body.point), 3)
+            rows.append(("board's point", body.point, p))
     if evidence is not None:
-        shapes["evidence_recon_from_camera"] = evidence.recon_from_camera, (m, 4, 4)
-        shapes["evidence_covariance"] = evidence.covariance, (6 * m, 6 * m)
+        shapes["evidence"] = evidence.recon_from_camera, (m, 4, 4)
+        shapes["covariance"] = evidence.covariance, (6 * m, 6 * m)
+        cameras += [*evidence.recon_from_camera]
+    if maps is not None:
+        IntrinsicsJson.model_validate(asdict(maps.intrinsics))
+        size = m, maps.intrinsics.height, maps.intrinsics.width
+        shapes |= {
+            name: (array, (*size, 3) if name in ("points_in_recon", "colors") else size)
+            for name, array in vars(maps).items()
+            if isinstance(array, np.ndarray)
+        }
+    IntrinsicsJson.model_validate(asdict(found.intrinsics))
     check_arrays(shapes)
-    for name, index, end in (
-        ("image_index", found.image_index, np.inf),
-        ("track_image", tracks.image, m),
-        ("track_point", tracks.point, p),
-        *(("board_point", body.point, p) for body in (tracks.boards.bodies if tracks.boards else ())),
-        ("board elsewhere", np.array(tracks.boards.elsewhere if tracks.boards else (), int), m),
-    ):
+    if min(positive) <= 0:
+        raise ValueError("a length or a standard deviation is not positive")
+    for name, index, end in (*rows, ("tracks.point", tracks.point, p)):
         if index.dtype.kind not in "iu" or (index < 0).any() or (index >= end).any():
             raise ValueError(f"{name} counts rows that are not there")
     if (np.diff(found.image_index) <= 0).any():
         raise ValueError("image_index does not ascend")
-    for cameras in (found.recon_from_camera, *(() if evidence is None else (evidence.recon_from_camera,))):
-        for row, camera in enumerate(cameras):
-            require_rigid(camera, f"camera {row}")
+    for row, camera in enumerate(cameras):
+        require_rigid(camera, f"camera {row % m}")

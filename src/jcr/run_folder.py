@@ -114,11 +114,12 @@ def state_of(capture: Capture, options: RunOptions) -> State:
     # Back ends that `auto` means on this machine, and weights where they are files.
     deciding = asdict(made) | {"backend": candidates(made)}
     deciding["weights"] = Path(made.weights) if made.weights and Path(made.weights).exists() else made.weights
+    paths = {name: path.resolve() for name, path in vars(made).items() if isinstance(path, Path)}
     images = [(name, capture.folder / name) for name in capture.images]
     inputs = images, capture.base_from_gripper, capture.intrinsics
     return State(
         capture=folder,
-        options=replace(options, reconstruct=made.with_absolute_paths()),
+        options=replace(options, reconstruct=replace(made, **paths)),
         reconstruction=fingerprint(*inputs, deciding, __version__, FORMAT),
     )
 

@@ -14,7 +14,7 @@ import struct
 import subprocess
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from jcr.cli import dispatch
 from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import forward_kinematics
 from jcr.pipeline import run, selection
+from jcr.records import Reconstruction
 from jcr.run_folder import RunResult
 from simulation.problems import hand_eye_problem
 
@@ -504,9 +505,9 @@ def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(
 
 
 ARRAYS = {
-    "jcr.reconstruction/8": {
-        "about", "image_index", "recon_from_camera", "track_image", "track_point", "track_points_in_recon",
-        "track_std_px", "track_x_px", "tracks_from_board", "tracks_from_pointmaps",
+    "jcr.reconstruction/9": {
+        "about", "image_index", "recon_from_camera", "tracks.image", "tracks.point", "tracks.points_in_recon",
+        "tracks.std_px", "tracks.x_px",
     },
     "jcr.depth/2": {"about", "confidence", "depth", "filled", "matched", "relative_std"},
 }  # fmt: skip
@@ -520,21 +521,17 @@ def test_a_reconstruction_of_another_version_is_distinguished(
         arrays = dict(file)
     about = json.loads(str(arrays["about"]))
     assert ARRAYS[about["format"]] == set(arrays)
-    assert set(about) == {
-        "format", "backend", "is_metric", "metric_std", "notes", "warnings", "intrinsics", "pointmap_intrinsics",
-        "predicted_focal",
-        "boards",
-    }  # fmt: skip
+    assert set(about["reconstruction"]) == {field.name for field in fields(Reconstruction)}
     with np.load(done / "depth.npz") as file:
         assert ARRAYS[json.loads(str(file["about"]))["format"]] == set(file)
     out = tmp_path / "out"
     shutil.copytree(done, out)
-    del about["metric_std"]
+    del about["reconstruction"]["metric_std"]
     old = json.dumps(about | {"format": "jcr.reconstruction/1"})
     np.savez(out / "reconstruction.npz", **arrays | {"about": np.array(old)})
     assert dispatch(["map", str(out), "--quiet"]) == 2
     said = capsys.readouterr().err
-    assert "'jcr.reconstruction/1', not 'jcr.reconstruction/8'; delete it and run again" in said
+    assert "'jcr.reconstruction/1', not 'jcr.reconstruction/9'; delete it and run again" in said
 
 
 def test_a_full_disk_leaves_the_earlier_results(tmp_path: Path, small_done: Path, capsys):

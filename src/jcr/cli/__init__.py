@@ -103,8 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _end(status: int) -> NoReturn:
-    """End the process now that all is written: the interpreter would take every module apart, torch's and the
-    compiler's for a second."""
+    """End the process after its output is written, without the second in which the interpreter takes modules apart."""
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError):
@@ -123,7 +122,7 @@ def wait_asleep() -> None:
 
 
 def _open_closed_streams() -> None:
-    """Nowhere, in place of standard streams that are closed: the next file would get their number, and be written to."""
+    """Open closed standard streams to nowhere; the next file would get their number, and be written to."""
     for number in range(3):
         try:
             os.fstat(number)
@@ -213,13 +212,13 @@ def _guarded(action: Callable[[], int]) -> int:
 
 
 def _write_no_more() -> None:
-    """Nothing to standard output from now on, not even at exit."""
+    """Write nothing to standard output from now on, not even at exit."""
     with contextlib.suppress(OSError):  # no file, where tests read it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _interrupted(error: BaseException | None) -> bool:
-    """Whether Ctrl-C is behind an error; libraries interrupted while they load call it an error of their own."""
+    """Test whether Ctrl-C is behind an error; libraries that it interrupts while they load raise errors of their own."""
     while error is not None:
         if isinstance(error, KeyboardInterrupt):
             return True

@@ -15,7 +15,6 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Literal, get_args
 
-from jcr.calibration.record import Calibration
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, RejectedError
@@ -103,51 +102,41 @@ def batch(
 
 def run_one(task: Task) -> Row:
     """Run one capture, unless it is finished, and return its row; an error is in the row."""
-    start = time.perf_counter()
+    start, reason = time.perf_counter(), ""
     try:
         with locked(task.out):
             capture = read_capture(task.capture, task.read, into=task.out / CAPTURE)
         options = replace(task.run, map=None) if task.calibrate_only else task.run
-        reason = ""
         try:
             content = run(capture, task.out, options).calibration
         except RejectedError as error:
             content, reason = load_run(task.out).calibration, str(error)
-        row = replace(_row(task, content), seconds=round(time.perf_counter() - start, 2))
-        named = next((sentence(one) for one in content.findings if one.severity != "informs"), "")
-        return replace(row, reason=reason or named)
     except InputError as error:
         return _failed(task, str(error))
     except Exception as error:  # a bug shows in its row, and does not take the other captures with it
         return _failed(task, f"{type(error).__name__}: {error}")
-
-
-def _failed(task: Task, reason: str) -> Row:
-    return Row(capture=str(task.capture), out=str(task.out), status="failed", reason=reason)
-
-
-def _row(task: Task, content: Calibration) -> Row:
-    row = Row(
+    uncertainty, held_out = content.uncertainty, content.held_out
+    named = next((sentence(one) for one in content.findings if one.severity != "informs"), "")
+    return Row(
         capture=str(task.capture),
         out=str(task.out),
         status=verdict_of(content.findings),
         backend=content.backend,
         images=len(content.images),
         used=content.images_used,
+        offset_std_mm=None if uncertainty is None else max(uncertainty.translation_std_mm),
+        turn_std_deg=None if uncertainty is None else max(uncertainty.rotation_std_deg),
+        scale_std_percent=None if uncertainty is None else uncertainty.scale_std_percent,
+        held_out_mm=None if held_out is None else held_out.translation_mm,
+        held_out_deg=None if held_out is None else held_out.rotation_deg,
+        seconds=round(time.perf_counter() - start, 2),
+        reason=reason or named,
     )
-    if content.uncertainty is not None:
-        uncertainty = content.uncertainty
-        row = replace(
-            row,
-            offset_std_mm=max(uncertainty.translation_std_mm),
-            turn_std_deg=max(uncertainty.rotation_std_deg),
-            scale_std_percent=uncertainty.scale_std_percent,
-        )
-    if content.held_out is not None:
-        row = replace(
-            row, held_out_mm=content.held_out.translation_mm, held_out_deg=content.held_out.rotation_deg
-        )
-    return row
+
+
+def _failed(task: Task, reason: str) -> Row:
+    """Return the row of a capture that failed."""
+    return Row(capture=str(task.capture), out=str(task.out), status="failed", reason=reason)
 
 
 def is_accepted(row: Row) -> bool:
@@ -263,17 +252,14 @@ def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[Row]:
 
 
 def _write_summary(out: Path, rows: list[Row]) -> None:
+    """Write the table as CSV and as a page."""
     text = io.StringIO()
     table = csv.DictWriter(text, [field.name for field in fields(Row)], lineterminator="\n")
     table.writeheader()
     table.writerows(asdict(row) for row in rows)
     write_text(out / "summary.csv", text.getvalue())
-    write_text(out / "summary.html", _page(rows))
-
-
-def _page(rows: list[Row]) -> str:
     numbers = ("offset_std_mm", "turn_std_deg", "scale_std_percent", "held_out_mm", "held_out_deg", "seconds")
-    table = [
+    shown = [
         {
             "row": row,
             "name": Path(row.out).name,
@@ -283,4 +269,4 @@ def _page(rows: list[Row]) -> str:
         }
         for row in rows
     ]
-    return render("batch.html", {"table": table})
+    write_text(out / "summary.html", render("batch.html", {"table": shown}))

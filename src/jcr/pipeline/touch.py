@@ -17,8 +17,6 @@ from jcr.run_folder import RunResult
 COLUMNS = ("image", "x_px", "y_px", "x_m", "y_m", "z_m")
 LEAST = 3
 """Fewest points that distinguish a wrong calibration from one bad touch."""
-UNLIKELY = 1e-3
-"""Largest p-value of errors that the reported uncertainty does not explain."""
 
 
 @dataclass(frozen=True)
@@ -59,42 +57,33 @@ def touch(out: str | Path, points: str | Path) -> TouchTest:
     """
     points = Path(points)
     calibration, capture, reconstruction = RunResult(out).of_wrist_camera()
-    rows = _rows(points)
+    images, numbers = _read(points)
     x, base_from_recon = calibration.gripper_from_camera, calibration.base_from_recon
-    scale = base_from_recon.scale
-    found = np.array([surface_at(capture, reconstruction, image, px, points.name) for image, px, _ in rows])
-    mapped = base_from_recon(found)
     row_of = {capture.images[row]: k for k, row in enumerate(reconstruction.image_index)}
-    jacobian = np.empty((len(rows), 3, 7))
-    for k, (image, _, _) in enumerate(rows):
-        seen_by = row_of[image]
-        arm = x[:3, :3] @ (scale * apply(inverse(reconstruction.recon_from_camera[seen_by]), found[k]))
-        rotation = capture.base_from_gripper[reconstruction.image_index[seen_by], :3, :3]
+    error, jacobian = np.empty((len(images), 3)), np.empty((len(images), 3, 7))
+    for k, (image, own) in enumerate(zip(images, numbers, strict=True)):
+        found = surface_at(capture, reconstruction, image, own[:2], points.name)
+        error[k], row = own[2:] - base_from_recon(found), row_of[image]
+        in_camera = apply(inverse(reconstruction.recon_from_camera[row]), found)
+        arm = x[:3, :3] @ (base_from_recon.scale * in_camera)
+        rotation = capture.base_from_gripper[reconstruction.image_index[row], :3, :3]
         jacobian[k] = rotation @ np.column_stack([np.eye(3), -skew(arm), arm])
-    stacked = jacobian.reshape(-1, 7)
-    covariance = stacked @ calibration.covariance @ stacked.T
-    covariance += _touch_variance(calibration) * np.eye(len(covariance))
-    error = np.array([tip for _, _, tip in rows]) - mapped
-    squared = float(error.ravel() @ np.linalg.solve(covariance, error.ravel()))
-    return TouchTest(
-        tuple(image for image, _, _ in rows),
-        error,
-        np.sqrt(np.diag(covariance)).reshape(-1, 3),
-        float(chi2.sf(squared, error.size)),
-    )
-
-
-def _touch_variance(calibration) -> float:
-    """Return the variance (m² per axis) of a single gripper position, random and systematic."""
     noise, errors = calibration.robot_noise, calibration.robot_errors
+    assert noise is not None  # wherever there is a transform
     systematic_mm = 0.0 if errors is None else errors.translation_mm
-    return (noise.translation_mm**2 + systematic_mm**2) / 1e6
+    touch_variance = (noise.translation_mm**2 + systematic_mm**2) / 1e6
+    stacked = jacobian.reshape(-1, 7)
+    covariance = stacked @ calibration.covariance @ stacked.T + touch_variance * np.eye(len(stacked))
+    squared = float(error.ravel() @ np.linalg.solve(covariance, error.ravel()))
+    std = np.sqrt(np.diag(covariance)).reshape(-1, 3)
+    return TouchTest(tuple(images), error, std, float(chi2.sf(squared, error.size)))
 
 
-def _rows(path: Path) -> list[tuple[str, Float[ndarray, "2"], Float[ndarray, "3"]]]:
+def _read(path: Path) -> tuple[list[str], list[Float[ndarray, "5"]]]:
+    """Return the image of each point, and pixel and position (m)."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a CSV with the columns {', '.join(COLUMNS)}")
-    rows = []
+    images, numbers = list[str](), list[ndarray]()
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
@@ -103,16 +92,16 @@ def _rows(path: Path) -> list[tuple[str, Float[ndarray, "2"], Float[ndarray, "3"
                 raise InputError(f"{path}: has no column {', '.join(missing)}; give {', '.join(COLUMNS)}")
             for line, row in enumerate(reader, start=2):
                 try:
-                    numbers = np.array([float(row[name]) for name in COLUMNS[1:]])
+                    own = np.array([float(row[name]) for name in COLUMNS[1:]])
                 except (TypeError, ValueError):
-                    raise InputError(
-                        f"{path}: line {line}: {', '.join(COLUMNS[1:])} must be numbers"
-                    ) from None
-                if not np.isfinite(numbers).all() or np.abs(numbers[2:]).max() > 100:
+                    numeric = ", ".join(COLUMNS[1:])
+                    raise InputError(f"{path}: line {line}: {numeric} must be numbers") from None
+                if not np.isfinite(own).all() or np.abs(own[2:]).max() > 100:
                     raise InputError(f"{path}: line {line}: positions are finite and in metres")
-                rows.append((row["image"].strip(), numbers[:2], numbers[2:]))
+                images.append(row["image"].strip())
+                numbers.append(own)
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: is no CSV ({error})") from None
-    if len(rows) < LEAST:
-        raise InputError(f"{path}: {len(rows)} points; touch {LEAST} or more, spread over the scene")
-    return rows
+    if len(images) < LEAST:
+        raise InputError(f"{path}: {len(images)} points; touch {LEAST} or more, spread over the scene")
+    return images, numbers
