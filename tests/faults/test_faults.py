@@ -24,11 +24,10 @@ from PIL import Image
 
 import jcr
 from jcr.calibration.record import read_calibration
-from jcr.capture.read import read_capture
 from jcr.cli import dispatch
 from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import forward_kinematics
-from jcr.pipeline import run, selection
+from jcr.pipeline import run
 from jcr.records import Reconstruction
 from jcr.run_folder import RunResult
 from simulation.problems import hand_eye_problem
@@ -487,20 +486,18 @@ def test_a_failed_run_leaves_no_map_of_an_earlier_one(tmp_path: Path, sound: Pat
 
 
 def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(
-    tmp_path: Path, small_done: Path, sound: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, small_done: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Killed between the two files of another capture, the first capture's run would take the wrong one."""
-    out = tmp_path / "out"
+    out, made = tmp_path / "out", RunResult(small_done)
     shutil.copytree(small_done, out)
-    kept = RunResult(small_done).reconstruction
-    monkeypatch.setattr(selection, "reconstruct", lambda *_: kept)
 
     def killed(*_) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(run, "write_reconstruction", killed)
     with pytest.raises(KeyboardInterrupt):
-        run.calibrate(read_capture(sound), out, backend="colmap")
+        run._keep_reconstruction(out, made.reconstruction, made.state)
     assert not (out / "run.json").exists()
 
 
