@@ -1,12 +1,12 @@
 """A simulated recording: a ROS bag in which an arm goes through a capture's views and stops at each."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -99,22 +99,34 @@ def _messages(
 ) -> Iterator[tuple[int, str, Any]]:
     """Yield the recorded messages in order of time."""
 
-    def header(at: int, frame: str) -> Any:
+    def header(at: int, frame: str = "camera") -> Any:
         stamp = types["builtin_interfaces/msg/Time"](at // 10**9, at % 10**9)
         sequence = (0,) if kind == "ros1" else ()
         return types["std_msgs/msg/Header"](*sequence, stamp, frame)
 
     def tf(at: int, parent: str, child: str, pose: Float[ndarray, "4 4"]) -> Any:
-        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
-        translation = types["geometry_msgs/msg/Vector3"](*pose[:3, 3].tolist())
-        moved = types["geometry_msgs/msg/Transform"](
-            translation, types["geometry_msgs/msg/Quaternion"](x, y, z, w)
+        rotation = types["geometry_msgs/msg/Quaternion"](
+            *Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
         )
+        translation = types["geometry_msgs/msg/Vector3"](*pose[:3, 3].tolist())
+        moved = types["geometry_msgs/msg/Transform"](translation, rotation)
         stamped = types["geometry_msgs/msg/TransformStamped"](header(at, parent), child, moved)
         return types["tf2_msgs/msg/TFMessage"]([stamped])
 
+    def image_message(at: int, form: str, pixels: ndarray) -> Any:
+        height, width = pixels.shape[:2]
+        data = pixels.view(np.uint8).ravel()
+        fields = (height, width, form, 0, len(data) // height, data)
+        return types["sensor_msgs/msg/Image"](header(at), *fields)
+
+    camera = capture.intrinsics
+    assert camera is not None
+    k, d = camera.matrix.ravel(), np.array(camera.distortion)
+    p = np.column_stack([camera.matrix, np.zeros(3)]).ravel()
+    roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    optics = (camera.height, camera.width, "plumb_bob", d, k, np.eye(3).ravel(), p, 0, 0, roi)
     yield START_NS, "/tf_static", tf(START_NS, "world", "base_link", np.eye(4))
-    yield START_NS, "/camera/camera_info", _camera_info(types, header(START_NS, "camera"), capture)
+    yield START_NS, "/camera/camera_info", types["sensor_msgs/msg/CameraInfo"](header(START_NS), *optics)
     images = [read_image(capture.folder / name) for name in capture.images]
     rng = np.random.default_rng(0)
     events = [(k / tf_hz, "tf") for k in range(round(seconds * tf_hz))]
@@ -125,45 +137,18 @@ def _messages(
         if what == "tf":
             yield at, "/tf", tf(at, "base_link", "tool0", poses[0])
             continue
-        yield from _depth_images(types, header, capture, at, float(rows[0]))
-        image = _blurred(images[round(float(rows[0]))], float(speeds[0]), rng)
+        row = round(float(rows[0]))
+        if capture.depths is not None and (name := capture.depths[row]) is not None:
+            depth = (1000 * read_depth(capture.folder / name, capture.image_size)).round().astype("<u2")
+            message = image_message(at + DEPTH_LATER_NS, "16UC1", depth)
+            yield at, "/camera/aligned_depth_to_color/image_raw", message
+        # Blurred by the camera's speed, with one grey level of noise in places: no two frames are alike.
+        length = 1 + round(BLUR_PX_PER_M * float(speeds[0]))
+        image = images[row] ^ (rng.random(images[row].shape[:2]) < 0.02)[..., None].astype(np.uint8)
+        image = np.asarray(cv2.blur(image, (length, 1)), np.uint8) if length > 1 else image
         if compressed:
             data = np.asarray(cv2.imencode(".jpg", image[:, :, ::-1])[1]).ravel()
-            message = types["sensor_msgs/msg/CompressedImage"](header(at, "camera"), "jpeg", data)
+            message = types["sensor_msgs/msg/CompressedImage"](header(at), "jpeg", data)
             yield at, "/camera/image_raw/compressed", message
         else:
-            height, width, _ = image.shape
-            fields = (height, width, "rgb8", 0, 3 * width, image.ravel())
-            yield at, "/camera/image_raw", types["sensor_msgs/msg/Image"](header(at, "camera"), *fields)
-
-
-def _depth_images(
-    types: dict[str, Any], header: Callable[[int, str], Any], capture: Capture, at: int, row: float
-) -> Iterator[tuple[int, str, Any]]:
-    """Yield depth, a little later than the image at `row` of the capture."""
-    if capture.depths is not None and (name := capture.depths[round(row)]) is not None:
-        depth = (1000 * read_depth(capture.folder / name, capture.image_size)).round().astype("<u2")
-        fields = (*depth.shape, "16UC1", 0, 2 * depth.shape[1], depth.view(np.uint8).ravel())
-        message = types["sensor_msgs/msg/Image"](header(at + DEPTH_LATER_NS, "camera"), *fields)
-        yield at, "/camera/aligned_depth_to_color/image_raw", message
-
-
-def _blurred(
-    image: UInt8[ndarray, "h w 3"], speed: float, rng: np.random.Generator
-) -> UInt8[ndarray, "h w 3"]:
-    """Blur an image by the camera's speed, with one grey level of noise in places: no two frames are alike."""
-    length = 1 + round(BLUR_PX_PER_M * speed)
-    noisy = image ^ (rng.random(image.shape[:2]) < 0.02)[..., None].astype(np.uint8)
-    return np.asarray(cv2.blur(noisy, (length, 1)), dtype=np.uint8) if length > 1 else noisy
-
-
-def _camera_info(types: dict[str, Any], header: Any, capture: Capture) -> Any:
-    camera = capture.intrinsics
-    assert camera is not None
-    k, d = camera.matrix.ravel(), np.array(camera.distortion)
-    p = np.column_stack([camera.matrix, np.zeros(3)]).ravel()
-    roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-    size = (camera.height, camera.width)
-    return types["sensor_msgs/msg/CameraInfo"](
-        header, *size, "plumb_bob", d, k, np.eye(3).ravel(), p, 0, 0, roi
-    )
+            yield at, "/camera/image_raw", image_message(at, "rgb8", image)
