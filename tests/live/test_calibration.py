@@ -19,9 +19,8 @@ from jcr.capture.images import read_image
 from jcr.findings import FindingKind, sentence
 from jcr.geometry import inverse, rotation_exp, step_between, transform
 from jcr.live.calibration import LiveCalibration
-from jcr.live.notation import Notation
 from jcr.live.page import page_content
-from jcr.live.progress import Progress, next_lines
+from jcr.live.progress import Notation, Progress, next_lines
 from jcr.live.session import SessionState
 
 REQUIRED = (2.0, 0.3)

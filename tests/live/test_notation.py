@@ -9,7 +9,8 @@ from jcr.capture.conventions import CONVENTIONS, numbers_from_poses, poses_from_
 from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import forward_kinematics
 from jcr.geometry import inverse, rotation_angle, rotation_exp, transform
-from jcr.live.notation import Notation, joints_at, pose_lines
+from jcr.live.next_pose import joints_at
+from jcr.live.progress import Notation, pose_lines
 from jcr.live.robot import typed_poses
 
 POSES = transform(

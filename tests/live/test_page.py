@@ -16,8 +16,7 @@ import pytest
 import jcr
 from chromium import Chromium
 from jcr.capture.images import read_image
-from jcr.live.notation import Notation
-from jcr.live.progress import progress_lines
+from jcr.live.progress import Notation, progress_lines
 from jcr.live.robot import RobotState
 from jcr.live.server import Listen, LiveServer
 from jcr.live.session import LiveSession

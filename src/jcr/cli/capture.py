@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from jcr.capture.camera_info import IntrinsicsEntry
     from jcr.live.folder import LiveFolder
-    from jcr.live.notation import Notation
+    from jcr.live.progress import Notation
     from jcr.live.robot import States
     from jcr.live.server import Listen, LiveServer
     from jcr.live.session import Answer, LiveSession
@@ -213,7 +213,7 @@ def _listen(arguments: Capture) -> "Listen":
 def _notation(arguments: Capture, folder: "LiveFolder") -> "Notation":
     """Return the notation of printed poses: that of the options, else that of the arm."""
     from jcr.live.arms import NOTATIONS
-    from jcr.live.notation import Notation
+    from jcr.live.progress import Notation
 
     convention = arguments.pose_convention
     if convention == "auto":

@@ -10,11 +10,11 @@ from numpy import ndarray
 from jcr.calibration.case import Case
 from jcr.calibration.requirement import Proposals
 from jcr.calibration.robot_errors import RobotErrors, errors_of
-from jcr.estimation.kinematics import Arm
+from jcr.estimation.inverse_kinematics import FITS, inverse_kinematics, reach_toward
+from jcr.estimation.kinematics import Arm, forward_kinematics
 from jcr.estimation.next_poses import median_distance
 from jcr.estimation.prediction import Assumptions, assumed, typical_camera
-from jcr.geometry import rotation_angle
-from jcr.live.notation import joints_at
+from jcr.geometry import inverse, rotation_angle
 from jcr.records import Capture, HandEye
 
 PROPOSALS = 12
@@ -156,3 +156,28 @@ def _best(
             break
     best = proposals.next_poses(1)[0]
     return {"next_pose": best, "next_joints": joints, "next_like": capture.images[rows[best.like]]}
+
+
+def joints_at(
+    arm: Arm,
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    joints: Float[ndarray, "n dof"] | None,
+    goal: Float[ndarray, "4 4"],
+) -> Float[ndarray, " dof"] | None:
+    """Return joint angles (rad) within the limits that reach `goal`; None where none do.
+
+    `base_from_gripper` and `joints` (rad, None where not recorded) are those of the images. With recorded angles the
+    tool follows from them and their pose, and the answer is of the branch that the arm is in.
+    """
+    if joints is not None:
+        now = joints[-1:]
+        flange_from_tool = (inverse(forward_kinematics(arm, now)) @ base_from_gripper[-1:])[0]
+        flange = (goal @ inverse(flange_from_tool))[None]
+        found = reach_toward(arm, flange, now, steps=60)
+        off = inverse(forward_kinematics(arm, found)) @ flange
+        if np.linalg.norm(off[0, :3, 3]) < FITS[0] and float(rotation_angle(off[0, :3, :3])) < FITS[1]:
+            return found[0]
+        return None
+    posture = inverse_kinematics(arm, np.concatenate([base_from_gripper, goal[None]]))
+    reached = posture.misfit_m[-1] < FITS[0] and posture.misfit_rad[-1] < FITS[1]
+    return posture.joints[-1] if reached else None

@@ -14,9 +14,9 @@ from jcr.calibration.options import GRASPING
 from jcr.capture.images import read_image
 from jcr.findings import sentence
 from jcr.findings.sentences import reached_in_words
-from jcr.live.notation import Notation
 from jcr.live.progress import (
     FIRST_ADVICE,
+    Notation,
     Progress,
     accuracy_line,
     faults,

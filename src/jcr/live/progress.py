@@ -7,8 +7,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.capture.conventions import CONVENTIONS, numbers_from_poses
+from jcr.capture.options import ConventionName, UnitsName
+from jcr.estimation.kinematics import Arm
 from jcr.findings import Finding, FindingKind, remedy, sentence, text, without_consequences
-from jcr.live.notation import Notation, pose_lines
 from jcr.records import HandEye, LeaveOneOut, NextPose
 from jcr.rounding import significant
 
@@ -16,6 +18,17 @@ CONFIRMING_IMAGES = 8
 """Least number of used images with which the leave-one-out error can confirm an accuracy."""
 REQUIREMENT_MET = "requirement met: finish, or go on"
 FIRST_ADVICE = "rotate the wrist by 20° or more, and move, between images"
+
+
+@dataclass(frozen=True)
+class Notation:
+    """Convention, units and arm with which poses are written."""
+
+    convention: ConventionName = "auto"
+    """Pose convention; auto: quat-xyzw."""
+    units: UnitsName = "auto"
+    arm: Arm | None = None
+    """Arm whose joint angles are written too; None where it is not known."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,3 +205,40 @@ def accuracy_line(state: Progress) -> str:
     return (
         f"{images}: ± {mm} mm and {deg}° (95 % of errors of a point at the working distance){verdict}{limits}"
     )
+
+
+def pose_lines(
+    pose: Float[ndarray, "4 4"], notation: Notation, joints: Float[ndarray, " dof"] | None = None
+) -> list[str]:
+    """Return the pose as the arm's pendant or program writes it, and its joint angles (rad) where they are known."""
+    convention = "quat-xyzw" if notation.convention == "auto" else notation.convention
+    if convention == "ur":
+        row = numbers_from_poses(pose[None], "ur")[0]
+        shown = ", ".join(f"{name} {1e3 * value:.1f}" for name, value in zip("xyz", row[:3], strict=True))
+        rotation = ", ".join(
+            f"{name} {value:.4f}" for name, value in zip(("rx", "ry", "rz"), row[3:], strict=True)
+        )
+        numbers = ", ".join(f"{value:.5f}" for value in row)
+        lines = [f"pendant: {shown} mm, {rotation} rad", f"URScript: movel(p[{numbers}], a=0.3, v=0.1)"]
+    elif convention in ("franka", "matrix"):
+        row = numbers_from_poses(pose[None], convention, notation.units)[0]
+        order = "O_T_EE, by columns" if convention == "franka" else "base_from_gripper, by rows"
+        lines = [f"{order}: [{', '.join(f'{value:.5f}' for value in row)}]"]
+    else:
+        lines = [named_numbers(pose, convention, notation.units)]
+    if joints is not None:
+        degrees = ", ".join(f"{value:.2f}" for value in np.degrees(joints))
+        lines.append(f"joints, °: {degrees}")
+        lines.append(f"joints, rad: {', '.join(f'{value:.4f}' for value in joints)}")
+    return lines
+
+
+def named_numbers(pose: Float[ndarray, "4 4"], convention: ConventionName, units: UnitsName) -> str:
+    """Return the numbers of the pose, each with its name, and the units."""
+    form = CONVENTIONS[convention]
+    length, angle = form.units(units)
+    row = numbers_from_poses(pose[None], convention, units)[0]
+    digits = [1 if length == "mm" else 4] * 3 + [5 if not form.has_angles else 2 if angle == "deg" else 4] * 4
+    text = [f"{name} {value:.{k}f}" for name, value, k in zip(form.columns, row, digits, strict=False)]
+    unit = f" {angle.replace('deg', '°')}" if form.has_angles else ""
+    return f"{' '.join(text[:3])} {length}, {' '.join(text[3:])}{unit}"

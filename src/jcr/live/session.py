@@ -18,8 +18,7 @@ from numpy import ndarray
 from jcr.capture.formats.capture_json import FrameEntry
 from jcr.errors import InputError, RejectedError
 from jcr.live.cameras import Camera, Frame, frame_at_rest
-from jcr.live.notation import Notation
-from jcr.live.progress import Progress, progress_lines
+from jcr.live.progress import Notation, Progress, progress_lines
 from jcr.live.robot import MOVED_ON, REST, TRY_AGAIN, Action, RobotState, States, is_farther, next_rest
 
 if TYPE_CHECKING:
