@@ -22,6 +22,10 @@ class Sheet:
     """Height of its short edges over its middle."""
     size_error: float = 0.0
     """Relative excess of the printed size over `side_m`."""
+    stretch: float = 0.0
+    """Relative excess of its first side over its second."""
+    moved_m: float = 0.0
+    """Distance along x by which it is moved before the last third of the images."""
     noise_px: float = 0.1
     """Standard deviation of a coordinate of a corner."""
 
@@ -31,6 +35,7 @@ def with_sheet(found: FaultyCapture, rng: np.random.Generator, sheet: Sheet) -> 
     grid = np.stack(np.meshgrid(*map(np.arange, sheet.corners)), axis=-1).reshape(-1, 2).astype(float)
     grid = np.column_stack([grid - grid.mean(0), np.zeros(len(grid))])
     printed = sheet.side_m * (1 + sheet.size_error) * grid
+    printed[:, 0] *= 1 + sheet.stretch
     printed[:, 2] = sheet.bend_m * (grid[:, 0] / grid[:, 0].max()) ** 2
     base_from_sheet = transform(
         rotation_exp(np.array([0.0, 0.0, rng.uniform(0, np.pi)])), np.array([0.5, 0.0, 0.005])
@@ -39,7 +44,8 @@ def with_sheet(found: FaultyCapture, rng: np.random.Generator, sheet: Sheet) -> 
     tracks = found.tracks
     first, image, x_px = len(tracks.points_in_recon), [tracks.image], [tracks.x_px]
     for k, camera in enumerate(found.base_from_camera):
-        seen = project(found.intrinsics, apply(inverse(camera), x_in_base))
+        moved = [sheet.moved_m if 3 * k >= 2 * len(found.base_from_camera) else 0.0, 0.0, 0.0]
+        seen = project(found.intrinsics, apply(inverse(camera), x_in_base + moved))
         if ((seen > 0) & (seen < [INTRINSICS.width, INTRINSICS.height])).all():
             image.append(np.full(len(grid), k))
             x_px.append(seen + sheet.noise_px * rng.normal(size=seen.shape))

@@ -92,6 +92,7 @@ EXAMPLES: dict[FindingKind, dict] = {
     FindingKind.SCALES: {"value": 0.03, "std": 0.005, "details": {"one": "board", "other": "known length"}},
     FindingKind.BOARD_SIDE: {"value": 0.0254, "std": 5e-5, "details": {"board": "chessboard:9x6:SIDE"}},
     FindingKind.BOARD_MOVED: {"images": ("03.png",), "details": {"board": "chessboard:9x6:0.025"}},
+    FindingKind.BOARD_STRETCHED: {"value": 0.01, "details": {"board": "chessboard:9x6:0.025"}},
     FindingKind.BOARD_NOT_FOUND: {
         "details": {"board": "chessboard:9x6:0.025", "proposed": "aruco:SIDE:DICT_4X4_50"}
     },

@@ -78,6 +78,26 @@ def test_a_board_of_30_mm_given_for_one_of_25_rejects_the_calibration_in_one_lin
     assert "16.6 ± 0.2" in line and "% smaller than given; measure its squares" in line
 
 
+@pytest.mark.parametrize(
+    ("sheet", "kind"),
+    [
+        (Sheet(stretch=0.01), FindingKind.BOARD_STRETCHED),
+        (Sheet(stretch=0.03), FindingKind.BOARD_STRETCHED),
+        (Sheet(moved_m=3e-3), FindingKind.BOARD_MOVED),
+    ],
+)
+def test_a_board_that_is_wrong_is_named_and_leaves_the_result_as_it_is_without(
+    sheet: Sheet, kind: FindingKind
+):
+    alone, _ = calibrated(None)
+    hand_eye, x = calibrated(sheet)
+    assert of_kind(hand_eye, kind).severity == "warns"
+    assert hand_eye.converged and hand_eye.lengths == ()
+    std, without = (np.sqrt(np.diag(one.covariance)) for one in (hand_eye, alone))
+    assert (std < 1.1 * without).all()
+    assert (np.abs(step_between(hand_eye.gripper_from_camera, x)) < 3 * std[:6]).all()
+
+
 def test_the_side_of_a_board_of_unknown_size_is_stated_by_the_robot():
     hand_eye, _ = calibrated(Sheet(stated_m=None), pose_scale=1.016)
     side = of_kind(hand_eye, FindingKind.BOARD_SIDE)

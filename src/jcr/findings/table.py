@@ -212,6 +212,10 @@ class FindingKind(StrEnum):
     BOARD_MOVED = "board at several places", Row("lengths",
         "in {images} {board} is at another place than in the other images: it was moved, or there are two",
         "its corners there are left out; keep one board of a kind, and keep it still")
+    BOARD_STRETCHED = "board stretched", Row("lengths",
+        "{board} is {size_percent:.1f} % longer along one side than along the other: it was not printed at its size",
+        "print it without scaling (jcr board) and measure both sides; its size is not used for the scale",
+        evidence="share")
     BOARD_NOT_FOUND = "board not found", Row("lengths",
         "no two images show {board}: features alone are used{proposed:, but they seem to show $}",
         "check its kind and its numbers of squares or corners (jcr docs markers)",

@@ -17,6 +17,7 @@ from jcr.calibration.adjust import refined_by
 from jcr.calibration.case import Case
 from jcr.calibration.cues import CONTRADICTED, length_cue
 from jcr.capture.images import read_depth
+from jcr.estimation.boards import STRETCH_STD
 from jcr.estimation.equation import SCALE
 from jcr.estimation.hand_eye import judged
 from jcr.estimation.problem import LinearPrior
@@ -51,6 +52,10 @@ EXACT = 0.015
 """Relative standard deviation up to which a length can reject a calibration."""
 WORTH = 10.0
 """Standard deviations of the robot's scale: a length less exact than that hardly moves it, and is compared alone."""
+STRETCHED = 4.0
+"""Standard deviations of a printer's stretch from which a board was not printed at its size."""
+MOVED = 4.0
+"""Factor from the residuals of a board's corners in a quarter of the images to those in an image where it was moved."""
 MIN_IMAGES, MIN_FEATURES = 3, 60
 """Fewest images and features at which depth is compared."""
 OUTSIDE = 0.3
@@ -118,6 +123,7 @@ def _measured(case: Case) -> tuple[HandEye, list[Length]]:
         and boards is not None
         and boards.size_std is not None
         and hand_eye.before is not None
+        and not board_faults(case)
     ):
         off, by_unknown = size_of_boards(adjusted)
         together = float(by_unknown @ adjusted.covariance @ by_unknown)
@@ -240,6 +246,7 @@ def check_boards(case: Case) -> Case:
     hand_eye = case.hand_eye
     if case.adjusted is None or case.adjusted.problem.boards is None:
         return case.after(tuple(findings))
+    findings += board_faults(case)
     found = board_found(case.adjusted, boards)
     if boards.size_std is None and hand_eye.before is not None:
         side = 1e-3 * found.side_mm, 1e-3 * found.side_std_mm
@@ -247,6 +254,34 @@ def check_boards(case: Case) -> Case:
             Finding.of(FindingKind.BOARD_SIDE, "informs", value=side[0], std=side[1], board=boards.spec)
         )
     return case.after(tuple(findings), replace(hand_eye, board=found))
+
+
+def board_faults(case: Case) -> list[Finding]:
+    """Return a finding of each fault that an adjustment shows of its boards, whose size is then no known length.
+
+    A board whose sides are stretched was not printed at its size. A board that was moved leaves its corners, in some of
+    the images, farther from the observations than in most.
+    """
+    adjusted, boards = case.adjusted, case.reconstruction.tracks.boards
+    if boards is None or adjusted is None or adjusted.problem.boards is None:
+        return []
+    observations, shapes, findings = adjusted.problem.observations, adjusted.problem.boards, list[Finding]()
+    assert observations is not None
+    shape = adjusted.state.camera_steps[adjusted.problem.columns.boards]
+    stretch = max(shape[shapes.shape_std == STRETCH_STD].tolist(), key=abs, default=0.0)
+    if abs(stretch) > STRETCHED * STRETCH_STD:
+        findings.append(
+            Finding.of(FindingKind.BOARD_STRETCHED, "warns", "none", value=abs(stretch), board=boards.spec)
+        )
+    of_corners = np.isin(observations.point, shapes.point)
+    squared = (adjusted.images.view.residual_px[of_corners].reshape(of_corners.sum(), -1) ** 2).sum(1)
+    rows, image = np.unique(observations.image[of_corners], return_inverse=True)
+    rms = np.sqrt(np.bincount(image, squared) / np.bincount(image))
+    away = rows[rms > MOVED * np.quantile(rms, 0.25)]
+    if len(away):
+        names = [case.names[row] for row in case.used[away]]
+        findings.append(Finding.of(FindingKind.BOARD_MOVED, "warns", "images", *names, board=boards.spec))
+    return findings
 
 
 def board_found(adjusted: Solution, boards: Boards) -> BoardFound:
