@@ -99,17 +99,14 @@ def test_errors_of_the_gripper_pose_stand_beside_those_of_the_calibration():
     x_in_base, found = point_in_base(estimate, start.robot_noise, X_PX, depth_m, pose)
     assert x_in_base == pytest.approx(apply(pose, placed(estimate.gripper_from_camera, estimate.intrinsics)))
     here = point_covariance(estimate, estimate.intrinsics, X_PX, DISTANCE_M)
-    assert np.trace(found.calibration, axis1=1, axis2=2) == pytest.approx(np.trace(here, axis1=1, axis2=2))
-    noise, rng = start.robot_noise, np.random.default_rng(0)
-    steps = rng.normal(size=(4000, 6)) * np.repeat((noise.translation, noise.rotation), 3)
-    drawn = np.array(
-        [
-            apply(retract(pose, step), placed(estimate.gripper_from_camera, estimate.intrinsics))[1]
-            for step in steps
-        ]
-    )
-    assert np.cov(drawn.T) == pytest.approx(found.robot_random[1], abs=0.06 * np.trace(found.robot_random[1]))
-    assert found.together == pytest.approx(found.calibration + found.robot_random + found.robot_systematic)
+    on_gripper = placed(estimate.gripper_from_camera, estimate.intrinsics)[1]
+    noise, rng, drawn = start.robot_noise, np.random.default_rng(0), np.zeros((4000, 3))
+    for metres, radians in ((noise.translation, noise.rotation), noise.systematic_left):
+        steps = rng.normal(size=(4000, 6)) * np.repeat((metres, radians), 3)
+        drawn += [apply(retract(pose, step), on_gripper) for step in steps]
+    to_base = pose[:3, :3] @ estimate.gripper_from_camera[:3, :3]
+    expected = to_base @ here[1] @ to_base.T + np.cov(drawn.T)
+    assert found[1] == pytest.approx(expected, abs=0.06 * np.trace(found[1]))
 
 
 def test_each_intrinsics_have_a_transform_of_their_own():
@@ -138,18 +135,16 @@ def test_points_of_the_scene_are_where_they_are_said_to_be():
         rng = np.random.default_rng(seed)
         problem = hand_eye_problem(rng, 10, robot_noise=(5e-4, np.radians(0.05)))
         found, _, _ = adjusted(problem, seed)
-        points = scene_points(found)
+        in_base, together, own = points = scene_points(found)
         # The tracks are of points that the problem drew first, in the base.
         true = np.random.default_rng([seed, 1]).uniform([0.25, -0.25, 0.0], [0.75, 0.25, 0.12], (300, 3))
-        nearest = np.linalg.norm(points.in_base[:, None] - true, axis=2).min(1)
+        nearest = np.linalg.norm(in_base[:, None] - true, axis=2).min(1)
         n = np.arange(len(nearest))
-        covariance = points.together[n, :, n] + points.own
+        covariance = together[n, :, n] + own
         inside.append(nearest < np.array([within_95(one) for one in covariance]))
         scene = scene_uncertainty(points)
-        sizes.append(np.trace(scene.covariance_at(points.in_base), axis1=1, axis2=2).mean())
-        assert sizes[-1] == pytest.approx(
-            np.trace(points.together[n, :, n], axis1=1, axis2=2).mean(), rel=0.1
-        )
+        sizes.append(np.trace(scene.covariance_at(in_base), axis1=1, axis2=2).mean())
+        assert sizes[-1] == pytest.approx(np.trace(together[n, :, n], axis1=1, axis2=2).mean(), rel=0.1)
     assert np.concatenate(inside).mean() > 0.8
 
 

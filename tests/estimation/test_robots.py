@@ -8,12 +8,7 @@ from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.estimation.inverse_kinematics import inverse_kinematics, required_posture
-from jcr.estimation.kinematics import (
-    error_jacobian,
-    error_std,
-    forward_kinematics,
-    with_tool,
-)
+from jcr.estimation.kinematics import error_jacobian, error_std, forward_kinematics, with_tool
 from jcr.estimation.mounting import LengthError, mounted_arm
 from jcr.geometry import inverse, rotation_exp, step_between, transform
 from simulation.arms import BentArm, error_names
@@ -213,19 +208,12 @@ def test_joint_angles_contradict_positions_that_are_all_too_long(name):
         bent = forward_kinematics(arm, joints + rng.normal(0, 1e-3, joints.shape[1]))
         bent[:, :3, 3] += rng.normal(0, 5e-4, (12, 3))
         mounted_arm(arm, joints, bent)
-        for factor, said in (
-            (1.05, r"[45]\.\d ± [01]\.\d % too long"),
-            (1 / 1.05, r"[45]\.\d ± [01]\.\d % too short"),
-        ):
+        # The last are so far off that without the factor nothing agrees.
+        said = [rf"[45]\.\d ± [01]\.\d % too {way} " for way in ("long", "short")]
+        for factor, words in ((1.05, said[0]), (1 / 1.05, said[1]), (0.3048, ""), (1.25, ""), (2.54, "")):
             poses = bent.copy()
             poses[:, :3, 3] *= factor
-            with pytest.raises(LengthError, match=f"{said} for a {name}"):
-                mounted_arm(arm, joints, poses)
-        # So far off that without the factor nothing agrees.
-        for factor in (0.3048, 1.25, 2.54):
-            poses = bent.copy()
-            poses[:, :3, 3] *= factor
-            with pytest.raises(LengthError, match=f"for a {name}"):
+            with pytest.raises(LengthError, match=f"{words}for a {name}"):
                 mounted_arm(arm, joints, poses)
 
 

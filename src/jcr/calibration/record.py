@@ -501,14 +501,13 @@ class Calibration(Part):
         self._require(self.on_gripper, "gripper")
         if self.intrinsics is None or self.robot_noise is None:
             raise InputError("the calibration has no intrinsics: it was made from camera poses alone")
-        x_in_base, uncertainty = point_in_base(
+        return point_in_base(
             as_estimate(self),
             self.robot_noise.record(self.robot_errors),
             np.asarray(pixel, float),
             np.asarray(depth_m, float),
             np.asarray(base_from_gripper, float),
         )
-        return x_in_base, uncertainty.together
 
     @property
     def doubt(self) -> str | None:

@@ -71,27 +71,31 @@ def absolute_pose(
     returned. The standard deviation of the pixels is estimated from the residuals beside `point_covariance`.
     `loss` "linear" is for detected corners, whose identity is certain.
     """
-    least = 4 if planar else 6
+    least, p = 4 if planar else 6, 7 if focal == "free" else 6
     spread = np.zeros((len(points), 3, 3)) if point_covariance is None else point_covariance
     if len(points) < least:
         return None
-    factors = FOCAL_FACTORS if focal == "free" else (1.0,)
-    starts = [
-        start
-        for factor in factors
-        for start in _initial_poses(x_px, points, _scaled(camera, factor), gate_px, planar)
-    ]
+    starts = list[_Start]()
+    for factor in FOCAL_FACTORS if focal == "free" else (1.0,):
+        scaled = _scaled(camera, factor)
+        ideal_px = scaled.fx * unproject(scaled, x_px)[:, :2]
+        if planar:
+            # Both poses of the plane, with all points.
+            matrix, every = np.diag([scaled.fx, scaled.fx, 1.0]), np.ones(len(points), bool)
+            _, turns, shifts, _ = cv2.solvePnPGeneric(points, ideal_px, matrix, None, flags=cv2.SOLVEPNP_IPPE)
+            poses = [
+                transform(rotation_exp(r.ravel()), t.ravel()) for r, t in zip(turns, shifts, strict=True)
+            ]
+            ahead = (pose for pose in poses if (apply(pose, points)[:, 2] > 0).all())
+            starts.extend((inverse(pose), scaled, every) for pose in ahead)
+        elif (agreed := ransac_pose(ideal_px, points, scaled.fx, gate_px)) is not None:
+            starts.append((agreed[0], scaled, agreed[1]))
     most = max((int(inlier.sum()) for _, _, inlier in starts), default=0)
-    found = [
-        one
-        for start in starts
-        if start[2].sum() == most >= least
-        and (one := _refined(x_px, points, spread, start, gate_px, 7 if focal == "free" else 6, least, loss))
-    ]
-    if not found:
-        return None
-    best, *others = sorted(found, key=lambda one: one.rms_px)
+    starts = [start for start in starts if start[2].sum() == most >= least]
+    refined = (_refined(x_px, points, spread, start, gate_px, p, least, loss) for start in starts)
+    best, *others = sorted(filter(None, refined), key=lambda one: one.rms_px) or (None,)
     for other in others:
+        assert best is not None
         apart = float(rotation_angle(best.a_from_camera[:3, :3].T @ other.a_from_camera[:3, :3]))
         if planar and apart > APART and other.rms_px < AMBIGUOUS * best.rms_px + 0.05:
             return replace(best, rival=other.a_from_camera)
@@ -105,24 +109,6 @@ _Start = tuple[Float[ndarray, "4 4"], Intrinsics, Bool[ndarray, " k"]]
 def _scaled(camera: Intrinsics, factor: float) -> Intrinsics:
     """Return the intrinsics with the focal lengths times a factor."""
     return replace(camera, fx=float(factor * camera.fx), fy=float(factor * camera.fy))
-
-
-def _initial_poses(
-    x_px: Float[ndarray, "k 2"],
-    points: Float[ndarray, "k 3"],
-    camera: Intrinsics,
-    gate_px: float,
-    planar: bool,
-) -> list[_Start]:
-    """Return the two poses of a plane, with all points, or the one on which RANSAC finds that most points agree."""
-    if not planar:
-        found = ransac_pose(camera.fx * unproject(camera, x_px)[:, :2], points, camera.fx, gate_px)
-        return [] if found is None else [(found[0], camera, found[1])]
-    pixels, matrix = camera.fx * unproject(camera, x_px)[:, :2], np.diag([camera.fx, camera.fx, 1.0])
-    _, rotations, shifts, _ = cv2.solvePnPGeneric(points, pixels, matrix, None, flags=cv2.SOLVEPNP_IPPE)
-    poses = [transform(rotation_exp(r.ravel()), s.ravel()) for r, s in zip(rotations, shifts, strict=True)]
-    every = np.ones(len(points), bool)
-    return [(inverse(pose), camera, every) for pose in poses if (apply(pose, points)[:, 2] > 0).all()]
 
 
 def ransac_pose(

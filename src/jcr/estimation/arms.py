@@ -65,6 +65,8 @@ def _iiwa(name: str, base: float, upper: float, forearm: float) -> Arm:
     return from_dh(name, rows, limits, (0.0, 0.4, 0.0, -1.6, 0.0, 1.1, 0.0), modified=False)
 
 
+# Source of the xArms: xarm_description/config/kinematics/default/*.yaml and urdf/*/*.urdf.xacro of
+# xArm-Developer/xarm_ros; the gripper is link_eef, the flange.
 XARM6 = """
 0 0 0.267 0 0 0
 0 0 0 -90 0 0
@@ -80,14 +82,6 @@ XARM7 = """
 0.0775 -0.3425 0 90 0 0
 0 0 0 90 0 0
 0.076 0.097 0 -90 0 0"""
-
-
-def _xarm(name: str, origins: str, limits: Limits, rest: Sequence[float]) -> Arm:
-    """Return a UFACTORY xArm; the gripper is link_eef, the flange.
-
-    Source: xarm_description/config/kinematics/default/*.yaml and urdf/*/*.urdf.xacro of xArm-Developer/xarm_ros.
-    """
-    return _from_origins(name, origins, np.eye(4), limits, rest)
 
 
 Z1 = """
@@ -167,8 +161,8 @@ _ARMS: dict[RobotName, Callable[[], Arm]] = {
     "fr3": lambda: _franka("fr3", _FR3),
     "iiwa7": lambda: _iiwa("iiwa7", 0.34, 0.4, 0.4),
     "iiwa14": lambda: _iiwa("iiwa14", 0.36, 0.42, 0.4),
-    "xarm6": lambda: _xarm("xarm6", XARM6, _XARM6, (0.0, -0.3, -0.9, 0.0, 1.2, 0.0)),
-    "xarm7": lambda: _xarm("xarm7", XARM7, _XARM7, (0.0, -0.3, 0.0, 0.9, 0.0, 1.2, 0.0)),
+    "xarm6": lambda: _from_origins("xarm6", XARM6, np.eye(4), _XARM6, (0.0, -0.3, -0.9, 0.0, 1.2, 0.0)),
+    "xarm7": lambda: _from_origins("xarm7", XARM7, np.eye(4), _XARM7, (0.0, -0.3, 0.0, 0.9, 0.0, 1.2, 0.0)),
     "z1": _z1,
     "so101": _so101,
 }

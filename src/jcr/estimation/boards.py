@@ -20,7 +20,7 @@ from numpy import ndarray
 from numpy.polynomial.legendre import legvander2d
 
 from jcr.estimation.elimination import Derivatives
-from jcr.geometry import apply, fit_similarity, skew
+from jcr.geometry import Transform, apply, fit_similarity, skew
 from jcr.records import Boards
 
 CORNER_STD_M = np.array([5e-5, 5e-5, 1e-4])
@@ -71,12 +71,6 @@ class BoardShapes:
             by_shape=self.by_shape[rows],
         )
 
-    def is_corner(self, points: int) -> Bool[ndarray, " p"]:
-        """Return a mask of the corners among `count` points."""
-        out = np.zeros(points, bool)
-        out[self.point] = True
-        return out
-
     def residual(
         self,
         world_from_rig: Float[ndarray, "m 4 4"],
@@ -84,7 +78,9 @@ class BoardShapes:
         shape: Float[ndarray, " s"],
     ) -> Float[ndarray, "c 3"]:
         """Return the residual of each corner along the axes of its body, in standard deviations."""
-        in_body = self._in_body(world_from_rig, points_in_world, shape)
+        pose = world_from_rig[self.rig]
+        ahead = points_in_world[self.point] - pose[:, :3, 3]
+        in_body = np.exp(-shape[0]) * (ahead[:, None] @ pose[:, :3, :3])[:, 0]
         return (in_body - self.x_in_body - self.by_shape @ shape) / CORNER_STD_M
 
     def derivatives(
@@ -133,28 +129,6 @@ class BoardShapes:
         """Return the height of each corner above the plane of its body, in the unit of the world."""
         return self.by_shape[:, 2] @ shape
 
-    def _in_body(
-        self,
-        world_from_rig: Float[ndarray, "m 4 4"],
-        points_in_world: Float[ndarray, "p 3"],
-        shape: Float[ndarray, " s"],
-    ) -> Float[ndarray, "c 3"]:
-        pose = world_from_rig[self.rig]
-        ahead = points_in_world[self.point] - pose[:, :3, 3]
-        return np.exp(-shape[0]) * (ahead[:, None] @ pose[:, :3, :3])[:, 0]
-
-
-@dataclass(frozen=True)
-class _SeenBody:
-    """Observed corners of a body, and its initial pose in the world."""
-
-    point: Int[ndarray, " c"]
-    """Row of the scene's points."""
-    x_in_body: Float[ndarray, "c 3"]
-    world_from_body: Float[ndarray, "4 4"]
-    size: float
-    """Size in the world over the stated size."""
-
 
 def shapes_of(
     boards: Boards | None, points_in_world: Float[ndarray, "p 3"], seen: Bool[ndarray, " p"], first_rig: int
@@ -166,32 +140,33 @@ def shapes_of(
     bodies = [] if boards is None else list(_seen_bodies(boards, points_in_world, seen))
     if not bodies:
         return None, np.zeros((0, 4, 4))
-    corners = [len(body.point) for body in bodies]
-    unit = float(np.average([body.size for body in bodies], weights=corners))
-    ways, std = zip(*(_deformations(unit * body.x_in_body) for body in bodies), strict=True)
+    points, x_in_body, poses, sizes = zip(*bodies, strict=True)
+    corners = [len(point) for point in points]
+    unit = float(np.average(sizes, weights=corners))
+    ways, std = zip(*(_deformations(unit * x) for x in x_in_body), strict=True)
     each = np.split(np.arange(sum(corners)), np.cumsum(corners)[:-1])
     by_shape, column = np.zeros((sum(corners), 3, 1 + sum(map(len, std)))), 1
     for rows, own in zip(each, ways, strict=True):
         by_shape[rows, :, column : column + own.shape[2]] = own
         column += own.shape[2]
-    point = np.concatenate([body.point for body in bodies])
+    point = np.concatenate(points)
     order = np.argsort(point)
     shapes = BoardShapes(
         point=point[order],
         body=np.repeat(np.arange(len(bodies)), corners)[order],
         first_rig=first_rig,
-        x_in_body=unit * np.concatenate([body.x_in_body for body in bodies])[order],
+        x_in_body=unit * np.concatenate(x_in_body)[order],
         by_shape=by_shape[order],
         shape_std=np.concatenate([[SIZE_STD], *std]),
         unit=unit,
     )
-    return shapes, np.stack([body.world_from_body for body in bodies])
+    return shapes, np.stack(poses)
 
 
 def _seen_bodies(
     boards: Boards, points_in_world: Float[ndarray, "p 3"], seen: Bool[ndarray, " p"]
-) -> Iterator[_SeenBody]:
-    """Return the bodies whose observed corners determine their pose."""
+) -> Iterator[tuple[Int[ndarray, " c"], Float[ndarray, "c 3"], Transform, float]]:
+    """Yield point rows, coordinates, world_from_body and size in the world of each body with a determined pose."""
     for body in boards.bodies:
         rows = np.flatnonzero(seen[body.point])
         x, there = body.x_in_body[rows], points_in_world[body.point[rows]]
@@ -199,7 +174,7 @@ def _seen_bodies(
             continue
         pose, size = fit_similarity(there, x)
         if np.abs(apply(pose, size * x) - there).max() < size * np.ptp(x):
-            yield _SeenBody(body.point[rows], x, pose, size)
+            yield body.point[rows], x, pose, size
 
 
 def _deformations(x: Float[ndarray, "c 3"]) -> tuple[Float[ndarray, "c 3 w"], Sequence[float]]:

@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from jcr.estimation.equation import pose_by_pose
 from jcr.estimation.pose_equations import pose_equations, reported_poses
-from jcr.estimation.robot_noise import Equations, growth_scores, log_evidence, most_likely, solve_equations
+from jcr.estimation.robot_noise import growth_scores, log_evidence, most_likely
 from jcr.estimation.wrist import Start, pose_problem
 from jcr.geometry import Poses, skew
 
@@ -57,22 +57,21 @@ def drift_covariance(
     before, size_information = most_likely(plain)
     if growth_scores(plain, before, parts).max() < SUSPICIOUS:
         return None
-    best, found = _evidence(plain, before, size_information) + CLEAR, None
+    best, found = log_evidence(plain, before, size_information) + CLEAR, None
     for count in (2, 3):
         free = replace(plain, walks=tuple(parts[:count]))
         sizes, information = most_likely(free)
-        if (evidence := _evidence(free, sizes, information)) > best:
-            variances = free.variances(sizes)[3:]
-            best, found = (
-                evidence,
-                sum((v * w for v, w in zip(variances, walks, strict=False)), 0.0 * walks[0]),
-            )
+        evidence = log_evidence(free, sizes, information)
+        if evidence > best:
+            best, found = evidence, np.tensordot(free.variances(sizes)[3:], walks[:count], 1)
     return found
 
 
 def random_walks(recon_from_camera: Poses, scale: float) -> list[Float[ndarray, "s s"]]:
-    """Return covariances of the steps of cameras whose errors grow from one to the next: of position by 1 m per image,
-    of rotation by 1 rad, and of the logarithm of the scale by 1; s = 6n. `scale` is in metres per unit."""
+    """Return covariances of the steps of cameras whose errors grow from one to the next, s = 6n.
+
+    They grow by 1 m of position per image, 1 rad, and 1 of log scale; `scale` is in metres per unit.
+    """
     n, position = len(recon_from_camera), recon_from_camera[:, :3, 3]
     later = np.tril(np.ones((n, n)))[:, 1:]
     by_position = np.zeros((n, 6, n - 1, 3))
@@ -86,13 +85,3 @@ def random_walks(recon_from_camera: Poses, scale: float) -> list[Float[ndarray, 
     return [
         half @ half.T for half in (one.reshape(6 * n, -1) for one in (by_position, by_rotation, by_scale))
     ]
-
-
-def _evidence(
-    equations: Equations, log_sizes: Float[ndarray, " c"], information: Float[ndarray, "c c"]
-) -> float:
-    """Return the log evidence of a model, the density of its priors of the sizes included."""
-    found = solve_equations(equations, log_sizes)
-    return log_evidence(equations, float(found.log_posterior), information) - float(
-        np.log(equations.prior[1]).sum()
-    )

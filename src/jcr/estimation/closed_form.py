@@ -34,9 +34,8 @@ def closed_form(
     weights = np.ones(base_from_gripper.shape[:-2]) if weights is None else weights
     of_gripper, of_camera = base_from_gripper[..., :3, :3], recon_from_camera[..., :3, :3]
     rotation, base_rotation = rotations(of_gripper, of_camera, weights, rounds)
-    found = _translations(base_from_gripper, recon_from_camera, base_rotation, weights)
-    translation, scale, base_translation = found
-    return transform(rotation, translation), scale, transform(base_rotation, base_translation)
+    x, scale, z = _translations(base_from_gripper, recon_from_camera, base_rotation, weights)
+    return transform(rotation, x), scale, transform(base_rotation, z)
 
 
 def initial_estimate(

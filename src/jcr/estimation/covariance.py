@@ -6,7 +6,7 @@ standard deviations off is the worst fault.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -22,8 +22,8 @@ from jcr.estimation.robot_noise import (
     LinearSolution,
     LogSizes,
     Weighed,
-    expected_information,
     over_sizes,
+    score,
     solve_equations,
 )
 from jcr.estimation.systematic import Region
@@ -39,16 +39,9 @@ Square = Float[ndarray, "p p"]
 Stack = Float[ndarray, "*k p p"]
 
 
-@dataclass(frozen=True)
-class Posterior:
-    """Unknowns averaged over the sizes of the errors."""
-
-    step: Float[ndarray, " p"]
-    covariance: Square
-    """Scaled so that its 99 % ellipsoid holds 99 %."""
-    budget: Budget
-    log_sizes: LogSizes
-    """Log sizes at the mode."""
+Posterior = tuple[Float[ndarray, " p"], Square, Budget]
+"""Step of the unknowns averaged over the sizes of the errors, their covariance, scaled so that its 99 % ellipsoid holds
+99 %, and its causes."""
 
 
 def posterior(
@@ -60,8 +53,7 @@ def posterior(
 
 
 def expected_posterior(equations: Equations, noise: RobotNoise, region: Region) -> Posterior:
-    """Return the posterior to expect for a robot with this noise, before there are residuals: those of `equations` are
-    0.
+    """Return the posterior to expect for a robot with this noise; the residuals of `equations` are 0.
 
     In the density of the sizes the squares of residuals are replaced by their expectations, tr(P V) for the covariance
     V of the noise.
@@ -73,7 +65,7 @@ def expected_posterior(equations: Equations, noise: RobotNoise, region: Region) 
         whitened, fitted = _whitened_and_fitted(solution, root)
         return solution.log_posterior - ((whitened**2).sum((-1, -2)) - (fitted**2).sum((-1, -2))) / 2
 
-    found = over_sizes(equations, mode, expected_information(equations, mode), density)
+    found = over_sizes(equations, mode, score(equations, mode)[2], density)
     return _averaged(equations, mode, found, lambda _, sizes: _expected_elsewhere(equations, sizes, region))
 
 
@@ -98,7 +90,7 @@ def _averaged(
     n = UNKNOWNS
     covariance *= _widening(weight, off[:, :n], each[:, :n, :n], covariance[:n, :n])
     at_mode = elsewhere(solve_equations(equations, mode), mode)
-    return Posterior(step, covariance, _budget(equations, mode, at_mode, covariance), mode)
+    return step, covariance, _budget(equations, mode, at_mode, covariance)
 
 
 def _elsewhere(equations: Equations, solution: LinearSolution, log_sizes: LogSizes, region: Region) -> Stack:
@@ -140,8 +132,7 @@ def _widening(
     each: Float[ndarray, "k p p"],
     covariance: Square,
 ) -> float:
-    """Return the factor on the covariance of a mixture of normal distributions that makes its 99 % ellipsoid hold 99
-    %.
+    """Return the factor on the covariance of a mixture of normals that makes its 99 % ellipsoid hold 99 %.
 
     Squared Mahalanobis distances under each component are matched by a scaled χ² of the same mean and variance
     (Satterthwaite, Biometrics Bulletin 2, 1946).

@@ -6,6 +6,7 @@ a small dense system (Triggs et al., "Bundle adjustment: a modern synthesis", 20
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -66,8 +67,7 @@ class Sightings:
 
     @staticmethod
     def of(point: Int[ndarray, " k"], image: Int[ndarray, " k"], images: int) -> "Sightings":
-        """Return the sightings of observations that are sorted by point and then by image, each point with at least
-        one."""
+        """Return the sightings of observations sorted by point and then by image, each point with at least one."""
         starts = np.flatnonzero(np.diff(point, prepend=-1))
         rows = [np.flatnonzero(image == i) for i in range(images)]
         return Sightings(rows, starts, _groups(starts, image))
@@ -124,8 +124,11 @@ def without_points(
         by_point = np.empty((len(group.rows), 2, 3))
         for points, observations in group.batches:
             of_batch, count = group.rows[observations], points.stop - points.start
-            root[points], by_point[observations] = _whitened(rows.by_point[of_batch], count, damping)
-            flat = np.swapaxes(by_point[observations].reshape(count, -1, 3), 1, 2)
+            of_point = rows.by_point[of_batch].reshape(count, -1, 3)
+            block = _regular(np.swapaxes(of_point, 1, 2) @ of_point, damping)
+            root[points] = np.linalg.inv(np.linalg.cholesky(block))
+            of_point = of_point @ np.swapaxes(root[points], 1, 2)
+            by_point[observations], flat = of_point.reshape(-1, 2, 3), np.swapaxes(of_point, 1, 2)
             half[points, :, :s] = flat @ rows.shared[of_batch].reshape(count, flat.shape[2], s)
             half[points, :, -1:] = flat @ rows.residual[of_batch].reshape(count, -1, 1)
         places = group.point[:, None, None], np.arange(3)[:, None], own_columns[group.image][:, None]
@@ -135,16 +138,6 @@ def without_points(
         right[columns] += flat[:, :-1].T @ flat[:, -1]
         blocks.append((group.points, columns, root, half))
     return Normal(hessian, right, blocks)
-
-
-def _whitened(
-    by_point: Float[ndarray, "k 2 3"], points: int, damping: float
-) -> tuple[Float[ndarray, "n 3 3"], Float[ndarray, "k 2 3"]]:
-    """Return the inverse roots of the blocks of points with equally many observations, and whitened derivatives by
-    them."""
-    of_point = by_point.reshape(points, -1, 3)
-    root = np.linalg.inv(np.linalg.cholesky(_regular(np.swapaxes(of_point, 1, 2) @ of_point, damping)))
-    return root, (of_point @ np.swapaxes(root, 1, 2)).reshape(by_point.shape)
 
 
 def point_blocks(by_point: Float[ndarray, "k 2 3"], starts: Int[ndarray, " n"]) -> Float[ndarray, "n 3 3"]:
@@ -177,11 +170,13 @@ def _groups(starts: Int[ndarray, " p"], image: Int[ndarray, " k"]) -> list[_Grou
         images, of_image = np.unique(image[rows], return_inverse=True)
         of_point = np.repeat(np.arange(len(points)), counts)
         pairs = np.flatnonzero(np.diff(of_point * len(images) + of_image, prepend=-1))
+        edges = np.r_[np.flatnonzero(np.diff(counts, prepend=-1)), len(counts)].tolist()
+        ends = np.r_[0, np.cumsum(counts)].tolist()
         groups.append(
             _Group(
                 points=points,
                 rows=rows,
-                batches=_batches(counts),
+                batches=[(slice(a, b), slice(ends[a], ends[b])) for a, b in pairwise(edges)],
                 images=images,
                 pairs=pairs,
                 point=of_point[pairs],
@@ -189,10 +184,3 @@ def _groups(starts: Int[ndarray, " p"], image: Int[ndarray, " k"]) -> list[_Grou
             )
         )
     return groups
-
-
-def _batches(counts: Int[ndarray, " n"]) -> list[tuple[slice, slice]]:
-    """Return ranges of neighbouring points with the same number of observations, and of these observations."""
-    edges = np.r_[np.flatnonzero(np.diff(counts, prepend=-1)), len(counts)].tolist()
-    ends = np.r_[0, np.cumsum(counts)].tolist()
-    return [(slice(a, b), slice(ends[a], ends[b])) for a, b in zip(edges[:-1], edges[1:], strict=True)]

@@ -161,8 +161,7 @@ def explains_by_order(
     share: Float[ndarray, " n"],
     own: slice,
 ) -> bool:
-    """Return whether a motion with these shares in the images explains more than in nearly all other orders
-    of the images `own`.
+    """Return whether a motion with these shares explains more than in nearly all other orders of the images `own`.
 
     A permutation test of the score gain: the errors of real arms have heavy tails, and one wrong pose is no motion.
     """

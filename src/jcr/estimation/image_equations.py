@@ -17,7 +17,7 @@ from numpy import ndarray
 from jcr.estimation.cholesky import cholesky, inverse_of, over
 from jcr.estimation.elimination import Normal, with_fixed_points, without_points
 from jcr.estimation.model_error import size_of
-from jcr.estimation.pixel_noise import common_share, left_of_points, pixel_noise, variance_ratios
+from jcr.estimation.pixel_noise import pixel_noise, refined_noise
 from jcr.estimation.problem import Problem, State, image_step, similarities, similarities_of_rigs
 from jcr.estimation.projection import (
     View,
@@ -54,16 +54,6 @@ class RigInformation(NamedTuple):
         return step_between(self.world_from_rig, state.world_from_rig[: len(self.world_from_rig)]).ravel()
 
 
-class RigsGivenCameras(NamedTuple):
-    """Normal distribution of the rigs that arms move, given the free columns."""
-
-    follow: Float[ndarray, "s e"]
-    """Step of the rigs with each free column, the sign reversed."""
-    step: Float[ndarray, " s"]
-    """Step to the mean, the sign reversed."""
-    covariance: Float[ndarray, "s s"]
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImageEvidence:
     """Normal distribution of the columns of the images about a state, without the reported poses."""
@@ -83,26 +73,13 @@ class ImageEvidence:
         return weights_of(self.problem, self.state, self.view)
 
     @cached_property
-    def rigs(self) -> RigsGivenCameras:
-        """Distribution of the rigs that arms move, given the free columns."""
+    def rigs(self) -> tuple[Float[ndarray, "s e"], Float[ndarray, " s"], Float[ndarray, "s s"]]:
+        """Steps of the arms' rigs with each free column and to their mean, signs reversed, and their covariance."""
         by_arm, free = self.problem.by_arm, self.problem.free
         root = cholesky(self.information[np.ix_(by_arm, by_arm)])
         coupling = self.information[np.ix_(by_arm, free)]
         solved = over(root, np.column_stack([coupling, self.gradient[by_arm]]))
-        return RigsGivenCameras(solved[:, :-1], solved[:, -1], inverse_of(root))
-
-    def rig_covariance(self) -> Float[ndarray, "r r"]:
-        """Return the covariance of the steps of the rigs, r = 6m, in the frame of the first and at one size of the
-        world; the steps of the first rig are 0."""
-        first, rigs = self.problem.columns.first_rig, self.state.world_from_rig
-        unseen, others = similarities(self.problem, self.state), slice(first + 6, None)
-        gauge = np.zeros((7, len(unseen)))
-        gauge[:6, first : first + 6] = np.eye(6)
-        gauge[6, first:].reshape(-1, 6)[:, :3] = rigs[:, :3, 3] - rigs[0, :3, 3]
-        to_gauge = (np.eye(len(unseen)) - unseen @ np.linalg.solve(gauge @ unseen, gauge))[others]
-        covariance = np.zeros((6 * len(rigs), 6 * len(rigs)))
-        covariance[6:, 6:] = to_gauge @ np.linalg.solve(self.information, to_gauge.T)
-        return (covariance + covariance.T) / 2
+        return solved[:, :-1], solved[:, -1], inverse_of(root)
 
 
 @one_blas_thread
@@ -147,9 +124,7 @@ def with_pixel_noise(problem: Problem, state: State, view: View) -> State:
         noise = pixel_noise(layout, residual_px, depth, np.ones(layout.groups))
     else:
         by, known = by_points(problem, state, view), shape_information(problem, state)
-        left = left_of_points(layout, before, residual_px, depth, by, problem.seen.starts, known)
-        ratio = variance_ratios(layout, before, residual_px, depth, left)
-        noise = pixel_noise(layout, residual_px, depth, ratio, common_share(layout, residual_px, left, ratio))
+        noise = refined_noise(layout, before, residual_px, depth, by, problem.seen.starts, known)
     return replace(state, pixel_noise=noise)
 
 
@@ -170,7 +145,13 @@ def adjusted_images(
     weight, known = weights_of(problem, state, view), [*_known_rigs(problem), *known]
 
     def step(now: tuple[State, View], _: None, damping: float) -> tuple[State, View]:
-        tried = _after_step(problem, now[0], _normal_equations(problem, *now, weight, known, damping))
+        normal = _normal_equations(problem, *now, weight, known, damping)
+        scale = 1 / np.sqrt(np.maximum(normal.hessian.diagonal(), FAINT))
+        # Along the similarity of the world the step is the smallest one.
+        scaled = scale[:, None] * normal.hessian * scale + 1e-12 * np.eye(len(scale))
+        along = scale * over(cholesky(scaled), (scale * normal.right)[:, None])[:, 0]
+        points = normal.stepped(now[0].points_in_world, along)
+        tried = replace(image_step(problem, now[0], along), points_in_world=points)
         return tried, view_of(problem, tried)
 
     found, _, damping, _ = damped_gauss_newton(
@@ -299,13 +280,3 @@ def _normal_equations(
         right[of_rigs] -= one.information @ one.steps(state) + one.gradient
     hessian[np.diag_indices(len(right))] *= 1 + damping
     return without_points(hessian, right, weighted, seen, damping)
-
-
-def _after_step(problem: Problem, state: State, normal: Normal) -> State:
-    """Return the state after one Gauss-Newton step; along the similarity of the world, the smallest one."""
-    scale = 1 / np.sqrt(np.maximum(normal.hessian.diagonal(), FAINT))
-    scaled = scale[:, None] * normal.hessian * scale
-    scaled[np.diag_indices(len(scale))] += 1e-12
-    step = scale * over(cholesky(scaled), (scale * normal.right)[:, None])[:, 0]
-    points = normal.stepped(state.points_in_world, step)
-    return replace(image_step(problem, state, step), points_in_world=points)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.estimation.kinematics import Arm, Joints, forward_kinematics, kinematic_jacobian, unwrapped
+from jcr.estimation.kinematics import Arm, Joints, forward_kinematics, kinematic_jacobian
 from jcr.geometry import (
     ARM,
     Transform,
@@ -41,12 +41,8 @@ MISFIT_WEIGHT, REST_WEIGHT = 1e10, 0.05
 """Weights of the squared misfit (m²) and the squared distance from rest (rad²), beside squared change between poses."""
 TOOL_STD = (0.15, 1.0)
 """Standard deviation (m, rad) of a weak prior on an unknown tool."""
-TOOLS = tuple(
-    (np.array([0.0, 0.0, ahead]), np.array([0.0, 0.0, yaw]))
-    for ahead in (0.1, 0.2)
-    for yaw in (0.0, -np.pi / 4)
-)
-"""Initial estimates of an unknown tool, translation (m) and rotation vector (rad)."""
+TOOLS = (0.0, 0.0), (0.1, 0.0), (0.1, -np.pi / 4), (0.2, 0.0), (0.2, -np.pi / 4)
+"""Initial estimates of an unknown tool: translation along z (m) and rotation about it (rad)."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +52,13 @@ class Posture:
     joints: Float[ndarray, "n dof"]
     flange_from_tool: Transform
     """Given, the identity, or estimated."""
-    misfit_m: Float[ndarray, " n"]
-    misfit_rad: Float[ndarray, " n"]
+    misfit: Float[ndarray, "n 2"]
+    """Distance (m) and angle (rad) from each pose."""
 
     @property
     def fits(self) -> bool:
         """Whether the arm reaches every pose."""
-        return bool((self.misfit_m < FITS[0]).all() and (self.misfit_rad < FITS[1]).all())
+        return bool((self.misfit < FITS).all())
 
 
 def inverse_kinematics(
@@ -79,22 +75,24 @@ def inverse_kinematics(
     if posture.fits or flange_from_tool is not None:
         return posture
     tried = [posture]
-    for start in (np.eye(4), *(transform(rotation_exp(vector), shift) for shift, vector in TOOLS)):
+    for ahead, yaw in TOOLS:
+        start = transform(rotation_exp(np.array([0.0, 0.0, yaw])), np.array([0.0, 0.0, ahead]))
         first = _posture(arm, base_from_gripper, start, rng)
         joints, found = _with_tool(arm, base_from_gripper, first.joints, start)
         tried.append(_posture(arm, base_from_gripper, found, rng, joints))
         if tried[-1].fits:
             break
-    return min(tried, key=lambda one: float((one.misfit_m**2 + (ARM * one.misfit_rad) ** 2).sum()))
+    return min(tried, key=lambda one: float(((one.misfit * (1.0, ARM)) ** 2).sum()))
 
 
 def required_posture(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"]) -> Posture:
     """Return the result of `inverse_kinematics`; raise InputError with the misfit where the poses do not fit the arm."""
     posture = inverse_kinematics(arm, base_from_gripper)
-    if posture.misfit_m.max() > REFUSED[0] * arm.reach or posture.misfit_rad.max() > REFUSED[1]:
+    metres, radians = posture.misfit.max(0)
+    if metres > REFUSED[0] * arm.reach or radians > REFUSED[1]:
         raise InputError(
-            f"poses do not fit a {arm.name}: {1e3 * posture.misfit_m.max():.0f} mm, "
-            f"{np.degrees(posture.misfit_rad.max()):.1f}° off; name another robot, or leave it out"
+            f"poses do not fit a {arm.name}: {1e3 * metres:.0f} mm, {np.degrees(radians):.1f}° off; name another robot, "
+            "or leave it out"
         )
     return posture
 
@@ -167,8 +165,8 @@ def _posture(
     n, s, dof = starts.shape
     found = reach_toward(arm, np.repeat(base_from_gripper, s, 0), starts.reshape(-1, dof)).reshape(n, s, dof)
     misfit = _misfit(arm, found.reshape(-1, dof), np.repeat(base_from_tool, s, 0), flange_from_tool)
-    joints = _path(arm, found, ((misfit / (1.0, 1 / ARM)) ** 2).sum(1).reshape(n, s))
-    return Posture(joints, flange_from_tool, *_misfit(arm, joints, base_from_tool, flange_from_tool).T)
+    joints = _path(arm, found, ((misfit * (1.0, ARM)) ** 2).sum(1).reshape(n, s))
+    return Posture(joints, flange_from_tool, _misfit(arm, joints, base_from_tool, flange_from_tool))
 
 
 def _misfit(
@@ -203,7 +201,7 @@ def _change(
     arm: Arm, a: Float[ndarray, "... dof"], b: Float[ndarray, "... dof"]
 ) -> Float[ndarray, "... dof"]:
     """Return the change from angles a to b, the shorter way where the joint has a full rotation."""
-    return np.where(np.diff(arm.limits)[:, 0] >= 2 * np.pi, unwrapped(b - a), b - a)
+    return np.where(np.diff(arm.limits)[:, 0] >= 2 * np.pi, (b - a + np.pi) % (2 * np.pi) - np.pi, b - a)
 
 
 def _with_tool(

@@ -68,8 +68,7 @@ def from_dh(
     modified: bool,
     last_from_gripper: Transform | None = None,
 ) -> Arm:
-    """Return an arm from rows (a, d, α, θ₀) in metres and radians, of standard (distal) or modified (Craig)
-    parameters.
+    """Return an arm from rows (a, d, α, θ₀) in m and rad, of standard (distal) or modified (Craig) parameters.
 
     Standard: R_z(q+θ₀) T_z(d) T_x(a) R_x(α). Modified: R_x(α) T_x(a) R_z(q+θ₀) T_z(d), α and a being those of the link
     before.
@@ -161,8 +160,3 @@ def perpendicular(axes: Float[ndarray, "dof 3"]) -> Float[ndarray, "dof 3 2"]:
     first = first - (first * axes).sum(1, keepdims=True) * axes
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack([first, np.cross(axes, first)], -1)
-
-
-def unwrapped(angles: Float[ndarray, "*n"]) -> Float[ndarray, "*n"]:
-    """Return angles in [-π, π)."""
-    return (angles + np.pi) % (2 * np.pi) - np.pi

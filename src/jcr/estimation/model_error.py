@@ -35,7 +35,10 @@ def displacements(
         rows = np.flatnonzero(camera == c)
         by_prior = by_parameters(one.intrinsics, unproject(one.intrinsics, x_px[rows])) @ one.directions
         block = np.zeros((len(camera), 2, count))
-        block[rows] = one.intrinsics.width * _beside(_polynomials(x_px[rows], one.intrinsics), by_prior)
+        polynomials = _polynomials(x_px[rows], one.intrinsics)
+        basis = np.linalg.qr(by_prior.reshape(2 * len(rows), -1))[0]
+        flat = polynomials.reshape(2 * len(rows), -1)
+        block[rows] = (flat - basis @ (basis.T @ flat)).reshape(polynomials.shape)
         blocks.append(block)
     return np.concatenate(blocks, axis=2)
 
@@ -65,10 +68,8 @@ def expressed(camera: Camera, x_px: Float[ndarray, "k 2"]) -> Float[ndarray, "q 
     """Return the part of each polynomial over these pixels that the camera's parameters express."""
     intrinsics = camera.intrinsics
     by_prior = by_parameters(intrinsics, unproject(intrinsics, x_px)) @ camera.directions
-    polynomials = intrinsics.width * _polynomials(x_px, intrinsics)
-    fit = np.linalg.lstsq(
-        by_prior.reshape(2 * len(x_px), -1), polynomials.reshape(2 * len(x_px), -1), rcond=None
-    )[0]
+    rows, polynomials = 2 * len(x_px), _polynomials(x_px, intrinsics)
+    fit = np.linalg.lstsq(by_prior.reshape(rows, -1), polynomials.reshape(rows, -1), rcond=None)[0]
     return camera.directions @ fit
 
 
@@ -80,8 +81,7 @@ def second_moment_px2(
     A projection with the camera alone errs by the displacement and by its uncertainty.
     """
     flat = x_px.reshape(-1, 2)
-    by = camera.width * _polynomials(flat, camera)
-    by = by - by_parameters(camera, unproject(camera, flat)) @ left.expressed
+    by = _polynomials(flat, camera) - by_parameters(camera, unproject(camera, flat)) @ left.expressed
     moment = left.covariance + np.outer(left.likeliest, left.likeliest)
     return (by @ moment @ np.swapaxes(by, 1, 2)).reshape(*x_px.shape, 2)
 
@@ -92,17 +92,9 @@ def polynomials_of(camera: Camera) -> int:
 
 
 def _polynomials(x_px: Float[ndarray, "k 2"], camera: Intrinsics) -> Float[ndarray, "k 2 e"]:
-    """Return the displacements of x, then of y: products of Legendre polynomials up to a total degree over a square."""
+    """Return the displacements (px) of x, then of y, by products of Legendre polynomials, one image width each."""
     u, v = ((2 * x_px - [camera.width - 1, camera.height - 1]) / max(camera.width, camera.height)).T
     every = legvander2d(u, v, [DEGREE, DEGREE]).reshape(-1, DEGREE + 1, DEGREE + 1)
     i, j = np.nonzero(np.add.outer(np.arange(DEGREE + 1), np.arange(DEGREE + 1)) <= DEGREE)
     kept = every[:, i, j]
-    nothing = np.zeros_like(kept)
-    return np.stack([np.hstack([kept, nothing]), np.hstack([nothing, kept])], axis=1)
-
-
-def _beside(by: Float[ndarray, "k 2 e"], expressed: Float[ndarray, "k 2 q"]) -> Float[ndarray, "k 2 e"]:
-    """Return displacements without the part that others express, over these observations."""
-    flat, basis = by.reshape(-1, by.shape[2]), expressed.reshape(-1, expressed.shape[2])
-    orthonormal = np.linalg.qr(basis)[0]
-    return (flat - orthonormal @ (orthonormal.T @ flat)).reshape(by.shape)
+    return np.kron(camera.width * np.eye(2), kept[:, None]).reshape(len(kept), 2, -1)

@@ -39,15 +39,14 @@ def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Poses) -> Arm:
     disagree, and LengthError where they do by a factor of all positions.
     """
     nominal = forward_kinematics(arm, joints)
-    weights = np.ones(len(joints))
     half_rotation = transform(rotation_exp(np.array([0.0, 0.0, np.pi])), np.zeros(3))
-    tool, _, base = closed_form(base_from_gripper, nominal, weights)
+    tool, _, base = closed_form(base_from_gripper, nominal)
     fits = [
         fit_known_scale(base_from_gripper, nominal, start, NOISE)
         for start in ((np.eye(4), np.eye(4)), (np.eye(4), half_rotation), (tool, base))
     ]
     _require_length(arm, base_from_gripper, nominal)
-    best = min(fits, key=lambda fit: float((fit.residual / np.repeat(NOISE, 3)) ** 2 @ np.ones(6) @ weights))
+    best = min(fits, key=lambda fit: float(((fit.residual / np.repeat(NOISE, 3)) ** 2).sum()))
     metres, radians = _apart(best.residual)
     if metres > AGREE[0] * arm.reach or radians > AGREE[1]:
         raise InputError(

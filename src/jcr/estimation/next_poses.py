@@ -134,7 +134,7 @@ def assumed_camera(base_from_gripper: Poses) -> Transform:
     The axis is the one whose lines over all poses pass nearest to a common point, relative to the distance of that
     point: views of one scene have such a point.
     """
-    center, best, least = base_from_gripper[:, :3, 3], np.array([0.0, 0.0, 1.0]), np.inf
+    center, best, least = base_from_gripper[:, :3, 3], np.eye(3)[2], np.inf
     for axis in np.concatenate([np.eye(3)[::-1], -np.eye(3)[::-1]]):
         along = base_from_gripper[:, :3, :3] @ axis
         to_scene = nearest_to_lines(center, along) - center

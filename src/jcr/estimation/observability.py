@@ -81,7 +81,7 @@ def observability(
 def _unseen(motion: str, at: Float[ndarray, "3"] | None = None, frame: str = "") -> Finding:
     """Return a finding of a direction that a kind of motion does not show, with an axis or a point of a frame."""
     where: dict[str, Any] = (
-        {} if at is None else dict(zip("xyz", at.tolist(), strict=True)) | {"frame": frame}
+        {} if at is None else {**dict(zip("xyz", at.tolist(), strict=True)), "frame": frame}
     )
     return Finding.of(FindingKind.UNOBSERVABLE, "rejects", "motion", motion=motion, **where)
 
@@ -100,27 +100,23 @@ def _explained(
             return [_unseen("planar", u[:, 0], "base")]
         parts = ("translation", "scale", "rotation")[: max(int(unseen.sum()), 2)]
         return [_unseen(f"one axis, {part}", u[:, 0], "base") for part in parts]
-    if loses_scale:
-        return [_lost_scale(base_from_gripper, recon_from_camera)]
-    weakest = found.direction[0]
-    what, axis = max(
-        (("translation", weakest[:3]), ("rotation", weakest[3:6])), key=lambda part: np.linalg.norm(part[1])
-    )
-    return [_unseen(f"weak {what}", axis / np.linalg.norm(axis), "gripper")]
-
-
-def _lost_scale(base_from_gripper: Poses, recon_from_camera: Poses | None) -> Finding:
-    """Return the finding of the point fixed to the gripper whose rest makes the scale unobservable."""
+    if not loses_scale:
+        translation, rotation = found.direction[0][:3], found.direction[0][3:6]
+        is_translation = np.linalg.norm(translation) >= np.linalg.norm(rotation)
+        axis = translation if is_translation else rotation
+        what = "translation" if is_translation else "rotation"
+        return [_unseen(f"weak {what}", axis / np.linalg.norm(axis), "gripper")]
+    # A point fixed to the gripper stays where it is, which makes the scale unobservable.
     tool = still_point(base_from_gripper)[0]
     if recon_from_camera is None:
-        return _unseen("one point", tool, "gripper")
+        return [_unseen("one point", tool, "gripper")]
     # The cameras determine the point better than X, whose offset trades against the lost scale.
     in_camera, moves, spread = still_point(recon_from_camera)
     if moves > 0.5 * spread:
-        return _unseen("own centre")
+        return [_unseen("own centre")]
     if in_camera[2] > np.cos(np.radians(8)) * np.linalg.norm(in_camera):
-        return _unseen("look-at")
-    return _unseen("tool point", tool, "gripper")
+        return [_unseen("look-at")]
+    return [_unseen("tool point", tool, "gripper")]
 
 
 def still_point(a_from_b: Poses) -> tuple[Float[ndarray, "3"], float, float]:

@@ -101,7 +101,7 @@ class Layout:
         seen = np.bincount(observations.point)
         corner = np.zeros(len(seen), bool)
         if boards is not None:
-            corner = boards.is_corner(len(seen))
+            corner[boards.point] = True
         freedom = np.maximum(2 * seen - 3 * ~corner, 1)
         cameras = len(widths)
         stated = (observations.std_px / np.median(observations.std_px)) ** 2 if len(camera) else np.ones(0)
@@ -140,12 +140,8 @@ def pixel_noise(
 
     `ratio` is that of the variances of each group's observations to those of the first. With independent errors the
     squared sum of the weighted residuals over a cell is, on average, the sum of their squares. The factor beyond that
-    is the information that errors shared by neighbours cost the images.
-
-    `ratio` is that of the variances of each group's observations to those of the first. Were errors independent, the
-    squared sum over a cell of what each observation pulls would be, on average, the sum of the squares; what it is
-    times that is what the errors that neighbours share cost of the images' information (the variance inflation of
-    cluster sampling; Liang and Zeger, Biometrika 73, 1986).
+    is the information that errors shared by neighbours cost the images (variance inflation of cluster sampling; Liang
+    and Zeger, Biometrika 73, 1986).
     """
     relative = (residual_px**2).sum(1) / (ratio[layout.group] * layout.relative_variance(common))
     far = relative > FAR_OFF**2 * np.median(relative)
@@ -159,7 +155,7 @@ def pixel_noise(
     return replace(noise, inflation=max(1.0, inflation))
 
 
-def left_of_points(
+def refined_noise(
     layout: Layout,
     before: PixelNoise,
     residual_px: Float[ndarray, "k 2"],
@@ -167,45 +163,29 @@ def left_of_points(
     by_point: Float[ndarray, "k 2 3"],
     starts: Int[ndarray, " p"],
     known: Float[ndarray, "p 3 3"] | None = None,
-) -> Float[ndarray, " k"]:
-    """Return the share of each observation's variance that is left in its residual by the leverage of the points.
+) -> PixelNoise:
+    """Return the pixel noise with the variances of each group over those of the first, and of matches as stated.
 
-    `by_point` are derivatives by the points, `starts` each point's first observation, `known` the information that
-    each point has beside its observations.
+    Sums of squares are divided by the share of each variance that the leverage of the points left in the residuals: a
+    group whose residuals are small because points follow it is not the better one. `by_point` are derivatives by the
+    points, `starts` each point's first observation, `known` the information that each point has beside its observations.
     """
     weight = replace(before, inflation=1.0).weights(residual_px, depth, layout)
     j = np.sqrt(weight)[:, None, None] * by_point
     blocks = point_blocks(j, starts)
     inverse = np.linalg.inv(blocks if known is None else blocks + known)[layout.point]
-    return 1 - np.minimum(np.einsum("kai,kij,kaj->k", j, inverse, j) / 2, 1.0)
-
-
-def variance_ratios(
-    layout: Layout,
-    before: PixelNoise,
-    residual_px: Float[ndarray, "k 2"],
-    depth: Float[ndarray, " k"],
-    left: Float[ndarray, " k"],
-) -> Float[ndarray, " g"]:
-    """Return the variances of each group's observations over those of the first.
-
-    The sums of squares are divided by what the points left of them: a group whose residuals are small because points
-    follow it is not the better one.
-    """
-    count = len(before.sigma_px)
-    ratio = np.ones(count)
-    if count == 1:
-        return ratio
-    tame = replace(before, inflation=1.0).weights(residual_px, depth, layout) * before.variance_px2(layout)
+    left = 1 - np.minimum(np.einsum("kai,kij,kaj->k", j, inverse, j) / 2, 1.0)
+    ratio, tame = np.ones(layout.groups), weight * before.variance_px2(layout)
     square = (residual_px**2).sum(1) / layout.relative_variance(before.common)
-    for c in range(count):
-        rows = layout.group == c
-        if rows.any():
-            ratio[c] = (tame[rows] @ square[rows]) / max(2 * float(tame[rows] @ left[rows]), 1e-12)
-    return np.clip(ratio / max(ratio[0], 1e-12), *RATIOS)
+    for group in range(layout.groups):
+        rows = layout.group == group
+        if rows.any() and layout.groups > 1:
+            ratio[group] = (tame[rows] @ square[rows]) / max(2 * float(tame[rows] @ left[rows]), 1e-12)
+    ratio = np.clip(ratio / max(ratio[0], 1e-12), *RATIOS)
+    return pixel_noise(layout, residual_px, depth, ratio, _common_share(layout, residual_px, left, ratio))
 
 
-def common_share(
+def _common_share(
     layout: Layout,
     residual_px: Float[ndarray, "k 2"],
     left: Float[ndarray, " k"],

@@ -6,8 +6,7 @@ estimated together: an error of the principal point that a rotation of the camer
 are used. Their joint covariance is therefore propagated (Kogan, mrcal, "Projection uncertainty").
 """
 
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -28,36 +27,11 @@ from jcr.records import Estimate, Intrinsics, InUse, RobotNoise, SceneUncertaint
 Pixels = Float[ndarray, "*points 2"]
 Distances = Float[ndarray, "*#points"] | float
 Covariances = Float[ndarray, "*points 3 3"]
+ScenePoints = tuple[Float[ndarray, "p 3"], Float[ndarray, "p 3 p 3"], Float[ndarray, "p 3 3"]]
+"""Some reconstructed points in the frame of the first arm's poses (m), their covariance by rigs, cameras and arms, which
+they share, and by the triangulation of each (m²)."""
 SCENE_POINTS = 300
 """Number of points, drawn at random, that represent a scene."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PointUncertainty:
-    """Covariances (m²) of points in the robot's base frame, by cause."""
-
-    calibration: Covariances
-    """Covariance by intrinsics, X and scale together: common to all points observed from one gripper pose."""
-    robot_random: Covariances
-    """Covariance by the random error of the gripper pose of the observation."""
-    robot_systematic: Covariances
-    """Covariance by the systematic error of that pose, beside its part in the effective X; for poses in the region of
-    the capture."""
-
-    @property
-    def together(self) -> Covariances:
-        """Sum of the covariances."""
-        return self.calibration + self.robot_random + self.robot_systematic
-
-
-class ScenePoints(NamedTuple):
-    """Some reconstructed points in the frame of the first arm's poses, and their covariance (m²)."""
-
-    in_base: Float[ndarray, "p 3"]
-    together: Float[ndarray, "p 3 p 3"]
-    """Covariance by rigs, cameras and arms, which the points share."""
-    own: Float[ndarray, "p 3 3"]
-    """Covariance by the triangulation of each point."""
 
 
 def point_covariance(
@@ -79,10 +53,11 @@ def point_in_base(
     x_px: Pixels,
     depth_m: Distances,
     base_from_gripper: Float[ndarray, "4 4"],
-) -> tuple[Float[ndarray, "*points 3"], PointUncertainty]:
-    """Return the base-frame coordinates (m) of points at pixels, z = `depth_m` in the camera, and their covariances.
+) -> tuple[Float[ndarray, "*points 3"], Covariances]:
+    """Return the base-frame coordinates (m) of points at pixels, z = `depth_m` in the camera, and their covariance.
 
-    `noise` is that of the reported gripper pose, whose errors add to those of the calibration.
+    `noise` is that of the reported gripper pose, in the region of the capture, whose errors add to those of intrinsics,
+    X and scale.
     """
     intrinsics, x = estimate.intrinsics, estimate.gripper_from_camera
     assert intrinsics is not None
@@ -93,15 +68,10 @@ def point_in_base(
     in_camera = point_covariance(estimate, intrinsics, x_px, distance_m)
     lever = skew(p_in_gripper @ base_from_gripper[:3, :3].T)
     square = lever @ np.swapaxes(lever, -1, -2)
-    random, systematic = (
-        metres**2 * np.eye(3) + radians**2 * square
-        for metres, radians in ((noise.translation, noise.rotation), noise.systematic_left)
-    )
-    return apply(base_from_gripper, p_in_gripper), PointUncertainty(
-        calibration=base_from_camera_axes @ in_camera @ base_from_camera_axes.T,
-        robot_random=random,
-        robot_systematic=systematic,
-    )
+    covariance = base_from_camera_axes @ in_camera @ base_from_camera_axes.T
+    for metres, radians in ((noise.translation, noise.rotation), noise.systematic_left):
+        covariance = covariance + metres**2 * np.eye(3) + radians**2 * square
+    return apply(base_from_gripper, p_in_gripper), covariance
 
 
 def bounds_at(
@@ -200,14 +170,15 @@ def within_95(covariance: Float[ndarray, "n n"]) -> float:
 
 def scene_uncertainty(points: ScenePoints) -> SceneUncertainty:
     """Return the uncertainty of a scene as a whole, and of its shape, by some of its points."""
-    middle, count = np.median(points.in_base, axis=0), len(points.in_base)
-    by_step = by_similarity(points.in_base - middle).reshape(3 * count, 7)
-    together = points.together.reshape(3 * count, 3 * count)
+    in_base, shared, own = points
+    middle, count = np.median(in_base, axis=0), len(in_base)
+    by_step = by_similarity(in_base - middle).reshape(3 * count, 7)
+    together = shared.reshape(3 * count, 3 * count)
     fit = np.linalg.pinv(by_step)
     as_whole = fit @ together @ fit.T
     left = np.trace(together) - 2 * np.sum((fit @ together) * by_step.T)
     left += np.sum((as_whole @ by_step.T) * by_step.T)
-    each = points.together[np.arange(count), :, np.arange(count)] + points.own
+    each = shared[np.arange(count), :, np.arange(count)] + own
     return SceneUncertainty(
         middle_in_base=middle,
         covariance=as_whole,
@@ -237,11 +208,9 @@ def scene_points(solution: Solution) -> ScenePoints:
     j[:, :, SCALE] += by_frame[:, :, 6:]
     j, by_column = j.reshape(3 * len(some), -1), by_column.reshape(3 * len(some), -1)
     together = j @ solution.covariance @ j.T + by_column @ column_covariance @ by_column.T
-    return ScenePoints(
-        in_base_axes + likely.z[0][:3, 3],
-        together.reshape(len(some), 3, len(some), 3),
-        scale**2 * base_from_world @ own @ base_from_world.T,
-    )
+    together = together.reshape(len(some), 3, len(some), 3)
+    own = scale**2 * base_from_world @ own @ base_from_world.T
+    return in_base_axes + likely.z[0][:3, 3], together, own
 
 
 def _triangulation(
@@ -270,17 +239,21 @@ def _rigs_given_unknowns(solution: Solution) -> tuple[Float[ndarray, "d p"], Flo
 
     That covariance is what images and reported poses leave of the rigs.
     """
-    problem, equations, rigs = solution.problem, solution.equations, solution.images.rigs
+    problem, equations, (follow, _, rig_covariance) = (
+        solution.problem,
+        solution.equations,
+        solution.images.rigs,
+    )
     by_rig = reported_poses(problem, solution.most_likely)[2]
-    shown = pose_by_pose(by_rig, rigs.covariance)
+    shown = pose_by_pose(by_rig, rig_covariance)
     gain = over(cholesky(equations.covariance(solution.log_sizes)), shown).T
     robots, columns, free, by_arm = problem.arm_unknowns, problem.columns.count, problem.free, problem.by_arm
     by_unknown = np.zeros((columns, len(solution.covariance)))
     by_unknown[free, robots + np.arange(len(free))] = 1.0
     by_unknown[by_arm] = -gain @ equations.jacobian
-    by_unknown[by_arm, robots:] -= rigs.follow
+    by_unknown[by_arm, robots:] -= follow
     left = np.zeros((columns, columns))
-    left[np.ix_(by_arm, by_arm)] = rigs.covariance - gain @ shown
+    left[np.ix_(by_arm, by_arm)] = rig_covariance - gain @ shown
     return by_unknown, left
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy.linalg import block_diag
 
@@ -34,8 +34,7 @@ class PoseEquations:
 def reported_poses(
     problem: Problem, state: State
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 u"], Float[ndarray, "n 6 6"]]:
-    """Return the residuals of the reported poses of all arms, and their derivatives by the arms' unknowns and by the rig
-    of each."""
+    """Return the residuals of all reported poses, and their derivatives by the arms' unknowns and by their rigs."""
     each, begin = [], 0
     jacobian = np.zeros((sum(len(arm.rigs) for arm in problem.arms), 6, problem.arm_unknowns))
     for k, arm in enumerate(problem.arms):
@@ -60,18 +59,22 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
     used = np.ones(n, bool) if problem.used is None else problem.used
     rows = np.flatnonzero(np.repeat(used, 6))
     jacobian = by_arms.reshape(6 * n, arms)
-    information, gradient = prior_of_unknowns(problem, state)
+    information, gradient = np.zeros((problem.unknowns, problem.unknowns)), np.zeros(problem.unknowns)
+    information[:arms, :arms] = weak_prior(len(problem.arms))
+    for row, value, std in problem.priors:
+        information += np.outer(row, row) / std**2
+        gradient += row * (row @ problem.coordinates(state) - value) / std**2
     if images is None:
         assert problem.known_rigs is not None
         covariance = problem.known_rigs.covariance
     else:
-        rigs, coupling = images.rigs, images.information[np.ix_(problem.by_arm, free)]
-        covariance = rigs.covariance
-        residual = residual - pose_by_pose(by_rig, rigs.step[:, None]).reshape(n, 6)
-        jacobian = np.concatenate([jacobian, -pose_by_pose(by_rig, rigs.follow)], axis=1)
-        of_free = images.information[np.ix_(free, free)] - coupling.T @ rigs.follow
+        follow, step, covariance = images.rigs
+        coupling = images.information[np.ix_(problem.by_arm, free)]
+        residual = residual - pose_by_pose(by_rig, step[:, None]).reshape(n, 6)
+        jacobian = np.concatenate([jacobian, -pose_by_pose(by_rig, follow)], axis=1)
+        of_free = images.information[np.ix_(free, free)] - coupling.T @ follow
         information[arms:, arms:] += (of_free + of_free.T) / 2
-        gradient[arms:] += images.gradient[free] - coupling.T @ rigs.step
+        gradient[arms:] += images.gradient[free] - coupling.T @ step
     shared = None
     if covariance is not None:
         shared = pose_by_pose(by_rig, pose_by_pose(by_rig, covariance).T)
@@ -83,6 +86,11 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
     everywhere = replace(region, by_unknown=by_unknown, fit=fit)
     systematic = everywhere.left(np.asarray(block_diag(*(arm.error_covariance for arm in problem.arms))))
     among = np.ix_(rows, rows)
+    confirmed = (
+        np.zeros((6 * len(arm.rigs), 0)) if arm.confirmed_errors is None else arm.confirmed_errors
+        for arm in problem.arms
+    )
+    columns = np.asarray(block_diag(*confirmed))[rows]
     return PoseEquations(
         residual=residual,
         jacobian=jacobian,
@@ -98,29 +106,6 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
             known=None if shared is None else shared[among],
             systematic=systematic[among],
             given=problem.robot_noise_floor,
-            confirmed=_confirmed(problem, region, rows),
+            confirmed=region.left(columns @ columns.T) if columns.size else None,
         ),
     )
-
-
-def prior_of_unknowns(problem: Problem, state: State) -> tuple[Float[ndarray, "p p"], Float[ndarray, " p"]]:
-    """Return the information of the weak prior and the linear priors, and their gradient."""
-    arms = problem.arm_unknowns
-    information, gradient = np.zeros((problem.unknowns, problem.unknowns)), np.zeros(problem.unknowns)
-    information[:arms, :arms] = weak_prior(len(problem.arms))
-    for row, value, std in problem.priors:
-        information += np.outer(row, row) / std**2
-        gradient += row * (row @ problem.coordinates(state) - value) / std**2
-    return information, gradient
-
-
-def _confirmed(problem: Problem, region: Region, rows: Int[ndarray, " r"]) -> Float[ndarray, "r r"] | None:
-    """Return the covariance that confirmed errors leave in the used poses of all arms; None where there are none."""
-    if all(arm.confirmed_errors is None for arm in problem.arms):
-        return None
-    each = [
-        np.zeros((6 * len(arm.rigs), 0)) if arm.confirmed_errors is None else arm.confirmed_errors
-        for arm in problem.arms
-    ]
-    columns = np.asarray(block_diag(*each))[rows]
-    return region.left(columns @ columns.T)

@@ -20,7 +20,7 @@ from jcr.estimation.next_poses import assumed_camera, median_distance
 from jcr.estimation.pixel_noise import PixelNoise
 from jcr.estimation.point_uncertainty import in_use
 from jcr.estimation.pose_equations import pose_equations
-from jcr.estimation.problem import LinearPrior, scale_prior
+from jcr.estimation.problem import scale_prior
 from jcr.estimation.robot_noise import GIVEN_SHARE, TYPICAL
 from jcr.estimation.solve import Solution, expected_solution
 from jcr.estimation.wrist import estimate_in, pose_problem, wrist_arm, wrist_problem
@@ -88,11 +88,6 @@ class Assumptions:
     faults: Float[ndarray, "7 7"] | None = None
     """Covariance that findings add; None: nothing."""
 
-    @property
-    def priors(self) -> tuple[LinearPrior, ...]:
-        """Measurement of the scale."""
-        return () if self.scale_std is None else (scale_prior(1.0, self.scale_std),)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Prediction:
@@ -158,14 +153,16 @@ def predict(
 
     `systematic` is the covariance of their systematic errors at 1 rad.
     """
-    x, identity = assumptions.gripper_from_camera, np.eye(4)
     if assumptions.camera is None:
-        covariance = predict_covariance(assumptions, base_from_gripper, systematic)
-        estimate = Estimate(gripper_from_camera=x, scale=1.0, base_from_recon=identity, covariance=covariance)
-    else:
-        estimate = estimate_in(
-            _predicted_solution(assumptions, assumptions.camera, base_from_gripper, systematic), 1.0, identity
+        estimate = Estimate(
+            gripper_from_camera=assumptions.gripper_from_camera,
+            scale=1.0,
+            base_from_recon=np.eye(4),
+            covariance=predict_covariance(assumptions, base_from_gripper, systematic),
         )
+    else:
+        found = _predicted_solution(assumptions, assumptions.camera, base_from_gripper, systematic)
+        estimate = estimate_in(found, 1.0, np.eye(4))
     if assumptions.faults is not None:
         estimate = estimate.with_fault(assumptions.faults)
     return Prediction(estimate=estimate, in_use=in_use(estimate, assumptions.distance_m))
@@ -188,7 +185,7 @@ def predict_covariance(
         (x, 1.0, np.eye(4)),
         error_covariance=systematic,
         noise_floor=noise.given,
-        priors=assumptions.priors,
+        priors=() if assumptions.scale_std is None else (scale_prior(1.0, assumptions.scale_std),),
     )
     if averaged:
         return expected_solution(problem, state, None, noise).covariance[:7, :7]
@@ -238,24 +235,8 @@ def _observed_points(cameras: Poses, intrinsics: Intrinsics, distance_m: float) 
     )
     rays = unproject(intrinsics, np.stack([u.ravel(), v.ravel()], axis=1))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    points, source = _on_surface(cameras, rays, distance_m)
-    chosen = np.linspace(0, len(points) - 1, min(len(points), MOST_POINTS)).round().astype(int)
-    points, source = points[chosen], source[chosen]
-    image, point = np.nonzero(_visible(cameras, intrinsics, points, source))
-    x_px = np.empty((len(image), 2))
-    for i, pose in enumerate(cameras):
-        mine = image == i
-        x_px[mine] = project(intrinsics, apply(inverse(pose), points[point[mine]]))
-    return Tracks(image=image, x_px=x_px, point=point, points_in_recon=points)
-
-
-def _on_surface(
-    cameras: Poses, rays: Float[ndarray, "r 3"], distance_m: float
-) -> tuple[Float[ndarray, "p 3"], Int[ndarray, " p"]]:
-    """Return points of a surface across the mean optical axis, and the camera of each point's ray; p = n · r.
-
-    The relief is a pattern of the rays, alike in all images; rays along the surface end at twice its distance.
-    """
+    # The surface is across the mean optical axis; rays along it end at twice its distance. The relief is a pattern of
+    # the rays, alike in all images.
     centre, axis = cameras[:, :3, 3], cameras[:, :3, 2]
     normal = axis.mean(0)
     normal = normal / max(float(np.linalg.norm(normal)), 1e-9)
@@ -264,8 +245,16 @@ def _on_surface(
     depth = ((middle - centre) @ normal)[:, None] / np.maximum(direction @ normal, 1e-9)
     relief = RELIEF * distance_m * np.cos(2.4 * np.arange(len(rays)))
     depth = np.clip(depth, 0.3 * distance_m, 2 * distance_m) + relief
-    points = centre[:, None] + depth[..., None] * direction
-    return points.reshape(-1, 3), np.repeat(np.arange(len(cameras)), len(rays))
+    points = (centre[:, None] + depth[..., None] * direction).reshape(-1, 3)
+    source = np.repeat(np.arange(len(cameras)), len(rays))
+    chosen = np.linspace(0, len(points) - 1, min(len(points), MOST_POINTS)).round().astype(int)
+    points, source = points[chosen], source[chosen]
+    image, point = np.nonzero(_visible(cameras, intrinsics, points, source))
+    x_px = np.empty((len(image), 2))
+    for i, pose in enumerate(cameras):
+        mine = image == i
+        x_px[mine] = project(intrinsics, apply(inverse(pose), points[point[mine]]))
+    return Tracks(image=image, x_px=x_px, point=point, points_in_recon=points)
 
 
 def _visible(

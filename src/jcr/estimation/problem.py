@@ -233,10 +233,6 @@ class Problem:
         """Number of unknowns of the mixed model."""
         return self.arm_unknowns + len(self.free)
 
-    def unknown_of(self, column: int) -> int:
-        """Return the row in the mixed model's unknowns of a free column of the images' Jacobian."""
-        return self.arm_unknowns + int(np.searchsorted(self.free, column))
-
     def prior_std(self, state: State) -> Float[ndarray, " l"]:
         """Return the prior standard deviations of the columns before the mounts."""
         each = [np.full(c.stop - c.start, size)
@@ -246,12 +242,10 @@ class Problem:
 
     def intrinsics(self, state: State) -> tuple[Intrinsics, ...]:
         """Return the estimated intrinsics of each camera."""
+        steps = (state.camera_steps[columns] for columns in self.columns.intrinsics)
         return tuple(
-            with_parameters(
-                camera.intrinsics,
-                parameters(camera.intrinsics) + camera.directions @ state.camera_steps[columns],
-            )
-            for camera, columns in zip(self.cameras, self.columns.intrinsics, strict=True)
+            with_parameters(one.intrinsics, parameters(one.intrinsics) + one.directions @ step)
+            for one, step in zip(self.cameras, steps, strict=True)
         )
 
     def nuisances(self, state: State) -> Float[ndarray, " r"]:
@@ -348,8 +342,7 @@ def image_step(problem: Problem, state: State, step: Float[ndarray, " d"]) -> St
 
 
 def full_step(problem: Problem, state: State, step: Float[ndarray, " p"]) -> State:
-    """Return the state after a step of the unknowns of the mixed model: X, log scale, Z of the first arm, X and Z of the
-    others, then the free columns."""
+    """Return the state after a step of X, log scale and Z, of X and Z of further arms, and of the free columns."""
     own = np.stack([step[columns_of_arm(arm)] for arm in range(len(state.x))])
     of_images = np.zeros(problem.columns.count)
     of_images[problem.free] = step[problem.arm_unknowns :]

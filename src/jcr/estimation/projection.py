@@ -99,7 +99,11 @@ def derivatives(problem: Problem, state: State, view: View, weight: Float[ndarra
         here = _rotated(by_rig[rows], rotation)
         by_world[rows] = here
         own[rows, :, :3] = -here
-        own[rows, :, 3:] = _crossed(here, (view.from_rig[rows] @ rotation.T)[:, None])
+        # A cross product, several times faster than NumPy's.
+        away = (view.from_rig[rows] @ rotation.T)[:, None]
+        own[rows, :, 3:] = (
+            here[..., [1, 2, 0]] * away[..., [2, 0, 1]] - here[..., [2, 0, 1]] * away[..., [1, 2, 0]]
+        )
     residual = view.residual_px * root[..., 0]
     of_images = Derivatives(shared=shared, own=own, by_point=by_world, residual=residual)
     if problem.boards is None:
@@ -164,24 +168,18 @@ def _by_cameras(problem: Problem, state: State, view: View) -> Float[ndarray, "k
         # The shear is counted in focal lengths, and grows with it.
         sheared = view.own_map[rows, 1] * view.from_centre_px[rows, 1] / camera.fx
         out[rows, 0, columns] += sheared[:, None] * prior.directions[0]
-    out[:, :, problem.columns.nuisance] = _by_nuisances(problem, view, view.own_map)
-    return out
-
-
-def _by_nuisances(problem: Problem, view: View, own_map: Float[ndarray, "k 2"]) -> Float[ndarray, "k 2 e"]:
-    """Return the derivative of every observation by the steps of nuisances."""
     assert problem.observations is not None
-    image, about = problem.observations.image, view.from_centre_px
-    directions = problem.nuisance_directions
+    about, directions = view.from_centre_px, problem.nuisance_directions
     of_images = directions[:-PRISM].reshape(OF_IMAGE, -1, directions.shape[1])
-    focal, sheared, *offset = of_images[:, image]
+    focal, sheared, *offset = of_images[:, problem.observations.image]
     shear_px = _of_camera(problem, [camera.fx / camera.height for camera in view.cameras]) * about[:, 1]
     width = _of_camera(problem, [camera.width for camera in view.cameras])
-    out = (own_map[:, :1] * about)[..., None] * focal[:, None]
-    out[:, 0] += shear_px[:, None] * sheared
-    out += width[:, None, None] * np.stack(offset, axis=1)
+    by_nuisance = (view.own_map[:, :1] * about)[..., None] * focal[:, None]
+    by_nuisance[:, 0] += shear_px[:, None] * sheared
+    by_nuisance += width[:, None, None] * np.stack(offset, axis=1)
     if directions[-PRISM:].any():
-        out += problem.prism @ directions[-PRISM:]
+        by_nuisance += problem.prism @ directions[-PRISM:]
+    out[:, :, problem.columns.nuisance] = by_nuisance
     return out
 
 
@@ -200,8 +198,3 @@ def _of_camera(problem: Problem, values: list[float] | list[int]) -> Float[ndarr
 def _rotated(by: Float[ndarray, "k 2 3"], rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "k 2 3"]:
     """Return derivatives by a point in other axes; one product, where NumPy would make one of each observation."""
     return (by.reshape(-1, 3) @ rotation.T).reshape(by.shape)
-
-
-def _crossed(a: Float[ndarray, "k 2 3"], b: Float[ndarray, "k 1 3"]) -> Float[ndarray, "k 2 3"]:
-    """Return cross products, several times faster than NumPy's."""
-    return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]

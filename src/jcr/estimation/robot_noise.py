@@ -244,12 +244,12 @@ def most_likely(
     2006, eq. 6.19): where the expected information is half of the curvature, steps swing about the mode.
     """
     at = equations.prior[0] if start is None else start
-    value, gradient, information = _score(equations, at)
+    value, gradient, information = score(equations, at)
     curvature = information
     for _ in range(40):
         step = np.linalg.solve(curvature, gradient)
         step /= max(1.0, float(np.abs(step).max()))
-        while (scored := _score(equations, at + step))[0] < value and np.abs(step).max() > settled:
+        while (scored := score(equations, at + step))[0] < value and np.abs(step).max() > settled:
             step = step / 2
         if scored[0] < value:
             break
@@ -266,15 +266,17 @@ def most_likely(
     return at, information
 
 
-def log_evidence(equations: Equations, log_posterior: float, information: Information) -> float:
+def log_evidence(equations: Equations, log_sizes: LogSizes, information: Information) -> float:
     """Return the log density of the residuals, averaged over unknowns and sizes, up to a common constant.
 
-    Laplace's method is used about the mode of the sizes, at which `log_posterior` and `information` are. The factor
+    Laplace's method is used about the mode of the sizes, where the expected information is `information`. The factor
     (2π)^(−s/2) of s residuals is left out.
     """
     gradient = equations.prior_gradient
     against_prior = gradient @ np.linalg.lstsq(equations.prior_information, gradient, rcond=None)[0]
-    return log_posterior - float(against_prior) / 2 - float(np.linalg.slogdet(information)[1]) / 2
+    volumes = np.linalg.slogdet(information)[1] / 2 + np.log(equations.prior[1]).sum()
+    log_posterior = solve_equations(equations, log_sizes).log_posterior
+    return float(log_posterior - against_prior / 2 - volumes)
 
 
 def growth_scores(
@@ -322,12 +324,7 @@ def over_sizes(
     return list(zip(shares, groups, solutions, strict=True))
 
 
-def expected_information(equations: Equations, log_sizes: LogSizes) -> Information:
-    """Return the expected information of the log sizes, including their prior."""
-    return _score(equations, log_sizes)[2]
-
-
-def _score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, Information]:
+def score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, Information]:
     """Return the log posterior of the sizes, its gradient, and the expected information."""
     solution = solve_equations(equations, log_sizes)
     projection, left = solution.projection, solution.weighed_left

@@ -8,7 +8,7 @@ residuals, averaged over what is unknown, where those of wrong poses may be of a
 less to take the arm for a worse one than many poses for wrong.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -23,8 +23,8 @@ from jcr.estimation.wrist import pose_problem
 from jcr.geometry import ARM, Poses, rotation_angle, transform
 
 Images = Bool[ndarray, " n"]
-Fit = tuple[float, Float[ndarray, "n 6"], Float[ndarray, "n 6 6"], Float[ndarray, " c"]]
-"""Log evidence of a fit, leave-one-out residuals of all poses with their covariances, log sizes of the errors."""
+Fit = tuple[float, Float[ndarray, "n 6"], Float[ndarray, "n 6 6"]]
+"""Log evidence of a fit, and the leave-one-out residuals of all poses with their covariances."""
 
 SHARE_RIGHT = 0.65
 """Share of images that the trimmed fit relies on; up to the rest may be wrong."""
@@ -81,66 +81,56 @@ def robust_fit(
 
     def fit_to(used: Images, averaged: bool = False) -> Solution:
         x, scale, z = initial_estimate(base_from_gripper, recon_from_camera, used.astype(float))
-        sizes = next(iter(fits.values()))[3] if fits else None
-        start = replace(state, x=x[None], scale=scale, z=z[None], robot_log_sizes=sizes)
+        start = replace(state, x=x[None], scale=scale, z=z[None])
         return solve(replace(every, used=used), start, averaged=averaged)
 
     def fitted(used: Images) -> Fit:
         if used.tobytes() not in fits:
             found = fit_to(used)
-            fits[used.tobytes()] = found.log_evidence, *found.leave_one_out(), found.log_sizes
+            fits[used.tobytes()] = found.log_evidence, *found.leave_one_out()
         return fits[used.tobytes()]
 
     used = np.ones(n, dtype=bool)
     if n >= 5:
         fewest = least_trimmed(base_from_gripper, recon_from_camera)[0]
-        used = max(_left(fitted, used), _joined(fitted, fewest), key=lambda found: found[1])[0]
+        used = max(
+            _improved(fitted, used, _fewer), _improved(fitted, fewest, _more), key=lambda found: found[1]
+        )[0]
     fit = fit_to(used, averaged=True)
     scale, z = fit.state.scale / unit, fit.state.z[0]
     z = transform(z[:3, :3], z[:3, 3] - z[:3, :3] @ (scale * middle))
     return replace(fit, state=replace(fit.state, scale=scale, z=z[None]))
 
 
-def _joined(fitted: Callable[[Images], Fit], used: Images) -> tuple[Images, float]:
-    """Return the images to use and their log evidence, after images joined `used` while the evidence grew.
-
-    Those that are likelier right than wrong join, or the likeliest one.
-    """
+def _improved(
+    fitted: Callable[[Images], Fit], used: Images, changes: Callable[[Fit, Images], Iterator[Images]]
+) -> tuple[Images, float]:
+    """Return the images to use and their log evidence, after `changes` of `used` while the evidence grew."""
     fit = fitted(used)
     best = _evidence(fit, used)
-    while not used.all():
-        _, spread = np.linalg.slogdet(fit[2])
-        likelier = np.where(used, -np.inf, -(_distance(fit) + spread) / 2 - _log_wrong(fit))
-        for joining in (likelier > 0, likelier == likelier.max()):
-            if not joining.any():
-                continue
-            changed = used | joining
-            fit = fitted(changed)
-            evidence = _evidence(fit, changed)
+    while True:
+        for changed in changes(fit, used):
+            tried = fitted(changed)
+            evidence = _evidence(tried, changed)
             if evidence > best:
+                used, best, fit = changed, evidence, tried
                 break
         else:
-            break
-        used, best = changed, evidence
-    return used, best
+            return used, best
 
 
-def _left(fitted: Callable[[Images], Fit], used: Images) -> tuple[Images, float]:
-    """Return the images to use and their log evidence, after the farthest left while the evidence grew.
+def _more(fit: Fit, used: Images) -> Iterator[Images]:
+    """Yield the used images with those that are likelier right than wrong, then with the likeliest one."""
+    _, spread = np.linalg.slogdet(fit[2])
+    likelier = np.where(used, -np.inf, -(_distance(fit) + spread) / 2 - _log_wrong(fit))
+    if not used.all():
+        yield from (used | joining for joining in (likelier > 0, likelier == likelier.max()) if joining.any())
 
-    At least four images stay.
-    """
-    fit = fitted(used)
-    best = _evidence(fit, used)
-    while used.sum() > 4:
-        changed = used.copy()
-        changed[np.where(used, _distance(fit), -np.inf).argmax()] = False
-        fit = fitted(changed)
-        evidence = _evidence(fit, changed)
-        if evidence <= best:
-            break
-        used, best = changed, evidence
-    return used, best
+
+def _fewer(fit: Fit, used: Images) -> Iterator[Images]:
+    """Yield the used images without the farthest one; at least four stay."""
+    if used.sum() > 4:
+        yield used & (np.arange(len(used)) != np.where(used, _distance(fit), -np.inf).argmax())
 
 
 def _evidence(fit: Fit, used: Images) -> float:
@@ -149,7 +139,7 @@ def _evidence(fit: Fit, used: Images) -> float:
 
 def _distance(fit: Fit) -> Float[ndarray, " n"]:
     """Return the squared distance of each pose from a fit without it, in the expected covariance."""
-    _, left_out, covariance, _ = fit
+    _, left_out, covariance = fit
     gap = np.linalg.solve(covariance, left_out[..., None])[..., 0]
     return np.einsum("ni,ni->n", left_out, gap)
 

@@ -27,10 +27,10 @@ from jcr.estimation.solve import Solution
 from jcr.geometry import Transform
 from jcr.records import Intrinsics
 
-WEAK = {"fx": 0.3, "fy": 0.3, "cx": 0.2, "cy": 0.2}
+WEAK = 0.3, 0.3, 0.2, 0.2
 """Standard deviations that only keep finite what the images cannot see: focal lengths relative, centre per width."""
-WEAK_DISTORTION, WEAK_SHEAR, WEAK_FOCAL, WEAK_OFFSET, WEAK_PRISM = 1.0, 0.3, 0.05, 0.1, 0.3
-
+WEAK_DISTORTION, WEAK_PRISM, WEAK_OF_IMAGE = 1.0, 0.3, (0.05, 0.3, 0.1, 0.1)
+"""Standard deviations of the distortion, of a thin prism, and of the nuisances of each image."""
 
 OfImage = Literal["focal", "shear", "x", "y"]
 """Nuisance of each image, in the order of the rows of `Problem.nuisance_directions`."""
@@ -128,18 +128,33 @@ def alternatives(
     kept = np.setdiff1d(np.arange(len(hessian)), rest)
     coupling = hessian[np.ix_(kept, rest)]
     by_column = over(cholesky(hessian[np.ix_(kept, kept)]), coupling)
-    start = problem.intrinsics(solution.images.state)[camera]
+    # The camera's pose does not depend on parameters of cameras.
+    derivative = solution.derivative(place)
+    after = derivative.shape[1] - begin - problem.columns.boards.start
+    by_kept = np.zeros((6, len(hessian)))
+    by_kept[:, :begin] = derivative[:, :begin]
+    by_kept[:, len(hessian) - after :] = derivative[:, derivative.shape[1] - after :]
+    # Dispersion of the weighted residuals, at least that of their sums over cells of the images, which are clusters in
+    # the sense of Liang and Zeger (Biometrika 73, 1986).
+    images, weight = solution.images, solution.images.weight
+    pull = weight[:, None] * images.view.residual_px
+    taken = 3 * len(images.state.points_in_world) + 6 * len(problem.seen.rows)
+    expected = 2 * weight.sum() * max(1 - taken / (2 * len(weight)), 0.1)
+    start = problem.intrinsics(images.state)[camera]
     now, rig = solution.state, problem.observations.rig[mine]
+    # An image without points is as far away as the others.
+    depth, image = wider.view.depth, problem.observations.image
+    distance = np.array([np.median(depth[image == k]) if (image == k).any() else np.nan for k in mine])
     return Alternatives(
         hessian=hessian[np.ix_(rest, rest)] - coupling.T @ by_column,
         right=right[rest] - by_column.T @ right[kept],
-        place_by_column=-_place_by_kept(solution, place, len(hessian), kept) @ by_column,
+        place_by_column=-by_kept[:, kept] @ by_column,
         images=len(mine),
         freedom=max(len(equations.residual) - begin, 1),
-        dispersion=_dispersion(solution.images),
+        dispersion=max(float((pull**2).sum()), problem.layout.squares_of_cells(pull)) / expected,
         names=parameter_names(start),
-        units=units_of(start),
-        distance=_distances(wider, mine),
+        units=units_of(start)[0],
+        distance=np.where(np.isfinite(distance), distance, np.nanmedian(distance)),
         down_in_camera=-(now.z[0] @ now.world_from_rig[rig] @ now.rig_from_camera[camera])[:, 2, :3],
     )
 
@@ -159,11 +174,11 @@ def _with_all_free(
     """Return the evidence of the images where every parameter of a camera and of its images is free."""
     problem, state, own = solution.problem, solution.images.state, len(prior.std)
     start = problem.intrinsics(state)[camera]
-    units = units_of(start)
+    units, weak = units_of(start)
     wider = replace(
         prior,
         directions=np.column_stack([prior.directions, np.diag(units)]),
-        std=np.r_[prior.std, weak_of(start)],
+        std=np.r_[prior.std, weak],
     )
     rows = nuisances_of(images, problem.n_images)
     all_free = with_free(
@@ -186,28 +201,6 @@ def _with_all_free(
     return evidence(all_free, replace(state, camera_steps=wider_steps, model_error_std=sizes))
 
 
-def _place_by_kept(
-    solution: Solution, place: Callable[[State], Transform], columns: int, kept: Int[ndarray, " k"]
-) -> Float[ndarray, "6 k"]:
-    """Return the derivative of a camera's pose by the kept columns; it does not depend on parameters of cameras."""
-    derivative = solution.derivative(place)
-    arms = solution.problem.arm_unknowns
-    after = derivative.shape[1] - arms - solution.problem.columns.boards.start
-    wide = np.zeros((6, columns))
-    wide[:, :arms] = derivative[:, :arms]
-    if after:
-        wide[:, -after:] = derivative[:, -after:]
-    return wide[:, kept]
-
-
-def _distances(images: ImageEvidence, mine: Int[ndarray, " m"]) -> Float[ndarray, " m"]:
-    """Return the median depth of the points of each image; that of the other images for one without points."""
-    assert images.problem.observations is not None
-    depth, image = images.view.depth, images.problem.observations.image
-    distance = np.array([np.median(depth[image == k]) if (image == k).any() else np.nan for k in mine])
-    return np.where(np.isfinite(distance), distance, np.nanmedian(distance))
-
-
 def with_camera(problem: Problem, prior: Camera, camera: int = 0) -> Problem:
     """Return the problem with another prior of a camera's intrinsics."""
     cameras = problem.cameras
@@ -222,15 +215,11 @@ def beyond_prior(solution: Solution, prior: Camera, camera: int = 0) -> Float[nd
     return problem.cameras[camera].directions[:, own:] @ steps[own:]
 
 
-def units_of(camera: Intrinsics) -> Float[ndarray, " q"]:
-    """Return the units of a camera's parameters: focal lengths relative, the centre in widths."""
-    distortion = [1.0] * (len(parameter_names(camera)) - 4)
-    return np.array([camera.fx, camera.fy, camera.width, camera.width, *distortion])
-
-
-def weak_of(camera: Intrinsics) -> Float[ndarray, " q"]:
-    """Return standard deviations of the parameters, in their units, that only keep unobservable ones finite."""
-    return np.array([WEAK.get(name, WEAK_DISTORTION) for name in parameter_names(camera)])
+def units_of(camera: Intrinsics) -> tuple[Float[ndarray, " q"], Float[ndarray, " q"]]:
+    """Return the units of the parameters, focal lengths and widths for the centre, and weak priors' std in these."""
+    more = len(parameter_names(camera)) - 4
+    units = np.r_[camera.fx, camera.fy, camera.width, camera.width, np.ones(more)]
+    return units, np.r_[WEAK, np.full(more, WEAK_DISTORTION)]
 
 
 def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
@@ -261,10 +250,11 @@ def freed(
     own = problem.cameras[camera]
     q = len(parameter_names(own.intrinsics))
     of_camera, of_images = spanned(combinations[:q]), spanned(combinations[q:])
+    units, weak = units_of(own.intrinsics)
     wider = replace(
         own,
-        directions=np.column_stack([own.directions, units_of(own.intrinsics)[:, None] * of_camera]),
-        std=np.r_[own.std, _std(of_camera, weak_of(own.intrinsics))],
+        directions=np.column_stack([own.directions, units[:, None] * of_camera]),
+        std=np.r_[own.std, _std(of_camera, weak)],
     )
     directions = np.zeros((OF_IMAGE * n_images + PRISM, of_images.shape[1]))
     directions[nuisances_of(images, n_images)] = of_images
@@ -274,8 +264,7 @@ def freed(
 
 def _weak_nuisances(images: int) -> Float[ndarray, " r"]:
     """Return standard deviations of nuisances that only keep unobservable ones finite."""
-    of_images = np.repeat([WEAK_FOCAL, WEAK_SHEAR, WEAK_OFFSET, WEAK_OFFSET], images)
-    return np.r_[of_images, np.full(PRISM, WEAK_PRISM)]
+    return np.r_[np.repeat(WEAK_OF_IMAGE, images), np.full(PRISM, WEAK_PRISM)]
 
 
 def _std(combinations: Float[ndarray, "n p"], of_each: Float[ndarray, " n"]) -> Float[ndarray, " p"]:
@@ -295,8 +284,7 @@ def test_combinations(
     """Return the test of the combinations `free`, with those of `beside` free under both hypotheses."""
     q, both = beside.shape[1], np.concatenate([beside, free], axis=1)
     fewer, more = spanned(beside), spanned(both)
-    without, gain_without, _ = _step(equations, fewer)
-    step, gain, covariance = _step(equations, more)
+    (without, gain_without, _), (step, gain, covariance) = (_step(equations, one) for one in (fewer, more))
     spread, p = equations.dispersion, max(more.shape[1] - fewer.shape[1], 1)
     to_value = np.linalg.pinv(both)[q:] @ more
     return ScoreTest(
@@ -314,16 +302,3 @@ def _step(
     right = free.T @ equations.right
     step = covariance @ right
     return step, float(right @ step), covariance
-
-
-def _dispersion(images: ImageEvidence) -> float:
-    """Return the dispersion of the weighted residuals, at least that of their sums over cells of the images.
-
-    Cells are clusters in the sense of Liang and Zeger (Biometrika 73, 1986).
-    """
-    problem, weight = images.problem, images.weight
-    pull = weight[:, None] * images.view.residual_px
-    taken = 3 * len(images.state.points_in_world) + 6 * len(problem.seen.rows)
-    share = max(1 - taken / (2 * len(weight)), 0.1)
-    scale = 2 * weight.sum() * share
-    return max(float((pull**2).sum()), problem.layout.squares_of_cells(pull)) / scale

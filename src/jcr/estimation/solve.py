@@ -29,7 +29,6 @@ from jcr.estimation.image_equations import (
     with_model_error_of,
     with_pixel_noise,
 )
-from jcr.estimation.model_error import expressed, polynomials_of
 from jcr.estimation.pose_equations import PoseEquations, pose_equations, reported_poses
 from jcr.estimation.problem import (
     LinearPrior,
@@ -53,7 +52,7 @@ from jcr.estimation.robot_noise import (
 )
 from jcr.geometry import Transform, step_between
 from jcr.least_squares import one_blas_thread
-from jcr.records import Budget, ModelError, RobotNoise
+from jcr.records import Budget, RobotNoise
 
 START_NOISE = (1e-3, float(np.radians(0.2)))
 """Random errors of gripper poses before the first estimate (m, rad)."""
@@ -122,17 +121,13 @@ class Solution:
     @property
     def log_evidence(self) -> float:
         """Log density of the used residuals, averaged over unknowns and sizes, times (2π)^(3m)."""
-        found = solve_equations(self.equations, self.log_sizes)
-        return log_evidence(self.equations, float(found.log_posterior), self.size_information)
+        return log_evidence(self.equations, self.log_sizes, self.size_information)
 
     def leave_one_out(self) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 6"]]:
-        """Return the residual of each reported pose from a solution without it (m, rad; base axes), and its covariance,
-        the pose's own errors included."""
+        """Return each pose's residual from a solution without it (m, rad; base axes), and its whole covariance."""
         poses, noise = self.poses, self.noise
-        solution, random = (
-            solve_equations(self.equations, self.log_sizes),
-            (noise.translation, noise.rotation),
-        )
+        solution = solve_equations(self.equations, self.log_sizes)
+        random = noise.translation, noise.rotation
         found, covariance = np.empty_like(poses.residual), np.empty((len(poses.used), 6, 6))
         found[poses.used], covariance[poses.used] = left_out(solution, random)
         if poses.used.all():
@@ -149,34 +144,16 @@ class Solution:
             covariance[i] = own + by @ solution.covariance @ by.T
         return found, covariance
 
+    def camera_unknowns(self, columns: slice) -> slice:
+        """Return the unknowns of the mixed model that are these columns of the cameras."""
+        first = self.problem.arm_unknowns
+        return slice(first + columns.start, first + columns.stop)
+
     def intrinsics_covariance(self, camera: int) -> Float[ndarray, "q q"]:
         """Return the covariance of the parameters of a camera, in the order of camera.parameters."""
-        own, directions = self.intrinsics_columns(camera), self.problem.cameras[camera].directions
+        own = self.camera_unknowns(self.problem.columns.intrinsics[camera])
+        directions = self.problem.cameras[camera].directions
         return directions @ self.covariance[own, own] @ directions.T
-
-    def intrinsics_cross(self, camera: int) -> Float[ndarray, "7 q"]:
-        """Return the covariance of the first arm's X and scale with the parameters of a camera."""
-        return (
-            self.covariance[:7, self.intrinsics_columns(camera)] @ self.problem.cameras[camera].directions.T
-        )
-
-    def intrinsics_columns(self, camera: int) -> slice:
-        """Return the unknowns that are steps of the intrinsics of a camera."""
-        first, own = self.problem.arm_unknowns, self.problem.columns.intrinsics[camera]
-        return slice(first + own.start, first + own.stop)
-
-    def model_error(self) -> ModelError | None:
-        """Return the remaining distortion of the first camera's model; None where its intrinsics are exact."""
-        problem, own = self.problem, self.problem.columns.model_error[0]
-        if polynomials_of(problem.cameras[0]) == 0 or own.stop == own.start:
-            return None
-        assert problem.observations is not None
-        unknowns = slice(problem.arm_unknowns + own.start, problem.arm_unknowns + own.stop)
-        return ModelError(
-            likeliest=self.state.camera_steps[own],
-            covariance=self.covariance[unknowns, unknowns],
-            expressed=expressed(problem.cameras[0], problem.observations.x_px[problem.camera_rows[0]]),
-        )
 
     def transform(self, of: Callable[[State], Transform]) -> tuple[Transform, Float[ndarray, "6 6"]]:
         """Return a transform that is a function of the state, and the covariance of its step."""
@@ -213,7 +190,10 @@ def solve(
     if problem.observations is None:
         return _with_covariance(problem, start, None, averaged)
     if start.pixel_noise is None:
-        start = _adjusted_to_poses(problem, start, problem.robot_noise_floor or start_noise)
+        state = with_pixel_noise(problem, start, view_of(problem, start))
+        noise = np.repeat(problem.robot_noise_floor or start_noise, 3)
+        white = np.tile(noise, sum(len(arm.rigs) for arm in problem.arms))
+        start = adjusted_images(problem, state, [_rig_information(problem, state, np.diag(white))])[0]
     state, images, settled, rounds, last_step = _rounds(problem, start)
     found = _with_covariance(problem, state, images, averaged)
     return replace(found, settled=settled, iterations=rounds, last_step=last_step)
@@ -226,12 +206,11 @@ def with_priors(solution: Solution, priors: Sequence[LinearPrior]) -> Solution:
 
 
 def size_of_boards(solution: Solution) -> tuple[float, Float[ndarray, " p"]]:
-    """Return the logarithm of the metres, by the scale, of a stated metre of the boards, and its derivative by the
-    unknowns of the mixed model."""
+    """Return the log of the metres, by the scale, of a stated metre of the boards, and its derivative by unknowns."""
     problem, column = solution.problem, solution.problem.columns.boards.start
     assert problem.boards is not None
     by_unknown = np.zeros(problem.unknowns)
-    by_unknown[SCALE] = by_unknown[problem.unknown_of(column)] = 1.0
+    by_unknown[SCALE] = by_unknown[problem.arm_unknowns + np.searchsorted(problem.free, column)] = 1.0
     size = np.log(solution.state.scale * problem.boards.unit) + solution.state.camera_steps[column]
     return float(size), by_unknown
 
@@ -241,16 +220,17 @@ def expected_solution(
 ) -> Solution:
     """Return the solution to expect of a problem without residuals, the robot's errors having these sizes."""
     poses = pose_equations(problem, state, images)
-    found = expected_posterior(poses.equations, noise, poses.region)
-    state = replace(state, robot_log_sizes=found.log_sizes)
+    _, covariance, budget = expected_posterior(poses.equations, noise, poses.region)
+    log_sizes = poses.equations.log_sizes_of(noise)
+    state = replace(state, robot_log_sizes=log_sizes)
     return Solution(
         problem=problem,
         state=state,
-        covariance=found.covariance,
-        budget=found.budget,
+        covariance=covariance,
+        budget=budget,
         most_likely=state,
         poses=poses,
-        size_information=np.eye(len(found.log_sizes)),
+        size_information=np.eye(len(log_sizes)),
         evidence=images,
     )
 
@@ -308,9 +288,8 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
 def _joint_step(
     images: ImageEvidence, equations: Equations, log_sizes: LogSizes
 ) -> tuple[Float[ndarray, " u"], Float[ndarray, " d"], Float[ndarray, " p"]]:
-    """Return the Gauss-Newton step of the arms and of the columns of the images, and the standard deviations of the
-    unknowns of the mixed model."""
-    problem, rigs = images.problem, images.rigs
+    """Return the Gauss-Newton step of the arms and of the images' columns, and the std of the unknowns."""
+    problem, (follow, to_mean, rig_covariance) = images.problem, images.rigs
     solution, arms = solve_equations(equations, log_sizes), problem.arm_unknowns
     step = solution.step
     # The rigs step to the images' estimate given the cameras, and towards the reported poses by their weight.
@@ -318,15 +297,14 @@ def _joint_step(
     pull = pose_by_pose(np.swapaxes(by_rig, 1, 2), solution.weighed_left[:, None])[:, 0]
     columns = np.zeros(problem.columns.count)
     columns[problem.free] = step[arms:]
-    columns[problem.by_arm] = -rigs.step - rigs.follow @ step[arms:] - rigs.covariance @ pull
+    columns[problem.by_arm] = -to_mean - follow @ step[arms:] - rig_covariance @ pull
     return step[:arms], columns, np.sqrt(solution.covariance.diagonal())
 
 
 def _accelerated(
     ends: list[ndarray], steps: list[ndarray], judged: Int[ndarray, " p"], std: Float[ndarray, " p"]
 ) -> Float[ndarray, " n"]:
-    """Return the begin of the next round from the ends and steps of the last ones; unknowns that are not `judged`
-    follow the others."""
+    """Return the begin of the next round from the last ones; unknowns that are not `judged` follow the others."""
     if len(steps) == 1:
         return ends[-1]
     step = steps[-1][judged] / std
@@ -346,8 +324,8 @@ def _with_covariance(
     log_sizes, information = most_likely(poses.equations, state.robot_log_sizes)
     state = likeliest = replace(state, robot_log_sizes=log_sizes)
     if averaged:
-        found = posterior(poses.equations, log_sizes, information, poses.region)
-        covariance, budget, state = found.covariance, found.budget, full_step(problem, state, found.step)
+        step, covariance, budget = posterior(poses.equations, log_sizes, information, poses.region)
+        state = full_step(problem, state, step)
     else:
         covariance, budget = solve_equations(poses.equations, log_sizes).covariance, None
     return Solution(
@@ -363,8 +341,7 @@ def _with_covariance(
 
 
 def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | None, settled: float) -> State:
-    """Step the arms' unknowns and the sizes of the robot's errors, until a step is below `settled` squared standard
-    deviations."""
+    """Step the arms' unknowns and the sizes of errors until a step is below `settled` squared standard deviations."""
     arms = problem.arm_unknowns
     for _ in range(STEPS):
         equations = pose_equations(problem, state, images).equations
@@ -376,13 +353,6 @@ def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | No
         if float(((solution.information_root.T @ step) ** 2).sum()) < settled:
             break
     return state
-
-
-def _adjusted_to_poses(problem: Problem, start: State, noise: tuple[float, float]) -> State:
-    """Return the state after an adjustment of the images beside poses with random errors of this size (m, rad)."""
-    state = with_pixel_noise(problem, start, view_of(problem, start))
-    white = np.tile(np.repeat(noise, 3), sum(len(arm.rigs) for arm in problem.arms))
-    return adjusted_images(problem, state, [_rig_information(problem, state, np.diag(white))])[0]
 
 
 def _rig_information(problem: Problem, state: State, root: Float[ndarray, "s s"]) -> RigInformation:
@@ -406,8 +376,7 @@ def _rig_information(problem: Problem, state: State, root: Float[ndarray, "s s"]
 
 
 def _coordinates(problem: Problem, start: State, state: State) -> Float[ndarray, " n"]:
-    """Return a state as steps from the start: arms, columns of the images, points, and log sizes of the remaining
-    distortion."""
+    """Return a state as steps from the start: arms, columns of the images, points, log sizes of model errors."""
     points = (state.points_in_world - start.points_in_world).ravel()
     return np.concatenate([*step_to(problem, start, state), points, np.log(state.model_error_std)])
 

@@ -97,8 +97,7 @@ class Region:
         return half - (half @ self.fit.T) @ self.by_unknown.T
 
     def spread(self, second_moment: Float[ndarray, "*k m 6 6"]) -> Float[ndarray, "*k p p"]:
-        """Return the covariance (p,p) of the unknowns for other poses of the region, from E[e'e'ᵀ] of each of m used
-        poses.
+        """Return the covariance of the unknowns for other poses of the region, from E[e'e'ᵀ] of each used pose.
 
         The poses of the capture are a sample of the region: a regression on them differs from one on the region by
         what their residuals show, corrected for each pose's own leverage (MacKinnon and White, J. Econometrics 29,

@@ -6,6 +6,7 @@ from numpy import ndarray
 
 from jcr.estimation.boards import BoardShapes, shapes_of
 from jcr.estimation.intrinsics_prior import FIXED, Camera, camera_with_prior
+from jcr.estimation.model_error import expressed
 from jcr.estimation.observations import Observations
 from jcr.estimation.problem import (
     LinearPrior,
@@ -20,7 +21,7 @@ from jcr.estimation.score_test import freed
 from jcr.estimation.solve import START_NOISE, Solution, solve
 from jcr.estimation.systematic import smooth_errors
 from jcr.geometry import Poses, Transform, apply, fit_similarity, scale_translation
-from jcr.records import Estimate, Intrinsics, Tracks
+from jcr.records import Estimate, Intrinsics, ModelError, Tracks
 
 Start = tuple[Transform, float, Transform]
 """Initial estimate of gripper_from_camera, scale and base_from_recon."""
@@ -148,16 +149,27 @@ def estimate_of(found: Solution, tracks: Tracks) -> Estimate:
 
 def estimate_in(found: Solution, scale: float, base_from_recon: Transform) -> Estimate:
     """Return the estimate of an adjustment in a reconstruction with this scale and base_from_recon."""
+    problem, (camera, *_), observations = found.problem, found.problem.cameras, found.problem.observations
+    intrinsics = found.camera_unknowns(problem.columns.intrinsics[0])
+    own, model_error = problem.columns.model_error[0], None
+    if own.stop > own.start:
+        assert observations is not None
+        unknowns = found.camera_unknowns(own)
+        model_error = ModelError(
+            likeliest=found.state.camera_steps[own],
+            covariance=found.covariance[unknowns, unknowns],
+            expressed=expressed(camera, observations.x_px[problem.camera_rows[0]]),
+        )
     return Estimate(
         gripper_from_camera=found.state.x[0],
         scale=scale,
         base_from_recon=base_from_recon,
         covariance=found.covariance[:7, :7],
         budget=found.budget,
-        intrinsics=found.problem.intrinsics(found.state)[0],
+        intrinsics=problem.intrinsics(found.state)[0],
         intrinsics_covariance=found.intrinsics_covariance(0),
-        intrinsics_cross=found.intrinsics_cross(0),
-        model_error=found.model_error(),
+        intrinsics_cross=found.covariance[:7, intrinsics] @ camera.directions.T,
+        model_error=model_error,
     )
 
 

@@ -179,5 +179,5 @@ def joints_at(
             return found[0]
         return None
     posture = inverse_kinematics(arm, np.concatenate([base_from_gripper, goal[None]]))
-    reached = posture.misfit_m[-1] < FITS[0] and posture.misfit_rad[-1] < FITS[1]
+    reached = bool((posture.misfit[-1] < FITS).all())
     return posture.joints[-1] if reached else None
