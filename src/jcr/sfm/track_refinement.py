@@ -12,6 +12,7 @@ the smallest counts, and an observation where none is small keeps its keypoint.
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import Any, no_type_check
 
 import cv2
@@ -69,72 +70,36 @@ def align_tracks(
     warp, bend = _warps(
         x_px, image, tracks.points_in_recon[point], facing, of_reference, recon_from_camera, intrinsics
     )
+
+    def align(level: UInt8[ndarray, "m h2 w2"], job: tuple[Any, ...], first: int) -> None:
+        """Align some tracks; each thread writes to the observations of its own."""
+        some = slice(first, first + _POINTS_AT_ONCE)
+        _align_all(level, image, ends[first : some.stop + 1], reference[some], *job)
+
     start_px, start_affine = x_px.copy(), warp
     found, variance = x_px.copy(), np.full(len(point), KEYPOINT_STD_PX**2)
     for reduced in _REDUCED:
-        level = _reduced(greys, reduced)
-        level_from_image = np.array([level.shape[2] / intrinsics.width, level.shape[1] / intrinsics.height])
-        seen_px = _resized(start_px, level_from_image)
-        aligned_px, affine, variance_px = seen_px.copy(), start_affine.copy(), np.full(len(point), np.inf)
-        _align_in_threads(
-            level,
-            image,
-            ends,
-            reference,
-            _resized(x_px, level_from_image),
-            (aligned_px, affine, bend * reduced),
-            variance_px,
-            MOST_PX / reduced,
-        )
-        aligned = variance_px * reduced**2 < KEYPOINT_STD_PX**2
-        start_px[aligned] = _resized(aligned_px[aligned], 1 / level_from_image)
+        size = max(greys.shape[2] // reduced, 1), max(greys.shape[1] // reduced, 1)
+        level = np.stack([cv2.resize(grey, size, interpolation=cv2.INTER_AREA) for grey in greys])
+        factor = np.array(size) / [intrinsics.width, intrinsics.height]
+        keypoint_px, aligned_px = ((at + 0.5) * factor - 0.5 for at in (x_px, start_px))
+        affine, variance_px = start_affine.copy(), np.full(len(point), np.inf)
+        job = (keypoint_px, (aligned_px, affine, bend * reduced), variance_px, MOST_PX / reduced)
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            list(pool.map(partial(align, level, job), range(0, len(reference), _POINTS_AT_ONCE)))
+        variance_px *= reduced**2
+        aligned, better = variance_px < KEYPOINT_STD_PX**2, variance_px < variance
+        start_px[aligned] = (aligned_px[aligned] + 0.5) / factor - 0.5
         start_affine[aligned] = affine[aligned]
-        better = variance_px * reduced**2 < variance
-        found[better], variance[better] = start_px[better], variance_px[better] * reduced**2
-    refined, std_px = np.empty_like(found), np.empty(len(found))
-    refined[order], std_px[order] = found, np.sqrt(_with_references(variance, reference, of_reference))
-    return replace(tracks, x_px=refined, std_px=std_px)
-
-
-def _align_in_threads(
-    greys: UInt8[ndarray, "m h w"],
-    image: Int[ndarray, " k"],
-    ends: Int[ndarray, " p_1"],
-    reference: Int[ndarray, " p"],
-    *observations: Any,
-) -> None:
-    """`_align_all`, some tracks at a time; each thread writes to the observations of its own."""
-
-    def align(first: int) -> None:
-        some = slice(first, first + _POINTS_AT_ONCE)
-        _align_all(greys, image, ends[first : some.stop + 1], reference[some], *observations)
-
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(align, range(0, len(reference), _POINTS_AT_ONCE)))
-
-
-def _with_references(
-    variance: Float[ndarray, " k"], reference: Int[ndarray, " p"], of_reference: Int[ndarray, " k"]
-) -> Float[ndarray, " k"]:
-    """Return variances of all observations; a reference has the harmonic mean of those aligned to it."""
+        found[better], variance[better] = start_px[better], variance_px[better]
+    # A reference has the harmonic mean of the variances of those aligned to it.
     aligned = variance < KEYPOINT_STD_PX**2
     count = np.bincount(of_reference, aligned, len(variance))[reference]
     inverse_sum = np.bincount(of_reference, aligned / variance, len(variance))[reference]
-    out = variance.copy()
-    out[reference] = np.where(count > 0, count / np.maximum(inverse_sum, 1e-12), KEYPOINT_STD_PX**2)
-    return out
-
-
-def _reduced(greys: UInt8[ndarray, "m h w"], by: int) -> UInt8[ndarray, "m h2 w2"]:
-    size = max(greys.shape[2] // by, 1), max(greys.shape[1] // by, 1)
-    if by == 1:
-        return np.ascontiguousarray(greys)
-    return np.stack([cv2.resize(grey, size, interpolation=cv2.INTER_AREA) for grey in greys])
-
-
-def _resized(x_px: Float[ndarray, "k 2"], factor: Float[ndarray, "2"]) -> Float[ndarray, "k 2"]:
-    """Return pixels in images resized by `factor`."""
-    return (x_px + 0.5) * factor - 0.5
+    variance[reference] = np.where(count > 0, count / np.maximum(inverse_sum, 1e-12), KEYPOINT_STD_PX**2)
+    refined, std_px = np.empty_like(found), np.empty(len(found))
+    refined[order], std_px[order] = found, np.sqrt(variance)
+    return replace(tracks, x_px=refined, std_px=std_px)
 
 
 def _facing(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Float[ndarray, "p 3"]:
@@ -253,16 +218,10 @@ def _align_all(greys, image, ends, reference, keypoint_px, warp, variance_px, mo
 def _window(radius):
     """Offsets (n,2) of the pixels of a patch, row by row, and their weights, whose sum is 1."""
     side = 2 * radius + 1
-    offsets = np.empty((side * side, 2))
-    weight = np.empty(side * side)
-    for k in range(side * side):
-        offsets[k, 0] = k % side - radius
-        offsets[k, 1] = k // side - radius
-        weight[k] = np.exp(-0.5 * (offsets[k, 0] ** 2 + offsets[k, 1] ** 2) / _WINDOW**2)
-    total = weight.sum()
-    for k in range(side * side):
-        weight[k] /= total
-    return offsets, weight
+    index = np.arange(side * side)
+    offsets = np.stack((index % side - radius, index // side - radius), axis=1).astype(np.float64)
+    weight = np.exp(-0.5 * (offsets**2).sum(axis=1) / _WINDOW**2)
+    return offsets, weight / weight.sum()
 
 
 @compiled
@@ -293,28 +252,13 @@ def _smooth(grey, x, y):
     row = int(y)
     f = x - column
     g = y - row
-    a0 = (1 - f) ** 3 / 6
-    a1 = 2 / 3 - f * f * (1 - f / 2)
-    a3 = f * f * f / 6
-    a2 = 1 - a0 - a1 - a3
-    b0 = (1 - g) ** 3 / 6
-    b1 = 2 / 3 - g * g * (1 - g / 2)
-    b3 = g * g * g / 6
-    b2 = 1 - b0 - b1 - b3
-    above = grey[row - 1]
-    upper = grey[row]
-    lower = grey[row + 1]
-    below = grey[row + 2]
-    value = a0 * (
-        b0 * above[column - 1] + b1 * upper[column - 1] + b2 * lower[column - 1] + b3 * below[column - 1]
-    )
-    value += a1 * (b0 * above[column] + b1 * upper[column] + b2 * lower[column] + b3 * below[column])
-    value += a2 * (
-        b0 * above[column + 1] + b1 * upper[column + 1] + b2 * lower[column + 1] + b3 * below[column + 1]
-    )
-    value += a3 * (
-        b0 * above[column + 2] + b1 * upper[column + 2] + b2 * lower[column + 2] + b3 * below[column + 2]
-    )
+    across = ((1 - f) ** 3 / 6, 2 / 3 - f * f * (1 - f / 2), 2 / 3 - (1 - f) ** 2 * (1 + f) / 2, f**3 / 6)
+    down = ((1 - g) ** 3 / 6, 2 / 3 - g * g * (1 - g / 2), 2 / 3 - (1 - g) ** 2 * (1 + g) / 2, g**3 / 6)
+    value = 0.0
+    for i in range(4):
+        line = grey[row + i - 1]
+        for j in range(4):
+            value += down[i] * across[j] * line[column + j - 1]
     return value
 
 
@@ -345,38 +289,12 @@ def _template(around, offsets, window, template, pull):
         for i in range(2):
             for j in range(2):
                 jacobian[k, 4 + 2 * i + j] = jacobian[k, i] * offsets[k, j] / _WINDOW
-    inverse_normal = _inverse_normal(jacobian, window)
-    for k in range(len(offsets)):
-        for i in range(_FREE):
-            pull[k, i] = 0.0
-            for j in range(_FREE):
-                pull[k, i] += inverse_normal[i, j] * jacobian[k, j] * window[k]
+    weighted = jacobian * window.reshape((-1, 1))
+    normal = jacobian.T @ weighted
+    for i in range(_FREE):  # what is singular is held by next to nothing
+        normal[i, i] += 1e-9 * normal[i, i] + 1e-12
+    pull[:] = weighted @ np.linalg.inv(normal)
     return deviation
-
-
-@compiled
-@no_type_check
-def _inverse_normal(jacobian, window):
-    """Inverse (8,8) of the weighted normal equations, by elimination; what is singular is held by next to nothing."""
-    n = _FREE
-    wide = np.zeros((n, 2 * n))
-    for i in range(n):
-        for j in range(n):
-            for k in range(len(window)):
-                wide[i, j] += window[k] * jacobian[k, i] * jacobian[k, j]
-        wide[i, n + i] = 1.0
-    for i in range(n):
-        wide[i, i] += 1e-9 * wide[i, i] + 1e-12
-    for i in range(n):
-        pivot = wide[i, i]
-        for j in range(2 * n):
-            wide[i, j] /= pivot
-        for row in range(n):
-            factor = wide[row, i]
-            if row != i:
-                for j in range(2 * n):
-                    wide[row, j] -= factor * wide[i, j]
-    return wide[:, n:]
 
 
 @compiled
