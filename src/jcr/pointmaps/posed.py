@@ -44,10 +44,6 @@ class PosedPointmaps:
         points = self.x_in_camera[..., 2:] * rays(pinhole).astype(np.float32)
         return replace(self, x_in_camera=np.where((self.confidence > 0)[..., None], points, 0))
 
-    def covariance_or_published(self) -> Float[ndarray, "r r"]:
-        """Return the covariance of the cameras, that of the published errors of a network where it is unknown."""
-        return published_covariance(self) if self.covariance is None else self.covariance
-
 
 def fit_pinhole(maps: PosedPointmaps) -> tuple[Intrinsics, float]:
     """Fit a pinhole of the grid to all points and pixels; return it with the median misfit in pixels.

@@ -17,10 +17,10 @@ from jcr.geometry import apply
 from jcr.pointmaps.global_alignment.align import PIXELS, global_align
 from jcr.pointmaps.grid import PreparedImages
 from jcr.pointmaps.pairs import PairPredictions
-from jcr.pointmaps.posed import FOCAL_STD, PosedPointmaps, fit_pinhole
+from jcr.pointmaps.posed import FOCAL_STD, PosedPointmaps, fit_pinhole, published_covariance
 from jcr.pointmaps.refine import refine
 from jcr.progress import Progress, silent
-from jcr.records import CameraEvidence, Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
+from jcr.records import CameraEvidence, Capture, Pointmaps, Reconstruction, Tracks
 
 NO_TRACKS = Tracks(
     image=np.zeros(0, int), x_px=np.zeros((0, 2)), point=np.zeros(0, int), points_in_recon=np.zeros((0, 3))
@@ -74,7 +74,8 @@ def reconstruct_pointmaps(
         images=tuple(capture.images[row] for row in rows),
         base_from_gripper=capture.base_from_gripper[rows],
     )
-    predicted = _predicted_pinhole(maps)
+    found, misfit_px = fit_pinhole(maps)
+    predicted = maps.grid.original_intrinsics(found) if np.isfinite(misfit_px) else None
     if (pinhole := images.pinhole or predicted) is None:
         raise InputError(f"--backend {backend}: its points lie on no pinhole's rays; give the intrinsics")
     maps = maps.on_rays(maps.grid.grid_intrinsics(pinhole))
@@ -82,7 +83,8 @@ def reconstruct_pointmaps(
     refined = refine(part, images, maps, pinhole)
     report("refine cameras", 1.0)
     if refined is None:
-        tracks, evidence = NO_TRACKS, CameraEvidence(maps.recon_from_camera, maps.covariance_or_published())
+        covariance = published_covariance(maps) if maps.covariance is None else maps.covariance
+        tracks, evidence = NO_TRACKS, CameraEvidence(maps.recon_from_camera, covariance)
         note = "too few matches between the images: the cameras are as predicted"
         if images.pinhole is None:
             maps = replace(maps, warnings=(*maps.warnings, UNCONFIRMED))
@@ -92,11 +94,18 @@ def reconstruct_pointmaps(
         maps = replace(maps, recon_from_camera=refined.recon_from_camera, x_in_camera=depth)
         maps = maps.on_rays(maps.grid.grid_intrinsics(pinhole))
         note = f"cameras refined by {len(tracks.image)} matches, {refined.error_px:.2f} px"
+    points = np.stack([apply(*each) for each in zip(maps.recon_from_camera, maps.x_in_camera, strict=True)])
+    pointmaps = Pointmaps(
+        intrinsics=maps.grid.grid_intrinsics(pinhole),
+        points_in_recon=np.where((maps.confidence > 0)[..., None], points, 0).astype(np.float32),
+        confidence=maps.confidence,
+        colors=images.colors,
+    )
     return Reconstruction(
         image_index=rows,
         recon_from_camera=maps.recon_from_camera,
         intrinsics=images.intrinsics_of_capture or pinhole,
-        pointmaps=_pointmaps(maps, images, pinhole),
+        pointmaps=pointmaps,
         tracks=tracks,
         backend=backend,
         is_metric=maps.is_metric,
@@ -105,21 +114,3 @@ def reconstruct_pointmaps(
         evidence=evidence,
         predicted_focal=None if refined or predicted is None else (predicted.fx, FOCAL_STD),
     )
-
-
-def _pointmaps(maps: PosedPointmaps, images: PreparedImages, pinhole: Intrinsics) -> Pointmaps:
-    """Return the record of the pointmaps in the reconstruction's frame."""
-    points = np.stack([apply(*each) for each in zip(maps.recon_from_camera, maps.x_in_camera, strict=True)])
-    known = (maps.confidence > 0)[..., None]
-    return Pointmaps(
-        intrinsics=maps.grid.grid_intrinsics(pinhole),
-        points_in_recon=np.where(known, points, 0).astype(np.float32),
-        confidence=maps.confidence,
-        colors=images.colors,
-    )
-
-
-def _predicted_pinhole(maps: PosedPointmaps) -> Intrinsics | None:
-    """Return the pinhole of the undistorted images that fits the points of all images; None where none fits them."""
-    found, misfit_px = fit_pinhole(maps)
-    return maps.grid.original_intrinsics(found) if np.isfinite(misfit_px) else None
