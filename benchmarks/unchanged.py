@@ -10,9 +10,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -33,35 +34,27 @@ from simulation.problems import bent_problem, hand_eye_problem
 Record = dict[str, Any]
 COUNTED = (("jcr.estimation.image_equations", "without_points"), ("jcr.estimation.solve", "pose_equations"))
 """Functions whose calls are counted as linearisations, by module."""
-CELLS: tuple[Kind, ...] = ("fixed", "wrists", "arms", "carried")
 ARMS = (("panda", "typical", 12), ("ur5e", "low-cost", 8), ("iiwa7", "white", 30))
 TOLERANCE = 0.05
 """Largest accepted change of a result, in standard deviations of the state before."""
 
 
-def cases(captures: Path, runs: Path) -> Iterator[tuple[str, Callable[[], Record]]]:
+def cases(captures: Path, runs: Path) -> Iterator[tuple[str, Callable[[], HandEye | Record]]]:
     """Yield the name of each problem and a function that solves it."""
     for folder in sorted(path.parent for path in runs.glob("*/reconstruction.npz")):
-        yield f"capture {folder.name}", lambda folder=folder: _record_run(captures, folder)
+        yield f"capture {folder.name}", partial(_stored, captures / folder.name, folder)
     for k, case in enumerate(OBSERVED):
-        name = f"fault {k} {case.what}"
-        assert isinstance(case.fault, Faults)
-        yield name, lambda case=case, faults=case.fault: _record(calibrated(faults, 0, given=case.given)[1])
+        yield f"fault {k} {case.what}", lambda case=case: calibrated(case.fault, 0, given=case.given)[1]
     for seed in range(3):
-        estimated = seed % 2 == 1
-        yield (
-            f"clean {seed}",
-            lambda seed=seed, estimated=estimated: _record(
-                calibrated(Faults(), 1000 + seed, (8, 12, 20)[seed], given=not estimated)[1]
-            ),
-        )
-    yield "sheet, bent", lambda: _record(_with_sheet(Sheet(bend_m=2e-3)))
-    yield "sheet, size 1 % off", lambda: _record(_with_sheet(Sheet(size_error=0.01)))
+        images, given = (8, 12, 20)[seed], seed % 2 == 0
+        yield f"clean {seed}", lambda s=seed, n=images, g=given: calibrated(Faults(), 1000 + s, n, given=g)[1]
+    yield "sheet, bent", partial(_with_sheet, Sheet(bend_m=2e-3))
+    yield "sheet, size 1 % off", partial(_with_sheet, Sheet(size_error=0.01))
     for arm, preset, count in ARMS:
-        yield f"arm {arm} {preset} {count}", lambda a=arm, p=preset, c=count: _record(_arm(a, p, c))
-    yield "poses with camera covariance", lambda: _record(_weighed_poses())
-    for kind in CELLS:
-        yield f"cell {kind}", lambda kind=kind: _record_cell(kind)
+        yield f"arm {arm} {preset} {count}", partial(_arm, arm, preset, count)
+    yield "poses with camera covariance", _weighed_poses
+    for kind in get_args(Kind):
+        yield f"cell {kind}", partial(_cell, kind)
 
 
 def measure(captures: Path, runs: Path, out: Path) -> None:
@@ -73,7 +66,8 @@ def measure(captures: Path, runs: Path, out: Path) -> None:
     for name, solve in cases(captures, runs):
         calls[0], start = 0, time.process_time()
         try:
-            record = solve()
+            found = solve()
+            record = found if isinstance(found, dict) else _record(found)
         except Exception as error:  # noqa: BLE001 (a failure is a result to compare)
             record = {"verdict": f"failed: {type(error).__name__}", "findings": [], "x": None, "std": None}
         record |= {"linearisations": calls[0], "seconds": round(time.process_time() - start, 3)}
@@ -85,21 +79,18 @@ def measure(captures: Path, runs: Path, out: Path) -> None:
 def compare(before: Path, after: Path) -> int:
     """Print each difference and the totals; return the number of problems that differ."""
     old, new = json.loads(before.read_text()), json.loads(after.read_text())
-    changed = 0
-    for name in [name for name in old if name in new]:
-        differences = list(_differences(old[name], new[name]))
-        changed += bool(differences)
-        for text in differences:
-            sys.stdout.write(f"{name}: {text}\n")
     both = [name for name in old if name in new]
+    different = {name: found for name in both if (found := list(_differences(old[name], new[name])))}
+    for name, found in different.items():
+        sys.stdout.writelines(f"{name}: {text}\n" for text in found)
     for what in ("linearisations", "seconds"):
         totals = [sum(one[name][what] for name in both) for one in (old, new)]
         sys.stdout.write(f"{what}: {totals[0]:.0f} before, {totals[1]:.0f} after\n")
     alone = [len(one) - len(both) for one in (old, new)]
     sys.stdout.write(
-        f"{changed} of {len(both)} problems differ; {alone[0]} only before, {alone[1]} only after\n"
+        f"{len(different)} of {len(both)} problems differ; {alone[0]} only before, {alone[1]} only after\n"
     )
-    return changed
+    return len(different)
 
 
 def _differences(old: Record, new: Record) -> Iterator[str]:
@@ -132,12 +123,6 @@ def _count_calls(module: Any, name: str, calls: list[int]) -> None:
     setattr(module, name, counted)
 
 
-def _record_run(captures: Path, run: Path) -> Record:
-    """Return the record of a capture that is calibrated from a stored reconstruction."""
-    capture = read_capture(captures / run.name)
-    return _record(calibrate(capture, read_reconstruction(run / "reconstruction.npz")))
-
-
 def _record(hand_eye: HandEye) -> Record:
     """Return verdict, findings and result of a calibration."""
     return {
@@ -149,21 +134,21 @@ def _record(hand_eye: HandEye) -> Record:
     }
 
 
-def _record_cell(kind: Kind) -> Record:
+def _stored(capture: Path, run: Path) -> HandEye:
+    """Calibrate a capture from a stored reconstruction."""
+    return calibrate(read_capture(capture), read_reconstruction(run / "reconstruction.npz"))
+
+
+def _cell(kind: Kind) -> Record:
     """Return the last transform that is sought in a simulated cell."""
     problem = cell_problem(kind, "typical", COUNT, 0)
-    answer = answered(problem, 0)
-    found, covariance = answer.transform(list(wanted(problem).values())[-1])
-    return {
-        "verdict": "solved",
-        "findings": [],
-        "x": found.tolist(),
-        "std": np.sqrt(np.diag(covariance)).tolist(),
-    }
+    found, covariance = answered(problem, 0).transform(list(wanted(problem).values())[-1])
+    std = np.sqrt(np.diag(covariance)).tolist()
+    return {"verdict": "solved", "findings": [], "x": found.tolist(), "std": std}
 
 
 def _with_sheet(sheet: Sheet) -> HandEye:
-    """Return the calibration of a simulated capture whose scene contains a printed sheet."""
+    """Calibrate a simulated capture whose scene contains a printed sheet."""
     rng = np.random.default_rng([0, IMAGES])
     bare = faulty_capture(rng, IMAGES)
     capture, reconstruction = reconstructed(bare, False)
@@ -171,15 +156,13 @@ def _with_sheet(sheet: Sheet) -> HandEye:
 
 
 def _arm(arm: str, preset: Any, count: int) -> HandEye:
-    """Return the calibration of poses of an arm with systematic errors, its joint angles known."""
-    problem = bent_problem(arm_named(arm), preset, count, 0)
-    return fit_hand_eye(
-        problem.base_from_gripper, problem.recon_from_camera, joints=problem.joints, robot=problem.bent.arm
-    )
+    """Solve by poses of an arm with systematic errors, its joint angles known."""
+    p = bent_problem(arm_named(arm), preset, count, 0)
+    return fit_hand_eye(p.base_from_gripper, p.recon_from_camera, joints=p.joints, robot=p.bent.arm)
 
 
 def _weighed_poses() -> HandEye:
-    """Return the calibration of camera poses with a stated covariance, one of 14 gripper poses being wrong."""
+    """Solve by camera poses with a stated covariance, one of 14 gripper poses being wrong."""
     rng = np.random.default_rng(5)
     problem = hand_eye_problem(rng, 14, robot_noise=(5e-4, 1e-3), camera_noise=(1e-3, 2e-3))
     gripper = problem.base_from_gripper.copy()

@@ -188,7 +188,12 @@ def views(
     target = table_center(arm) if target_in_base is None else target_in_base
     kept = np.zeros((0, arm.dof))
     for _ in range(8):
-        wished, aim = _wished(max(count, 12), target, size, gripper_from_camera, rng)
+        # The pattern `varied` at the arm's size, and where each optical axis meets the table.
+        wished = gripper_poses("varied", max(count, 12), np.zeros(3), gripper_from_camera, rng)
+        wished = wished @ gripper_from_camera
+        aim = wished[:, :3, 3] - wished[:, :3, 2] * (wished[:, 2, 3] / wished[:, 2, 2])[:, None]
+        wished = transform(wished[:, :3, :3], size * wished[:, :3, 3] + target)
+        aim = size * aim + target
         start = np.tile(arm.rest, (len(wished), 1))
         # The first joint faces the target.
         start[:, 0] += np.arctan2(target[1], target[0])
@@ -201,7 +206,13 @@ def views(
         else:
             joints = reach_toward(arm, wished @ inverse(gripper_from_camera), start, REACHING_STEPS)
         camera = forward_kinematics(arm, joints) @ gripper_from_camera
-        kept = np.concatenate([kept, joints[_shows(camera, wished, aim)]])[:count]
+        to_aim = aim - camera[:, :3, 3]
+        distance = np.linalg.norm(to_aim, axis=1)
+        ratio = distance / np.linalg.norm(aim - wished[:, :3, 3], axis=1)
+        shows = (to_aim * camera[:, :3, 2]).sum(1) > np.cos(IN_VIEW) * distance
+        shows &= -to_aim[:, 2] > np.sin(LOWEST_VIEW) * distance
+        shows &= (ratio > NEAREST) & (ratio < FARTHEST)
+        kept = np.concatenate([kept, joints[shows]])[:count]
         if len(kept) == count:
             return kept
     raise InputError(
@@ -233,34 +244,6 @@ def _looking(
         step = -np.linalg.pinv(to_camera @ moved, rcond=1e-3) @ error[..., None]
         joints = np.clip(joints + np.clip(step[..., 0], -0.3, 0.3), *arm.limits.T)
     return joints
-
-
-def _wished(
-    count: int,
-    target: Float[ndarray, "3"],
-    size: float,
-    gripper_from_camera: Float[ndarray, "4 4"],
-    rng: np.random.Generator,
-) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, "n 3"]]:
-    """base_from_camera of the pattern `varied` at the arm's size, and where each optical axis meets the table."""
-    views = gripper_poses("varied", count, np.zeros(3), gripper_from_camera, rng) @ gripper_from_camera
-    aim = views[:, :3, 3] - views[:, :3, 2] * (views[:, 2, 3] / views[:, 2, 2])[:, None]
-    return transform(views[:, :3, :3], size * views[:, :3, 3] + target), size * aim + target
-
-
-def _shows(
-    camera: Float[ndarray, "n 4 4"], wished: Float[ndarray, "n 4 4"], aim: Float[ndarray, "n 3"]
-) -> np.ndarray:
-    to_aim = aim - camera[:, :3, 3]
-    distance = np.linalg.norm(to_aim, axis=1)
-    ratio = distance / np.linalg.norm(aim - wished[:, :3, 3], axis=1)
-    ahead = (to_aim * camera[:, :3, 2]).sum(1) / distance
-    return (
-        (ahead > np.cos(IN_VIEW))
-        & (-to_aim[:, 2] > np.sin(LOWEST_VIEW) * distance)
-        & (ratio > NEAREST)
-        & (ratio < FARTHEST)
-    )
 
 
 def effective_about(
