@@ -143,13 +143,13 @@ def colmap_alone(place: str) -> None:
 def run_by_stage(place: str) -> None:
     """Run all stages in a process of its own, and write the processor seconds of each into stages.json."""
     import jcr
-    from jcr.pipeline import mapping, selection
     from jcr.pipeline import run as stages
+    from jcr.pipeline import selection
     from jcr.report import html
 
     spent: dict[str, float] = dict.fromkeys(STAGES, 0.0)
-    functions = "reconstruct", "calibrate", "densify", "make_map", "report_html"
-    modules = selection, selection, stages, mapping, html
+    functions = "reconstruct", "calibrate", "densify", "_map", "report_html"
+    modules = selection, selection, stages, stages, html
     for module, function, name in zip(modules, functions, STAGES, strict=True):
         setattr(module, function, _timed(getattr(module, function), spent, name))
     jcr.run(CAPTURE, Path(place) / "run")

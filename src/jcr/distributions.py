@@ -13,27 +13,12 @@ Number = float | int | np.number | ndarray
 
 
 class chi2:  # noqa: N801
-    """Sum of `freedom` squares of standard normal numbers."""
+    """Sum of `freedom` squares of standard normal numbers: probabilities of x and quantiles, by x or share, freedom."""
 
-    @staticmethod
-    def cdf(x: Number, freedom: Number) -> Any:
-        """Probability of at most x."""
-        return chdtr(freedom, x)
-
-    @staticmethod
-    def sf(x: Number, freedom: Number) -> Any:
-        """Probability of more than x."""
-        return chdtrc(freedom, x)
-
-    @staticmethod
-    def ppf(share: Number, freedom: Number) -> Any:
-        """Return the value that is exceeded with a probability of 1 - share."""
-        return 2 * gammaincinv(np.asarray(freedom) / 2, share)
-
-    @staticmethod
-    def isf(share: Number, freedom: Number) -> Any:
-        """Return the value that is exceeded with a probability of share."""
-        return chdtri(freedom, share)
+    cdf = staticmethod(lambda x, freedom: chdtr(freedom, x))
+    sf = staticmethod(lambda x, freedom: chdtrc(freedom, x))
+    ppf = staticmethod(lambda share, freedom: 2 * gammaincinv(np.asarray(freedom) / 2, share))
+    isf = staticmethod(lambda share, freedom: chdtri(freedom, share))
 
 
 class f:  # noqa: N801

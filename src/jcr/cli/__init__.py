@@ -74,12 +74,14 @@ examples:
 
 
 _DISK = {
-    errno.ENOSPC: "make room on that disk, or choose another folder; finished results are kept",
-    errno.EDQUOT: "make room in that quota, or choose another folder; finished results are kept",
+    **dict.fromkeys(
+        (errno.ENOSPC, errno.EDQUOT), "make room, or choose another folder; finished results are kept"
+    ),
     errno.EFBIG: "the disk cannot hold a file of that size; choose another folder",
     errno.EROFS: "choose a folder on a writable disk",
-    errno.EACCES: "choose a folder that you can write to, or files that you can read",
-    errno.EPERM: "choose a folder that you can write to, or files that you can read",
+    **dict.fromkeys(
+        (errno.EACCES, errno.EPERM), "choose a folder that you can write to, or files that you can read"
+    ),
     errno.EIO: "the disk is failing; copy its files and use another",
     errno.EISDIR: "there is a folder where a file belongs; move it away",
     errno.ENOTDIR: "there is a file where a folder belongs; move it away",

@@ -6,7 +6,7 @@ import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -18,7 +18,7 @@ from jcr.live.cameras import CameraOptions
 from jcr.live.session import LEAST_IMAGES, SessionOptions
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from jcr.capture.camera_info import IntrinsicsEntry
     from jcr.live.folder import LiveFolder
@@ -105,11 +105,8 @@ def _take(arguments: Capture, out: Path, robot: RobotName | None) -> int:
     options = arguments.session
     if options.until_accurate and options.require is None:
         raise InputError("--until-accurate: needs --require MM DEG, the accuracy that is meant")
-    states, listen, given = (
-        states_of(arguments.poses),
-        _listen(arguments),
-        _intrinsics(arguments.intrinsics_from),
-    )
+    states, listen = states_of(arguments.poses), _listen(arguments)
+    given = _intrinsics(arguments.intrinsics_from)
     if states is None and arguments.poses not in ("typed", "http"):
         raise InputError(f"--poses {arguments.poses}: give ur:HOST, franka:HOST, xarm:HOST, typed or http")
     answers: list[Answer] = []
@@ -173,28 +170,26 @@ def _source(
     arguments: Capture, session: "LiveSession", states: "States | None", server: "LiveServer"
 ) -> "Callable[[], None]":
     """Return the function that requests images where `--poses` says; read typed commands."""
-    from jcr.live.robot import HELP, typed_poses, without_commands
+    from jcr.live.robot import HELP, RobotState, typed_poses, without_commands
 
     lines = without_commands(sys.stdin, session.press)
     if sys.stdin.isatty():
         _print(HELP)
     if arguments.poses == "typed":
         poses = typed_poses(lines, _print, arguments.pose_convention, arguments.pose_units)
-        return lambda: _take_all(session, poses)
+
+        def take_all() -> None:
+            """Take an image at each typed pose."""
+            for pose in poses:
+                session.take(RobotState(time.monotonic(), pose))
+
+        return take_all
     threading.Thread(target=lambda: all(True for _ in lines), daemon=True).start()
     if states is not None:
         _print(f"move the arm; an image is taken whenever it rests ({arguments.poses.partition(':')[2]})")
         return lambda: session.watch(states)
     _print(f"waiting for POST http://{server.hosts[0]}/sample with the key {server.key}")
     return lambda: server.await_samples(arguments.timeout)
-
-
-def _take_all(session: "LiveSession", poses: "Iterator[Any]") -> None:
-    """Take an image at each typed pose."""
-    from jcr.live.robot import RobotState
-
-    for pose in poses:
-        session.take(RobotState(time.monotonic(), pose))
 
 
 def _listen(arguments: Capture) -> "Listen":

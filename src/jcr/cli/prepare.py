@@ -1,6 +1,5 @@
 """Commands around a calibration: board, models and docs."""
 
-import sys
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
@@ -13,7 +12,7 @@ from jcr.errors import InputError, did_you_mean
 from jcr.extras import DISTRIBUTION
 from jcr.files import write_bytes
 from jcr.hub import HUB_ID, download
-from jcr.reconstruct import BACKENDS, Backend, weights_command
+from jcr.reconstruct import BACKENDS, weights_command
 
 CHECKOUT = Path(__file__).parents[3] / "docs"
 SECTIONS = ("tutorials", "how-to", "reference", "explanation", "results")
@@ -137,7 +136,7 @@ class Models:
     name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[NAME]")] = None
     """For get: the back end whose weights are downloaded, or a hub id for --weights or --sam-weights."""
     accept_licence: bool = False
-    """For get: accept a non-commercial licence, which is asked for otherwise."""
+    """For get: accept a non-commercial licence."""
     revision: str | None = None
     """For get: another commit of the weights than the one this release was written for; give its folder to --weights."""
     output: Output = field(default_factory=Output)
@@ -183,9 +182,9 @@ class Models:
                 f"jcr models get: {named}; there are {', '.join(with_weights)}, and hub ids OWNER/NAME"
             )
         hub_id, revision = (row.hub_id, row.revision) if row else (name, None)
-        if row and not (row.commercial or row.has_weights() or self.accept_licence or _accepts(row)):
+        if row and not (row.commercial or row.has_weights() or self.accept_licence):
             raise InputError(
-                f"jcr models get {name}: its licence is {row.licence}; accept it with --accept-licence, or take da3"
+                f"{weights_command(row)}; its licence is {row.licence}; accept it with --accept-licence, or take da3"
             )
         folder = download(hub_id, self.revision or revision, self.output.quiet)
         text = f"{hub_id}: revision {folder.name[:12]}, checked, in {folder}\n"
@@ -194,12 +193,3 @@ class Models:
         facts = {"backend": row.name if row else None, "weights": hub_id, "revision": folder.name}
         self.output.result(text, facts | {"folder": str(folder)})
         return 0
-
-
-def _accepts(row: Backend) -> bool:
-    """Whether the user accepts a licence; False where nobody can be asked."""
-    if not sys.stdin.isatty():
-        return False
-    sys.stderr.write(f"{weights_command(row)}.\nIts licence: {row.licence}\nDo you accept it? [y/N] ")
-    sys.stderr.flush()
-    return sys.stdin.readline().strip().lower() in ("y", "yes")

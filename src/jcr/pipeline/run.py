@@ -7,6 +7,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -39,7 +40,7 @@ from jcr.findings import sentence
 from jcr.options import checked_options
 from jcr.pipeline.selection import NothingFoundError, again, choose, timings_of
 from jcr.progress import Progress, silent
-from jcr.reconstruct import BackendName, check_board
+from jcr.reconstruct import BackendName, check_board, device_of
 from jcr.reconstruction_npz import write_reconstruction
 from jcr.records import Capture, CellCamera, PosePairs, Reconstruction
 from jcr.run_folder import (
@@ -408,16 +409,46 @@ def _densify(result: RunResult, options: RunOptions, progress: Progress) -> tupl
 
 
 def _map(result: RunResult, options: RunOptions, progress: Progress) -> tuple[RunResult, list[str]]:
-    """Add cloud, map and measured objects."""
-    from jcr.pipeline.mapping import make_map  # labels and sizes need half of SciPy, a calibration does not
+    """Add cloud, map and measured objects, with the images that were added later.
 
-    result, notes = make_map(result, options, progress)
-    assert result.cloud is not None and result.scene is not None
-    write_cloud(result.out / CLOUD, result.cloud)
-    result.scene.save(result.out / MAP)
-    if len(result.added):
-        write_added(result.added, result.capture)
-    return result, notes
+    Raises InputError where no point is confident enough, or the options leave nothing to map.
+    """
+    # Labels and sizes need half of SciPy, the map torch, which takes seconds; a calibration does not.
+    from jcr.depth.added import extend
+    from jcr.depth.measured import with_measured_depth
+    from jcr.scene.build import build_scene
+    from jcr.scene.cloud import point_cloud
+    from jcr.segments.measure import measure_objects
+    from jcr.segments.segments import image_labels, label_cloud
+    from jcr.segments.tabletop import fit_support
+
+    assert options.map is not None  # or this stage is left out
+    out, device, added = result.out, device_of(options.reconstruct), result.added
+    capture, hand_eye, made = result.capture, result.hand_eye, result.reconstruction
+    if len(added):
+        made = extend(made, hand_eye, len(capture), added, progress)
+    made, remarks = with_measured_depth(capture, made, hand_eye)
+    given = image_labels(capture, made, hand_eye, options.segment, progress)
+    labels, names = (None, ("none",)) if given is None else (given.labels, given.names)
+    cloud, support = point_cloud(capture, made, hand_eye, labels, options.cloud, names), None
+    with suppress(InputError):
+        support = fit_support(cloud)
+    cloud, more = label_cloud(cloud, options.segment, support)
+    notes = [*remarks, *more]
+    if len(added) and options.segment.segments in ("auto", "labels") and given is not None:
+        notes.append(
+            "images added later have no label images; --segments tabletop labels what they show, too"
+        )
+    give_back()
+    with ThreadPoolExecutor(1) as beside:
+        sizes = None if support is None else beside.submit(measure_objects, cloud, result.scale_std, support)
+        scene = build_scene(cloud, options.map, progress, device=device)
+        measured = None if sizes is None else sizes.result()
+    write_cloud(out / CLOUD, cloud)
+    scene.save(out / MAP)
+    if len(added):
+        write_added(added, capture)
+    return result.with_parts(cloud=cloud, scene=scene, measured=measured), notes
 
 
 def _report(result: RunResult, options: RunOptions, progress: Progress) -> tuple[RunResult, list[str]]:
