@@ -123,18 +123,6 @@ def test_a_map_is_made_later_where_torch_is(calibrated: Path, tmp_path: Path):
     assert [(out / name).stat().st_mtime_ns for name in names] == made
 
 
-def test_torch_is_absent():
-    done = without_torch("import importlib.util\nprint(importlib.util.find_spec('torch'))\nimport torch")
-    assert done.stdout == "None\n" and "No module named 'torch'" in done.stderr
-
-
-def test_a_map_is_not_read(tmp_path: Path):
-    (tmp_path / "map.safetensors").write_bytes(b"")
-    code = "import jcr\ntry: jcr.load_map(sys.argv[1])\nexcept jcr.InputError as error: print(error)"
-    done = without_torch(code, tmp_path)
-    assert f"pip install '{DISTRIBUTION}[map]'" in done.stdout, done.stderr
-
-
 def test_only_the_modules_that_work_with_tensors_need_torch():
     source = ROOT / "src" / "jcr"
     names = [str(file.relative_to(source).with_suffix("")) for file in sorted(source.rglob("*.py"))]
