@@ -111,6 +111,7 @@ EXAMPLES: dict[FindingKind, dict] = {
     },
     FindingKind.AT_ANOTHER_CAMERA: {"images": ("a.png",), "details": {"camera": "wrist"}},
     FindingKind.BLURRED: {"value": 14.0, "images": ("a.png", "b.png"), "details": {"of": 4.0}},
+    FindingKind.REPETITIVE: {"value": 0.95},
     FindingKind.FEW_USED: {"value": 4.0, "details": {"of": 12.0}},
     FindingKind.PIECES: {"value": 5.0, "images": ("a.png",), "details": {"of": 12.0}},
     FindingKind.STATIC_IMAGES: {"value": 0.2, "details": SIZE},

@@ -2,11 +2,14 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
+from jcr.calibration.checks.capture import REPETITIVE, share_of_twins
 from jcr.calibration.stage import calibrate
 from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.geometry import retract, step_between
+from places import ROOT
 from simulation.faults import faulty_capture, reconstructed
 
 
@@ -22,3 +25,12 @@ def test_the_adjustment_replaces_a_rejected_fit_from_poses():
     assert calibrated.converged and calibrated.inliers.all()
     step = step_between(right.gripper_from_camera, calibrated.gripper_from_camera)
     assert (np.abs(step) < 0.1 * np.sqrt(np.diag(right.covariance)[:6])).all()
+
+
+def test_a_regular_tiling_is_repetitive_and_a_table_with_objects_is_not():
+    rng = np.random.default_rng(0)
+    tile = cv2.GaussianBlur(rng.uniform(0, 255, (60, 60, 3)), (0, 0), 2.0)
+    tiled = 5 * (np.tile(tile, (8, 10, 1)) - tile.mean()) + rng.normal(scale=4, size=(480, 600, 3)) + 128
+    assert share_of_twins(tiled.clip(0, 255).astype(np.uint8)) > REPETITIVE
+    table = cv2.imread(str(ROOT / "examples/tabletop/images/00.jpg"))
+    assert share_of_twins(table) < 0.5

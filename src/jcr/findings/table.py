@@ -299,6 +299,11 @@ class FindingKind(StrEnum):
         "take them again at rest, in focus and with more light", explains=(*MISFIT, *TOO_FEW),
         means="the strongest edges of these `images` climb over more than 1/80 of the long side; rejects "
         "where a quarter of all are and the calibration is rejected", evidence="px, how wide the edges are")
+    REPETITIVE = "repetitive scene", Row("images",
+        "the scene repeats itself: {percent:.0f} % of the features look like others of the same image, so that images "
+        "may be matched in the wrong places",
+        "put different, textured objects on the table", explains=(*MISFIT, *TOO_FEW),
+        means="regular tiles or patterns; rejects where the calibration is rejected", evidence="share of the features")
     FEW_USED = "few images used", Row("reconstruction",
         "only {value:.0f} of {of:.0f} images are used, and their motions alone are degenerate, those of "
         "all are not", "let the views overlap more and show more texture, or use a board (jcr docs markers)",

@@ -4,6 +4,8 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import UInt8
+from numpy import ndarray
 
 from jcr.calibration.case import MIN_IMAGES, Case
 from jcr.calibration.conventions import better_reading, convention_finding
@@ -14,6 +16,7 @@ from jcr.estimation.closed_form import initial_estimate
 from jcr.estimation.equation import predict
 from jcr.estimation.observability import observability
 from jcr.estimation.robust import least_trimmed
+from jcr.features.sift import FARTHEST, detect, grey_of
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import inverse, largest_motion, scale_translation, step_between
 from jcr.records import Capture
@@ -28,6 +31,10 @@ MOST_IN_PIECES = 2 / 3
 """Smallest share of the images beside the largest piece that are in further pieces."""
 STILL = (20e-3, np.radians(5.0))
 """m, rad: larger motions of the gripper are visible in the images of a wrist camera."""
+REPETITIVE = 0.9
+"""Share of features with twins from which images are matched in the wrong places: a tenth is left to match."""
+TWINS, MIN_TWINS, APART_PX, TWINS_AT = 3, 100, 8.0, 640
+"""Twins of a feature and features of an image at least, distance from which two are not one (px), long side (px)."""
 MANY = 1 / 4
 """Share of blurred images from which they explain a rejection."""
 
@@ -116,8 +123,8 @@ def view_findings(capture: Capture) -> tuple[Finding, ...]:
     first = read_image(capture.folder / capture.images[0])
     metres, radians = largest_motion(capture.base_from_gripper)
     is_still = metres > STILL[0] or radians > STILL[1]
-    width = {}
-    for name in capture.images:
+    width, images = {}, capture.images
+    for name in images:
         image = read_image(capture.folder / name)
         width[name] = edge_width(image)
         is_still = is_still and show_one_view(first, image)
@@ -133,14 +140,31 @@ def view_findings(capture: Capture) -> tuple[Finding, ...]:
                 FindingKind.BLURRED, "warns", "images", *blurred, value=edge_px, of=float(len(capture))
             )
         )
+    some = [images[row] for row in np.linspace(0, len(images) - 1, 4).astype(int)]
+    share = float(np.median([share_of_twins(read_image(capture.folder / name)) for name in some]))
+    if share > REPETITIVE:
+        findings.append(Finding.of(FindingKind.REPETITIVE, "informs", "images", value=share))
     return tuple(findings)
+
+
+def share_of_twins(image: UInt8[ndarray, "h w 3"]) -> float:
+    """Return the share of an image's features that have TWINS or more nearly equal ones elsewhere in the image."""
+    height, width = image.shape[:2]
+    shrunk = min(1.0, TWINS_AT / max(height, width))
+    x_px, descriptors = detect(grey_of(image, (round(shrunk * width), round(shrunk * height))))
+    if len(x_px) < MIN_TWINS:
+        return 0.0
+    is_twin = descriptors @ descriptors.T > 1 - (FARTHEST / 2) ** 2 / 2
+    is_twin &= np.linalg.norm(x_px[:, None] - x_px[None], axis=-1) > APART_PX
+    return float((is_twin.sum(1) >= TWINS).mean())
 
 
 def as_causes(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Return findings of the images alone for a rejected capture; those that concern many images reject."""
     return tuple(
         replace(one, severity="rejects")
-        if one.kind is FindingKind.BLURRED and len(one.images) > MANY * float(one.details["of"])
+        if one.kind is FindingKind.REPETITIVE
+        or (one.kind is FindingKind.BLURRED and len(one.images) > MANY * float(one.details["of"]))
         else one
         for one in findings
     )

@@ -17,7 +17,7 @@ from jcr.calibration.adjust import refined_by
 from jcr.calibration.case import Case
 from jcr.calibration.cues import CONTRADICTED, length_cue
 from jcr.capture.images import read_depth
-from jcr.estimation.boards import STRETCH_STD
+from jcr.estimation.boards import FEWEST_CORNERS, STRETCH_STD
 from jcr.estimation.equation import SCALE
 from jcr.estimation.hand_eye import judged
 from jcr.estimation.problem import LinearPrior
@@ -55,7 +55,7 @@ WORTH = 10.0
 STRETCHED = 4.0
 """Standard deviations of a printer's stretch from which a board was not printed at its size."""
 MOVED = 4.0
-"""Factor from the residuals of a board's corners in a quarter of the images to those in an image where it was moved."""
+"""Factor from the scatter of a board's corners in an image to their common shift where the board was moved."""
 MIN_IMAGES, MIN_FEATURES = 3, 60
 """Fewest images and features at which depth is compared."""
 OUTSIDE = 0.3
@@ -257,31 +257,32 @@ def check_boards(case: Case) -> Case:
 
 
 def board_faults(case: Case) -> list[Finding]:
-    """Return a finding of each fault that an adjustment shows of its boards, whose size is then no known length.
+    """Return a finding of the fault that an adjustment shows of its boards, whose size is then no known length.
 
-    A board whose sides are stretched was not printed at its size. A board that was moved leaves its corners, in some of
-    the images, farther from the observations than in most.
+    A board whose sides are stretched was not printed at its size. The corners of a board that was moved are, in some of
+    the images, all displaced alike.
     """
     adjusted, boards = case.adjusted, case.reconstruction.tracks.boards
     if boards is None or adjusted is None or adjusted.problem.boards is None:
         return []
-    observations, shapes, findings = adjusted.problem.observations, adjusted.problem.boards, list[Finding]()
+    observations, shapes = adjusted.problem.observations, adjusted.problem.boards
     assert observations is not None
     shape = adjusted.state.camera_steps[adjusted.problem.columns.boards]
     stretch = max(shape[shapes.shape_std == STRETCH_STD].tolist(), key=abs, default=0.0)
     if abs(stretch) > STRETCHED * STRETCH_STD:
-        findings.append(
+        return [
             Finding.of(FindingKind.BOARD_STRETCHED, "warns", "none", value=abs(stretch), board=boards.spec)
-        )
+        ]
     of_corners = np.isin(observations.point, shapes.point)
-    squared = (adjusted.images.view.residual_px[of_corners].reshape(of_corners.sum(), -1) ** 2).sum(1)
-    rows, image = np.unique(observations.image[of_corners], return_inverse=True)
-    rms = np.sqrt(np.bincount(image, squared) / np.bincount(image))
-    away = rows[rms > MOVED * np.quantile(rms, 0.25)]
-    if len(away):
-        names = [case.names[row] for row in case.used[away]]
-        findings.append(Finding.of(FindingKind.BOARD_MOVED, "warns", "images", *names, board=boards.spec))
-    return findings
+    residual_px = adjusted.images.view.residual_px[of_corners]
+    rows, image, count = np.unique(observations.image[of_corners], return_inverse=True, return_counts=True)
+    shift_px = np.stack([np.bincount(image, axis) for axis in residual_px.T], axis=1) / count[:, None]
+    scatter_px = np.sqrt(np.median(((residual_px - shift_px[image]) ** 2).sum(1)))
+    away = rows[(count >= FEWEST_CORNERS) & (np.linalg.norm(shift_px, axis=1) > MOVED * scatter_px)]
+    if not len(away):
+        return []
+    names = [case.names[row] for row in case.used[away]]
+    return [Finding.of(FindingKind.BOARD_MOVED, "warns", "images", *names, board=boards.spec)]
 
 
 def board_found(adjusted: Solution, boards: Boards) -> BoardFound:
