@@ -69,19 +69,3 @@ def test_a_distorted_capture_is_undistorted_and_pixels_find_their_way_back(tmp_p
         near = prepared.colors[0, ..., 0] * (np.hypot(x - spot[0], y - spot[1]) < 14)
         centroid = np.array([(x * near).sum(), (y * near).sum()]) / near.sum()
         np.testing.assert_allclose(centroid, spot, atol=0.1)
-
-
-def test_a_folding_distortion_is_dropped_and_said(tmp_path: Path) -> None:
-    Image.new("RGB", (640, 480)).save(tmp_path / "0.png")
-    intrinsics = Intrinsics(400.0, 400.0, 320.0, 240.0, 640, 480, (-0.9, 0.0, 0.0, 0.0, 0.0))
-    prepared = prepare_images(
-        Capture(
-            folder=tmp_path,
-            images=("0.png",),
-            base_from_gripper=np.eye(4)[None],
-            image_size=(640, 480),
-            intrinsics=intrinsics,
-        )
-    )
-    assert "folds over" in prepared.warnings[0]
-    assert prepared.intrinsics_of_capture == Intrinsics(400.0, 400.0, 320.0, 240.0, 640, 480)

@@ -191,6 +191,7 @@ class PatchEmbed(nn.Module):
         self.proj = nn.Conv2d(3, dim, PATCH, PATCH)
 
     def forward(self, images: Float[Tensor, "b 3 h w"]) -> Tokens:
+        """Return the tokens of images."""
         return self.proj(images).flatten(2).mT
 
 
@@ -204,6 +205,7 @@ class Attention(nn.Module):
         self.proj = nn.Linear(dim, dim)
 
     def forward(self, x: Tokens, rotary: Rotary) -> Tokens:
+        """Return tokens after attention to each other."""
         q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         out = F.scaled_dot_product_attention(rotate(q, rotary), rotate(k, rotary), v)
         return self.proj(out.transpose(1, 2).flatten(2))
@@ -218,6 +220,7 @@ class CrossAttention(nn.Module):
         self.projq, self.projk, self.projv, self.proj = (nn.Linear(dim, dim) for _ in range(4))
 
     def forward(self, x: Tokens, y: Tokens, rotary_x: Rotary, rotary_y: Rotary) -> Tokens:
+        """Return what tokens x gather from tokens y."""
         q, k, v = (
             project(tokens).unflatten(-1, (self.heads, -1)).transpose(1, 2)
             for project, tokens in ((self.projq, x), (self.projk, y), (self.projv, y))
@@ -235,6 +238,7 @@ class Mlp(nn.Module):
         self.fc2 = nn.Linear(int(dim * ratio), dim)
 
     def forward(self, x: Tokens) -> Tokens:
+        """Return the tokens after the perceptron."""
         return self.fc2(F.gelu(self.fc1(x)))
 
 
@@ -248,6 +252,7 @@ class EncoderBlock(nn.Module):
         self.mlp = Mlp(dim, mlp_ratio)
 
     def forward(self, x: Tokens, rotary: Rotary) -> Tokens:
+        """Return the tokens after the block."""
         x = x + self.attn(self.norm1(x), rotary)
         return x + self.mlp(self.norm2(x))
 
@@ -263,6 +268,7 @@ class DecoderBlock(nn.Module):
         self.mlp = Mlp(dim, mlp_ratio)
 
     def forward(self, x: Tokens, y: Tokens, rotary_x: Rotary, rotary_y: Rotary) -> Tokens:
+        """Return the tokens x after the block, which reads the tokens y."""
         x = x + self.attn(self.norm1(x), rotary_x)
         x = x + self.cross_attn(self.norm2(x), self.norm_y(y), rotary_x, rotary_y)
         return x + self.mlp(self.norm3(x))
@@ -283,6 +289,7 @@ class LinearHead(nn.Module):
         self.proj = nn.Linear(dec_dim, 4 * PATCH**2)
 
     def forward(self, layers: list[Tensor], grid: tuple[int, int]) -> Pointmap:
+        """Return the pointmap of a view from its layers of tokens."""
         with torch.autocast(layers[-1].device.type, enabled=False):
             tokens = self.proj(layers[-1].float())
         return pointmap(F.pixel_shuffle(tokens.mT.unflatten(-1, grid), PATCH))
@@ -297,6 +304,7 @@ class DptHead(nn.Module):
         self.dpt = Dpt((enc_dim, dec_dim, dec_dim, dec_dim))
 
     def forward(self, layers: list[Tensor], grid: tuple[int, int]) -> Pointmap:
+        """Return the pointmap of a view from its layers of tokens."""
         return pointmap(self.dpt([layers[layer].mT.unflatten(-1, grid) for layer in self.layers]))
 
 
@@ -322,6 +330,7 @@ class Dpt(nn.Module):
         )
 
     def forward(self, maps: list[Tensor]) -> Float[Tensor, "b 4 h w"]:
+        """Return the raw map at pixel resolution."""
         x = self.head[:4](self.scratch([f(x) for f, x in zip(self.act_postprocess, maps, strict=True)]))
         # bfloat16 keeps 8 bits, too few for a coordinate: the last map is made in float32.
         with torch.autocast(x.device.type, enabled=False):
@@ -339,6 +348,7 @@ class Scratch(nn.Module):
         self.refinenet1, self.refinenet2, self.refinenet3, self.refinenet4 = (Fusion(width) for _ in range(4))
 
     def forward(self, levels: list[Tensor]) -> FeatureMap:
+        """Return the fused map."""
         level1, level2, level3, level4 = (conv(x) for conv, x in zip(self.layer_rn, levels, strict=True))
         # With an odd grid the stride-2 level is a row or column too large.
         x = self.refinenet4(level4)[..., : level3.shape[-2], : level3.shape[-1]]
@@ -359,6 +369,7 @@ class Fusion(nn.Module):
         self.out_conv = nn.Conv2d(width, width, 1)
 
     def forward(self, x: FeatureMap) -> Float[Tensor, "b c 2*h 2*w"]:
+        """Return the refined map at twice the resolution."""
         # A 1x1 convolution commutes with bilinear upsampling; before it, it costs a quarter.
         x = self.out_conv(self.resConfUnit2(x))
         return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=True)
@@ -373,4 +384,5 @@ class ResidualUnit(nn.Module):
         self.conv2 = nn.Conv2d(width, width, 3, 1, 1)
 
     def forward(self, x: FeatureMap) -> FeatureMap:
+        """Return the map after the unit."""
         return x + self.conv2(F.relu_(self.conv1(F.relu(x))))
