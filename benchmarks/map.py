@@ -23,8 +23,7 @@ from jcr.camera import project
 from jcr.capture.read import read_capture
 from jcr.depth.densify import densify
 from jcr.errors import InputError
-from jcr.export.options import ExportOptions
-from jcr.export.provenance import Provenance
+from jcr.export.options import ExportOptions, Provenance
 from jcr.export.volume import write_octomap
 from jcr.geometry import apply, inverse
 from jcr.reconstruct import ReconstructOptions, reconstruct
@@ -33,8 +32,8 @@ from jcr.scene.build import build_scene
 from jcr.scene.cloud import point_cloud
 from jcr.scene.options import MapOptions
 from jcr.scene.scene_map import SceneMap
-from jcr.segments.labels import read_labels
 from jcr.segments.measure import ObjectSize, measure_objects
+from jcr.segments.segments import read_labels
 from jcr.segments.tabletop import label_tabletop
 from simulation.capture import SimulateOptions, simulate
 from simulation.scenes import make_scene, solid_labels

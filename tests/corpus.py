@@ -46,10 +46,10 @@ from jcr.records import (
     Tracks,
 )
 from jcr.run_folder import RunResult
-from jcr.scene.cloud_ply import read_cloud, write_cloud
+from jcr.scene.cloud import read_cloud, write_cloud
 from jcr.scene.map_file import load_map
 from jcr.scene.options import MapOptions
-from jcr.segments.labels import _read_names
+from jcr.segments.segments import _read_names
 from simulation.problems import hand_eye_problem
 from simulation.ros_bag import write_bag
 

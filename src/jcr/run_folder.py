@@ -36,7 +36,7 @@ from jcr.files import read_bytes, remove_unfinished
 from jcr.reconstruct import BACKENDS, ReconstructOptions, candidates, tries, with_cameras_of
 from jcr.reconstruction_npz import FORMAT, read_reconstruction
 from jcr.records import Attempt, Capture, HandEye, Intrinsics, PointCloud, Reconstruction
-from jcr.scene.cloud_ply import read_cloud
+from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import FILE as MAP
 from jcr.scene.map_file import load_map
 from jcr.scene.options import CloudOptions, MapOptions

@@ -15,7 +15,7 @@ import jcr
 from in_process import run_jcr
 from jcr.cli.use import read_points
 from jcr.errors import InputError
-from jcr.scene.cloud_ply import read_cloud
+from jcr.scene.cloud import read_cloud
 from jcr.scene.options import MapOptions
 
 pytestmark = pytest.mark.slow

@@ -17,7 +17,7 @@ from jcr.calibration.record import read_calibration
 from jcr.cli import dispatch, main
 from jcr.reconstruction_npz import read_reconstruction
 from jcr.run_folder import RunResult
-from jcr.scene.cloud_ply import read_cloud
+from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import load_map
 
 pytestmark = pytest.mark.slow

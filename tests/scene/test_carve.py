@@ -61,7 +61,7 @@ def test_priors_make_surfaces_and_nothing_free() -> None:
 
 
 def test_a_cloud_keeps_reasons_and_sigmas_on_disk(tmp_path: Path) -> None:
-    from jcr.scene.cloud_ply import read_cloud, write_cloud
+    from jcr.scene.cloud import read_cloud, write_cloud
 
     plain = analytic_scene.cloud(300)
     draw = np.random.default_rng(0)

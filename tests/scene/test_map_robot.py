@@ -12,7 +12,7 @@ import analytic_scene
 from analytic_scene import BALL_CENTER, WORKSPACE
 from jcr.errors import InputError
 from jcr.geometry import apply, transform
-from jcr.scene.cloud_ply import write_cloud
+from jcr.scene.cloud import write_cloud
 from jcr.scene.options import MapOptions
 from places import ROOT
 
@@ -147,30 +147,28 @@ def test_robots_and_joints_that_make_no_sense_are_refused(scene: "SceneMap", urd
     from jcr.scene.robot import load_robot
 
     robot = load_robot(urdf)
-    with pytest.raises(InputError, match="no such URDF"):
-        scene.check_robot(tmp_path / "none.urdf", np.zeros(3))
-    with pytest.raises(InputError, match=r"expected \(…, 3\), for turn, bend, push"):
-        scene.check_robot(robot, np.zeros(4))
-    with pytest.raises(InputError, match="elbow"):
-        scene.check_robot(robot, {"turn": 0.0, "bend": 0.0, "push": 0.0, "elbow": 1.0})
-    with pytest.raises(InputError, match="push"):
-        scene.check_robot(robot, {"turn": 0.0, "bend": 0.0})
-    with pytest.raises(InputError, match="not finite"):
-        scene.check_robot(robot, np.array([0.0, np.nan, 0.0]))
-    with pytest.raises(InputError, match="arm7"):
-        scene.check_robot(robot, np.zeros(3), ignore_links=("arm7",))
-    with pytest.raises(InputError, match="base_from_robot"):
-        scene.check_robot(robot, np.zeros(3), base_from_robot=np.diag([2.0, 2, 2, 1]))
+    wrong = {
+        "no such URDF": (tmp_path / "none.urdf", np.zeros(3)),
+        r"expected \(…, 3\), for turn, bend, push": (robot, np.zeros(4)),
+        "elbow": (robot, {"turn": 0.0, "bend": 0.0, "push": 0.0, "elbow": 1.0}),
+        "push": (robot, {"turn": 0.0, "bend": 0.0}),
+        "not finite": (robot, np.array([0.0, np.nan, 0.0])),
+        "arm7": (robot, np.zeros(3), "occupied", None, ("arm7",)),
+        "base_from_robot": (robot, np.zeros(3), "occupied", np.diag([2.0, 2, 2, 1])),
+    }
+    for words, arguments in wrong.items():
+        with pytest.raises(InputError, match=words):
+            scene.check_robot(*arguments)
     broken = tmp_path / "broken.urdf"
-    broken.write_text("<robot><link")
-    with pytest.raises(InputError, match="not a readable URDF"):
-        load_robot(broken)
-    broken.write_text(URDF)  # its mesh is not beside it
-    with pytest.raises(InputError, match="mesh of link slide"):
-        load_robot(broken)
-    broken.write_text('<robot name="a"><link name="b"/></robot>')
-    with pytest.raises(InputError, match="no link has a <collision>"):
-        load_robot(broken)
+    robots = {  # the second one's mesh is not beside it
+        "not a readable URDF": "<robot><link",
+        "mesh of link slide": URDF,
+        "no link has a <collision>": '<robot name="a"><link name="b"/></robot>',
+    }
+    for words, text in robots.items():
+        broken.write_text(text)
+        with pytest.raises(InputError, match=words):
+            load_robot(broken)
 
 
 def test_the_page_on_the_map_runs_as_printed(

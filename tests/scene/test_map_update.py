@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from jcr.camera import rays, resized, undistort_image
+from jcr.camera import project, rays, resized, undistort_image
 from jcr.capture.added import read_added, with_images, write_added
 from jcr.capture.formats import capture_json
 from jcr.capture.images import encode_png, read_image
@@ -16,7 +16,7 @@ from jcr.capture.read import read_capture
 from jcr.depth.added import extend
 from jcr.errors import InputError
 from jcr.files import write_bytes
-from jcr.geometry import inverse, scale_translation, transform
+from jcr.geometry import apply, inverse, scale_translation, transform
 from jcr.records import (
     BOTH,
     MATCHED,
@@ -83,8 +83,7 @@ def known_reconstruction(truth: Truth, rendered: list[View]) -> tuple[Reconstruc
     for view, recon_from in zip(rendered, recon_from_camera, strict=True):
         assert view.depth is not None
         depth = cv2.resize(view.depth, SIZE, interpolation=cv2.INTER_NEAREST) / SCALE
-        x_in_camera = depth[..., None] * rays(pinhole)
-        points.append(x_in_camera @ recon_from[:3, :3].T + recon_from[:3, 3])
+        points.append(apply(recon_from, depth[..., None] * rays(pinhole)))
         confidence.append((depth > 0).astype(float))
         colors.append(undistort_image(view.image, truth.intrinsics, pinhole))
     points_in_recon = np.stack(points)
@@ -92,9 +91,8 @@ def known_reconstruction(truth: Truth, rendered: list[View]) -> tuple[Reconstruc
     x = points_in_recon.reshape(-1, 3)[some]
     image, point, x_px = [], [], []
     for k, camera_from_recon in enumerate(inverse(recon_from_camera)):
-        seen = x @ camera_from_recon[:3, :3].T + camera_from_recon[:3, 3]
-        pixel = seen[:, :2] / seen[:, 2:] * [pinhole.fx, pinhole.fy] + [pinhole.cx, pinhole.cy]
-        inside = ((pixel > 0) & (pixel < np.array(SIZE) - 1)).all(1) & (seen[:, 2] > 0)
+        pixel = project(pinhole, apply(camera_from_recon, x))
+        inside = ((pixel > 0) & (pixel < np.array(SIZE) - 1)).all(1)
         image.append(np.full(inside.sum(), k))
         point.append(np.flatnonzero(inside))
         x_px.append(pixel[inside])
@@ -229,11 +227,7 @@ def test_an_unchanged_scene_loses_nothing_and_the_new_depth_is_right(
     after = extend(before, hand_eye, len(capture), new, lambda stage, fraction: None)
     known = before.dense.confidence > 0
     assert (after.dense.confidence[:8][known] > 0).mean() > 0.98
-    camera_from_recon = inverse(after.recon_from_camera[8])
-    depth = (
-        SCALE
-        * (after.dense.points_in_recon[8] @ camera_from_recon[:3, :3].T + camera_from_recon[:3, 3])[..., 2]
-    )
+    depth = SCALE * apply(inverse(after.recon_from_camera[8]), after.dense.points_in_recon[8])[..., 2]
     true = cv2.resize(true_depth(truth, 8), SIZE, interpolation=cv2.INTER_NEAREST)
     found = (after.dense.confidence[8] > 0) & (true > 0)
     assert found.mean() > 0.3

@@ -25,10 +25,9 @@ from jcr.records import (
     RobotNoise,
     Tracks,
 )
-from jcr.segments.labels import read_labels
 from jcr.segments.measure import measure_objects
 from jcr.segments.options import SegmentOptions
-from jcr.segments.segments import image_labels, label_cloud
+from jcr.segments.segments import image_labels, label_cloud, read_labels
 from jcr.segments.tabletop import fit_support, label_tabletop
 
 NOISE = 5e-4
@@ -124,14 +123,6 @@ def test_sizes_are_recovered_on_a_tilted_table(rng: np.random.Generator):
     outline = apply(inverse(base_from_table), lying.footprint_in_base)
     np.testing.assert_allclose(outline[:, 2], 0, atol=3e-4)
     assert cv2.contourArea(outline[:, :2].astype(np.float32)) == pytest.approx(0.12 * 0.07, rel=0.05)
-
-
-def test_points_are_labelled_by_what_they_lie_on(rng: np.random.Generator):
-    parts = table(rng), box(rng, (0.1, 0.08, 0.06), (0.12, 0.0)), ring(rng, 0.0, 0.02, 0.05, (-0.1, 0.0))
-    label = label_tabletop(cloud_of(rng, *parts)).label
-    first, second, third = np.split(label, np.cumsum([len(part) for part in parts])[:-1])
-    assert (first == 1).mean() > 0.93  # what lies under the objects is theirs
-    assert (second == 2).mean() > 0.93 and (third == 3).mean() > 0.93  # all but the foot
 
 
 def test_a_wall_behind_with_more_points_is_no_table_and_no_object(rng: np.random.Generator):

@@ -16,12 +16,9 @@ from scipy.ndimage import minimum_filter
 from scipy.spatial.transform import Rotation
 
 from chromium import Chromium
-from jcr.camera import project
 from jcr.errors import InputError
-from jcr.geometry import apply, inverse
 from jcr.records import Capture
 from jcr.run_folder import RunResult
-from jcr.viewer.robot import read_robot
 from simulation.truth import Truth, read_truth
 from waiting import until
 
@@ -66,9 +63,8 @@ def capture(done: Path) -> Capture:
 @pytest.fixture(scope="module")
 def viewer(done: Path, capture: Capture, gantry: Path) -> "Iterator[Viewer]":
     from jcr.viewer import viewer as module
-    from jcr.viewer.server import open_server
 
-    server = open_server(0, "test")
+    server = module.open_server(0, "test")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "MAP_POINTS", 15_000)  # drawn without a graphics card
         yield module.Viewer(server, RunResult(done, capture=capture), gantry)
@@ -133,25 +129,6 @@ def test_click_finds_the_first_point_and_shows_what_is_there(viewer: "Viewer", t
     viewer.show_points()
 
 
-def test_the_photograph_lies_where_its_camera_sees_it(viewer: "Viewer"):
-    viewer.image.value, viewer.photo.value = 3, 40
-    viewer.choose_image()
-    camera, photo, intrinsics = viewer._camera_of_image(), viewer._photo, viewer.intrinsics
-    assert camera is not None and photo.visible and photo.image.shape[2] == 4
-    assert (photo.image[..., 3] == 102).all() and (photo.image[..., :3] == viewer.pixels[camera]).all()
-    half = np.array([photo.render_width, photo.render_height]) / 2
-    axes = Rotation.from_quat(np.asarray(photo.wxyz)[[1, 2, 3, 0]]).as_matrix()
-    for sign in ((-1, -1), (1, 1)):
-        corner = np.asarray(photo.position) + axes @ np.array([*(sign * half), 0])
-        seen = project(intrinsics, apply(inverse(viewer.base_from_camera[camera]), corner))
-        assert seen == pytest.approx(
-            (np.array(sign) + 1) / 2 * [intrinsics.width, intrinsics.height] - 0.5, abs=1e-3
-        )
-    viewer.photo.value = 0
-    viewer.choose_image()
-    assert not photo.visible and all(frustum.visible for frustum in viewer.frusta)
-
-
 def test_robot_and_chosen_camera_follow_the_image(viewer: "Viewer"):
     from jcr.viewer.viewer import CHOSEN
 
@@ -167,6 +144,8 @@ def test_robot_and_chosen_camera_follow_the_image(viewer: "Viewer"):
 def test_a_robot_without_joint_values_or_with_too_few_joints_is_refused(
     capture: Capture, gantry: Path, tmp_path: Path
 ):
+    from jcr.viewer.viewer import read_robot
+
     robot, configurations = read_robot(gantry, replace(capture, joints=np.ones((12, 4))))
     assert configurations.shape == (12, len(robot.actuated_joint_names)) and configurations[:, 4:].max() == 0
     with pytest.raises(InputError, match="no joint values"):

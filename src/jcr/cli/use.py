@@ -311,8 +311,7 @@ class View:
         run = load_run(self.out)  # raises at once where there is none
         for package in ("viser", "torch"):
             extra(package, "view", "jcr view")
-        from jcr.viewer.server import open_server
-        from jcr.viewer.viewer import Viewer
+        from jcr.viewer.viewer import Viewer, open_server
 
         server = open_server(self.port, f"jcr · {self.out.resolve().name}")
         try:

@@ -150,6 +150,5 @@ def _with_projections(
         image.append(np.full(inside.sum(), row))
         x_px.append(np.stack([u, v], -1)[inside].astype(float))
         point.append(np.flatnonzero(inside))
-    return replace(
-        tracks, image=np.concatenate(image), x_px=np.concatenate(x_px), point=np.concatenate(point)
-    )
+    rows, pixels, points = (np.concatenate(parts) for parts in (image, x_px, point))
+    return Tracks(image=rows, x_px=pixels, point=points, points_in_recon=tracks.points_in_recon)

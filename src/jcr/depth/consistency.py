@@ -1,4 +1,4 @@
-"""Consistency of depths and colours across views, compiled for 16 pixels of a row at once in vector registers."""
+"""Consistency of depths and colours across views; depths of 16 pixels of a row at once in vector registers."""
 
 from typing import Any, no_type_check
 
@@ -22,15 +22,12 @@ table often gets the object's depth; the neighbours that look past the object th
 def evidence(
     inverse_depth: Float[ndarray, "m h w"], known: Bool[ndarray, "m h w"], sees: Bool[ndarray, "m h w"]
 ) -> Float[ndarray, "m h _"]:
-    """Return the maps for `agreement`: inverse depths, 0 where not `known`, negative where not `sees`."""
-    return padded(np.where(known, np.where(sees, inverse_depth, -inverse_depth), 0))
+    """Return the maps for `agreement`: inverse depths, 0 where not `known`, negative where not `sees`.
 
-
-def padded(maps: Float[ndarray, "..."]) -> Float[ndarray, "..."]:
-    """Return maps (m,h,w,…) as float32 with w continued by zeros to a multiple of the lanes."""
-    margins = [(0, 0)] * maps.ndim
-    margins[2] = (0, -maps.shape[2] % LANES)
-    return np.pad(maps.astype(np.float32, copy=False), margins)
+    Their rows are continued by zeros to a multiple of the lanes.
+    """
+    maps = np.where(known, np.where(sees, inverse_depth, -inverse_depth), 0).astype(np.float32, copy=False)
+    return np.pad(maps, [(0, 0), (0, 0), (0, -maps.shape[2] % LANES)])
 
 
 @compiled
@@ -57,21 +54,39 @@ def agreement(i, compared, others, a, b, centre, k, width, tolerance):
 
 @compiled
 @no_type_check
-def colours_agree(i, inverse_depth, surfaces, others, a, b, k, width, tolerance):
+def colours_agree(i, asked, inverse_depth, colors, others, a, b, centre, k, tolerance):
     """Return numbers (3,h,w) of images that show the points of image i in their colour, in another, and see through.
 
-    `inverse_depth` (h,w) is 0 where no point is asked for; `surfaces` (m,h,w,4) holds every image's matched inverse
-    depth, or 0, and its colour. A point is hidden from an image whose matched depth there is nearer, and not counted.
+    `asked` (h,w) is the points' inverse depth, 0 where none is asked for; `inverse_depth` (m,h,w) holds every image's
+    matched one, or 0, and `colors` (m,h,w,3) its colours. A point is hidden from an image whose matched depth there is
+    nearer, and not counted.
     """
-    h, w = inverse_depth.shape
-    most = np.float32(tolerance * tolerance)
+    h, w = asked.shape
+    half, most = np.float32(0.5), np.float32(tolerance * tolerance)
+    nearer, farther = np.float32(1 - SEEN_THROUGH), np.float32(1 + SEEN_THROUGH)
     sums = np.zeros((3, h, w), np.float32)
-    for v in range(h):
-        for n in range(len(others)):
-            rays = _row(v, n, a, b, k, width, h)
-            for u in range(0, w, LANES):
-                _compare_colours(sums, inverse_depth, surfaces, (i, others[n], v, u), rays, most)
-    return sums[:, :, :width]
+    for n in range(len(others)):
+        j = others[n]
+        for v in range(h):
+            (x0, x1, bx), (y0, y1, by), (z0, z1, bz), (right, bottom, cx, per_fx) = _row(v, n, a, b, k, w, h)
+            for u in range(w):
+                here, ray = asked[v, u], (np.float32(u) - cx) * per_fx
+                z = z0 * ray + z1 + bz * here
+                if here <= 0 or z <= 0:
+                    continue
+                x, y = (x0 * ray + x1 + bx * here) / z, (y0 * ray + y1 + by * here) / z
+                if x < 0 or y < 0 or x >= right or y >= bottom:
+                    continue
+                p, q = int(y + half), int(x + half)
+                there = z * inverse_depth[j, p, q] if inverse_depth[j, p, q] > 0 else here
+                if there < here * nearer:
+                    sums[2, v, u] += 1
+                elif there <= here * farther:
+                    red = colors[i, v, u, 0] - colors[j, p, q, 0]
+                    green = colors[i, v, u, 1] - colors[j, p, q, 1]
+                    blue = colors[i, v, u, 2] - colors[j, p, q, 2]
+                    sums[int(red * red + green * green + blue * blue >= most), v, u] += 1
+    return sums
 
 
 @inlined
@@ -151,38 +166,3 @@ def _compare_depths(typing, sums, compared, place, rays, rest):
         return context.get_dummy_value()
 
     return signature(types.none, sums, compared, place, rays, rest), generate
-
-
-@intrinsic
-@no_type_check
-def _compare_colours(typing, sums, depth, surfaces, place, rays, most):
-    """Add to the maps of `colours_agree` what image j shows at the depths of 16 pixels; `place` is (i, j, v, u)."""
-
-    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        out, asked, maps = (
-            context.make_array(signature.args[n])(context, builder, given[n]) for n in range(3)
-        )
-        _, height, width, _ = cgutils.unpack_tuple(builder, maps.shape)
-        i, j, v, u = cgutils.unpack_tuple(builder, given[3])
-        size, own = builder.mul(height, width), builder.add(builder.mul(v, width), u)
-        here: Any = Lanes.read(builder, asked.data, own, LANES)
-        rows = [_numbers(builder, row) for row in cgutils.unpack_tuple(builder, given[4])]
-        x, y, z, inside = _other_pixels(here, u, rows)
-        row, first = (Lanes.repeated(builder, builder.trunc(n, INT), LANES) for n in (width, own))
-        nearest = (y + 0.5).as_ints() * row + (x + 0.5).as_ints()
-        surface = []
-        for image, pixel in ((i, first + Lanes.constant(builder, range(LANES), INT)), (j, nearest)):
-            start = builder.gep(maps.data, [builder.mul(image, builder.mul(size, LONG(4)))])
-            halves = ((pixel * 4 + k).gathered(start, LANES).as_pairs() for k in (0, 2))
-            surface.append([lanes for half in halves for lanes in half])
-        depth = surface[1][0]
-        there = (depth > 0.0).choose(z * depth, here)
-        through = inside & (there < here * (1.0 - SEEN_THROUGH))
-        shown = inside & (there >= here * (1.0 - SEEN_THROUGH)) & (here * (1.0 + SEEN_THROUGH) >= there)
-        r, g, b = (one - other for one, other in zip(surface[0][1:], surface[1][1:], strict=True))
-        difference, limit = r * r + g * g + b * b, Lanes.repeated(builder, given[5], LANES)
-        for n, where in enumerate((shown & (difference < limit), shown & (difference >= limit), through)):
-            where.choose(1.0, 0.0).add_to(out.data, builder.add(builder.mul(size, LONG(n)), own))
-        return context.get_dummy_value()
-
-    return signature(types.none, sums, depth, surfaces, place, rays, most), generate

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import rays
-from jcr.depth.consistency import agreement, evidence, padded
+from jcr.depth.consistency import agreement, evidence
 from jcr.depth.matched import grid, relative
 from jcr.depth.priors import ON_PLANE, evened, planar_prior, support_plane
 from jcr.geometry import apply
@@ -88,11 +88,9 @@ def fused_depth(
             return _chosen(inverse_depth, [matched], [confidence], [MATCHED], [std])
 
         support = _support(inverse_depth, matched, recon_from_camera, pinhole)
-        smooth = [
-            cv2.GaussianBlur(image, (0, 0), 1.0)
-            for image in evened(colors, inverse_depth, matched, views, pinhole)
-        ]
-        surfaces = padded(np.concatenate([np.where(matched, inverse_depth, 0)[..., None], smooth], -1))
+        even = evened(colors, inverse_depth, matched, views, pinhole)
+        smooth = np.stack([cv2.GaussianBlur(image, (0, 0), 1.0) for image in even])
+        surfaces = np.where(matched, inverse_depth, 0).astype(np.float32), smooth
         report(0.4)
 
         def prior(i: int) -> tuple[ndarray, ...]:

@@ -28,7 +28,7 @@ LEAST = 0.25
 """Least inverse depth of the search, as a share of the largest one of the tracks."""
 
 
-Relative = tuple[Int[ndarray, " n"], Float[ndarray, "n 3 3"], Float[ndarray, "n 3"], Float[ndarray, " n"]]
+Relative = tuple[Int[ndarray, " _"], Float[ndarray, "_ 3 3"], Float[ndarray, "_ 3"], Float[ndarray, " _"]]
 """Projection of an image's pixels into its neighbours, u ~ a·ray + b·(inverse depth): rows of the neighbours, a, b, and
 z of each neighbour's camera in the image's camera."""
 

@@ -72,14 +72,12 @@ def with_measured_depth(
         std[k][new] = sigma[new] / hand_eye.scale
         confidence[k][new & ~matched] = usual
         reason[k][new] = MATCHED
-    notes = ()
-    if both and against > 0.2 * both:
-        notes = (
-            f"measured and matched depth differ at {100 * against / both:.0f} % of the pixels that have both; there the "
-            "matched one is kept",
-        )
     measured = replace(dense, points_in_recon=points, confidence=confidence, depth_std=std, reason=reason)
-    return replace(reconstruction, pointmaps=measured), notes
+    note = (
+        f"measured and matched depth differ at {100 * against / max(both, 1):.0f} % of the pixels that have both; there "
+        "the matched one is kept"
+    )
+    return replace(reconstruction, pointmaps=measured), (note,) * (against > 0.2 * both)
 
 
 def _sampled(depth: Float[ndarray, "h w"], at: ndarray) -> tuple[Float[ndarray, "p q"], Bool[ndarray, "p q"]]:

@@ -79,49 +79,31 @@ def _score(v, u, tried, packed, windows, k, near, starts, each):
 
 @inlined
 @no_type_check
-def _faces(p0, p1, p2, inverse_depth, rx, ry):
-    """Test whether the camera sees the front of the plane, not too slanted."""
-    if inverse_depth <= 0:
-        return False
-    normal, ray = p0 * p0 + p1 * p1 + p2 * p2, rx * rx + ry * ry + np.float32(1)
-    return inverse_depth > np.float32(MOST_SLANTED) * np.sqrt(normal * ray)
-
-
-@inlined
-@no_type_check
 def _keep_better(found, v, u, k, tried):
-    """Take the planes tried where they score better and face the camera."""
+    """Take the planes tried where they score better and the camera sees their front, not too slanted."""
     for lane in range(LANES):
         rx, ry = _ray(v, u + lane, k)
-        p0, p1, p2 = tried[0, lane], tried[1, lane], tried[2, lane]
-        if tried[6, lane] > found[3, v, u + lane] and _faces(p0, p1, p2, tried[5, lane], rx, ry):
+        p0, p1, p2, here = tried[0, lane], tried[1, lane], tried[2, lane], tried[5, lane]
+        normal, ray = p0 * p0 + p1 * p1 + p2 * p2, rx * rx + ry * ry + np.float32(1)
+        faces = here > 0 and here > np.float32(MOST_SLANTED) * np.sqrt(normal * ray)
+        if faces and tried[6, lane] > found[3, v, u + lane]:
             found[0, v, u + lane], found[1, v, u + lane], found[2, v, u + lane] = p0, p1, p2
             found[3, v, u + lane] = tried[6, lane]
 
 
 @inlined
 @no_type_check
-def _try_own(found, v, u, tried):
-    """Write the planes of the pixels themselves."""
-    for lane in range(LANES):
-        for c in range(3):
-            tried[c, lane] = found[c, v, u + lane]
-
-
-@inlined
-@no_type_check
-def _try_passed(found, before, u, side, tried):
-    """Write the planes of the pixels in the row before, or of the best of three to one `side` of them (-1 or 1)."""
+def _try_passed(found, row, u, side, tried):
+    """Write the planes of the pixels in a row, or of the best of three to one `side` of them (-1 or 1)."""
     last = found.shape[2] - 1
     for lane in range(LANES):
         best = min(max(u + lane + side, 0), last)
-        if side != 0:
-            for far in range(2, _BESIDE + 1):
-                column = min(max(u + lane + side * far, 0), last)
-                if found[3, before, column] > found[3, before, best]:
-                    best = column
+        for far in range(2, _BESIDE + 1 if side != 0 else 2):
+            column = min(max(u + lane + side * far, 0), last)
+            if found[3, row, column] > found[3, row, best]:
+                best = column
         for c in range(3):
-            tried[c, lane] = found[c, before, best]
+            tried[c, lane] = found[c, row, best]
 
 
 @inlined
@@ -140,16 +122,6 @@ def _try_changed(found, v, u, k, search, halvings, state, tried):
         q0 = p0 + tilt * (2 * uniform(state) - 1)
         q1 = p1 + tilt * (2 * uniform(state) - 1)
         tried[0, lane], tried[1, lane], tried[2, lane] = q0, q1, changed - q0 * rx - q1 * ry
-
-
-@inlined
-@no_type_check
-def _try_beside(found, v, u, k, step, tried):
-    """Write the planes of the pixels with another inverse depth, by a relative step."""
-    _try_own(found, v, u, tried)
-    for lane in range(LANES):
-        rx, ry = _ray(v, u + lane, k)
-        tried[2, lane] += step * (tried[0, lane] * rx + tried[1, lane] * ry + tried[2, lane])
 
 
 @compiled
@@ -202,7 +174,7 @@ def spread_planes(found, asked, packed, motions, windows, k, search, seed):
             _look(v, u, asked, packed, motions, k, near, starts)
             for option in range(-1 if fresh else 0, _PASSED + tries):
                 if option < 0:
-                    _try_own(found, v, u, tried)
+                    _try_passed(found, v, u, 0, tried)
                 elif option >= _PASSED:
                     _try_changed(found, v, u, k, search, option - _PASSED, state, tried)
                 elif row > 0:
@@ -224,7 +196,7 @@ def best_neighbours(found, asked, packed, motions, windows, k, count):
     for v in range(h):
         for u in range(0, w, LANES):
             _look(v, u, asked, packed, motions, k, near, starts)
-            _try_own(found, v, u, tried)
+            _try_passed(found, v, u, 0, tried)
             _score(v, u, tried, packed, windows, k, near, starts, each)
             for lane in range(LANES):
                 for rank in range(len(best)):
@@ -249,7 +221,11 @@ def peaks(found, asked, packed, motions, windows, k, step):
         for u in range(0, w, LANES):
             _look(v, u, asked, packed, motions, k, near, starts)
             for side in range(2):
-                _try_beside(found, v, u, k, np.float32(2 * side - 1) * step, tried)
+                _try_passed(found, v, u, 0, tried)
+                for lane in range(LANES):
+                    rx, ry = _ray(v, u + lane, k)
+                    here = tried[0, lane] * rx + tried[1, lane] * ry + tried[2, lane]
+                    tried[2, lane] += np.float32(2 * side - 1) * step * here
                 _score(v, u, tried, packed, windows, k, near, starts, each)
                 for lane in range(LANES):
                     beside[side, lane] = tried[6, lane]

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import rays
-from jcr.depth.consistency import colours_agree, padded
+from jcr.depth.consistency import colours_agree
 from jcr.depth.matched import Relative, grid
 from jcr.depth.regions import FEWEST, colour_regions, region_planes
 from jcr.records import Intrinsics
@@ -118,7 +118,7 @@ def evened(
 
 def planar_prior(
     i: int,
-    surfaces: Float[ndarray, "m h _ 4"],
+    surfaces: tuple[Float[ndarray, "m h w"], Float[ndarray, "m h w 3"]],
     inverse_depth: Float[ndarray, "h w"],
     matched: Bool[ndarray, "h w"],
     view: Relative,
@@ -128,14 +128,14 @@ def planar_prior(
 ) -> tuple[ndarray, ...]:
     """Return maps (h,w) of the planes of image i's regions; `support` is a plane (normal, d) in the recon frame.
 
-    `surfaces` hold the matched inverse depths of all images and their colours, gain-compensated and a little smooth, as
-    `colours_agree` takes them. The maps: inverse depth; whether it holds, since colours agree and nothing sees through
+    `surfaces` are the matched inverse depths of all images (0: none) and their colours, gain-compensated and a little
+    smooth. The maps: inverse depth; whether it holds, since colours agree and nothing sees through
     it; whether it is confirmed, since it holds or the one other image that looks there agrees, which is enough where the
     pixel's own match lies on it; images that show the point in the pixel's colour (of the support plane one is
     enough); matched pixels that a well-carried plane shows to be wrong; relative sigma of inverse depth.
     """
-    k = grid(pinhole)
-    label, count = colour_regions(np.ascontiguousarray(surfaces[i, :, : pinhole.width, 1:]))
+    k, (depths, colors) = grid(pinhole), surfaces
+    label, count = colour_regions(colors[i])
     # The support plane as p with p·x = 1 in the camera; 0 where it runs through the camera.
     offset = float(support[:3] @ recon_from_camera[:3, 3] + support[3])
     plane = -recon_from_camera[:3, :3].T @ support[:3] / offset if offset else np.zeros(3)
@@ -153,8 +153,8 @@ def planar_prior(
     carried = (inliers > 0) & (inliers >= CARRIED * fixed)
     near = (on_support | lonely)[label] | (away < FARTHEST)
     asked = (carried | lonely)[label] & (predicted > 0) & near
-    points = padded(np.where(asked, predicted, 0)[None])[0]
-    same, unlike, through = colours_agree(i, points, surfaces, *view[:3], k, pinhole.width, SAME_COLOUR)
+    points = np.where(asked, predicted, np.float32(0))
+    same, unlike, through = colours_agree(i, points, depths, colors, *view, k, SAME_COLOUR)
     holds = asked & (same >= FEWEST_VIEWS) & (same >= 2 * unlike) & (through == 0)
     # Where one image alone looks besides this one, it must agree, and the depth must rest on more than a colour.
     alone = asked & (same == 1) & (unlike == 0) & (through == 0)

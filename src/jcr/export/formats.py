@@ -14,13 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from jcr.errors import InputError, RejectedError, did_you_mean
 from jcr.export import ros
-from jcr.export.options import ExportName, ExportOptions
-from jcr.export.provenance import Provenance
+from jcr.export.options import ExportName, ExportOptions, Provenance
 from jcr.files import write_text
-from jcr.geometry import transform
+from jcr.geometry import apply_similarity, scale_translation, transform
 from jcr.options import checked_options
 from jcr.run_folder import CLOUD, RunResult
-from jcr.scene.cloud_ply import read_cloud
+from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import load_map
 
 if TYPE_CHECKING:
@@ -59,7 +58,7 @@ spheres | spheres.npz | spheres that cover what is solid | volume.write_spheres 
 nerfstudio | nerfstudio/ | transforms.json, images and first points for a splat or NeRF | views.write_nerfstudio | \
     views cloud provenance options
 colmap | colmap/ | COLMAP model in the base frame, binary and text | views.write_colmap | views provenance options
-rerun | run.rrd | recording for the Rerun viewer | rrd.write_rrd | views cloud scene provenance
+rerun | run.rrd | recording for the Rerun viewer | volume.write_rrd | views cloud scene provenance
 """
 FORMATS = tuple(
     ExportFormat(*map(str.strip, row.split("|"))) for row in _TABLE.replace("\\\n", "").strip().splitlines()
@@ -107,9 +106,9 @@ def write_run(
     if path.is_dir() and not row.file.endswith("/"):
         raise InputError(f"{path}: is a folder; name a file for {row.name}")
     before = path.read_bytes() if path.is_file() else None
+    values = [attrgetter(content)(run) for content in row.contents.split()]
     module, function = row.writer.split(".")
     write: Any = getattr(import_module(f"jcr.export.{module}"), function)
-    values = [attrgetter(content)(run) for content in row.contents.split()]
     if module == "ros":
         write_text(path, write(*values))
     else:
@@ -186,6 +185,16 @@ class Run:
             for arm in cameras.arms
         ]
 
+    @property
+    def cloud(self) -> "PointCloud":
+        """Content of cloud.ply."""
+        return read_cloud(self.run.out / CLOUD)
+
+    @property
+    def scene(self) -> "SceneMap":
+        """Content of map.safetensors."""
+        return load_map(self.run.out)
+
     def _camera(self, name: str) -> "CameraPlacement":
         """Return a further camera by its name; raise InputError where it was not placed."""
         cameras = self.run.cameras
@@ -225,21 +234,24 @@ class Run:
         )
 
     @property
-    def cloud(self) -> "PointCloud":
-        """Content of cloud.ply."""
-        return read_cloud(self.run.out / CLOUD)
-
-    @property
-    def scene(self) -> "SceneMap":
-        """Content of map.safetensors."""
-        return load_map(self.run.out)
-
-    @property
     def views(self) -> "PosedImages":
-        """Registered images in the base frame."""
-        from jcr.export.views import posed_images
+        """Registered images in the base frame.
+
+        The cameras are those of the reconstruction, transformed as one rigid body: they agree with each other to a
+        fraction of a pixel, which the gripper poses of most arms do not.
+        """
+        from jcr.export.views import PosedImages
 
         scale = self.calibration.scale
         assert scale is not None  # wherever there is a transform
-        calibration, capture, reconstruction = self.run.of_wrist_camera()
-        return posed_images(capture, reconstruction, calibration.base_from_recon.rigid, scale)
+        calibration, capture, found = self.run.of_wrist_camera()
+        base_from_recon = calibration.base_from_recon.rigid
+        return PosedImages(
+            folder=capture.folder,
+            images=tuple(capture.images[row] for row in found.image_index),
+            base_from_camera=base_from_recon @ scale_translation(found.recon_from_camera, scale),
+            base_from_gripper=capture.base_from_gripper[found.image_index],
+            intrinsics=found.intrinsics,
+            tracks=found.tracks,
+            points_in_base=apply_similarity(base_from_recon, scale, found.tracks.points_in_recon),
+        )

@@ -1,9 +1,11 @@
-"""Export formats and options, apart from the writers, for the help of the command line."""
+"""Export formats, options and provenance, apart from the writers, for the help of the command line."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import tyro
+
+from jcr import __version__
 
 ExportName = Literal[
     "ros2", "moveit", "urdf", "easy_handeye2", "camera_info", "ply", "glb", "octomap", "esdf", "spheres",
@@ -47,3 +49,20 @@ class ExportOptions:
     """Export a calibration that is rejected, too; the file then has the reason."""
     link_images: bool = False
     """Link to the capture's images instead of copying them."""
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Frame of a file's numbers, and the reason of a rejection."""
+
+    frame: str
+    doubt: str | None = None
+    """The reason the calibration gives; None when it converged."""
+
+    @property
+    def notes(self) -> dict[str, str]:
+        """Frame, unit, version, and a warning where there is a doubt: each one line."""
+        about = {"frame": self.frame, "unit": "m", "made_by": f"jcr {__version__}"}
+        if self.doubt is None:
+            return about
+        return about | {"warning": f"REJECTED: {' '.join(self.doubt.split())}"}

@@ -17,11 +17,10 @@ from PIL import Image
 from jcr.camera import pinhole_inside, project, undistort_image, unproject
 from jcr.capture.images import encode_png, read_image
 from jcr.errors import InputError
-from jcr.export.options import ExportOptions
-from jcr.export.provenance import Provenance
-from jcr.geometry import apply_similarity, inverse, scale_translation
-from jcr.records import COEFFICIENTS, Capture, Intrinsics, PointCloud, Reconstruction, Tracks
-from jcr.scene.cloud_ply import write_cloud
+from jcr.export.options import ExportOptions, Provenance
+from jcr.geometry import inverse
+from jcr.records import COEFFICIENTS, Intrinsics, PointCloud, Tracks
+from jcr.scene.cloud import write_cloud
 from jcr.sfm.mapping import camera_of
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -44,25 +43,6 @@ class PosedImages:
     tracks: Tracks
     points_in_base: Float[ndarray, "p 3"]
     """Points of the tracks (m)."""
-
-
-def posed_images(
-    capture: Capture, reconstruction: Reconstruction, base_from_recon: Float[ndarray, "4 4"], scale: float
-) -> PosedImages:
-    """Return the images of a run in the base frame (m).
-
-    The cameras are those of the reconstruction, transformed as one rigid body: they agree with each other to a
-    fraction of a pixel, which the gripper poses of most arms do not.
-    """
-    return PosedImages(
-        folder=capture.folder,
-        images=tuple(capture.images[row] for row in reconstruction.image_index),
-        base_from_camera=base_from_recon @ scale_translation(reconstruction.recon_from_camera, scale),
-        base_from_gripper=capture.base_from_gripper[reconstruction.image_index],
-        intrinsics=reconstruction.intrinsics,
-        tracks=reconstruction.tracks,
-        points_in_base=apply_similarity(base_from_recon, scale, reconstruction.tracks.points_in_recon),
-    )
 
 
 def write_ply(path: Path, cloud: PointCloud, provenance: Provenance) -> None:

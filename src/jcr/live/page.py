@@ -27,9 +27,8 @@ from jcr.live.progress import (
 from jcr.live.session import LiveSession, SessionState
 from jcr.records import Intrinsics
 from jcr.report.figures import Figure, course_figure
-from jcr.report.raster import TRACK_COLOR
 from jcr.report.render import Section, render
-from jcr.report.scene3d import TRACK_SIZE, PointLayer, scene_data, scene_view
+from jcr.report.scene3d import scene_data, scene_view, track_layer
 from jcr.report.verdict import Tile
 from jcr.rounding import significant
 
@@ -199,14 +198,14 @@ def _scene(state: SessionState) -> dict[str, Any]:
         for one in state.images
     ]
     points = np.zeros((0, 3)) if progress.points_in_base is None else progress.points_in_base
-    colors = np.tile(np.array(TRACK_COLOR, np.uint8), (len(points), 1))
     proposed = progress.next_pose if _is_proposed(state) else None
     next_poses = [] if proposed is None else [proposed.base_from_gripper]
     intrinsics = (found.intrinsics if found is not None else None) or ANY_CAMERA
     poses = [*(one.base_from_gripper for one in state.images), *next_poses]
     shown_in_base = np.array([np.zeros(3), *(pose[:3, 3] for pose in poses)])
-    layer = PointLayer("points of the scene", points, colors, TRACK_SIZE)
-    return scene_data([layer], views, next_poses, x, intrinsics, shown_in_base)
+    return scene_data(
+        [track_layer("points of the scene", points)], views, next_poses, x, intrinsics, shown_in_base
+    )
 
 
 @lru_cache(maxsize=128)

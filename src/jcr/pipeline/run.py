@@ -60,7 +60,7 @@ from jcr.run_folder import (
     locked,
     state_of,
 )
-from jcr.scene.cloud_ply import read_cloud, write_cloud
+from jcr.scene.cloud import read_cloud, write_cloud
 from jcr.scene.map_file import PACKAGES, require_packages
 from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions

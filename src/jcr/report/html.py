@@ -8,25 +8,18 @@ from jcr.calibration.record import Calibration
 from jcr.capture.formats.capture_json import origin
 from jcr.capture.formats.table import TABLES
 from jcr.errors import printable
-from jcr.geometry import scale_translation
 from jcr.records import Capture
-from jcr.report.cell_cameras import cameras_section
-from jcr.report.details import StageOptions, details_section
-from jcr.report.images import images_alone_section, images_section
+from jcr.report.details import StageOptions, cameras_section, details_section, objects_section
+from jcr.report.images import images_section
 from jcr.report.motion import motion_section
-from jcr.report.objects import objects_section
 from jcr.report.render import Section, render
-from jcr.report.residual_bars import residuals_section
+from jcr.report.residuals import residuals_section
 from jcr.report.scene3d import scene_section
-from jcr.report.seen import seen_section
 from jcr.report.transform import transform_section
 from jcr.report.verdict import failure_section, head, notes_section
 from jcr.rounding import significant
 from jcr.run_folder import RunResult
-from jcr.scene.samples import sample_surface
 
-SURFACE_POINTS = 80_000
-"""Sampled from the map, at most."""
 UNNAMED = {Path(name).stem for name in (*TABLES, "capture.json", "metadata.yaml")}
 """Files that are called so in every capture."""
 LINKS = {
@@ -35,9 +28,8 @@ LINKS = {
     "view": "3D view",
     "images": "Images",
     "cameras": "Cameras",
-    "seen": "Point uncertainty",
     "residuals": "Residuals",
-    "uncertainty": "Motion and poses to add",
+    "uncertainty": "Uncertainty, motion and poses to add",
     "objects": "Objects",
     "notes": "Notes",
     "details": "Details",
@@ -54,38 +46,21 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
     become unreadable.
     """
     calibration, capture, scene = result.calibration, result.capture, result.scene
-    about = _about_capture(capture, options or {})
-    if capture.mount == "base":
-        sections = [
-            *head(calibration),
-            transform_section(result.hand_eye, "base"),
-            images_section(result),
-            residuals_section(result),
-            *notes_section(calibration),
-            details_section(calibration, options or {}),
-        ]
-        return _page(about, origin(capture.folder), calibration, sections)
-    hand_eye, recon_from_camera = result.hand_eye, result.reconstruction.recon_from_camera
-    base_from_camera = hand_eye.base_from_recon @ scale_translation(recon_from_camera, hand_eye.scale)
-    surface = None if scene is None else sample_surface(scene, SURFACE_POINTS)
+    options, fixed = options or {}, capture.mount == "base"
+    objects = None if scene is None or result.measured is None else (result.measured, scene.label_names)
     sections = [
         *head(calibration),
-        transform_section(result.hand_eye),
-        scene_section(result, base_from_camera, surface),
-        images_section(result),
+        transform_section(result.hand_eye, capture.mount),
+        None if fixed else scene_section(result),
+        images_section(capture, result),
         None if result.cameras is None else cameras_section(result.cameras),
-        seen_section(result),
         residuals_section(result),
-        motion_section(result),
-        None
-        if scene is None or result.measured is None
-        else objects_section(result.measured, scene.label_names),
+        None if fixed else motion_section(result),
+        None if objects is None else objects_section(*objects),
         *notes_section(calibration),
-        details_section(
-            calibration, options or {}, result.reconstruction, None if scene is None else scene.history
-        ),
+        details_section(calibration, options, None if scene is None else scene.history),
     ]
-    return _page(about, origin(capture.folder), calibration, sections)
+    return _page(_about_capture(capture, options), origin(capture.folder), calibration, sections)
 
 
 def poses_report_html(result: RunResult, options: StageOptions | None = None) -> str:
@@ -108,7 +83,7 @@ def failed_report_html(
     """Return the report of a run that found no camera poses: reason, remedy and images."""
     sections = [
         failure_section(calibration),
-        images_alone_section(capture),
+        images_section(capture),
         details_section(calibration, options or {}),
     ]
     return _page(_about_capture(capture, options or {}), origin(capture.folder), calibration, sections)

@@ -7,15 +7,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from jcr.camera import is_distorted, project, resized, undistortion, unproject, without_distortion
 from jcr.capture.images import read_image
 from jcr.geometry import apply, inverse
-from jcr.records import Capture, ImageVerdict, Intrinsics, Reconstruction
-from jcr.report.raster import image_url
-from jcr.report.render import Section
+from jcr.records import Capture, ImageVerdict, Intrinsics
+from jcr.report.render import Section, image_url
 from jcr.rounding import significant
 from jcr.run_folder import RunResult
 
@@ -45,43 +42,26 @@ def image_numbers(image: ImageVerdict) -> str:
     return " · ".join(f"{significant(value)}{unit}" for value, unit in parts if value is not None)
 
 
-def images_section(result: RunResult) -> Section:
-    """Return every image with its numbers, and the reason where it was rejected."""
-    images, marks = result.calibration.images, _reprojections(result)
-    urls = thumbnails(result.capture, result.intrinsics)
-    cards = [
-        {
-            "path": image.image,
-            "name": name,
-            "url": url,
-            "numbers": image_numbers(image),
-            "rejected": None if image.used else image.reason or "no reason given",
-            "marks": marks.get(k),
-        }
-        for k, (image, name, url) in enumerate(zip(images, shown_names(images), urls, strict=True))
-    ]
-    return _section(cards, result.capture, result.intrinsics)
-
-
-def images_alone_section(capture: Capture) -> Section:
-    """Return the images of a run without a calibration."""
-    cards = [
+def images_section(capture: Capture, result: RunResult | None = None) -> Section:
+    """Return every image, of a calibration with its numbers, and the reason where it was rejected."""
+    intrinsics = capture.intrinsics if result is None else result.intrinsics
+    cards: list[dict[str, Any]] = [
         {"path": name, "name": name, "url": url, "numbers": "", "rejected": None, "marks": None}
-        for name, url in zip(capture.images, thumbnails(capture, capture.intrinsics), strict=True)
+        for name, url in zip(capture.images, thumbnails(capture, intrinsics), strict=True)
     ]
-    return _section(cards, capture, None)
-
-
-def _section(cards: Sequence[dict[str, Any]], capture: Capture, intrinsics: Intrinsics | None) -> Section:
-    """Return the section of cards; `intrinsics` are those of a calibration, None without one."""
-    width, height = capture.image_size
+    if result is not None:
+        images, marks = result.calibration.images, _reprojections(result)
+        for k, (card, image, name) in enumerate(zip(cards, images, shown_names(images), strict=True)):
+            card |= {"name": name, "numbers": image_numbers(image), "marks": marks.get(k)}
+            card["rejected"] = None if image.used else image.reason or "no reason given"
+    is_calibrated = result is not None and intrinsics is not None
     content = {
         "cards": cards,
         "shown": SHOWN,
-        "is_calibrated": intrinsics is not None,
+        "is_calibrated": is_calibrated,
         "rejected": sum(card["rejected"] is not None for card in cards),
         "magnified": MAGNIFIED,
-        "size": (width, height) if intrinsics is None else (intrinsics.width, intrinsics.height),
+        "size": (intrinsics.width, intrinsics.height) if is_calibrated and intrinsics else capture.image_size,
         "pixels": pixels_of_file(intrinsics or capture.intrinsics, capture.image_size),
     }
     return Section("images", content)
@@ -98,35 +78,22 @@ def pixels_of_file(intrinsics: Intrinsics | None, size: tuple[int, int]) -> dict
 
 
 def _reprojections(result: RunResult) -> dict[int, str]:
-    """Return an SVG path per image of the capture: reprojection errors of some features."""
-    tracks = result.reconstruction.tracks
-    intrinsics = result.intrinsics or result.reconstruction.intrinsics
-    if len(tracks.image) == 0:
-        return {}
-    errors, straight = reprojections_px(result.reconstruction), without_distortion(intrinsics)
+    """Return an SVG path per image of the capture: lines from some features to the projections of their 3D points."""
+    found, tracks = result.reconstruction, result.reconstruction.tracks
+    straight = without_distortion(result.intrinsics or found.intrinsics)
     drawings, draw = {}, np.random.default_rng(0)
     for k, row in enumerate(result.image_index):
-        seen = np.flatnonzero(tracks.image == k)
+        seen = draw.permutation(np.flatnonzero(tracks.image == k))[:MARKS]
         if len(seen) == 0:
             continue
-        seen = draw.permutation(seen)[:MARKS]
-        at = project(straight, unproject(intrinsics, tracks.x_px[seen])) + 0.5
+        x_px = tracks.x_px[seen]
+        x_in_camera = apply(inverse(found.recon_from_camera[k]), tracks.points_in_recon[tracks.point[seen]])
+        error = MAGNIFIED * (project(found.intrinsics, x_in_camera) - x_px)
+        at = project(straight, unproject(result.intrinsics or found.intrinsics, x_px)) + 0.5
         drawings[int(row)] = "".join(
-            f"M{x:.0f} {y:.0f}l{dx:.0f} {dy:.0f}"
-            for (x, y), (dx, dy) in zip(at, MAGNIFIED * errors[seen], strict=True)
+            f"M{x:.0f} {y:.0f}l{dx:.0f} {dy:.0f}" for (x, y), (dx, dy) in zip(at, error, strict=True)
         )
     return drawings
-
-
-def reprojections_px(reconstruction: Reconstruction) -> Float[ndarray, "k 2"]:
-    """Return the vector from each feature to the projection of its 3D point (px)."""
-    tracks = reconstruction.tracks
-    errors = np.zeros_like(tracks.x_px)
-    for k, camera_from_recon in enumerate(inverse(reconstruction.recon_from_camera)):
-        seen = tracks.image == k
-        x_in_camera = apply(camera_from_recon, tracks.points_in_recon[tracks.point[seen]])
-        errors[seen] = project(reconstruction.intrinsics, x_in_camera) - tracks.x_px[seen]
-    return errors
 
 
 def thumbnails(capture: Capture, intrinsics: Intrinsics | None) -> list[str]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from jcr.calibration.words import given_in_words, seen_in_words
 from jcr.capture.conventions import CONVENTIONS, OF_ARM, numbers_from_poses, units_of
 from jcr.estimation.observability import WEAK
 from jcr.records import Capture, Excitation, NextPose
@@ -36,6 +37,7 @@ def motion_section(result: RunResult) -> Section:
         "is_observable": observed.observable,
         "tick": f"{100 * WEAK / GENERAL:.1f}",
         "excitation": [] if found is None else list(excitation_bars(found)),
+        "seen": _seen(result),
         "spreads": []
         if uncertainty is None
         else [
@@ -46,6 +48,16 @@ def motion_section(result: RunResult) -> Section:
         "next_poses": _next_poses(result),
     }
     return Section("uncertainty", content)
+
+
+def _seen(result: RunResult) -> list[str]:
+    """Return sentences on the point uncertainty; none without intrinsics."""
+    calibration = result.calibration
+    if calibration.uncertainty is None or (seen := calibration.uncertainty.seen) is None:
+        return []
+    kept = calibration.with_given_intrinsics
+    sentences = [f"At {significant(1e-3 * seen.distance_mm)} m: {seen_in_words(seen)} (95 % of the errors)."]
+    return sentences + ([] if kept is None else [f"{given_in_words(kept).capitalize()}."])
 
 
 def excitation_bars(found: Excitation) -> Iterator[tuple[str, str, float, str]]:

@@ -2,21 +2,19 @@
 
 import base64
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from jcr.cell.placement import CameraPlacement
-from jcr.geometry import apply_similarity, inverse
-from jcr.records import CellCamera, Intrinsics
+from jcr.geometry import apply_similarity, inverse, scale_translation
+from jcr.records import Intrinsics
 from jcr.report.images import image_numbers, shown_names
-from jcr.report.raster import TRACK_COLOR, label_colors
-from jcr.report.render import Section
+from jcr.report.render import TRACK_COLOR, Section, label_colors
 from jcr.run_folder import RunResult
-from jcr.scene.samples import SurfacePoints, point_size
+from jcr.scene.surface import point_size, sample_surface
 
 POINTS = 60_000
 """Most points of each layer."""
@@ -24,42 +22,73 @@ TRACK_SIZE = 0.006
 """Side (m) of the squares that are drawn in place of tracked features."""
 
 
-@dataclass(frozen=True)
-class PointLayer:
-    """Points of one kind, which can be shown or hidden."""
-
-    name: str
-    points_in_base: Float[ndarray, "n 3"]
-    color: UInt8[ndarray, "n 3"]
-    size: float
-    """Side (m) of the squares that are drawn in place of the points."""
+PointLayer = tuple[str, Float[ndarray, "_ 3"], UInt8[ndarray, "_ 3"], float]
+"""Points of one kind, which can be shown or hidden: name, points in the base frame, colours, and side (m) of the
+squares that are drawn in their place."""
 
 
-def scene_section(
-    result: RunResult, base_from_camera: Float[ndarray, "m 4 4"], surface: SurfacePoints | None
-) -> Section:
+def scene_section(result: RunResult) -> Section:
     """Return the section of the 3D view: cameras, grippers and points in the base frame."""
-    layers = [*_map_layers(result, surface), *_measured_layer(result)]
-    views = _views(result, base_from_camera)
-    next_poses = [np.array(pose.base_from_gripper) for pose in result.calibration.next_poses]
+    hand_eye, reconstruction = result.hand_eye, result.reconstruction
+    x, next_poses = hand_eye.gripper_from_camera, result.calibration.next_poses
+    base_from_camera = hand_eye.base_from_recon @ scale_translation(
+        reconstruction.recon_from_camera, hand_eye.scale
+    )
+    layers, labels = [], []
+    if result.scene is not None:
+        surface, names = sample_surface(result.scene, POINTS), result.scene.label_names
+        at = surface.points_in_base
+        layers.append(("map, predicted colour", at, surface.color, surface.point_size))
+        if len(names) > 1:
+            palette = label_colors(len(names))
+            labels = list(zip(names, palette.tolist(), strict=True))
+            layers.append(("map, predicted label", at, palette[surface.label], surface.point_size))
+    if (cloud := result.cloud) is not None:
+        some = np.random.default_rng(0).permutation(len(cloud.points_in_base))[:POINTS]
+        at = cloud.points_in_base[some]
+        layers.append(("points as measured", at, cloud.color[some], point_size(at)))
+    tracked = reconstruction.tracks.points_in_recon
+    tracked = apply_similarity(hand_eye.base_from_recon, hand_eye.scale, tracked)
+    row_of, images = {int(row): k for k, row in enumerate(result.image_index)}, result.calibration.images
+    views = [
+        scene_view(
+            name,
+            image_numbers(image) if image.used else f"rejected: {image.reason}",
+            image.used,
+            result.capture.base_from_gripper[i],
+            base_from_camera[row_of[i]] if i in row_of else None,
+        )
+        for i, (image, name) in enumerate(zip(images, shown_names(images), strict=True))
+    ]
     others = _others(result, base_from_camera)
-    x, centers = result.hand_eye.gripper_from_camera, base_from_camera[:, :3, 3]
-    intrinsics = result.intrinsics or result.reconstruction.intrinsics
-    data = scene_data([*layers, _tracks(result)], views, next_poses, x, intrinsics, centers)
-    data |= {"others": others, "bases": _bases(result)}
+    poses = [np.array(pose.base_from_gripper) for pose in next_poses]
+    intrinsics = result.intrinsics or reconstruction.intrinsics
+    drawn = [*layers, track_layer("tracked features", tracked)]
+    data = scene_data(drawn, views, poses, x, intrinsics, base_from_camera[:, :3, 3]) | {
+        "others": others,
+        "bases": [
+            {"name": f"base of {arm.name}", "base": _rows(np.array(arm.base_from_other_base))}
+            for arm in (() if result.cameras is None else result.cameras.arms)
+        ],
+    }
     checks = [("cameras", "cameras", True), *([("others", "other cameras", True)] * bool(others))]
     checks += [("grippers", "grippers", True), ("grid", "base and grid", True)]
-    if result.calibration.next_poses:
-        checks.append(("next", "poses to add (green)", False))
+    checks += [("next", "poses to add (green)", False)] * bool(next_poses)
     checks.append(("tracks", "tracked features (red)", not layers))
     content = {
-        "layers": [layer.name for layer in layers] + ["no points"] * bool(layers),
+        "layers": [name for name, *_ in layers] + ["no points"] * bool(layers),
         "checks": checks,
         "through": [(k, view["name"]) for k, view in enumerate(views) if view["camera"]],
-        "labels": _labels(result),
+        "labels": labels,
         "data": data,
     }
     return Section("view", content)
+
+
+def track_layer(name: str, points_in_base: Float[ndarray, "n 3"]) -> PointLayer:
+    """Return points in red."""
+    red = np.tile(np.array(TRACK_COLOR, np.uint8), (len(points_in_base), 1))
+    return name, points_in_base, red, TRACK_SIZE
 
 
 def scene_data(
@@ -70,12 +99,24 @@ def scene_data(
     intrinsics: Intrinsics,
     shown_in_base: Float[ndarray, "m 3"],
 ) -> dict[str, Any]:
-    """Return the data of scene3d.js: points, images (`scene_view`), and gripper poses to add.
+    """Return the data of scene3d.js: points as 16-bit steps through their box, images (`scene_view`), poses to add.
 
     `shown_in_base` are further points (m) that the box of coordinates contains.
     """
+    everything = np.vstack([points for _, points, *_ in layers] + [shown_in_base])
+    # A few stray points far away must not take the resolution, and the view, from all others.
+    low, high = np.percentile(everything, [1, 99], axis=0)
+    margin = 0.25 * (high - low) + 0.05
+    low, high = box = np.stack([low - margin, high + margin]).round(4)
+    packed = []
+    for name, points, color, size in layers:
+        inside = ((points >= low) & (points <= high)).all(1)
+        steps = ((points[inside] - low) / (high - low) * 65535).round().astype("<u2")
+        xyz, rgb = (base64.b64encode(part.tobytes()).decode() for part in (steps, color[inside]))
+        packed.append({"name": name, "size": size, "xyz": xyz, "rgb": rgb})
     return {
-        **_packed_layers(layers, shown_in_base),
+        "box": box.tolist(),
+        "layers": packed,
         "views": views,
         "others": [],
         "bases": [],
@@ -109,82 +150,6 @@ def _rows(a_from_b: Float[ndarray, "4 4"]) -> list[list[float]]:
     return a_from_b[:3].round(6).tolist()
 
 
-def _labels(result: RunResult) -> list[tuple[str, list[int]]]:
-    """Return names and colours of the map's labels; none for a single label."""
-    names = () if result.scene is None else result.scene.label_names
-    return list(zip(names, label_colors(len(names)).tolist(), strict=True)) if len(names) > 1 else []
-
-
-def _map_layers(result: RunResult, surface: SurfacePoints | None) -> list[PointLayer]:
-    """Return the surface of the map by colour, and by label where it has several."""
-    if surface is None:
-        return []
-    x, size = surface.points_in_base[:POINTS], surface.point_size
-    layers = [PointLayer("map, predicted colour", x, surface.color[:POINTS], size)]
-    if labels := _labels(result):
-        palette = np.array([color for _, color in labels], np.uint8)
-        layers.append(PointLayer("map, predicted label", x, palette[surface.label[:POINTS]], size))
-    return layers
-
-
-def _measured_layer(result: RunResult) -> list[PointLayer]:
-    """Return the measured points; none without a cloud."""
-    if (cloud := result.cloud) is None:
-        return []
-    some = np.random.default_rng(0).permutation(len(cloud.points_in_base))[:POINTS]
-    x = cloud.points_in_base[some]
-    return [PointLayer("points as measured", x, cloud.color[some], point_size(x))]
-
-
-def _tracks(result: RunResult) -> PointLayer:
-    """Return the tracked features in red."""
-    hand_eye, tracked = result.hand_eye, result.reconstruction.tracks.points_in_recon
-    tracked = apply_similarity(hand_eye.base_from_recon, hand_eye.scale, tracked)
-    red = np.tile(np.array(TRACK_COLOR, np.uint8), (len(tracked), 1))
-    return PointLayer("tracked features", tracked, red, TRACK_SIZE)
-
-
-def _packed_layers(
-    layers: Sequence[PointLayer], centers_in_base: Float[ndarray, "m 3"]
-) -> dict[str, list[Any]]:
-    """Return the points in their common box, as 16-bit steps through it."""
-    everything = np.vstack([layer.points_in_base for layer in layers] + [centers_in_base])
-    # A few stray points far away must not take the resolution, and the view, from all others.
-    low, high = np.percentile(everything, [1, 99], axis=0)
-    margin = 0.25 * (high - low) + 0.05
-    box = np.stack([low - margin, high + margin]).round(4)
-    return {"box": box.tolist(), "layers": [_packed(layer, box) for layer in layers]}
-
-
-def _packed(layer: PointLayer, box: Float[ndarray, "2 3"]) -> dict[str, Any]:
-    """Return a layer as base64 text."""
-    low, high = box
-    inside = ((layer.points_in_base >= low) & (layer.points_in_base <= high)).all(1)
-    steps = (layer.points_in_base[inside] - low) / (high - low) * 65535
-    return {
-        "name": layer.name,
-        "size": layer.size,
-        "xyz": base64.b64encode(steps.round().astype("<u2").tobytes()).decode(),
-        "rgb": base64.b64encode(layer.color[inside].tobytes()).decode(),
-    }
-
-
-def _views(result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]) -> list[dict[str, Any]]:
-    """Return every image with its numbers, gripper pose and camera pose."""
-    row_of = {int(row): k for k, row in enumerate(result.image_index)}
-    images = result.calibration.images
-    return [
-        scene_view(
-            name,
-            image_numbers(image) if image.used else f"rejected: {image.reason}",
-            image.used,
-            result.capture.base_from_gripper[i],
-            base_from_camera[row_of[i]] if i in row_of else None,
-        )
-        for i, (image, name) in enumerate(zip(images, shown_names(images), strict=True))
-    ]
-
-
 def _others(result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]) -> list[dict[str, Any]]:
     """Return the cell's further cameras with their poses and intrinsics."""
     if result.cameras is None:
@@ -194,45 +159,25 @@ def _others(result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]) -> lis
     known = {camera.name: camera for camera in result.capture.others}
     shown = []
     for found in result.cameras.cameras:
-        places = _places(result, found, known, by_row)
-        if not places or found.intrinsics is None:
+        if found.parent_from_camera is None or (intrinsics := found.intrinsics) is None:
+            continue
+        fixed, places = found.mount == "base", [np.array(found.parent_from_camera)]
+        if not fixed:
+            if found.name not in known:
+                continue
+            places = result.cameras.base_from_camera(known[found.name], found, by_row)
+        if not places:
             continue
         arm = "" if found.arm is None else f" of arm {found.arm}"
         doubt = "" if found.doubt is None else "\nrejected"
-        intrinsics = found.intrinsics
+        sizes = ("fx", "fy", "cx", "cy", "width", "height")
         shown.append(
             {
                 "name": found.name,
-                "caption": f"{'fixed in the base' if found.mount == 'base' else f'on the gripper{arm}'}{doubt}",
-                "fixed": found.mount == "base",
-                "intrinsics": {
-                    key: getattr(intrinsics, key) for key in ("fx", "fy", "cx", "cy", "width", "height")
-                },
+                "caption": f"{'fixed in the base' if fixed else f'on the gripper{arm}'}{doubt}",
+                "fixed": fixed,
+                "intrinsics": {key: getattr(intrinsics, key) for key in sizes},
                 "cameras": [_rows(place) for place in places],
             }
         )
     return shown
-
-
-def _places(
-    result: RunResult,
-    found: CameraPlacement,
-    known: dict[str, CellCamera],
-    by_row: dict[int, Float[ndarray, "4 4"]],
-) -> list[Float[ndarray, "4 4"]]:
-    """Return base_from_camera of each image of a further camera; one pose of a fixed camera."""
-    if found.parent_from_camera is None or result.cameras is None:
-        return []
-    if found.mount == "base":
-        return [np.array(found.parent_from_camera)]
-    if found.name not in known:
-        return []
-    return result.cameras.base_from_camera(known[found.name], found, by_row)
-
-
-def _bases(result: RunResult) -> list[dict[str, Any]]:
-    """Return the bases of other arms."""
-    arms = () if result.cameras is None else result.cameras.arms
-    return [
-        {"name": f"base of {arm.name}", "base": _rows(np.array(arm.base_from_other_base))} for arm in arms
-    ]

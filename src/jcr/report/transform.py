@@ -1,10 +1,14 @@
-"""Section of the hand-eye transform in the notations of robot software, ready to copy."""
+"""Section of the hand-eye transform: notations of robot software, ready to copy, and a sketch to scale."""
 
 import json
+from collections.abc import Callable
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
+from jcr.camera import unproject, without_distortion
 from jcr.export.ros import (
     BASE,
     CHILD,
@@ -14,13 +18,19 @@ from jcr.export.ros import (
     static_transform_publisher,
     urdf_origin,
 )
-from jcr.geometry import roll_pitch_yaw
-from jcr.records import COVARIANCE_ORDER, HandEye, Mount
+from jcr.geometry import apply, roll_pitch_yaw
+from jcr.records import COVARIANCE_ORDER, HandEye, Intrinsics, Mount
+from jcr.report.figures import WIDTH, Figure, Shape, caption, line
 from jcr.report.render import Section
-from jcr.report.sketch import sketch
 from jcr.rounding import significant
 
 FIXED_AXES = "fixed axes x, y, z: R = Rz(yaw)·Ry(pitch)·Rx(roll)"
+HEIGHT, MARGIN = 320.0, 34.0
+"""Height of the sketch and its margin (px)."""
+EYE_DEG = (-55.0, 22.0)
+"""Azimuth of the eye about the parent's z axis, and elevation above its plane."""
+FLANGE_M = 0.0315
+"""Radius of the drawn flange: ISO 9409-1-50."""
 
 
 def transform_section(hand_eye: HandEye, mount: Mount = "gripper") -> Section:
@@ -69,3 +79,56 @@ def transform_section(hand_eye: HandEye, mount: Mount = "gripper") -> Section:
         "camera_info": None if hand_eye.intrinsics is None else camera_info(mounted),
     }
     return Section("transform", content)
+
+
+def sketch(parent_from_camera: Float[ndarray, "4 4"], intrinsics: Intrinsics | None, mount: Mount) -> Figure:
+    """Return the camera's pyramid and axes in the frame of the flange (z drawn downwards) or of the base."""
+    down = mount == "gripper"
+    away = float(np.linalg.norm(parent_from_camera[:3, 3]))
+    size = max(away, 2 * FLANGE_M)
+    camera, axes = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480), 0.45 * size * np.eye(3)
+    if intrinsics is not None:
+        camera = without_distortion(intrinsics)
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * [camera.width, camera.height] - 0.5
+    pyramid = apply(parent_from_camera, 0.4 * size * np.vstack([np.zeros(3), unproject(camera, corners)]))
+    tips = apply(parent_from_camera, 0.6 * axes)
+    turn = np.linspace(0, 2 * np.pi, 49)
+    flange = FLANGE_M * down * np.column_stack([np.cos(turn), np.sin(turn), np.zeros(49)])
+    place = _projection(np.vstack([pyramid, tips, axes, flange]), down)
+    origin, centre = place(np.zeros((1, 3)))[0], place(pyramid[:1])[0]
+    shapes = [line(place(flange), "flange")] * down
+    shapes += [line([origin, centre], "offset")]
+    tip, *rim = place(pyramid)
+    shapes += [
+        Shape("polygon", {"class": "cone", "points": " ".join(f"{x:.1f},{y:.1f}" for x, y in face)})
+        for face in [*([tip, rim[k - 1], rim[k]] for k in range(4)), rim]
+    ]
+    for begin, ends in ((origin, place(axes)), (centre, place(tips))):
+        for name, end in zip("xyz", ends, strict=True):
+            x, y = end + 10 * (end - begin) / max(float(np.linalg.norm(end - begin)), 1.0)
+            shapes += [line([begin, end], f"axis-{name}"), caption(x, y + 4, name, "small middle")]
+    parent, (x, y) = "gripper" if down else "base", (origin + centre) / 2
+    shapes.append(caption(x + 12, y - 6, f"{1e3 * away:.0f} mm", "small"))
+    shapes.append(caption(12.0, 18.0, f"{parent.capitalize()} and camera, to scale", "title"))
+    return Figure(
+        f"The camera in the frame of the {parent}, {1e3 * away:.0f} mm from its origin", shapes, HEIGHT
+    )
+
+
+def _projection(
+    x: Float[ndarray, "n 3"], down: bool
+) -> Callable[[Float[ndarray, "k 3"]], Float[ndarray, "k 2"]]:
+    """Return a parallel projection (n,3) m -> (n,2) px that shows all points, with z downwards or upwards."""
+    azimuth, elevation = np.radians(EYE_DEG)
+    up_z = -1.0 if down else 1.0
+    eye = np.array(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), up_z * np.sin(elevation)]
+    )
+    up = np.array([0.0, 0.0, up_z]) - up_z * np.sin(elevation) * eye
+    up /= np.linalg.norm(up)
+    axes = np.array([np.cross(up, eye), up])
+    flat = x @ axes.T
+    low, high = flat.min(0), flat.max(0)
+    zoom = float(((np.array([WIDTH, HEIGHT]) - 2 * MARGIN) / np.maximum(high - low, 1e-6)).min())
+    middle, centre = (low + high) / 2, np.array([WIDTH / 2, HEIGHT / 2 + 8])
+    return lambda points: (points @ axes.T - middle) * [zoom, -zoom] + centre

@@ -1,10 +1,14 @@
-"""Metric point cloud in the base frame from pointmaps and a calibration (JCR, section IV-C)."""
+"""Metric point cloud in the base frame from pointmaps and a calibration (JCR, section IV-C), and its file cloud.ply."""
+
+from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer, UInt8
 from numpy import ndarray
 
 from jcr.errors import InputError
+from jcr.files import read_bytes, write_bytes
 from jcr.geometry import apply, apply_similarity, by_similarity, inverse, scale_translation
 from jcr.records import MATCHED, PRIOR, Capture, HandEye, PointCloud, Reconstruction
 from jcr.scene.options import CloudOptions
@@ -12,6 +16,14 @@ from jcr.scene.options import CloudOptions
 LEAST_SURE = 40.0
 """Percent of the points that rest on matching alone, the least confident, to which the way counts as seen by no one:
 few images agree on them, and a depth that ends too deep is one of theirs. It takes a third of what is free and wrong."""
+_COLUMNS = {
+    **dict.fromkeys("xyz", "f4"),
+    **dict.fromkeys(("red", "green", "blue"), "u1"),
+    **{"label": "i4", "confidence": "f4", "margin": "f4", "image": "i4", "reason": "u1", "depth_std": "f4"},
+}
+"""Properties of a point; the last two of clouds with a reason and a standard deviation (m) for each depth."""
+_PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
+_FIRST = "comment jcr cloud in the base frame, metres"
 
 
 def point_cloud(
@@ -107,3 +119,72 @@ def position_std(
         by = by_similarity(x_in_camera @ hand_eye.gripper_from_camera[:3, :3].T)
         covariance = by @ hand_eye.covariance @ np.swapaxes(by, -1, -2)
     return np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0.0))
+
+
+def write_cloud(path: Path, cloud: PointCloud, notes: Mapping[str, str] | None = None) -> None:
+    """Write points with colour, label, confidence, margin (m) and image as binary PLY.
+
+    The header's comments name the labels and the camera centres, so that `read_cloud` gives all of it back;
+    `notes`, each of one line, are added to them.
+    """
+    columns = dict(zip(_COLUMNS, (*cloud.points_in_base.T, *cloud.color.T), strict=False))
+    for name in list(_COLUMNS)[6:]:
+        if (column := getattr(cloud, name)) is not None:
+            columns[name] = column
+    vertices = np.empty(len(cloud.image), [(name, f"<{_COLUMNS[name]}") for name in columns])
+    for name, column in columns.items():
+        vertices[name] = column
+    centers = cloud.camera_centers_in_base.tolist()
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        _FIRST,
+        *(f"comment {name} {text}" for name, text in (notes or {}).items()),
+        *(f"comment label {k} {name}" for k, name in enumerate(cloud.label_names)),
+        *(f"comment camera {k} {x} {y} {z}" for k, (x, y, z) in enumerate(centers)),
+        f"element vertex {len(vertices)}",
+        *(f"property {_PLY_TYPES[_COLUMNS[name]]} {name}" for name in columns),
+        "end_header\n",
+    ]
+    write_bytes(path, "\n".join(header).encode() + vertices.tobytes())
+
+
+def read_cloud(path: Path) -> PointCloud:
+    """Read a cloud that `write_cloud` wrote; raise InputError for any other file."""
+    try:
+        header, separator, body = read_bytes(path).partition(b"end_header\n")
+        lines = header.decode().splitlines()
+    except OSError as error:
+        raise InputError(f"{path}: no cloud here ({error.strerror}); make one with jcr map OUT") from None
+    except UnicodeDecodeError:
+        separator, lines, body = b"", [], b""
+    words = [line.split(maxsplit=3) for line in lines]
+    if not separator or _FIRST not in lines:
+        raise InputError(f"{path}: is no cloud of jcr; make it again with jcr map OUT")
+    names = [name for name, kind in _COLUMNS.items() if f"property {_PLY_TYPES[kind]} {name}" in lines]
+    vertex = np.dtype([(name, f"<{_COLUMNS[name]}") for name in names])
+    if len(names) < len(_COLUMNS) - 2 or len(body) % vertex.itemsize:
+        raise InputError(f"{path}: the cloud is cut short; make it again with jcr map OUT")
+    vertices = np.frombuffer(body, vertex)
+    if not all(np.isfinite(vertices[name]).all() for name in names):
+        raise InputError(
+            f"{path}: the cloud is damaged (a number is not finite); make it again with jcr map OUT"
+        )
+    try:
+        centers = [[float(x) for x in word[3].split()] for word in words if word[:2] == ["comment", "camera"]]
+        label_names = tuple(word[3] for word in words if word[:2] == ["comment", "label"])
+        camera_centers = np.array(centers, np.float64).reshape(-1, 3)
+    except (ValueError, IndexError):
+        raise InputError(f"{path}: the cloud's header is damaged; make it again with jcr map OUT") from None
+    return PointCloud(
+        points_in_base=np.stack([vertices[name] for name in "xyz"], 1).astype(np.float64),
+        color=np.stack([vertices[name] for name in ("red", "green", "blue")], 1),
+        confidence=vertices["confidence"].astype(np.float64),
+        margin=vertices["margin"].astype(np.float64),
+        label=vertices["label"].astype(int),
+        image=vertices["image"].astype(int),
+        camera_centers_in_base=camera_centers,
+        label_names=label_names,
+        reason=vertices["reason"].copy() if "reason" in names else None,
+        depth_std=vertices["depth_std"].astype(np.float64) if "depth_std" in names else None,
+    )

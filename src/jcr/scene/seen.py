@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Integer, UInt8
 from numpy import ndarray
 from torch import Tensor
+from torch.nn import functional as F
 
 from jcr.compiled import compiled
 
@@ -90,11 +91,7 @@ def dilate(mask: Bool[Tensor, "nz ny nx"], cells: int) -> Bool[Tensor, "nz ny nx
 
 def halve(mask: Bool[Tensor, "nz ny nx"]) -> Bool[Tensor, "z y x"]:
     """Return the mask at half the resolution: set where any of eight cells is."""
-    z, y, x = (n // 2 * 2 for n in mask.shape)
-    for axis, n in enumerate((z, y, x)):
-        mask = mask.narrow(axis, 0, n).unflatten(axis, (n // 2, 2))
-        mask = mask.select(axis + 1, 0) | mask.select(axis + 1, 1)
-    return mask
+    return F.max_pool3d(mask[None].float(), 2)[0] > 0
 
 
 def carve(

@@ -171,7 +171,7 @@ def workspace_rays(
     )
 
 
-Samples = tuple[Float[Tensor, "k 3"], Float[Tensor, " k"], Float[Tensor, " k"]]
+Samples = tuple[Float[Tensor, "_ 3"], Float[Tensor, " _"], Float[Tensor, " _"]]
 """Places, their known occupancy (0 or 1) and weight; the first are surface points, which carry other properties."""
 
 

@@ -56,20 +56,6 @@ class Measurement:
     """Largest footprint first."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Shape:
-    """Size and place of one object, in the support's frame."""
-
-    top: float
-    spread: float
-    """One-sigma spread of the points about the top."""
-    rotation_rad: float
-    """Radians from the support's x axis to the longer side."""
-    center: Float[ndarray, "2"]
-    sides: Float[ndarray, "2"]
-    outline: Float[ndarray, "k 2"]
-
-
 def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support | None = None) -> Measurement:
     """Measure all labelled objects above the support plane.
 
@@ -84,59 +70,43 @@ def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support 
     plane_label = np.bincount(cloud.label[support.on_plane]).argmax()
     # Seen from the others alone, the plane lies a little higher or lower.
     plane_without = _without_each(x_in_support[support.on_plane, 2], cloud.image[support.on_plane])
+    bent = np.sqrt(max(support.noise**2 - support.roughness**2, 0.0))
     sizes = []
     for label in np.unique(cloud.label):
         rows = cloud.label == label
         if label in (0, plane_label) or rows.sum() < FEWEST:
             continue
         x, image = x_in_support[rows], cloud.image[rows]
-        whole = _shape(x, support.roughness)
-        if whole.top <= 0:
+        top, spread, rotation_rad, center, sides, outline = _shape(x, support.roughness)
+        if top <= 0:
             continue
         parts = []
         for k in np.unique(image):
             if (image != k).sum() >= FEWEST:
-                part = _shape(x[image != k], support.roughness, whole.rotation_rad)
-                parts.append([part.top - plane_without.get(k, 0.0), *part.sides])
+                part = _shape(x[image != k], support.roughness, rotation_rad)
+                parts.append([*part[4], part[0] - plane_without.get(k, 0.0)])
+        size, jackknife = np.array([*sides, top]), np.zeros(3)
+        if len(parts) > 1:
+            jackknife = np.sqrt((len(parts) - 1) * np.var(parts, axis=0))
+        own = np.array([CELL / 2, CELL / 2, np.hypot(bent, spread / np.sqrt(max(len(parts), 1)))])
+        std = np.sqrt(jackknife**2 + own**2 + (scale_std * size) ** 2)
+        turn = rotation_exp(np.array([0.0, 0.0, rotation_rad]))
+        outline = np.column_stack([outline, np.zeros(len(outline))])
         sizes.append(
-            _size(int(label), cloud.label_names[label], len(x), whole, np.array(parts), support, scale_std)
+            ObjectSize(
+                label=int(label),
+                name=cloud.label_names[label],
+                points=len(x),
+                height=top,
+                height_std=float(std[2]),
+                top_seen=bool(jackknife[2] < SAME_TOP * top),
+                footprint_in_base=apply(support.base_from_support, outline),
+                base_from_box=support.base_from_support @ transform(turn, np.append(center, top / 2)),
+                box_size=size,
+                box_std=std,
+            )
         )
     return Measurement(support, tuple(sorted(sizes, key=lambda size: -size.box_size[0] * size.box_size[1])))
-
-
-def _size(
-    label: int,
-    name: str,
-    points: int,
-    shape: _Shape,
-    parts: Float[ndarray, "m 3"],
-    support: Support,
-    scale_std: float,
-) -> ObjectSize:
-    """Return the size of an object with its jackknife over images; `parts` have top and sides without each image."""
-    size = np.array([*shape.sides, shape.top])
-    bent = np.sqrt(max(support.noise**2 - support.roughness**2, 0.0))
-    own = np.array([CELL / 2, CELL / 2, np.hypot(bent, shape.spread / np.sqrt(max(len(parts), 1)))])
-    jackknife = np.zeros(3)
-    if len(parts) > 1:
-        jackknife = np.sqrt((len(parts) - 1) * parts[:, [1, 2, 0]].var(0))
-    std = np.sqrt(jackknife**2 + own**2 + (scale_std * size) ** 2)
-    support_from_box = transform(
-        rotation_exp(np.array([0.0, 0.0, shape.rotation_rad])), np.append(shape.center, shape.top / 2)
-    )
-    outline = np.column_stack([shape.outline, np.zeros(len(shape.outline))])
-    return ObjectSize(
-        label=label,
-        name=name,
-        points=points,
-        height=shape.top,
-        height_std=float(std[2]),
-        top_seen=bool(jackknife[2] < SAME_TOP * shape.top),
-        footprint_in_base=apply(support.base_from_support, outline),
-        base_from_box=support.base_from_support @ support_from_box,
-        box_size=size,
-        box_std=std,
-    )
 
 
 def _without_each(values: Float[ndarray, " n"], image: Int[ndarray, " n"]) -> dict[int, float]:
@@ -147,38 +117,32 @@ def _without_each(values: Float[ndarray, " n"], image: Int[ndarray, " n"]) -> di
 
 
 def _shape(
-    x_in_support: Float[ndarray, "n 3"], roughness: float, rotation_rad: float | None = None
-) -> _Shape:
-    """Return top, box and outline of an object; its rotation is estimated where it is not given."""
+    x_in_support: Float[ndarray, "n 3"], roughness: float, given_rad: float | None = None
+) -> tuple[float, float, float, Float[ndarray, "2"], Float[ndarray, "2"], Float[ndarray, "k 2"]]:
+    """Return top and spread of its points, rotation to the longer side, centre, sides and outline of an object.
+
+    The rotation is estimated where it is not given.
+    """
     top, spread = _top(x_in_support[:, 2], roughness)
     xy, area = _dense(x_in_support[:, :2])
     middle = xy.mean(0)
-    rotation_rad = _rotation_to_longer_side(_outline(xy - middle)) if rotation_rad is None else rotation_rad
+    rotation_rad = given_rad or 0.0
+    if given_rad is None:
+        hull = _outline(xy - middle)
+        angle = float(np.radians(cv2.minAreaRect(hull.astype(np.float32))[2]))
+        length, width = np.ptp(hull @ _axes(angle).T, axis=0)
+        rotation_rad = angle + np.pi / 2 * float(length < width)
     along = (xy - middle) @ _axes(rotation_rad).T
     ends = [SIDE_SHARE, 1 - SIDE_SHARE]
     low, high = np.quantile(along, ends, axis=0, weights=area, method="inverted_cdf")
     within = ((along >= low) & (along <= high)).all(1)
     center = middle + (low + high) / 2 @ _axes(rotation_rad)
-    return _Shape(
-        top=top,
-        spread=spread,
-        rotation_rad=rotation_rad,
-        center=center,
-        sides=high - low,
-        outline=_outline(xy[within] - middle) + middle,
-    )
+    return top, spread, rotation_rad, center, high - low, _outline(xy[within] - middle) + middle
 
 
 def _outline(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "k 2"]:
     """Return the convex hull in single precision, which is exact enough near the origin."""
     return cv2.convexHull(xy.astype(np.float32))[:, 0].astype(np.float64)
-
-
-def _rotation_to_longer_side(hull: Float[ndarray, "k 2"]) -> float:
-    """Return the angle (rad) to the longer side of the smallest rectangle around a convex outline."""
-    rotation_rad = float(np.radians(cv2.minAreaRect(hull.astype(np.float32))[2]))
-    length, width = np.ptp(hull @ _axes(rotation_rad).T, axis=0)
-    return rotation_rad + np.pi / 2 * (length < width)
 
 
 def _top(height: Float[ndarray, " n"], roughness: float) -> tuple[float, float]:

@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from torch import Tensor
 from torch.nn import functional as F
 
 from jcr.errors import InputError
@@ -22,7 +21,7 @@ from jcr.geometry import apply_similarity
 from jcr.hub import cached_files
 from jcr.progress import Progress
 from jcr.records import HandEye, Reconstruction
-from jcr.segments.labels import LabelImages
+from jcr.segments.segments import LabelImages
 
 if TYPE_CHECKING:
     from transformers import Sam2Model
@@ -116,21 +115,15 @@ def image_masks(model: "Sam2Model", image: UInt8[ndarray, "h w 3"]) -> Bool[ndar
         good = (out.iou_scores[0][row, best] >= LEAST_QUALITY) & (stable >= LEAST_STABILITY)
         found.append(logits[good] > 0)
         quality.append(out.iou_scores[0][row, best][good])
-    order = torch.cat(quality).argsort(descending=True)
-    return _distinct(torch.cat(found)[order]).cpu().numpy()
-
-
-def _distinct(masks: Bool[Tensor, "k h w"]) -> Bool[Tensor, "j h w"]:
-    """Return the masks without those that repeat an earlier one."""
+    masks = torch.cat(found)[torch.cat(quality).argsort(descending=True)]
     flat = masks.flatten(1).float()
-    area = flat.sum(1)
-    shared = flat @ flat.T
+    area, shared = flat.sum(1), flat @ flat.T
     same = shared > SAME * (area[:, None] + area - shared)
     kept: list[int] = []
-    for k in range(len(masks)):
+    for k in range(len(masks)):  # without those that repeat an earlier one
         if area[k] > 0 and not same[k, kept].any():
             kept.append(k)
-    return masks[kept]
+    return masks[kept].cpu().numpy()
 
 
 def merged(

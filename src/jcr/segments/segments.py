@@ -1,11 +1,96 @@
-"""Selection of the segments: label images of the user, geometry, or Segment Anything."""
+"""Segments of a scene: label images of the user (one PNG an image), geometry, or Segment Anything."""
 
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Int
+from numpy import ndarray
+
+from jcr.camera import project, rays
 from jcr.errors import InputError
 from jcr.progress import Progress
 from jcr.records import Capture, HandEye, PointCloud, Reconstruction
-from jcr.segments.labels import LabelImages, read_labels
 from jcr.segments.options import SegmentOptions
 from jcr.segments.tabletop import Support, label_tabletop
+
+MOST = 1024
+"""Largest number of labels; an image given by mistake has more."""
+
+
+@dataclass(frozen=True)
+class LabelImages:
+    """Labels at the pointmaps' pixels."""
+
+    labels: Int[ndarray, "m h w"]
+    """0 = none."""
+    names: tuple[str, ...]
+    """Name of each label; label 0 is none."""
+
+
+def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages | None:
+    """Read the capture's `labels/NAME.png` (8 or 16 bit, the image's size, 0 = none); None where there are none.
+
+    `labels/names.json` may name them: {"1": "mug", …}. Raises InputError when the labels of a registered image
+    are missing or unreadable, have another size than the image, or go beyond 1023.
+    """
+    folder = capture.folder / "labels"
+    if not any(folder.glob("*.png")):
+        return None
+    stack = []
+    for row in reconstruction.image_index:
+        if row >= len(capture):  # added to the run later
+            stack.append(np.zeros(reconstruction.dense.confidence.shape[1:], np.int64))
+            continue
+        label = _read(folder / f"{Path(capture.images[row]).stem}.png", capture, capture.images[row])
+        stack.append(_on_pointmap(label, reconstruction))
+    labels = np.stack(stack)
+    names = (
+        {0: "none"}
+        | {k: str(k) for k in range(1, int(labels.max()) + 1)}
+        | _read_names(folder / "names.json")
+    )
+    return LabelImages(labels, tuple(names[k] for k in range(int(labels.max()) + 1)))
+
+
+def _read(path: Path, capture: Capture, image: str) -> Int[ndarray, "h w"]:
+    """Read the labels of an image; raise InputError where they are missing or do not fit it."""
+    if not path.is_file():
+        raise InputError(
+            f"{path}: not found; give labels for every image of the capture, or for none ({image})"
+        )
+    label = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if label is None or label.ndim != 2:
+        raise InputError(f"{path}: no label image; save it as PNG with one channel of 8 or 16 bits")
+    if label.shape[::-1] != capture.image_size:
+        raise InputError(
+            f"{path}: is {label.shape[::-1]} pixels and {image} is {capture.image_size}; make them alike"
+        )
+    if label.max() >= MOST:
+        raise InputError(f"{path}: holds label {label.max()}; number the labels from 1, at most {MOST - 1}")
+    return label.astype(np.int64)
+
+
+def _on_pointmap(label: Int[ndarray, "h w"], reconstruction: Reconstruction) -> Int[ndarray, "r c"]:
+    """Return the nearest label of the capture's image at each pixel of the pointmap."""
+    camera, grid = reconstruction.intrinsics, reconstruction.dense.intrinsics
+    x_px, y_px = np.moveaxis(project(camera, rays(grid)).astype(np.float32), -1, 0)
+    nearest = cv2.remap(label.astype(np.uint16), x_px, y_px, cv2.INTER_NEAREST, borderValue=0)
+    return nearest.astype(np.int64)
+
+
+def _read_names(path: Path) -> dict[int, str]:
+    """Read the names of labels; none without a file."""
+    if not path.is_file():
+        return {}
+    try:
+        named = json.loads(path.read_text("utf-8")).items()
+        # One line each: the header of cloud.ply names them.
+        return {int(label): " ".join(str(name).split()) or label for label, name in named}
+    except (ValueError, AttributeError, RecursionError):
+        raise InputError(f'{path}: expected {{"1": "mug", "2": "box"}}') from None
 
 
 def image_labels(

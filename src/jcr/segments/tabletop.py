@@ -133,7 +133,11 @@ def label_tabletop(
         cell = np.floor(x_in_support[:, :2] / (options.object_gap / 2)).astype(int)
         # Two empty cells all around, the outermost one stands for all that lies farther out.
         low, high = cell[over].min(0) - 2, cell[over].max(0) + 2
-        parts = _parts(cell[over] - low, tuple((high - low + 1).tolist()))
+        # Connected cells that hold more than a few stray points.
+        count = np.zeros(high - low + 1)
+        np.add.at(count, tuple((cell[over] - low).T), 1)
+        enough = max(FEWEST_IN_CELL, STRAY_SHARE * float(np.median(count[count > 0])))
+        parts, _ = ndimage.label(count >= enough, np.ones((3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
         place = tuple((np.clip(cell, low, high) - low).T)
         # What is too low to found an object belongs to the one it lies under: its foot.
         part = np.where((height > noise) & (height < options.object_highest), parts[place], 0)
@@ -146,15 +150,6 @@ def label_tabletop(
     label = np.where(object_of > 0, object_of + 1, np.where(table, 1, 0))
     names = ("none", "table", *(f"object {k}" for k in range(1, int(object_of.max(initial=0)) + 1)))
     return replace(cloud, label=label, label_names=names)
-
-
-def _parts(cell: Int[ndarray, "k 2"], shape: tuple[int, ...]) -> Int[ndarray, "c r"]:
-    """Return connected cells (from 1) seen from above that hold more than a few stray points."""
-    count = np.zeros(shape)
-    np.add.at(count, tuple(cell.T), 1)
-    enough = max(FEWEST_IN_CELL, STRAY_SHARE * float(np.median(count[count > 0])))
-    labelled, _ = ndimage.label(count >= enough, np.ones((3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
-    return labelled
 
 
 def _objects(

@@ -1,8 +1,13 @@
-"""3D view of a run in the browser: points, cameras, robot, slices of the map, a sphere to test."""
+"""3D view of a run in the browser: points, cameras, robot, slices of the map, a sphere to test.
 
+What can only be shown or hidden has no control here: viser's list of the scene has a switch for each part.
+"""
+
+import io
 import threading
+from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import cv2
 import numpy as np
@@ -15,15 +20,19 @@ from viser.extras import ViserUrdf
 
 from jcr.camera import pinhole_inside, undistortion
 from jcr.capture.images import read_image
-from jcr.geometry import apply, apply_similarity, scale_translation
+from jcr.capture.urdf_chain import load_urdf
+from jcr.errors import InputError
+from jcr.geometry import apply_similarity, scale_translation
 from jcr.progress import Progress, silent
-from jcr.report.raster import TRACK_COLOR, label_colors
-from jcr.report.render import render
+from jcr.records import Capture
+from jcr.report.render import TRACK_COLOR, label_colors, render
 from jcr.report.verdict import head
 from jcr.run_folder import RunResult
-from jcr.scene.samples import Slice, level_slice, sample_surface
 from jcr.scene.scene_map import SceneMap, Unknown
-from jcr.viewer.robot import read_robot
+from jcr.scene.surface import Slice, level_slice, sample_surface
+
+if TYPE_CHECKING:
+    import yourdfpy
 
 CAMERA, CHOSEN, REJECTED = (200, 110, 30), (37, 99, 235), (200, 50, 43)
 FREE, COLLIDES, OCCUPIED = (40, 160, 90), (220, 40, 40), (37, 99, 235)
@@ -32,16 +41,72 @@ CLOUD, MAP = "points as measured", "map"
 MAP_POINTS = 150_000
 UNKNOWN_CELLS = 300_000
 """Cells queried to find the border of unknown space."""
-IMAGE_PX = 512
-"""Longer side of the photographs."""
-FRUSTUM_M, PHOTO_M = 0.05, 0.1
-"""Distances from a camera to its drawn image plane, and to the photograph laid over the map (m)."""
+IMAGE_PX = 160
+"""Longer side of the images in the cameras."""
+FRUSTUM_M, POINT_M = 0.05, 0.005
+"""Distance from a camera to its drawn image plane, and size of a point (m)."""
 CLICK_RAD = 0.006
 """Angle about a click's ray within which points are found."""
 FAR_M = 0.2
 """Distance at which the colours of a slice end."""
+HOST = "127.0.0.1"
+"""Other machines must not reach viser, which has no password and no encryption."""
 Value = Float[ndarray, "3"]
 SliceOf = Literal["distance", "occupancy"]
+
+
+class LocalServer(viser.ViserServer):
+    """viser server that never opens a tunnel to the internet."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        """Return no address: sharing is disabled."""
+        return None
+
+    def stop(self) -> None:
+        """Stop without printing: standard output belongs to the command."""
+        with redirect_stdout(io.StringIO()):
+            super().stop()
+
+
+def open_server(port: int, title: str) -> LocalServer:
+    """Return a running server at a port of 127.0.0.1 (0: any free one); raise InputError where the port is taken."""
+    if not 0 <= port <= 65535:
+        raise InputError(f"--port {port}: no such port; take one from 1024 to 65535, or 0 for any free one")
+    with redirect_stdout(io.StringIO()):
+        server = LocalServer(host=HOST, port=port, label=title, verbose=False)
+    if port not in (0, server.get_port()):  # viser takes the next free port silently
+        server.stop()
+        raise InputError(
+            f"cannot listen on port {port} of {HOST}; choose another with --port (0 takes any free one)"
+        )
+    server.gui.configure_theme(show_logo=False, show_share_button=False)
+    return server
+
+
+def read_robot(urdf: Path, capture: Capture) -> "tuple[yourdfpy.URDF, Float[ndarray, 'n dof']]":
+    """Return the robot with its visual meshes, and its configuration at each image (rad or m).
+
+    The capture's joints are the first that move in the URDF; others, such as fingers, stay at 0. Raises InputError
+    for a URDF that cannot be read or moves fewer joints, and for a capture without joint values.
+    """
+    import yourdfpy
+
+    moving = load_urdf(urdf).actuated_joint_names
+    if (joints := capture.joints) is None:
+        raise InputError(
+            f"{capture.folder}: has no joint values, so the robot's pose is unknown; add `joints` (rad) to each frame "
+            "of its capture.json, or leave out --urdf"
+        )
+    if len(moving) < joints.shape[1]:
+        raise InputError(
+            f"{urdf}: moves {len(moving)} joints, but the capture has {joints.shape[1]} values for each image; give "
+            "the URDF of the whole arm"
+        )
+    try:
+        robot = yourdfpy.URDF.load(str(urdf))
+    except Exception as error:  # whatever the readers of meshes raise
+        raise InputError(f"{urdf}: a mesh cannot be read ({error})") from error
+    return robot, np.pad(joints, ((0, 0), (0, len(moving) - joints.shape[1])))
 
 
 class Viewer:
@@ -76,7 +141,6 @@ class Viewer:
             robot, self._configurations = read_robot(urdf, self.capture)
             server.scene.add_frame("/robot", show_axes=False)
             self.robot = ViserUrdf(server, robot, root_node_name="/robot")
-        self.show_robot.visible = self.robot is not None
         report("view", 0.3)
         self._add_points()
         if self.scene is not None:
@@ -104,7 +168,7 @@ class Viewer:
         server, gui, intrinsics = self.server, self.server.gui, self.reconstruction.intrinsics
         server.scene.add_frame("/base", axes_length=0.1, axes_radius=0.003)
         server.scene.add_label("/base/name", "base")
-        self._grid = server.scene.add_grid(
+        server.scene.add_grid(
             "/grid",
             infinite_grid=True,
             cell_size=0.1,
@@ -112,14 +176,10 @@ class Viewer:
             fade_distance=6.0,
             fade_from="origin",
         )
-        self.intrinsics = pinhole = pinhole_inside(intrinsics, IMAGE_PX)
-        undistort, names = (
-            undistortion(intrinsics, pinhole),
-            [self.capture.images[k] for k in self.image_index],
-        )
-        self.pixels = np.stack([undistort(read_image(self.capture.folder / name)) for name in names])
+        pinhole = pinhole_inside(intrinsics, IMAGE_PX)
+        undistort = undistortion(intrinsics, pinhole)
         self._fov = 2 * float(np.arctan2(pinhole.height / 2, pinhole.fy))
-        self.frusta, step = [], max(1, pinhole.width // 160)
+        self.frusta = []
         for k, pose in enumerate(self.base_from_camera):
             frustum = server.scene.add_camera_frustum(
                 f"/cameras/{k}",
@@ -128,36 +188,19 @@ class Viewer:
                 scale=FRUSTUM_M,
                 thickness=2.0,
                 thickness_units="screen",
-                image=self.pixels[k, ::step, ::step],
+                image=undistort(read_image(self.capture.folder / self.capture.images[self.image_index[k]])),
                 wxyz=_wxyz(pose),
                 position=pose[:3, 3],
             )
             frustum.on_click(lambda event, k=k: self.look_from(k, event.client))
             self.frusta.append(frustum)
-        self.grippers = [
-            server.scene.add_frame(
-                f"/grippers/{k}",
-                axes_length=0.03,
-                axes_radius=0.001,
-                wxyz=_wxyz(pose),
-                position=pose[:3, 3],
-            )
-            for k, pose in enumerate(self.capture.base_from_gripper)
-        ]
-        self._photo = server.scene.add_image("/photo", np.zeros((2, 2, 4), np.uint8), 0.1, 0.1, visible=False)
+        for k, pose in enumerate(self.capture.base_from_gripper):
+            place = {"wxyz": _wxyz(pose), "position": pose[:3, 3]}
+            server.scene.add_frame(f"/grippers/{k}", axes_length=0.03, axes_radius=0.001, **place)
         with gui.add_folder("Capture", expand_by_default=False):
             self.image = gui.add_slider("image", 0, len(self.calibration.images) - 1, 1, 0)
             self._about_image = gui.add_markdown("")
-            look = gui.add_button("look from this camera")
-            self.photo = gui.add_slider("photograph", 0, 100, 5, 0, hint="laid over the map, %")
-            self.show_cameras = gui.add_checkbox("cameras", True)
-            self.show_grippers = gui.add_checkbox("grippers", True)
-            self.show_grid = gui.add_checkbox("grid", True, hint="0.1 m, base z = 0")
-            self.show_robot = gui.add_checkbox("robot", True)
-        switches = (self.show_cameras, self.show_grippers, self.show_robot, self.show_grid, self.photo)
-        for control in (self.image, *switches):
-            control.on_update(lambda _: self.choose_image())
-        look.on_click(lambda event: self.look_from(self._camera_of_image(), event.client))
+        self.image.on_update(lambda _: self.choose_image())
 
     def _add_points(self) -> None:
         """Add the controls of the drawn points."""
@@ -168,8 +211,7 @@ class Viewer:
             self.by_label = gui.add_checkbox("coloured by label", False, visible=several)
             self._legend = gui.add_html("")
             self.show_tracks = gui.add_checkbox("features", len(names) == 1, hint="tracked, red")
-            self.size = gui.add_slider("size (mm)", 1.0, 15.0, 0.5, 5.0)
-        for control in (self.shown, self.by_label, self.show_tracks, self.size):
+        for control in (self.shown, self.by_label, self.show_tracks):
             control.on_update(lambda _: self.show_points())
 
     def _add_map(self, scene: SceneMap) -> None:
@@ -199,7 +241,6 @@ class Viewer:
         """Add the sphere that shows collisions, 0.15 m above the support."""
         gui = self.server.gui
         with gui.add_folder("Sphere to drag", expand_by_default=False):
-            self.show_sphere = gui.add_checkbox("sphere", True)
             self.radius = gui.add_slider("radius (mm)", 5.0, 150.0, 5.0, 30.0)
             self.answer = gui.add_markdown("")
         start = np.array([*np.median(self._solid(), axis=0)[:2], self._support() + 0.15])
@@ -208,7 +249,7 @@ class Viewer:
         )
         self.gizmo.on_update(lambda _: self.move_sphere())
         self.ball = self.server.scene.add_icosphere("/sphere/ball", 0.03, FREE, opacity=0.75)
-        for control in (self.show_sphere, self.radius, self.unknown):
+        for control in (self.radius, self.unknown):
             control.on_update(lambda _: self.move_sphere())
         self.move_sphere()
 
@@ -236,34 +277,11 @@ class Viewer:
             for k, frustum in enumerate(self.frusta):
                 used = self.calibration.images[int(self.image_index[k])].used
                 frustum.color = CHOSEN if k == camera else CAMERA if used else REJECTED
-                # Their images would hide the photograph.
-                frustum.visible = self.show_cameras.value and self.photo.value == 0
-            for gripper in self.grippers:
-                gripper.visible = self.show_grippers.value
-            self._grid.visible = self.show_grid.value
-            self._show_photo(camera)
             if self.robot is not None:
-                self.robot.show_visual = self.show_robot.value
                 self.robot.update_cfg(self._configurations[row])
 
-    def _show_photo(self, camera: int | None) -> None:
-        """Place the chosen camera's photograph before it, so that it covers the map as seen from there."""
-        self._photo.visible = camera is not None and self.photo.value > 0
-        if camera is None or self.photo.value == 0:
-            return
-        pinhole, pose = self.intrinsics, self.base_from_camera[camera]
-        opaque = np.full((*self.pixels.shape[1:3], 1), round(2.55 * self.photo.value), np.uint8)
-        self._photo.image = np.concatenate([self.pixels[camera], opaque], axis=-1)
-        size, focal = np.array([pinhole.width, pinhole.height]), np.array([pinhole.fx, pinhole.fy])
-        middle = ((size - 1) / 2 - [pinhole.cx, pinhole.cy]) / focal
-        self._photo.render_width, self._photo.render_height = (PHOTO_M * size / focal).tolist()
-        self._photo.wxyz = _wxyz(pose)
-        self._photo.position = apply(pose, PHOTO_M * np.array([*middle, 1.0]))
-
-    def look_from(self, camera: int | None, client: viser.ClientHandle | None) -> None:
+    def look_from(self, camera: int, client: viser.ClientHandle | None) -> None:
         """Choose the image of a registered camera and move the client's view to it."""
-        if camera is None:
-            return
         self.image.value = int(self.image_index[camera])
         if client is None:
             return
@@ -285,7 +303,7 @@ class Viewer:
                     labels = list(zip(self.scene.label_names, self._palette.tolist(), strict=True))
                     legend = render("labels.html", {"labels": labels}, "jcr.viewer")
             self.points, self._legend.content = x, legend
-            self._draw("/points", x, color, self.size.value / 1e3)
+            self._draw("/points", x, color, POINT_M)
             tracks = self.tracks_in_base if self.show_tracks.value else np.zeros((0, 3))
             self._draw("/tracks", tracks, np.tile(np.array(TRACK_COLOR, np.uint8), (len(tracks), 1)), 0.004)
 
@@ -320,7 +338,6 @@ class Viewer:
             hit = bool(self.scene.check_spheres(center, radius, unknown)[0])
             at = self.scene.query(center, unknown)
             self.ball.radius, self.ball.color = radius, COLLIDES if hit else FREE
-            self.ball.visible = self.gizmo.visible = self.show_sphere.value
             distance, (x, y, z) = float(at.distance[0]), center[0]
             where = (
                 "outside of the workspace" if np.isnan(distance) else f"surface {1e3 * distance:.0f} mm away"
@@ -335,7 +352,7 @@ class Viewer:
             x = self.points
             along = (x - origin_in_base) @ direction
             aside = np.linalg.norm(x - origin_in_base - along[:, None] * direction, axis=1)
-            reach = np.maximum(CLICK_RAD * along, self.size.value / 2e3)
+            reach = np.maximum(CLICK_RAD * along, POINT_M / 2)
             near = np.flatnonzero((along > 0.02) & (aside < reach))
             self._mark.visible = len(near) > 0
             if len(near) == 0:

@@ -1,0 +1,44 @@
+"""Section of residuals: a bar for each image, and the numbers of the whole fit."""
+
+import numpy as np
+
+from jcr.calibration.words import leave_one_out_text
+from jcr.report.images import shown_names
+from jcr.report.render import Section
+from jcr.rounding import significant
+from jcr.run_folder import RunResult
+
+NOTICEABLE = 1.05
+"""Times the random noise, from which the noise with systematic errors is named beside it."""
+
+
+def residuals_section(result: RunResult) -> Section:
+    """Return residuals by image and of the whole fit."""
+    fit, names = result.hand_eye, shown_names(result.calibration.images)
+    used, columns = fit.inliers, []
+    for values, unit in (
+        (1e3 * fit.translation_residual_m, " mm"),
+        (np.degrees(fit.rotation_residual_rad), "°"),
+    ):
+        share = 100 * values / (float(values[used].max(initial=0.0)) or 1.0)
+        columns.append(
+            [(min(s, 100.0), f"{significant(v)}{unit}") for s, v in zip(share, values, strict=True)]
+        )
+    noise, together = fit.robot_noise.translation, fit.robot_noise.together[0]
+    count = 6 * int(used.sum())
+    content = {
+        "rows": [
+            (bool(used[k]), names[int(row)], [column[k] for column in columns])
+            for k, row in enumerate(result.image_index)
+        ],
+        "noise": {
+            "mm": significant(1e3 * noise),
+            "together_mm": significant(1e3 * together) if together > NOTICEABLE * noise else None,
+            "count": count,
+            "factor": f"{np.sqrt(count / max(count - 13, 1)):.2f}",
+        },
+        "error": leave_one_out_text(fit.leave_one_out) if fit.leave_one_out else "–",
+        "translation": f"{significant(1e3 * fit.residuals.translation)} mm",
+        "rotation": significant(fit.residuals.rotation),
+    }
+    return Section("residuals", content)
