@@ -1,9 +1,11 @@
-"""Options of segmentation, in a module of their own so that the command line's help imports no SciPy."""
+"""Options and result of segmentation, in a module of their own so that the command line's help imports no SciPy."""
 
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import tyro
+from jaxtyping import Int
+from numpy import ndarray
 
 
 @dataclass(frozen=True)
@@ -30,3 +32,13 @@ class SegmentOptions:
     sam_weights: Annotated[str, tyro.conf.arg(metavar="PATH_OR_HUB_ID")] = "facebook/sam2.1-hiera-tiny"
     """Path or hub id of Segment Anything's weights."""
     tabletop: TabletopOptions = field(default_factory=TabletopOptions)
+
+
+@dataclass(frozen=True)
+class LabelImages:
+    """Labels at the pointmaps' pixels."""
+
+    labels: Int[ndarray, "m h w"]
+    """0 = none."""
+    names: tuple[str, ...]
+    """Name of each label; label 0 is none."""

@@ -21,7 +21,7 @@ from jcr.geometry import apply_similarity
 from jcr.hub import cached_files
 from jcr.progress import Progress
 from jcr.records import HandEye, Reconstruction
-from jcr.segments.segments import LabelImages
+from jcr.segments.options import LabelImages
 
 if TYPE_CHECKING:
     from transformers import Sam2Model

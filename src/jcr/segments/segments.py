@@ -1,7 +1,6 @@
 """Segments of a scene: label images of the user (one PNG an image), geometry, or Segment Anything."""
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -13,21 +12,11 @@ from jcr.camera import project, rays
 from jcr.errors import InputError
 from jcr.progress import Progress
 from jcr.records import Capture, HandEye, PointCloud, Reconstruction
-from jcr.segments.options import SegmentOptions
+from jcr.segments.options import LabelImages, SegmentOptions
 from jcr.segments.tabletop import Support, label_tabletop
 
 MOST = 1024
 """Largest number of labels; an image given by mistake has more."""
-
-
-@dataclass(frozen=True)
-class LabelImages:
-    """Labels at the pointmaps' pixels."""
-
-    labels: Int[ndarray, "m h w"]
-    """0 = none."""
-    names: tuple[str, ...]
-    """Name of each label; label 0 is none."""
 
 
 def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages | None:
