@@ -83,9 +83,7 @@ def refine(
     camera, poses = work.grid_intrinsics(pinhole), maps.recon_from_camera
     depth = _depth_on(work, maps)
     factor = np.ones(maps.confidence.shape, np.float32)
-    at_depth, at_map = (
-        _basis(*np.moveaxis(_pixels_on(grid, work), -1, 0), work.size) for grid in (work, maps.grid)
-    )
+    at_depth, at_map = (_basis(_pixels_on(grid, work), work.size) for grid in (work, maps.grid))
     tracks, error_px = None, np.inf
     for _ in range(ROUNDS):
         tracks = _match(gray, camera, poses, depth)
@@ -113,9 +111,10 @@ def _pixels_on(grid: ImageGrid, other: ImageGrid) -> Float[ndarray, "h w 2"]:
     return other.grid_from_original(grid.original_from_grid(np.stack([u, v], -1).astype(np.float64)))
 
 
-def _basis(x_px: ndarray, y_px: ndarray, size: tuple[int, int]) -> ndarray:
+def _basis(x_px: Float[ndarray, "*k 2"], size: tuple[int, int]) -> Float[ndarray, "*k 6"]:
     """Return 1, x, y, x², xy, y² of pixels of an image (width, height), scaled to -1 … 1."""
-    x, y = 2 * x_px / (size[0] - 1) - 1, 2 * y_px / (size[1] - 1) - 1
+    scaled = 2 * x_px / (np.array(size) - 1) - 1
+    x, y = scaled[..., 0], scaled[..., 1]
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
 
 
@@ -298,14 +297,15 @@ def _depth_changes(
     z = np.einsum("kj,kj->k", camera_from_recon[:, 2, :3], tracks.points_in_recon[tracks.point])
     z += camera_from_recon[:, 2, 3]
     size = depth.shape[2], depth.shape[1]
-    column, row = np.clip(np.rint(tracks.x_px).astype(int), 0, np.array(size) - 1).T
+    pixel = np.clip(np.rint(tracks.x_px), 0, np.array(size) - 1)
+    column, row = pixel.astype(int).T
     own = depth[tracks.image, row, column]
     found = np.zeros((len(depth), 6))
     for view, coefficients in enumerate(found):
         mine = (tracks.image == view) & (own > 0) & (z > 0)
         if not mine.any():
             continue
-        design, target = _basis(column[mine], row[mine], size), np.log(z[mine] / own[mine])
+        design, target = _basis(pixel[mine], size), np.log(z[mine] / own[mine])
         coefficients[0] = np.median(target)
         for _ in range(10):
             off = target - design @ coefficients
