@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from jcr.calibration.consider import with_intrinsics_considered
+from jcr.calibration.adjust import with_intrinsics_considered
 from jcr.camera import parameters, with_parameters
 from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.estimation.intrinsics_prior import camera_with_prior

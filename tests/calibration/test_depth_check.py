@@ -19,16 +19,7 @@ from jcr.errors import InputError
 from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.files import write_bytes
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.records import (
-    MATCHED,
-    PRIOR,
-    Capture,
-    HandEye,
-    Intrinsics,
-    Pointmaps,
-    Reconstruction,
-    Tracks,
-)
+from jcr.records import MATCHED, PRIOR, Capture, HandEye, Intrinsics, Pointmaps, Reconstruction, Tracks
 
 INTRINSICS = Intrinsics(FOCAL_PX, FOCAL_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
 OFF, NOISE_PER_M, SCALE = 1.03, 0.004, 0.1
@@ -174,9 +165,7 @@ def test_depth_of_another_unit_is_named_and_left_out(measured: tuple):
     check = depth_check(capture, reconstruction, hand_eye)
     assert check is not None
     found, notes = with_measured_depth(
-        capture,
-        reconstruction,
-        replace(hand_eye, depth=replace(check, off_percent=900.0)),
+        capture, reconstruction, replace(hand_eye, depth=replace(check, off_percent=900.0))
     )
     assert found is reconstruction and "+900 % off by the robot" in notes[0]
     _, notes = with_measured_depth(capture, reconstruction, hand_eye)

@@ -9,10 +9,7 @@ import pytest
 
 from jcr.calibration.case import with_findings
 from jcr.calibration.poses import calibrate_poses
-from jcr.calibration.record import (
-    calibration_of,
-    read_calibration,
-)
+from jcr.calibration.record import calibration_of, read_calibration
 from jcr.calibration.stage import calibrate
 from jcr.calibration.words import summary
 from jcr.errors import InputError

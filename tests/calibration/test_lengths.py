@@ -19,10 +19,7 @@ pytestmark = pytest.mark.slow
 
 
 def calibrated(
-    sheet: Sheet | None,
-    pose_scale: float = 1.0,
-    seed: int = 0,
-    options: CalibrateOptions | None = None,
+    sheet: Sheet | None, pose_scale: float = 1.0, seed: int = 0, options: CalibrateOptions | None = None
 ) -> tuple[HandEye, np.ndarray]:
     """12 images, and the true transform."""
     rng = np.random.default_rng([seed, 12])

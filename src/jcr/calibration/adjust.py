@@ -11,26 +11,32 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.case import Case
-from jcr.calibration.consider import with_intrinsics_considered
-from jcr.camera import parameter_names
+from jcr.camera import by_parameters, by_point, parameter_names
+from jcr.estimation.closed_form import initial_estimate
 from jcr.estimation.equation import paper_residuals, predict
 from jcr.estimation.hand_eye import judged
 from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.intrinsics_prior import Camera, decentring
+from jcr.estimation.problem import LinearPrior
 from jcr.estimation.projection import view_of
 from jcr.estimation.score_test import focal_lengths
-from jcr.estimation.solve import START_NOISE, Solution
-from jcr.estimation.wrist import adjust_wrist, estimate_of, wrist_arm
+from jcr.estimation.solve import START_NOISE, Solution, solve
+from jcr.estimation.wrist import adjust_wrist, estimate_of, pose_problem, wrist_arm
 from jcr.findings import Finding, FindingKind
-from jcr.geometry import inverse, retract, scale_translation, step_between
-from jcr.records import (
-    Estimate,
-    HandEye,
-    Intrinsics,
-    LeaveOneOut,
-    PaperResiduals,
+from jcr.geometry import (
+    apply,
+    inverse,
+    retract,
+    rotation_exp,
+    scale_translation,
+    skew,
+    step_between,
+    transform,
 )
+from jcr.records import Estimate, HandEye, Intrinsics, LeaveOneOut, PaperResiduals, Tracks
 
+FEWEST = 6
+"""Fewest observations of an image from which the motion of its camera with the intrinsics is computed."""
 SETTLED_ENOUGH = 0.5
 """Standard deviations of the last step below which an adjustment that did not settle is only noted: smaller effects
 are not reported either (checks/effects.py)."""
@@ -171,6 +177,65 @@ def _considered(case: Case) -> Case:
         case.systematic,
     )
     return replace(case, hand_eye=judged(considered))
+
+
+def with_intrinsics_considered(
+    hand_eye: HandEye,
+    base_from_gripper: Float[ndarray, "m 4 4"],
+    recon_from_camera: Float[ndarray, "m 4 4"],
+    tracks: Tracks,
+    camera: Camera,
+    priors: tuple[LinearPrior, ...],
+    systematic: Float[ndarray, "s s"],
+) -> HandEye:
+    """Return the calibration with the errors of its intrinsics in its covariance C and budget: C + S Φ Sᵀ.
+
+    This is the consider covariance of Schmidt, Φ that of the intrinsics (Tapley, Schutz and Born, "Statistical Orbit
+    Determination", 2004, chapter 6), for a calibration from camera poses alone, which cannot estimate them.
+    All arguments are of the used images. The sensitivity S follows from solutions with the cameras that one standard
+    deviation of each parameter would give: cameras that keep the pixels of `tracks` in place.
+    """
+    seen = [np.flatnonzero(tracks.image == row) for row in range(len(recon_from_camera))]
+    if hand_eye.budget is None or min(map(len, seen)) < FEWEST:
+        return hand_eye
+    each = zip(recon_from_camera, seen, strict=True)
+    moved = np.array([_camera_with_other_intrinsics(one, tracks, rows, camera) for one, rows in each])
+
+    def solved(recon_from_camera: Float[ndarray, "m 4 4"]) -> tuple[Float[ndarray, "4 4"], float]:
+        problem, state = pose_problem(
+            base_from_gripper,
+            recon_from_camera,
+            initial_estimate(base_from_gripper, recon_from_camera),
+            error_covariance=systematic,
+            noise_floor=hand_eye.robot_noise.given,
+            priors=priors,
+        )
+        found = solve(problem, state, averaged=False).state
+        return found.x[0], found.scale
+
+    x, scale = solved(recon_from_camera)
+    shifts = np.zeros((7, len(camera.std)))
+    for k in range(len(camera.std)):
+        x_k, scale_k = solved(moved[:, k])
+        shifts[:, k] = np.append(step_between(x, x_k), np.log(scale_k / scale))
+    considered = shifts @ shifts.T
+    return replace(
+        hand_eye,
+        covariance=hand_eye.covariance + considered,
+        budget=replace(hand_eye.budget, intrinsics=hand_eye.budget.intrinsics + considered),
+    )
+
+
+def _camera_with_other_intrinsics(
+    recon_from_camera: Float[ndarray, "4 4"], tracks: Tracks, rows: ndarray, camera: Camera
+) -> Float[ndarray, "c 4 4"]:
+    """Return the camera poses that fit the image's points after one standard deviation more of each parameter."""
+    x_in_camera = apply(inverse(recon_from_camera), tracks.points_in_recon[tracks.point[rows]].astype(float))
+    by_x = by_point(camera.intrinsics, x_in_camera)
+    by_pose = np.concatenate([by_x, -by_x @ skew(x_in_camera)], axis=2).reshape(-1, 6)
+    by_intrinsics = by_parameters(camera.intrinsics, x_in_camera) @ (camera.directions * camera.std)
+    steps = -np.linalg.lstsq(by_pose, by_intrinsics.reshape(len(by_pose), -1), rcond=None)[0].T
+    return recon_from_camera @ inverse(transform(rotation_exp(steps[:, 3:]), steps[:, :3]))
 
 
 def refined_by(case: Case, found: Solution) -> HandEye:

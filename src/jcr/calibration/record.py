@@ -486,10 +486,7 @@ class Calibration(Part):
         return table(heading, rows, f"1σ, {self.mount} axes. {note}")
 
     def point_in_base(
-        self,
-        pixel: ArrayLike,
-        depth_m: ArrayLike | float,
-        base_from_gripper: ArrayLike,
+        self, pixel: ArrayLike, depth_m: ArrayLike | float, base_from_gripper: ArrayLike
     ) -> tuple[Float[ndarray, "*points 3"], Float[ndarray, "*points 3 3"]]:
         """Return the base-frame coordinates (m) of points that the camera shows, and their covariances (m²).
 

@@ -32,16 +32,7 @@ from jcr.estimation.prediction import (
 )
 from jcr.findings import Concerns, Finding, FindingKind
 from jcr.geometry import inverse, rotation_angle
-from jcr.records import (
-    Estimate,
-    HandEye,
-    InUse,
-    NextPose,
-    Requirement,
-    RobotNoise,
-    SceneUncertainty,
-    Where,
-)
+from jcr.records import Estimate, HandEye, InUse, NextPose, Requirement, RobotNoise, SceneUncertainty, Where
 
 PROPOSED = 2
 """Number of gripper poses proposed after a calibration, if these are enough."""

@@ -13,15 +13,7 @@ from jcr.calibration.record import (
     Uncertainty,
     UncertaintyBudget,
 )
-from jcr.findings import (
-    Finding,
-    FindingKind,
-    remedy,
-    sentence,
-    text,
-    verdict_of,
-    without_consequences,
-)
+from jcr.findings import Finding, FindingKind, remedy, sentence, text, verdict_of, without_consequences
 from jcr.findings.sentences import network_scale
 from jcr.records import Attempt, BoardFound, DepthCheck, LeaveOneOut, Requirement
 from jcr.rounding import significant, with_std

@@ -301,10 +301,7 @@ class Estimate:
         known = self.intrinsics_covariance
         return None if known is None else np.sqrt(np.diag(known))
 
-    def with_fault(
-        self: AnyEstimate,
-        covariance: Float[ndarray, "7 7"],
-    ) -> AnyEstimate:
+    def with_fault(self: AnyEstimate, covariance: Float[ndarray, "7 7"]) -> AnyEstimate:
         """Return the estimate, as uncertain as a fault with this covariance makes it."""
         budget = None if self.budget is None else replace(self.budget, faults=self.budget.faults + covariance)
         return replace(self, covariance=self.covariance + covariance, budget=budget)

@@ -10,12 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from jcr.calibration.case import Case
-from jcr.calibration.checks.capture import (
-    check_convention,
-    check_pieces,
-    check_registered,
-    check_remarks,
-)
+from jcr.calibration.checks.capture import check_convention, check_pieces, check_registered, check_remarks
 from jcr.calibration.checks.effects import check_effects
 from jcr.calibration.checks.lengths import check_boards, check_lengths
 from jcr.estimation.hypotheses import joint_offsets
