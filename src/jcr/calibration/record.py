@@ -146,9 +146,9 @@ class Share(Part):
 
     @classmethod
     def of(cls, covariance: Float[ndarray, "7 7"]) -> "Share":
-        """Return the size of a part of the covariance."""
-        metres, radians = np.sqrt(np.diag(covariance)[:6].reshape(2, 3).mean(1))
-        return cls(**mm_and_deg(metres, radians), covariance=covariance)
+        """Return the size of a part of the covariance, which degenerate motions leave with negative rounding."""
+        metres, radians = np.sqrt(np.maximum(np.diag(covariance)[:6], 0.0).reshape(2, 3).mean(1))
+        return cls.model_construct(**mm_and_deg(metres, radians), covariance=covariance)
 
 
 class UncertaintyBudget(Part):

@@ -32,7 +32,7 @@ from jcr.estimation.prediction import (
 )
 from jcr.findings import Concerns, Finding, FindingKind
 from jcr.geometry import inverse, rotation_angle
-from jcr.records import Estimate, HandEye, InUse, NextPose, Requirement, RobotNoise, SceneUncertainty, Where
+from jcr.records import Estimate, HandEye, InUse, NextPose, Requirement, SceneUncertainty, Where
 
 PROPOSED = 2
 """Number of gripper poses proposed after a calibration, if these are enough."""
@@ -72,7 +72,8 @@ class Proposals:
         possible = candidates(now, x, reach, np.random.default_rng(seed))
         if is_likely is not None and (likely := is_likely(possible)).any():
             possible = possible[likely]
-        possible, existing = possible[:COMPARED], _spread(len(now))
+        possible = possible[:COMPARED]
+        existing = np.linspace(0, len(now) - 1, min(len(now), EXISTING)).round().astype(int)
         systematic, poses = robot.with_poses(now, possible), np.concatenate([now, possible])
 
         def uncertainty_of(rows: Int[ndarray, " c"]) -> float:
@@ -176,7 +177,9 @@ def advised(
         required = replace(required, more_images=more)
     else:
         # A rejected X is not used, and a robot that is worse than usual is not expected to improve.
-        noise = _worse_of(hand_eye.robot_noise, typical_noise())
+        found, usual = hand_eye.robot_noise, typical_noise()
+        sizes = ("translation", "rotation", "systematic")
+        noise = replace(found, **{name: max(getattr(found, name), getattr(usual, name)) for name in sizes})
         assumptions = replace(assumptions, gripper_from_camera=assumed_camera(used), noise=noise, camera=None)
         proposed = Proposals.of(assumptions, used, robot, PROPOSED).next_poses(PROPOSED)
     seen = excitation(used, hand_eye.gripper_from_camera) if len(used) > 1 else None
@@ -203,21 +206,6 @@ def not_exact_enough(required: Requirement, systematic: bool) -> Finding | None:
     }
     finding = Finding.of(FindingKind.NOT_EXACT_ENOUGH, "rejects" if required.asked else "warns", concerns)
     return replace(finding, value=1e-3 * required.reached_mm, details=numbers)
-
-
-def _spread(count: int) -> Int[ndarray, " k"]:
-    """Return the rows of at most EXISTING poses, evenly along the capture."""
-    return np.linspace(0, count - 1, min(count, EXISTING)).round().astype(int)
-
-
-def _worse_of(noise: RobotNoise, other: RobotNoise) -> RobotNoise:
-    """Return the larger errors of two robots, with the given noise of the first."""
-    return replace(
-        noise,
-        translation=max(noise.translation, other.translation),
-        rotation=max(noise.rotation, other.rotation),
-        systematic=max(noise.systematic, other.systematic),
-    )
 
 
 def _required(hand_eye: HandEye, options: CalibrateOptions) -> Requirement:

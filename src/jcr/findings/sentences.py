@@ -222,10 +222,12 @@ def worst_direction(gripper_from_camera: ndarray, covariance: ndarray) -> str:
 
 
 def not_exact_enough(finding: "Finding") -> str:
+    """Return the bound of 95 % of the errors that is not within the requirement, in words."""
     return f"{SHORT}: {_reached(finding.details)}"
 
 
 def network_scale_of(finding: "Finding") -> str:
+    """Return the message of a network's metre that contradicts the robot's."""
     assert finding.value is not None and finding.std is not None
     return network_scale(100 * finding.value, 100 * finding.std)
 
@@ -250,6 +252,7 @@ def intrinsics(finding: "Finding") -> str:
 
 
 def joints_off(finding: "Finding") -> str:
+    """Return each joint that is surely off, and by how much."""
     sizes = joined(
         filled(f"{{joint_{k}_deg:+.2f}} ± {{joint_{k}_std_deg:.2f}}°", finding) for k in finding.joints
     )

@@ -99,13 +99,13 @@ class FindingKind(StrEnum):
     NOISE_ABOVE_GIVEN = "noise above the given one", Row("motion",
         "gripper poses and images disagree by {mm:.2g} mm and {deg:.2g}° per axis, more than the given "
         "robot noise ({given_mm:.2g} mm, {given_rotation_deg:.2g}°): the larger is used",
-        evidence="m per axis", help="none needed: the larger is used")
+        evidence="m per axis")
     UNCERTAIN = "too uncertain", Row("motion",
         "the {part} is known to ±{part:translation={mm:.0f} mm|rotation={size_deg:.1f}°|scale={percent:.0f} %} only",
         "add images, rotated by 20° or more about different axes{noise_unknown:, or give the robot's repeatability "
         "(--robot-noise MM DEG)|}",
         means="translation, rotation or scale (`details.part`) is less certain than 20 mm, 3° or 5 %",
-        evidence="1σ: m, rad, share", help="more images, rotated about different axes")
+        evidence="1σ: m, rad, share")
     LEAVE_ONE_OUT = "leave-one-out error", Row("motion",
         "the leave-one-out error ({mm:.1f} mm) is well above the fit's residual ({residual_mm:.1f} mm): "
         "too few images for this motion", "add some", evidence="m")
@@ -118,53 +118,51 @@ class FindingKind(StrEnum):
     FOCUS_BY_DISTANCE = "focal length changes with distance", Row("camera",
         "the focal length {way:grows|shrinks} by {size_percent:.1f} ± {std_percent} % from the nearest "
         "view to the farthest", "lock the focus, or --focus varies", explains=MISFIT,
-        means="autofocus", evidence="share, from the nearest view to the farthest; the chance `p`")
+        evidence="share, from the nearest view to the farthest; the chance `p`")
     FOCUS_BY_IMAGE = "focal length differs between images", Row("camera",
         "the focal length differs between images by {percent:.1f} % (rms, each ± {std_percent} %)",
-        "lock the focus and take the images again, or --focus varies", explains=MISFIT,
-        means="autofocus or zoom", evidence="share, rms")
+        "lock the focus and take the images again, or --focus varies", explains=MISFIT, evidence="share, rms")
     ZOOM = "focal length changed once", Row("camera",
         "the focal length changes by {percent:+.1f} ± {std_percent} % after {images[0]}: the "
         "zoom or focus was moved", "calibrate the images before or after it, or --focus varies",
-        explains=MISFIT, means="between two `images`", evidence="share; the chance `p`")
+        explains=MISFIT, evidence="share; the chance `p`")
     ROLLING_SHUTTER = "images sheared alike", Row("camera",
         "the images are sheared by {value:.1f} ± {std} px from top to bottom, as by the rolling "
-        "shutter of a moving camera", "take the images at rest", explains=MISFIT, means="a rolling shutter",
+        "shutter of a moving camera", "take the images at rest", explains=MISFIT,
         evidence="px from top to bottom; the chance `p`")
     ROLLING_SHUTTER_BY_IMAGE = "images sheared each by itself", Row("camera",
         "each image is sheared by itself, {value:.1f} px from top to bottom (rms), as by the "
         "rolling shutter of a moving camera", "take the images at rest", explains=MISFIT,
-        means="a rolling shutter", evidence="px from top to bottom, rms")
+        evidence="px from top to bottom, rms")
     THIN_PRISM = "thin prism", Row("camera",
         "the images show a thin-prism distortion of up to {value:.1f} ± {std} px: the sensor is "
         "tilted, or the optics are decentred",
         "use the transform with the estimated intrinsics, which have the coefficients s1 to s4",
-        explains=MISFIT, means="a tilted sensor, or decentred optics",
+        explains=MISFIT,
         evidence="px, where it is largest; the chance `p`")
     CENTRE_SAGS = "principal point moves with gravity", Row("camera",
         "the principal point moves with gravity, by {value:.1f} ± {std} px when it lies in the image"
         ": the optics are image-stabilised or loose",
         "switch image stabilisation off, or fix the optics", explains=MISFIT,
-        means="image-stabilised or loose optics",
         evidence="px, when gravity lies in the image; the chance `p`")
     INTRINSICS = "intrinsics contradict the images", Row("camera", sentences.intrinsics,
         "{estimated:use the transform with the intrinsics of this calibration|calibrate the intrinsics again at this "
         "resolution, or give no intrinsics (null) to have them estimated}",
-        explains=MISFIT, help="calibrate them again at this resolution, or give none (null) to have them estimated",
+        explains=MISFIT,
+        help="calibrate them again at this resolution, or give none (null) to have them estimated",
         means="the given intrinsics are not those of the images; parameters in `details`",
         evidence="the chance `p`")
     SLIP = "camera moved on the gripper", Row("order",
         "the camera seems to have moved on the gripper by {mm:.1f} mm and {deg:.2f}° after {images[0]}",
-        ONE_PART + "the camera still sits as then", explains=MISFIT, evidence="m; the chance `p`",
-        help="calibrate the longer part alone")
+        ONE_PART + "the camera still sits as then", explains=MISFIT, evidence="m; the chance `p`")
     DRIFT = "camera drifts on the gripper", Row("order",
         "the camera seems to drift on the gripper by {mm:.1f} mm and {deg:.2f}° from the first image to "
         "the last", "tighten its mount, let it warm up, and take the images again",
         explains=MISFIT, evidence="m; the chance `p`")
     BASE_MOVED = "robot base moved against the scene", Row("order",
         "the robot's base and the scene moved against each other by {mm:.1f} mm and {deg:.2f}° after "
-        "{images[0]}", ONE_PART + "base and scene still stand as then", explains=MISFIT, evidence="m; the chance `p`",
-        help="calibrate the longer part alone; bolt the base")
+        "{images[0]}", ONE_PART + "base and scene still stand as then", explains=MISFIT,
+        evidence="m; the chance `p`")
     DELAY = "gripper poses early or late", Row("order",
         "the gripper poses look as if read {size:.3f} ± {std} of the time from one image to the next too "
         "{way:late|early}", "stop the arm at each image, or read pose and image by the same clock",
@@ -173,7 +171,7 @@ class FindingKind(StrEnum):
         "the images fit a camera that the gripper carries, not a fixed one",
         "write mount gripper for {camera}", explains=MISFIT)
     ROBOT_UNUSED = "robot not used", Row("robot", "the capture's robot is not used: {text}",
-        means="the poses are not those of the capture's arm", help="correct its name, URDF or joint angles")
+        help="correct its name, URDF or joint angles")
     JOINT_OFFSETS = "joint offsets", Row("robot", sentences.joints_off,
         means="`joints` are off; each in `details`", evidence="rad, the largest",
         help="master the joints")
@@ -181,19 +179,17 @@ class FindingKind(StrEnum):
         "along {axis} the robot's positions are {size_percent:.1f} ± {std_percent} % too {way:long|short} "
         "beside those across it",
         "check that axis (a lift, a rail, a gantry): its gear ratio, its unit", explains=MISFIT,
-        means="positions along one axis of the base (`details`) are too long beside those across it",
         evidence="share, positive: too long; the chance `p`")
     BASE_LEANS = "robot base leans with reach", Row("strain",
         "the robot's base leans {way:towards|away from} the gripper by {size_deg:.1f} ± {std_deg}° per "
         "metre of reach, which its poses do not say", "bolt the stand to the floor, or brace it",
-        explains=MISFIT, means="a stand that bends as the arm reaches out",
+        explains=MISFIT,
         evidence="rad per m, positive: towards the gripper; the chance `p`")
     TOOL_SAGS = "tool sags", Row("strain",
         "the gripper rotates by {size_deg:.2f} ± {std_deg}° where it is level, as a tool does that sags "
         "under its weight",
         "stiffen its mount, and check the zero of the wrist's joints, which looks like it", explains=MISFIT,
-        means="the gripper rotates with its tilt, as under its weight; the zero of a wrist joint that is "
-        "off looks alike", evidence="rad, where it is level; the chance `p`")
+        evidence="rad, where it is level; the chance `p`")
     BOARD_SIZE = "board size contradicts the robot", Row("lengths",
         "by the robot's motion the {marker:marker|board} is {size_percent:.1f} ± {std_percent} % {way:larger|smaller} "
         "than given",
@@ -276,7 +272,7 @@ class FindingKind(StrEnum):
     IMAGE_MISSES = "image contradicts the camera's place", Row("cell",
         "{images[0]} misses the place that fits its images together by {value:.0f} px (median): {mount:base=it is not "
         "fixed|gripper=it is not rigid on the gripper}, the scene changed, or the intrinsics are wrong",
-        means="that image does not fit the place of the camera's others", evidence="px, median",
+        evidence="px, median",
         help="tighten the mount, or leave the image out")
     PLACE_UNCERTAIN = "camera's place too uncertain", Row("cell",
         "its place is known to ±{mm:.0f} mm and {deg:.1f}° only{focal_std_percent:, for its images do not show its "

@@ -122,18 +122,11 @@ def _matters(found: Finding, after: State) -> bool:
     """Return whether an effect moves the camera, or contradicts given intrinsics that users have elsewhere."""
     if found.kind is FindingKind.INTRINSICS and is_far_off(after):
         return True
-    return is_material(found, _std_of(after))
-
-
-def _std_of(state: State) -> Float[ndarray, "6"]:
-    """Return the uncertainty of the camera's place by which effects are measured.
-
-    A rejected calibration is uncertain by the effect itself: that uncertainty counts which remains beside the effects.
-    """
-    imaged = state.imaged
-    if imaged.std.any():
-        return imaged.std
-    return np.sqrt(np.diag(state.adjusted.transform(imaged.place)[1]))
+    std = after.imaged.std
+    if not std.any():
+        # A rejected calibration is uncertain by the effect: the uncertainty that remains beside the effects counts.
+        std = np.sqrt(np.diag(after.adjusted.transform(after.imaged.place)[1]))
+    return is_material(found, std)
 
 
 def _explains(state: State, test: Test, of_camera: CameraEffect, log_chance: float) -> bool:
@@ -166,8 +159,6 @@ class ArmEquations:
             return []
         blocks = self.by_motion()
         found = [*order_rows(self.base_from_gripper, *blocks), *arm_rows(self.base_from_gripper)]
-        if s == 6 * n:
-            return found
         wide = [np.zeros((s, row.columns.shape[1])) for row in found]
         for columns, row in zip(wide, found, strict=True):
             columns[self.rows] = row.columns
@@ -328,20 +319,18 @@ def with_effects(
         found = [one.with_parameters(own, own_now) for one in found if one.kind is not FindingKind.THIN_PRISM]
     bent = np.concatenate([row.prior_std * row.columns for row in strains], axis=1) if strains else None
     adjusted = adjust_case(case, combinations=all_combinations(found), confirmed_errors=bent)
-    straight = [np.zeros(7)] * len(strains)
-    if bent is not None:
-        straight[0] = straight_shift(adjusted.equations, adjusted.log_sizes, bent)[:7]
-    shifts = dict(zip((row.kind for row in strains), straight, strict=True))
-    return adjusted, tuple(_with_rest(one, shifts.get(one.kind), adjusted) for one in findings)
-
-
-def _with_rest(found: Finding, straight: Float[ndarray, "7"] | None, adjusted: Solution) -> Finding:
-    """Return a finding with the uncertainty that remains after the calibration adopted the effect."""
-    if found.kind.row.group == "camera":
-        return as_adopted(found)
-    if straight is None:
-        return found
-    return replace(found, shift=tuple(_with_metre(found, straight, adjusted).tolist()))
+    remaining = []
+    for one in findings:
+        if one.kind.row.group == "camera":
+            one = as_adopted(one)
+        elif bent is not None and one.kind in (row.kind for row in strains):
+            # The shift by all strains counts once.
+            straight = np.zeros(7)
+            if one.kind is strains[0].kind:
+                straight = straight_shift(adjusted.equations, adjusted.log_sizes, bent)[:7]
+            one = replace(one, shift=tuple(_with_metre(one, straight, adjusted).tolist()))
+        remaining.append(one)
+    return adjusted, tuple(remaining)
 
 
 def as_adopted(found: Finding) -> Finding:
