@@ -148,7 +148,8 @@ class Share(Part):
     def of(cls, covariance: Float[ndarray, "7 7"]) -> "Share":
         """Return the size of a part of the covariance, which degenerate motions leave with negative rounding."""
         metres, radians = np.sqrt(np.maximum(np.diag(covariance)[:6], 0.0).reshape(2, 3).mean(1))
-        return cls.model_construct(**mm_and_deg(metres, radians), covariance=covariance)
+        size = mm_and_deg(metres, radians)
+        return cls.model_construct(None, **size, covariance=covariance)
 
 
 class UncertaintyBudget(Part):

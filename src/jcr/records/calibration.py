@@ -310,8 +310,8 @@ class Estimate:
         """Return the estimate, as uncertain as the shifts of a finding make transform and intrinsics."""
         cross, known = self.intrinsics_cross, self.intrinsics_covariance
         if finding.intrinsics_shift is not None and cross is not None and known is not None:
-            moved = np.array(finding.intrinsics_shift)
-            cross, known = cross + np.outer(finding.shift, moved), known + np.outer(moved, moved)
+            shift, moved = np.array(finding.shift), np.array(finding.intrinsics_shift)
+            cross, known = cross + np.outer(shift, moved), known + np.outer(moved, moved)
         faulty = self.with_fault(finding.covariance)
         return replace(faulty, intrinsics_cross=cross, intrinsics_covariance=known)
 
