@@ -139,7 +139,7 @@ def to_mjcf(
         at = scene.light_in_base + 0.12 * np.array([np.cos(angle), np.sin(angle), 0.0])
         shine = {"diffuse": _text(np.full(3, 0.6 / _LAMPS)), "specular": _text(np.full(3, 0.3 / _LAMPS))}
         fixed = {"ambient": "0 0 0", "cutoff": "40", "exponent": "1", "castshadow": "true"}
-        xml.SubElement(world, "light", pos=_text(at), dir=_text(center - at), **shine, **fixed)
+        xml.SubElement(world, "light", shine | fixed, pos=_text(at), dir=_text(center - at))
     xml.SubElement(world, "camera", name=CAMERA, fovy=repr(float(np.degrees(fovy))))
     floor = _text(center - [0, 0, _FLOOR_BELOW_TABLE])
     xml.SubElement(world, "geom", type="box", size="3 3 .01", pos=floor, rgba=".36 .36 .37 1")
@@ -159,7 +159,7 @@ def to_mjcf(
                 assets, "mesh", name=name, vertex=vertex, texcoord=texcoord, face=face, inertia="shell"
             )
             shine = {"specular": f"{part.shine}", "shininess": "0.4"}
-            material = xml.SubElement(assets, "material", name=name, **shine)
+            material = xml.SubElement(assets, "material", shine, name=name)
             if textured and part.texture is not None:
                 files[f"{name}.png"] = encode_png(part.texture)
                 xml.SubElement(assets, "texture", name=name, type="2d", file=f"{name}.png")
@@ -167,7 +167,7 @@ def to_mjcf(
             else:
                 material.set("rgba", _text((*part.color, 1.0)))
             of_mesh = {"mesh": name, "material": name, "contype": "0", "conaffinity": "0"}
-            xml.SubElement(body, "geom", name=name, type="mesh", **of_mesh)
+            xml.SubElement(body, "geom", of_mesh, name=name, type="mesh")
     return xml.tostring(root, encoding="unicode"), files
 
 
