@@ -254,5 +254,5 @@ def test_positions_that_are_all_too_long_are_said_to_be_beyond_what_images_show_
     assert alone in file.notes
     # Simulated observations are metric as the scene is; the robot's positions are not.
     metric = calibrate(capture, replace(reconstruction, is_metric=True, metric_std=0.002))
-    assert "4.8 ± 0.2" in metric.warnings[0] and "larger than given" in metric.warnings[0]
+    assert "4.8 ± 0.15 %" in metric.warnings[0] and "larger than given" in metric.warnings[0]
     assert alone not in calibration_of(capture, reconstruction, metric, {}, "").notes
