@@ -44,7 +44,9 @@ def cases(captures: Path, runs: Path) -> Iterator[tuple[str, Callable[[], HandEy
     for folder in sorted(path.parent for path in runs.glob("*/reconstruction.npz")):
         yield f"capture {folder.name}", partial(_stored, captures / folder.name, folder)
     for k, case in enumerate(OBSERVED):
-        yield f"fault {k} {case.what}", lambda case=case: calibrated(case.fault, 0, given=case.given)[1]
+        assert isinstance(case.fault, Faults)
+        solve = partial(calibrated, case.fault, 0, given=case.given)
+        yield f"fault {k} {case.what}", lambda solve=solve: solve()[1]
     for seed in range(3):
         images, given = (8, 12, 20)[seed], seed % 2 == 0
         yield f"clean {seed}", lambda s=seed, n=images, g=given: calibrated(Faults(), 1000 + s, n, given=g)[1]
