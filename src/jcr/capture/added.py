@@ -26,13 +26,8 @@ def read_added(run_folder: Path, capture: Capture) -> Capture:
     folder = run_folder / FOLDER
     file = folder / capture_json.FILE
     if not file.is_file():
-        return Capture(
-            folder=folder,
-            images=(),
-            base_from_gripper=np.zeros((0, 4, 4)),
-            image_size=capture.image_size,
-            intrinsics=capture.intrinsics,
-        )
+        none, size, known = np.zeros((0, 4, 4)), capture.image_size, capture.intrinsics
+        return Capture(folder=folder, images=(), base_from_gripper=none, image_size=size, intrinsics=known)
     added, owner = capture_json.read(folder), read_json(file).get(OWNER)
     if owner != str(capture.folder.resolve()):
         raise InputError(

@@ -121,15 +121,10 @@ class _CameraInfo(BaseModel):
 
 def read_camera_info(file: Path, size: tuple[int, int]) -> Intrinsics | None:
     """Read the intrinsics of a camera_info YAML for images of `size`; None of a camera that is not calibrated."""
-    info = validated(_CameraInfo, read_yaml(file), str(file))
-    return intrinsics_of_ros(
-        info.camera_matrix.data,
-        info.distortion_model,
-        info.distortion_coefficients.data,
-        (info.image_width, info.image_height),
-        size,
-        str(file),
-    )
+    info: _CameraInfo = validated(_CameraInfo, read_yaml(file), str(file))
+    matrix, coefficients = info.camera_matrix.data, info.distortion_coefficients.data
+    calibrated = info.image_width, info.image_height
+    return intrinsics_of_ros(matrix, info.distortion_model, coefficients, calibrated, size, str(file))
 
 
 def intrinsics_of_ros(
@@ -148,9 +143,7 @@ def intrinsics_of_ros(
         raise InputError(f"{where}: the camera matrix has {len(matrix)} numbers, not nine")
     if not any(matrix):
         return None
-    known = _ROS_MODELS.get(model)
-    if known is None and not any(coefficients):
-        known = "pinhole"
+    known = _ROS_MODELS.get(model, None if any(coefficients) else "pinhole")
     if known is None or any(coefficients[len(COEFFICIENTS[known]) :]):
         raise InputError(
             f"{where}: distortion model {shown(model)} with {len(coefficients)} coefficients; jcr knows plumb_bob (5), "

@@ -55,22 +55,20 @@ class CameraEntry(BaseModel):
     @model_validator(mode="after")
     def _agrees(self) -> "CameraEntry":
         """Raise ValueError where mount, arm, frames and images contradict each other."""
-        is_fixed, watches = self.mount == "base", self.watches or "scene"
-        if self.is_own and self.watches is not None and is_fixed is not (self.watches == "gripper"):
-            raise ValueError(
-                "the frames have gripper poses, so a fixed camera's images in them must show what the gripper "
-                "carries; list images of the scene as its images"
-            )
-        if not self.is_own and watches == "gripper":
-            raise ValueError(
-                "watches the gripper; give its images a capture of their own, whose camera has mount base"
-            )
-        if (self.arm is None) is not (self.frames is None) or (self.arm is not None and is_fixed):
-            raise ValueError(
-                "a camera on another arm has mount gripper, that arm's name as arm, and frames of its own"
-            )
-        if not self.is_own and not any(self.images or self.frames or ()):
-            raise ValueError("no images; list some, or remove the camera")
+        is_fixed, own = self.mount == "base", self.is_own
+        shows_gripper = (self.watches or "scene") == "gripper"
+        text = None
+        if own and self.watches is not None and is_fixed is not shows_gripper:
+            text = "the frames have gripper poses, so a fixed camera's images in them must show what the gripper "
+            text += "carries; list images of the scene as its images"
+        elif not own and shows_gripper:
+            text = "watches the gripper; give its images a capture of their own, whose camera has mount base"
+        elif (self.arm is None) is not (self.frames is None) or (self.arm is not None and is_fixed):
+            text = "a camera on another arm has mount gripper, that arm's name as arm, and frames of its own"
+        elif not own and not any(self.images or self.frames or ()):
+            text = "no images; list some, or remove the camera"
+        if text is not None:
+            raise ValueError(text)
         return self
 
 
@@ -149,25 +147,19 @@ def cameras_as_json(capture: Capture) -> dict[str, Any]:
     if not capture.others and capture.mount == "gripper":
         return {}
     entries = {capture.camera_name: CameraEntry(mount=capture.mount)}
-    entries |= {camera.name: _entry(camera, len(capture)) for camera in capture.others}
+    for camera in capture.others:
+        entry: dict[str, Any] = {"mount": camera.mount}
+        if camera.base_from_gripper is not None:
+            pairs = zip(camera.images, camera.base_from_gripper, strict=True)
+            frames = [CameraFrame(image=image, base_from_gripper=pose) for image, pose in pairs]
+            entry |= {"arm": camera.arm, "frames": frames}
+        elif camera.frame is None:
+            entry["images"] = [*camera.images]
+        else:
+            at = dict(zip(camera.frame.tolist(), camera.images, strict=True))
+            entry["images"] = [at.get(row) for row in range(len(capture))]
+        entry["intrinsics"] = None if camera.intrinsics is None else IntrinsicsEntry.of(camera.intrinsics)
+        if camera.intrinsics_std is not None:
+            entry["intrinsics_std"] = StdEntry.of(camera.intrinsics_std)
+        entries[camera.name] = CameraEntry(**entry)
     return {name: entry.model_dump(mode="json", exclude_unset=True) for name, entry in entries.items()}
-
-
-def _entry(camera: CellCamera, count: int) -> CameraEntry:
-    """Return the entry of a camera beside a capture of `count` frames."""
-    entry: dict[str, Any] = {"mount": camera.mount}
-    if camera.base_from_gripper is not None:
-        pairs = zip(camera.images, camera.base_from_gripper, strict=True)
-        frames = [CameraFrame(image=image, base_from_gripper=pose) for image, pose in pairs]
-        entry |= {"arm": camera.arm, "frames": frames}
-    else:
-        listed: list[str | None] = [*camera.images]
-        if camera.frame is not None:
-            listed = [None] * count
-            for row, image in zip(camera.frame, camera.images, strict=True):
-                listed[row] = image
-        entry["images"] = listed
-    entry["intrinsics"] = None if camera.intrinsics is None else IntrinsicsEntry.of(camera.intrinsics)
-    if camera.intrinsics_std is not None:
-        entry["intrinsics_std"] = StdEntry.of(camera.intrinsics_std)
-    return CameraEntry(**entry)

@@ -89,13 +89,13 @@ def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
 
 def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None:
     """Raise InputError where three gripper poses or more are all the same."""
-    metres, radians = np.abs(step_between(base_from_gripper[:1], base_from_gripper).reshape(-1, 2, 3)).max(
-        axis=(0, 2), initial=0.0
-    )
+    steps = np.abs(step_between(base_from_gripper[:1], base_from_gripper)).max(axis=0, initial=0.0)
+    metres, radians = steps[:3].max(), steps[3:].max()
     if len(base_from_gripper) >= MIN_FRAMES and metres < SAME_POSE[0] and radians < SAME_POSE[1]:
+        within = f"within {1e3 * metres:.2g} mm and {np.degrees(radians):.2g}°"
         raise InputError(
-            f"{where}: all {len(base_from_gripper)} gripper poses are the same (within {1e3 * metres:.2g} mm and "
-            f"{np.degrees(radians):.2g}°); read the pose again for each image"
+            f"{where}: all {len(base_from_gripper)} gripper poses are the same ({within}); read the pose again for each "
+            "image"
         )
 
 

@@ -80,10 +80,9 @@ def read_source(
 
 def format_of(path: Path, options: ReadOptions | None = None) -> str:
     """Return the name of the format that the files at a path show; raise InputError when they show none."""
+    has_poses = options is not None and options.poses is not None
     for form in FORMATS.values():
-        if form.recognises(path) or (
-            form.name == "table" and options is not None and options.poses is not None
-        ):
+        if form.recognises(path) or (form.name == "table" and has_poses):
             return form.name
     if path.is_file():
         raise InputError(
