@@ -291,49 +291,42 @@ def write_lerobot(
     (folder / "meta").mkdir(parents=True)
     (folder / "meta" / "info.json").write_text(json.dumps(info))
 
-    def table(rows: list[tuple[int, np.ndarray]]) -> pa.Table:
-        states = np.concatenate([states for _, states in rows]).tolist()
+    def table(group: list[int]) -> pa.Table:
+        counts = [len(episodes[k][1]) for k in group]
         columns = {
-            key: pa.array(states, pa.list_(pa.float64())),
-            "timestamp": np.concatenate([np.arange(len(states)) / fps for _, states in rows]),
-            "episode_index": np.concatenate([np.full(len(states), index) for index, states in rows]),
-            "frame_index": np.concatenate([np.arange(len(states)) for _, states in rows]),
+            key: pa.array(np.concatenate([episodes[k][1] for k in group]).tolist(), pa.list_(pa.float64())),
+            "timestamp": np.concatenate([np.arange(count) / fps for count in counts]),
+            "episode_index": np.repeat(group, counts),
+            "frame_index": np.concatenate([np.arange(count) for count in counts]),
         }
         if codec is None:
-            columns[camera] = [
-                {"bytes": encode_png(image), "path": f"{index}_{k}.png"}
-                for index, _ in rows
-                for k, image in enumerate(episodes[index][0])
-            ]
+            images = [image for k in group for image in episodes[k][0]]
+            columns[camera] = [{"bytes": encode_png(image), "path": "x.png"} for image in images]
         return pa.table(columns)
 
     def save(content: pa.Table, file: Path) -> None:
         file.parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(content, file)
 
-    if not v3:
-        for index, (images, states) in enumerate(episodes):
-            save(table([(index, states)]), folder / f"data/chunk-000/episode_{index:06d}.parquet")
-            if codec:
-                file = folder / f"videos/chunk-000/{camera}/episode_{index:06d}.mp4"
-                write_video(file, images, fps, codec)
-        return folder
-    save(
-        table([(k, states) for k, (_, states) in enumerate(episodes)]),
-        folder / "data/chunk-000/file-000.parquet",
-    )
-    if codec:
-        everything = [image for images, _ in episodes for image in images]
-        write_video(folder / f"videos/{camera}/chunk-000/file-000.mp4", everything, fps, codec)
-    starts = np.cumsum([0, *(len(images) for images, _ in episodes)])[:-1] / fps
-    zeros = [0] * len(episodes)
-    columns = {
-        "episode_index": list(range(len(episodes))),
-        "data/chunk_index": zeros,
-        "data/file_index": zeros,
-    }
-    if codec:
-        columns |= {f"videos/{camera}/{name}": zeros for name in ("chunk_index", "file_index")}
-        columns[f"videos/{camera}/from_timestamp"] = starts
-    save(pa.table(columns), folder / "meta/episodes/chunk-000/file-000.parquet")
+    every = list(range(len(episodes)))
+    for number, group in enumerate([every] if v3 else [[k] for k in every]):
+        fields = {
+            "chunk_index": 0,
+            "file_index": 0,
+            "episode_chunk": 0,
+            "episode_index": number,
+            "video_key": camera,
+        }
+        save(table(group), folder / info["data_path"].format(**fields))
+        if codec:
+            images = [image for k in group for image in episodes[k][0]]
+            write_video(folder / info["video_path"].format(**fields), images, fps, codec)
+    if v3:
+        zeros = [0] * len(episodes)
+        columns = {"episode_index": every, "data/chunk_index": zeros, "data/file_index": zeros}
+        if codec:
+            columns |= {f"videos/{camera}/{name}": zeros for name in ("chunk_index", "file_index")}
+            starts = np.cumsum([0, *(len(images) for images, _ in episodes)])[:-1] / fps
+            columns[f"videos/{camera}/from_timestamp"] = starts
+        save(pa.table(columns), folder / "meta/episodes/chunk-000/file-000.parquet")
     return folder
