@@ -14,7 +14,7 @@ from jcr.capture.images import encode_png, read_depth
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import NEVER, pose_track
 from jcr.capture.recording import best_frames
-from jcr.capture.ros_image import depth_of, image_of
+from jcr.capture.ros_image import image_of, read_ros_depth
 from jcr.files import write_bytes
 from jcr.geometry import rotation_exp, transform
 from jcr.records import Capture
@@ -94,15 +94,15 @@ def test_depth_messages_are_read_in_every_encoding():
             encoding=encoding, is_bigendian=is_bigendian, height=2, width=2, step=step, data=data
         )
 
-    assert (depth_of(message(mm, "16UC1"), "d") == mm).all()
-    assert (depth_of(message(mm.byteswap(), "16UC1", 1), "d") == mm).all()
-    assert depth_of(message(metres, "32FC1"), "d").tolist() == [[0, 700], [1200, 0]]
+    assert (read_ros_depth(message(mm, "16UC1"), "d") == mm).all()
+    assert (read_ros_depth(message(mm.byteswap(), "16UC1", 1), "d") == mm).all()
+    assert read_ros_depth(message(metres, "32FC1"), "d").tolist() == [[0, 700], [1200, 0]]
     with pytest.raises(jcr.InputError, match="no depth"):
-        depth_of(message(mm, "rgb8"), "d")
+        read_ros_depth(message(mm, "rgb8"), "d")
     packed = SimpleNamespace(
         format="16UC1; compressedDepth png", data=np.frombuffer(bytes(12) + encode_png(mm), np.uint8)
     )
-    assert (depth_of(packed, "d") == mm).all()
+    assert (read_ros_depth(packed, "d") == mm).all()
 
 
 @pytest.mark.slow

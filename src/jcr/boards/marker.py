@@ -100,7 +100,10 @@ def _intrinsics(
             "check the board's kind and size, or give the intrinsics",
         )
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_ASPECT_RATIO
-    x_in_body, x_px = ([np.float32(getattr(s, name)) for s in shown] for name in ("x_in_body", "x_px"))
+    x_in_body, x_px = (
+        [np.asarray(s.x_in_body, np.float32) for s in shown],
+        [np.asarray(s.x_px, np.float32) for s in shown],
+    )
     rms_px, matrix, distortion, _, _, std, *_ = cv2.calibrateCameraExtended(
         x_in_body, x_px, capture.image_size, np.eye(3), np.zeros(5), flags=flags
     )

@@ -83,6 +83,4 @@ def proposed(images: Sequence[UInt8[ndarray, "h w 3"]]) -> Finding | None:
     """Return the finding of a board in view with the --board that would use it; None where there is none."""
     if (board := board_in_view(images)) is None:
         return None
-    return Finding(
-        kind=FindingKind.BOARD_IN_VIEW, severity="warns", concerns="reconstruction", details={"board": board}
-    )
+    return Finding.of(FindingKind.BOARD_IN_VIEW, "warns", "reconstruction", board=board)

@@ -70,17 +70,15 @@ def board_sheet(spec: str, paper: str = "a4") -> Sheet:
     below, ruler = page[1] - MARGIN_MM, RULER_MM if height >= RULER_MM else 50.0
     _ruler(pixels, px_per_mm, (left, below - 6.0), ruler, along_x=True)
     _ruler(pixels, px_per_mm, (MARGIN_MM + 6.0, top), ruler, along_x=False)
+    rulers = f"Both rulers are {ruler:g} mm. If yours measure R mm, multiply the lengths in --board by R/{ruler:g}."
+    use = f"--board {spec}   Print at 100 %, not fitted to the page; glue it to something flat."
+    font, draw = ImageFont.load_default(TEXT_MM * px_per_mm), ImageDraw.Draw(pixels)
     for x_mm, y_mm, text in (
-        (left, below, f"--board {spec}   Print at 100 %, not fitted to the page; glue it to something flat."),
-        (
-            left + ruler + 4.0,
-            below - 5.0,
-            f"Both rulers are {ruler:g} mm. If yours measure R mm, multiply the lengths in --board by R/{ruler:g}.",
-        ),
+        (left, below, use),
+        (left + ruler + 4.0, below - 5.0, rulers),
         (MARGIN_MM, top + ruler + TEXT_MM + 1.0, f"{ruler:g} mm"),
     ):
-        font = ImageFont.load_default(TEXT_MM * px_per_mm)
-        ImageDraw.Draw(pixels).text((x_mm * px_per_mm, y_mm * px_per_mm), text, 0, font, anchor="ls")
+        draw.text((x_mm * px_per_mm, y_mm * px_per_mm), text, 0, font, anchor="ls")
     return Sheet(pixels, px_per_mm)
 
 

@@ -143,7 +143,9 @@ def intrinsics_of_ros(
         raise InputError(f"{where}: the camera matrix has {len(matrix)} numbers, not nine")
     if not any(matrix):
         return None
-    known = _ROS_MODELS.get(model, None if any(coefficients) else "pinhole")
+    known = _ROS_MODELS.get(model)
+    if known is None and not any(coefficients):
+        known = "pinhole"
     if known is None or any(coefficients[len(COEFFICIENTS[known]) :]):
         raise InputError(
             f"{where}: distortion model {shown(model)} with {len(coefficients)} coefficients; jcr knows plumb_bob (5), "

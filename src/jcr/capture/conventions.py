@@ -78,18 +78,13 @@ CONVENTIONS = {
     "unitree": Convention(_XYZ + _RPY, "xyz"),
     "realman": Convention(_XYZ + _WXYZ, "wxyz"),
 }
-OF_ARM = {
-    "ur3e": "ur",
-    "ur5e": "ur",
-    "ur10e": "ur",
-    "panda": "franka",
-    "fr3": "franka",
-    "iiwa7": "kuka",
-    "iiwa14": "kuka",
-    "xarm6": "xarm",
-    "xarm7": "xarm",
-    "z1": "unitree",
-}
+OF_ARM = (
+    dict.fromkeys(("ur3e", "ur5e", "ur10e"), "ur")
+    | dict.fromkeys(("panda", "fr3"), "franka")
+    | dict.fromkeys(("iiwa7", "iiwa14"), "kuka")
+    | dict.fromkeys(("xarm6", "xarm7"), "xarm")
+    | {"z1": "unitree"}
+)
 """Convention of the controller of each arm of estimation.arms.ROBOT_NAMES."""
 
 
@@ -139,7 +134,7 @@ def checked_rows(
     per_m, per_rad = form.scales(units)
     names = [f"{where}: pose {k + 1}" for k in range(len(numbers))]
     text = f"holds NaN or infinity (or beyond {HUGE:.0e}); record it again or drop the row"
-    unusable = ~(np.abs(numbers) < HUGE).all(axis=1)
+    unusable = np.asarray(~(np.abs(numbers) < HUGE).all(axis=1))
     faults = {k: f"{names[k]} {text}" for k in np.flatnonzero(unusable).tolist()}
     numbers = np.where(unusable[:, None], 0.0, numbers)
     is_matrix, rest = form.rotation in ("rows", "columns"), numbers[:, 3:].copy()

@@ -40,11 +40,6 @@ def read_ros_image(message: Any) -> UInt8[ndarray, "h w 3"]:
     return pixels
 
 
-def read_ros_depth(message: Any) -> UInt16[ndarray, "h w"]:
-    """Return the depth (mm) of a sensor_msgs/Image or CompressedImage, 0 where there is none."""
-    return depth_of(message, "depth")
-
-
 def read_ros_camera_info(message: Any) -> Intrinsics | None:
     """Return the intrinsics of a sensor_msgs/CameraInfo; None of a camera that was never calibrated."""
     size = (message.width, message.height)
@@ -79,8 +74,11 @@ def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"],
     return np.asarray(cv2.cvtColor(pixels, _TO_RGB[encoding]), dtype=np.uint8), ".png"
 
 
-def depth_of(message: Any, where: str) -> UInt16[ndarray, "h w"]:
-    """Return depth in mm, 0 where there is none; raise InputError for a message that is no depth image."""
+def read_ros_depth(message: Any, where: str = "depth") -> UInt16[ndarray, "h w"]:
+    """Return the depth (mm) of a sensor_msgs/Image or CompressedImage, 0 where there is none.
+
+    Raises InputError, begun with `where`, for a message that is no depth image.
+    """
     if hasattr(message, "format"):
         # compressed_depth_image_transport writes its quantisation before the PNG.
         data = bytes(message.data)

@@ -23,15 +23,6 @@ if TYPE_CHECKING:
 ANY_ANGLE = (-2 * np.pi, 2 * np.pi)
 
 
-def read_chain(file: Path, dof: int) -> Arm:
-    """Read the arm of `dof` joints in a URDF file; its gripper frame is the link behind the last joint.
-
-    Raises InputError where the file is no URDF, has no such chain or several, or has a joint in it that does not
-    rotate.
-    """
-    return chain_of(load_urdf(file), dof, str(file))
-
-
 def load_urdf(file: Path) -> "yourdfpy.URDF":
     """Read the robot of a URDF file, without its meshes.
 
@@ -72,8 +63,16 @@ def joints_to(urdf: "yourdfpy.URDF", link: str) -> list["yourdfpy.Joint"]:
     return chain
 
 
+def read_chain(file: Path, dof: int) -> Arm:
+    """Read the arm of `dof` joints in a URDF file, as `chain_of`."""
+    return chain_of(load_urdf(file), dof, str(file))
+
+
 def chain_of(urdf: "yourdfpy.URDF", dof: int, where: str) -> Arm:
-    """Return the arm of `dof` joints in a loaded URDF, as `read_chain`; `where` begins the messages."""
+    """Return the arm of `dof` joints in a URDF; its gripper frame is the link behind the last joint.
+
+    Raises InputError, begun with `where`, where there is no such chain or several, or a joint does not rotate.
+    """
     chains = {link.name: joints_to(urdf, link.name) for link in urdf.robot.links}
     # A chain ends with its last moving joint: links that are fixed behind it belong to the gripper.
     chains = {
@@ -102,14 +101,8 @@ def chain_of(urdf: "yourdfpy.URDF", dof: int, where: str) -> Arm:
         frame = np.eye(4)
     both = np.array(limits, float)
     rest = np.where((both[:, 0] <= 0) & (both[:, 1] >= 0), 0.0, both.mean(1))
-    return Arm(
-        name="robot of the URDF",
-        parent_from_joint=np.stack(frames),
-        axes=np.array(axes, float),
-        last_from_gripper=frame,
-        limits=both,
-        rest=rest,
-    )
+    arm: dict[str, ndarray] = {"parent_from_joint": np.stack(frames), "axes": np.array(axes, float)}
+    return Arm(name="robot of the URDF", last_from_gripper=frame, limits=both, rest=rest, **arm)
 
 
 def _limits(joint: "yourdfpy.Joint") -> tuple[float, float]:

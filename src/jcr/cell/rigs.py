@@ -70,8 +70,10 @@ class Rigs:
         metres, radians = _apart(np.stack(self.poses[: len(self._rows)]), middle)
         near = np.flatnonzero((metres < AT_A_FRAME[0]) & (radians < AT_A_FRAME[1]))
         images = [self._capture.images[self._rows[row]] for row in near[:1]]
-        own = {"camera": self._capture.camera_name}
-        at_own = [Finding.of(FindingKind.AT_ANOTHER_CAMERA, "warns", "mount", one, **own) for one in images]
+        own = self._capture.camera_name
+        at_own = [
+            Finding.of(FindingKind.AT_ANOTHER_CAMERA, "warns", "mount", one, camera=own) for one in images
+        ]
         self.poses.append(middle)
         return replace(seen, rig=rig, findings=tuple(at_own))
 

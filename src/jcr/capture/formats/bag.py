@@ -14,7 +14,7 @@ from jcr.capture.formats import Format
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import TfTree, speed
 from jcr.capture.recording import Picture, Recording, capture_of_recording, chosen_name
-from jcr.capture.ros_image import depth_of, image_of
+from jcr.capture.ros_image import image_of, read_ros_depth
 from jcr.capture.urdf_chain import JointTrack, read_arm
 from jcr.errors import InputError
 from jcr.extras import extra
@@ -132,7 +132,7 @@ class _Bag:
             for connection, at, message in self.messages(self.depth, **span)
         ]
         apart, topic, message = min(near, key=lambda one: one[0], default=(SAME_MOMENT_NS + 1, "", None))
-        return depth_of(message, f"{self.path}: {topic}") if apart <= SAME_MOMENT_NS else None
+        return read_ros_depth(message, f"{self.path}: {topic}") if apart <= SAME_MOMENT_NS else None
 
     def intrinsics(self, options: ReadOptions, size: tuple[int, int]) -> Intrinsics | None:
         """Return the intrinsics of --camera-info or CameraInfo; of rectified images P. ROS 1 writes K, D, P."""

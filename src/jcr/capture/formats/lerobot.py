@@ -59,7 +59,7 @@ class Info(BaseModel):
     video_path: Annotated[str, Field(max_length=1000)] = ""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Episode:
     """Rows of one recording of the set, and the files of its images."""
 
@@ -136,21 +136,15 @@ def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> E
     rows = _read_table(table, ["frame_index", "timestamp", key], index)
     try:
         time_s, state = (np.array(rows[name], np.float64) for name in ("timestamp", key))
+        if not (len(time_s) and time_s.ndim == 1 and state.ndim == 2):
+            raise ValueError
     except (TypeError, ValueError):
-        raise InputError(f"{table}: {key} has rows of different lengths; choose another episode") from None
-    if len(time_s) == 0 or time_s.ndim != 1 or state.ndim != 2:
-        raise InputError(f"{table}: {key} of episode {index} is empty or no list; choose another episode")
+        text = "is empty, no list, or has rows of different lengths; choose another episode"
+        raise InputError(f"{table}: {key} of episode {index} {text}") from None
     if not (np.isfinite(time_s).all() and np.isfinite(state).all()):
         raise InputError(f"{table}: {key} holds NaN or infinity; choose another episode")
-    return Episode(
-        index=index,
-        frame=np.array(rows["frame_index"]),
-        time_s=time_s,
-        state=state,
-        table=table,
-        video=_file(path, info.video_path, video_fields | {"video_key": camera}) if has_video else None,
-        video_start_s=start_s,
-    )
+    video = _file(path, info.video_path, video_fields | {"video_key": camera}) if has_video else None
+    return Episode(index, np.array(rows["frame_index"]), time_s, state, table, video, start_s)
 
 
 def _read_table(

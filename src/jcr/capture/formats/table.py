@@ -229,10 +229,13 @@ def _columns(
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise InputError(f"{where}: two columns are named {', '.join(sorted(twice))}; keep one")
+    convention: ConventionName = "auto"
+    for cell in header:
+        convention = _EXPLICIT.get(cell, convention)
     return PoseColumns(
         cells=dict(zip(names, cells, strict=True)),
         units=frozenset(units) - {"", "s", "ns"},
-        convention=next((_EXPLICIT[cell] for cell in header if cell in _EXPLICIT), "auto"),
+        convention=convention,
     )
 
 
