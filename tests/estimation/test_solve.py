@@ -1,5 +1,7 @@
 """The calibration from poses: known answers, invariances, outliers, coverage, degenerate motions."""
 
+import time
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -280,3 +282,12 @@ def test_poses_that_belong_to_other_images_are_rejected():
 def test_what_cannot_be_poses_is_an_input_error(gripper, camera, words):
     with pytest.raises(jcr.InputError, match=words):
         fit_hand_eye(gripper, camera)
+
+
+def test_two_hundred_poses_take_seconds():
+    problem = hand_eye_problem(np.random.default_rng(3), 200, robot_noise=(5e-4, 1e-3))
+    start = time.process_time()
+    solved = fit_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    assert time.process_time() - start < 8
+    off = error(problem, solved.gripper_from_camera, solved.scale)
+    assert (np.abs(off) < 4 * np.sqrt(np.diag(solved.covariance))).all()
