@@ -82,7 +82,7 @@ def _escaped(text: str) -> str:
 
 
 def _text(docstring: str) -> str:
-    """A docstring as Markdown: indented blocks after `examples:` are code."""
+    """A docstring as Markdown: indented blocks after `for example:` are code."""
     lines, code = [], False
     for line in inspect.cleandoc(docstring).splitlines():
         if line.startswith("  ") and not code:

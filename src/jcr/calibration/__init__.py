@@ -1,0 +1,1 @@
+"""Calibration of a capture: fit, adjustment, checks, verdict, requirement."""

@@ -146,10 +146,12 @@ class Share(Part):
 
     @classmethod
     def of(cls, covariance: Float[ndarray, "7 7"]) -> "Share":
-        """Return the size of a part of the covariance, which degenerate motions leave with negative rounding."""
-        metres, radians = np.sqrt(np.maximum(np.diag(covariance)[:6], 0.0).reshape(2, 3).mean(1))
-        size = mm_and_deg(metres, radians)
-        return cls.model_construct(None, **size, covariance=covariance)
+        """Return the size of a part of the covariance, without the negative rounding that degenerate motions leave."""
+        std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        values, vectors = np.linalg.eigh(covariance / np.outer(*[np.where(std > 0, std, np.inf)] * 2))
+        covariance = (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(std, std)
+        metres, radians = np.sqrt((std[:6] ** 2).reshape(2, 3).mean(1))
+        return cls(**mm_and_deg(metres, radians), covariance=covariance)
 
 
 class UncertaintyBudget(Part):

@@ -67,7 +67,7 @@ jcr COMMAND --help     arguments, options and examples of a command
 jcr --version          the version
 jcr --tyro-write-completion bash FILE  a script that completes commands, options and files; also zsh, fish
 
-examples:
+for example:
   jcr run captures/table out/table
   jcr query out/table points.csv
 """

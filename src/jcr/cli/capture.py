@@ -38,7 +38,7 @@ class Capture:
     calibration of all images. After Ctrl-C the same command resumes. The live page, whose address is printed, has
     buttons to take, retake and remove images, to undo that, and to finish; the same words can be typed.
 
-    examples:
+    for example:
       jcr capture captures/table --camera 0 --poses ur:192.168.0.2 --robot ur5e
       jcr capture --robot list
       jcr capture captures/table --camera 0 --poses ur:192.168.0.2 --require 2 0.3 --until-accurate

@@ -31,7 +31,7 @@ class Check:
 
     The exit status is 3 if its calibration would be rejected; the message has the reason and the remedy.
 
-    examples:
+    for example:
       jcr check captures/table
       jcr check captures/table --suggest 3 --robot-noise 0.1 0.05
       jcr check captures/table --poses-only --json
@@ -192,7 +192,7 @@ class Compare:
     calibrations of one arm p is too large, because they share systematic errors. The exit status is 3 if one of the
     two is rejected, or if the reported errors do not explain the difference.
 
-    examples:
+    for example:
       jcr compare out/tabletop examples/tabletop
       jcr compare out/today out/yesterday --json
     """
@@ -257,7 +257,7 @@ class Verify:
     or with five or more images of another scene. Fixed cameras of the run that CAPTURE names in `cameras` are tested
     too. The exit status is 3 if something has moved, or if the images cannot decide.
 
-    examples:
+    for example:
       jcr verify out/table captures/this-morning
       jcr verify out/table captures/this-morning --tolerance 1 0.1 --json
     """
@@ -337,7 +337,7 @@ class Touch:
     more points, spread over the scene; corners and printed marks are best. The exit status is 3 if the errors are larger
     than the reported uncertainty explains.
 
-    examples:
+    for example:
       jcr touch out/table touched.csv
     """
 

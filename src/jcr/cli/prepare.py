@@ -26,7 +26,7 @@ class Board:
 
     Print it at 100 %, measure the rulers, and calibrate with the --board that the sheet names.
 
-    examples:
+    for example:
       jcr board board.pdf
       jcr board a3.pdf charuco:9x6:0.040:0.030:DICT_5X5_100 --paper a3
       jcr board board.pdf chessboard:9x6:0.025
@@ -59,7 +59,7 @@ class Board:
 class Docs:
     """Print a page of the manual, or list the pages.
 
-    examples:
+    for example:
       jcr docs
       jcr docs captures
       jcr docs results/speed
@@ -124,7 +124,7 @@ class Models:
 
     Those that `--backend auto` may try come first, in its order. Listing downloads nothing.
 
-    examples:
+    for example:
       jcr models
       jcr models get da3-small
       jcr models get dust3r --accept-licence

@@ -37,7 +37,7 @@ class Calibrate:
 
     CAPTURE may also be a samples file of easy_handeye2 or MoveIt Calibration, whose marker poses need no images.
 
-    examples:
+    for example:
       jcr calibrate examples/tabletop out/tabletop
       jcr calibrate captures/table out/table --backend colmap --seed 1 --json
       jcr calibrate samples.yaml out/marker
@@ -80,7 +80,7 @@ class Run(Calibrate):
     of poses, bags, LeRobot data sets, COLMAP models … The run writes calibration.json, reconstruction.npz, depth.npz,
     cloud.ply, map.safetensors, report.html and log.txt to OUT. The same command resumes an interrupted run.
 
-    examples:
+    for example:
       jcr run examples/tabletop out/tabletop
       jcr run captures/table out/table --robot-noise 0.1 0.05 --json
       jcr run captures/ur5 out/ur5 --pose-convention ur
@@ -118,7 +118,7 @@ class Batch:
     A capture that fails does not stop the others. The same command again runs only what is missing or has changed. The
     exit status is 3 if any capture failed or was rejected.
 
-    examples:
+    for example:
       jcr batch captures/* out/all
       jcr batch captures/* out/all --processes 4 --calibrate-only
       jcr batch /shared/captures/* /shared/out --ray auto --gpus-per-task 0.25
@@ -160,7 +160,7 @@ class AddCamera:
     and the output names it if the image does not determine it. The camera becomes part of the run (OUT/cameras.json, the
     report, `jcr export`). If it cannot be located, nothing is written and the exit status is 3.
 
-    examples:
+    for example:
       jcr add-camera out/table overhead.png --intrinsics overhead.json
       jcr add-camera out/table left/0.png left/1.png --name left
     """

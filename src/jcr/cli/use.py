@@ -32,7 +32,7 @@ _FORMATS = "%.6f,%.6f,%.6f,%.4f,%d,%.5f,%.4f,%.4f,%.4f,%d,%d,%d,%d"
 class Map:
     """(Re)build cloud, map and report of a run with other options, or with further images.
 
-    examples:
+    for example:
       jcr map out/tabletop --preset paper
       jcr map out/tabletop --segments labels
       jcr map out/tabletop --workspace 0.2 -0.4 -0.05 0.9 0.4 0.6
@@ -70,7 +70,7 @@ class Export:
     Every file names its frames and units. Map, images and cameras are in the robot's base frame, in metres. A
     calibration that is rejected is exported with --force alone; the exit status is 3 without it.
 
-    examples:
+    for example:
       jcr export out/table ros2 --parent-frame tool0 --child-frame camera_color_optical_frame
       jcr export out/table urdf --to-root camera_link
       jcr export out/table octomap table.bt --voxel-size 0.02
@@ -122,7 +122,7 @@ class Query:
 
     Points are in metres, in the robot's base frame. Distances are NaN outside of the mapped workspace.
 
-    examples:
+    for example:
       jcr query out/table points.csv
       jcr query out/table cloud.ply --write answers.npy
       jcr query out/table points.npy --unknown occupied --json
@@ -234,7 +234,7 @@ class Measure:
 
     OUT is the folder of a run. `jcr map --segments` selects how the scene is divided into objects.
 
-    examples:
+    for example:
       jcr measure out/tabletop
       jcr measure out/tabletop --json > sizes.json
     """
@@ -289,7 +289,7 @@ class View:
     The page is served until Ctrl-C, and only to this machine; from another one use
     ssh -L 8080:127.0.0.1:8080. Needs viser: pip install 'jcr-handeye[view]'.
 
-    examples:
+    for example:
       jcr view out/table
       jcr view out/table --urdf arm.urdf --port 9000
     """

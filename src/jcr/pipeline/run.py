@@ -329,12 +329,13 @@ def _with_reconstruction_of(state: State, out: Path, capture: Capture) -> RunRes
     A state that cannot be read proves nothing: to make every stage again is always right.
     """
     for folder in (out, capture.folder / LIVE):
-        before = RunResult(folder, capture=capture)
+        before, is_same = RunResult(folder, capture=capture), False
         with suppress(InputError):
-            if before.state.reconstruction == state.reconstruction and (folder / RECONSTRUCTION).is_file():
-                if folder == out and not is_made_from(out / DEPTH, state.depth):
-                    (out / DEPTH).unlink(missing_ok=True)
-                return before
+            is_same = before.state.reconstruction == state.reconstruction
+        if is_same and (folder / RECONSTRUCTION).is_file():
+            if folder == out and not is_made_from(out / DEPTH, state.depth):
+                (out / DEPTH).unlink(missing_ok=True)
+            return before
     return None
 
 
