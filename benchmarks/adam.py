@@ -27,8 +27,8 @@ from jcr.files import written_whole
 from jcr.geometry import inverse, transform
 from jcr.pointmaps.global_alignment.align import Alignment, global_align
 from jcr.pointmaps.global_alignment.initial_estimate import initial_state
-from jcr.pointmaps.global_alignment.observations import Problem, observe
-from jcr.pointmaps.global_alignment.residuals import State, initial_depth
+from jcr.pointmaps.global_alignment.observations import AlignmentProblem, observe
+from jcr.pointmaps.global_alignment.residuals import AlignmentState, initial_depth
 from jcr.pointmaps.pairs import PairPredictions, read_pairs
 
 STEPS, LEARNING_RATE = 300, 0.01
@@ -87,7 +87,7 @@ def main(words: Sequence[str]) -> int:
 
 def align_adam(predictions: PairPredictions, steps: int = STEPS) -> Alignment:
     """Align by Adam steps over all pixels of all pairs; the result has no covariance (NaN)."""
-    problem = Problem.of(predictions)
+    problem = AlignmentProblem.of(predictions)
     count, height, width = predictions.image_count, *predictions.conf.shape[1:]
     start = initial_state(problem.observe_all(START_PIXELS), predictions.edges)
     everything = (observe(problem, k, slice(None)) for k in range(count))
@@ -145,7 +145,9 @@ def align_adam(predictions: PairPredictions, steps: int = STEPS) -> Alignment:
 class PointmapModel(torch.nn.Module):
     """The unknowns of eq. 1: X̂_i by camera, focal length and depth of each image; P_e and σ_e of each pair."""
 
-    def __init__(self, start: State, depth: Float[ndarray, "n p"], problem: Problem) -> None:
+    def __init__(
+        self, start: AlignmentState, depth: Float[ndarray, "n p"], problem: AlignmentProblem
+    ) -> None:
         super().__init__()
         predictions = problem.predictions
         self.images = torch.from_numpy(predictions.edges)

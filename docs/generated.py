@@ -22,11 +22,11 @@ from jcr.calibration.record import Calibration
 from jcr.cell.placement import CamerasFile
 from jcr.cli import COMMANDS, dispatch
 from jcr.cli.prepare import SCALES, pages
-from jcr.depth.depth_npz import About as DepthAbout
+from jcr.depth.depth_npz import DepthHeader as DepthAbout
 from jcr.findings import FindingKind
-from jcr.findings.table import GROUPS, Row
+from jcr.findings.table import GROUPS, KindRow
 from jcr.reconstruct import BACKENDS
-from jcr.run_folder import State
+from jcr.run_folder import RunState
 
 REFERENCE = Path(__file__).parent / "reference"
 SCHEMAS = REFERENCE / "schemas"
@@ -37,7 +37,7 @@ FORMATS = {
         "The hand-eye transform, its covariance, and what was made of each image.",
     ),
     "cameras.json": (CamerasFile, "Further cameras and arms of the cell, where there are some."),
-    "run.json": (State, "The state of a run folder: capture, options, fingerprint of the reconstruction."),
+    "run.json": (RunState, "The state of a run folder: capture, options, fingerprint of the reconstruction."),
     "depth.npz": (
         DepthAbout,
         "The array `about` in it, as JSON; other arrays have the names of [Pointmaps](api.md#jcrpointmaps). "
@@ -382,7 +382,7 @@ def _blanked(template: str) -> str:
     return template
 
 
-def _about_kind(row: Row) -> Iterator[str]:
+def _about_kind(row: KindRow) -> Iterator[str]:
     if isinstance(row.message, str) and row.message != "{text}":
         yield f"> {_blanked(row.message)}\n"
     yield from (

@@ -14,7 +14,7 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
 from jcr.cli import dispatch
 from jcr.pipeline import batch as module
-from jcr.pipeline.batch import Row, Task, batch, run_one
+from jcr.pipeline.batch import BatchRow, Task, batch, run_one
 from jcr.pipeline.options import BatchOptions
 from jcr.pipeline.run import RunOptions
 
@@ -54,7 +54,7 @@ def test_a_bad_capture_fails_alone_and_what_is_finished_is_not_run_again(
     command = ["batch", *names, str(out), "--calibrate-only", "--processes", "2", "--quiet"]
     assert dispatch([*command, "--json"]) == 3
     printed = capsys.readouterr()
-    rows = {Path(row["capture"]).name: Row(**row) for row in json.loads(printed.out)["captures"]}
+    rows = {Path(row["capture"]).name: BatchRow(**row) for row in json.loads(printed.out)["captures"]}
     assert "of 4 captures failed or are rejected" in printed.err and printed.err.count("\n") == 1
     assert rows["broken"].status == "failed" and "not a readable image" in rows["broken"].reason
     assert rows["plain"].status == "rejected" and "registered" in rows["plain"].reason
@@ -137,12 +137,12 @@ def test_a_node_of_a_ray_cluster_that_dies_loses_nothing(monkeypatch: pytest.Mon
 
     first, removed = tmp_path / "0", tmp_path / "removed"
 
-    def unfinished(task: Task) -> Row:
+    def unfinished(task: Task) -> BatchRow:
         """The first ends at once, the others when the node is gone on which some of them run."""
         deadline = time.monotonic() + 60
         while task.capture != first and not removed.exists() and time.monotonic() < deadline:
             time.sleep(0.01)
-        return Row(capture=str(task.capture), out=str(task.out), status="accepted", offset_std_mm=1.0)
+        return BatchRow(capture=str(task.capture), out=str(task.out), status="accepted", offset_std_mm=1.0)
 
     monkeypatch.setattr(module, "run_one", unfinished)
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 2})

@@ -24,7 +24,7 @@ ARRAY = "array"
 """Key of the JSON that names an array of the file."""
 
 
-class About(BaseModel):
+class ReconstructionContent(BaseModel):
     """Content of the file: its JSON, with the arrays in place of their names."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
@@ -70,7 +70,7 @@ def _filled(value: Any, file: Mapping[str, np.ndarray]) -> Any:
 def read_reconstruction(path: Path) -> Reconstruction:
     """Read a reconstruction.npz; raise InputError where it is damaged or of another format."""
     with read_npz(path, FORMAT) as (text, file):
-        found = About.model_validate(_filled(json.loads(text), file)).reconstruction
+        found = ReconstructionContent.model_validate(_filled(json.loads(text), file)).reconstruction
         _check(found)
         return found
 

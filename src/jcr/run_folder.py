@@ -82,7 +82,7 @@ class RunOptions:
         return replace(self, reconstruct=with_cameras_of(capture, reconstruct))
 
 
-class State(BaseModel):
+class RunState(BaseModel):
     """Content of run.json."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -103,7 +103,7 @@ class State(BaseModel):
         return fingerprint(self.reconstruction, replace(self.options.depth, dense=True), DEPTH_FORMAT)
 
 
-def state_of(capture: Capture, options: RunOptions) -> State:
+def state_of(capture: Capture, options: RunOptions) -> RunState:
     """Return the state of a run before anything was tried; raise InputError for a name that is not UTF-8."""
     folder = str(capture.folder.resolve())
     try:
@@ -117,14 +117,14 @@ def state_of(capture: Capture, options: RunOptions) -> State:
     paths = {name: path.resolve() for name, path in vars(made).items() if isinstance(path, Path)}
     images = [(name, capture.folder / name) for name in capture.images]
     inputs = images, capture.base_from_gripper, capture.intrinsics
-    return State(
+    return RunState(
         capture=folder,
         options=replace(options, reconstruct=replace(made, **paths)),
         reconstruction=fingerprint(*inputs, deciding, __version__, FORMAT),
     )
 
 
-def fingerprint_of_run(out: Path, capture: Capture, state: State) -> str:
+def fingerprint_of_run(out: Path, capture: Capture, state: RunState) -> str:
     """Return the fingerprint of all that a run is made from, of its calibration.json, and of the files that exist."""
     others = [
         asdict(camera) | {"folder": [(camera.folder or capture.folder) / name for name in camera.images]}
@@ -188,11 +188,11 @@ class RunResult:
         return read_calibration(self.out)
 
     @cached_property
-    def state(self) -> State:
+    def state(self) -> RunState:
         """Content of run.json; InputError where there is no run."""
         file = self.out / STATE
         try:
-            return State.model_validate_json(read_bytes(file), strict=True)
+            return RunState.model_validate_json(read_bytes(file), strict=True)
         except ValidationError as error:
             raise InputError(
                 f"{file}: {first_fault(error)}; run `jcr calibrate` or `jcr run` again"

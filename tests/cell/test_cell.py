@@ -21,7 +21,7 @@ from jcr.cell.carried import carried_scene, refined
 from jcr.cell.images import CellImages
 from jcr.cell.placement import CameraPlacement, CellPlacement, read_cameras, write_cameras
 from jcr.cell.stage import place_cameras
-from jcr.estimation.intrinsics_prior import FIXED, Camera, camera_with_prior
+from jcr.estimation.intrinsics_prior import FIXED, CameraPrior, camera_with_prior
 from jcr.estimation.problem import Problem, State, with_observations
 from jcr.estimation.solve import Solution, solve
 from jcr.findings import Finding, FindingKind
@@ -51,7 +51,7 @@ def adjusted(problem: CellProblem, world: np.ndarray | None = None, intrinsics_o
 
 
 def cell_of(
-    problem: CellProblem, cameras: Sequence[Camera], move: np.ndarray | None = None
+    problem: CellProblem, cameras: Sequence[CameraPrior], move: np.ndarray | None = None
 ) -> tuple[Problem, State]:
     """The problem without its observations, in a world that is moved."""
     move = np.eye(4) if move is None else move

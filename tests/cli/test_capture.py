@@ -8,7 +8,7 @@ import pytest
 
 from jcr.calibration.record import read_calibration
 from jcr.cli import dispatch
-from jcr.cli.capture import Capture, _conclude
+from jcr.cli.capture import CaptureCommand, _conclude
 from jcr.estimation.arms import ROBOT_NAMES
 from jcr.live.session import SessionOptions
 from jcr.records import Requirement
@@ -55,7 +55,7 @@ def test_a_rejected_result_exits_with_three_and_the_last_line_is_a_command_that_
     capsys: pytest.CaptureFixture[str],
 ):
     options = SessionOptions(until_accurate=until_accurate, require=(2.0, 0.3))
-    arguments = Capture(out=Path("captures/live"), session=options)
+    arguments = CaptureCommand(out=Path("captures/live"), session=options)
     folder: Any = SimpleNamespace(names=[f"{k}.png" for k in range(images)])
     assert _conclude(arguments, folder, [], found, requirement_met=True) == status
     printed = capsys.readouterr().out.splitlines()

@@ -7,7 +7,7 @@ from jcr.estimation.closed_form import motions
 from jcr.features.gate import Pair, judge, rolls
 from jcr.features.pairs import translation_of_x
 from jcr.features.stage import hidden, still_cells
-from jcr.features.two_view import Reading, readings
+from jcr.features.two_view import TwoViewMotion, readings
 from jcr.geometry import rotation_angle, rotation_exp, transform
 from simulation.problems import HandEyeProblem, hand_eye_problem
 
@@ -76,7 +76,7 @@ def problem_and_pairs(seed: int) -> tuple[HandEyeProblem, list[Pair]]:
         return v / np.linalg.norm(v)
 
     return problem, [
-        Pair((i, j), rows, (Reading(camera[i, j, :3, :3], unit(camera[i, j, :3, 3]), sure, 0.5),))
+        Pair((i, j), rows, (TwoViewMotion(camera[i, j, :3, :3], unit(camera[i, j, :3, 3]), sure, 0.5),))
         for i in range(N)
         for j in range(i + 1, N)
     ]
@@ -89,7 +89,7 @@ def test_wrong_pairs_are_contradicted_and_right_ones_are_not(seed: int):
     wrong = set(rng.permutation(len(pairs))[:12].tolist())
     for k in wrong:
         reading = pairs[k].readings[0]
-        bad = Reading(rotation_exp(rng.normal(size=3)), reading.direction, reading.covariance, 0.5)
+        bad = TwoViewMotion(rotation_exp(rng.normal(size=3)), reading.direction, reading.covariance, 0.5)
         pairs[k] = Pair(pairs[k].key, pairs[k].rows, (bad,))
     gate = judge(pairs, motions(problem.base_from_gripper))
     assert gate.of_x is not None
@@ -103,7 +103,7 @@ def test_wrong_pairs_are_contradicted_and_right_ones_are_not(seed: int):
 def test_the_second_reading_of_a_plane_is_tried():
     problem, pairs = problem_and_pairs(0)
     right = pairs[3].readings[0]
-    other = Reading(
+    other = TwoViewMotion(
         rotation_exp(np.array([0.5, 0.0, 0.0])) @ right.rotation, right.direction, right.covariance, 0.4
     )
     pairs[3] = Pair(pairs[3].key, pairs[3].rows, (other, right))

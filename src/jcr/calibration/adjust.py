@@ -16,7 +16,7 @@ from jcr.estimation.closed_form import initial_estimate
 from jcr.estimation.equation import paper_residuals, predict
 from jcr.estimation.hand_eye import judged
 from jcr.estimation.image_equations import median_reprojection_px
-from jcr.estimation.intrinsics_prior import Camera, decentring
+from jcr.estimation.intrinsics_prior import CameraPrior, decentring
 from jcr.estimation.problem import LinearPrior
 from jcr.estimation.projection import view_of
 from jcr.estimation.score_test import focal_lengths
@@ -80,7 +80,7 @@ def _not_settled(found: Solution) -> Iterator[Finding]:
 def adjust_case(
     case: Case,
     *,
-    prior: Camera | None = None,
+    prior: CameraPrior | None = None,
     combinations: Float[ndarray, "e p"] | None = None,
     confirmed_errors: Float[ndarray, "s b"] | None = None,
 ) -> Solution:
@@ -137,7 +137,7 @@ def with_decentring(estimate: Estimate, camera: Intrinsics) -> Estimate:
     )
 
 
-def with_prior_of_intrinsics(estimate: HandEye, camera: Camera) -> HandEye:
+def with_prior_of_intrinsics(estimate: HandEye, camera: CameraPrior) -> HandEye:
     """Return an estimate from a network's cameras with the prior uncertainty of the intrinsics.
 
     The focal length does not move these cameras. A wrong principal point rotates all of them, so that the transform and
@@ -184,7 +184,7 @@ def with_intrinsics_considered(
     base_from_gripper: Float[ndarray, "m 4 4"],
     recon_from_camera: Float[ndarray, "m 4 4"],
     tracks: Tracks,
-    camera: Camera,
+    camera: CameraPrior,
     priors: tuple[LinearPrior, ...],
     systematic: Float[ndarray, "s s"],
 ) -> HandEye:
@@ -227,7 +227,7 @@ def with_intrinsics_considered(
 
 
 def _camera_with_other_intrinsics(
-    recon_from_camera: Float[ndarray, "4 4"], tracks: Tracks, rows: ndarray, camera: Camera
+    recon_from_camera: Float[ndarray, "4 4"], tracks: Tracks, rows: ndarray, camera: CameraPrior
 ) -> Float[ndarray, "c 4 4"]:
     """Return the camera poses that fit the image's points after one standard deviation more of each parameter."""
     x_in_camera = apply(inverse(recon_from_camera), tracks.points_in_recon[tracks.point[rows]].astype(float))

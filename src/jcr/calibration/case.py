@@ -15,7 +15,7 @@ from jcr.estimation.intrinsics_prior import (
     ESTIMATED,
     MEASURED,
     PRISM,
-    Camera,
+    CameraPrior,
     camera_about,
     camera_with_prior,
 )
@@ -80,7 +80,7 @@ class Case:
         return of_poses(self.robot.systematic, self.used)
 
     @property
-    def camera(self) -> Camera:
+    def camera(self) -> CameraPrior:
         """Camera with the prior of its intrinsics before the calibration."""
         given, found = self.capture.intrinsics, self.reconstruction.intrinsics
         if given is None and self.reconstruction.predicted_focal is not None:

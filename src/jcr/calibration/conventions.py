@@ -76,7 +76,7 @@ EULER_MISTAKES = _euler_mistakes()
 
 
 @dataclass(frozen=True)
-class Reading:
+class PoseConvention:
     """Convention or order of the poses, and its misfit."""
 
     name: str
@@ -92,7 +92,7 @@ class Reading:
         return self.translation_mm + 5 * self.rotation_deg
 
     @classmethod
-    def of(cls, name: str, solved: HandEye) -> "Reading":
+    def of(cls, name: str, solved: HandEye) -> "PoseConvention":
         """Return a reading with the misfit of its calibration."""
         metres, radians = solved.robot_noise.together
         return cls(name, 1e3 * metres, float(np.degrees(radians)), int(solved.inliers.sum()))
@@ -107,7 +107,7 @@ def better_reading(
     recon_from_camera: Poses,
     by_name: Mapping[bool, Poses] | None = None,
     solved: HandEye | None = None,
-) -> tuple[Reading, Reading] | None:
+) -> tuple[PoseConvention, PoseConvention] | None:
     """Return the reading that fits far better than the poses as given, and the reading as given; None without one.
 
     `by_name` holds the poses by other orders of the images' names: as numbers (True), as text (False). `solved` is the
@@ -117,7 +117,7 @@ def better_reading(
     given, *others = _candidates(base_from_gripper)
     for by_number, poses in (by_name or {}).items():
         others.append((BY_NUMBER if by_number else BY_TEXT, poses, np.arange(n)))
-    as_given = _solved(given, recon_from_camera) if solved is None else Reading.of(given[0], solved)
+    as_given = _solved(given, recon_from_camera) if solved is None else PoseConvention.of(given[0], solved)
     if as_given.misfit < FITS and as_given.used >= MIN_SHARE * n:
         return None
     camera_angle = _angles(recon_from_camera)
@@ -141,7 +141,9 @@ def better_reading(
     return (best, as_given) if is_better else None
 
 
-def convention_finding(found: tuple[Reading, Reading], severity: Severity = "rejects") -> Finding:
+def convention_finding(
+    found: tuple[PoseConvention, PoseConvention], severity: Severity = "rejects"
+) -> Finding:
     """Return the finding that the poses fit under another reading, with the remedy."""
     best, given = (
         f"{reading.translation_mm:.1f} mm and {reading.rotation_deg:.2f}° per axis over {reading.used} images"
@@ -153,9 +155,11 @@ def convention_finding(found: tuple[Reading, Reading], severity: Severity = "rej
     return replace(finding, details=details)
 
 
-def _solved(candidate: _Candidate, recon_from_camera: Poses) -> Reading:
+def _solved(candidate: _Candidate, recon_from_camera: Poses) -> PoseConvention:
     name, base_from_gripper, image = candidate
-    return Reading.of(name, fit_hand_eye(base_from_gripper, recon_from_camera[image], in_sequence=False))
+    return PoseConvention.of(
+        name, fit_hand_eye(base_from_gripper, recon_from_camera[image], in_sequence=False)
+    )
 
 
 def _rough_error(candidate: _Candidate, recon_from_camera: Poses) -> float:

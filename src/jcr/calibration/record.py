@@ -274,14 +274,14 @@ class MotionObservability(Part):
     advice: list[str]
 
 
-class Noise(Part):
+class PoseNoise(Part):
     """Random noise of the gripper poses, one sigma per axis."""
 
     translation_mm: float
     rotation_deg: float
     estimated: bool
 
-    def record(self, errors: "RobotErrors | None") -> RobotNoise:
+    def record(self, errors: "EstimatedRobotErrors | None") -> RobotNoise:
         """Return the noise with the systematic errors that are left in the poses."""
         left = (
             (0.0, 0.0) if errors is None else (errors.translation_mm / 1e3, np.radians(errors.rotation_deg))
@@ -301,7 +301,7 @@ class JointOffset(Part):
     std_deg: Spread
 
 
-class RobotErrors(Part):
+class EstimatedRobotErrors(Part):
     """Systematic errors of the gripper poses, as estimated."""
 
     systematic_deg: Spread
@@ -313,7 +313,7 @@ class RobotErrors(Part):
     """The joints from the base on; null where the arm is not known."""
 
     @classmethod
-    def of(cls, robot: HandEye) -> "RobotErrors":
+    def of(cls, robot: HandEye) -> "EstimatedRobotErrors":
         """Return the errors of a robot that the residuals show."""
         offsets, joints = robot.joint_offsets, None
         if offsets is not None:
@@ -378,7 +378,7 @@ class Calibration(Part):
     """Along axes of the gripper; of a fixed camera along axes of the base."""
     held_out: LeaveOneOut | None
     observability: MotionObservability
-    robot_noise: Noise | None
+    robot_noise: PoseNoise | None
     intrinsics: IntrinsicsAndStd | None
     """Intrinsics that belong to the transform."""
     findings: list[FindingJson]
@@ -389,7 +389,7 @@ class Calibration(Part):
     version: str
     next_poses: list[Proposal] = []
     scale_check: ScaleCheck | None = None
-    robot_errors: RobotErrors | None = None
+    robot_errors: EstimatedRobotErrors | None = None
     depth_check: DepthCheck | None = None
     lengths: list[LengthCheck] = []
     """Every length that was compared with the robot's positions."""
@@ -594,7 +594,7 @@ def calibration_of(
         "version": version,
         "next_poses": [{name: pose[name] for name in Proposal.model_fields} for pose in proposals],
         "scale_check": hand_eye.network,
-        "robot_errors": RobotErrors.of(hand_eye),
+        "robot_errors": EstimatedRobotErrors.of(hand_eye),
         "depth_check": hand_eye.depth,
         "lengths": list(hand_eye.lengths),
         "board": hand_eye.board,

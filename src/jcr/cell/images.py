@@ -11,7 +11,7 @@ from jcr.calibration.case import MIN_OBSERVATIONS, of_images
 from jcr.calibration.options import CalibrateOptions
 from jcr.cell.camera_views import CameraViews
 from jcr.cell.rigs import Rigs
-from jcr.estimation.intrinsics_prior import Camera, camera_about
+from jcr.estimation.intrinsics_prior import CameraPrior, camera_about
 from jcr.estimation.observations import Observations
 from jcr.estimation.problem import Problem, RigGaussian, State, with_observations
 from jcr.estimation.score_test import freed, with_camera
@@ -47,7 +47,7 @@ class CellImages:
         return solve(*with_observations(self.problem, self.state, self.observations))
 
     def with_freed(
-        self, prior: Camera, camera: int, combinations: Float[ndarray, "e p"] | None = None
+        self, prior: CameraPrior, camera: int, combinations: Float[ndarray, "e p"] | None = None
     ) -> "CellImages":
         """Return the cell with another prior of a camera's intrinsics.
 
@@ -132,7 +132,7 @@ def cell_images(
 
 def _cameras(
     capture: Capture, own: Intrinsics, hand_eye: HandEye, members: Sequence[CameraViews]
-) -> tuple[Camera, ...]:
+) -> tuple[CameraPrior, ...]:
     """Return the cameras with the prior of their intrinsics; a mount is free only beside another camera on its rig.
 
     Given intrinsics that the own camera's images contradict count as estimated.

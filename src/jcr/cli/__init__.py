@@ -22,34 +22,37 @@ from jcr.errors import InputError, RejectedError, did_you_mean, printable
 
 GROUPS = {
     "calibrate": {
-        "run": ("everything: reconstruct, calibrate, map, report", "run.Run"),
-        "calibrate": ("reconstruct and calibrate only: calibration.json", "run.Calibrate"),
-        "add-camera": ("locate a fixed camera from its images of a run's scene", "run.AddCamera"),
-        "batch": ("run many captures, on this machine or a Ray cluster", "run.Batch"),
+        "run": ("everything: reconstruct, calibrate, map, report", "run.RunCommand"),
+        "calibrate": ("reconstruct and calibrate only: calibration.json", "run.CalibrateCommand"),
+        "add-camera": ("locate a fixed camera from its images of a run's scene", "run.AddCameraCommand"),
+        "batch": ("run many captures, on this machine or a Ray cluster", "run.BatchCommand"),
     },
     "use": {
-        "export": ("export to ROS, MoveIt, OctoMap, cuRobo, COLMAP, nerfstudio, …", "use.Export"),
-        "query": ("query the map at points: occupancy, distance, colour, label", "use.Query"),
-        "measure": ("measure the support plane and the objects on it", "use.Measure"),
-        "view": ("show a run in 3D, in the browser", "use.View"),
-        "map": ("build or rebuild the map of a run", "use.Map"),
+        "export": ("export to ROS, MoveIt, OctoMap, cuRobo, COLMAP, nerfstudio, …", "use.ExportCommand"),
+        "query": ("query the map at points: occupancy, distance, colour, label", "use.QueryCommand"),
+        "measure": ("measure the support plane and the objects on it", "use.MeasureCommand"),
+        "view": ("show a run in 3D, in the browser", "use.ViewCommand"),
+        "map": ("build or rebuild the map of a run", "use.MapCommand"),
     },
     "check": {
-        "check": ("check a capture before any heavy work", "check.Check"),
-        "verify": ("has the camera moved? test a calibration with a few new images", "check.Verify"),
+        "check": ("check a capture before any heavy work", "check.CheckCommand"),
+        "verify": ("has the camera moved? test a calibration with a few new images", "check.VerifyCommand"),
         "compare": (
             "compare two calibrations: do their uncertainties explain the difference?",
-            "check.Compare",
+            "check.CompareCommand",
         ),
-        "touch": ("touch test: compare points touched with the robot's tip with the map", "check.Touch"),
+        "touch": (
+            "touch test: compare points touched with the robot's tip with the map",
+            "check.TouchCommand",
+        ),
     },
     "prepare": {
-        "capture": ("take a capture live, with advice on the next pose", "capture.Capture"),
-        "board": ("draw a calibration board to print, if you want one", "prepare.Board"),
+        "capture": ("take a capture live, with advice on the next pose", "capture.CaptureCommand"),
+        "board": ("draw a calibration board to print, if you want one", "prepare.BoardCommand"),
     },
     "more": {
-        "models": ("list back ends with their licences; download weights", "prepare.Models"),
-        "docs": ("print the pages of the manual", "prepare.Docs"),
+        "models": ("list back ends with their licences; download weights", "prepare.ModelsCommand"),
+        "docs": ("print the pages of the manual", "prepare.DocsCommand"),
     },
 }
 """Commands by their group: what each does, and module and class of its arguments."""

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Capture:
+class CaptureCommand:
     """Take a capture live, with a camera and the gripper poses of a robot, and see what is still missing.
 
     An image is taken when the arm rests, and kept if it is sharp and nothing moves. The calibration is made meanwhile:
@@ -92,7 +92,7 @@ class Capture:
         return _take(self, self.out, self.robot)
 
 
-def _take(arguments: Capture, out: Path, robot: RobotName | None) -> int:
+def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
     """Take images until there are enough, or the calibration is as accurate as required; calibrate all of them."""
     from jcr.live.arms import states_of
     from jcr.live.calibration import LiveCalibration
@@ -132,7 +132,7 @@ def _take(arguments: Capture, out: Path, robot: RobotName | None) -> int:
 
 
 def _conclude(
-    arguments: Capture,
+    arguments: CaptureCommand,
     folder: "LiveFolder",
     answers: "list[Answer]",
     result: "RunResult | None",
@@ -167,7 +167,7 @@ def _print(text: str) -> None:
 
 
 def _source(
-    arguments: Capture, session: "LiveSession", states: "States | None", server: "LiveServer"
+    arguments: CaptureCommand, session: "LiveSession", states: "States | None", server: "LiveServer"
 ) -> "Callable[[], None]":
     """Return the function that requests images where `--poses` says; read typed commands."""
     from jcr.live.robot import HELP, RobotState, typed_poses, without_commands
@@ -192,7 +192,7 @@ def _source(
     return lambda: server.await_samples(arguments.timeout)
 
 
-def _listen(arguments: Capture) -> "Listen":
+def _listen(arguments: CaptureCommand) -> "Listen":
     """Return the address of the server; raise InputError where it is open to others without a token."""
     from jcr.live.arms import address_of
     from jcr.live.server import Listen
@@ -205,7 +205,7 @@ def _listen(arguments: Capture) -> "Listen":
     return listen
 
 
-def _notation(arguments: Capture, folder: "LiveFolder") -> "Notation":
+def _notation(arguments: CaptureCommand, folder: "LiveFolder") -> "Notation":
     """Return the notation of printed poses: that of the options, else that of the arm."""
     from jcr.live.arms import NOTATIONS
     from jcr.live.progress import Notation

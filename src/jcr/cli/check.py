@@ -26,7 +26,7 @@ UNLIKELY = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check:
+class CheckCommand:
     """Check a capture: files, units, motion, observability, pose convention, and which poses to add.
 
     The exit status is 3 if its calibration would be rejected; the message has the reason and the remedy.
@@ -87,7 +87,7 @@ class Check:
         return 3 if found.verdict == "rejected" else 0
 
 
-def _check_text(command: Check, capture: "Capture | PosePairs", found: "Examination") -> str:
+def _check_text(command: CheckCommand, capture: "Capture | PosePairs", found: "Examination") -> str:
     """Return the verdict with its cause and remedy, or with what a calibration is expected to reach."""
     from jcr.calibration.words import MOST_LINES, actions, labelled, verdict_in_words
     from jcr.findings import sentence
@@ -183,7 +183,7 @@ def _check_facts(capture: "Capture | PosePairs", found: "Examination") -> dict[s
 
 
 @dataclass(frozen=True)
-class Compare:
+class CompareCommand:
     """Compare two calibrations: their difference in mm and degrees, and whether their covariances explain it.
 
     Each is a run folder, a calibration.json, or any JSON with a `gripper_from_camera` (a capture's reference.json, or
@@ -249,7 +249,7 @@ def _difference_lines(found: "Difference", is_contradiction: bool) -> list[str]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verify:
+class VerifyCommand:
     """Test a calibration with new images: has the camera moved on the gripper since?
 
     OUT is the run folder of the calibration; its capture must still be at its old path. CAPTURE is a capture in any
@@ -328,7 +328,7 @@ def _drift_facts(found: "Verification") -> dict[str, object]:
 
 
 @dataclass(frozen=True)
-class Touch:
+class TouchCommand:
     """Measure the error in task space: touch points with a calibrated tip and compare them with the map.
 
     OUT is the folder of a run, POINTS a CSV with one line per point: image, x_px, y_px (the pixel of an image of the

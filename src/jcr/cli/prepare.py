@@ -21,7 +21,7 @@ SCALES = {True: "metres", False: "arbitrary", None: "your file's is_metric"}
 
 
 @dataclass(frozen=True)
-class Board:
+class BoardCommand:
     """Write a ChArUco board or chessboard at its exact size, with rulers to check the printer.
 
     Print it at 100 %, measure the rulers, and calibrate with the --board that the sheet names.
@@ -56,7 +56,7 @@ class Board:
 
 
 @dataclass(frozen=True)
-class Docs:
+class DocsCommand:
     """Print a page of the manual, or list the pages.
 
     for example:
@@ -119,7 +119,7 @@ def title(path: Path) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Models:
+class ModelsCommand:
     """List the back ends with their licences, and what is installed on this machine; or download weights.
 
     Those that `--backend auto` may try come first, in its order. Listing downloads nothing.

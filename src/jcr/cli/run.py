@@ -25,14 +25,14 @@ from jcr.segments.options import SegmentOptions
 
 if TYPE_CHECKING:
     from jcr.cell.placement import CameraPlacement
-    from jcr.pipeline.batch import Row
+    from jcr.pipeline.batch import BatchRow
     from jcr.progress import Progress
     from jcr.records import Capture, PosePairs
     from jcr.run_folder import RunOptions, RunResult
 
 
 @dataclass(frozen=True, kw_only=True)
-class Calibrate:
+class CalibrateCommand:
     """Calibrate a capture, without dense depth and map: calibration.json, report.html and log.txt.
 
     CAPTURE may also be a samples file of easy_handeye2 or MoveIt Calibration, whose marker poses need no images.
@@ -73,7 +73,7 @@ class Calibrate:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Run(Calibrate):
+class RunCommand(CalibrateCommand):
     """Reconstruct, calibrate, map and report a capture.
 
     CAPTURE is a folder with capture.json and images, or any format that `jcr docs captures` lists: images and a table
@@ -112,7 +112,7 @@ class Run(Calibrate):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Batch:
+class BatchCommand:
     """Run many captures, each into its own folder in OUT, and rank them in OUT/summary.csv and .html.
 
     A capture that fails does not stop the others. The same command again runs only what is missing or has changed. The
@@ -152,7 +152,7 @@ class Batch:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AddCamera:
+class AddCameraCommand:
     """Locate a fixed camera (base_from_camera) from its images of the scene of a run.
 
     OUT is the run folder; the capture of the run must still be at its old path. No marker is needed: the images are
@@ -208,7 +208,7 @@ def _announce(path: Path) -> None:
         sys.stderr.flush()
 
 
-def _source(command: Calibrate, progress: "Progress") -> "Capture | PosePairs":
+def _source(command: CalibrateCommand, progress: "Progress") -> "Capture | PosePairs":
     """Read the capture of a command; the frames of a recording are put in the run folder."""
     _announce(command.capture)
     from jcr.capture.read import read_source
@@ -243,7 +243,9 @@ def with_images(found: "Capture | PosePairs", path: Path, needed: str) -> "Captu
     return found
 
 
-def _run(command: Calibrate, capture: "Capture", options: "RunOptions", progress: "Progress") -> "RunResult":
+def _run(
+    command: CalibrateCommand, capture: "Capture", options: "RunOptions", progress: "Progress"
+) -> "RunResult":
     """Run a capture, and print the calibration as soon as it stands.
 
     Where no back end found anything, calibration.json has the reason.
@@ -318,7 +320,7 @@ def _camera_in_words(camera: "CameraPlacement") -> str:
     )
 
 
-def _line(ranked: "tuple[int, Row]") -> str:
+def _line(ranked: "tuple[int, BatchRow]") -> str:
     """Return the line of a row of a batch."""
     rank, row = ranked
     std = "" if row.offset_std_mm is None else f"± {row.offset_std_mm:.2f} mm, {row.turn_std_deg:.3f}°"

@@ -29,7 +29,7 @@ _FORMATS = "%.6f,%.6f,%.6f,%.4f,%d,%.5f,%.4f,%.4f,%.4f,%d,%d,%d,%d"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Map:
+class MapCommand:
     """(Re)build cloud, map and report of a run with other options, or with further images.
 
     for example:
@@ -64,7 +64,7 @@ class Map:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export:
+class ExportCommand:
     """Write a run's calibration or map in another tool's format; without FORMAT, list the formats.
 
     Every file names its frames and units. Map, images and cameras are in the robot's base frame, in metres. A
@@ -117,7 +117,7 @@ class Export:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Query:
+class QueryCommand:
     """Query the map of a run at points: occupancy, unknown, distance, its gradient, colour and label.
 
     Points are in metres, in the robot's base frame. Distances are NaN outside of the mapped workspace.
@@ -229,7 +229,7 @@ def _finite(column: ndarray) -> list:
 
 
 @dataclass(frozen=True)
-class Measure:
+class MeasureCommand:
     """Measure the support plane, and the height, footprint and box of each object on it, with 1 sigma.
 
     OUT is the folder of a run. `jcr map --segments` selects how the scene is divided into objects.
@@ -283,7 +283,7 @@ def sizes_table(measured: "Measurement") -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class View:
+class ViewCommand:
     """Show a run in the browser: points, cameras, grippers, robot, the map's layers, a sphere to drag.
 
     The page is served until Ctrl-C, and only to this machine; from another one use

@@ -22,7 +22,7 @@ GREY = 128
 """Colour where the images are no longer there."""
 
 
-class About(BaseModel):
+class DepthHeader(BaseModel):
     """JSON part of depth.npz."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -56,7 +56,7 @@ def is_made_from(path: Path, made_from: str) -> bool:
     if not path.is_file():
         return False
     with read_npz(path, FORMAT) as (text, _):
-        return About.model_validate_json(text, strict=True).made_from == made_from
+        return DepthHeader.model_validate_json(text, strict=True).made_from == made_from
 
 
 def read_depth(path: Path, reconstruction: Reconstruction, capture: Capture | None) -> Pointmaps:
@@ -65,7 +65,7 @@ def read_depth(path: Path, reconstruction: Reconstruction, capture: Capture | No
     Raises InputError when the file is damaged, of another format, or of other images.
     """
     with read_npz(path, FORMAT) as (text, file):
-        pinhole = About.model_validate_json(text, strict=True).intrinsics.record()
+        pinhole = DepthHeader.model_validate_json(text, strict=True).intrinsics.record()
         shape = len(reconstruction.image_index), pinhole.height, pinhole.width
         depth, std, confidence = (file[name] for name in ("depth", "relative_std", "confidence"))
         check_arrays(

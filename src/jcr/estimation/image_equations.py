@@ -20,7 +20,7 @@ from jcr.estimation.model_error import size_of
 from jcr.estimation.pixel_noise import pixel_noise, refined_noise
 from jcr.estimation.problem import Problem, State, image_step, similarities, similarities_of_rigs
 from jcr.estimation.projection import (
-    View,
+    ProjectedObservations,
     by_points,
     derivatives,
     shape_information,
@@ -60,7 +60,7 @@ class ImageEvidence:
 
     problem: Problem
     state: State
-    view: View
+    view: ProjectedObservations
     information: Float[ndarray, "d d"]
     """Information, including that of the priors of intrinsics and nuisances, and a negligible one of the world's
     similarity."""
@@ -113,7 +113,7 @@ def adjust_images(problem: Problem, state: State) -> ImageEvidence:
     return evidence(problem, state)
 
 
-def with_pixel_noise(problem: Problem, state: State, view: View) -> State:
+def with_pixel_noise(problem: Problem, state: State, view: ProjectedObservations) -> State:
     """Return the state with the pixel errors that its residuals show.
 
     Groups of observations, and observations by their stated variances, are distinguished where an estimate was made
@@ -128,7 +128,7 @@ def with_pixel_noise(problem: Problem, state: State, view: View) -> State:
     return replace(state, pixel_noise=noise)
 
 
-def weights_of(problem: Problem, state: State, view: View) -> Float[ndarray, " k"]:
+def weights_of(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, " k"]:
     """Return the weight of each observation, 1/px²."""
     assert state.pixel_noise is not None
     return state.pixel_noise.weights(view.residual_px, view.depth, problem.layout)
@@ -136,7 +136,7 @@ def weights_of(problem: Problem, state: State, view: View) -> Float[ndarray, " k
 
 def adjusted_images(
     problem: Problem, state: State, known: Sequence[RigInformation], damping: float = START_DAMPING
-) -> tuple[State, View, float]:
+) -> tuple[State, ProjectedObservations, float]:
     """Adjust the columns of the images with the weights that observations have at the start; return also the damping.
 
     `known` is information about the rigs beside that of the images and `known_rigs`.
@@ -144,7 +144,9 @@ def adjusted_images(
     view = view_of(problem, state)
     weight, known = weights_of(problem, state, view), [*_known_rigs(problem), *known]
 
-    def step(now: tuple[State, View], _: None, damping: float) -> tuple[State, View]:
+    def step(
+        now: tuple[State, ProjectedObservations], _: None, damping: float
+    ) -> tuple[State, ProjectedObservations]:
         normal = _normal_equations(problem, *now, weight, known, damping)
         scale = 1 / np.sqrt(np.maximum(normal.hessian.diagonal(), FAINT))
         # Along the similarity of the world the step is the smallest one.
@@ -171,7 +173,7 @@ def evidence(problem: Problem, state: State) -> ImageEvidence:
     return linearised(problem, state, view_of(problem, state))[0]
 
 
-def linearised(problem: Problem, state: State, view: View) -> tuple[ImageEvidence, Normal]:
+def linearised(problem: Problem, state: State, view: ProjectedObservations) -> tuple[ImageEvidence, Normal]:
     """Return the evidence about a state, and the normal equations, which step the points."""
     weight = weights_of(problem, state, view)
     normal = _normal_equations(problem, state, view, weight, _known_rigs(problem), 0.0)
@@ -211,7 +213,7 @@ def with_model_error_of(images: ImageEvidence) -> tuple[ImageEvidence, float]:
     return replace(images, state=state, information=information, gradient=gradient), change
 
 
-def median_reprojection_px(problem: Problem, view: View) -> Float[ndarray, " n"]:
+def median_reprojection_px(problem: Problem, view: ProjectedObservations) -> Float[ndarray, " n"]:
     """Return the median reprojection error of every image; NaN of an image without observations."""
     assert problem.observations is not None
     length, image = np.linalg.norm(view.residual_px, axis=1), problem.observations.image
@@ -237,7 +239,7 @@ def information_along(steps: Float[ndarray, "d 7"], strength: float) -> Float[nd
 def _cost(
     problem: Problem,
     state: State,
-    view: View,
+    view: ProjectedObservations,
     weight: Float[ndarray, " k"],
     known: Sequence[RigInformation],
 ) -> float:
@@ -263,7 +265,7 @@ def _known_rigs(problem: Problem) -> list[RigInformation]:
 def _normal_equations(
     problem: Problem,
     state: State,
-    view: View,
+    view: ProjectedObservations,
     weight: Float[ndarray, " k"],
     known: Sequence[RigInformation],
     damping: float,

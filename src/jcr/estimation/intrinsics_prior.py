@@ -54,7 +54,7 @@ LEAST = 1e-12
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Camera:
+class CameraPrior:
     """A camera, independent directions in which its intrinsics may differ, and their standard deviations."""
 
     intrinsics: Intrinsics
@@ -68,7 +68,7 @@ class Camera:
 
 def camera_with_prior(
     intrinsics: Intrinsics, std: Mapping[str, float] | Float[ndarray, " q"] = MEASURED
-) -> Camera:
+) -> CameraPrior:
     """Return the camera with relative standard deviations as in MEASURED, or one for each of its `parameters`.
 
     One that is not a number is that of MEASURED. Coefficients that the distortion model does not have are left out.
@@ -77,7 +77,7 @@ def camera_with_prior(
         usual = camera_with_prior(intrinsics)
         std = np.where(np.isnan(std), np.sqrt(usual.directions**2 @ usual.std**2), std)
         free = np.flatnonzero(std > LEAST)
-        return Camera(intrinsics=intrinsics, directions=np.eye(len(std))[:, free], std=std[free])
+        return CameraPrior(intrinsics=intrinsics, directions=np.eye(len(std))[:, free], std=std[free])
     fx, fy, width = intrinsics.fx, intrinsics.fy, intrinsics.width
     moves = {
         "f": {"fx": fx, "fy": fy},
@@ -91,10 +91,10 @@ def camera_with_prior(
     for column, name in enumerate(known):
         for parameter, unit in moves.get(name, {name: 1.0}).items():
             directions[names.index(parameter), column] = unit
-    return Camera(intrinsics=intrinsics, directions=directions, std=np.array(list(known.values())))
+    return CameraPrior(intrinsics=intrinsics, directions=directions, std=np.array(list(known.values())))
 
 
-def camera_about(found: Intrinsics, given: bool, std: Float[ndarray, " q"] | None = None) -> Camera:
+def camera_about(found: Intrinsics, given: bool, std: Float[ndarray, " q"] | None = None) -> CameraPrior:
     """Return a camera whose intrinsics were given, with standard deviations or not, or were estimated."""
     if not given:
         return camera_with_prior(found, ESTIMATED)

@@ -8,7 +8,7 @@ from numpy import ndarray
 from numpy.polynomial.legendre import legvander2d
 
 from jcr.camera import by_parameters, unproject
-from jcr.estimation.intrinsics_prior import Camera
+from jcr.estimation.intrinsics_prior import CameraPrior
 from jcr.records import Intrinsics, ModelError
 
 DEGREE = 5
@@ -22,7 +22,10 @@ WORTH = 2.0
 
 
 def displacements(
-    cameras: Sequence[Camera], counts: Sequence[int], x_px: Float[ndarray, "k 2"], camera: Int[ndarray, " k"]
+    cameras: Sequence[CameraPrior],
+    counts: Sequence[int],
+    x_px: Float[ndarray, "k 2"],
+    camera: Int[ndarray, " k"],
 ) -> Float[ndarray, "k 2 e"]:
     """Return the displacement of each observation by each of the `counts` polynomials of each camera.
 
@@ -64,7 +67,7 @@ def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], 
     return float(np.sqrt(variance))
 
 
-def expressed(camera: Camera, x_px: Float[ndarray, "k 2"]) -> Float[ndarray, "q e"]:
+def expressed(camera: CameraPrior, x_px: Float[ndarray, "k 2"]) -> Float[ndarray, "q e"]:
     """Return the part of each polynomial over these pixels that the camera's parameters express."""
     intrinsics = camera.intrinsics
     by_prior = by_parameters(intrinsics, unproject(intrinsics, x_px)) @ camera.directions
@@ -86,7 +89,7 @@ def second_moment_px2(
     return (by @ moment @ np.swapaxes(by, 1, 2)).reshape(*x_px.shape, 2)
 
 
-def polynomials_of(camera: Camera) -> int:
+def polynomials_of(camera: CameraPrior) -> int:
     """Return the number of displacements of a camera; 0 where its intrinsics are exact."""
     return (DEGREE + 1) * (DEGREE + 2) if len(camera.std) else 0
 

@@ -15,7 +15,7 @@ from jcr.camera import parameters, project, unproject, with_parameters
 from jcr.estimation.covariance import expected_covariance_at
 from jcr.estimation.equation import Poses
 from jcr.estimation.image_equations import evidence
-from jcr.estimation.intrinsics_prior import Camera, camera_about
+from jcr.estimation.intrinsics_prior import CameraPrior, camera_about
 from jcr.estimation.next_poses import assumed_camera, median_distance
 from jcr.estimation.pixel_noise import PixelNoise
 from jcr.estimation.point_uncertainty import in_use
@@ -55,7 +55,7 @@ USUAL_FOCAL = 0.8
 class PredictedCamera:
     """A camera with the prior of its intrinsics, and the information of its images."""
 
-    camera: Camera
+    camera: CameraPrior
     information_per_px2: float = TYPICAL_INFORMATION
     """Mean over the images of the sum of the inverse variances of the observations of one coordinate."""
     model_error: float = TYPICAL_MODEL_ERROR

@@ -18,7 +18,7 @@ from jcr.camera import parameters, unproject, with_parameters
 from jcr.estimation.boards import BoardShapes
 from jcr.estimation.elimination import Sightings
 from jcr.estimation.equation import SCALE, UNKNOWNS, columns_of_arm
-from jcr.estimation.intrinsics_prior import Camera
+from jcr.estimation.intrinsics_prior import CameraPrior
 from jcr.estimation.model_error import TYPICAL, displacements, polynomials_of
 from jcr.estimation.observations import Observations, sorted_by_point
 from jcr.estimation.pixel_noise import Layout, PixelNoise
@@ -113,7 +113,7 @@ class Problem:
 
     arms: tuple[ReportedPoses, ...]
     n_rigs: int
-    cameras: tuple[Camera, ...] = ()
+    cameras: tuple[CameraPrior, ...] = ()
     observations: Observations | None = None
     """Sorted by point and rig, every point with at least two; None: the poses of the rigs are in `known_rigs`."""
     boards: BoardShapes | None = None

@@ -22,7 +22,7 @@ CENTRE = slice(2, 4)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class View:
+class ProjectedObservations:
     """Observed points in the frames of their cameras, and the residuals."""
 
     cameras: tuple[Intrinsics, ...]
@@ -44,7 +44,7 @@ class View:
         return self.in_camera[:, 2]
 
 
-def view_of(problem: Problem, state: State) -> View:
+def view_of(problem: Problem, state: State) -> ProjectedObservations:
     """Return the observed points as the state projects them."""
     observations = problem.observations
     assert observations is not None
@@ -71,7 +71,7 @@ def view_of(problem: Problem, state: State) -> View:
         projected += problem.prism @ parameters[-PRISM:]
     first, last = problem.columns.nuisance.stop, problem.columns.boards.start
     projected += problem.displacements @ state.camera_steps[first:last]
-    return View(
+    return ProjectedObservations(
         cameras=cameras,
         from_rig=from_rig,
         from_camera=from_camera,
@@ -82,7 +82,9 @@ def view_of(problem: Problem, state: State) -> View:
     )
 
 
-def derivatives(problem: Problem, state: State, view: View, weight: Float[ndarray, " k"]) -> Derivatives:
+def derivatives(
+    problem: Problem, state: State, view: ProjectedObservations, weight: Float[ndarray, " k"]
+) -> Derivatives:
     """Return residuals and derivatives of all rows of the equations, times the square roots of their weights."""
     columns, root = problem.columns, np.sqrt(weight)[:, None, None]
     by_rig = root * _by_rig(problem, state, view)
@@ -134,7 +136,7 @@ def shape_information(problem: Problem, state: State) -> Float[ndarray, "p 3 3"]
     return problem.boards.point_information(state.world_from_rig, shape, len(state.points_in_world))
 
 
-def by_points(problem: Problem, state: State, view: View) -> Float[ndarray, "k 2 3"]:
+def by_points(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, "k 2 3"]:
     """Return the derivative of every observation by its point, world axes."""
     out = _by_rig(problem, state, view)
     for pose, rows in zip(state.world_from_rig, problem.seen.rows, strict=True):
@@ -142,7 +144,7 @@ def by_points(problem: Problem, state: State, view: View) -> Float[ndarray, "k 2
     return out
 
 
-def _by_rig(problem: Problem, state: State, view: View) -> Float[ndarray, "k 2 3"]:
+def _by_rig(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, "k 2 3"]:
     """Return the derivative of every observation by its point, rig axes."""
     out = np.empty((len(view.in_camera), 2, 3))
     for camera, mount, rows in zip(view.cameras, state.rig_from_camera, problem.camera_rows, strict=True):
@@ -150,7 +152,7 @@ def _by_rig(problem: Problem, state: State, view: View) -> Float[ndarray, "k 2 3
     return out if view.own_map is None else _mapped(view.own_map, out)
 
 
-def _by_cameras(problem: Problem, state: State, view: View) -> Float[ndarray, "k 2 l"]:
+def _by_cameras(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, "k 2 l"]:
     """Return the derivative of every observation by the steps of intrinsics and nuisances."""
     out = np.zeros((len(view.in_camera), 2, problem.columns.nuisance.stop))
     each = list(

@@ -19,7 +19,7 @@ from jcr.camera import parameter_names
 from jcr.distributions import f as f_distribution
 from jcr.estimation.cholesky import cholesky, over
 from jcr.estimation.image_equations import ImageEvidence, evidence
-from jcr.estimation.intrinsics_prior import Camera
+from jcr.estimation.intrinsics_prior import CameraPrior
 from jcr.estimation.pose_equations import pose_equations
 from jcr.estimation.problem import OF_IMAGE, PRISM, Problem, State, with_free
 from jcr.estimation.robot_noise import solve_equations
@@ -99,7 +99,7 @@ def first_x(state: State) -> Transform:
 
 def alternatives(
     solution: Solution,
-    prior: Camera,
+    prior: CameraPrior,
     camera: int = 0,
     place: Callable[[State], Transform] = first_x,
     model_error_std: float | None = None,
@@ -166,7 +166,7 @@ def nuisances_of(images: Int[ndarray, " m"], count: int) -> Int[ndarray, " r"]:
 
 def _with_all_free(
     solution: Solution,
-    prior: Camera,
+    prior: CameraPrior,
     camera: int,
     images: Int[ndarray, " m"],
     model_error_std: float | None,
@@ -201,14 +201,14 @@ def _with_all_free(
     return evidence(all_free, replace(state, camera_steps=wider_steps, model_error_std=sizes))
 
 
-def with_camera(problem: Problem, prior: Camera, camera: int = 0) -> Problem:
+def with_camera(problem: Problem, prior: CameraPrior, camera: int = 0) -> Problem:
     """Return the problem with another prior of a camera's intrinsics."""
     cameras = problem.cameras
     prior = replace(prior, mount_free=cameras[camera].mount_free)
     return replace(problem, cameras=(*cameras[:camera], prior, *cameras[camera + 1 :]))
 
 
-def beyond_prior(solution: Solution, prior: Camera, camera: int = 0) -> Float[ndarray, " q"]:
+def beyond_prior(solution: Solution, prior: CameraPrior, camera: int = 0) -> Float[ndarray, " q"]:
     """Return the displacement of a camera's parameters along directions that were freed beside its prior."""
     problem, own = solution.problem, len(prior.std)
     steps = solution.images.state.camera_steps[problem.columns.intrinsics[camera]]

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.estimation.boards import BoardShapes, shapes_of
-from jcr.estimation.intrinsics_prior import FIXED, Camera, camera_with_prior
+from jcr.estimation.intrinsics_prior import FIXED, CameraPrior, camera_with_prior
 from jcr.estimation.model_error import expressed
 from jcr.estimation.observations import Observations
 from jcr.estimation.problem import (
@@ -61,7 +61,7 @@ def pose_problem(
 
 def image_problem(
     world_from_rig: Float[ndarray, "m 4 4"],
-    camera: Camera,
+    camera: CameraPrior,
     observations: Observations,
     points_in_world: Float[ndarray, "p 3"],
     boards: BoardShapes | None = None,
@@ -79,7 +79,7 @@ def wrist_problem(
     arm: ReportedPoses,
     start: Start,
     recon_from_camera: Poses,
-    camera: Camera,
+    camera: CameraPrior,
     tracks: Tracks,
     *,
     noise: tuple[float, float] | None = None,
@@ -117,7 +117,7 @@ def adjust_wrist(  # noqa: PLR0913 (each is a fact about the capture)
     arm: ReportedPoses | Poses,
     start: Start,
     recon_from_camera: Poses,
-    camera: Camera | Intrinsics,
+    camera: CameraPrior | Intrinsics,
     tracks: Tracks,
     *,
     noise: tuple[float, float] | None = None,

@@ -82,7 +82,7 @@ def export_run(
 
 def write_run(
     out: Path, format: ExportName, path: Path | None, options: ExportOptions
-) -> "tuple[Run, ExportFormat, Path, bool]":
+) -> "tuple[ExportedRun, ExportFormat, Path, bool]":
     """Write a run folder in a format; return run, row of the table, path, and whether other content was replaced.
 
     Raises InputError for a format that does not exist, options that it cannot serve, and a run that lacks what it
@@ -97,7 +97,7 @@ def write_run(
     if options.root_from_optical and not options.to_root:
         raise InputError("--root-from-optical: needs --to-root LINK, the link it is given in")
     path = path or out / "export" / row.file
-    run = Run(out, options, path)
+    run = ExportedRun(out, options, path)
     if run.doubt is not None and not options.force:
         raise RejectedError(
             f"{out}: its calibration is rejected, and nothing was exported: {run.doubt}; to export it nevertheless, "
@@ -116,7 +116,7 @@ def write_run(
     return run, row, path, before is not None and path.read_bytes() != before
 
 
-class Run:
+class ExportedRun:
     """Run folder with export options; only the data that a format needs are read."""
 
     def __init__(self, out: Path, options: ExportOptions, path: Path) -> None:

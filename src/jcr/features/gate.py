@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.estimation.closed_form import sine_axis
-from jcr.features.two_view import Reading
+from jcr.features.two_view import TwoViewMotion
 from jcr.geometry import nearest_rotation, rotation_angle, rotation_exp, rotation_log
 
 ROBOT_STD = math.radians(0.3)
@@ -51,7 +51,7 @@ class Pair:
     """Rows of the two images."""
     rows: Int[ndarray, "m 2"]
     """Rows of the matched keypoints of both."""
-    readings: tuple[Reading, ...]
+    readings: tuple[TwoViewMotion, ...]
     """Best first; empty where none could be found."""
 
 
@@ -80,7 +80,7 @@ class Gate:
     """None while too few pairs agree."""
 
 
-def agreeing_readings(pair: Pair, angle: float, systematic: float) -> list[tuple[Reading, float]]:
+def agreeing_readings(pair: Pair, angle: float, systematic: float) -> list[tuple[TwoViewMotion, float]]:
     """Return the readings whose angle is the gripper's, with the largest difference (rad) that each allows."""
     found = []
     for reading in pair.readings:
@@ -136,7 +136,7 @@ def judge(
     return Gate(tuple(confirmed), tuple(undecided), tuple(contradicted), of_x)
 
 
-def _rotation_tolerance(reading: Reading, angle: float, of_x: RotationOfX, systematic: float) -> float:
+def _rotation_tolerance(reading: TwoViewMotion, angle: float, of_x: RotationOfX, systematic: float) -> float:
     """Return the largest angle (rad) between a pair's rotation and the one that X predicts."""
     own = float(np.trace(reading.covariance[:3, :3]))
     of_mean = 4 * math.sin(min(angle, math.pi) / 2) ** 2 * float(np.trace(of_x.covariance))
@@ -145,7 +145,7 @@ def _rotation_tolerance(reading: Reading, angle: float, of_x: RotationOfX, syste
 
 
 def _common_rotation(
-    passing: Sequence[tuple[Key, Reading, float]], motion: Float[ndarray, "n n 4 4"]
+    passing: Sequence[tuple[Key, TwoViewMotion, float]], motion: Float[ndarray, "n n 4 4"]
 ) -> RotationOfX | None:
     """Return X's rotation where enough pairs agree on it."""
     keys = [key for key, _, _ in passing]

@@ -56,7 +56,7 @@ class Features(Protocol):
 
 
 @dataclass(frozen=True)
-class View:
+class ImageGeometry:
     """Keypoints, rays and intrinsics of the images at the working size."""
 
     x_px: Sequence[Float[ndarray, "_ 2"]]
@@ -67,9 +67,9 @@ class View:
     """x/z, y/z of the keypoints through those intrinsics."""
 
     @staticmethod
-    def of(x_px: Sequence[Float[ndarray, "_ 2"]], intrinsics: Intrinsics) -> "View":
+    def of(x_px: Sequence[Float[ndarray, "_ 2"]], intrinsics: Intrinsics) -> "ImageGeometry":
         """Return the keypoints with their rays."""
-        return View(x_px, intrinsics, [unproject(intrinsics, x)[:, :2] for x in x_px])
+        return ImageGeometry(x_px, intrinsics, [unproject(intrinsics, x)[:, :2] for x in x_px])
 
 
 class Matcher:
@@ -114,7 +114,7 @@ class Matcher:
             self._verified[depends] = matched(x_px, self._camera, key, rows, self.seed, self.known)
         return self._verified[depends]
 
-    def pair(self, view: View, key: Key, geometry: pycolmap.TwoViewGeometry) -> Pair:
+    def pair(self, view: ImageGeometry, key: Key, geometry: pycolmap.TwoViewGeometry) -> Pair:
         """Return a geometry with its readings through the view's intrinsics, kept in memory."""
         depends = key, id(geometry), view.intrinsics
         if depends not in self._pairs:

@@ -8,7 +8,7 @@ from numpy import ndarray
 
 from jcr.camera import project
 from jcr.features.gate import Gate, Key
-from jcr.features.matchers import View
+from jcr.features.matchers import ImageGeometry
 from jcr.geometry import apply, inverse, motion_length, nearest_to_lines, rotation_angle, skew, transform
 
 FIRST_NEIGHBOURS, NEIGHBOURS = 4, 8
@@ -55,7 +55,7 @@ def viewpoints(motion: Float[ndarray, "n n 4 4"]) -> Int[ndarray, " n"]:
     return first
 
 
-def seen_in_common(view: View, found: Gate, motion: Float[ndarray, "n n 4 4"]) -> list[Key]:
+def seen_in_common(view: ImageGeometry, found: Gate, motion: Float[ndarray, "n n 4 4"]) -> list[Key]:
     """Return the pairs of every image with the viewpoints that share most of its scene, by X and the points so far."""
     x = translation_of_x(found, motion)
     if x is None:
@@ -104,7 +104,7 @@ def translation_of_x(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> Float[nd
 
 
 def _scene_points(
-    view: View, found: Gate, first_from_camera: Float[ndarray, "n 4 4"]
+    view: ImageGeometry, found: Gate, first_from_camera: Float[ndarray, "n 4 4"]
 ) -> Float[ndarray, "p 3"]:
     """Return points that confirmed pairs see with parallax, in the frame of the first gripper (m)."""
     kept = [np.zeros((0, 3))]

@@ -28,7 +28,7 @@ from jcr.features.gate import (
     judge,
     rolls,
 )
-from jcr.features.matchers import Geometries, Matcher, View, matrices
+from jcr.features.matchers import Geometries, ImageGeometry, Matcher, matrices
 from jcr.features.pairs import FEW, FIRST_NEIGHBOURS, NEIGHBOURS, all_pairs, near_pairs, seen_in_common
 from jcr.features.two_view import starting_motions
 from jcr.geometry import rotation_angle
@@ -79,7 +79,7 @@ class _Search:
 
     matcher: Matcher
     motion: Float[ndarray, "n n 4 4"]
-    view: View
+    view: ImageGeometry
     pairs: dict[Key, tuple[Pair, pycolmap.TwoViewGeometry]] = field(default_factory=dict)
     still: Bool[ndarray, "r c"] | None = None
     """Parts of the image that do not move."""
@@ -110,7 +110,7 @@ class _Search:
             return
         found = self.matcher.geometries(list(todo), np.array(list(todo.values())), coarse)
         if self.matcher.features.minds_roll:  # an image that is rotated brings keypoints of its own
-            self.view = View.of(self.matcher.x_px, self.view.intrinsics)
+            self.view = ImageGeometry.of(self.matcher.x_px, self.view.intrinsics)
         for key, geometry in found.items():
             clean = self._without_still(key, geometry)
             if clean is not None and self._is_better(pair := self.matcher.pair(self.view, key, clean)):
@@ -187,7 +187,7 @@ class _Search:
     def gate(self) -> Gate:
         """Return the gate with the given intrinsics, or with those for which most pairs agree with the gripper."""
         if not self.matcher.known and (intrinsics := self._intrinsics_by_robot()) is not None:
-            self.view = View.of(self.view.x_px, intrinsics)
+            self.view = ImageGeometry.of(self.view.x_px, intrinsics)
             self.pairs = {
                 key: (self.matcher.pair(self.view, key, geometry), geometry)
                 for key, (_, geometry) in self.pairs.items()
@@ -245,7 +245,7 @@ def match_with_robot(
     n, features = len(base_from_gripper), matcher.features
     motion = motions(base_from_gripper)
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
-    search = _Search(matcher=matcher, motion=motion, view=View.of(matcher.x_px, intrinsics))
+    search = _Search(matcher=matcher, motion=motion, view=ImageGeometry.of(matcher.x_px, intrinsics))
     everything = all_pairs(n) if n <= features.every_pair else near_pairs(motion, NEIGHBOURS)
     at_once = n <= FEW and not features.minds_roll
     first = everything if at_once else near_pairs(motion, FIRST_NEIGHBOURS)

@@ -24,7 +24,7 @@ LARGEST_SIGMA_PX = 3.0
 
 
 @dataclass(frozen=True)
-class Reading:
+class TwoViewMotion:
     """One way in which two images can have been taken."""
 
     rotation: Float[ndarray, "3 3"]
@@ -52,12 +52,12 @@ def readings(
     focal_px: float,
     j_from_i_essential: Float[ndarray, "3 3"] | None,
     j_from_i_homography: Float[ndarray, "3 3"] | None,
-) -> list[Reading]:
+) -> list[TwoViewMotion]:
     """Return the motions that explain matched directions (x/z, y/z), best first; empty where none fits.
 
     The matrices are of normalised coordinates, each where one was found.
     """
-    found: list[Reading] = []
+    found: list[TwoViewMotion] = []
     for start in starting_motions(ray_i, ray_j, j_from_i_essential, j_from_i_homography):
         reading = _least_squares_motion(*start, ray_i, ray_j, focal_px)
         if reading is None or reading.sigma_px > LARGEST_SIGMA_PX:
@@ -142,7 +142,7 @@ def _least_squares_motion(
     ray_i: Float[ndarray, "m 2"],
     ray_j: Float[ndarray, "m 2"],
     focal_px: float,
-) -> Reading | None:
+) -> TwoViewMotion | None:
     """Refine a motion by Gauss-Newton over five numbers under a Cauchy loss."""
     if len(ray_i) < 8:
         return None
@@ -167,7 +167,7 @@ def _least_squares_motion(
     # Matches of one detector share errors with their neighbours: no more than a hundred count as independent.
     independent = min(len(ray_i), 100) / len(ray_i)
     covariance = sigma**2 * np.linalg.inv(independent * information + 1e-6 * np.eye(5))
-    return Reading(rotation, direction, covariance, sigma)
+    return TwoViewMotion(rotation, direction, covariance, sigma)
 
 
 def _retracted(

@@ -46,7 +46,7 @@ GROUPS = {
 
 
 @dataclass(frozen=True)
-class Row:
+class KindRow:
     """Properties of a kind of finding."""
 
     group: str
@@ -68,9 +68,9 @@ class Row:
 class FindingKind(StrEnum):
     """Kinds of findings."""
 
-    row: Row
+    row: KindRow
 
-    def __new__(cls, name: str, row: Row) -> "FindingKind":
+    def __new__(cls, name: str, row: KindRow) -> "FindingKind":
         """Make a member whose value is its name and which carries its row."""
         member = str.__new__(cls, name)
         member._value_ = name
@@ -78,249 +78,249 @@ class FindingKind(StrEnum):
         return member
 
     # fmt: off
-    UNOBSERVABLE = "unobservable motion", Row("motion",
+    UNOBSERVABLE = "unobservable motion", KindRow("motion",
         "{nearly:nearly unobservable|unobservable} from these motions: {direction}", "{concerns:motion={move}|}",
         means="the motions do not determine a direction of translation, rotation or scale",
         evidence="excitation of that direction, 0 to 0.06",
         help="other motions; `details.motion` says what these are like")
-    FEW_IMAGES = "few images", Row("motion", "with {value:.0f} images a wrong one cannot be identified",
+    FEW_IMAGES = "few images", KindRow("motion", "with {value:.0f} images a wrong one cannot be identified",
         "take 8 or more", evidence="images")
-    FEW_AGREE = "few images agree", Row("motion",
+    FEW_AGREE = "few images agree", KindRow("motion",
         "only {value:.0f} of {images:.0f} images agree on one calibration",
         "check that images and poses are paired, and how the poses are written (jcr docs captures)",
         evidence="images that agree")
-    POSES_CONTRADICT_IMAGES = "gripper poses contradict the images", Row("motion",
+    POSES_CONTRADICT_IMAGES = "gripper poses contradict the images", KindRow("motion",
         "gripper poses and images disagree by {mm:.0f} mm and {deg:.1f}° per axis",
         "check the pairing, and how the poses are written (jcr docs captures)", evidence="m per axis")
-    POSE_CONVENTION = "pose convention", Row("motion",
+    POSE_CONVENTION = "pose convention", KindRow("motion",
         "the poses fit when read as {reading}: {fits}, instead of {given}", "{remedy}",
         explains=MISFIT, evidence="m per axis, when read so",
         help="the option in `remedy`, or correct them at their source")
-    NOISE_ABOVE_GIVEN = "noise above the given one", Row("motion",
+    NOISE_ABOVE_GIVEN = "noise above the given one", KindRow("motion",
         "gripper poses and images disagree by {mm:.2g} mm and {deg:.2g}° per axis, more than the given "
         "robot noise ({given_mm:.2g} mm, {given_rotation_deg:.2g}°): the larger is used",
         evidence="m per axis")
-    UNCERTAIN = "too uncertain", Row("motion",
+    UNCERTAIN = "too uncertain", KindRow("motion",
         "the {part} is known to ±{part:translation={mm:.0f} mm|rotation={size_deg:.1f}°|scale={percent:.0f} %} only",
         "add images, rotated by 20° or more about different axes{noise_unknown:, or give the robot's repeatability "
         "(--robot-noise MM DEG)|}",
         means="translation, rotation or scale (`details.part`) is less certain than 20 mm, 3° or 5 %",
         evidence="1σ: m, rad, share")
-    LEAVE_ONE_OUT = "leave-one-out error", Row("motion",
+    LEAVE_ONE_OUT = "leave-one-out error", KindRow("motion",
         "the leave-one-out error ({mm:.1f} mm) is well above the fit's residual ({residual_mm:.1f} mm): "
         "too few images for this motion", "add some", evidence="m")
-    NOT_EXACT_ENOUGH = "requirement not met", Row("motion", sentences.not_exact_enough,
+    NOT_EXACT_ENOUGH = "requirement not met", KindRow("motion", sentences.not_exact_enough,
         "{concerns:images=add {more_images:.0f} more at the poses of next_poses|robot=most of it comes from systematic "
         "robot errors: name the arm (--robot) or add its joint angles|none=a dozen more images would not be enough; "
         "move closer to the scene, or use a better camera or robot}",
         means="not as exact as `--require` asks, which rejects, or as grasping needs, which warns",
         evidence="m, 95 % of errors are smaller", help="the images in `next_poses`; or the arm's name")
-    FOCUS_BY_DISTANCE = "focal length changes with distance", Row("camera",
+    FOCUS_BY_DISTANCE = "focal length changes with distance", KindRow("camera",
         "the focal length {way:grows|shrinks} by {size_percent:.1f} ± {std_percent} % from the nearest "
         "view to the farthest", "lock the focus, or --focus varies", explains=MISFIT,
         evidence="share, from the nearest view to the farthest; the chance `p`")
-    FOCUS_BY_IMAGE = "focal length differs between images", Row("camera",
+    FOCUS_BY_IMAGE = "focal length differs between images", KindRow("camera",
         "the focal length differs between images by {percent:.1f} % (rms, each ± {std_percent} %)",
         "lock the focus and take the images again, or --focus varies", explains=MISFIT, evidence="share, rms")
-    ZOOM = "focal length changed once", Row("camera",
+    ZOOM = "focal length changed once", KindRow("camera",
         "the focal length changes by {percent:+.1f} ± {std_percent} % after {images[0]}: the "
         "zoom or focus was moved", "calibrate the images before or after it, or --focus varies",
         explains=MISFIT, evidence="share; the chance `p`")
-    ROLLING_SHUTTER = "images sheared alike", Row("camera",
+    ROLLING_SHUTTER = "images sheared alike", KindRow("camera",
         "the images are sheared by {value:.1f} ± {std} px from top to bottom, as by the rolling "
         "shutter of a moving camera", "take the images at rest", explains=MISFIT,
         evidence="px from top to bottom; the chance `p`")
-    ROLLING_SHUTTER_BY_IMAGE = "images sheared each by itself", Row("camera",
+    ROLLING_SHUTTER_BY_IMAGE = "images sheared each by itself", KindRow("camera",
         "each image is sheared by itself, {value:.1f} px from top to bottom (rms), as by the "
         "rolling shutter of a moving camera", "take the images at rest", explains=MISFIT,
         evidence="px from top to bottom, rms")
-    THIN_PRISM = "thin prism", Row("camera",
+    THIN_PRISM = "thin prism", KindRow("camera",
         "the images show a thin-prism distortion of up to {value:.1f} ± {std} px: the sensor is "
         "tilted, or the optics are decentred",
         "use the transform with the estimated intrinsics, which have the coefficients s1 to s4",
         explains=MISFIT,
         evidence="px, where it is largest; the chance `p`")
-    CENTRE_SAGS = "principal point moves with gravity", Row("camera",
+    CENTRE_SAGS = "principal point moves with gravity", KindRow("camera",
         "the principal point moves with gravity, by {value:.1f} ± {std} px when it lies in the image"
         ": the optics are image-stabilised or loose",
         "switch image stabilisation off, or fix the optics", explains=MISFIT,
         evidence="px, when gravity lies in the image; the chance `p`")
-    INTRINSICS = "intrinsics contradict the images", Row("camera", sentences.intrinsics,
+    INTRINSICS = "intrinsics contradict the images", KindRow("camera", sentences.intrinsics,
         "{estimated:use the transform with the intrinsics of this calibration|calibrate the intrinsics again at this "
         "resolution, or give no intrinsics (null) to have them estimated}",
         explains=MISFIT,
         help="calibrate them again at this resolution, or give none (null) to have them estimated",
         means="the given intrinsics are not those of the images; parameters in `details`",
         evidence="the chance `p`")
-    SLIP = "camera moved on the gripper", Row("order",
+    SLIP = "camera moved on the gripper", KindRow("order",
         "the camera seems to have moved on the gripper by {mm:.1f} mm and {deg:.2f}° after {images[0]}",
         ONE_PART + "the camera still sits as then", explains=MISFIT, evidence="m; the chance `p`")
-    DRIFT = "camera drifts on the gripper", Row("order",
+    DRIFT = "camera drifts on the gripper", KindRow("order",
         "the camera seems to drift on the gripper by {mm:.1f} mm and {deg:.2f}° from the first image to "
         "the last", "tighten its mount, let it warm up, and take the images again",
         explains=MISFIT, evidence="m; the chance `p`")
-    BASE_MOVED = "robot base moved against the scene", Row("order",
+    BASE_MOVED = "robot base moved against the scene", KindRow("order",
         "the robot's base and the scene moved against each other by {mm:.1f} mm and {deg:.2f}° after "
         "{images[0]}", ONE_PART + "base and scene still stand as then", explains=MISFIT,
         evidence="m; the chance `p`")
-    DELAY = "gripper poses early or late", Row("order",
+    DELAY = "gripper poses early or late", KindRow("order",
         "the gripper poses look as if read {size:.3f} ± {std} of the time from one image to the next too "
         "{way:late|early}", "stop the arm at each image, or read pose and image by the same clock",
         explains=MISFIT, evidence="intervals between images; the chance `p`")
-    WRONG_MOUNT = "wrong mount", Row("robot",
+    WRONG_MOUNT = "wrong mount", KindRow("robot",
         "the images fit a camera that the gripper carries, not a fixed one",
         "write mount gripper for {camera}", explains=MISFIT)
-    ROBOT_UNUSED = "robot not used", Row("robot", "the capture's robot is not used: {text}",
+    ROBOT_UNUSED = "robot not used", KindRow("robot", "the capture's robot is not used: {text}",
         help="correct its name, URDF or joint angles")
-    JOINT_OFFSETS = "joint offsets", Row("robot", sentences.joints_off,
+    JOINT_OFFSETS = "joint offsets", KindRow("robot", sentences.joints_off,
         means="`joints` are off; each in `details`", evidence="rad, the largest",
         help="master the joints")
-    LENGTHS = "robot lengths differ by direction", Row("strain",
+    LENGTHS = "robot lengths differ by direction", KindRow("strain",
         "along {axis} the robot's positions are {size_percent:.1f} ± {std_percent} % too {way:long|short} "
         "beside those across it",
         "check that axis (a lift, a rail, a gantry): its gear ratio, its unit", explains=MISFIT,
         evidence="share, positive: too long; the chance `p`")
-    BASE_LEANS = "robot base leans with reach", Row("strain",
+    BASE_LEANS = "robot base leans with reach", KindRow("strain",
         "the robot's base leans {way:towards|away from} the gripper by {size_deg:.1f} ± {std_deg}° per "
         "metre of reach, which its poses do not say", "bolt the stand to the floor, or brace it",
         explains=MISFIT,
         evidence="rad per m, positive: towards the gripper; the chance `p`")
-    TOOL_SAGS = "tool sags", Row("strain",
+    TOOL_SAGS = "tool sags", KindRow("strain",
         "the gripper rotates by {size_deg:.2f} ± {std_deg}° where it is level, as a tool does that sags "
         "under its weight",
         "stiffen its mount, and check the zero of the wrist's joints, which looks like it", explains=MISFIT,
         evidence="rad, where it is level; the chance `p`")
-    BOARD_SIZE = "board size contradicts the robot", Row("lengths",
+    BOARD_SIZE = "board size contradicts the robot", KindRow("lengths",
         "by the robot's motion the {marker:marker|board} is {size_percent:.1f} ± {std_percent} % {way:larger|smaller} "
         "than given",
         "measure its squares, and check that the gripper poses are in metres", explains=MISFIT,
         evidence="share, positive: larger")
-    SCALES = "lengths contradict each other", Row("lengths",
+    SCALES = "lengths contradict each other", KindRow("lengths",
         "{one} and {other} contradict each other by {size_percent:.1f} ± {std_percent} %",
         "measure both again",
         explains=MISFIT,
         means="two of what the scale is known from (`details.one`, `details.other`: robot, board, known "
         "length, depth camera, network) differ by more than they may",
         evidence="share, positive: the second is longer")
-    BOARD_SIDE = "side of a board", Row("lengths",
+    BOARD_SIDE = "side of a board", KindRow("lengths",
         "by the robot's positions the sides of {board} are {value_std_mm} mm",
         "measure one, and give it in --board: the scale is then known twice", evidence="m")
-    BOARD_MOVED = "board at several places", Row("lengths",
+    BOARD_MOVED = "board at several places", KindRow("lengths",
         "in {images} {board} is at another place than in the other images: it was moved, or there are two",
         "its corners there are left out; keep one board of a kind, and keep it still")
-    BOARD_STRETCHED = "board stretched", Row("lengths",
+    BOARD_STRETCHED = "board stretched", KindRow("lengths",
         "{board} is {size_percent:.1f} % longer along one side than along the other: it was not printed at its size",
         "print it without scaling (jcr board) and measure both sides; its size is not used for the scale",
         evidence="share")
-    BOARD_NOT_FOUND = "board not found", Row("lengths",
+    BOARD_NOT_FOUND = "board not found", KindRow("lengths",
         "no two images show {board}: features alone are used{proposed:, but they seem to show $}",
         "check its kind and its numbers of squares or corners (jcr docs markers)",
         means="no two images show what `--board` names; `details.proposed` is what they seem to show")
-    NETWORK_SCALE = "a network's metre contradicts the robot", Row("lengths", sentences.network_scale_of,
+    NETWORK_SCALE = "a network's metre contradicts the robot", KindRow("lengths", sentences.network_scale_of,
         "check the unit of the gripper poses", means="by far more than networks err",
         evidence="share, positive: too long")
-    SCALE_ASSUMED = "scale assumed", Row("lengths",
+    SCALE_ASSUMED = "scale assumed", KindRow("lengths",
         "the scale is unobservable from these motions: it is taken as 1, from the marker's size",
         help="other motions")
-    SCALE_FROM_ROBOT = "scale from the robot alone", Row("lengths",
+    SCALE_FROM_ROBOT = "scale from the robot alone", KindRow("lengths",
         "the scale comes from the robot's positions alone: if all of them are wrong by one factor, no "
         "image shows it, and ± does not include it", "the size of a board or --known-length would show it")
-    IMAGES_ROTATED = "images rotated", Row("reconstruction",
+    IMAGES_ROTATED = "images rotated", KindRow("reconstruction",
         "EXIF orientation {value:.0f}: the images are {rotated}, as viewers show them, and "
         "gripper_from_camera and the intrinsics are of the camera that would see them so",
         "for a driver that gives the sensor's own images remove the tag (exiftool -Orientation= FILES) and "
         "calibrate again", evidence="the orientation, 2 to 8")
-    BOARD_IN_VIEW = "board in view", Row("reconstruction", "a calibration board is in view",
+    BOARD_IN_VIEW = "board in view", KindRow("reconstruction", "a calibration board is in view",
         "try --board {board} with its SIDE in metres, or for tags of a ChArUco board "
         "charuco:COLUMNSxROWS:SIDE:MARKER:DICTIONARY (jcr docs markers)")
-    RECONSTRUCTION = "reconstruction", Row("reconstruction", "{text}", "{remedy}",
+    RECONSTRUCTION = "reconstruction", KindRow("reconstruction", "{text}", "{remedy}",
         means="what a back end says to act on, in words", help="in its words")
-    NO_RECONSTRUCTION = "no reconstruction", Row("reconstruction", "{text}", "{remedy}",
+    NO_RECONSTRUCTION = "no reconstruction", KindRow("reconstruction", "{text}", "{remedy}",
         means="no back end found camera poses", help="in its words")
-    NOT_SETTLED = "adjustment not settled", Row("reconstruction",
+    NOT_SETTLED = "adjustment not settled", KindRow("reconstruction",
         "the adjustment has not settled: its last round moved the result by {value:.2g} standard deviations",
         "add images of textured, still things", evidence="the last step, in standard deviations")
-    OWN_REJECTED = "the capture's own camera is rejected", Row("cell",
+    OWN_REJECTED = "the capture's own camera is rejected", KindRow("cell",
         "the {camera} camera's own calibration is rejected", help="correct that first")
-    FEW_POINTS_SHARED = "few points shared with the scene", Row("cell",
+    FEW_POINTS_SHARED = "few points shared with the scene", KindRow("cell",
         "{images[0]} shares {value:.0f} points with the mapped scene, too few",
         "it must see the same scene, unchanged, from a direction not too different",
         evidence="points, of the best image")
-    FEW_LOCALISED = "few images localised", Row("cell",
+    FEW_LOCALISED = "few images localised", KindRow("cell",
         "{value:.0f} of its images share enough of the mapped scene; {needed:.0f} are needed",
         "add images of the mapped scene", evidence="images")
-    NO_COMMON_POSE = "no image taken with one that is used", Row("cell",
+    NO_COMMON_POSE = "no image taken with one that is used", KindRow("cell",
         "none of its images was taken with an image that is used", help="more images")
-    ONE_GRIPPER_POSE = "camera seen at one gripper pose", Row("cell",
+    ONE_GRIPPER_POSE = "camera seen at one gripper pose", KindRow("cell",
         "its images show one gripper pose only: whether it is on the gripper, and at which frame each "
         "image was taken, cannot be tested",
         "add an image at another gripper pose, or write mount base for a fixed camera")
-    SECOND_ON_ARM = "second camera on another arm", Row("cell",
+    SECOND_ON_ARM = "second camera on another arm", KindRow("cell",
         "a second camera on arm {arm}: one each is supported")
-    NOT_FIXED = "camera not fixed", Row("cell",
+    NOT_FIXED = "camera not fixed", KindRow("cell",
         "{images[0]} and {images[1]} were taken from places {mm:.0f} mm and {deg:.1f}° apart: it is not "
         "fixed", "of a camera on the gripper write mount gripper, of several cameras give each its own name",
         evidence="m")
-    NOT_RIGID = "camera not rigid on the gripper", Row("cell",
+    NOT_RIGID = "camera not rigid on the gripper", KindRow("cell",
         "its place beside the {camera} camera differs by up to {mm:.0f} mm between images: the two are not "
         "rigid, or the images are not of the frames that they stand for", evidence="m",
         help="tighten the mounts; check the frames")
-    FAR_FROM_GRIPPER = "camera far from the gripper", Row("cell",
+    FAR_FROM_GRIPPER = "camera far from the gripper", KindRow("cell",
         "it is {value:.2f} m from the gripper's frame",
         "check that it is on the gripper, and that the images are of the frames that they stand for",
         evidence="m")
-    IMAGE_MISSES = "image contradicts the camera's place", Row("cell",
+    IMAGE_MISSES = "image contradicts the camera's place", KindRow("cell",
         "{images[0]} misses the place that fits its images together by {value:.0f} px (median): {mount:base=it is not "
         "fixed|gripper=it is not rigid on the gripper}, the scene changed, or the intrinsics are wrong",
         evidence="px, median",
         help="tighten the mount, or leave the image out")
-    PLACE_UNCERTAIN = "camera's place too uncertain", Row("cell",
+    PLACE_UNCERTAIN = "camera's place too uncertain", KindRow("cell",
         "its place is known to ±{mm:.0f} mm and {deg:.1f}° only{focal_std_percent:, for its images do not show its "
         "intrinsics (focal length ± $ %)}",
         "{concerns:intrinsics=give them, or images with more of the scene, at other depths|images=let it see more of "
         "the mapped scene, or add images to the wrist camera's capture}",
         means="a further camera is known worse than to 20 mm and 3°", evidence="m, 1σ of the worst axis",
         help="intrinsics, or more images")
-    AT_ANOTHER_CAMERA = "camera stands where another was", Row("cell",
+    AT_ANOTHER_CAMERA = "camera stands where another was", KindRow("cell",
         "it stands where the {camera} camera was at {images[0]}: if its image is one of that camera, it is "
         "not fixed", help="check that the image is its own")
-    POINTS_CROWDED = "points crowded", Row("cell", "its points lie in {percent:.0f} % of the image",
+    POINTS_CROWDED = "points crowded", KindRow("cell", "its points lie in {percent:.0f} % of the image",
         "more of the scene in view would help", evidence="share of the image")
-    STATIC_IMAGES = "images show no motion", Row("images",
+    STATIC_IMAGES = "images show no motion", KindRow("images",
         "all images show the same view but for noise, while the gripper moves by {mm:.0f} mm and rotates "
         "by {deg:.0f}°",
         "check that the camera is on the gripper and its stream is live, and take each image at its own pose",
         explains=(*MISFIT, *TOO_FEW), evidence="m, the gripper's motion")
-    BLURRED = "images blurred", Row("images", "{images} {images:is|are} blurred (edges {value:.0f} px wide)",
+    BLURRED = "images blurred", KindRow("images", "{images} {images:is|are} blurred (edges {value:.0f} px wide)",
         "take them again at rest, in focus and with more light", explains=(*MISFIT, *TOO_FEW),
         means="the strongest edges of these `images` climb over more than 1/80 of the long side; rejects "
         "where a quarter of all are and the calibration is rejected", evidence="px, how wide the edges are")
-    REPETITIVE = "repetitive scene", Row("images",
+    REPETITIVE = "repetitive scene", KindRow("images",
         "the scene repeats itself: {percent:.0f} % of the features look like others of the same image, so that images "
         "may be matched in the wrong places",
         "put different, textured objects on the table", explains=(*MISFIT, *TOO_FEW),
         means="regular tiles or patterns; rejects where the calibration is rejected", evidence="share of the features")
-    FEW_USED = "few images used", Row("reconstruction",
+    FEW_USED = "few images used", KindRow("reconstruction",
         "only {value:.0f} of {of:.0f} images are used, and their motions alone are degenerate, those of "
         "all are not", "let the views overlap more and show more texture, or use a board (jcr docs markers)",
         explains=(*MISFIT, *TOO_FEW), evidence="images")
-    PIECES = "reconstruction in pieces", Row("reconstruction",
+    PIECES = "reconstruction in pieces", KindRow("reconstruction",
         "the reconstruction is in pieces: {value:.0f} of {of:.0f} images, such as {images[0]}, agree with their gripper "
         "poses among themselves and contradict the other images",
         "avoid patterns that repeat, as of a board alone, or name the board (--board); let the views overlap more",
         explains=MISFIT, evidence="images of the further pieces")
-    POSES_SWAPPED = "gripper poses exchanged", Row("single",
+    POSES_SWAPPED = "gripper poses exchanged", KindRow("single",
         "{images[0]} and {images[1]} have each other's gripper pose", "exchange the two poses",
         explains=MISFIT)
-    POSE_CONTRADICTS_IMAGE = "gripper pose contradicts its image", Row("single",
+    POSE_CONTRADICTS_IMAGE = "gripper pose contradicts its image", KindRow("single",
         "the gripper pose of {images[0]} is {mm:.0f} mm and {deg:.1f}° from where its image shows the "
         "gripper", "correct that pose, or drop the image", evidence="m")
-    NOT_REGISTERED = "image not registered", Row("single",
+    NOT_REGISTERED = "image not registered", KindRow("single",
         "{images} {images:is|are} not registered: {value:.0f} other images match, too little of each",
         "take such a view again, nearer to a pose that registered, with textured things in view",
         means="while a capture is taken (`jcr capture`): its camera is not in the reconstruction",
         evidence="other images that match it")
-    CLOCK_JUMPS = "clock jumps back", Row("single",
+    CLOCK_JUMPS = "clock jumps back", KindRow("single",
         "the time of {images[0]} is {value:.3g} s before that of the image before it",
         "check that images and poses are stamped by one clock", evidence="s")
     # fmt: on

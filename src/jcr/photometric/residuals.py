@@ -88,7 +88,7 @@ class Points:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Equations:
+class PhotometricEquations:
     """Gauss-Newton equations of cameras, log focal length last, with the log depths eliminated (Schur)."""
 
     normal: Float[ndarray, "p p"]
@@ -243,7 +243,9 @@ def energy(level: Level, cameras: Cameras, points: Points, sigma: float) -> floa
     return float((weight * misfit / (misfit + np.float32(sigma**2))).sum() / max(weight.sum(), 1))
 
 
-def equations(level: Level, cameras: Cameras, points: Points, sigma: float, tied: bool) -> Equations:
+def equations(
+    level: Level, cameras: Cameras, points: Points, sigma: float, tied: bool
+) -> PhotometricEquations:
     """Linearised for twists (v, ω) in camera axes, T ← T·exp(ξ): one for all cameras if `tied`, else one for each."""
     n, k = level.count, len(points.host)
     p = 7 if tied else 6 * n + 1
@@ -272,7 +274,7 @@ def equations(level: Level, cameras: Cameras, points: Points, sigma: float, tied
         by_depth[rows] = b
         normal += (flat.T @ flat) - (b / information[rows, None]).T @ b
         gradient[rows] = (a * r).sum(1) - b * (depth_gradient[rows] / information[rows])[:, None]
-    return Equations(
+    return PhotometricEquations(
         normal=normal,
         gradient=gradient,
         by_depth=by_depth,

@@ -32,7 +32,7 @@ RETRIES = 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
+class BatchRow:
     """Row of the table: one capture."""
 
     capture: str
@@ -70,7 +70,7 @@ def batch(
     options: BatchOptions,
     progress: Progress | None = None,
     read: ReadOptions | None = None,
-) -> list[Row]:
+) -> list[BatchRow]:
     """Run every capture into a folder of its own in `out`; summary.csv and summary.html rank them, best first.
 
     A capture that fails fails alone. One that was finished from the same inputs and options is not run again.
@@ -91,7 +91,7 @@ def batch(
     ]
     out.mkdir(parents=True, exist_ok=True)
     report("captures", 0.0)
-    rows: list[Row] = []
+    rows: list[BatchRow] = []
     for row in _on_ray(tasks, options) if options.ray else _on_this_machine(tasks, options):
         rows.append(row)
         rows.sort(key=_rank)
@@ -100,7 +100,7 @@ def batch(
     return rows
 
 
-def run_one(task: Task) -> Row:
+def run_one(task: Task) -> BatchRow:
     """Run one capture, unless it is finished, and return its row; an error is in the row."""
     start, reason = time.perf_counter(), ""
     try:
@@ -117,7 +117,7 @@ def run_one(task: Task) -> Row:
         return _failed(task, f"{type(error).__name__}: {error}")
     uncertainty, held_out = content.uncertainty, content.held_out
     named = next((sentence(one) for one in content.findings if one.severity != "informs"), "")
-    return Row(
+    return BatchRow(
         capture=str(task.capture),
         out=str(task.out),
         status=verdict_of(content.findings),
@@ -134,17 +134,17 @@ def run_one(task: Task) -> Row:
     )
 
 
-def _failed(task: Task, reason: str) -> Row:
+def _failed(task: Task, reason: str) -> BatchRow:
     """Return the row of a capture that failed."""
-    return Row(capture=str(task.capture), out=str(task.out), status="failed", reason=reason)
+    return BatchRow(capture=str(task.capture), out=str(task.out), status="failed", reason=reason)
 
 
-def is_accepted(row: Row) -> bool:
+def is_accepted(row: BatchRow) -> bool:
     """Test whether the calibration is accepted, with warnings or without."""
     return row.status in ("accepted", "accepted with warnings")
 
 
-def _rank(row: Row) -> tuple[int, float, str]:
+def _rank(row: BatchRow) -> tuple[int, float, str]:
     order = (*get_args(Verdict), "failed").index(row.status)
     return order, float("inf") if row.offset_std_mm is None else row.offset_std_mm, row.capture
 
@@ -161,7 +161,7 @@ def _names(captures: Sequence[Path]) -> list[str]:
     return names
 
 
-def _on_this_machine(tasks: list[Task], options: BatchOptions) -> Iterator[Row]:
+def _on_this_machine(tasks: list[Task], options: BatchOptions) -> Iterator[BatchRow]:
     # macOS cannot bind a process to cores.
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     processes = min(options.processes or max(1, cores // 2), len(tasks))
@@ -216,7 +216,7 @@ def _threads_per_process(threads: int) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[Row]:
+def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[BatchRow]:
     extra("ray", "cluster", "--ray")
     import ray  # pyright: ignore[reportMissingImports]
     from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
@@ -251,10 +251,10 @@ def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[Row]:
             ray.shutdown()
 
 
-def _write_summary(out: Path, rows: list[Row]) -> None:
+def _write_summary(out: Path, rows: list[BatchRow]) -> None:
     """Write the table as CSV and as a page."""
     text = io.StringIO()
-    table = csv.DictWriter(text, [field.name for field in fields(Row)], lineterminator="\n")
+    table = csv.DictWriter(text, [field.name for field in fields(BatchRow)], lineterminator="\n")
     table.writeheader()
     table.writerows(asdict(row) for row in rows)
     write_text(out / "summary.csv", text.getvalue())

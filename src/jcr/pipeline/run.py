@@ -55,7 +55,7 @@ from jcr.run_folder import (
     STATE,
     RunOptions,
     RunResult,
-    State,
+    RunState,
     fingerprint_of_run,
     locked,
     state_of,
@@ -274,7 +274,7 @@ def _load_map_code(estimates_depth: bool) -> None:
         import jcr.scene.build  # noqa: F401
 
 
-def _is_complete(before: RunResult, state: State) -> bool:
+def _is_complete(before: RunResult, state: RunState) -> bool:
     """Test whether a run of the same input is finished, and its files were neither changed nor removed since."""
     try:
         found = before.state.run
@@ -323,7 +323,7 @@ def _calibrated(result: RunResult, options: RunOptions, progress: Progress) -> R
     )
 
 
-def _with_reconstruction_of(state: State, out: Path, capture: Capture) -> RunResult | None:
+def _with_reconstruction_of(state: RunState, out: Path, capture: Capture) -> RunResult | None:
     """Return the earlier run of the folder, or of `jcr capture`, whose reconstruction was made from the same input.
 
     A state that cannot be read proves nothing: to make every stage again is always right.
@@ -340,7 +340,7 @@ def _with_reconstruction_of(state: State, out: Path, capture: Capture) -> RunRes
 
 
 def _failed(
-    out: Path, capture: Capture, options: RunOptions, state: State, error: NothingFoundError
+    out: Path, capture: Capture, options: RunOptions, state: RunState, error: NothingFoundError
 ) -> NothingFoundError:
     """Return the error, with the --board that the images show, after its reason is written to the folder."""
     from jcr.report.html import failed_report_html
@@ -474,13 +474,13 @@ def _noted(result: RunResult, *notes: str | None) -> RunResult:
     return result.with_parts(calibration=result.calibration.model_copy(update={"notes": every}))
 
 
-def _write_state(out: Path, state: State) -> None:
+def _write_state(out: Path, state: RunState) -> None:
     """Write run.json."""
     content = state.model_dump(mode="json", warnings=False)
     write_text(out / STATE, json.dumps(content, indent=2) + "\n")
 
 
-def _write_complete(state: State, out: Path, capture: Capture) -> None:
+def _write_complete(state: RunState, out: Path, capture: Capture) -> None:
     """Note in run.json that all files of a run are there."""
     _write_state(out, state.model_copy(update={"run": fingerprint_of_run(out, capture, state)}))
 
@@ -491,7 +491,7 @@ def _forget_reconstruction(out: Path) -> None:
         (out / name).unlink(missing_ok=True)
 
 
-def _keep_reconstruction(out: Path, reconstruction: Reconstruction, state: State) -> None:
+def _keep_reconstruction(out: Path, reconstruction: Reconstruction, state: RunState) -> None:
     """Write a reconstruction, then its fingerprint; pointmaps that were estimated become depth.npz."""
     _forget_reconstruction(out)
     pointmaps = reconstruction.pointmaps
@@ -500,7 +500,7 @@ def _keep_reconstruction(out: Path, reconstruction: Reconstruction, state: State
     _write_state(out, state)
 
 
-def _keep_depth(out: Path, reconstruction: Reconstruction, state: State) -> None:
+def _keep_depth(out: Path, reconstruction: Reconstruction, state: RunState) -> None:
     """Write depth.npz, where the reconstruction has estimated pointmaps and they are not there already."""
     pointmaps = reconstruction.pointmaps
     if pointmaps is None or pointmaps.is_predicted or is_made_from(out / DEPTH, state.depth):

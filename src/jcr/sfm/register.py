@@ -29,7 +29,7 @@ MIN_POINTS = 30
 
 
 @dataclass(frozen=True)
-class Features:
+class ImageFeatures:
     """Features of one image."""
 
     x_px: Float[ndarray, "k 2"]
@@ -46,7 +46,7 @@ class KnownImages:
 
     camera: Intrinsics
     recon_from_camera: Float[ndarray, "m 4 4"]
-    features: tuple[Features, ...]
+    features: tuple[ImageFeatures, ...]
 
     @classmethod
     def of(
@@ -106,18 +106,18 @@ def register(
     return [one.pose if isinstance(one, Registration) else one for one in found]
 
 
-def features(image: UInt8[ndarray, "h w 3"], intrinsics: Intrinsics) -> Features:
+def features(image: UInt8[ndarray, "h w 3"], intrinsics: Intrinsics) -> ImageFeatures:
     """Return the SIFT features of an image of these intrinsics."""
     scale = min(1.0, WORKING_SIZE_PX / max(intrinsics.width, intrinsics.height))
     size = round(intrinsics.width * scale), round(intrinsics.height * scale)
     found, descriptors = detect(grey_of(image, size))
     to_original = np.array([intrinsics.width / size[0], intrinsics.height / size[1]])
-    return Features(
+    return ImageFeatures(
         (found + 0.5) * to_original - 0.5, unproject(resized(intrinsics, *size), found)[:, :2], descriptors
     )
 
 
-def shared_points(known: KnownImages, new: Features) -> SharedPoints:
+def shared_points(known: KnownImages, new: ImageFeatures) -> SharedPoints:
     """Match the features of a new image with those of known images, and triangulate them from these."""
     of_row = [matches(new.descriptors, others.descriptors) for others in known.features]
     feature = np.concatenate([mine for mine, _ in of_row])

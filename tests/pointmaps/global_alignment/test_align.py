@@ -13,8 +13,8 @@ from jcr.geometry import apply_similarity, fit_similarity, retract, rotation_bet
 from jcr.pointmaps.dust3r.pair_graph import complete_pairs, window_pairs
 from jcr.pointmaps.global_alignment.align import Alignment, global_align
 from jcr.pointmaps.global_alignment.gauss_newton import gauss_newton
-from jcr.pointmaps.global_alignment.observations import Problem
-from jcr.pointmaps.global_alignment.residuals import State
+from jcr.pointmaps.global_alignment.observations import AlignmentProblem
+from jcr.pointmaps.global_alignment.residuals import AlignmentState
 from jcr.records import Intrinsics
 from simulation.pairs import PairErrors, PairTruth, synthetic_pairs, write_pairs
 
@@ -66,7 +66,7 @@ def test_fast_beats_adam_and_both_are_near_the_truth():
 def test_one_step_from_near_the_truth_is_almost_all_the_way():
     # A wrong block of the normal equations leaves the fixed point and spoils the step towards it.
     predictions, truth = synthetic_pairs(complete_pairs(4), SMALL, NO_ERRORS)
-    problem = Problem.of(predictions)
+    problem = AlignmentProblem.of(predictions)
     images = problem.observe_all(300)
     log_depth = [np.log(_depth_at(truth, o)) for o in images]
     rng = np.random.default_rng(0)
@@ -74,7 +74,7 @@ def test_one_step_from_near_the_truth_is_almost_all_the_way():
     nudge[0] = 0
     log_unit = -np.log(truth.pair_unit)
     scale_nudge = 2e-3 * rng.normal(size=len(log_unit))
-    start = State(
+    start = AlignmentState(
         recon_from_camera=retract(truth.base_from_camera, nudge),
         log_focal=float(np.log(truth.intrinsics.fx)) + 2e-3,
         log_pair_scale=log_unit + scale_nudge - scale_nudge.mean(),

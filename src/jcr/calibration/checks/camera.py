@@ -18,10 +18,9 @@ from jcr.calibration.case import Case, of_points
 from jcr.camera import parameter_names, parameters
 from jcr.distributions import f as f_distribution
 from jcr.estimation.hypotheses import Row
-from jcr.estimation.intrinsics_prior import Camera
+from jcr.estimation.intrinsics_prior import CameraPrior
 from jcr.estimation.model_error import TYPICAL
-from jcr.estimation.problem import OF_IMAGE, PRISM
-from jcr.estimation.problem import State as ProblemState
+from jcr.estimation.problem import OF_IMAGE, PRISM, State
 from jcr.estimation.score_test import (
     Alternatives,
     ScoreTest,
@@ -94,7 +93,7 @@ class CameraAdjustment:
     """Camera of an adjustment, and the function that adjusts its images again with more of it free."""
 
     adjusted: Solution
-    adjust: Callable[[Camera, Combinations | None, Float[ndarray, "s b"] | None], Solution]
+    adjust: Callable[[CameraPrior, Combinations | None, Float[ndarray, "s b"] | None], Solution]
     """Adjust all images with another prior of this camera's intrinsics, with combinations of its columns free, and with
     errors of one standard deviation of the gripper poses."""
     names: Sequence[str]
@@ -102,14 +101,14 @@ class CameraAdjustment:
     start: Intrinsics
     """Intrinsics that were given, or that the reconstruction estimated."""
     is_given: bool
-    prior: Camera
+    prior: CameraPrior
     std: Float[ndarray, "6"]
     """Standard deviations of the camera's pose; 0 where it is rejected."""
     answer: Callable[[Solution], tuple[Float[ndarray, "4 4"], float]]
     """Function that returns the camera's pose by an adjustment, and the scale."""
     camera: int = 0
     """Number of the camera among the adjusted ones."""
-    place: Callable[[ProblemState], Float[ndarray, "4 4"]] = first_x
+    place: Callable[[State], Float[ndarray, "4 4"]] = first_x
     """Function that returns the camera's pose on its parent."""
     arm: int | None = 0
     """Number of the arm whose gripper poses are tested with the camera; None where another camera's test has them."""
@@ -190,7 +189,7 @@ class CameraEffect:
 
 
 @dataclass(frozen=True)
-class State:
+class EffectsState:
     """Adjustment of the images with effects on the camera and on the gripper poses free."""
 
     imaged: CameraAdjustment
@@ -200,14 +199,14 @@ class State:
     """Effects on the gripper poses."""
 
     @staticmethod
-    def start(imaged: CameraAdjustment) -> "State":
+    def start(imaged: CameraAdjustment) -> "EffectsState":
         """Return the adjustment as it is; a focal length of each image is free where the user asked for that."""
         if (free := imaged.free) is None:
-            return State(imaged, (), imaged.adjusted)
+            return EffectsState(imaged, (), imaged.adjusted)
         varies = CameraEffect(FindingKind.FOCUS_BY_IMAGE, free, np.zeros((len(free), 0)))
-        return State(imaged, (varies,), imaged.adjusted)
+        return EffectsState(imaged, (varies,), imaged.adjusted)
 
-    def with_free(self, found: Sequence[CameraEffect], poses: Sequence[Row]) -> "State":
+    def with_free(self, found: Sequence[CameraEffect], poses: Sequence[Row]) -> "EffectsState":
         """Adjust again with these effects free: the sizes of all errors change with them.
 
         Raises LinAlgError where the images then determine nothing any more.
@@ -257,7 +256,7 @@ def of_fewer_points(case: Case) -> Case:
     return replace(fewer, adjusted=adjust_case(fewer, combinations=free))
 
 
-def freed(state: State, best: CameraEffect) -> State | None:
+def freed(state: EffectsState, best: CameraEffect) -> EffectsState | None:
     """Adjust with one more effect free, or with the simpler one that explains nearly the same.
 
     Return None where the first step towards the effect moves the camera too little, or where the images then determine
@@ -285,7 +284,7 @@ def is_material(found: Finding, std: Float[ndarray, "6"]) -> bool:
     return bool((np.abs(found.shift[:6]) > MATERIAL * std).any())
 
 
-def contradicted_intrinsics(state: State, dismissed: Sequence[CameraEffect]) -> CameraEffect | None:
+def contradicted_intrinsics(state: EffectsState, dismissed: Sequence[CameraEffect]) -> CameraEffect | None:
     """Return the effect of given intrinsics that the images contradict; None where they agree.
 
     The score test compares with intrinsics that are off by what is usual, and the adjustment may have left those that
@@ -297,7 +296,7 @@ def contradicted_intrinsics(state: State, dismissed: Sequence[CameraEffect]) -> 
     return next(one for one in _hypotheses(state) if one.kind is FindingKind.INTRINSICS)
 
 
-def is_far_off(state: State) -> bool:
+def is_far_off(state: EffectsState) -> bool:
     """Return whether focal length or principal point differ from given ones by OFF."""
     if not state.imaged.is_given:
         return False
@@ -306,7 +305,7 @@ def is_far_off(state: State) -> bool:
     return bool((off > given.fx * np.array([OFF, OFF, OFF_CENTRE, OFF_CENTRE])).any())
 
 
-def _log_p_of_given(state: State) -> float:
+def _log_p_of_given(state: EffectsState) -> float:
     """Return the logarithm of the probability of the estimated intrinsics if the given ones were exact; 0 near them."""
     if not is_far_off(state):
         return 0.0
@@ -317,7 +316,7 @@ def _log_p_of_given(state: State) -> float:
     return float(f_distribution.logsf(float(ratio), 4, state.equations.freedom))
 
 
-def camera_finding(after: State, before: State) -> Finding:
+def camera_finding(after: EffectsState, before: EffectsState) -> Finding:
     """Return the last camera effect that was freed as a finding."""
     best = after.found[-1]
     alone = test_combinations(before.equations, best.both, _all(before))
@@ -350,13 +349,15 @@ def of_some(tracks: Tracks, most: int) -> Tracks:
     return of_points(tracks, chosen)
 
 
-def _all(state: State) -> Float[ndarray, "e r"]:
+def _all(state: EffectsState) -> Float[ndarray, "e r"]:
     """Return a basis of the combinations that are free already."""
     nothing = np.zeros((state.equations.columns, 1))
     return spanned(np.concatenate([nothing, *(one.both for one in state.found)], axis=1))
 
 
-def best_camera_effect(state: State, dismissed: Sequence[CameraEffect]) -> tuple[CameraEffect | None, float]:
+def best_camera_effect(
+    state: EffectsState, dismissed: Sequence[CameraEffect]
+) -> tuple[CameraEffect | None, float]:
     """Return the significant camera effect that explains most and the logarithm of its probability by chance.
 
     The size of the camera-model error absorbs every effect until all of them gain as little: the effects are compared
@@ -375,13 +376,13 @@ def best_camera_effect(state: State, dismissed: Sequence[CameraEffect]) -> tuple
     return best, log_p(best, state, state.equations)
 
 
-def _limit(one: CameraEffect, state: State) -> float:
+def _limit(one: CameraEffect, state: EffectsState) -> float:
     """Return the logarithm of the probability up to which an effect is significant."""
     is_given = one.kind is FindingKind.INTRINSICS and state.imaged.is_given
     return LOG_P_GIVEN if is_given else LOG_P
 
 
-def log_p(one: CameraEffect, state: State, equations: Alternatives) -> float:
+def log_p(one: CameraEffect, state: EffectsState, equations: Alternatives) -> float:
     """Return the logarithm of the probability of the effect's gain by chance, times the places searched."""
     beside = np.concatenate([_all(state), one.beside], axis=1)
     return test_combinations(equations, one.free, beside).log_p + float(np.log(one.places))
@@ -391,7 +392,7 @@ def _alike(one: CameraEffect, other: CameraEffect) -> bool:
     return one.kind == other.kind or {one.kind, other.kind} <= FOCUS
 
 
-def _simpler(state: State) -> CameraEffect | None:
+def _simpler(state: EffectsState) -> CameraEffect | None:
     """Return a focal length that follows distance, or changed once, where that explains nearly all of its scatter."""
     scatter = state.found[-1]
     focal = scatter.free @ _value(scatter, state.total)
@@ -409,7 +410,7 @@ def _value(fault: CameraEffect, total: Float[ndarray, " e"]) -> Float[ndarray, "
     return np.linalg.lstsq(fault.both, total, rcond=None)[0][fault.beside.shape[1] :]
 
 
-def _hypotheses(state: State) -> list[CameraEffect]:
+def _hypotheses(state: EffectsState) -> list[CameraEffect]:
     equations = state.equations
     m = equations.images
     far = np.log(equations.distance)
@@ -442,7 +443,7 @@ def _hypotheses(state: State) -> list[CameraEffect]:
     return [*found, intrinsics]
 
 
-def _of_intrinsics(after: State, last: ScoreTest) -> dict[str, Any]:
+def _of_intrinsics(after: EffectsState, last: ScoreTest) -> dict[str, Any]:
     """Return the fields of a finding that state the intrinsics which the images show."""
     units = dict(zip(after.equations.names, after.equations.units, strict=True))
     std = np.sqrt(np.maximum(np.diag(last.covariance), 0.0))
@@ -455,7 +456,7 @@ def _of_intrinsics(after: State, last: ScoreTest) -> dict[str, Any]:
     return {"concerns": "intrinsics", "details": found}
 
 
-def _size(after: State, last: ScoreTest) -> dict[str, Any]:
+def _size(after: EffectsState, last: ScoreTest) -> dict[str, Any]:
     """Return the fields of a finding that state the size of the effect."""
     fault, equations = after.found[-1], after.equations
     value = _value(fault, after.total)
@@ -482,7 +483,7 @@ def _size(after: State, last: ScoreTest) -> dict[str, Any]:
 
 
 def _largest_px(
-    after: State, value: Float[ndarray, "4"], covariance: Float[ndarray, "4 4"]
+    after: EffectsState, value: Float[ndarray, "4"], covariance: Float[ndarray, "4 4"]
 ) -> tuple[float, float]:
     """Return the largest displacement by a thin prism among the points, and its standard deviation."""
     by = after.adjusted.problem.prism
@@ -492,7 +493,7 @@ def _largest_px(
     return float(moved[k]), float(np.sqrt(along @ covariance @ along))
 
 
-def _freed(state: State) -> tuple[str, ...]:
+def _freed(state: EffectsState) -> tuple[str, ...]:
     """Return the parameters of the camera model that are tested."""
     tested_names = INTRINSICS if state.imaged.is_given else ASPECT
     return tuple(name for name in tested_names if name in state.equations.names)

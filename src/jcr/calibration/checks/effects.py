@@ -19,7 +19,7 @@ from jcr.calibration.checks.camera import (
     LOG_P,
     CameraAdjustment,
     CameraEffect,
-    State,
+    EffectsState,
     all_combinations,
     best_camera_effect,
     camera_finding,
@@ -46,8 +46,7 @@ from jcr.estimation.hypotheses import (
     order_rows,
 )
 from jcr.estimation.pose_equations import pose_equations
-from jcr.estimation.problem import Problem
-from jcr.estimation.problem import State as ProblemState
+from jcr.estimation.problem import Problem, State
 from jcr.estimation.robot_noise import Equations, LogSizes, most_likely, solve_equations
 from jcr.estimation.solve import Solution
 from jcr.estimation.systematic import Region
@@ -85,12 +84,12 @@ def check_effects(case: Case) -> Case:
     return case.after(findings) if longer is not case else _adopted(case, state, findings)
 
 
-def effects(imaged: CameraAdjustment) -> tuple[State, tuple[Finding, ...]]:
+def effects(imaged: CameraAdjustment) -> tuple[EffectsState, tuple[Finding, ...]]:
     """Return the adjustment with all effects free that one camera's images show, and a finding of each.
 
     An effect beside which the gripper poses still contradict the images is not their cause, and is not reported.
     """
-    state, findings = State.start(imaged), list[Finding]()
+    state, findings = EffectsState.start(imaged), list[Finding]()
     dismissed, passed = list[CameraEffect](), set[FindingKind]()
     camera_explains = True
     while len(findings) < AT_ONCE:
@@ -118,7 +117,7 @@ def effects(imaged: CameraAdjustment) -> tuple[State, tuple[Finding, ...]]:
     return state, tuple(findings)
 
 
-def _matters(found: Finding, after: State) -> bool:
+def _matters(found: Finding, after: EffectsState) -> bool:
     """Return whether an effect moves the camera, or contradicts given intrinsics that users have elsewhere."""
     if found.kind is FindingKind.INTRINSICS and is_far_off(after):
         return True
@@ -129,7 +128,7 @@ def _matters(found: Finding, after: State) -> bool:
     return is_material(found, std)
 
 
-def _explains(state: State, test: Test, of_camera: CameraEffect, log_chance: float) -> bool:
+def _explains(state: EffectsState, test: Test, of_camera: CameraEffect, log_chance: float) -> bool:
     """Return whether an effect on the poses rather than one on the camera is the cause where both are significant."""
     with_camera = freed(state, of_camera)
     if with_camera is None:
@@ -170,7 +169,7 @@ class ArmEquations:
         return own[:, :, :6], own[:, :, 6:]
 
 
-def _poses_of(state: State) -> ArmEquations | None:
+def _poses_of(state: EffectsState) -> ArmEquations | None:
     """Return the equations of the arm whose poses are tested with the camera."""
     adjusted, arm = state.adjusted, state.imaged.arm
     if arm is None:
@@ -184,7 +183,7 @@ def _poses_of(state: State) -> ArmEquations | None:
     )
 
 
-def _best_pose_effect(state: State, passed: Collection[FindingKind]) -> Test | None:
+def _best_pose_effect(state: EffectsState, passed: Collection[FindingKind]) -> Test | None:
     """Return the most significant effect on the gripper poses that its cause can produce."""
     poses = _poses_of(state)
     return None if poses is None else best_pose_effect(poses, {*passed, *(row.kind for row in state.poses)})
@@ -289,7 +288,7 @@ def _size_of_strain(test: Test) -> dict[str, Any]:
     }
 
 
-def _adopted(case: Case, state: State, findings: tuple[Finding, ...]) -> Case:
+def _adopted(case: Case, state: EffectsState, findings: tuple[Finding, ...]) -> Case:
     """Return the calibration with the effects that its model can carry; one that is rejected stays."""
     adjusted, adopted = with_effects(case, state, findings)
     if adjusted is None:
@@ -299,7 +298,7 @@ def _adopted(case: Case, state: State, findings: tuple[Finding, ...]) -> Case:
 
 
 def with_effects(
-    case: Case, state: State, findings: tuple[Finding, ...]
+    case: Case, state: EffectsState, findings: tuple[Finding, ...]
 ) -> tuple[Solution | None, tuple[Finding, ...]]:
     """Adjust a case with the effects on camera and arm free, and return the findings with the shifts that remain.
 
@@ -396,7 +395,7 @@ def _effects_of_poses(case: Case) -> tuple[Finding, ...]:
 
 
 def effects_of_fit(
-    problem: Problem, state: ProblemState, hand_eye: HandEye, names: Sequence[str]
+    problem: Problem, state: State, hand_eye: HandEye, names: Sequence[str]
 ) -> tuple[Finding, ...]:
     """Return the most significant effect of the order on a fit to camera poses; `names` are those of its poses."""
     found = pose_equations(problem, state, None)

@@ -11,7 +11,7 @@ from numpy import ndarray
 from jcr.allocator import give_back
 from jcr.errors import InputError, RejectedError
 from jcr.hub import Weights
-from jcr.pointmaps.dust3r.network import Features
+from jcr.pointmaps.dust3r.network import EncodedImages
 from jcr.pointmaps.dust3r.pair_graph import PairGraph, pairs_of_graph
 from jcr.pointmaps.dust3r.weights import LoadedNetwork, load_weights
 from jcr.pointmaps.grid import PreparedImages, prepare_images
@@ -63,7 +63,7 @@ def predict_pairs(
     Where CUDA runs out of memory the batch is halved. Raises InputError where the memory does not suffice for one pair.
     """
     network, report, notes = loaded.network, progress or silent, tuple[str, ...]()
-    batch, features = MAX_BATCH[network.device.type], dict[int, Features]()
+    batch, features = MAX_BATCH[network.device.type], dict[int, EncodedImages]()
     height, width = images.colors.shape[1:3]
     arrays = [np.empty((len(edges), height, width, *point), np.float32) for point in ((3,), ()) * 2]
 
@@ -71,12 +71,12 @@ def predict_pairs(
         colors = torch.from_numpy(images.colors[rows]).to(network.device).permute(0, 3, 1, 2)
         tokens, grid = network.encode((colors / 255 - 0.5) / 0.5)
         features.update(
-            (row, Features(own[None], grid)) for row, own in zip(rows.tolist(), tokens, strict=True)
+            (row, EncodedImages(own[None], grid)) for row, own in zip(rows.tolist(), tokens, strict=True)
         )
 
     def decode(rows: Int[ndarray, " b"]) -> None:
         first, second = (
-            Features(torch.cat([features[row].tokens for row in side]), features[side[0]].grid)
+            EncodedImages(torch.cat([features[row].tokens for row in side]), features[side[0]].grid)
             for side in edges[rows].T.tolist()
         )
         view1, view2 = network.decode(first, second)

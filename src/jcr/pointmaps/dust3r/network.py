@@ -25,7 +25,7 @@ Rotary = Float[Tensor, "2 n 2 frequencies"]
 """Cosines and sines per token, coordinate (y, x) and frequency."""
 
 
-class Features(NamedTuple):
+class EncodedImages(NamedTuple):
     """Encoded images, independent of the images they are paired with."""
 
     tokens: Tensor
@@ -119,7 +119,7 @@ class Dust3r(nn.Module):
         """Return pointmaps of images in [-1, 1] whose height and width are multiples of 16, portrait included."""
         return self.decode(self.encode(image1), self.encode(image2))
 
-    def encode(self, images: Float[Tensor, "b 3 h w"]) -> Features:
+    def encode(self, images: Float[Tensor, "b 3 h w"]) -> EncodedImages:
         """Return the features of images in [-1, 1]; each image is encoded once for all its pairs."""
         if images.shape[-2] % PATCH or images.shape[-1] % PATCH:
             raise ValueError(
@@ -132,9 +132,9 @@ class Dust3r(nn.Module):
             x = self.patch_embed(images).float()
             for block in self.enc_blocks:
                 x = block(x, rotary)
-            return Features(self.enc_norm(x), grid)
+            return EncodedImages(self.enc_norm(x), grid)
 
-    def decode(self, features1: Features, features2: Features) -> tuple[Pointmap, Pointmap]:
+    def decode(self, features1: EncodedImages, features2: EncodedImages) -> tuple[Pointmap, Pointmap]:
         """Return pointmaps of both images in the first camera's frame; (1, 2) does not give (2, 1)."""
         with self._autocast(features1.tokens):
             rotary1, rotary2 = (

@@ -11,8 +11,8 @@ from numpy import ndarray
 
 from jcr.camera import rays
 from jcr.errors import InputError
-from jcr.pointmaps.global_alignment.gauss_newton import ITERATIONS, Solution, solve
-from jcr.pointmaps.global_alignment.observations import Problem, observe
+from jcr.pointmaps.global_alignment.gauss_newton import ITERATIONS, AlignmentSolution, solve
+from jcr.pointmaps.global_alignment.observations import AlignmentProblem, observe
 from jcr.pointmaps.global_alignment.residuals import fused_depth
 from jcr.pointmaps.pairs import PairPredictions, read_pairs
 from jcr.progress import Progress, silent
@@ -79,7 +79,7 @@ def global_align(
     if pixels < LEAST_PIXELS:
         raise InputError(f"{pixels} pixels per image are too few; alignment needs {LEAST_PIXELS} or more")
     _check_connected(predictions)
-    problem = Problem.of(predictions)
+    problem = AlignmentProblem.of(predictions)
     return _dense_alignment(problem, solve(problem, pixels), progress or silent)
 
 
@@ -101,7 +101,7 @@ def _check_connected(predictions: PairPredictions) -> None:
         )
 
 
-def _dense_alignment(problem: Problem, solution: Solution, progress: Progress) -> Alignment:
+def _dense_alignment(problem: AlignmentProblem, solution: AlignmentSolution, progress: Progress) -> Alignment:
     """Return the alignment of a solution in its own recon frame, with the depth of every pixel."""
     predictions, state = problem.predictions, solution.state
     count, (height, width) = predictions.image_count, predictions.conf.shape[1:]

@@ -22,11 +22,11 @@ from jcr.errors import RejectedError
 from jcr.geometry import adjoint, inverse, retract, skew, twist_from_step
 from jcr.least_squares import one_blas_thread
 from jcr.pointmaps.global_alignment.initial_estimate import initial_state
-from jcr.pointmaps.global_alignment.observations import ImageObservations, Problem
+from jcr.pointmaps.global_alignment.observations import AlignmentProblem, ImageObservations
 from jcr.pointmaps.global_alignment.residuals import (
-    Noise,
+    AlignmentState,
     Residuals,
-    State,
+    ResidualSpread,
     agreement,
     fused_depth,
     measure_noise,
@@ -51,14 +51,14 @@ UNDETERMINED = "the pointmaps of the pairs have too little in common to be align
 
 
 @dataclass(frozen=True, kw_only=True)
-class Solution:
+class AlignmentSolution:
     """The result of Gauss-Newton."""
 
-    state: State
+    state: AlignmentState
     covariance: Float[ndarray, "r r"]
     """Covariance of the cameras' steps, r = 6n, from the equations of the last step; zero for the first camera."""
     images: list[ImageObservations]
-    noise: list[Noise]
+    noise: list[ResidualSpread]
     """Noise of the pointmaps of each image."""
     pair_spread: Float[ndarray, "6"]
     """Standard deviation per axis of the pairs' errors: translation, rotation."""
@@ -90,7 +90,7 @@ class ImageEquations:
     coupling: Float[ndarray, "c m"]
 
 
-def solve(problem: Problem, pixels: int) -> Solution:
+def solve(problem: AlignmentProblem, pixels: int) -> AlignmentSolution:
     """Estimate cameras, focal length, pair scales and the depths of about `pixels` pixels per image."""
     images = problem.observe_all(min(COARSE_PIXELS, pixels))
     state = initial_state(images, problem.predictions.edges)
@@ -104,8 +104,8 @@ def solve(problem: Problem, pixels: int) -> Solution:
 
 @one_blas_thread
 def gauss_newton(
-    images: list[ImageObservations], state: State, pair_spread: Float[ndarray, "6"], tolerance: float
-) -> Solution:
+    images: list[ImageObservations], state: AlignmentState, pair_spread: Float[ndarray, "6"], tolerance: float
+) -> AlignmentSolution:
     """Iterate until no unknown moves by more than `tolerance` (rad, or relative).
 
     The weights, and the spread of the pairs' errors, are measured again in each iteration, and depths and pairs' errors
@@ -142,7 +142,7 @@ def gauss_newton(
         if settled or iteration == ITERATIONS:
             covariance = np.zeros((focal, focal))
             covariance[6:, 6:] = np.linalg.inv(normal)[: focal - 6, : focal - 6]
-            return Solution(
+            return AlignmentSolution(
                 state=state,
                 covariance=covariance,
                 images=images,
@@ -156,10 +156,10 @@ def gauss_newton(
 
 def _after_step(
     images: list[ImageObservations],
-    state: State,
+    state: AlignmentState,
     equations: list[ImageEquations],
     step: Float[ndarray, " p"],
-) -> tuple[State, Float[ndarray, "e 6"]]:
+) -> tuple[AlignmentState, Float[ndarray, "e 6"]]:
     """Return the state after a step of the unknowns that are not eliminated, and the variances of the pairs' errors."""
     log_depth, pair_error = [], state.pair_error.copy()
     variance = np.zeros_like(pair_error)
@@ -175,7 +175,7 @@ def _after_step(
         pair_error[second_pairs] += np.einsum("kij,kj->ki", e.axes, pair_step.reshape(-1, 6))
         variance[second_pairs] = e.error_variance
     focal = 6 * len(images)
-    after = State(
+    after = AlignmentState(
         recon_from_camera=retract(state.recon_from_camera, step[:focal].reshape(-1, 6)),
         log_focal=state.log_focal + float(step[focal]),
         log_pair_scale=state.log_pair_scale + step[focal + 1 :],
@@ -199,7 +199,11 @@ def _spread(
 
 
 def image_equations(
-    o: ImageObservations, r: Residuals, noise: Noise, state: State, pair_spread: Float[ndarray, "6"]
+    o: ImageObservations,
+    r: Residuals,
+    noise: ResidualSpread,
+    state: AlignmentState,
+    pair_spread: Float[ndarray, "6"],
 ) -> ImageEquations:
     """Return the Gauss-Newton equations of one image's pointmaps with residuals `r` of spread `noise`.
 
@@ -301,7 +305,7 @@ def _isotropic(alpha: Float[ndarray, "n m"], x: Float[ndarray, "3 m"]) -> Float[
     return out
 
 
-def _selection(o: ImageObservations, state: State) -> csr_array:
+def _selection(o: ImageObservations, state: AlignmentState) -> csr_array:
     """Return the matrix from a step of all unknowns to the local unknowns of an image's equations."""
     n, maps, focal = o.second_count, len(o.pair), 6 * len(state.recon_from_camera)
     observers, to_twist = o.observer[:n], twist_from_step(state.recon_from_camera)

@@ -8,10 +8,10 @@ from jcr.errors import RejectedError
 from jcr.estimation.absolute_pose import ransac_pose
 from jcr.geometry import apply, fit_similarity, inverse
 from jcr.pointmaps.global_alignment.observations import ImageObservations
-from jcr.pointmaps.global_alignment.residuals import State
+from jcr.pointmaps.global_alignment.residuals import AlignmentState
 
 
-def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"]) -> State:
+def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"]) -> AlignmentState:
     """Estimate the state to a few per cent: every image's own depth, chained along the pairs that agree best."""
     focal = _focal(images)
     depth, unit = [], np.zeros(len(edges))
@@ -34,7 +34,7 @@ def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"]) -
     shift = (log_scale[edges[:, 0]] - unit).mean()
     log_scale -= shift
     recon_from_camera[:, :3, 3] *= np.exp(-shift)
-    return State(
+    return AlignmentState(
         recon_from_camera=recon_from_camera,
         log_focal=float(np.log(focal)),
         log_pair_scale=log_scale[edges[:, 0]] - unit,

@@ -16,7 +16,7 @@ POOR = 0.2
 
 
 @dataclass(frozen=True)
-class Problem:
+class AlignmentProblem:
     """Predictions with the fixed parameters of their alignment."""
 
     predictions: PairPredictions
@@ -28,7 +28,7 @@ class Problem:
     """Whether confidences follow DUSt3R, from 1 up with weight log C; else they are weights."""
 
     @classmethod
-    def of(cls, predictions: PairPredictions) -> "Problem":
+    def of(cls, predictions: PairPredictions) -> "AlignmentProblem":
         """Return the problem of some predictions; the principal point is the middle without their intrinsics."""
         given = predictions.intrinsics
         height, width = predictions.conf.shape[1:]
@@ -69,7 +69,7 @@ class ImageObservations:
     weight: Float[ndarray, "k m"]
 
 
-def _choose_pixels(problem: Problem, count: int) -> list[Int[ndarray, " _"]]:
+def _choose_pixels(problem: AlignmentProblem, count: int) -> list[Int[ndarray, " _"]]:
     """Choose per image the most confident pixel of each of about `count` equal cells; return flat indices.
 
     Equal cells keep the whole field of view, which a plain ranking by confidence would give up. Cells without
@@ -102,7 +102,7 @@ def _choose_pixels(problem: Problem, count: int) -> list[Int[ndarray, " _"]]:
     return chosen
 
 
-def observe(problem: Problem, image: int, pixels: Int[ndarray, " m"] | slice) -> ImageObservations:
+def observe(problem: AlignmentProblem, image: int, pixels: Int[ndarray, " m"] | slice) -> ImageObservations:
     """Gather the pointmaps of all pairs at `pixels` (flat indices) of one image."""
     predictions = problem.predictions
     height, width = predictions.conf.shape[1:]

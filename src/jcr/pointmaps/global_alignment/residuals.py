@@ -30,7 +30,7 @@ DEPTH_ITERATIONS = 2
 
 
 @dataclass(frozen=True, kw_only=True)
-class State:
+class AlignmentState:
     """Unknowns of the alignment."""
 
     recon_from_camera: Float[ndarray, "n 4 4"]
@@ -44,7 +44,7 @@ class State:
 
 
 @dataclass(frozen=True)
-class Noise:
+class ResidualSpread:
     """Spread of the residuals of some pointmaps, `across` (rad per axis) and `along` (relative) the sight."""
 
     across: Float[ndarray, " k"]
@@ -72,7 +72,7 @@ class Residuals:
     along: Float[ndarray, "k m"]
 
 
-def residuals(o: ImageObservations, state: State, log_depth: Float[ndarray, " m"]) -> Residuals:
+def residuals(o: ImageObservations, state: AlignmentState, log_depth: Float[ndarray, " m"]) -> Residuals:
     """Model one image's points at `log_depth` and compare them with every pointmap that shows them."""
     camera, observer = state.recon_from_camera[o.image], state.recon_from_camera[o.observer]
     error = state.pair_error[o.pair]
@@ -103,13 +103,13 @@ def residuals(o: ImageObservations, state: State, log_depth: Float[ndarray, " m"
     )
 
 
-def agreement(r: Residuals, noise: Noise) -> Float[ndarray, "k m"]:
+def agreement(r: Residuals, noise: ResidualSpread) -> Float[ndarray, "k m"]:
     """Return the Geman-McClure weights of the residuals, in (0, 1]."""
     u = r.across_squared / noise.across[:, None] ** 2 + r.along**2 / noise.along[:, None] ** 2
     return (1.0 + u * np.float32(ROBUST_WIDTH**-2)) ** -2
 
 
-def measure_noise(images: list[ImageObservations], misfit: list[Residuals]) -> list[Noise]:
+def measure_noise(images: list[ImageObservations], misfit: list[Residuals]) -> list[ResidualSpread]:
     """Estimate the noise of every pointmap, per image: its own spreads and the inflations of its kind of view.
 
     A spread is at least a third of the usual one of its kind, so that no pair outweighs all others by a lucky fit.
@@ -121,7 +121,7 @@ def measure_noise(images: list[ImageObservations], misfit: list[Residuals]) -> l
     result = []
     for noise, kinds in zip(own, is_second, strict=True):
         of_kind = np.stack([usual[kind] for kind in kinds.tolist()], axis=1)
-        result.append(Noise(*np.maximum(noise[:2], of_kind[:2] / 3), *of_kind[2:]))
+        result.append(ResidualSpread(*np.maximum(noise[:2], of_kind[:2] / 3), *of_kind[2:]))
     return result
 
 
@@ -129,7 +129,7 @@ def _own_noise(o: ImageObservations, r: Residuals) -> Float[ndarray, "4 k"]:
     """Estimate spreads per pointmap from medians, and inflations from the agreement within cells; fields of Noise."""
     across = np.maximum(np.sqrt(np.median(r.across_squared, axis=1) / 1.386), LEAST_NOISE)
     along = np.maximum(1.4826 * np.median(np.abs(r.along), axis=1), LEAST_NOISE)
-    weight = o.weight * agreement(r, Noise(across, along, across, along))
+    weight = o.weight * agreement(r, ResidualSpread(across, along, across, along))
     return np.stack([across, along, _inflation(o, weight, r.across), _inflation(o, weight, r.along[:, None])])
 
 
@@ -147,7 +147,7 @@ def _inflation(
     return np.maximum(1.0, per_cell * variance_of_means / np.maximum(variance, 1e-30))
 
 
-def initial_depth(o: ImageObservations, state: State) -> Float[ndarray, " m"]:
+def initial_depth(o: ImageObservations, state: AlignmentState) -> Float[ndarray, " m"]:
     """Return the median over the pairs of the predicted depth, of first views alone where the image has any."""
     n, camera = o.second_count, state.recon_from_camera[o.image]
     scale = np.exp(o.log_range + state.log_pair_scale[o.pair].astype(np.float32)[:, None])
@@ -161,7 +161,7 @@ def initial_depth(o: ImageObservations, state: State) -> Float[ndarray, " m"]:
 
 
 def fused_depth(
-    o: ImageObservations, state: State, noise: Noise
+    o: ImageObservations, state: AlignmentState, noise: ResidualSpread
 ) -> tuple[Float[ndarray, " m"], Float[ndarray, " m"]]:
     """Estimate the depth of the observed pixels by Gauss-Newton from `initial_depth`, and their mean weight.
 
