@@ -106,7 +106,9 @@ def step_between(
 
 
 def step_axes(rotation: Rotations) -> Float[ndarray, "*batch 6 6"]:
-    """Matrices (...,6,6) that take steps from the axes of b to those of a, by the rotations of `a_from_b`.
+    """Return the matrices (…,6,6) that turn steps (m, then rad) from the axes of frame b to those of a.
+
+    `rotation` (…,3,3) holds the rotations a_from_b.
 
     A motion on the right, T ← T·exp(ξ), is the step `step_axes(R) @ ξ` to first order.
     """

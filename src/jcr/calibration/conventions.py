@@ -108,7 +108,7 @@ def better_reading(
     by_name: Mapping[bool, Poses] | None = None,
     solved: HandEye | None = None,
 ) -> tuple[PoseConvention, PoseConvention] | None:
-    """Return the reading that fits far better than the poses as given, and the reading as given; None without one.
+    """Return the pose convention that fits far better than the given one, and the given one; None where none does.
 
     `by_name` holds the poses by other orders of the images' names: as numbers (True), as text (False). `solved` is the
     calibration of the poses as given, where there is one from the camera poses alone.

@@ -38,7 +38,7 @@ def read_added(run_folder: Path, capture: Capture) -> Capture:
 
 
 def with_images(added: Capture, path: Path, options: ReadOptions | None = None) -> Capture:
-    """Copy the images of the capture at a path beside those added before; `write_added` makes them part of the run.
+    """Return the added images and those of one more capture, which are copied; `write_added` makes them part of the run.
 
     Raises InputError for images of another size than the run's, and for images that were added before.
     """

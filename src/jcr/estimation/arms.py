@@ -42,7 +42,7 @@ def _ur(name: str, d1: float, a2: float, a3: float, d4: float, d5: float, d6: fl
 
 
 def _franka(name: str, limits: Limits) -> Arm:
-    """Return a Franka Emika Panda (FER) or Research 3, by modified parameters; the gripper is the flange.
+    """Return a Franka Panda (FER) or Research 3, by modified Denavit-Hartenberg parameters; the gripper is the flange.
 
     Source: Franka Control Interface documentation, "Robot and interface specifications"; robots/fer/kinematics.yaml
     and robots/fr3/joint_limits.yaml of frankaemika/franka_description.

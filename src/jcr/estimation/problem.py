@@ -342,7 +342,11 @@ def image_step(problem: Problem, state: State, step: Float[ndarray, " d"]) -> St
 
 
 def full_step(problem: Problem, state: State, step: Float[ndarray, " p"]) -> State:
-    """Return the state after a step of X, log scale and Z, of X and Z of further arms, and of the free columns."""
+    """Return the state after a step of all parameters.
+
+    `step` holds X, log scale and Z of the first arm, X and Z of further arms, then the intrinsics and other camera
+    parameters that are estimated.
+    """
     own = np.stack([step[columns_of_arm(arm)] for arm in range(len(state.x))])
     of_images = np.zeros(problem.columns.count)
     of_images[problem.free] = step[problem.arm_unknowns :]

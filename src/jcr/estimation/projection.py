@@ -85,7 +85,7 @@ def view_of(problem: Problem, state: State) -> ProjectedObservations:
 def derivatives(
     problem: Problem, state: State, view: ProjectedObservations, weight: Float[ndarray, " k"]
 ) -> Derivatives:
-    """Return residuals and derivatives of all rows of the equations, times the square roots of their weights."""
+    """Return the residuals of the observations and their derivatives by all parameters, times the roots of the weights."""
     columns, root = problem.columns, np.sqrt(weight)[:, None, None]
     by_rig = root * _by_rig(problem, state, view)
     shared = np.zeros((len(weight), 2, columns.first_rig))
@@ -153,7 +153,7 @@ def _by_rig(problem: Problem, state: State, view: ProjectedObservations) -> Floa
 
 
 def _by_cameras(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, "k 2 l"]:
-    """Return the derivative of every observation by the steps of intrinsics and nuisances."""
+    """Return the derivative of every observation by the intrinsics and the other camera parameters."""
     out = np.zeros((len(view.in_camera), 2, problem.columns.nuisance.stop))
     each = list(
         zip(view.cameras, problem.cameras, problem.columns.intrinsics, problem.camera_rows, strict=True)

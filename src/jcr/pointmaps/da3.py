@@ -88,7 +88,7 @@ def grid_of(size: tuple[int, int], long_edge: int = LONG_EDGE) -> ImageGrid:
 
 
 def resized(image: UInt8[ndarray, "h w 3"], grid: ImageGrid, long_edge: int) -> UInt8[ndarray, "h2 w2 3"]:
-    """Resize an image to the grid in the two steps and with the filters of the package."""
+    """Resize an image to `long_edge` and then to the grid, with the filters that Depth Anything 3 uses for each."""
     height, width = image.shape[:2]
     scale = long_edge / max(width, height)
     for size in ((max(1, round(width * scale)), max(1, round(height * scale))), grid.size):

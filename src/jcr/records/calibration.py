@@ -410,7 +410,7 @@ class HandEye(Estimate):
     """Findings, strongest first; of the same severity causes before consequences."""
 
     def with_findings(self, *findings: Finding) -> "HandEye":
-        """Return the calibration with more findings, each in its place."""
+        """Return the calibration with more findings, ordered from strongest to weakest."""
         return replace(self, findings=strongest_first((*self.findings, *findings)))
 
     @property

@@ -250,7 +250,7 @@ class Fields(nn.Module):
         return {name: out[name] for name in names}
 
     def expand(self, name: str) -> None:
-        """Make the field with that head answer faster, at the cost of memory; for maps that are trained."""
+        """Keep the features of the field with this output at every node: queries are faster and take more memory."""
         for shape, field in zip(self.shapes, self.of, strict=True):
             if name in shape.heads and isinstance(field.encoding, GridEncoding):
                 field.encoding.expand()

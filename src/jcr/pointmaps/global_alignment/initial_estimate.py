@@ -62,7 +62,7 @@ def _focal(images: list[ImageObservations]) -> float:
 
 
 def _own_depth(o: ImageObservations, focal: float) -> tuple[Float[ndarray, " m"], Float[ndarray, " f"]]:
-    """Estimate the depth of an image in its own unit, and the log units of the pairs whose first image it is.
+    """Return the median depth of each pixel over the pairs whose first image this is, and the log scale of each pair.
 
     An image that is first in no pair has its depth by resection from the view with most inliers.
     """
