@@ -85,7 +85,7 @@ def view_of(problem: Problem, state: State) -> ProjectedObservations:
 def derivatives(
     problem: Problem, state: State, view: ProjectedObservations, weight: Float[ndarray, " k"]
 ) -> Derivatives:
-    """Return the residuals of the observations and their derivatives by all parameters, times the roots of the weights."""
+    """Return residuals of the observations and their derivatives by all parameters, times the roots of the weights."""
     columns, root = problem.columns, np.sqrt(weight)[:, None, None]
     by_rig = root * _by_rig(problem, state, view)
     shared = np.zeros((len(weight), 2, columns.first_rig))
