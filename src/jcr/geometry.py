@@ -167,10 +167,6 @@ class Similarity:
         """Return points (…,3) in a."""
         return apply(self.rigid, self.scale * np.asarray(x_in_b, float))
 
-    def of_cameras(self, b_from_camera: Transforms) -> Transforms:
-        """Return the rigid transforms a_from_camera (…,4,4) of cameras whose poses in b have its unit."""
-        return self.rigid @ scale_translation(b_from_camera, self.scale)
-
 
 def apply_similarity(a_from_b: Transform, scale: float, x_in_b: Vectors) -> Vectors:
     """x_in_a = R · (scale · x_in_b) + t for points (...,3)."""

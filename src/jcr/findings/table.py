@@ -207,7 +207,7 @@ class FindingKind(StrEnum):
         "measure one, and give it in --board: the scale is then known twice", evidence="m")
     BOARD_MOVED = "board at several places", KindRow("lengths",
         "in {images} {board} is at another place than in the other images: it was moved, or there are two",
-        "its corners there are left out; keep one board of a kind, and keep it still")
+        "its corners there count little or not at all; keep one board of a kind, and keep it still")
     BOARD_STRETCHED = "board stretched", KindRow("lengths",
         "{board} is {size_percent:.1f} % longer along one side than along the other: it was not printed at its size",
         "print it without scaling (jcr board) and measure both sides; its size is not used for the scale",
