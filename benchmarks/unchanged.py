@@ -24,8 +24,8 @@ from jcr.capture.read import read_capture
 from jcr.estimation.arms import arm_named
 from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.geometry import step_between
-from jcr.reconstruction_npz import read_reconstruction
 from jcr.records import HandEye
+from jcr.records.npz import read_reconstruction
 from simulation.boards import Sheet, with_sheet
 from simulation.cells import Kind, cell_problem
 from simulation.faults import Faults, faulty_capture, reconstructed

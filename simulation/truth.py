@@ -14,8 +14,8 @@ from jcr.camera import rays
 from jcr.capture.images import encode_png
 from jcr.files import write_bytes, write_text
 from jcr.geometry import apply
-from jcr.intrinsics_json import IntrinsicsJson
 from jcr.records import Intrinsics
+from jcr.records.json_fields import IntrinsicsJson
 
 DEPTH_UNIT_M = 1e-4
 """Metres per count of the 16-bit depth images."""

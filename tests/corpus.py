@@ -34,7 +34,6 @@ from jcr.live.folder import LiveFolder
 from jcr.live.server import sample_pose
 from jcr.pointmaps.pairs import pairs_from_arrays, read_arrays
 from jcr.reconstruct import ReconstructOptions
-from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import (
     Attempt,
     Capture,
@@ -45,6 +44,7 @@ from jcr.records import (
     Reconstruction,
     Tracks,
 )
+from jcr.records.npz import read_reconstruction, write_reconstruction
 from jcr.run_folder import RunResult
 from jcr.scene.cloud import read_cloud, write_cloud
 from jcr.scene.map_file import load_map

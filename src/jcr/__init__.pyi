@@ -23,7 +23,6 @@ from .export.options import ExportOptions as ExportOptions
 from .findings import Finding as Finding
 from .findings import FindingKind as FindingKind
 from .geometry import Similarity as Similarity
-from .intrinsics_json import IntrinsicsAndStd as IntrinsicsAndStd
 from .live.calibration import LiveCalibration as LiveCalibration
 from .live.cameras import Camera as Camera
 from .live.cameras import Frame as Frame
@@ -64,6 +63,7 @@ from .records import PosePairs as PosePairs
 from .records import Reconstruction as Reconstruction
 from .records import Requirement as Requirement
 from .records import RobotNoise as RobotNoise
+from .records.json_fields import IntrinsicsAndStd as IntrinsicsAndStd
 from .run_folder import RunOptions as RunOptions
 from .run_folder import RunResult as RunResult
 from .run_folder import load_run as load_run

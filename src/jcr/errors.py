@@ -1,7 +1,14 @@
-"""Errors that are no bug: input that cannot be used, and a rejected result."""
+"""Errors that are no bug, input that cannot be used and a rejected result, and the parts of their messages."""
 
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
+
+LONGEST_SHOWN = 80
+"""Characters of the longest value that a message quotes."""
 
 
 def printable(text: str) -> str:
@@ -13,6 +20,20 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Return a question for the known word that is like this one; empty where none is."""
     like = get_close_matches(word.lower(), known, n=1)
     return f"; did you mean {like[0]}?" if like else ""
+
+
+def shown(value: object) -> str:
+    """Return a value of a file as a message quotes it: a long one is cut."""
+    text = repr(value)
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}… ({len(text)} characters)"
+
+
+def first_fault(error: "ValidationError") -> str:
+    """Return the first fault that a schema finds, with its place."""
+    first = error.errors()[0]
+    place = ".".join(str(part)[:LONGEST_SHOWN] for part in first["loc"])
+    what = "is missing" if first["type"] == "missing" else first["msg"].removeprefix("Value error, ")
+    return f"{place}: {what}" if place else what
 
 
 class InputError(ValueError):

@@ -24,18 +24,17 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration, read_calibration
 from jcr.capture.added import FOLDER as ADDED
 from jcr.capture.added import read_added
-from jcr.capture.plain_files import first_fault
 from jcr.capture.read import read_capture
 from jcr.cell.placement import CamerasFile, read_cameras
 from jcr.depth.depth_npz import FILE as DEPTH
 from jcr.depth.depth_npz import FORMAT as DEPTH_FORMAT
 from jcr.depth.depth_npz import read_depth
 from jcr.depth.options import DepthOptions
-from jcr.errors import InputError
+from jcr.errors import InputError, first_fault
 from jcr.files import read_bytes, remove_unfinished
 from jcr.reconstruct import BACKENDS, ReconstructOptions, candidates, tries, with_cameras_of
-from jcr.reconstruction_npz import FORMAT, read_reconstruction
 from jcr.records import Attempt, Capture, HandEye, Intrinsics, PointCloud, Reconstruction
+from jcr.records.npz import FORMAT, read_reconstruction
 from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import FILE as MAP
 from jcr.scene.map_file import load_map

@@ -12,8 +12,8 @@ from jcr.calibration.stage import calibrate
 from jcr.camera import project
 from jcr.findings import FindingKind, sentence
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Capture, Reconstruction
+from jcr.records.npz import read_reconstruction, write_reconstruction
 from simulation.faults import Faults, FaultyCapture, faulty_capture, reconstructed
 
 pytestmark = pytest.mark.slow

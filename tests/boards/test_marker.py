@@ -18,8 +18,8 @@ from jcr.cli import dispatch
 from jcr.depth.densify import densify
 from jcr.errors import InputError
 from jcr.geometry import rotation_between_deg
-from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Intrinsics
+from jcr.records.npz import read_reconstruction, write_reconstruction
 from places import SHARED
 from simulation.problems import TARGET_IN_BASE, HandEyeProblem, hand_eye_problem
 

@@ -11,8 +11,8 @@ from jcr.capture import camera_info
 from jcr.capture.formats import colmap
 from jcr.capture.plain_files import validated
 from jcr.export import ros
-from jcr.intrinsics_json import IntrinsicsAndStd
 from jcr.records import Intrinsics
+from jcr.records.json_fields import IntrinsicsAndStd
 
 SIZE = (640, 480)
 RATIONAL = Intrinsics(

@@ -17,7 +17,7 @@ from capture_writers import write_easy_handeye2
 from jcr.calibration.record import read_calibration
 from jcr.errors import InputError
 from jcr.geometry import scale_translation
-from jcr.reconstruction_npz import read_reconstruction
+from jcr.records.npz import read_reconstruction
 from simulation.problems import hand_eye_problem
 from waiting import until
 

@@ -11,12 +11,11 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from jcr.arrays_json import Matrix, Spread3
 from jcr.calibration.record import Calibration, read_content, validated
-from jcr.capture.plain_files import first_fault
 from jcr.distributions import chi2
-from jcr.errors import InputError
+from jcr.errors import InputError, first_fault
 from jcr.geometry import require_rigid, step_between
+from jcr.records.json_fields import Matrix, Spread3
 
 if TYPE_CHECKING:
     from jcr.run_folder import RunResult

@@ -20,18 +20,6 @@ from pydantic import (
     model_validator,
 )
 
-from jcr.arrays_json import (
-    Covariance7,
-    Matrix,
-    Numbers,
-    Numbers3,
-    Numbers7,
-    Part,
-    PartCovariance7,
-    Spread,
-    Spread3,
-    Square,
-)
 from jcr.camera import parameter_names
 from jcr.capture.plain_files import first_fault, read_json, shown
 from jcr.errors import InputError, RejectedError
@@ -52,7 +40,6 @@ from jcr.findings import (
 )
 from jcr.findings.sentences import worst_direction
 from jcr.geometry import Similarity, rotation_log
-from jcr.intrinsics_json import IntrinsicsAndStd, IntrinsicsJson, Positive
 from jcr.records import (
     COVARIANCE_ORDER,
     Attempt,
@@ -74,6 +61,21 @@ from jcr.records import (
     RobotNoise,
     ScaleCheck,
     Seen,
+)
+from jcr.records.json_fields import (
+    Covariance7,
+    IntrinsicsAndStd,
+    IntrinsicsJson,
+    Matrix,
+    Numbers,
+    Numbers3,
+    Numbers7,
+    Part,
+    PartCovariance7,
+    Positive,
+    Spread,
+    Spread3,
+    Square,
 )
 from jcr.records.notebook import table
 

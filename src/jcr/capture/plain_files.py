@@ -10,7 +10,7 @@ import numpy as np
 from numpy import ndarray
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from jcr.errors import InputError
+from jcr.errors import InputError, first_fault, shown
 from jcr.files import read_bytes, require_file
 
 LONGEST = 255
@@ -19,8 +19,6 @@ MAX_YAML, MAX_JSON = 4_000_000, 32_000_000
 """Characters of the longest files: a longer one takes long to read, and is no capture."""
 NAMED = 10
 """Names that a message lists; of more it gives the number."""
-LONGEST_SHOWN = 80
-"""Characters of the longest value that a message quotes."""
 
 
 def read_text(file: Path) -> str:
@@ -92,12 +90,6 @@ def _bounded(file: Path, most: int) -> str:
     return text
 
 
-def shown(value: object) -> str:
-    """Return a value of a file as a message quotes it: a long one is cut."""
-    text = repr(value)
-    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}… ({len(text)} characters)"
-
-
 def first_few(names: Sequence[str]) -> str:
     """Return the first names, and how many more there are."""
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
@@ -111,14 +103,6 @@ def validated(schema: type[BaseModel] | TypeAdapter, content: Any, where: str) -
         return validate(content)
     except ValidationError as error:
         raise InputError(f"{where}: {first_fault(error)}; correct it there") from None
-
-
-def first_fault(error: ValidationError) -> str:
-    """Return the first fault that a schema finds, with its place."""
-    first = error.errors()[0]
-    place = ".".join(str(part)[:LONGEST_SHOWN] for part in first["loc"])
-    what = "is missing" if first["type"] == "missing" else first["msg"].removeprefix("Value error, ")
-    return f"{place}: {what}" if place else what
 
 
 def read_npy(file: Path) -> ndarray:

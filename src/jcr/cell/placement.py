@@ -11,15 +11,14 @@ from jaxtyping import Float
 from numpy import ndarray
 from pydantic import Field, ValidationError, model_validator
 
-from jcr.arrays_json import Covariance6, Matrix, Part, Spread, Spread3
 from jcr.calibration.record import FindingJson, derived, require_one_verdict
 from jcr.capture.plain_files import first_fault, read_json
 from jcr.errors import InputError
 from jcr.files import write_text
 from jcr.findings import Finding, Verdict, doubt_of, strongest_first
 from jcr.geometry import skew
-from jcr.intrinsics_json import IntrinsicsAndStd
 from jcr.records import CellCamera, Mount
+from jcr.records.json_fields import Covariance6, IntrinsicsAndStd, Matrix, Part, Spread, Spread3
 from jcr.rounding import significant
 
 if TYPE_CHECKING:

@@ -26,10 +26,10 @@ from jcr.estimation.problem import State
 from jcr.estimation.solve import Solution
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import apply, inverse, scale_translation
-from jcr.intrinsics_json import IntrinsicsAndStd
 from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress, silent, steps
 from jcr.records import Capture, CellCamera, HandEye, Reconstruction
+from jcr.records.json_fields import IntrinsicsAndStd
 from jcr.sfm.register import KnownImages, Registration
 
 CONTRADICTS = 5.0

@@ -11,9 +11,9 @@ from pydantic import BaseModel, ConfigDict
 
 from jcr.depth.densify import pointmaps_of, undistorted
 from jcr.geometry import apply, inverse
-from jcr.intrinsics_json import IntrinsicsJson
-from jcr.reconstruction_npz import check_arrays, read_npz, write_npz
 from jcr.records import Capture, Pointmaps, Reconstruction
+from jcr.records.json_fields import IntrinsicsJson
+from jcr.records.npz import check_arrays, read_npz, write_npz
 
 FILE = "depth.npz"
 FORMAT = "jcr.depth/2"

@@ -41,8 +41,8 @@ from jcr.options import checked_options
 from jcr.pipeline.selection import NothingFoundError, again, choose, timings_of
 from jcr.progress import Progress, silent
 from jcr.reconstruct import BackendName, check_board, device_of
-from jcr.reconstruction_npz import write_reconstruction
 from jcr.records import Capture, CellCamera, PosePairs, Reconstruction
+from jcr.records.npz import write_reconstruction
 from jcr.run_folder import (
     CALIBRATION,
     CAPTURE,

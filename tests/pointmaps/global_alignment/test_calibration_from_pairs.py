@@ -21,8 +21,8 @@ from jcr.pointmaps.dust3r.pair_graph import complete_pairs
 from jcr.pointmaps.grid import ImageGrid, PreparedImages
 from jcr.pointmaps.pairs import PairPredictions
 from jcr.pointmaps.reconstruction import align_pairs, reconstruct_pointmaps
-from jcr.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Capture, HandEye, Reconstruction
+from jcr.records.npz import read_reconstruction, write_reconstruction
 from simulation.pairs import PairErrors, synthetic_pairs
 
 SIZE = (48, 36)

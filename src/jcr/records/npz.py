@@ -11,12 +11,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from jcr.allocator import require_memory
-from jcr.capture.plain_files import first_fault, shown
-from jcr.errors import InputError
+from jcr.errors import InputError, first_fault, shown
 from jcr.files import require_file, written_whole
 from jcr.geometry import require_rigid
-from jcr.intrinsics_json import IntrinsicsJson
-from jcr.records import Reconstruction
+from jcr.records.json_fields import IntrinsicsJson
+from jcr.records.reconstruction import Reconstruction
 
 FORMAT = "jcr.reconstruction/9"
 """Changes with what the file holds."""
