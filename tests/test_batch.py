@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from dying_process import dies_on_bad
+from dying_process import copies_a_run, dies_on_bad
 from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
 from jcr.cli import dispatch
@@ -111,6 +111,18 @@ def test_a_process_that_dies_takes_no_other_capture_with_it(monkeypatch: pytest.
     rows = batch(paths, tmp_path / "out", RunOptions(), COMPLETE)
     assert [row.status for row in rows] == ["accepted", "accepted", "accepted", "failed"]
     assert "process died" in rows[-1].reason
+
+
+def test_the_episode_whose_camera_moved_is_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, small_done: Path
+):
+    monkeypatch.setattr(module, "run_one", copies_a_run)
+    read = ReadOptions(episode=(0, 1, 2))
+    rows = batch([small_done], tmp_path / "out", RunOptions(), COMPLETE, read=read)
+    moved = {Path(row.out).name[-1]: row for row in rows}
+    assert [round(moved[k].moved_mm or 0.0, 6) for k in "012"] == [0.0, 0.0, 20.0]
+    assert not moved["0"].reason and "differs by 20.0 mm" in moved["2"].reason
+    assert "differs by 20.0 mm" in (tmp_path / "out" / "summary.html").read_text()
 
 
 def test_a_capture_that_falls_short_of_what_is_required_is_rejected(tmp_path: Path, captures: list[Path]):

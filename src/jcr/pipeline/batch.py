@@ -15,6 +15,9 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Literal, get_args
 
+import numpy as np
+
+from jcr.calibration.difference import compare
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, RejectedError
@@ -29,6 +32,10 @@ from jcr.run_folder import CAPTURE, RunOptions, load_run, locked
 
 RETRIES = 3
 """Number of times a task is started again whose Ray node died."""
+MIN_EPISODES = 3
+"""Smallest number of accepted episodes of which most can agree."""
+MOVED_P = 1e-3
+"""Chance of a difference between two episodes below which the camera moved; the false-alarm rate of `jcr verify`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,9 +54,12 @@ class BatchRow:
     scale_std_percent: float | None = None
     held_out_mm: float | None = None
     held_out_deg: float | None = None
+    moved_mm: float | None = None
+    """Translation from the camera that most episodes of the data set agree on; `moved_deg` is the rotation."""
+    moved_deg: float | None = None
     seconds: float = 0.0
     reason: str = ""
-    """Why it failed or is rejected, or its first warning."""
+    """Why it failed or is rejected, a camera that moved between episodes, or its first warning."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,21 +83,24 @@ def batch(
 ) -> list[BatchRow]:
     """Run every capture into a folder of its own in `out`; summary.csv and summary.html rank them, best first.
 
-    A capture that fails fails alone. One that was finished from the same inputs and options is not run again.
+    A capture that fails fails alone. One that was finished from the same inputs and options is not run again. Each
+    episode that `read` names is a capture of its own, and its camera is compared with that of the other episodes.
     Raises InputError for options that mean nothing.
     """
     if options.processes is not None and options.processes < 1:
         raise InputError(f"--processes {options.processes}: give 1 or more")
     report = progress or silent
+    read = read or ReadOptions()
+    parts = [(path, episode) for path in captures for episode in read.episode]
     tasks = [
         Task(
             capture=path.resolve(),
-            out=out.resolve() / name,
+            out=out.resolve() / (name if len(read.episode) == 1 else f"{name}-episode-{episode}"),
             run=run_options,
             calibrate_only=options.calibrate_only,
-            read=read or ReadOptions(),
+            read=replace(read, episode=(episode,)),
         )
-        for path, name in zip(captures, _names(captures), strict=True)
+        for (path, episode), name in zip(parts, np.repeat(_names(captures), len(read.episode)), strict=True)
     ]
     out.mkdir(parents=True, exist_ok=True)
     report("captures", 0.0)
@@ -97,6 +110,8 @@ def batch(
         rows.sort(key=_rank)
         _write_summary(out, rows)
         report("captures", len(rows) / len(tasks))
+    rows = _with_moved_cameras(rows)
+    _write_summary(out, rows)
     return rows
 
 
@@ -132,6 +147,35 @@ def run_one(task: Task) -> BatchRow:
         seconds=round(time.perf_counter() - start, 2),
         reason=reason or named,
     )
+
+
+def _with_moved_cameras(rows: Sequence[BatchRow]) -> list[BatchRow]:
+    """Return the rows with the difference of each episode's camera from the one that most episodes agree on.
+
+    The common camera is that of the episode with the smallest median χ² to the others of its data set.
+    """
+    of_set: dict[str, list[int]] = {}
+    for k, row in enumerate(rows):
+        if is_accepted(row):
+            of_set.setdefault(row.capture, []).append(k)
+    found = list(rows)
+    for members in of_set.values():
+        if len(members) < MIN_EPISODES:
+            continue
+        results = [load_run(Path(rows[k].out)).calibration for k in members]
+        squared = [np.median([compare(one, other).chi2 or 0.0 for other in results]) for one in results]
+        common = results[int(np.argmin(squared))]
+        for k, result in zip(members, results, strict=True):
+            apart = compare(common, result)
+            mm, deg = (
+                1e3 * np.linalg.norm(apart.translation_m),
+                np.degrees(np.linalg.norm(apart.rotation_vector)),
+            )
+            reason = rows[k].reason
+            if apart.p_value is not None and apart.p_value < MOVED_P:
+                reason = f"the camera differs by {mm:.1f} mm and {deg:.2f}° from that of most episodes"
+            found[k] = replace(rows[k], moved_mm=float(mm), moved_deg=float(deg), reason=reason)
+    return found
 
 
 def _failed(task: Task, reason: str) -> BatchRow:
@@ -258,7 +302,16 @@ def _write_summary(out: Path, rows: list[BatchRow]) -> None:
     table.writeheader()
     table.writerows(asdict(row) for row in rows)
     write_text(out / "summary.csv", text.getvalue())
-    numbers = ("offset_std_mm", "turn_std_deg", "scale_std_percent", "held_out_mm", "held_out_deg", "seconds")
+    numbers = (
+        "offset_std_mm",
+        "turn_std_deg",
+        "scale_std_percent",
+        "held_out_mm",
+        "held_out_deg",
+        "moved_mm",
+        "moved_deg",
+        "seconds",
+    )
     shown = [
         {
             "row": row,
