@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.cameras import answered
 from jcr.estimation.intrinsics_prior import MEASURED, camera_with_prior
 from jcr.estimation.problem import (
     OF_IMAGE,
@@ -16,7 +17,7 @@ from jcr.estimation.problem import (
 )
 from jcr.estimation.projection import derivatives, view_of
 from jcr.estimation.solve import solve
-from simulation.cells import CellProblem, cell_problem
+from simulation.cells import CellProblem, Kind, cell_problem
 
 COUNT = 6
 
@@ -93,3 +94,10 @@ def test_what_robots_report_is_no_part_of_the_evidence_of_images():
     assert one == pytest.approx(other, rel=0.1)
     # A robot that is exact a hundred times over makes the calibration better, and the images no wiser.
     assert (np.diag(exact.covariance)[:6] < 0.3 * np.diag(coarse.covariance)[:6]).all()
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("fixed", 0), ("wrists", 0), ("arms", 2)])
+def test_rounds_settle_from_a_scale_that_is_several_times_too_small(kind: Kind, seed: int):
+    """Steps that were cut short gave the combination of rounds a direction in which the scale shrank."""
+    found = answered(cell_problem(kind, "typical", 8, seed), seed)
+    assert found.settled and found.iterations < 12

@@ -271,7 +271,8 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
             + cost_of_images(images, one)
             for one in (state, moved)
         )
-        if moved_cost <= cost * (1 + ROUNDING):
+        # The combination of rounds assumes whole steps; one that was cut short comes from a poor initial estimate.
+        if share == 1 and moved_cost <= cost * (1 + ROUNDING):
             begin, end = _coordinates(problem, start, unresized), _coordinates(problem, start, moved)
             ends, steps = [*ends[-ROUNDS_BEFORE:], end], [*steps[-ROUNDS_BEFORE:], end - begin]
             judged = np.r_[:robots, robots + problem.free]
