@@ -16,15 +16,13 @@ import yaml
 
 import jcr
 from benchmarks.__main__ import Arguments as BenchArguments
-from jcr.capture.camera_info import IntrinsicsEntry
-from jcr.capture.cell_cameras import CameraEntry
-from jcr.capture.formats.capture_json import CaptureFile, FrameEntry
 from jcr.cli import COMMANDS, command, dispatch
 from jcr.cli.prepare import page as page_named
 from jcr.cli.prepare import pages
 from jcr.cli.usage import parsed
 from jcr.errors import InputError
 from jcr.findings import FindingKind
+from jcr.records.capture_json import CameraEntry, CaptureFile, FrameEntry, IntrinsicsEntry
 from places import ROOT
 from simulation.__main__ import Arguments as SimulationArguments
 

@@ -21,7 +21,7 @@ from numpy import ndarray
 from PIL import Image
 from scipy.io import loadmat
 
-from jcr.capture.conventions import poses_from_numbers
+from jcr.capture.controllers import poses_from_numbers
 from jcr.capture.formats import capture_json
 from jcr.capture.options import UnitsName
 from jcr.errors import InputError
@@ -54,7 +54,7 @@ class Recipe:
     """Places in the doubles of a MATLAB table: first rotation, step to the next, count, position after a rotation."""
     convention: str = "matrix"
     units: UnitsName = "auto"
-    """Notation and units of the numbers, as in jcr.capture.conventions."""
+    """Notation and units of the numbers, as in jcr.capture.controllers."""
     robot: RobotName | None = None
     """Arm whose joint angles (rad) are stored in place of poses."""
     joints: list[int] = field(default_factory=list)

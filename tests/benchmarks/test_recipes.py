@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from benchmarks.real_captures.fetch import Recipe, build, recipes
-from jcr.capture.conventions import numbers_from_poses
+from jcr.capture.controllers import numbers_from_poses
 from jcr.capture.read import read_capture
 from jcr.errors import InputError
 from simulation.problems import hand_eye_problem

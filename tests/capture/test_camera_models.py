@@ -12,6 +12,7 @@ from jcr.capture.formats import colmap
 from jcr.capture.plain_files import validated
 from jcr.export import ros
 from jcr.records import Intrinsics
+from jcr.records.capture_json import IntrinsicsEntry
 from jcr.records.json_fields import IntrinsicsAndStd
 
 SIZE = (640, 480)
@@ -26,8 +27,8 @@ CAMERAS = [RATIONAL, FISHEYE, Intrinsics(500.0, 500.0, 320.0, 240.0, *SIZE, (0.1
 def test_intrinsics_survive_capture_json_camera_info_and_calibration_json(
     intrinsics: Intrinsics, tmp_path: Path
 ):
-    entry = camera_info.IntrinsicsEntry.of(intrinsics).model_dump_json(exclude_unset=True)
-    assert camera_info.IntrinsicsEntry.model_validate_json(entry).record(SIZE, "here") == intrinsics
+    entry = IntrinsicsEntry.of(intrinsics).model_dump_json(exclude_unset=True)
+    assert IntrinsicsEntry.model_validate_json(entry).record(SIZE, "here") == intrinsics
     mount = ros.CameraMount(
         parent="tool0", child="optical", parent_from_child=np.eye(4), intrinsics=intrinsics
     )
@@ -74,7 +75,7 @@ def test_other_camera_models_are_refused_by_name(model: str, count: int, words: 
 
 def test_a_capture_names_the_models_that_there_are():
     intrinsics = {"fx": 500, "fy": 500, "cx": 320, "cy": 240}
-    entry = camera_info.IntrinsicsEntry
+    entry = IntrinsicsEntry
     with pytest.raises(
         jcr.InputError, match="model: Input should be 'pinhole', 'rational', 'thin_prism' or 'fisheye'"
     ):

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import capture_writers as writers
 import jcr
 from in_process import run_jcr
-from jcr.capture.conventions import CONVENTIONS, poses_from_numbers
+from jcr.capture.controllers import CONVENTIONS, poses_from_numbers
 from jcr.capture.formats import colmap
 from jcr.capture.formats.table import PoseTable, read_pose_table
 from jcr.capture.options import ReadOptions

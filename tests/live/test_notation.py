@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from jcr.capture.conventions import CONVENTIONS, numbers_from_poses, poses_from_numbers
+from jcr.capture.controllers import CONVENTIONS, numbers_from_poses, poses_from_numbers
 from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import forward_kinematics
 from jcr.geometry import inverse, rotation_angle, rotation_exp, transform

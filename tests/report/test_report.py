@@ -20,7 +20,7 @@ from conftest import shrunk_capture
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import calibration_of, failed_calibration
 from jcr.calibration.stage import calibrate
-from jcr.capture.conventions import numbers_from_poses, poses_from_numbers
+from jcr.capture.controllers import numbers_from_poses, poses_from_numbers
 from jcr.capture.formats.capture_json import kept, origin
 from jcr.capture.options import ReadOptions
 from jcr.cell.placement import ArmPlacement, CameraPlacement, CellPlacement, ImageUse, TransformUncertainty

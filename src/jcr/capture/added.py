@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from jcr.capture.formats import capture_json
-from jcr.capture.images import other_size
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import read_json, shown
 from jcr.capture.read import read_source
 from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.records import Capture
+from jcr.records.capture_json import other_size
 
 FOLDER, OWNER = "added", "added_to"
 

@@ -1,22 +1,17 @@
-"""Intrinsics and their standard deviations in capture.json, camera_info YAML and CameraInfo messages."""
+"""Intrinsics of ROS: camera_info YAML, CameraInfo messages, and other sources whose numbers are those of an entry."""
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict
 
-from jcr.capture.images import other_size
-from jcr.capture.plain_files import read_yaml, shown, validated
-from jcr.errors import InputError
-from jcr.geometry import HUGE
-from jcr.records import COEFFICIENTS, DistortionModel, Intrinsics, coefficients_of
+from jcr.capture.plain_files import read_yaml, validated
+from jcr.errors import InputError, shown
+from jcr.records import COEFFICIENTS, DistortionModel, Intrinsics
+from jcr.records.capture_json import IntrinsicsEntry
 
 FILE = "camera_info.yaml"
-NAMES = ("fx", "fy", "cx", "cy")
 _ROS_MODELS: dict[str, DistortionModel] = {
     "": "pinhole",
     "plumb_bob": "pinhole",
@@ -25,81 +20,6 @@ _ROS_MODELS: dict[str, DistortionModel] = {
     "fisheye": "fisheye",
 }
 """Distortion models by their names in ROS (sensor_msgs/distortion_models.hpp; depthai and others write fisheye)."""
-Positive = Annotated[float, Field(gt=0, lt=HUGE)]
-Std = Annotated[float, Field(ge=0, lt=HUGE)]
-
-
-class IntrinsicsEntry(BaseModel):
-    """Intrinsics in a capture.json, px; the size of the images is that of the capture."""
-
-    model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False)
-    fx: Positive
-    fy: Positive
-    cx: float
-    cy: float
-    distortion: list[float] | None = None
-    """Coefficients in OpenCV's order; none given: 0."""
-    model: DistortionModel = "pinhole"
-    width: int | None = None
-    """Width of the images, px; of the capture's images where it is not stated."""
-    height: int | None = None
-    """Height of the images, px; of the capture's images where it is not stated."""
-
-    @staticmethod
-    def of(intrinsics: Intrinsics) -> "IntrinsicsEntry":
-        """Return the entry of intrinsics."""
-        model = {} if intrinsics.model == "pinhole" else {"model": intrinsics.model}
-        numbers = {key: getattr(intrinsics, key) for key in NAMES}
-        return IntrinsicsEntry(**model, **numbers, distortion=list(intrinsics.distortion))
-
-    def record(self, size: tuple[int, int], where: str) -> Intrinsics:
-        """Return the intrinsics of images of `size`; raise InputError, begun with `where`, where they cannot be."""
-        names = COEFFICIENTS[self.model]
-        distortion = self.distortion or [0.0] * len(names)
-        if len(distortion) != len(names):
-            raise InputError(
-                f"{where}: distortion has {len(distortion)} numbers, not the {len(names)} of a {self.model} model, "
-                f'{",".join(names)}; "model" may be {", ".join(COEFFICIENTS)}'
-            )
-        stated = (self.width or size[0], self.height or size[1])
-        if stated != size:
-            raise other_size(where, stated, size, remedy="give those of these images, or null")
-        if not (0 < self.cx < size[0] and 0 < self.cy < size[1]):
-            raise InputError(
-                f"{where}: the principal point ({self.cx:.4g}, {self.cy:.4g}) lies outside the {size[0]}x{size[1]} "
-                "images; give the intrinsics of this resolution, or null to estimate them"
-            )
-        coefficients = coefficients_of(distortion)
-        return Intrinsics(self.fx, self.fy, self.cx, self.cy, *size, coefficients, self.model)
-
-
-class StdEntry(BaseModel):
-    """Standard deviations of intrinsics in a capture.json, px and units of distortion; 0 is exact, null not stated."""
-
-    model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False, extra="forbid")
-    fx: Std | None = None
-    fy: Std | None = None
-    cx: Std | None = None
-    cy: Std | None = None
-    distortion: list[Std | None] = []
-
-    @staticmethod
-    def of(std: Float[ndarray, " p"]) -> "StdEntry":
-        """Return the entry of standard deviations, NaN where one is not stated."""
-        values = [None if np.isnan(value) else value for value in std.tolist()]
-        return StdEntry(**dict(zip(NAMES, values, strict=False)), distortion=values[4:])
-
-    def array(self, intrinsics: Intrinsics | None, where: str) -> Float[ndarray, " p"]:
-        """Return the standard deviations in the order of `intrinsics`, NaN where one is not stated."""
-        if intrinsics is None:
-            raise InputError(f"{where}: there are no intrinsics whose errors these are; give both or none")
-        count = len(intrinsics.distortion)
-        if len(self.distortion) > count:
-            raise InputError(f"{where}: distortion must be a list of at most {count} numbers")
-        values = [*(getattr(self, name) for name in NAMES), *self.distortion]
-        std = np.full(4 + count, np.nan)
-        std[: len(values)] = [np.nan if value is None else value for value in values]
-        return std
 
 
 class _Numbers(BaseModel):
@@ -153,8 +73,25 @@ def intrinsics_of_ros(
         )
     if known == "rational" and not any(coefficients[5:]):
         known = "pinhole"
+    fx, _, cx, _, fy, cy, *_ = matrix
     count = len(COEFFICIENTS[known])
-    entry = dict(zip(("fx", "cx", "fy", "cy"), (matrix[k] for k in (0, 2, 4, 5)), strict=True))
-    entry |= {"distortion": [*coefficients[:count], *[0.0] * (count - len(coefficients))], "model": known}
-    entry |= {"width": calibrated_size[0], "height": calibrated_size[1]}
-    return validated(IntrinsicsEntry, entry, where).record(size, f"{where}: intrinsics")
+    padded = [*coefficients[:count], *[0.0] * (count - len(coefficients))]
+    return checked_intrinsics((fx, fy, cx, cy), padded, known, calibrated_size, size, (where, "intrinsics"))
+
+
+def checked_intrinsics(
+    parameters: Sequence[Any],
+    distortion: Sequence[Any],
+    model: DistortionModel,
+    calibrated_size: tuple[int, int],
+    size: tuple[int, int],
+    where: tuple[str, str],
+) -> Intrinsics:
+    """Return the intrinsics of images of `size`; raise InputError where a number cannot be.
+
+    `parameters` are fx, fy, cx and cy (px) at the size of calibration; `where` is the source and its part.
+    """
+    entry = dict(zip(("fx", "fy", "cx", "cy"), parameters, strict=True))
+    entry |= {"distortion": [*distortion], "model": model}
+    entry |= dict(zip(("width", "height"), calibrated_size, strict=True))
+    return validated(IntrinsicsEntry, entry, where[0]).record(size, ": ".join(where))

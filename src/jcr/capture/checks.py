@@ -4,21 +4,20 @@ import hashlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from pydantic import BeforeValidator, PlainSerializer
 
-from jcr.capture.conventions import far_faults, tolerated
-from jcr.capture.images import other_size, read_oriented
+from jcr.capture.controllers import far_faults, tolerated
+from jcr.capture.images import read_oriented
 from jcr.capture.options import MAX_FRAMES, MIN_FRAMES
 from jcr.capture.plain_files import contained, first_few
 from jcr.errors import InputError
 from jcr.findings import Finding, FindingKind
-from jcr.geometry import require_rigid, step_between
+from jcr.geometry import step_between
 from jcr.records import Capture
+from jcr.records.capture_json import other_size
 
 ROTATED = {3: "rotated by 180°", 6: "rotated by 90° clockwise", 8: "rotated by 90° counter-clockwise"}
 """Rotation that shows an image of each EXIF orientation (EXIF 2.32, tag 274); the others mirror it."""
@@ -97,25 +96,6 @@ def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> No
             f"{where}: all {len(base_from_gripper)} gripper poses are the same ({within}); read the pose again for each "
             "image"
         )
-
-
-def read_rigid(value: Any, where: str = "matrix") -> Float[ndarray, "4 4"]:
-    """Return a rigid 4x4 from nested lists; raise InputError that says how it differs from rigid."""
-    try:
-        matrix = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{where}: not a 4x4 matrix of numbers; write four rows of four") from None
-    if matrix.shape != (4, 4):
-        raise InputError(f"{where}: shape {matrix.shape}, not 4x4; write four rows of four numbers")
-    return require_rigid(matrix, where)
-
-
-RigidMatrix = Annotated[
-    Any,
-    BeforeValidator(lambda value: value if isinstance(value, ndarray) else read_rigid(value)),
-    PlainSerializer(lambda pose: pose.tolist()),
-]
-"""Rigid transform (4,4) in a file; an array is one already, and stays as it is to the last bit."""
 
 
 def _common_orientation(folder: Path, orientation_of: Mapping[str, int]) -> int:

@@ -1,7 +1,7 @@
 """Reading and writing of images, and measures of their exposure and sharpness."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -12,6 +12,7 @@ from PIL import Image, ImageOps
 
 from jcr.errors import InputError
 from jcr.files import require_file
+from jcr.records.capture_json import other_size
 
 MAX_PIXELS = 64_000_000
 """Larger than any wrist camera; a decompression bomb is refused before it is unpacked."""
@@ -119,19 +120,6 @@ def read_depth(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h w"]:
         remedy = "align depth with colour (ROS: align_depth.enable, librealsense: rs.align)"
         raise other_size(f"{path}: depth", found, size, remedy=remedy)
     return depth.astype(np.float32) / 1000
-
-
-def other_size(
-    what: str,
-    size: Sequence[object],
-    expected: tuple[int, int],
-    whose: str = "images",
-    remedy: str = "take all with one camera at one resolution",
-) -> InputError:
-    """Return the error of an image, depth image or intrinsics of another resolution than the images'."""
-    return InputError(
-        f"{what} of {size[0]}x{size[1]} pixels, {whose} of {expected[0]}x{expected[1]}; {remedy}"
-    )
 
 
 def size_of_all(sizes: Mapping[str, tuple[int, int]], where: str) -> tuple[int, int]:

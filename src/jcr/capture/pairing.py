@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture.conventions import tolerated
+from jcr.capture.controllers import tolerated
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import first_few, shown
 from jcr.capture.pose_track import pose_track

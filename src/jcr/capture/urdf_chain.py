@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.capture.conventions import RADIANS_LIMIT
+from jcr.capture.controllers import RADIANS_LIMIT
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import read_text
 from jcr.capture.pose_track import Stamps, bracket

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from jcr.capture.camera_info import IntrinsicsEntry
-from jcr.capture.cell_cameras import NAME, cameras_as_json, with_cameras
+from jcr.capture.formats.capture_json import camera_entries, with_cameras
 from jcr.capture.images import read_image, size_of_all
 from jcr.capture.plain_files import read_json, validated
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.records import Capture, CellCamera
+from jcr.records.capture_json import NAME, IntrinsicsEntry
 
 FOLDER, FILE = "cameras", "cameras.json"
 
@@ -65,7 +65,8 @@ def keep_camera(run_folder: Path, capture: Capture, camera: CellCamera) -> CellC
         write_bytes(folder / images[-1], source.read_bytes())
     kept = replace(camera, images=tuple(images), folder=folder)
     every = (*read_added_cameras(run_folder, capture), kept)
-    content = cameras_as_json(replace(capture, others=every))
-    del content[capture.camera_name]
+    entries = camera_entries(replace(capture, others=every))
+    del entries[capture.camera_name]
+    content = {name: entry.model_dump(mode="json", exclude_unset=True) for name, entry in entries.items()}
     write_text(folder / FILE, json.dumps(content, indent=1) + "\n")
     return kept

@@ -20,12 +20,12 @@ from jcr.live.session import LEAST_IMAGES, SessionOptions
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from jcr.capture.camera_info import IntrinsicsEntry
     from jcr.live.folder import LiveFolder
     from jcr.live.progress import Notation
     from jcr.live.robot import States
     from jcr.live.server import Listen, LiveServer
     from jcr.live.session import Answer, LiveSession
+    from jcr.records.capture_json import IntrinsicsEntry
     from jcr.run_folder import RunResult
 
 
@@ -219,8 +219,8 @@ def _notation(arguments: CaptureCommand, folder: "LiveFolder") -> "Notation":
 
 def _intrinsics(file: Path | None) -> "IntrinsicsEntry | None":
     """Return the intrinsics in a JSON file; raise InputError where it has none."""
-    from jcr.capture.camera_info import IntrinsicsEntry
     from jcr.capture.plain_files import read_json, validated
+    from jcr.records.capture_json import IntrinsicsEntry
 
     if file is None:
         return None

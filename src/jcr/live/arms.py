@@ -13,13 +13,12 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from jcr.capture.checks import read_rigid
-from jcr.capture.conventions import poses_from_numbers
-from jcr.capture.formats.capture_json import MOST_ROTATION
+from jcr.capture.controllers import poses_from_numbers
 from jcr.capture.options import ConventionName
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.live.robot import RobotState, States, pose_of_numbers
+from jcr.records.capture_json import MOST_ROTATION, read_rigid
 
 UR_PORT = 30003
 UR_TIMEOUT_S = 5.0

@@ -19,9 +19,7 @@ from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised, assumptions_of
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import checked
-from jcr.capture.camera_info import IntrinsicsEntry
-from jcr.capture.checks import read_rigid
-from jcr.capture.conventions import far_faults
+from jcr.capture.controllers import far_faults
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
@@ -36,6 +34,7 @@ from jcr.live.next_pose import Attempts, Reach, propose, propose_before_calibrat
 from jcr.live.progress import Accuracy, Progress
 from jcr.options import checked_options
 from jcr.records import Capture, HandEye, Intrinsics, Tracks
+from jcr.records.capture_json import IntrinsicsEntry, read_rigid
 from jcr.sfm.live_map import LiveMap
 
 if TYPE_CHECKING:

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 from numpy import ndarray
 
-from jcr.capture.camera_info import IntrinsicsEntry
 from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault
 from jcr.errors import InputError
+from jcr.records.capture_json import IntrinsicsEntry
 
 TIMEOUT_S = 10.0
 """Time without an image after which a camera counts as lost."""

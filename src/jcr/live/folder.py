@@ -8,22 +8,15 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 from numpy import ndarray
 
-from jcr.capture.camera_info import IntrinsicsEntry
-from jcr.capture.formats.capture_json import (
-    FILE,
-    CaptureFile,
-    FrameEntry,
-    frame_of,
-    read_content,
-    stated_fields,
-)
-from jcr.capture.images import encode_png, other_size, read_image, size_of_all
+from jcr.capture.formats.capture_json import FILE, frame_of, read_content, stated_fields
+from jcr.capture.images import encode_png, read_image, size_of_all
 from jcr.capture.plain_files import contained, validated
 from jcr.errors import InputError
 from jcr.estimation.arms import ROBOT_NAMES
 from jcr.files import remove_unfinished, write_bytes, write_text
 from jcr.live.cameras import ImageSummary
 from jcr.records import Capture
+from jcr.records.capture_json import CaptureFile, FrameEntry, IntrinsicsEntry, other_size
 
 IMAGES = "images"
 

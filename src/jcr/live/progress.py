@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture.conventions import CONVENTIONS, numbers_from_poses
+from jcr.capture.controllers import CONVENTIONS, numbers_from_poses
 from jcr.capture.options import ConventionName, UnitsName
 from jcr.estimation.kinematics import Arm
 from jcr.findings import Finding, FindingKind, remedy, sentence, text, without_consequences

@@ -10,10 +10,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from jcr.capture.camera_info import IntrinsicsEntry
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.live.cameras import TIMEOUT_S, Camera, CameraOptions, Frame, Frames
+from jcr.records.capture_json import IntrinsicsEntry
 
 REALSENSE = "realsense"
 """Name for `--camera`, followed by `:SERIAL` or `:FILE` where needed."""

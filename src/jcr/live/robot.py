@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture.conventions import CONVENTIONS, poses_from_numbers
+from jcr.capture.controllers import CONVENTIONS, poses_from_numbers
 from jcr.capture.options import ConventionName, UnitsName
 from jcr.errors import InputError
 from jcr.geometry import inverse, rotation_angle

@@ -15,11 +15,11 @@ import tyro
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture.formats.capture_json import FrameEntry
 from jcr.errors import InputError, RejectedError
 from jcr.live.cameras import Camera, Frame, frame_at_rest
 from jcr.live.progress import Notation, Progress, progress_lines
 from jcr.live.robot import MOVED_ON, REST, TRY_AGAIN, Action, RobotState, States, is_farther, next_rest
+from jcr.records.capture_json import FrameEntry
 
 if TYPE_CHECKING:
     from jcr.live.calibration import LiveCalibration

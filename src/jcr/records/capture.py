@@ -107,7 +107,7 @@ class Capture:
     orientation: int = 1
     """EXIF's, of all images: 1 as the sensor has them; others were rotated upright, and the camera frame is theirs."""
     pose_convention: str | None = None
-    """Pose convention, a name of capture.conventions.CONVENTIONS; None where the file does not state one."""
+    """Pose convention, a name of capture.controllers.CONVENTIONS; None where the file does not state one."""
     depths: tuple[str | None, ...] | None = None
     """Images of a depth camera, one for each image or None: aligned 16-bit PNG in mm, relative to `folder`."""
     camera_name: str = "wrist"

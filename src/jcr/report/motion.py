@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jcr.calibration.words import given_in_words, seen_in_words
-from jcr.capture.conventions import CONVENTIONS, OF_ARM, numbers_from_poses, units_of
+from jcr.capture.controllers import CONVENTIONS, OF_ARM, numbers_from_poses, units_of
 from jcr.estimation.observability import WEAK
 from jcr.records import Capture, Excitation, NextPose
 from jcr.report.render import Section

@@ -1,69 +1,35 @@
 """The capture folder: `capture.json` and the images that it names."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import TypeAdapter
 
-from jcr.capture.camera_info import IntrinsicsEntry, StdEntry
-from jcr.capture.cell_cameras import cameras_as_json, with_cameras
-from jcr.capture.checks import RigidMatrix, checked_capture, require_frames
-from jcr.capture.conventions import CONVENTIONS
+from jcr.capture.checks import checked_capture, require_frames
+from jcr.capture.controllers import CONVENTIONS
 from jcr.capture.formats import Format
+from jcr.capture.images import read_image, size_of_all
 from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import contained, read_json, shown, validated
-from jcr.errors import InputError
+from jcr.capture.plain_files import contained, read_json, validated
+from jcr.errors import InputError, shown
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.files import write_new
-from jcr.records import Capture
+from jcr.records import Capture, CellCamera
+from jcr.records.capture_json import (
+    CameraEntries,
+    CameraEntry,
+    CameraFrame,
+    CaptureFile,
+    FrameEntry,
+    IntrinsicsEntry,
+    StdEntry,
+)
 
 FILE, URDF = "capture.json", "robot.urdf"
-MOST_ROTATION = 6 * np.pi + 0.01
-"""Largest joint angle, rad: no joint rotates farther to either side."""
-
-
-def _plausible(angles: list[float]) -> list[float]:
-    """Return joint angles (rad); raise ValueError where they look like degrees."""
-    if (largest := max(map(abs, angles))) > MOST_ROTATION:
-        raise ValueError(f"up to {largest:.4g} rad; these look like degrees: convert them")
-    return angles
-
-
-class FrameEntry(BaseModel):
-    """Frame of a capture.json: an image with the data recorded at it."""
-
-    model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False)
-    image: str
-    """Path in the folder of the capture."""
-    base_from_gripper: RigidMatrix
-    joints: Annotated[list[float], Field(min_length=1), AfterValidator(_plausible)] | None = None
-    """Joint angles (rad), from the base on."""
-    depth: str | None = None
-    """Path of a depth camera's image."""
-    time_s: float | None = None
-    """Time on the camera's clock."""
-
-
-class CaptureFile(BaseModel):
-    """Content of a capture.json; other keys are kept."""
-
-    model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False, extra="allow")
-    frames: list[Any]
-    """Entries that FrameEntry validates one by one, so that a few of them may be faulty."""
-    intrinsics: IntrinsicsEntry | None = None
-    intrinsics_std: StdEntry | None = None
-    pose_convention: Any = None
-    robot: Any = None
-    urdf: str | None = None
-    cameras: dict[str, Any] | None = None
-
-    def as_text(self) -> str:
-        """Return the text of the file."""
-        return json.dumps(self.model_dump(mode="json", exclude_unset=True), indent=1) + "\n"
+_CAMERAS = TypeAdapter(CameraEntries)
 
 
 def read_content(file: Path) -> CaptureFile:
@@ -78,9 +44,8 @@ def read_content(file: Path) -> CaptureFile:
 
 def frame_of(content: CaptureFile, row: int, file: Path) -> FrameEntry:
     """Return a frame of a capture.json; raise InputError that names its image where the frame cannot be used."""
-    return validated(
-        FrameEntry, content.frames[row], f"{file}: frame {row} ({_image_name(content, row, file)})"
-    )
+    where = f"{file}: frame {row} ({_image_name(content, row, file)})"
+    return validated(FrameEntry, content.frames[row], where)
 
 
 def read(path: Path, options: ReadOptions | None = None) -> Capture:
@@ -120,32 +85,113 @@ def stated_fields(
     content: CaptureFile, frames: Sequence[FrameEntry], size: tuple[int, int], file: Path
 ) -> dict[str, Any]:
     """Return the fields of the Capture of some frames that a capture.json states, other cameras apart."""
-    intrinsics = None
-    if content.intrinsics is not None:
-        intrinsics = content.intrinsics.record(size, f"{file}: intrinsics")
-    std = content.intrinsics_std
     angles = [frame.joints for frame in frames if frame.joints is not None]
     joints = np.array(angles) if angles and len(angles) == len(frames) else None
-    robot, notes = content.robot, ()
+    robot, notes, convention = content.robot, (), content.pose_convention
     if robot is not None and robot not in ROBOT_NAMES:
         known = ", ".join(ROBOT_NAMES)
         robot, notes = None, (f"robot {shown(robot)} is not one of {known}: its kinematics are not used",)
     if robot is not None and joints is not None and joints.shape[1] != (dof := arm_named(robot).dof):
         text = f"frames have {joints.shape[1]} joints, but a {robot} has {dof}; correct either"
         raise InputError(f"{file}: {text}")
-    urdf = None if content.urdf is None else _inside(file.parent, content.urdf, f"{file}: urdf")
     depths = tuple(frame.depth for frame in frames)
-    convention = content.pose_convention
-    return {
-        "intrinsics": intrinsics,
-        "intrinsics_std": None if std is None else std.array(intrinsics, f"{file}: intrinsics_std"),
+    return _stated_intrinsics(content, size, str(file)) | {
         "joints": joints,
         "robot": robot,
-        "urdf": urdf,
+        "urdf": None if content.urdf is None else _inside(file.parent, content.urdf, f"{file}: urdf"),
         "depths": depths if any(depths) else None,
         "pose_convention": convention if isinstance(convention, str) and convention in CONVENTIONS else None,
         "notes": notes,
     }
+
+
+def with_cameras(capture: Capture, cameras: Any, where: str, used: Sequence[bool] | None = None) -> Capture:
+    """Return the capture with the cameras of "cameras"; raise InputError, begun with `where`, where they cannot be.
+
+    `used` tells for each frame of the file whether the capture has it, all by default.
+    """
+    entries: dict[str, CameraEntry] = validated(_CAMERAS, cameras, f"{where}: cameras")
+    own = next((name for name, entry in entries.items() if entry.is_own), None)
+    if own is not None:
+        capture = replace(capture, camera_name=own, mount=entries.pop(own).mount)
+    elif capture.camera_name in entries:
+        raise InputError(
+            f"{where}: camera {capture.camera_name} is the frames' own; give the other another name"
+        )
+    used = [True] * len(capture) if used is None else used
+    others = [
+        _camera(name, entry, capture, f"{where}: camera {name}", used) for name, entry in entries.items()
+    ]
+    return replace(capture, others=tuple(others))
+
+
+def _camera(name: str, entry: CameraEntry, capture: Capture, where: str, used: Sequence[bool]) -> CellCamera:
+    """Return a further camera with its images, all of one size."""
+    poses, frame = None, None
+    listed: Sequence[str | None] = entry.images or ()
+    if entry.frames is not None:
+        listed = [one.image for one in entry.frames]
+        poses = np.array([one.base_from_gripper for one in entry.frames])
+    elif entry.mount == "gripper":
+        if len(listed) != len(used):
+            raise InputError(
+                f"{where}: {len(listed)} images for {len(used)} frames; give one for each, or null"
+            )
+        listed = [image for image, is_used in zip(listed, used, strict=True) if is_used]
+        frame = np.flatnonzero([image is not None for image in listed])
+    images = [image for image in listed if image is not None]
+    require_frames(len(images), where, 1)
+    for image in images:
+        contained(capture.folder, image, where)
+    if len(set(images)) < len(images) or set(images) & set(capture.images):
+        raise InputError(f"{where}: an image is named twice, or is one of the frames' own")
+    size = size_of_all({name: read_image(capture.folder / name).shape[1::-1] for name in images}, where)
+    return CellCamera(
+        name=name,
+        mount=entry.mount,
+        images=tuple(images),
+        image_size=size,
+        frame=frame,
+        arm=entry.arm,
+        base_from_gripper=poses,
+        **_stated_intrinsics(entry, size, where),
+    )
+
+
+def _stated_intrinsics(
+    stated: CaptureFile | CameraEntry, size: tuple[int, int], where: str
+) -> dict[str, Any]:
+    """Return the fields `intrinsics` and `intrinsics_std` of a record of images of `size`."""
+    given, std = stated.intrinsics, stated.intrinsics_std
+    intrinsics = None if given is None else given.record(size, f"{where}: intrinsics")
+    spread = None if std is None else std.array(intrinsics, f"{where}: intrinsics_std")
+    return {"intrinsics": intrinsics, "intrinsics_std": spread}
+
+
+def _intrinsics_entries(record: Capture | CellCamera) -> dict[str, Any]:
+    """Return the entries of the intrinsics of a record, the inverse of `_stated_intrinsics`."""
+    given, std = record.intrinsics, record.intrinsics_std
+    entries: dict[str, Any] = {"intrinsics": None if given is None else IntrinsicsEntry.of(given)}
+    return entries if std is None else entries | {"intrinsics_std": StdEntry.of(std)}
+
+
+def camera_entries(capture: Capture) -> dict[str, CameraEntry]:
+    """Return the "cameras" of a capture.json; empty where there is only the wrist camera."""
+    if not capture.others and capture.mount == "gripper":
+        return {}
+    entries = {capture.camera_name: CameraEntry(mount=capture.mount)}
+    for camera in capture.others:
+        if camera.base_from_gripper is not None:
+            pairs = zip(camera.images, camera.base_from_gripper, strict=True)
+            frames = [CameraFrame(image=image, base_from_gripper=pose) for image, pose in pairs]
+            listed: dict[str, Any] = {"arm": camera.arm, "frames": frames}
+        elif camera.frame is None:
+            listed = {"images": [*camera.images]}
+        else:
+            at = dict(zip(camera.frame.tolist(), camera.images, strict=True))
+            listed = {"images": [at.get(row) for row in range(len(capture))]}
+        entries[camera.name] = CameraEntry(mount=camera.mount, **listed, **_intrinsics_entries(camera))
+    return entries
 
 
 def write(folder: Path, capture: Capture, **remarks: Any) -> None:
@@ -156,19 +202,18 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
         if capture.depths is not None and capture.depths[row] is not None:
             more["depth"] = capture.depths[row]
         frames.append(FrameEntry.model_validate({"image": name, "base_from_gripper": pose} | more))
-    given, std, urdf = capture.intrinsics, capture.intrinsics_std, capture.urdf
+    urdf = capture.urdf
     if urdf is not None and urdf.resolve() != (folder / URDF).resolve():
         write_new(folder / URDF, urdf.read_bytes())  # a capture is complete in its folder
     optional = {
-        "intrinsics_std": None if std is None else StdEntry.of(std),
         "pose_convention": capture.pose_convention,
         "robot": capture.robot,
         "urdf": None if urdf is None else URDF,
-        "cameras": cameras_as_json(capture) or None,
+        "cameras": camera_entries(capture) or None,
     }
     stated = {key: value for key, value in optional.items() if value is not None} | remarks
-    intrinsics = None if given is None else IntrinsicsEntry.of(given)
-    write_new(folder / FILE, CaptureFile(frames=frames, intrinsics=intrinsics, **stated).as_text().encode())
+    content = CaptureFile(frames=frames, **_intrinsics_entries(capture), **stated)
+    write_new(folder / FILE, content.as_text().encode())
 
 
 def origin(folder: Path) -> Path:

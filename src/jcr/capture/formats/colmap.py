@@ -13,10 +13,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.camera import HALF_PIXEL
-from jcr.capture.camera_info import IntrinsicsEntry
+from jcr.capture.camera_info import checked_intrinsics
 from jcr.capture.formats import Format, table
 from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import contained, validated
+from jcr.capture.plain_files import contained
 from jcr.errors import InputError
 from jcr.geometry import inverse, transform
 from jcr.records import COEFFICIENTS, Capture, DistortionModel, Intrinsics
@@ -131,10 +131,10 @@ def read_intrinsics(folder: Path, size: tuple[int, int], names: Collection[str] 
     distortion: DistortionModel = (
         "fisheye" if "FISHEYE" in name else "rational" if any(rest[5:]) else "pinhole"
     )
-    entry = {"fx": fx, "fy": fy, "cx": cx - HALF_PIXEL, "cy": cy - HALF_PIXEL, "model": distortion}
-    entry |= {"distortion": [value.get(key, 0.0) for key in COEFFICIENTS[distortion]]}
-    entry |= {"width": width, "height": height}
-    return validated(IntrinsicsEntry, entry, str(folder)).record(size, f"{folder}: cameras")
+    parameters = (fx, fy, cx - HALF_PIXEL, cy - HALF_PIXEL)
+    coefficients = [value.get(key, 0.0) for key in COEFFICIENTS[distortion]]
+    where = str(folder), "cameras"
+    return checked_intrinsics(parameters, coefficients, distortion, (width, height), size, where)
 
 
 FORMAT = Format(

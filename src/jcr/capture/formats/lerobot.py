@@ -12,7 +12,7 @@ from numpy import ndarray
 from pydantic import BaseModel, ConfigDict, Field
 
 from jcr.capture.camera_info import read_camera_info
-from jcr.capture.conventions import CONVENTIONS, poses_from_numbers
+from jcr.capture.controllers import CONVENTIONS, poses_from_numbers
 from jcr.capture.formats import Format
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_json, validated

@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from jcr.capture.camera_info import FILE, read_camera_info
 from jcr.capture.checks import checked_capture, require_frames
-from jcr.capture.conventions import CONVENTIONS, checked_rows, tolerated
+from jcr.capture.controllers import CONVENTIONS, checked_rows, tolerated
 from jcr.capture.formats import Format, pose_lists
 from jcr.capture.images import DEPTH
 from jcr.capture.options import ConventionName, ReadOptions, UnitsName

@@ -1,0 +1,235 @@
+"""Content of a capture.json: frames, intrinsics and further cameras, as they are read and written."""
+
+import json
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    StringConstraints,
+    model_validator,
+)
+
+from jcr.errors import InputError
+from jcr.geometry import HUGE, require_rigid
+from jcr.records.capture import COEFFICIENTS, DistortionModel, Intrinsics, Mount, coefficients_of
+
+NAME = r"[A-Za-z][A-Za-z0-9_]{0,63}"
+"""Pattern of the names of cameras and arms."""
+Name = Annotated[str, StringConstraints(pattern=f"^{NAME}$")]
+MOST_ROTATION = 6 * np.pi + 0.01
+"""Largest joint angle, rad: no joint rotates farther to either side."""
+PARAMETERS = ("fx", "fy", "cx", "cy")
+Positive = Annotated[float, Field(gt=0, lt=HUGE)]
+Std = Annotated[float, Field(ge=0, lt=HUGE)] | None
+
+
+def other_size(
+    what: str,
+    size: Sequence[object],
+    expected: tuple[int, int],
+    whose: str = "images",
+    remedy: str = "take all with one camera at one resolution",
+) -> InputError:
+    """Return the error of an image, depth image or intrinsics of another resolution than the images'."""
+    return InputError(
+        f"{what} of {size[0]}x{size[1]} pixels, {whose} of {expected[0]}x{expected[1]}; {remedy}"
+    )
+
+
+def read_rigid(value: Any, where: str = "matrix") -> Float[ndarray, "4 4"]:
+    """Return a rigid 4x4 from nested lists; raise InputError that says how it differs from rigid."""
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{where}: not a 4x4 matrix of numbers; write four rows of four") from None
+    if matrix.shape != (4, 4):
+        raise InputError(f"{where}: shape {matrix.shape}, not 4x4; write four rows of four numbers")
+    return require_rigid(matrix, where)
+
+
+RigidMatrix = Annotated[
+    Any,
+    BeforeValidator(lambda value: value if isinstance(value, ndarray) else read_rigid(value)),
+    PlainSerializer(lambda pose: pose.tolist()),
+]
+"""Rigid transform (4,4) in a file; an array is one already, and stays as it is to the last bit."""
+
+
+def _plausible(angles: list[float]) -> list[float]:
+    """Return joint angles (rad); raise ValueError where they look like degrees."""
+    if (largest := max(map(abs, angles))) > MOST_ROTATION:
+        raise ValueError(f"up to {largest:.4g} rad; these look like degrees: convert them")
+    return angles
+
+
+class Entry(BaseModel):
+    """Part of a capture.json; other keys than its fields are ignored."""
+
+    model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False)
+
+
+class IntrinsicsEntry(Entry):
+    """Intrinsics in a capture.json, px; the size of the images is that of the capture."""
+
+    fx: Positive
+    fy: Positive
+    cx: float
+    cy: float
+    distortion: list[float] | None = None
+    """Coefficients in OpenCV's order; none given: 0."""
+    model: DistortionModel = "pinhole"
+    width: int | None = None
+    """Width of the images, px; of the capture's images where it is not stated."""
+    height: int | None = None
+    """Height of the images, px; of the capture's images where it is not stated."""
+
+    @staticmethod
+    def of(intrinsics: Intrinsics) -> "IntrinsicsEntry":
+        """Return the entry of intrinsics."""
+        model = {} if intrinsics.model == "pinhole" else {"model": intrinsics.model}
+        numbers = {key: getattr(intrinsics, key) for key in PARAMETERS}
+        return IntrinsicsEntry(**model, **numbers, distortion=list(intrinsics.distortion))
+
+    def record(self, size: tuple[int, int], where: str) -> Intrinsics:
+        """Return the intrinsics of images of `size`; raise InputError, begun with `where`, where they cannot be."""
+        names = COEFFICIENTS[self.model]
+        distortion = self.distortion or [0.0] * len(names)
+        if len(distortion) != len(names):
+            raise InputError(
+                f"{where}: distortion has {len(distortion)} numbers, not the {len(names)} of a {self.model} model, "
+                f'{",".join(names)}; "model" may be {", ".join(COEFFICIENTS)}'
+            )
+        stated = (self.width or size[0], self.height or size[1])
+        if stated != size:
+            raise other_size(where, stated, size, remedy="give those of these images, or null")
+        if not (0 < self.cx < size[0] and 0 < self.cy < size[1]):
+            raise InputError(
+                f"{where}: the principal point ({self.cx:.4g}, {self.cy:.4g}) lies outside the {size[0]}x{size[1]} "
+                "images; give the intrinsics of this resolution, or null to estimate them"
+            )
+        coefficients = coefficients_of(distortion)
+        return Intrinsics(self.fx, self.fy, self.cx, self.cy, *size, coefficients, self.model)
+
+
+class StdEntry(Entry, extra="forbid"):
+    """Standard deviations of intrinsics in a capture.json, px and units of distortion; 0 is exact, null not stated."""
+
+    fx: Std = None
+    fy: Std = None
+    cx: Std = None
+    cy: Std = None
+    distortion: list[Std] = []
+
+    @staticmethod
+    def of(std: Float[ndarray, " p"]) -> "StdEntry":
+        """Return the entry of standard deviations, NaN where one is not stated."""
+        values = [None if np.isnan(value) else value for value in std.tolist()]
+        return StdEntry(**dict(zip(PARAMETERS, values, strict=False)), distortion=values[4:])
+
+    def array(self, intrinsics: Intrinsics | None, where: str) -> Float[ndarray, " p"]:
+        """Return the standard deviations in the order of `intrinsics`, NaN where one is not stated."""
+        if intrinsics is None:
+            raise InputError(f"{where}: there are no intrinsics whose errors these are; give both or none")
+        count = len(intrinsics.distortion)
+        if len(self.distortion) > count:
+            raise InputError(f"{where}: distortion must be a list of at most {count} numbers")
+        values = [*(getattr(self, name) for name in PARAMETERS), *self.distortion]
+        return np.array([*values, *[None] * (4 + count - len(values))], dtype=np.float64)
+
+
+class FrameEntry(Entry):
+    """Frame of a capture.json: an image with the data recorded at it."""
+
+    image: str
+    """Path in the folder of the capture."""
+    base_from_gripper: RigidMatrix
+    joints: Annotated[list[float], Field(min_length=1), AfterValidator(_plausible)] | None = None
+    """Joint angles (rad), from the base on."""
+    depth: str | None = None
+    """Path of a depth camera's image."""
+    time_s: float | None = None
+    """Time on the camera's clock."""
+
+
+class CameraFrame(Entry):
+    """Image of a camera on another arm, and that arm's gripper pose in its own base."""
+
+    image: str
+    base_from_gripper: RigidMatrix
+
+
+class CameraEntry(Entry, extra="forbid"):
+    """Camera in "cameras" of a capture.json."""
+
+    mount: Mount
+    watches: Literal["scene", "gripper"] | None = None
+    """Subject of the images; unset: the gripper for a fixed camera without images, else the scene."""
+    arm: Name | None = None
+    """Other arm that carries the camera."""
+    frames: list[CameraFrame] | None = None
+    """Images of a camera on another arm."""
+    images: list[str | None] | None = None
+    intrinsics: IntrinsicsEntry | None = None
+    intrinsics_std: StdEntry | None = None
+
+    @property
+    def is_own(self) -> bool:
+        """Whether the entry is that of the camera of the capture's frames."""
+        return self.images is None and self.frames is None
+
+    @model_validator(mode="after")
+    def _agrees(self) -> "CameraEntry":
+        """Raise ValueError where mount, arm, frames and images contradict each other."""
+        is_fixed, own, shows_gripper = self.mount == "base", self.is_own, self.watches == "gripper"
+        if own and self.watches is not None and is_fixed is not shows_gripper:
+            raise ValueError(
+                "the frames have gripper poses, so a fixed camera's images in them must show what the gripper "
+                "carries; list images of the scene as its images"
+            )
+        if not own and shows_gripper:
+            raise ValueError(
+                "watches the gripper; give its images a capture of their own, whose camera has mount base"
+            )
+        if (self.arm is None) is not (self.frames is None) or (self.arm is not None and is_fixed):
+            raise ValueError(
+                "a camera on another arm has mount gripper, that arm's name as arm, and frames of its own"
+            )
+        if not own and not any(self.images or self.frames or ()):
+            raise ValueError("no images; list some, or remove the camera")
+        return self
+
+
+def _one_own(cameras: dict[str, CameraEntry]) -> dict[str, CameraEntry]:
+    """Return the cameras; raise ValueError where several of them are without images."""
+    if len(own := [name for name, camera in cameras.items() if camera.is_own]) > 1:
+        raise ValueError(f"{', '.join(own)} have no images; only one can be the camera of the frames")
+    return cameras
+
+
+CameraEntries = Annotated[dict[Name, CameraEntry], AfterValidator(_one_own)]
+
+
+class CaptureFile(Entry, extra="allow"):
+    """Content of a capture.json; other keys are kept."""
+
+    frames: list[Any]
+    """Entries that FrameEntry validates one by one, so that a few of them may be faulty."""
+    intrinsics: IntrinsicsEntry | None = None
+    intrinsics_std: StdEntry | None = None
+    pose_convention: Any = None
+    robot: Any = None
+    urdf: str | None = None
+    cameras: CameraEntries | None = None
+
+    def as_text(self) -> str:
+        """Return the text of the file."""
+        return json.dumps(self.model_dump(mode="json", exclude_unset=True), indent=1) + "\n"
