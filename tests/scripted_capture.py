@@ -90,9 +90,6 @@ class Scripted:
         )
         return self.progress
 
-    def keep(self, image, pose, joints, time_s, depth_mm) -> str:
-        return self.live.add(image, pose, joints, depth_mm, time_s)
-
     def propose_elsewhere(self, base_from_gripper: ndarray) -> Progress:
         self.progress = replace(self.progress, next_joints=base_from_gripper[:3, 3])
         return self.progress

@@ -55,9 +55,8 @@ def test_a_rejected_result_exits_with_three_and_the_last_line_is_a_command_that_
     capsys: pytest.CaptureFixture[str],
 ):
     options = SessionOptions(until_accurate=until_accurate, require=(2.0, 0.3))
-    arguments = CaptureCommand(out=Path("captures/live"), session=options)
-    folder: Any = SimpleNamespace(names=[f"{k}.png" for k in range(images)])
-    assert _conclude(arguments, folder, [], found, requirement_met=True) == status
+    facts = {"capture": "captures/live", "images": images * ["0.png"], "answers": []}
+    assert _conclude(CaptureCommand(session=options), facts, found, requirement_met=True) == status
     printed = capsys.readouterr().out.splitlines()
     assert printed[-1] == f"Next        {last}" and len(printed) <= 14
     if found is not None:

@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.live.next_pose import AIMED, ELSEWHERE_M, Attempts, Reach, propose_before_calibration
+from jcr.live.next_pose import AIMED, ELSEWHERE_M, Reach, propose
 from jcr.records import Capture, HandEye
 from simulation.poses import looking_at
 
@@ -35,8 +35,11 @@ def seen() -> tuple[Capture, HandEye]:
     return capture, fit_hand_eye(poses, cameras)
 
 
-def next_pose(attempts: Attempts, hand_eye: HandEye | None) -> ndarray:
-    return propose_before_calibration(attempts, Reach(), hand_eye)["next_pose"].base_from_gripper
+def next_pose(
+    capture: Capture, registered: int = 4, hand_eye: HandEye | None = None, refused: tuple[ndarray, ...] = ()
+) -> ndarray:
+    reach = Reach(refused=refused)
+    return propose(capture, np.arange(registered), reach, hand_eye)["next_pose"].base_from_gripper
 
 
 def past_scene(base_from_gripper: ndarray) -> float:
@@ -45,60 +48,40 @@ def past_scene(base_from_gripper: ndarray) -> float:
     return float(np.arctan2(np.hypot(x, y), z))
 
 
+def rotations_deg(pose: ndarray, others: ndarray) -> ndarray:
+    trace = np.einsum("nij,ij->n", others[:, :3, :3], pose[:3, :3])
+    return np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+
+
 def test_a_rejected_calibration_that_knows_where_the_camera_looks_aims_the_next_image():
     capture, hand_eye = seen()
     assert not hand_eye.is_sound and not hand_eye.observability.observable
     # Of planar rotations the translation along their axis stays open; only the rotation is known here.
     aimed = replace(hand_eye, gripper_from_camera=TILTED, covariance=np.diag(7 * [1e-6]))
-    attempts = Attempts(capture, np.arange(4))
-    assert past_scene(next_pose(attempts, aimed)) < np.radians(8)
+    assert past_scene(next_pose(capture, hand_eye=aimed)) < np.radians(8)
     unknown = replace(aimed, covariance=np.diag([*3 * [AIMED[0] ** 2], *3 * [0.1], 1e-6]))
-    assert np.array_equal(next_pose(attempts, unknown), next_pose(attempts, None))
+    assert np.array_equal(next_pose(capture, hand_eye=unknown), next_pose(capture))
 
 
 @pytest.mark.parametrize("is_calibrated", [True, False])
 def test_each_refused_pose_is_followed_by_one_elsewhere_that_is_rotated_little(is_calibrated: bool):
     capture, hand_eye = seen()
     aimed = replace(hand_eye, gripper_from_camera=TILTED, covariance=np.diag(7 * [1e-6]))
-    attempts = Attempts(capture, np.arange(4))
+    refused: tuple[ndarray, ...] = ()
     for _ in range(5):
-        new = next_pose(attempts, aimed if is_calibrated else None)
-        assert all(
-            np.linalg.norm((new @ TILTED)[:3, 3] - (old @ TILTED)[:3, 3]) > 0.5 * ELSEWHERE_M
-            for old in attempts.refused
-        )
-        if attempts.refused:
-            nearest = min(np.trace(old[:3, :3].T @ new[:3, :3]) for old in -capture.base_from_gripper)
-            assert np.degrees(np.arccos((-nearest - 1) / 2)) < 25
-        attempts = replace(attempts, refused=(*attempts.refused, new))
+        new = next_pose(capture, 4, aimed if is_calibrated else None, refused)
+        between = [np.linalg.norm((new @ TILTED)[:3, 3] - (old @ TILTED)[:3, 3]) for old in refused]
+        assert all(metres > 0.5 * ELSEWHERE_M for metres in between)
+        assert not refused or rotations_deg(new, capture.base_from_gripper).min() < 25
+        refused = (*refused, new)
 
 
-def test_a_proposed_pose_is_rotated_by_fifteen_degrees_or_more_from_every_image():
+def test_a_pose_is_rotated_from_every_image_and_away_from_one_that_did_not_register():
     capture, _ = seen()
-    new = next_pose(Attempts(capture, np.arange(4)), None)
-    assert _rotations_deg(new, capture.base_from_gripper).min() > 15
-    # Two images more at such poses do not use up what is advised.
-    more = replace(
-        capture,
-        images=(*capture.images, "4.png"),
-        base_from_gripper=np.concatenate([capture.base_from_gripper, new[None]]),
-    )
-    again = next_pose(Attempts(more, np.arange(5)), None)
-    assert _rotations_deg(again, more.base_from_gripper).min() > 15
-
-
-def _rotations_deg(pose: ndarray, others: ndarray) -> ndarray:
-    trace = np.einsum("nij,ij->n", others[:, :3, :3], pose[:3, :3])
-    return np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
-
-
-def test_an_image_that_did_not_register_counts_as_a_place_without_images():
-    capture, _ = seen()
-    first = next_pose(Attempts(capture, np.arange(4)), None)
-    more = replace(
-        capture,
-        images=(*capture.images, "4.png"),
-        base_from_gripper=np.concatenate([capture.base_from_gripper, first[None]]),
-    )
-    after = next_pose(Attempts(more, np.arange(4)), None)
-    assert np.linalg.norm(after[:3, 3] - first[:3, 3]) > 0.99 * ELSEWHERE_M
+    new = next_pose(capture)
+    assert rotations_deg(new, capture.base_from_gripper).min() > 15
+    images, poses = (*capture.images, "4.png"), np.concatenate([capture.base_from_gripper, new[None]])
+    more = replace(capture, images=images, base_from_gripper=poses)
+    # An image more at such a pose does not use up what is advised.
+    assert rotations_deg(next_pose(more, 5), poses).min() > 15
+    assert np.linalg.norm(next_pose(more, 4)[:3, 3] - new[:3, 3]) > 0.99 * ELSEWHERE_M

@@ -41,9 +41,9 @@ def add(capture: LiveSession, scripted: Scripted, tabletop: Path, count: int) ->
 
 @contextmanager
 def asked(page: LiveServer, method: str, path: str, body: str = "", **headers: str) -> Iterator[Any]:
-    connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=10)
+    connection = http.client.HTTPConnection("127.0.0.1", page.server_port, timeout=10)
     names = {name.replace("_", "-"): value for name, value in headers.items()}
-    connection.request(method, path, body or None, {"Host": f"127.0.0.1:{page.port}"} | names)
+    connection.request(method, path, body or None, {"Host": f"127.0.0.1:{page.server_port}"} | names)
     yield connection.getresponse()
     connection.close()
 
@@ -172,7 +172,7 @@ def test_only_the_page_itself_commands(capture: tuple[LiveSession, Scripted], ta
     live.press = lambda action, number=None: pressed.append((action, number))
     with LiveServer(live) as page:
         press, body = f"/{page.key}/press", json.dumps({"action": "remove", "number": 1})
-        own = {"Origin": f"http://127.0.0.1:{page.port}", "Content_Type": "application/json"}
+        own = {"Origin": f"http://127.0.0.1:{page.server_port}", "Content_Type": "application/json"}
 
         def status(method: str = "POST", path: str = press, text: str = body, **headers: str) -> int:
             with asked(page, method, path, text, **(own | headers)) as answer:
@@ -194,7 +194,7 @@ def test_only_the_page_itself_commands(capture: tuple[LiveSession, Scripted], ta
     other = LiveServer(live)
     assert other.key != page.key and len(other.key) >= 22
     with pytest.raises(jcr.InputError, match="--page-port"), other:
-        LiveServer(live, Listen(port=other.port))
+        LiveServer(live, Listen(port=other.server_port))
 
 
 def test_the_camera_now_is_shown_with_its_features(capture: tuple[LiveSession, Scripted], tabletop: Path):

@@ -57,7 +57,7 @@ def posted(
     body = content if isinstance(content, str) else json.dumps(content)
     sent = {"Host": server.hosts[0], "Authorization": f"Bearer {server.key}"}
     sent |= {name.replace("_", "-"): value for name, value in headers.items()}
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=60)
     connection.request("POST", path, body, {name: value for name, value in sent.items() if value is not None})
     answer = connection.getresponse()
     text = answer.read()
@@ -85,9 +85,9 @@ def test_a_web_page_on_the_same_machine_cannot_add_a_pose(serving: Callable[...,
         assert posted(server, sample, Origin="http://evil.example")[0] == 403
         assert posted(server, sample, Origin="null")[0] == 403
         # DNS rebinding: the name of the other site leads to this server.
-        assert posted(server, sample, Host=f"evil.example:{server.port}", Origin=None)[0] == 403
+        assert posted(server, sample, Host=f"evil.example:{server.server_port}", Origin=None)[0] == 403
         # The lines of a request are no samples either.
-        with socket.create_connection(("127.0.0.1", server.port), timeout=60) as raw:
+        with socket.create_connection(("127.0.0.1", server.server_port), timeout=60) as raw:
             raw.sendall(
                 sample.encode() + f"POST / HTTP/1.1\r\nHost: {server.hosts[0]}\r\n\r\n{sample}".encode()
             )
@@ -120,24 +120,24 @@ def test_bad_samples_are_answered_and_good_ones_taken(serving: Callable[..., Any
 
 def test_other_machines_need_a_token_and_the_name_of_the_host(serving: Callable[..., Any]):
     with pytest.raises(jcr.InputError, match="set a token"):
-        Listen("192.168.0.5", 7464, None, "--listen").check()
+        Listen("192.168.0.5", 7464, None, "--listen")
     for host in ("0.0.0.0", "::", ""):
         with pytest.raises(jcr.InputError, match="names no host"):
-            Listen(host, 7464, "sesame", "--listen").check()
+            Listen(host, 7464, "sesame", "--listen")
     with pytest.raises(jcr.InputError, match="letters, digits"):
-        Listen(token="a key").check()
+        Listen(token="a key")
     with serving(host="127.0.0.2", token="sesame") as (server, taken):
 
         def status(host: str, key: str = "sesame") -> int:
-            connection = http.client.HTTPConnection("127.0.0.2", server.port, timeout=60)
+            connection = http.client.HTTPConnection("127.0.0.2", server.server_port, timeout=60)
             connection.request(
                 "POST", "/sample", json.dumps(POSE), {"Host": host, "Authorization": f"Bearer {key}"}
             )
             return connection.getresponse().status
 
-        assert status(f"127.0.0.1:{server.port}") == status(f"localhost:{server.port}") == 403
-        assert status(f"127.0.0.2:{server.port}", "wrong") == 403 and not taken
-        assert status(f"127.0.0.2:{server.port}") == 200 and len(taken) == 1
+        assert status(f"127.0.0.1:{server.server_port}") == status(f"localhost:{server.server_port}") == 403
+        assert status(f"127.0.0.2:{server.server_port}", "wrong") == 403 and not taken
+        assert status(f"127.0.0.2:{server.server_port}") == 200 and len(taken) == 1
 
 
 def test_silence_ends_the_wait_and_samples_of_a_watched_arm_are_refused(tmp_path: Path, tabletop: Path):
@@ -197,8 +197,10 @@ def played_script(address: str, port: int, token: str, pose: list[float]) -> lis
 
 def test_the_urscript_example_sends_a_pose(serving: Callable[..., Any]):
     with serving(token="sesame") as (server, taken):
-        assert played_script("127.0.0.1", server.port, "sesame", POSE) == ["jcr capture: HTTP/1.0 200 OK"]
-        assert "403" in played_script("127.0.0.1", server.port, "guess", POSE)[0]
+        assert played_script("127.0.0.1", server.server_port, "sesame", POSE) == [
+            "jcr capture: HTTP/1.0 200 OK"
+        ]
+        assert "403" in played_script("127.0.0.1", server.server_port, "guess", POSE)[0]
     assert len(taken) == 1 and np.allclose(taken[0].base_from_gripper[:3, 3], POSE[:3])
 
 

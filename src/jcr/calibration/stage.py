@@ -34,14 +34,21 @@ def calibrate(
     """
     check_options(options := options or CalibrateOptions())
     robot = robot_errors(capture, options).of(reconstruction.image_index)
-    case = checked(capture, reconstruction, options, robot)
-    hand_eye = advised(
-        case.hand_eye, case.base_from_gripper, options, robot, assumptions_of(case), case.scene_uncertainty
-    )
+    case = calibrate_case(capture, reconstruction, options, robot)
     if capture.intrinsics is None or (distance_m := case.scene_distance_m) is None:
-        return hand_eye
-    pair = with_given_intrinsics(hand_eye, reconstruction.intrinsics, distance_m)
-    return replace(hand_eye, with_given_intrinsics=pair)
+        return case.hand_eye
+    pair = with_given_intrinsics(case.hand_eye, reconstruction.intrinsics, distance_m)
+    return replace(case.hand_eye, with_given_intrinsics=pair)
+
+
+def calibrate_case(
+    capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrors
+) -> Case:
+    """Return the case after fit, adjustment, checks and advice; `robot` is of the registered images."""
+    case = checked(capture, reconstruction, options, robot)
+    gripper, assumptions = case.base_from_gripper, assumptions_of(case)
+    found = advised(case.hand_eye, gripper, options, robot, assumptions, case.scene_uncertainty)
+    return replace(case, hand_eye=found)
 
 
 @one_blas_thread

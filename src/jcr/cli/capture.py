@@ -6,7 +6,7 @@ import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -20,10 +20,8 @@ from jcr.live.session import LEAST_IMAGES, SessionOptions
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from jcr.live.folder import LiveFolder
-    from jcr.live.progress import Notation
     from jcr.live.robot import States
-    from jcr.live.server import Listen, LiveServer
+    from jcr.live.server import LiveServer
     from jcr.live.session import Answer, LiveSession
     from jcr.records.capture_json import IntrinsicsEntry
     from jcr.run_folder import RunResult
@@ -85,7 +83,7 @@ class CaptureCommand:
             arms = [arm_named(name) for name in ROBOT_NAMES]
             lines = [f"{arm.name:<8}{arm.dof} joints, reach {arm.reach:.2f} m" for arm in arms]
             facts = {"robots": [{"name": arm.name, "joints": arm.dof, "reach_m": arm.reach} for arm in arms]}
-            self.output.result("\n".join(lines) + "\n", facts)
+            self.output.result(lines, facts)
             return 0
         if self.out is None:
             raise InputError("OUT: required, and not given (jcr capture --help)")
@@ -94,18 +92,21 @@ class CaptureCommand:
 
 def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
     """Take images until there are enough, or the calibration is as accurate as required; calibrate all of them."""
-    from jcr.live.arms import states_of
+    from jcr.live.arms import NOTATIONS, address_of, states_of
     from jcr.live.calibration import LiveCalibration
     from jcr.live.cameras import open_camera
     from jcr.live.folder import LiveFolder
-    from jcr.live.server import LiveServer
+    from jcr.live.progress import Notation
+    from jcr.live.server import Listen, LiveServer
     from jcr.live.session import LiveSession
     from jcr.run_folder import locked
 
-    options = arguments.session
+    options, token = arguments.session, arguments.token or os.environ.get("JCR_TOKEN") or None
     if options.until_accurate and options.require is None:
         raise InputError("--until-accurate: needs --require MM DEG, the accuracy that is meant")
-    states, listen = states_of(arguments.poses), _listen(arguments)
+    states, listen = states_of(arguments.poses), Listen(port=arguments.page_port, token=token)
+    if arguments.listen is not None:
+        listen = Listen(*address_of(arguments.listen, 7464, "--listen "), token, "--listen")
     given = _intrinsics(arguments.intrinsics_from)
     if states is None and arguments.poses not in ("typed", "http"):
         raise InputError(f"--poses {arguments.poses}: give ur:HOST, franka:HOST, xarm:HOST, typed or http")
@@ -120,7 +121,11 @@ def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
         folder = LiveFolder(out, given or camera.intrinsics, robot)
         calibration = LiveCalibration(folder, options={"require": options.require}, reach=options.reach_m)
         gripper = None if states is None else lambda: next(states())
-        session = LiveSession(calibration, camera, options, tell, _notation(arguments, folder), gripper)
+        convention = arguments.pose_convention
+        if convention == "auto":
+            convention = NOTATIONS.get(arguments.poses.partition(":")[0], "auto")
+        notation = Notation(convention, arguments.pose_units, calibration.arm)
+        session = LiveSession(calibration, camera, options, tell, notation, gripper)
         try:
             with LiveServer(session, listen, arguments.poses == "http") as server:
                 _print(f"{len(folder.names)} images in {out}; open {server.address} in a browser")
@@ -128,34 +133,30 @@ def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
                 result = session.finish()
         finally:
             calibration.close()
-    return _conclude(arguments, folder, answers, result, calibration.progress.requirement_met)
+    facts = {"capture": str(out), "images": folder.names, "answers": answers}
+    return _conclude(arguments, facts, result, calibration.progress.requirement_met)
 
 
 def _conclude(
-    arguments: CaptureCommand,
-    folder: "LiveFolder",
-    answers: "list[Answer]",
-    result: "RunResult | None",
-    requirement_met: bool,
+    arguments: CaptureCommand, facts: dict[str, Any], result: "RunResult | None", requirement_met: bool
 ) -> int:
     """Print the result and the next command; return 3 where it is rejected or not what `--until-accurate` requires."""
     from jcr.calibration.words import labelled, summary
 
-    out, images = arguments.out, len(folder.names)
-    assert out is not None
-    required = None if result is None else result.calibration.requirement
-    is_accepted = result is not None and result.converged
-    lines = [] if result is None else summary(result.calibration).splitlines()
-    command = f"jcr run {out} {Path('out') / out.resolve().name}" if is_accepted else f"jcr check {out}"
+    out, images, lines = facts["capture"], len(facts["images"]), list[str]()
+    is_accepted, is_met = False, False
+    if result is not None:
+        required, is_accepted = result.calibration.requirement, result.converged
+        is_met = is_accepted and required is not None and required.met and requirement_met
+        lines = summary(result.calibration).splitlines()
+    command = f"jcr run {out} {Path('out') / Path(out).resolve().name}" if is_accepted else f"jcr check {out}"
     if images < LEAST_IMAGES:
         command = f"the same command resumes; {LEAST_IMAGES} or more images are needed"
     lines += [*labelled("Capture", f"{images} images in {out}"), *labelled("Next", command)]
-    facts = {"capture": str(out), "images": folder.names, "answers": answers}
-    facts["result"] = None if result is None else str(result.out)
-    facts["verdict"] = None if result is None else result.verdict
-    arguments.output.result("\n".join(lines) + "\n", facts)
+    facts |= {"result": None if result is None else str(result.out)}
+    facts |= {"verdict": None if result is None else result.verdict}
+    arguments.output.result(lines, facts)
     if arguments.session.until_accurate:
-        is_met = is_accepted and required is not None and required.met and requirement_met
         return 0 if is_met else 3
     return 3 if images >= LEAST_IMAGES and not is_accepted else 0
 
@@ -190,31 +191,6 @@ def _source(
         return lambda: session.watch(states)
     _print(f"waiting for POST http://{server.hosts[0]}/sample with the key {server.key}")
     return lambda: server.await_samples(arguments.timeout)
-
-
-def _listen(arguments: CaptureCommand) -> "Listen":
-    """Return the address of the server; raise InputError where it is open to others without a token."""
-    from jcr.live.arms import address_of
-    from jcr.live.server import Listen
-
-    token = arguments.token or os.environ.get("JCR_TOKEN") or None
-    listen = Listen(port=arguments.page_port, token=token)
-    if arguments.listen is not None:
-        listen = Listen(*address_of(arguments.listen, 7464, "--listen "), token, "--listen")
-    listen.check()
-    return listen
-
-
-def _notation(arguments: CaptureCommand, folder: "LiveFolder") -> "Notation":
-    """Return the notation of printed poses: that of the options, else that of the arm."""
-    from jcr.live.arms import NOTATIONS
-    from jcr.live.progress import Notation
-
-    convention = arguments.pose_convention
-    if convention == "auto":
-        convention = NOTATIONS.get(arguments.poses.partition(":")[0], "auto")
-    name = folder.robot
-    return Notation(convention, arguments.pose_units, None if name is None else arm_named(name))
 
 
 def _intrinsics(file: Path | None) -> "IntrinsicsEntry | None":

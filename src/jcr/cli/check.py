@@ -9,14 +9,13 @@ import numpy as np
 import tyro
 
 from jcr.capture.options import ReadOptions
-from jcr.cli.output import Output, VerboseOutput
+from jcr.cli.output import Output, VerboseOutput, numbers
 from jcr.cli.run import looked_at, with_images
 from jcr.errors import InputError
 from jcr.pipeline.options import VerifyOptions
 from jcr.progress import progress_bars
 
 if TYPE_CHECKING:
-    from jcr.calibration.difference import Difference
     from jcr.pipeline.check import Examination
     from jcr.pipeline.verify import Verification
     from jcr.records import Capture, PosePairs
@@ -82,24 +81,22 @@ class CheckCommand:
                 progress,
                 self.thorough,
             )
-            text = "" if self.output.json else _check_text(self, capture, found)
-            self.output.result(text, _check_facts(capture, found))
+            self.output.result(_check_lines(self, capture, found), _check_facts(capture, found))
         return 3 if found.verdict == "rejected" else 0
 
 
-def _check_text(command: CheckCommand, capture: "Capture | PosePairs", found: "Examination") -> str:
+def _check_lines(command: CheckCommand, capture: "Capture | PosePairs", found: "Examination") -> list[str]:
     """Return the verdict with its cause and remedy, or with what a calibration is expected to reach."""
     from jcr.calibration.words import MOST_LINES, actions, labelled, verdict_in_words
     from jcr.findings import sentence
     from jcr.records import PosePairs
     from jcr.rounding import significant
 
-    if isinstance(capture, PosePairs):
-        about = f"{len(capture)} samples with the poses of gripper and camera, no images"
-    else:
-        width, height = capture.image_size
+    about = f"{len(capture)} samples with the poses of gripper and camera, no images"
+    if not isinstance(capture, PosePairs):
+        size = "x".join(map(str, capture.image_size))
         intrinsics = "given" if capture.intrinsics is not None else "unknown, to be estimated"
-        about = f"{len(capture)} images of {width}x{height}, intrinsics {intrinsics}"
+        about = f"{len(capture)} images of {size}, intrinsics {intrinsics}"
     is_rejected, closing = found.verdict == "rejected", "jcr docs troubleshooting"
     outcome = "a calibration would be rejected" if is_rejected else "good to calibrate"
     lines = [f"{verdict_in_words(found.findings)}: {outcome}. {about}"]
@@ -110,16 +107,17 @@ def _check_text(command: CheckCommand, capture: "Capture | PosePairs", found: "E
         closing = shlex.join(["jcr", "run", str(command.capture), f"out/{command.capture.stem}"])
     notes = [line for note in found.notes for line in labelled("Note", note)]
     acting = actions(found.findings, MOST_LINES - len(lines) - 1)
-    room = MOST_LINES - len(lines) - len(acting) - 1
     if command.output.verbose:
         acting += [f"{one.severity}: {sentence(one)}" for one in found.findings]
-    lines += [*acting, *(notes if command.output.verbose else notes[:room])]
+    else:
+        notes = notes[: MOST_LINES - len(lines) - len(acting) - 1]
+    lines += [*acting, *notes]
     for k, pose in enumerate(found.suggestions, start=1):
         matrix = np.array2string(pose.base_from_gripper, precision=4, suppress_small=True).splitlines()
         then = f"{significant(pose.within_95_mm)} mm, {significant(pose.rotation_95_deg)}°"
         near = f"{1e3 * pose.moved_m:.0f} mm, {np.degrees(pose.rotation_rad):.0f}° from {capture.images[pose.like]}"
         lines += labelled(f"Add pose {k}", f"{near}; then {then} (95 %); base_from_gripper:", *matrix)
-    return "\n".join([*lines, *labelled("Next", closing)]) + "\n"
+    return [*lines, *labelled("Next", closing)]
 
 
 def _expected(images: int, found: "Examination") -> list[str]:
@@ -128,24 +126,23 @@ def _expected(images: int, found: "Examination") -> list[str]:
     from jcr.pipeline.check import QUICK
     from jcr.rounding import significant
 
-    lines = []
+    lines, fitted = list[str](), found.hand_eye
     if found.expected is not None:
         seen, std = found.expected.in_use.seen, found.expected.std
-        offset = " ".join(significant(1e3 * value) for value in std[:3])
-        rotation = " ".join(significant(float(np.degrees(value))) for value in std[3:6])
-        errors = "found in the images" if found.hand_eye is not None else "usual"
+        sizes = (1e3 * std[:3], np.degrees(std[3:6]))
+        offset, rotation = (" ".join(significant(float(value)) for value in part) for part in sizes)
         lines = labelled(
             "Expected",
             f"a point at {significant(1e-3 * seen.distance_mm)} m: {significant(seen.within_95_mm)} mm, "
-            f"{significant(seen.rotation_95_deg)}° (95 %), from {len(found.counted)} images; errors as {errors}",
+            f"{significant(seen.rotation_95_deg)}° (95 %), from {len(found.counted)} images; "
+            f"errors as {'usual' if fitted is None else 'found in the images'}",
             f"1σ: {offset} mm, {rotation}°, scale {significant(100 * std[6])} %",
         )
-    if found.hand_eye is not None:
-        noise, inliers = found.hand_eye.robot_noise, found.hand_eye.inliers
-        agreement = f"{1e3 * noise.translation:.2f} mm, {np.degrees(noise.rotation):.3f}° per axis"
-        looked = f"{int(inliers.sum())} of {len(inliers)} images"
-        if len(inliers) == QUICK < images:
+    if fitted is not None:
+        noise, looked = fitted.robot_noise, f"{int(fitted.inliers.sum())} of {len(fitted.inliers)} images"
+        if len(fitted.inliers) == QUICK < images:
             looked += f"; distortion and focus show with all {images}: --thorough"
+        agreement = f"{1e3 * noise.translation:.2f} mm, {np.degrees(noise.rotation):.3f}° per axis"
         lines += labelled("Agreement", f"poses and images: {agreement} ({looked})")
     return lines
 
@@ -158,6 +155,7 @@ def _check_facts(capture: "Capture | PosePairs", found: "Examination") -> dict[s
     noise = None if found.hand_eye is None else found.hand_eye.robot_noise
     sharpness = found.sharpness.tolist() or [None] * len(capture)
     names = "base_from_gripper", "expected_std", "within_95_mm", "rotation_95_deg"
+    seen = ("observable", "unobservable", "advice")
     return {
         "verdict": found.verdict,
         "images": [
@@ -165,9 +163,7 @@ def _check_facts(capture: "Capture | PosePairs", found: "Examination") -> dict[s
         ],
         "largest_move_mm": 1e3 * found.largest_move_m,
         "largest_turn_deg": float(np.degrees(found.largest_rotation_rad)),
-        "observability": {
-            name: getattr(found.observability, name) for name in ("observable", "unobservable", "advice")
-        },
+        "observability": {name: getattr(found.observability, name) for name in seen},
         "expected_std": None if found.expected is None else found.expected.std,
         "expected_seen": None if found.expected is None else vars(found.expected.in_use.seen),
         "expected_images": [capture.images[row] for row in found.counted],
@@ -211,41 +207,37 @@ class CompareCommand:
         known = {path: read_hand_eye(path) for path in (self.out, self.reference)}
         found = difference(known[self.out], known[self.reference])
         rejected = {str(path): one.doubt for path, one in known.items() if one.doubt is not None}
+        mm, deg = 1e3 * found.translation_m, np.degrees(found.rotation_vector)
         facts: dict[str, object] = {
-            "translation_mm": 1e3 * float(np.linalg.norm(found.translation_m)),
-            "rotation_deg": float(np.degrees(np.linalg.norm(found.rotation_vector))),
-            "translation_xyz_mm": 1e3 * found.translation_m,
+            "translation_mm": float(np.linalg.norm(mm)),
+            "rotation_deg": float(np.linalg.norm(deg)),
+            "translation_xyz_mm": mm,
             "rejected": rejected,
         }
+        offset, explained = f"{numbers(mm, 3)} mm (gripper axes)", "; neither file states its errors"
+        is_contradiction = found.p_value is not None and found.p_value < UNLIKELY
         if found.sigmas is not None:
             facts |= {"sigmas": found.sigmas, "chi2": found.chi2, "p": found.p_value}
             facts["explained_by"] = found.explained_by
-        is_contradiction = found.p_value is not None and found.p_value < UNLIKELY
+            offset += f"; at most {found.sigmas.max():.1f} of the reported standard deviations on any axis"
+            explained = "; the reported errors explain it"
+        remedy = []
+        if is_contradiction:
+            explained = "; more than the reported errors explain"
+            remedy = ["find out what moved between the two, or which error they do not report"]
         verdict = "REJECTED" if is_contradiction or rejected else "ACCEPTED"
-        explained, *lines = _difference_lines(found, is_contradiction)
+        apart = f"{facts['translation_mm']:.3f} mm, {facts['rotation_deg']:.4f}° apart"
+        lines = [f"{verdict}: {apart}{explained}", *labelled("Remedy", *remedy)]
+        lines += labelled("Difference", offset)
+        causes = [
+            f"{name.replace('_', ' ')} {100 * share:.0f} %" for name, share in found.explained_by.items()
+        ]
+        lines += labelled("Causes", f"would be {', '.join(causes)}") if len(causes) > 1 else []
         if self.output.verbose and found.sigmas is not None:
             lines.append(f"χ² {found.chi2:.1f} of 6, p = {found.p_value:.2g}")
         lines += [line for path, why in rejected.items() for line in labelled("Rejected", f"{path}: {why}")]
-        apart = f"{facts['translation_mm']:.3f} mm, {facts['rotation_deg']:.4f}° apart"
-        self.output.result("\n".join([f"{verdict}: {apart}{explained}", *lines]) + "\n", facts)
+        self.output.result(lines, facts)
         return 3 if verdict == "REJECTED" else 0
-
-
-def _difference_lines(found: "Difference", is_contradiction: bool) -> list[str]:
-    """Return the end of the verdict's line, and the lines on the difference and its causes."""
-    from jcr.calibration.words import labelled
-
-    offset = " ".join(f"{1e3 * value:.3f}" for value in found.translation_m) + " mm (gripper axes)"
-    if found.sigmas is None:
-        return ["; neither file states its errors", *labelled("Difference", offset)]
-    offset += f"; at most {found.sigmas.max():.1f} of the reported standard deviations on any axis"
-    lines = ["; the reported errors explain it"]
-    if is_contradiction:
-        remedy = "find out what moved between the two, or which error they do not report"
-        lines = ["; more than the reported errors explain", *labelled("Remedy", remedy)]
-    lines += labelled("Difference", offset)
-    shares = [f"{name.replace('_', ' ')} {100 * share:.0f} %" for name, share in found.explained_by.items()]
-    return [*lines, *(labelled("Causes", f"would be {', '.join(shares)}") if len(shares) > 1 else ())]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -282,8 +274,9 @@ class VerifyCommand:
             found = verify_run(self.out, capture, self.verify, progress)
         cameras = (found, *found.others)
         facts = _drift_facts(found) | {"cameras": {one.fixed: _drift_facts(one) for one in found.others}}
-        lines = [line for one in cameras for line in _drift_lines(one, self.output.verbose)]
-        self.output.result("\n".join(lines) + "\n", facts)
+        self.output.result(
+            (line for one in cameras for line in _drift_lines(one, self.output.verbose)), facts
+        )
         return 3 if any(one.moved for one in cameras) else 0
 
 
@@ -292,38 +285,31 @@ def _drift_lines(found: "Verification", verbose: bool) -> list[str]:
     from jcr.calibration.words import labelled
 
     drift = f"{1e3 * found.drift_m:.2f} mm, {np.degrees(found.drift_rad):.3f}° from the calibration"
-    mm, mm_std = (" ".join(f"{1e3 * value:.2f}" for value in part[:3]) for part in (found.offset, found.std))
-    deg, deg_std = (
-        " ".join(f"{np.degrees(value):.3f}" for value in part[3:]) for part in (found.offset, found.std)
-    )
+    mm, mm_std = (numbers(1e3 * part[:3], 2) for part in (found.offset, found.std))
+    deg, deg_std = (numbers(np.degrees(part[3:]), 3) for part in (found.offset, found.std))
     parent = "gripper" if found.fixed is None else "base"
     noticed = f"{1e3 * found.detectable[0]:.1f} mm or {np.degrees(found.detectable[1]):.2f}°"
-    lines = [
+    return [
         f"{found.verdict.upper()}: {found.finding}, {drift}",
         *(labelled("Remedy", found.advice) if found.moved else ()),
         *labelled("Drift", f"{mm} ± {mm_std} mm, {deg} ± {deg_std}° (1σ, {parent} axes)"),
         *labelled("Images", f"{len(found.images)}, {found.how}; 9 of 10 drifts of {noticed} are noticed"),
         *(line for note in found.notes for line in labelled("WARNING", note)),
+        *([f"p = {found.p_value:.2g}"] if verbose else ()),
     ]
-    return [*lines, f"p = {found.p_value:.2g}"] if verbose else lines
 
 
 def _drift_facts(found: "Verification") -> dict[str, object]:
     """Return the result on one camera for JSON."""
-    return {
-        "verdict": found.verdict,
-        "moved": found.moved,
+    same = {name: getattr(found, name) for name in ("verdict", "moved", "p_value", "images", "notes", "how")}
+    return same | {
         "cause": found.cause if found.moved else None,
         "drift_mm": 1e3 * found.offset[:3],
         "drift_deg": np.degrees(found.offset[3:]),
         "drift_std_mm": 1e3 * found.std[:3],
         "drift_std_deg": np.degrees(found.std[3:]),
-        "p_value": found.p_value,
         "detectable_mm": 1e3 * found.detectable[0],
         "detectable_deg": float(np.degrees(found.detectable[1])),
-        "images": found.images,
-        "notes": found.notes,
-        "how": found.how,
     }
 
 
@@ -353,8 +339,8 @@ class TouchCommand:
         from jcr.pipeline.touch import touch
 
         found = touch(self.out, self.points)
-        is_larger = found.p_value < UNLIKELY
-        mean, rms, expected = 1e3 * found.common, 1e3 * found.rms, 1e3 * found.expected
+        is_larger, mean = found.p_value < UNLIKELY, 1e3 * found.common
+        rms, expected = 1e3 * found.rms, 1e3 * found.expected
         verdict = "REJECTED: larger than" if is_larger else "ACCEPTED: within"
         lines = [f"{verdict} the reported uncertainty: {rms:.2f} mm (rms), {expected:.2f} mm expected"]
         if is_larger:
@@ -362,20 +348,15 @@ class TouchCommand:
                 "check the tip's calibration (a constant error), then calibrate the camera again (jcr run)"
             )
             lines += labelled("Remedy", remedy)
-        lines += labelled("Mean", " ".join(f"{value:+.2f}" for value in mean) + " mm")
-        points = []
-        for image, error, std in zip(found.images, 1e3 * found.error, 1e3 * found.std, strict=True):
-            points.append({"image": image, "error_mm": error, "std_mm": std})
-            errors, stds = (
-                " ".join(f"{value:{sign}.2f}" for value in part) for part, sign in ((error, "+"), (std, ""))
-            )
-            lines.append(f"{image}: {errors} mm (± {stds})")
-        facts = {
-            "rms_mm": rms,
-            "expected_mm": expected,
-            "p": found.p_value,
-            "mean_mm": mean,
-            "points": points,
-        }
-        self.output.result("\n".join(lines) + "\n", facts)
+        lines += labelled("Mean", f"{numbers(mean, 2, '+')} mm")
+        points = [
+            {"image": image, "error_mm": error, "std_mm": std}
+            for image, error, std in zip(found.images, 1e3 * found.error, 1e3 * found.std, strict=True)
+        ]
+        lines += [
+            f"{one['image']}: {numbers(one['error_mm'], 2, '+')} mm (± {numbers(one['std_mm'], 2)})"
+            for one in points
+        ]
+        facts = {"rms_mm": rms, "expected_mm": expected, "p": found.p_value, "mean_mm": mean}
+        self.output.result(lines, facts | {"points": points})
         return 3 if is_larger else 0

@@ -3,7 +3,7 @@
 import io
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,11 +17,10 @@ class Output:
     quiet: bool = False
     """Print only errors and warnings on stderr: no progress, no notes."""
 
-    def result(self, text: str, facts: Mapping[str, object]) -> None:
-        """Print the result at once: `facts`, arrays as lists, with --json, else the text for people."""
-        sys.stdout.write(
-            json.dumps(facts, default=lambda array: array.tolist()) + "\n" if self.json else text
-        )
+    def result(self, lines: Iterable[str], facts: Mapping[str, object]) -> None:
+        """Print the result at once: `facts`, arrays as lists, with --json, else the lines for people."""
+        shown = [json.dumps(facts, default=lambda array: array.tolist())] if self.json else lines
+        sys.stdout.writelines(f"{line}\n" for line in shown)
         sys.stdout.flush()
 
 
@@ -45,3 +44,8 @@ def warn(text: str) -> None:
     """Print what asks the user to act on stderr, with --quiet too."""
     stream = sys.stderr.before if isinstance(sys.stderr, Quiet) else sys.stderr
     stream.write(f"warning: {text}\n")
+
+
+def numbers(values: Iterable[float], digits: int, sign: str = "") -> str:
+    """Return numbers with so many decimals in one line; `sign` "+": positive ones have a sign."""
+    return " ".join(f"{value:{sign}.{digits}f}" for value in values)

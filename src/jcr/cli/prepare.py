@@ -1,5 +1,6 @@
 """Commands around a calibration: board, models and docs."""
 
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
@@ -47,10 +48,9 @@ class BoardCommand:
         if self.out.suffix.lower() != ".pdf":
             raise InputError(f"jcr board {self.out}: writes a PDF; name a file that ends in .pdf")
         write_bytes(self.out, board_sheet(self.board, self.paper).as_pdf())
+        use = f"print at 100 % on {self.paper}, measure the rulers, then calibrate with --board {self.board}"
         self.output.result(
-            f"{self.out}: print at 100 % on {self.paper}, measure the rulers, then calibrate with "
-            f"--board {self.board}\n",
-            {"file": str(self.out), "board": self.board, "paper": self.paper},
+            [f"{self.out}: {use}"], {"file": str(self.out), "board": self.board, "paper": self.paper}
         )
         return 0
 
@@ -73,34 +73,27 @@ class DocsCommand:
         """Print a page, or the names and titles of all."""
         if self.name is not None:
             text = page(self.name)
-            self.output.result(text, {"page": self.name, "markdown": text})
+            self.output.result(text.splitlines(), {"page": self.name, "markdown": text})
             return 0
         titles = {name: title(path) for name, path in pages().items()}
-        text = "".join(f"{name:<22} {heading}\n" for name, heading in titles.items())
-        self.output.result(text, {"pages": titles})
+        self.output.result((f"{name:<22} {heading}" for name, heading in titles.items()), {"pages": titles})
         return 0
 
 
 def pages() -> dict[str, Path]:
     """Return the file of each page by its name, as `jcr docs` takes it; empty where no page was installed."""
-    if (CHECKOUT / "conf.py").is_file():
-        found = sorted(CHECKOUT.rglob("*.md"))
-    else:
-        try:
-            installed = [file for file in files(DISTRIBUTION) or [] if file.suffix == ".md"]
-        except PackageNotFoundError:  # run from source files alone
-            installed = []
-        found = sorted(Path(str(file.locate())) for file in installed if f"doc/{DISTRIBUTION}/" in str(file))
-    order = {section: number for number, section in enumerate(SECTIONS)}
-    found = [
-        path for path in found if path.parent.name in order and path.name not in ("index.md", "README.md")
-    ]
-    found.sort(key=lambda path: order[path.parent.name])
-    return {_name(path): path for path in found}
-
-
-def _name(path: Path) -> str:
-    return f"results/{path.stem}" if path.parent.name == "results" else path.stem
+    found = list(CHECKOUT.rglob("*.md"))
+    if not (CHECKOUT / "conf.py").is_file():
+        with suppress(PackageNotFoundError):  # run from source files alone
+            installed = [Path(str(file.locate())) for file in files(DISTRIBUTION) or []]
+            found = [
+                file for file in installed if file.suffix == ".md" and f"doc/{DISTRIBUTION}/" in str(file)
+            ]
+    sections = {name: number for number, name in enumerate(SECTIONS)}
+    named = [file for file in found if file.parent.name in sections and file.stem not in ("index", "README")]
+    named.sort(key=lambda file: (sections[file.parent.name], file))
+    results = "results"
+    return {f"{results}/{file.stem}" if file.parent.name == results else file.stem: file for file in named}
 
 
 def page(name: str) -> str:
@@ -114,8 +107,8 @@ def page(name: str) -> str:
 
 def title(path: Path) -> str:
     """Return the first heading of a page."""
-    with path.open(encoding="utf-8") as lines:
-        return next((line[2:].strip() for line in lines if line.startswith("# ")), path.stem)
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return next((line[2:].strip() for line in lines if line.startswith("# ")), path.stem)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,7 +161,7 @@ class ModelsCommand:
                 name: getattr(row, name) for name in ("licence", "commercial", "accuracy", "download_gb")
             }
             facts.append(fact | {"parameters_m": row.parameters})
-        self.output.result("\n".join(lines) + "\n", {"models": facts})
+        self.output.result(lines, {"models": facts})
         return 0
 
     def _get(self) -> int:
@@ -187,9 +180,9 @@ class ModelsCommand:
                 f"{weights_command(row)}; its licence is {row.licence}; accept it with --accept-licence, or take da3"
             )
         folder = download(hub_id, self.revision or revision, self.output.quiet)
-        text = f"{hub_id}: revision {folder.name[:12]}, checked, in {folder}\n"
+        lines = [f"{hub_id}: revision {folder.name[:12]}, checked, in {folder}"]
         if row and not row.is_installed():
-            text += f"its package is missing: {row.install}\n"
+            lines.append(f"its package is missing: {row.install}")
         facts = {"backend": row.name if row else None, "weights": hub_id, "revision": folder.name}
-        self.output.result(text, facts | {"folder": str(folder)})
+        self.output.result(lines, facts | {"folder": str(folder)})
         return 0

@@ -145,8 +145,8 @@ class BatchCommand:
         *captures, out = self.paths
         with progress_bars() as progress:
             rows = batch(captures, out, run_options(self), self.batch, progress, self.read)
-        table, summary = "".join(map(_line, enumerate(rows, start=1))), out / "summary.html"
-        self.output.result(f"{table}table: {summary}\n", {"captures": [asdict(row) for row in rows]})
+        summary, lines = out / "summary.html", [_line(rank, row) for rank, row in enumerate(rows, start=1)]
+        self.output.result([*lines, f"table: {summary}"], {"captures": [asdict(row) for row in rows]})
         if doubtful := sum(not is_accepted(row) for row in rows):
             raise RejectedError(f"{doubtful} of {len(rows)} captures failed or are rejected; see {summary}")
         return 0
@@ -188,7 +188,7 @@ class AddCameraCommand:
             result = add_camera(self.out, name or "camera", self.images, self.intrinsics, progress=progress)
         assert result.cameras is not None
         mine = result.cameras.model_copy(update={"cameras": result.cameras.cameras[-1:], "arms": []})
-        self.output.result("\n".join(in_words(mine)) + "\n", mine.as_json()["cameras"][0])
+        self.output.result(in_words(mine), mine.as_json()["cameras"][0])
         return 0
 
 
@@ -303,7 +303,7 @@ def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
     lines += [*more, *labelled("Report", str(out / "report.html")), *labelled("Next", following)]
     if output.verbose:
         lines += ["", *details(content), *(line for camera in placed for line in camera.in_words)]
-    output.result("\n".join(lines) + "\n", facts)
+    output.result(lines, facts)
     return 0 if content.converged and all(camera.converged for camera in placed) else 3
 
 
@@ -321,10 +321,8 @@ def _camera_in_words(camera: "CameraPlacement") -> str:
     )
 
 
-def _line(ranked: "tuple[int, BatchRow]") -> str:
+def _line(rank: int, row: "BatchRow") -> str:
     """Return the line of a row of a batch."""
-    rank, row = ranked
     std = "" if row.offset_std_mm is None else f"± {row.offset_std_mm:.2f} mm, {row.turn_std_deg:.3f}°"
     used = f"{row.used:3d}/{row.images:<3d}"
-    line = f"{rank:3d}  {Path(row.out).name:<24} {row.status:<22} {used} {std}  {row.reason}"
-    return line.rstrip() + "\n"
+    return f"{rank:3d}  {Path(row.out).name:<24} {row.status:<22} {used} {std}  {row.reason}".rstrip()

@@ -12,8 +12,7 @@ from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import fields, is_dataclass
 from itertools import takewhile
 from pathlib import Path
-from types import NoneType
-from typing import Annotated, Any, Union, get_args, get_type_hints
+from typing import Annotated, Any, Union, get_type_hints
 
 import tyro
 from tyro import _errors
@@ -31,8 +30,6 @@ WIDEST = 120
 """Columns of the paragraphs of the help, on a wider terminal too."""
 SHELLS = ("bash", "zsh", "tcsh", "fish")
 """Shells that tyro writes a completion script for."""
-VALUES = {float: "number", int: "whole number", str: "text", Path: "path"}
-"""Types of values in messages."""
 
 
 def parsed(record: Any, program: str, arguments: Sequence[str]) -> Any:
@@ -113,7 +110,7 @@ def _complaint(event: _errors.ParseErrorEvent, record: type, program: str, argum
             words = [part for word in arguments for part in (word.split("=", 1) if "=" in word else [word])]
             after = words[words.index(name) + 1 :] if name in words else []
             given = ", ".join(map(repr, takewhile(lambda word: not word.startswith("--"), after)))
-            return f"{name} takes {_wanted(argument.field.type)}, not {given or 'none'}"
+            return f"{name} takes {argument.lowered.metavar}, not {given or 'none'}"
         case _errors.InstantiationFailure(message=message):
             return message
     return "the arguments cannot be understood"
@@ -128,19 +125,3 @@ def _flags(record: Any) -> Iterator[str]:
                 yield from _flags(hints[field.name])
             else:
                 yield f"--{'no-' * (field.default is True)}{field.name.replace('_', '-')}"
-
-
-def _wanted(kind: object) -> str:
-    words = [VALUES.get(leaf, "value") for leaf in _leaves(kind) if leaf is not NoneType]
-    return f"a {words[0]}" if len(words) == 1 else f"{len(words)} values ({', '.join(words)})"
-
-
-def _leaves(kind: Any) -> Iterator[Any]:
-    """Yield the types that a union, a tuple or an annotated type is made of."""
-    if hasattr(kind, "__metadata__"):
-        yield from _leaves(get_args(kind)[0])
-    elif parts := get_args(kind):
-        for part in parts:
-            yield from _leaves(part)
-    elif kind is not Ellipsis:
-        yield kind

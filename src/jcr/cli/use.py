@@ -59,7 +59,7 @@ class MapCommand:
         with progress_bars() as progress:
             build_map(self.out, *options, add=self.add, read=self.read, progress=progress)
         files = {"map": str(self.out / "map.safetensors"), "report": str(self.out / "report.html")}
-        self.output.result("".join(f"{name}: {file}\n" for name, file in files.items()), files)
+        self.output.result((f"{name}: {file}" for name, file in files.items()), files)
         return 0
 
 
@@ -98,19 +98,19 @@ class ExportCommand:
 
         if self.format is None:
             formats = {row.name: row.about for row in FORMATS}
-            lines = "".join(f"{name:<14} {about}\n" for name, about in formats.items())
-            self.output.result(f"{lines}for one: jcr export {self.out} FORMAT\n", {"formats": formats})
+            lines = [f"{name:<14} {about}" for name, about in formats.items()]
+            self.output.result([*lines, f"for one: jcr export {self.out} FORMAT"], {"formats": formats})
             return 0
         run, row, path, replaced = write_run(self.out, self.format, self.path, self.export)
         sys.stderr.write(f"wrote {path}: {row.about}\n")
         if replaced:
             warn(f"{path}: replaced a file with other content; name another PATH to keep both")
-        line, facts = "", {"file": str(path), "format": row.name, "about": row.about}
+        lines, facts = list[str](), {"file": str(path), "format": row.name, "about": row.about}
         if row.name == "ros2":
             mount = run.mount
-            line = static_transform_publisher(mount.parent, mount.child, mount.parent_from_child)
-            facts["line"] = line
-        self.output.result(line and line + "\n", facts)
+            facts["line"] = static_transform_publisher(mount.parent, mount.child, mount.parent_from_child)
+            lines = [facts["line"]]
+        self.output.result(lines, facts)
         if run.doubt is not None:
             warn(f"the calibration is rejected, as the file says too: {run.doubt}")
         return 0
@@ -153,7 +153,7 @@ class QueryCommand:
         count = np.bincount(sample.label, minlength=len(scene.label_names))
         labels = [f"{name} {n}" for name, n in zip(scene.label_names[1:], count[1:], strict=False) if n]
         unseen = f"{100 * float(np.mean(sample.unknown)):.0f} % of them unseen" if len(x_in_base) else "none"
-        summary = f"{len(x_in_base)} points, {unseen}{'; by label: ' * bool(labels)}{', '.join(labels)}\n"
+        summary = f"{len(x_in_base)} points, {unseen}{'; by label: ' * bool(labels)}{', '.join(labels)}"
         answers: dict[str, object] = {"label_names": list(scene.label_names)}
         if self.output.json:
             answers |= dict(zip(_COLUMNS.split(","), map(_finite, columns), strict=True))
@@ -161,7 +161,7 @@ class QueryCommand:
             path = self.write or self.points.with_suffix(".answers.csv")
             _write(path, np.rec.fromarrays(columns, names=_COLUMNS))  # pyright: ignore[reportArgumentType]
             summary = f"wrote {path}: {summary}"
-        self.output.result(summary, answers)
+        self.output.result([summary], answers)
         return 0
 
 
@@ -183,6 +183,8 @@ def read_points(path: Path) -> Float[ndarray, "n 3"]:
 
     if not path.is_file():
         raise InputError(f"{path}: no such file of points (.csv, .npy or .ply)")
+    if path.suffix not in (".npy", ".ply", ".csv"):
+        raise InputError(f"{path}: points are read from .csv, .npy or .ply")
     try:
         if path.suffix == ".npy":
             points = read_npy(path)
@@ -190,10 +192,8 @@ def read_points(path: Path) -> Float[ndarray, "n 3"]:
             import trimesh
 
             points = np.asarray(trimesh.load(path).vertices)  # pyright: ignore[reportAttributeAccessIssue]
-        elif path.suffix == ".csv":
-            points = _read_csv(path)
         else:
-            raise InputError(f"{path}: points are read from .csv, .npy or .ply")
+            points = _read_csv(path)
     except InputError:
         raise
     except Exception as error:
@@ -210,15 +210,13 @@ def read_points(path: Path) -> Float[ndarray, "n 3"]:
 
 def _read_csv(path: Path) -> ndarray:
     """Read rows of numbers, without a header line and comments."""
-    text = path.read_text("utf-8").splitlines()
-    lines = [line for line in text if line.strip() and not line.startswith("#")]
-    if not lines:
-        return np.zeros((0, 3))
+    lines = [line.split("#")[0].split(",") for line in path.read_text("utf-8").splitlines()]
+    rows = [words for words in lines if any(word.strip() for word in words)]
     try:
-        [float(word) for word in lines[0].split(",")]
+        float(rows[0][0] if rows else 0)
     except ValueError:
-        lines = lines[1:]
-    return np.array([[float(word) for word in line.split(",")] for line in lines]).reshape(len(lines), -1)
+        rows = rows[1:]
+    return np.array([[float(word) for word in words] for words in rows]).reshape(len(rows), -1 if rows else 3)
 
 
 def _finite(column: ndarray) -> list:
@@ -252,13 +250,13 @@ class MeasureCommand:
         # Metres, base frame, one sigma; `on_plane` is a flag for each point of the cloud.
         support = {name: value for name, value in vars(measured.support).items() if name != "on_plane"}
         facts = {"support": support, "objects": [vars(size) for size in measured.objects]}
-        self.output.result(sizes_table(measured), facts)
+        self.output.result(sizes_lines(measured), facts)
         if (doubt := load_run(self.out).doubt) is not None:
             raise RejectedError(f"sizes rejected: {doubt}")
         return 0
 
 
-def sizes_table(measured: "Measurement") -> str:
+def sizes_lines(measured: "Measurement") -> list[str]:
     """Return a line for the plane and a line for each object, in millimetres."""
     support = measured.support
     x, y, z = support.base_from_support[:3, 2]
@@ -267,19 +265,17 @@ def sizes_table(measured: "Measurement") -> str:
         f"its points within {1e3 * support.noise:.1f} mm (1 σ)"
     ]
     if not measured.objects:
-        return lines[0] + "\nnothing stands on it\n"
+        return [*lines, "nothing stands on it"]
     width = max(6, *(len(size.name) for size in measured.objects))
     columns = f"{'height (mm)':>14}  {'length (mm)':>14}  {'width (mm)':>14}  centre x, y (m), ± 1 σ"
     lines.append(f"{'object':<{width}}  {columns}")
     for size in measured.objects:
-        length, across, height = (
-            f"{1e3 * value:.1f} ± {1e3 * std:.1f}"
-            for value, std in zip(size.box_size, size.box_std, strict=True)
-        )
+        sides = zip(1e3 * size.box_size, 1e3 * size.box_std, strict=True)
+        length, across, height = (f"{value:.1f} ± {std:.1f}" for value, std in sides)
         height = height if size.top_seen else f"≥ {1e3 * size.height:.1f}"
         x, y = size.base_from_box[:2, 3]
         lines.append(f"{size.name:<{width}}  {height:>14}  {length:>14}  {across:>14}  {x:.3f}, {y:.3f}")
-    return "\n".join(lines) + "\n"
+    return lines
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -318,7 +314,7 @@ class ViewCommand:
             with progress_bars() as progress:
                 Viewer(server, run, self.urdf, progress)
             address = f"http://127.0.0.1:{server.get_port()}"
-            self.output.result(f"{address} (Ctrl-C ends it)\n", {"address": address})
+            self.output.result([f"{address} (Ctrl-C ends it)"], {"address": address})
             threading.Event().wait()
         except KeyboardInterrupt:
             pass

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
@@ -14,27 +14,22 @@ from numpy.typing import ArrayLike
 
 from jcr.calibration.case import Case, of_points
 from jcr.calibration.checks.capture import SAME
-from jcr.calibration.checks.capture import STILL as MOVED
 from jcr.calibration.options import CalibrateOptions, check_options
-from jcr.calibration.requirement import advised, assumptions_of
 from jcr.calibration.robot_errors import robot_errors
-from jcr.calibration.stage import checked
-from jcr.capture.controllers import far_faults
+from jcr.calibration.stage import calibrate_case
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
-from jcr.estimation.kinematics import Arm
 from jcr.estimation.prediction import FEWEST
 from jcr.findings import Finding, FindingKind, strongest_first
-from jcr.geometry import apply, largest_motion
+from jcr.geometry import apply
 from jcr.least_squares import one_blas_thread
-from jcr.live.cameras import ImageSummary
-from jcr.live.folder import LiveFolder
-from jcr.live.next_pose import Attempts, Reach, propose, propose_before_calibration
+from jcr.live.folder import Channels, LiveFolder
+from jcr.live.next_pose import Reach, propose
 from jcr.live.progress import Accuracy, Progress
 from jcr.options import checked_options
-from jcr.records import Capture, HandEye, Intrinsics, Tracks
-from jcr.records.capture_json import IntrinsicsEntry, read_rigid
+from jcr.records import Capture, Intrinsics, Tracks
+from jcr.records.capture_json import IntrinsicsEntry
 from jcr.sfm.live_map import LiveMap
 
 if TYPE_CHECKING:
@@ -85,20 +80,16 @@ class LiveCalibration:
         self._options = checked_options(options, CalibrateOptions)
         check_options(self._options)
         name = self._options.robot or folder.robot
-        self._reach = Reach(None if name is None else arm_named(name), reach)
+        self.arm, self._box = None if name is None else arm_named(name), reach
+        """Arm that the user or the capture named, and the box of the gripper positions."""
         self._map: LiveMap | None = None
         self._mapped: tuple[str, ...] = ()
         self._of_image: dict[str, list[Finding]] = {}
         self._history: tuple[Accuracy, ...] = ()
         self._refused: list[Float[ndarray, "4 4"]] = []
-        self._next_pose: Callable[[], dict[str, Any]] = dict
-        """Fields of Progress for the capture as it was calibrated last and the gripper poses refused since."""
+        self._propose: Callable[[], dict[str, Any]] = dict
+        """Function that returns the next pose, by the last calibration and the gripper poses refused since."""
         self.progress = Progress(images=tuple(folder.names), history=self._history)
-
-    @property
-    def arm(self) -> Arm | None:
-        """Arm that the user or the capture named."""
-        return self._reach.arm
 
     def add(
         self,
@@ -108,7 +99,7 @@ class LiveCalibration:
         time_s: float | None = None,
         depth_mm: UInt16[ndarray, "h w"] | None = None,
         *,
-        color: Literal["rgb", "bgr"] = "rgb",
+        color: Channels = "rgb",
     ) -> Progress:
         """Keep an image (h,w,3) uint8 and the gripper pose (4,4) at it, and calibrate with it.
 
@@ -119,28 +110,8 @@ class LiveCalibration:
         add at once: one of them waits for the other.
         """
         with self._lock:
-            self.keep(image, base_from_gripper, joints, time_s, depth_mm, color=color)
+            self.live.add(image, base_from_gripper, joints, time_s, depth_mm, color)
             return self.update()
-
-    def keep(
-        self,
-        image: ArrayLike | Path,
-        base_from_gripper: ArrayLike,
-        joints: ArrayLike | None = None,
-        time_s: float | None = None,
-        depth_mm: UInt16[ndarray, "h w"] | None = None,
-        *,
-        color: Literal["rgb", "bgr"] = "rgb",
-    ) -> str:
-        """Write an image into the capture as `add`, without calibrating, and return its name; `update` calibrates."""
-        with self.live.lock:
-            number = f"image {len(self.live.names) + 1}"
-            pixels = checked_image(image, color, number)
-            pose = checked_pose(base_from_gripper, f"{number}: base_from_gripper")
-            if self.live.size == (pixels.shape[1], pixels.shape[0]):
-                self._refuse_repeated(pixels, pose, number)
-            angles = None if joints is None else np.asarray(joints, np.float64)
-            return self.live.add(pixels, pose, angles, depth_mm, time_s)
 
     def remove(self, index: int) -> Progress:
         """Remove the image at `index` from the capture, and calibrate without it."""
@@ -194,7 +165,7 @@ class LiveCalibration:
         """Return the state with a next pose away from a gripper pose at which no image could be kept."""
         with self._lock:
             self._refused.append(base_from_gripper)
-            self.progress = replace(self.progress, **self._next_pose())
+            self.progress = replace(self.progress, **self._propose())
             return self.progress
 
     def close(self) -> None:
@@ -202,24 +173,6 @@ class LiveCalibration:
         with self._lock:
             self.live.close()
             self._opened.close()
-
-    def _refuse_repeated(
-        self, image: UInt8[ndarray, "h w 3"], base_from_gripper: Float[ndarray, "4 4"], number: str
-    ) -> None:
-        """Raise InputError where an image repeats another."""
-        new = ImageSummary.of(image)
-        for one in self.live.images:
-            if not new.is_like(self.live.summary(one.image)):
-                continue
-            metres, radians = largest_motion(np.stack([one.base_from_gripper, base_from_gripper]))
-            if metres < MOVED[0] and radians < MOVED[1]:
-                raise InputError(
-                    f"{number}: repeats {one.image}, image and pose; move the arm and take another"
-                )
-            raise InputError(
-                f"{number}: is the same as {one.image}, though the gripper moved by {1e3 * metres:.0f} mm and "
-                f"{np.degrees(radians):.0f}°; check that the camera's stream is live"
-            )
 
     def _about(self, name: str, image: UInt8[ndarray, "h w 3"]) -> list[Finding]:
         """Return the findings about an image by itself and its time."""
@@ -233,42 +186,33 @@ class LiveCalibration:
 
     def _calibrated(self, capture: Capture | None, added: str | None) -> Progress:
         """Return the state of the mapped images, calibrated where enough of them registered."""
-        names, self._next_pose = self._mapped, dict
+        names, self._propose = self._mapped, dict
         state = Progress(images=names, added=added, history=self._history)
         if capture is None or self._map is None:
             return state
         made = self._map.reconstruction()
         rows = np.zeros(0, int) if made is None else made.image_index
-        state = replace(state, registered=tuple(names[row] for row in rows))
-        robot = robot_errors(capture, self._options)
-        # A model that contradicts the poses gives wrong joint angles.
-        reach = self._reach if robot.unused is None else replace(self._reach, arm=None)
-        of_images = [finding for name in names for finding in self._of_image[name]]
-        outside = set(range(len(names))) - set(self._map.registered) if len(names) >= FEWEST else ()
-        for row in sorted(outside):
-            matches = float(self._map.matched_with(row))
-            finding = Finding.of(FindingKind.NOT_REGISTERED, "warns", "images", names[row], value=matches)
-            of_images.append(finding)
-
-        def attempts() -> Attempts:
-            """Return the attempts with the gripper poses refused until now."""
-            return Attempts(capture, rows, tuple(self._refused))
-
+        robot, findings = robot_errors(capture, self._options), self._image_findings()
         case = None
         if made is not None and len(rows) >= FEWEST:
             most = min(OBSERVATIONS[0] * len(rows), OBSERVATIONS[1])
             some = replace(made, tracks=_longest(made.tracks, most))
             with suppress(RejectedError):
-                case = checked(capture, some, self._options, robot.of(rows))
+                case = calibrate_case(capture, some, self._options, robot.of(rows))
+        # A model that contradicts the poses gives wrong joint angles.
+        arm = self.arm if robot.unused is None else None
+        found = None if case is None else case.hand_eye
+
+        def propose_next() -> dict[str, Any]:
+            """Return the next pose away from the gripper poses refused until now."""
+            return propose(capture, rows, Reach(arm, self._box, tuple(self._refused)), found, case)
+
+        self._propose = propose_next
+        state = replace(state, registered=tuple(names[row] for row in rows), **self._propose())
         if case is None:
-            self._next_pose = lambda: propose_before_calibration(attempts(), reach)
             unused = () if robot.unused is None else (robot.unused,)
-            findings = strongest_first([*of_images, *unused, _too_few(len(names))])
-            return replace(state, findings=findings, **self._next_pose())
-        of_rows, assumptions = robot.of(rows), assumptions_of(case)
-        hand_eye = advised(
-            case.hand_eye, case.base_from_gripper, self._options, of_rows, assumptions, case.scene_uncertainty
-        )
+            return replace(state, findings=strongest_first([*findings, *unused, _too_few(len(names))]))
+        hand_eye = case.hand_eye
         required = hand_eye.requirement
         assert required is not None
         reached = Accuracy(
@@ -279,49 +223,23 @@ class LiveCalibration:
         )
         # Entries of more images belong to other images.
         self._history = (*(one for one in self._history if one.images < len(names)), reached)
-        self._next_pose = lambda: propose(case, hand_eye, of_rows, assumptions, reach, attempts())
         return replace(
             state,
             hand_eye=hand_eye,
-            findings=strongest_first([*of_images, *_contradicting(case, hand_eye), *hand_eye.findings]),
+            findings=strongest_first([*findings, *_contradicting(case), *hand_eye.findings]),
             history=self._history,
-            points_in_base=_points(case, hand_eye),
-            **self._next_pose(),
+            points_in_base=_points(case),
         )
 
-
-def checked_image(
-    image: ArrayLike | Path, color: str = "rgb", number: str = "image"
-) -> UInt8[ndarray, "h w 3"]:
-    """Return an image as RGB (h,w,3) uint8, grey ones converted; raise InputError for anything else."""
-    if isinstance(image, str | Path):
-        raise InputError(
-            f"{number}: {image} is a path; give the pixels, numpy.array(PIL.Image.open(path).convert('RGB'))"
-        )
-    if color not in ("rgb", "bgr"):
-        raise InputError(f'color={color!r}: give "rgb", or "bgr" for images of OpenCV')
-    pixels = np.asarray(image)
-    if pixels.dtype != np.uint8:
-        raise InputError(
-            f"{number}: {pixels.dtype} values; give uint8 from 0 to 255 "
-            "(of floats from 0 to 1: (255 * image).round().astype(numpy.uint8))"
-        )
-    if pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 1):
-        pixels = np.repeat(pixels.reshape(*pixels.shape[:2], 1), 3, axis=2)
-    if pixels.ndim != 3 or pixels.shape[2] != 3:
-        raise InputError(f"{number}: shape {pixels.shape}; give (height, width, 3), of RGBA image[..., :3]")
-    return np.ascontiguousarray(pixels[..., ::-1] if color == "bgr" else pixels)
-
-
-def checked_pose(base_from_gripper: ArrayLike, where: str) -> Float[ndarray, "4 4"]:
-    """Return a rigid transform (4,4) in metres; raise InputError, begun with `where`, for anything else."""
-    if np.shape(base_from_gripper) == (3, 3):
-        raise InputError(
-            f"{where}: a rotation (3x3) has no translation; give 4x4 with the position in metres"
-        )
-    pose = read_rigid(base_from_gripper, where)
-    far_faults(pose[None, :3, 3], where, [where])
-    return pose
+    def _image_findings(self) -> list[Finding]:
+        """Return the findings about single images, and those that the map does not have."""
+        assert self._map is not None
+        names, found = self._mapped, [one for name in self._mapped for one in self._of_image[name]]
+        outside = set(range(len(names))) - set(self._map.registered) if len(names) >= FEWEST else ()
+        for row in sorted(outside):
+            matches = float(self._map.matched_with(row))
+            found.append(Finding.of(FindingKind.NOT_REGISTERED, "warns", "images", names[row], value=matches))
+        return found
 
 
 def _longest(tracks: Tracks, most: int) -> Tracks:
@@ -347,8 +265,9 @@ def _too_few(images: int) -> Finding:
     return Finding.of(FindingKind.NO_RECONSTRUCTION, "rejects", "reconstruction", text=text, remedy=remedy)
 
 
-def _contradicting(case: Case, hand_eye: HandEye) -> list[Finding]:
+def _contradicting(case: Case) -> list[Finding]:
     """Return a finding for each image whose gripper pose a sound calibration rejects."""
+    hand_eye = case.hand_eye
     if not hand_eye.is_sound:
         return []
     return [
@@ -365,9 +284,9 @@ def _contradicting(case: Case, hand_eye: HandEye) -> list[Finding]:
     ]
 
 
-def _points(case: Case, hand_eye: HandEye) -> Float[ndarray, "p 3"]:
+def _points(case: Case) -> Float[ndarray, "p 3"]:
     """Return points of the scene that three or more images see (m, base frame)."""
-    tracks = case.reconstruction.tracks
+    tracks, hand_eye = case.reconstruction.tracks, case.hand_eye
     seen = np.flatnonzero(np.bincount(tracks.point, minlength=len(tracks.points_in_recon)) >= 3)
     some = seen[:: max(1, len(seen) // MOST_POINTS)]
     return apply(hand_eye.base_from_recon, hand_eye.scale * tracks.points_in_recon[some])

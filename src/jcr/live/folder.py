@@ -3,29 +3,36 @@
 import re
 import threading
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 from numpy import ndarray
+from numpy.typing import ArrayLike
 
+from jcr.calibration.checks.capture import STILL as MOVED
+from jcr.capture.controllers import far_faults
 from jcr.capture.formats.capture_json import FILE, frame_of, read_content, stated_fields
 from jcr.capture.images import encode_png, read_image, size_of_all
 from jcr.capture.plain_files import contained, validated
 from jcr.errors import InputError
 from jcr.estimation.arms import ROBOT_NAMES
 from jcr.files import remove_unfinished, write_bytes, write_text
+from jcr.geometry import largest_motion
 from jcr.live.cameras import ImageSummary
 from jcr.records import Capture
-from jcr.records.capture_json import CaptureFile, FrameEntry, IntrinsicsEntry, other_size
+from jcr.records.capture_json import CaptureFile, FrameEntry, IntrinsicsEntry, other_size, read_rigid
 
 IMAGES = "images"
+Channels = Literal["rgb", "bgr"]
+"""Order of the channels of an image."""
 
 
 class LiveFolder:
-    """Capture folder whose images are added, replaced and removed; images that it holds already are kept.
+    """Capture folder whose images are added and removed; images that it holds already are kept.
 
-    Changes are made by one thread at a time, which holds `lock`; others may read at any time. The files of removed
-    images stay until `close`, so that a change can be undone.
+    Methods that change it hold `lock`; others may read at any time. The files of removed images stay until `close`, so
+    that a change can be undone.
     """
 
     def __init__(
@@ -48,9 +55,9 @@ class LiveFolder:
         self.size = size_of_all(sizes, str(file)) if sizes else None
         remove_unfinished(folder / IMAGES)
         self._earlier: list[tuple[FrameEntry, ...]] = []
-        """Images before each change of this session."""
+        """Images before each change since the folder was opened."""
         self._summaries: dict[str, ImageSummary] = {}
-        self._before_session = frozenset(self.names)
+        self._opened_with = frozenset(self.names)
         self._ever = {one.image: one for one in self.images}
         # Above the numbers of all image files, files that no capture.json names included.
         files = [*self.names, *(f"{IMAGES}/{file.name}" for file in (folder / IMAGES).glob("*.png"))]
@@ -67,6 +74,11 @@ class LiveFolder:
         """Name of the arm; None where it is not known."""
         return self._content.robot if self._content.robot in ROBOT_NAMES else None
 
+    @property
+    def can_undo(self) -> bool:
+        """Whether there is a change since the folder was opened that is not undone."""
+        return len(self._earlier) > 0
+
     def summary(self, name: str) -> ImageSummary:
         """Return the summary of an image of the folder."""
         if name not in self._summaries:
@@ -75,64 +87,67 @@ class LiveFolder:
 
     def add(
         self,
-        image: UInt8[ndarray, "h w 3"],
-        base_from_gripper: Float[ndarray, "4 4"],
-        joints: Float[ndarray, " dof"] | None = None,
-        depth_mm: UInt16[ndarray, "h w"] | None = None,
+        image: ArrayLike | Path,
+        base_from_gripper: ArrayLike,
+        joints: ArrayLike | None = None,
         time_s: float | None = None,
+        depth_mm: UInt16[ndarray, "h w"] | None = None,
+        color: Channels = "rgb",
     ) -> str:
-        """Write an image (RGB) with its pose and return its name; capture.json is complete again after that.
+        """Check and write an image with its pose and return its name; capture.json is complete again after that.
 
-        `joints` (rad) are written when all images have them. Raises InputError where the frame cannot be part of this
-        capture, and OSError where a file cannot be written; the capture is then unchanged.
+        The arguments are those of `LiveCalibration.add`; `joints` are written when all images have them. Raises
+        InputError where the frame cannot be part of this capture, and OSError where a file cannot be written; the
+        capture is then unchanged.
         """
-        stem, size = f"{self._next_number:03d}", (image.shape[1], image.shape[0])
-        if self.size not in (None, size):
-            remedy = "set its old resolution or name a new folder"
-            raise other_size("the camera's image", size, self.size, f"those in {self.folder}", remedy)
-        entry = {"image": f"{IMAGES}/{stem}.png", "base_from_gripper": base_from_gripper, "time_s": time_s}
-        entry |= {"joints": None if joints is None else joints.tolist()}
-        entry |= {"depth": None if depth_mm is None else f"depth/{stem}.png"}
-        new: FrameEntry = validated(FrameEntry, entry, f"image {len(self.images) + 1}")
-        images = (*self.images, new)
-        if len({len(one.joints) for one in images if one.joints is not None}) > 1:
-            raise InputError(f"joints of {new.image}: not as many angles as the other images have; give all")
-        self._capture_of(images, size)
-        try:
-            write_bytes(self.folder / new.image, encode_png(image))
-            if new.depth is not None and depth_mm is not None:
-                write_bytes(self.folder / new.depth, encode_png(depth_mm))
-            self._change(images)
-        except OSError:
-            self._delete(new)
-            raise
-        self.size = size
-        self._summaries[new.image] = ImageSummary.of(image)
-        self._ever[new.image] = new
-        self._next_number += 1
-        return new.image
+        with self.lock:
+            number, stem = f"image {len(self.images) + 1}", f"{self._next_number:03d}"
+            pixels = checked_image(image, color, number)
+            pose = checked_pose(base_from_gripper, f"{number}: base_from_gripper")
+            size, summary = (pixels.shape[1], pixels.shape[0]), ImageSummary.of(pixels)
+            if self.size not in (None, size):
+                remedy = "set its old resolution or name a new folder"
+                raise other_size("the camera's image", size, self.size, f"those in {self.folder}", remedy)
+            self._refuse_repeated(summary, pose, number)
+            entry = {"image": f"{IMAGES}/{stem}.png", "base_from_gripper": pose, "time_s": time_s}
+            entry |= {"joints": None if joints is None else np.asarray(joints, np.float64).tolist()}
+            entry |= {"depth": None if depth_mm is None else f"depth/{stem}.png"}
+            new: FrameEntry = validated(FrameEntry, entry, number)
+            images = (*self.images, new)
+            if len({len(one.joints) for one in images if one.joints is not None}) > 1:
+                raise InputError(
+                    f"joints of {new.image}: not as many angles as the other images have; give all"
+                )
+            self._capture_of(images, size)
+            try:
+                write_bytes(self.folder / new.image, encode_png(pixels))
+                if new.depth is not None and depth_mm is not None:
+                    write_bytes(self.folder / new.depth, encode_png(depth_mm))
+                self._change(images)
+            except OSError:
+                self._delete(new)
+                raise
+            self.size = size
+            self._summaries[new.image], self._ever[new.image] = summary, new
+            self._next_number += 1
+            return new.image
 
     def remove(self, name: str) -> None:
         """Remove an image from the capture."""
         with self.lock:
             self._change(tuple(one for one in self.images if one.image != name))
 
-    @property
-    def can_undo(self) -> bool:
-        """Whether this session made a change that is not undone."""
-        return len(self._earlier) > 0
-
     def undo(self) -> bool:
-        """Take back the last change of this session; return whether there was one."""
+        """Take back the last change since the folder was opened; return whether there was one."""
         with self.lock:
-            if self._earlier:
-                self._write(self._earlier[-1])
-                self.images = self._earlier.pop()
-                return True
-            return False
+            if not self._earlier:
+                return False
+            self._write(self._earlier[-1])
+            self.images = self._earlier.pop()
+            return True
 
     def close(self) -> None:
-        """Delete the files of images that this session removed; no change can be undone after that."""
+        """Delete the files of images that were removed; no change can be undone after that."""
         for name in self._ever.keys() - set(self.names):
             self._delete(self._ever.pop(name))
         self._earlier.clear()
@@ -140,13 +155,13 @@ class LiveFolder:
     def seconds_back(self, name: str) -> float | None:
         """Return the time by which an image was stamped before its predecessor; None where it was not, or is unknown.
 
-        Images of an earlier session may have had another clock.
+        Images that the folder was opened with may have had another clock.
         """
         images, row = self.images, self.names.index(name)
         before, now = images[row - 1], images[row]
         if row == 0 or now.time_s is None or before.time_s is None:
             return None
-        if (before.image in self._before_session) != (name in self._before_session):
+        if (before.image in self._opened_with) != (name in self._opened_with):
             return None
         return before.time_s - now.time_s if now.time_s <= before.time_s else None
 
@@ -154,6 +169,21 @@ class LiveFolder:
         """Return the images kept so far as a capture; None before the first image."""
         images = self.images
         return None if not images or self.size is None else self._capture_of(images, self.size)
+
+    def _refuse_repeated(self, new: ImageSummary, base_from_gripper: ndarray, number: str) -> None:
+        """Raise InputError where an image shows what another shows."""
+        for one in self.images:
+            if not new.is_like(self.summary(one.image)):
+                continue
+            metres, radians = largest_motion(np.stack([one.base_from_gripper, base_from_gripper]))
+            if metres < MOVED[0] and radians < MOVED[1]:
+                raise InputError(
+                    f"{number}: repeats {one.image}, image and pose; move the arm and take another"
+                )
+            raise InputError(
+                f"{number}: is the same as {one.image}, though the gripper moved by {1e3 * metres:.0f} mm and "
+                f"{np.degrees(radians):.0f}°; check that the camera's stream is live"
+            )
 
     def _capture_of(self, images: tuple[FrameEntry, ...], size: tuple[int, int]) -> Capture:
         """Return images as a capture; raise InputError where capture.json contradicts them."""
@@ -181,3 +211,35 @@ class LiveFolder:
         """Delete the files of an image."""
         for file in filter(None, (one.image, one.depth)):
             contained(self.folder, file, str(self.folder)).unlink(missing_ok=True)
+
+
+def checked_image(image: ArrayLike | Path, color: str, number: str) -> UInt8[ndarray, "h w 3"]:
+    """Return an image as RGB (h,w,3) uint8, grey ones converted; raise InputError, begun with `number`, for others."""
+    if isinstance(image, str | Path):
+        raise InputError(
+            f"{number}: {image} is a path; give the pixels, numpy.array(PIL.Image.open(path).convert('RGB'))"
+        )
+    if color not in ("rgb", "bgr"):
+        raise InputError(f'color={color!r}: give "rgb", or "bgr" for images of OpenCV')
+    pixels = np.asarray(image)
+    if pixels.dtype != np.uint8:
+        raise InputError(
+            f"{number}: {pixels.dtype} values; give uint8 from 0 to 255 "
+            "(of floats from 0 to 1: (255 * image).round().astype(numpy.uint8))"
+        )
+    if pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 1):
+        pixels = np.repeat(pixels.reshape(*pixels.shape[:2], 1), 3, axis=2)
+    if pixels.ndim != 3 or pixels.shape[2] != 3:
+        raise InputError(f"{number}: shape {pixels.shape}; give (height, width, 3), of RGBA image[..., :3]")
+    return np.ascontiguousarray(pixels[..., ::-1] if color == "bgr" else pixels)
+
+
+def checked_pose(base_from_gripper: ArrayLike, where: str) -> Float[ndarray, "4 4"]:
+    """Return a rigid transform (4,4) in metres; raise InputError, begun with `where`, for anything else."""
+    if np.shape(base_from_gripper) == (3, 3):
+        raise InputError(
+            f"{where}: a rotation (3x3) has no translation; give 4x4 with the position in metres"
+        )
+    pose = read_rigid(base_from_gripper, where)
+    far_faults(pose[None, :3, 3], where, [where])
+    return pose

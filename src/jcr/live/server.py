@@ -64,24 +64,19 @@ class Listen:
     option: str = "--page-port"
     """Option that the user gave, for messages."""
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Raise InputError where the address would be open to others or cannot be named."""
         if self.token is not None and not re.fullmatch(r"[\w.~-]+", self.token, re.ASCII):
             raise InputError(
                 "--token: has characters that an address cannot have; use letters, digits, - and _"
             )
-        is_any_host = self.host == ""
+        where, is_any_host = f"{self.option} {self.host}:{self.port}", self.host == ""
         with suppress(ValueError):
             is_any_host |= ipaddress.ip_address(self.host).is_unspecified
         if is_any_host:
-            raise InputError(
-                f"{self.option} {self.host}:{self.port}: names no host; give the address of this machine that the "
-                "robot uses"
-            )
+            raise InputError(f"{where}: names no host; give the address of this machine that the robot uses")
         if self.option == "--listen" and self.token is None:
-            raise InputError(
-                f"{self.option} {self.host}:{self.port}: others can reach that address; set a token (JCR_TOKEN)"
-            )
+            raise InputError(f"{where}: others can reach that address; set a token (JCR_TOKEN)")
 
 
 class _Command(BaseModel):
@@ -92,15 +87,16 @@ class _Command(BaseModel):
     number: int | None = None
 
 
-class LiveServer:
-    """HTTP server of a session while it is entered."""
+class LiveServer(ThreadingHTTPServer):
+    """HTTP server of a session while it is entered; closing waits for requests that are being answered."""
+
+    daemon_threads = False
 
     def __init__(
         self, session: LiveSession, listen: Listen | None = None, takes_samples: bool = False
     ) -> None:
         """Bind the address; raise InputError where that fails. `takes_samples`: programs post gripper poses."""
         listen = listen or Listen()
-        listen.check()
         self.session, self.key, self.host = session, listen.token or secrets.token_urlsafe(16), listen.host
         self.takes_samples = takes_samples
         self.sampled_s = time.monotonic()
@@ -108,26 +104,17 @@ class LiveServer:
         self._page_version, self._page_s = -1, -np.inf
         """Version of the state that the page has, and the time of its last request."""
         try:
-            self._server = _HttpServer((self.host, listen.port), _Handler)
+            super().__init__((self.host, listen.port), _Handler)
         except (OSError, OverflowError) as error:
             raise InputError(
                 f"{listen.option} {listen.host}:{listen.port}: {error}; choose an address of this machine "
                 "and a free port"
             ) from None
-        self._server.owner = self
-        self.port = self._server.server_address[1]
-        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
-
-    @property
-    def address(self) -> str:
-        """Address of the page, key included."""
-        return f"http://{self.host}:{self.port}/{self.key}/"
-
-    @property
-    def hosts(self) -> tuple[str, ...]:
-        """Accepted values of the header Host."""
         names = (LOOPBACK, "localhost") if self.host == LOOPBACK else (self.host,)
-        return tuple(f"{name}:{self.port}" for name in names)
+        self.hosts = tuple(f"{name}:{self.server_address[1]}" for name in names)
+        """Accepted values of the header Host."""
+        self.address = f"http://{self.hosts[0]}/{self.key}/"
+        """Address of the page, key included."""
 
     @property
     def report(self) -> Path | None:
@@ -152,7 +139,7 @@ class LiveServer:
 
     def __enter__(self) -> "LiveServer":
         """Serve in a thread."""
-        self._thread.start()
+        threading.Thread(target=self.serve_forever, daemon=True).start()
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -162,15 +149,8 @@ class LiveServer:
             time.monotonic() - self._page_s < OPEN_S and self._page_version < self.session.state.version
         ):
             time.sleep(0.05)
-        self._server.shutdown()
-        self._server.server_close()
-
-
-class _HttpServer(ThreadingHTTPServer):
-    """Socket server with a reference to the `LiveServer` that owns it; closing waits for requests being answered."""
-
-    owner: LiveServer
-    daemon_threads = False
+        self.shutdown()
+        self.server_close()
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Ignore connections that the client closed; report anything else."""
@@ -183,29 +163,29 @@ class _Handler(BaseHTTPRequestHandler):
 
     timeout = TIMEOUT_S
     server_version, sys_version = "jcr", ""
-    server: _HttpServer  # pyright: ignore[reportIncompatibleVariableOverride]
+    server: LiveServer  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def do_GET(self) -> None:
         """Answer a request of the page."""
         if (path := self._path()) is None:
             return
         path, _, query = path.partition("?")
-        owner, session = self.server.owner, self.server.owner.session
-        name, state = path.removeprefix("image/"), session.state
+        server, session, state = self.server, self.server.session, self.server.session.state
+        name = path.removeprefix("image/")
         if path == "":
             self._send(whole_page(session).encode(), HTML)
         elif path == "state":
             # Only the version where the page has the state.
             has_it = query.removeprefix("version=") == str(state.version)
-            owner.page_has(state.version if has_it else -1)
-            has_report = owner.report is not None
+            server.page_has(state.version if has_it else -1)
+            has_report = server.report is not None
             self._send_json({"version": state.version} if has_it else page_parts(session, state, has_report))
         elif path == "now.jpg" and (frame := session.camera.latest()) is not None:
             jpeg, features = camera_image(frame.image)
-            self._send(jpeg, "image/jpeg", features=features)
+            self._send(jpeg, "image/jpeg", X_Features=features)
         elif path == "now.jpg":
             self._send(status=204)
-        elif path == "report.html" and (report := owner.report) is not None:
+        elif path == "report.html" and (report := server.report) is not None:
             self._send(report.read_bytes(), HTML)
         elif name != path and name in state.names:
             self._send(image_card(session.folder.folder / name), "image/jpeg")
@@ -216,9 +196,9 @@ class _Handler(BaseHTTPRequestHandler):
         """Obey a command of the page, or take a sample."""
         if self.path == "/sample":
             answer, status = self._sampled()
-            self._send_json(
-                {"accepted": False, "reason": answer} if isinstance(answer, str) else answer, status
-            )
+            if isinstance(answer, str):
+                answer = {"accepted": False, "reason": answer}
+            self._send_json(answer, status)
             return
         if (path := self._path()) is None:
             return
@@ -226,25 +206,24 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._is_own_origin(self.headers.get("Origin")) or not is_json:
             self._send(status=403)
             return
-        try:
+        command = None
+        with suppress(ValidationError):
             command = _Command.model_validate_json(self._body(MAX_COMMAND) or b"")
-        except ValidationError:
-            command = None
         if path != "press" or command is None:
             self._send(status=400)
         else:
-            self.server.owner.session.press(command.action, command.number)
+            self.server.session.press(command.action, command.number)
             self._send(status=204)
 
     def _sampled(self) -> tuple[dict[str, Any] | str, int]:
         """Take an image at the pose in the body; return the answer, or the reason of a refusal, and the status."""
-        owner, origin = self.server.owner, self.headers.get("Origin")
+        server, origin = self.server, self.headers.get("Origin")
         key = self.headers.get("Authorization", "").removeprefix("Bearer ").strip()
-        if self.headers.get("Host") not in owner.hosts or not self._is_key(key):
+        if self.headers.get("Host") not in server.hosts or not self._is_key(key):
             return "no or a wrong key; send the header Authorization: Bearer KEY", 403
         if origin is not None and not self._is_own_origin(origin):
             return "a sample from another web site", 403
-        if not owner.takes_samples:
+        if not server.takes_samples:
             return "the poses of this capture come from elsewhere (--poses)", 409
         if (body := self._body(MAX_SAMPLE)) is None:
             return f"no Content-Length, or more than {MAX_SAMPLE} bytes", 400
@@ -253,22 +232,22 @@ class _Handler(BaseHTTPRequestHandler):
         except InputError as error:
             return str(error), 400
         if pose is None:
-            owner.session.end()
+            server.session.end()
             return {"accepted": True, "done": True}, 200
-        owner.sampled_s = np.inf
-        answer = owner.session.take(RobotState(time.monotonic(), pose), waits=True)
-        owner.sampled_s = time.monotonic()
+        server.sampled_s = np.inf
+        answer = server.session.take(RobotState(time.monotonic(), pose), waits=True)
+        server.sampled_s = time.monotonic()
         # The status tells whether the image is kept, for programs that read a line only.
         return answer, 200 if answer["accepted"] else 422
 
     def _is_own_origin(self, origin: str | None) -> bool:
         """Test whether a browser's request comes from the page."""
-        return origin in [f"http://{host}" for host in self.server.owner.hosts]
+        return origin in [f"http://{host}" for host in self.server.hosts]
 
     def _path(self) -> str | None:
         """Return the path behind the key; None, after an answer, where host or key are wrong."""
         key, slash, path = self.path.removeprefix("/").partition("/")
-        if self.headers.get("Host") not in self.server.owner.hosts:
+        if self.headers.get("Host") not in self.server.hosts:
             self._send(status=403)
         elif not slash or not self._is_key(key):
             self._send(status=404)
@@ -278,7 +257,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _is_key(self, given: str) -> bool:
         """Compare a key in constant time."""
-        return hmac.compare_digest(given.encode(), self.server.owner.key.encode())
+        return hmac.compare_digest(given.encode(), self.server.key.encode())
 
     def _body(self, most: int) -> bytes | None:
         """Return the body; None where its length is not stated or above `most`."""
@@ -289,15 +268,12 @@ class _Handler(BaseHTTPRequestHandler):
         """Send a response of JSON."""
         self._send(json.dumps(content).encode() + b"\n", "application/json", status)
 
-    def _send(
-        self, body: bytes = b"", kind: str = "text/plain", status: int = 200, features: str | None = None
-    ) -> None:
+    def _send(self, body: bytes = b"", kind: str = "text/plain", status: int = 200, **headers: str) -> None:
         """Send a response with the headers that keep other sites out."""
         self.send_response(status)
-        of_camera = {} if features is None else {"X-Features": features}
-        own = {"Content-Type": kind, "Content-Length": str(len(body))} | of_camera
+        own = {"Content-Type": kind, "Content-Length": str(len(body))} | headers
         for name, value in (own | HEADERS).items():
-            self.send_header(name, value)
+            self.send_header(name.replace("_", "-"), value)
         self.end_headers()
         self.wfile.write(body)
 

@@ -203,17 +203,18 @@ class LiveSession:
             number = len(names) if number is None else number
             if action == "finish":
                 self._show(is_over=True)
-            elif action == "undo" and not self.folder.undo():
-                self._refuse("refused: nothing to undo")
+            elif action == "undo" and self.folder.undo():
+                self._follow_removal(f"undone: {len(self.folder.names)} images")
             elif action == "undo":
-                self._changed_by(f"undone: {len(self.folder.names)} images")
-            elif action in ("retake", "remove") and not 1 <= number <= len(names):
+                self._refuse("refused: nothing to undo")
+            elif action != "take" and not 1 <= number <= len(names):
                 self._refuse(f"refused: there is no image {number}")
-            elif action != "take":
-                self.folder.remove(names[number - 1])
-                self._changed_by(f"removed {names[number - 1]}")
-            if action == "take" or (action == "retake" and 1 <= number <= len(names)):
-                self._take_now()
+            else:
+                if action != "take":
+                    self.folder.remove(names[number - 1])
+                    self._follow_removal(f"removed {names[number - 1]}")
+                if action != "remove":
+                    self._take_now()
 
     def finish(self) -> "RunResult | None":
         """Return the calibration of all images; None, with a line that says why, where there is none."""
@@ -230,7 +231,7 @@ class LiveSession:
         """Take an image, let its calibration follow, and return the answer."""
         try:
             frame = self._frame(state, current)
-            name = self.calibration.keep(
+            name = self.folder.add(
                 frame.image, state.base_from_gripper, state.joints, frame.time_s, frame.depth_mm
             )
         except StopIteration:
@@ -284,7 +285,7 @@ class LiveSession:
         except InputError as error:
             self._refuse(f"refused: {error}")
 
-    def _changed_by(self, event: str) -> None:
+    def _follow_removal(self, event: str) -> None:
         """Show and tell a removal or its undoing, and let the calibration follow."""
         self._show(event)
         self._follow()
