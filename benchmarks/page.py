@@ -50,13 +50,7 @@ def apart(x: Float[ndarray, "4 4"], reference: Float[ndarray, "4 4"]) -> tuple[f
 
 def of_rows(capture: Capture, rows: Sequence[int]) -> Capture:
     """Return a capture with some of its images, without their depth."""
-    return replace(
-        capture,
-        images=tuple(capture.images[row] for row in rows),
-        base_from_gripper=capture.base_from_gripper[rows],
-        joints=None if capture.joints is None else capture.joints[rows],
-        depths=None,
-    )
+    return replace(capture.of_rows(rows), depths=None)
 
 
 def folders_with_captures(captures: Path) -> list[Path]:

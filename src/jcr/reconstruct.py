@@ -343,11 +343,7 @@ def reconstruct(
             )
         )
     order = np.arange(len(capture)) if row.keeps_order else order_by_pose(capture.base_from_gripper)
-    in_order = replace(
-        capture,
-        images=tuple(capture.images[k] for k in order),
-        base_from_gripper=capture.base_from_gripper[order],
-    )
+    in_order = capture.of_rows(order)
     made = row.reconstruct(in_order, replace(options, backend=row.name), progress)
     if options.board is not None and row.name != MARKER:
         from jcr.boards.corners import with_boards

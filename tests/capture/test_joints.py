@@ -8,7 +8,7 @@ import pytest
 import jcr
 from capture_writers import LIMIT, URDF, arm_poses
 from jcr.capture.options import ReadOptions
-from jcr.capture.urdf_chain import JointTrack, read_arm
+from jcr.capture.urdf_chain import read_arm
 
 MIMIC = URDF.replace(
     f'<axis xyz="1 0 0"/>{LIMIT}</joint>',
@@ -59,8 +59,8 @@ def test_an_angle_that_wraps_is_interpolated_the_shorter_way(tmp_path: Path, uni
     turn = 360.0 if units == "m-deg" else 2 * np.pi
     stamps = np.array([0, 10_000_000])
     pan, still = np.array([0.49, -0.49]) * turn, np.zeros(2)
-    track = JointTrack(arm, (stamps, stamps, stamps), (pan, still, still))
-    poses, gap = track.at(np.array([5_000_000]))
+    samples = [(stamps, pan), (stamps, still), (stamps, still)]
+    poses, gap = arm.poses_at(samples, np.array([5_000_000]))
     np.testing.assert_allclose(poses, arm_poses(np.array([[np.pi, 0, 0]])), atol=1e-12)
     assert gap.tolist() == [10_000_000]
 

@@ -56,12 +56,12 @@ def read_oriented(path: Path) -> tuple[UInt8[ndarray, "h w 3"], int]:
                 count = getattr(opened, "n_frames", 1)
                 if opened.format != "MPO" and count > 1:
                     raise InputError(f"{path}: holds {count} images; save one as PNG or JPEG")
-                is_deep = ";16" in str(opened.tile)  # Pillow's mode of coloured images does not tell
+                # Pillow's mode of coloured 16-bit images does not tell, and it keeps 8 of their bits.
+                is_deep = ";16" in str(opened.tile) or opened.mode[0] in "IF"
                 opened.load()
                 orientation = opened.getexif().get(ORIENTATION, 1)
-                if (deep := _sixteen_bit(path, opened, is_deep)) is not None:
-                    eight = np.minimum(deep >> (_bits(deep) - 8), 255)
-                    shown = Image.fromarray(eight.astype(np.uint8))
+                if is_deep:
+                    shown = Image.fromarray(_eight_bits(path))
                     shown.getexif()[ORIENTATION] = orientation
                     opened = shown
                 pixels = np.asarray(ImageOps.exif_transpose(opened).convert("RGB"))
@@ -76,33 +76,22 @@ def read_oriented(path: Path) -> tuple[UInt8[ndarray, "h w 3"], int]:
     return pixels, orientation if orientation in range(1, 9) else 1
 
 
-def _sixteen_bit(path: Path, opened: Image.Image, is_deep: bool) -> UInt16[ndarray, "h w *rgb"] | None:
-    """Return the pixels of a 16-bit image, grey or RGB; None of any other. Pillow keeps 8 bits of coloured ones.
+def _eight_bits(path: Path) -> UInt8[ndarray, "h w *rgb"]:
+    """Read the upper eight bits in use of a 16-bit image: sensors of 8, 10, 12 or 14 bits fill the lower ones.
 
-    Raises InputError for fractions and for more than 16 bits: which values are black and white is not in the file.
+    Single defective pixels, which may have any value, do not count. Raises InputError for fractions and for more than
+    16 bits: which values are black and white is not in the file.
     """
-    if opened.mode == "F":
-        raise InputError(f"{path}: pixels that are fractions; save it with 8 or 16 bits")
-    if opened.mode.startswith("I"):
-        values = np.asarray(opened, dtype=np.int64)
-        if values.min(initial=0) < 0 or values.max(initial=0) > 65535:
-            raise InputError(f"{path}: pixels of more than 16 bits; save it with 8 or 16 bits")
-        return values.astype(np.uint16)
-    if not is_deep:
-        return None
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    bgr = cv2.imread(str(path), flags)
-    return None if bgr is None or bgr.dtype != np.uint16 else np.asarray(bgr[..., ::-1])
-
-
-def _bits(deep: UInt16[ndarray, "h w *rgb"]) -> int:
-    """Return the bits that a 16-bit image uses: sensors of 8, 10, 12 or 14 bits fill the lower ones.
-
-    Single defective pixels, which may have any value, do not count.
-    """
+    deep = cv2.imread(str(path), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    if deep is None or deep.dtype != np.uint16:
+        raise InputError(
+            f"{path}: pixels that are fractions or of more than 16 bits; save it with 8 or 16 bits"
+        )
     rank = -2 - deep.size // DEFECTIVE
     largest = int(np.partition(deep, rank, axis=None)[rank])
-    return next(bits for bits in (8, 10, 12, 14, 16) if largest < 1 << bits)
+    bits = next(bits for bits in (8, 10, 12, 14, 16) if largest < 1 << bits)
+    eight = np.minimum(np.right_shift(deep, bits - 8), 255).astype(np.uint8)
+    return np.ascontiguousarray(eight[..., ::-1] if eight.ndim == 3 else eight)
 
 
 def read_depth(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h w"]:

@@ -11,24 +11,21 @@ from jcr.capture.camera_info import intrinsics_of_ros
 from jcr.errors import InputError
 from jcr.records import Intrinsics
 
-_CHANNELS = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "8UC3": 3, "mono8": 1, "8UC1": 1}
-_TO_RGB = {
-    "bgr8": cv2.COLOR_BGR2RGB,
-    "8UC3": cv2.COLOR_BGR2RGB,
-    "rgba8": cv2.COLOR_RGBA2RGB,
-    "bgra8": cv2.COLOR_BGRA2RGB,
-    "mono8": cv2.COLOR_GRAY2RGB,
-    "8UC1": cv2.COLOR_GRAY2RGB,
+_ENCODINGS: dict[str, tuple[int, int | None]] = {
+    "rgb8": (3, None),
+    **dict.fromkeys(("bgr8", "8UC3"), (3, cv2.COLOR_BGR2RGB)),
+    "rgba8": (4, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, cv2.COLOR_BGRA2RGB),
+    **dict.fromkeys(("mono8", "8UC1"), (1, cv2.COLOR_GRAY2RGB)),
     # OpenCV names a Bayer pattern by its second row, ROS by its first: rggb is OpenCV's BG.
-    "bayer_rggb8": cv2.COLOR_BayerBG2RGB,
-    "bayer_bggr8": cv2.COLOR_BayerRG2RGB,
-    "bayer_gbrg8": cv2.COLOR_BayerGR2RGB,
-    "bayer_grbg8": cv2.COLOR_BayerGB2RGB,
-    "yuv422": cv2.COLOR_YUV2RGB_UYVY,
-    "uyvy": cv2.COLOR_YUV2RGB_UYVY,
-    "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2,
-    "yuyv": cv2.COLOR_YUV2RGB_YUY2,
+    "bayer_rggb8": (1, cv2.COLOR_BayerBG2RGB),
+    "bayer_bggr8": (1, cv2.COLOR_BayerRG2RGB),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGR2RGB),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGB2RGB),
+    **dict.fromkeys(("yuv422", "uyvy"), (2, cv2.COLOR_YUV2RGB_UYVY)),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, cv2.COLOR_YUV2RGB_YUY2)),
 }
+"""Channels of each encoding of colours, and OpenCV's code of its conversion to RGB; None for RGB itself."""
 
 
 def read_ros_image(message: Any) -> UInt8[ndarray, "h w 3"]:
@@ -59,19 +56,15 @@ def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"],
             if data.startswith(magic):
                 return data, ending
         raise InputError(f"{where}: compressed as {message.format!r}; jcr reads JPEG and PNG of colours")
-    encoding = message.encoding
-    if encoding != "rgb8" and encoding not in _TO_RGB:
+    encoding, (height, width) = message.encoding, (message.height, message.width)
+    if encoding not in _ENCODINGS:
         raise InputError(
             f"{where}: encoding {encoding!r} is no colour image that jcr knows; choose another topic"
         )
-    channels = _CHANNELS.get(encoding, 2 if "yu" in encoding else 1)
-    rows = _rows(
-        message, message.width * channels, f"an image of {message.width}x{message.height} {encoding}", where
-    )
-    pixels = rows.reshape(message.height, message.width, channels)
-    if encoding == "rgb8":
-        return pixels, ".png"
-    return np.asarray(cv2.cvtColor(pixels, _TO_RGB[encoding]), dtype=np.uint8), ".png"
+    channels, code = _ENCODINGS[encoding]
+    rows = _rows(message, width * channels, f"an image of {width}x{height} {encoding}", where)
+    pixels = rows.reshape(height, width, channels)
+    return pixels if code is None else np.asarray(cv2.cvtColor(pixels, code), np.uint8), ".png"
 
 
 def read_ros_depth(message: Any, where: str = "depth") -> UInt16[ndarray, "h w"]:
@@ -95,9 +88,7 @@ def read_ros_depth(message: Any, where: str = "depth") -> UInt16[ndarray, "h w"]
     kind, to_mm = kinds[message.encoding]
     order = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
     what = f"a depth image of {message.width}x{message.height}"
-    values = (
-        _rows(message, message.width * order.itemsize, what, where).view(order).astype(np.float64) * to_mm
-    )
+    values = to_mm * _rows(message, message.width * order.itemsize, what, where).view(order).astype(float)
     return np.nan_to_num(values, posinf=0.0, neginf=0.0).clip(0, 65535).round().astype(np.uint16)
 
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     import yourdfpy
 
 ANY_ANGLE = (-2 * np.pi, 2 * np.pi)
+JointSamples = Sequence[tuple[Int[ndarray, " _"], Float[ndarray, " _"]]]
+"""Stamps (ns), ascending, and recorded positions of each joint."""
 
 
 def load_urdf(file: Path) -> "yourdfpy.URDF":
@@ -158,6 +160,30 @@ class RecordedArm:
             pose[:] = self.urdf.get_transform(self.gripper, self.base)
         return poses
 
+    def poses_at(
+        self, samples: JointSamples, stamp_ns: Stamps
+    ) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
+        """Return base_from_gripper at stamps, and the widest gap (ns) of the joints around each."""
+        recorded, gap = self.interpolated(samples, stamp_ns)
+        return self.poses(recorded), gap
+
+    def interpolated(
+        self, samples: JointSamples, stamp_ns: Stamps
+    ) -> tuple[Float[ndarray, "n j"], Int[ndarray, " n"]]:
+        """Return recorded positions at stamps, linear between each joint's samples, and the widest gap (ns) around each.
+
+        A joint turns the shorter way, also across ±π; each joint may be published by itself.
+        """
+        rows, gap = np.zeros((len(stamp_ns), len(samples))), np.zeros(len(stamp_ns), np.int64)
+        for k, ((stamps, positions), turn) in enumerate(zip(samples, self.turn.tolist(), strict=True)):
+            before, share, width = bracket(stamps, stamp_ns)
+            step = positions[np.minimum(before + 1, len(stamps) - 1)] - positions[before]
+            if turn > 0:
+                step = step - turn * np.round(step / turn)
+            rows[:, k] = positions[before] + share * step
+            gap = np.maximum(gap, width)
+        return rows, gap
+
 
 def read_arm(options: ReadOptions) -> RecordedArm:
     """Read the arm between the frames of the options; raise InputError where the URDF has no such arm."""
@@ -197,29 +223,3 @@ def read_arm(options: ReadOptions) -> RecordedArm:
         unit=np.where(slides, length, angle),
         turn=np.where(slides, 0.0, 2 * np.pi / angle),
     )
-
-
-@dataclass(frozen=True)
-class JointTrack:
-    """Joint positions of an arm in ascending time; each joint may be published by itself."""
-
-    arm: RecordedArm
-    stamp_ns: tuple[Stamps, ...]
-    positions: tuple[Float[ndarray, " n"], ...]
-
-    def at(self, stamp_ns: Stamps) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
-        """Return poses with every joint interpolated between its samples, and the widest gap (ns) of the joints."""
-        rows, gap = self.between(stamp_ns)
-        return self.arm.poses(rows), gap
-
-    def between(self, stamp_ns: Stamps) -> tuple[Float[ndarray, "n j"], Int[ndarray, " n"]]:
-        """Return recorded positions, linear between samples; a joint turns the shorter way, also across ±π."""
-        rows, gap = np.zeros((len(stamp_ns), len(self.positions))), np.zeros(len(stamp_ns), np.int64)
-        for k, (samples, positions) in enumerate(zip(self.stamp_ns, self.positions, strict=True)):
-            before, share, width = bracket(samples, stamp_ns)
-            step = positions[np.minimum(before + 1, len(samples) - 1)] - positions[before]
-            if (turn := self.arm.turn[k]) > 0:
-                step = step - turn * np.round(step / turn)
-            rows[:, k] = positions[before] + share * step
-            gap = np.maximum(gap, width)
-        return rows, gap

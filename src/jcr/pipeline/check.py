@@ -185,7 +185,8 @@ def _compare_with_images(
     if not thorough and len(capture) > QUICK:
         rows = spread_rows(len(capture))
         quick = ColmapOptions(seed=seed, working_size_px=QUICK_SIZE_PX)
-        shown = _compare_registered(_of_rows(capture, rows), robot.of(rows), options, quick, progress)
+        few = replace(capture.of_rows(rows), depths=None)
+        shown = _compare_registered(few, robot.of(rows), options, quick, progress)
         is_sound = verdict_of(shown.findings) != "rejected"
         if is_sound and shown.registered is not None and len(shown.registered) == QUICK:
             return replace(shown, registered=None)
@@ -270,7 +271,7 @@ def _best_fit(read: list[tuple[Capture, ReadOptions]], progress: Progress | None
     if not read:
         return None
     rows = spread_rows(len(read[0][0]))
-    few = _of_rows(read[0][0], rows)
+    few = read[0][0].of_rows(rows)
     try:
         found = reconstruct_colmap(few, ColmapOptions(working_size_px=QUICK_SIZE_PX), progress)
     except RejectedError:
@@ -296,14 +297,3 @@ def _best_fit(read: list[tuple[Capture, ReadOptions]], progress: Progress | None
 def spread_rows(count: int) -> Int[ndarray, " k"]:
     """Return the rows of the images, out of `count`, that are examined first."""
     return np.linspace(0, count - 1, min(count, QUICK)).round().astype(int)
-
-
-def _of_rows(capture: Capture, rows: Int[ndarray, " k"]) -> Capture:
-    """Return some images of a capture."""
-    return replace(
-        capture,
-        images=tuple(capture.images[row] for row in rows),
-        base_from_gripper=capture.base_from_gripper[rows],
-        joints=None if capture.joints is None else capture.joints[rows],
-        depths=None,
-    )

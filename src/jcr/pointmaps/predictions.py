@@ -139,11 +139,7 @@ def _images(
             raise InputError(f"{source}: colors must be uint8 of shape {(len(rows), size[1], size[0], 3)}")
         colors = colors[np.argsort(rows)]
     else:
-        part = replace(
-            capture,
-            images=tuple(capture.images[row] for row in ordered),
-            base_from_gripper=capture.base_from_gripper[ordered],
-        )
+        part = capture.of_rows(ordered)
         colors = read_colors(part, grid, intrinsics, pinhole)
     return PreparedImages(
         colors=colors, grid=grid, intrinsics_of_capture=intrinsics, pinhole=pinhole, warnings=warnings

@@ -69,11 +69,7 @@ def reconstruct_pointmaps(
     """
     report = progress or silent
     rows = np.arange(len(capture)) if image_index is None else image_index
-    part = replace(
-        capture,
-        images=tuple(capture.images[row] for row in rows),
-        base_from_gripper=capture.base_from_gripper[rows],
-    )
+    part = capture.of_rows(rows)
     found, misfit_px = fit_pinhole(maps)
     predicted = maps.grid.original_intrinsics(found) if np.isfinite(misfit_px) else None
     if (pinhole := images.pinhole or predicted) is None:

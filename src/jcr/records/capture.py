@@ -1,7 +1,7 @@
 """Input of a calibration: intrinsics, images with gripper poses, or poses alone."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, cast
 
@@ -118,6 +118,18 @@ class Capture:
     def __len__(self) -> int:
         """Return the number of images."""
         return len(self.images)
+
+    def of_rows(self, rows: Sequence[int] | Int[ndarray, " k"]) -> "Capture":
+        """Return the capture with some of its images, in this order, without further cameras."""
+        chosen = np.asarray(rows, dtype=int).tolist()
+        return replace(
+            self,
+            images=tuple(self.images[row] for row in chosen),
+            base_from_gripper=self.base_from_gripper[chosen],
+            joints=None if self.joints is None else self.joints[chosen],
+            depths=None if self.depths is None else tuple(self.depths[row] for row in chosen),
+            others=(),
+        )
 
     def _repr_html_(self) -> str:
         """Return a table for notebooks."""

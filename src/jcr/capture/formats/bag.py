@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import TfTree, speed
 from jcr.capture.recording import Picture, Recording, capture_of_recording, chosen_name
 from jcr.capture.ros_image import image_of, read_ros_depth
-from jcr.capture.urdf_chain import JointTrack, read_arm
+from jcr.capture.urdf_chain import JointSamples, RecordedArm, read_arm
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.progress import Progress
@@ -46,9 +47,14 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
         bag = _Bag(reader, path, options, report)
         stamps, order = np.unique(bag.stamp_ns, return_index=True)
         log_ns = np.array(bag.log_ns)[order]
-        track = None if options.urdf is None else _joint_track(bag.joint_states, options, path)
-        frames = options.base_frame, options.gripper_frame, path
-        poses_at = bag.tree.poses_at(*frames) if track is None else track.at
+        joints = None
+        if options.urdf is None:
+            poses_at = bag.tree.poses_at(options.base_frame, options.gripper_frame, path)
+        else:
+            arm = read_arm(options)
+            samples = _samples(arm, bag.joint_states, path)
+            poses_at = partial(arm.poses_at, samples)
+            joints = arm.angles(arm.interpolated(samples, stamps)[0])
         poses, gap_ns = poses_at(stamps)
         recording = Recording(
             source=path,
@@ -59,7 +65,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
             gap_ns=gap_ns,
             images_of_rows=lambda rows: bag.pictures(rows, stamps, log_ns),
             intrinsics_of_size=lambda size: bag.intrinsics(options, size),
-            joints=None if track is None else track.arm.angles(track.between(stamps)[0]),
+            joints=joints,
             depth_at=(lambda row: bag.depth_near(int(stamps[row]), int(log_ns[row]))) if bag.depth else None,
         )
         return capture_of_recording(recording, into, report)
@@ -195,23 +201,18 @@ def _pose_connections(reader: Any, options: ReadOptions, path: Path) -> list[Any
     return [c for c in reader.connections if c.topic == topic]
 
 
-def _joint_track(
-    joint_states: list[tuple[int, list[str], Any]], options: ReadOptions, path: Path
-) -> JointTrack:
-    """Return the joints of the arm of --urdf, each sampled at the stamps of its own messages."""
-    arm = read_arm(options)
-    samples: dict[str, list[tuple[int, float]]] = {}
+def _samples(arm: RecordedArm, joint_states: list[tuple[int, list[str], Any]], path: Path) -> JointSamples:
+    """Return the stamps and positions of each joint of the arm, in order of time."""
+    found: dict[str, dict[int, float]] = {}
     for stamp, names, values in joint_states:
         for name, value in zip(names, values, strict=False):
-            samples.setdefault(name, []).append((stamp, float(value)))
-    arm.columns(list(samples), str(path))
-    stamps, positions = [], []
-    for joint in arm.joints:
-        of_joint, values = zip(*samples[joint], strict=True)
-        stamp, order = np.unique(of_joint, return_index=True)
-        stamps.append(stamp)
-        positions.append(np.array(values)[order])
-    return JointTrack(arm, tuple(stamps), tuple(positions))
+            found.setdefault(name, {}).setdefault(stamp, float(value))
+    arm.columns(list(found), str(path))
+    ordered = [sorted(found[joint].items()) for joint in arm.joints]
+    return [
+        (np.array([stamp for stamp, _ in of_joint]), np.array([value for _, value in of_joint]))
+        for of_joint in ordered
+    ]
 
 
 def _stamp(message: Any, log_ns: int) -> int:

@@ -65,15 +65,12 @@ def read(path: Path, options: ReadOptions) -> Capture:
         raise InputError(
             f"{whole.source}: lists none of the model's images; it lists {whole.images[0]}, the model {first}"
         )
-    images, notes = tuple(whole.images[k] for k in rows), whole.notes
+    capture, notes = whole.of_rows(rows), whole.notes
     if unknown := len(name_of) - len(rows):
         notes = (f"{unknown} of {len(name_of)} images of the model have no gripper pose: left out", *notes)
     return replace(
-        whole,
-        images=images,
-        base_from_gripper=whole.base_from_gripper[rows],
-        depths=None if whole.depths is None else tuple(whole.depths[k] for k in rows),
-        intrinsics=read_intrinsics(folder, whole.image_size, {name_of[name] for name in images}),
+        capture,
+        intrinsics=read_intrinsics(folder, whole.image_size, {name_of[name] for name in capture.images}),
         source=folder,
         cameras=folder,
         notes=notes,

@@ -40,14 +40,23 @@ def pair_keys(content: Any) -> tuple[str, str] | None:
     return next((keys for keys in PAIRS if isinstance(first, dict) and set(keys) <= first.keys()), None)
 
 
-def read_entries(content: Any, where: str, key: str | None = None) -> list[Entry]:
-    """Return the cells of every pose of a list, of the part below `key` of each entry where one is given."""
+def read_rows(content: Any, where: str, key: str | None = None) -> tuple[list[str] | None, list[list[Any]]]:
+    """Return the header, None where there is none, and the cells of every pose of a list, as of a table's rows.
+
+    `key` is that of the pose in each entry, where the entry holds several. A cell that an entry lacks is empty.
+    """
     entries = _entries(content)
     if not entries:
         raise InputError(f"{where}: holds no list of poses; write one entry per image")
     if key is not None:
         entries = [entry.get(key) if isinstance(entry, dict) else None for entry in entries]
-    return [_entry(entry, f"{where}: entry {k}") for k, entry in enumerate(entries, start=1)]
+    cells = [_entry(entry, f"{where}: entry {k}") for k, entry in enumerate(entries, start=1)]
+    first = cells[0]
+    if isinstance(first, list):
+        return None, [row if isinstance(row, list) else [] for row in cells]
+    return list(first), [
+        [row.get(name, "") if isinstance(row, dict) else "" for name in first] for row in cells
+    ]
 
 
 def _entries(content: Any) -> list[Any]:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from jcr.capture.checks import require_frames
 from jcr.capture.formats import Format
-from jcr.capture.formats.pose_lists import SUFFIXES, pair_keys, read_content, read_entries
-from jcr.capture.formats.table import columns_of_entries, pose_table
+from jcr.capture.formats.pose_lists import SUFFIXES, pair_keys, read_content, read_rows
+from jcr.capture.formats.table import pose_table
 from jcr.capture.options import ReadOptions
 from jcr.errors import InputError
 from jcr.geometry import inverse
@@ -36,7 +36,7 @@ def read(path: Path, options: ReadOptions) -> PosePairs:
         )
     notes = () if kind == "eye_in_hand" else ("calibration_type is not given; taken as eye_in_hand",)
     gripper, marker = (
-        pose_table(columns_of_entries(read_entries(content, where, key), options, where), options, where)
+        pose_table(*read_rows(content, where, key), options, where)
         for key in keys
         for where in [f"{path}: {key}"]
     )

@@ -3,7 +3,7 @@
 import csv
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -51,18 +51,6 @@ _EXPLICIT: dict[str, ConventionName] = {
 _UR_POSE = re.compile(r"\bp\s*\[([^\]]*)\]")
 _UNIT = re.compile(r"^(.+?)(?:_|_?[\[(])(mm|cm|m|deg|rad|s|ns)[\])]?$")
 _DECIMAL_COMMA = re.compile(r"^([+-]?\d+),(\d+(?:[eE][+-]?\d+)?)$")
-
-
-@dataclass(frozen=True, kw_only=True)
-class PoseColumns:
-    """Columns of a file of poses: texts or numbers."""
-
-    cells: dict[str, tuple[Any, ...]]
-    """Cells by the columns' names: lower case, without units; tx, pos_x, q_x … as x and qx."""
-    units: frozenset[str] = frozenset()
-    """Units that the names give: of mm, cm, m, deg, rad."""
-    convention: ConventionName = "auto"
-    """Convention that the notation gives away: UR's p[…], rvec."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,28 +115,43 @@ def find_table(path: Path) -> Path | None:
 def read_pose_table(file: Path, options: ReadOptions) -> PoseTable:
     """Read the poses of a file; InputError naming the column at fault, or the option that it needs."""
     if file.suffix in pose_lists.SUFFIXES:
-        entries = pose_lists.read_entries(pose_lists.read_content(file), str(file))
-        return pose_table(columns_of_entries(entries, options, str(file)), options, str(file))
-    return pose_table(_columns(*_read_rows(file), options, str(file)), options, str(file))
+        header, rows = pose_lists.read_rows(pose_lists.read_content(file), str(file))
+    else:
+        header, rows = _read_rows(file)
+    return pose_table(header, rows, options, str(file))
 
 
-def pose_table(columns: PoseColumns, options: ReadOptions, where: str) -> PoseTable:
-    """Return the poses of named columns, NaN for a few rows that hold none; raise InputError where more hold none."""
-    cells = columns.cells
+def pose_table(
+    header: Sequence[str] | None, rows: Sequence[Sequence[Any]], options: ReadOptions, where: str
+) -> PoseTable:
+    """Return the poses of rows of cells, NaN for a few rows that hold none; raise InputError where more hold none.
+
+    `header` has the names of the columns, None where there are none.
+    """
+    if not rows or not rows[0]:
+        raise InputError(f"{where}: holds no poses; expected one row per image")
+    width = len(header or rows[0])
+    for number, row in enumerate(rows, start=1):
+        if len(row) != width:
+            raise InputError(
+                f"{where}: row {number} has {len(row)} columns, not {width}; complete or drop it"
+            )
+    cells, units, convention = _named_columns(header, rows, options, where)
     image, stamp = (
         next((cells[name] for name in names if name in cells), None) for names in (_IMAGE, _STAMP)
     )
     require_frames(0 if image is None else len(image), where, 0)
-    convention = _convention_of(columns, options, where)
-    wanted, rows = CONVENTIONS[convention].columns, len(next(iter(cells.values())))
+    if convention == "auto":
+        convention = _convention_of(cells, where)
+    wanted = CONVENTIONS[convention].columns
     if set(_LAST_ROW) <= set(wanted) and not set(_LAST_ROW) & set(cells):
-        cells = cells | {name: (cell,) * rows for name, cell in _LAST_ROW.items()}
+        cells = cells | {name: (cell,) * len(rows) for name, cell in _LAST_ROW.items()}
     if missing := [name for name in wanted if name not in cells]:
         raise InputError(
             f"{where}: no column {', '.join(missing)}, which --pose-convention {convention} needs; "
             f"it has {', '.join(cells)}"
         )
-    numbers, texts = np.full((rows, len(wanted)), np.nan), dict[int, str]()
+    numbers, texts = np.full((len(rows), len(wanted)), np.nan), dict[int, str]()
     for k, name in enumerate(wanted):
         for row, cell in enumerate(cells[name]):
             if (number := _number(cell)) is not None:
@@ -156,15 +159,9 @@ def pose_table(columns: PoseColumns, options: ReadOptions, where: str) -> PoseTa
             else:
                 text = f"{shown(cell)} is not a number; correct or drop the row"
                 texts.setdefault(row, f"{where}: row {row + 1}, column {name}: {text}")
-    units = options.pose_units
-    if units == "auto" and columns.units:
-        length, angle = CONVENTIONS[convention].units()
-        length = next((unit for unit in ("mm", "cm", "m") if unit in columns.units), length)
-        angle = next((unit for unit in ("deg", "rad") if unit in columns.units), angle)
-        units = next(units for units in get_args(UnitsName) if units == f"{length}-{angle}")
-    poses, faults = checked_rows(numbers, convention, units, where)
+    poses, faults = checked_rows(numbers, convention, _units_of(units, convention, options), where)
     faults |= texts
-    if len(faults) > tolerated(rows):
+    if len(faults) > tolerated(len(rows)):
         raise InputError(faults[min(faults)])
     return PoseTable(
         base_from_gripper=poses,
@@ -175,22 +172,30 @@ def pose_table(columns: PoseColumns, options: ReadOptions, where: str) -> PoseTa
     )
 
 
-def _convention_of(columns: PoseColumns, options: ReadOptions, where: str) -> ConventionName:
-    """Return the convention of named columns: the one of the options, or the one that the names show."""
-    if options.pose_convention != "auto" or columns.convention != "auto":
-        return options.pose_convention if options.pose_convention != "auto" else columns.convention
-    for name in _SHOWN:
-        if set(CONVENTIONS[name].columns) - set(_LAST_ROW) <= columns.cells.keys():
-            return name
-    if {"rx", "ry", "rz"} <= columns.cells.keys():
+def _convention_of(names: Collection[str], where: str) -> ConventionName:
+    """Return the convention that the names of columns show."""
+    for convention in _SHOWN:
+        if set(CONVENTIONS[convention].columns) - set(_LAST_ROW) <= set(names):
+            return convention
+    if {"rx", "ry", "rz"} <= set(names):
         raise OpenConventionError(
             f"{where}: columns rx, ry, rz may be a rotation vector (--pose-convention ur) or angles about fixed axes "
             "(--pose-convention yaskawa); say which, or find out from the images with jcr check"
         )
     raise InputError(
-        f"{where}: its columns ({', '.join(columns.cells)}) contain no pose; name them x, y, z and qx, qy, qz, qw or "
+        f"{where}: its columns ({', '.join(names)}) contain no pose; name them x, y, z and qx, qy, qz, qw or "
         "roll, pitch, yaw, or give --pose-convention"
     )
+
+
+def _units_of(named: Collection[str], convention: str, options: ReadOptions) -> UnitsName:
+    """Return the units of a table: those of the options, else those in the names of columns, else auto."""
+    if options.pose_units != "auto" or not named:
+        return options.pose_units
+    length, angle = CONVENTIONS[convention].units()
+    length = next((unit for unit in ("mm", "cm", "m") if unit in named), length)
+    angle = next((unit for unit in ("deg", "rad") if unit in named), angle)
+    return next(units for units in get_args(UnitsName) if units == f"{length}-{angle}")
 
 
 def _number(cell: Any) -> float | None:
@@ -201,69 +206,44 @@ def _number(cell: Any) -> float | None:
         return None
 
 
-def columns_of_entries(entries: Sequence[pose_lists.Entry], options: ReadOptions, where: str) -> PoseColumns:
-    """Return the named columns of a list's entries; a cell that an entry lacks is empty, which is no number."""
-    first = entries[0]
-    if isinstance(first, list):
-        return _columns(None, [entry if isinstance(entry, list) else [] for entry in entries], options, where)
-    rows = [[entry.get(name, "") if isinstance(entry, dict) else "" for name in first] for entry in entries]
-    return _columns(list(first), rows, options, where)
-
-
-def _columns(
+def _named_columns(
     header: Sequence[str] | None, rows: Sequence[Sequence[Any]], options: ReadOptions, where: str
-) -> PoseColumns:
-    """Return columns by their names; InputError where a row has too many or too few cells."""
-    if not rows:
-        raise InputError(f"{where}: holds no poses; expected one row per image")
-    width = len(header or rows[0])
-    for number, row in enumerate(rows, start=1):
-        if len(row) != width:
-            raise InputError(
-                f"{where}: row {number} has {len(row)} columns, not {width}; complete or drop it"
-            )
-    cells = [tuple(column) for column in zip(*rows, strict=True)]
-    if header is None:
-        return PoseColumns(cells=_named(where, cells, options))
-    names, units = zip(*(_name_and_unit(cell) for cell in header), strict=True)
-    twice = [name for name, count in Counter(names).items() if count > 1]
-    if twice:
-        raise InputError(f"{where}: two columns are named {', '.join(sorted(twice))}; keep one")
-    convention: ConventionName = "auto"
-    for cell in header:
-        convention = _EXPLICIT.get(cell, convention)
-    return PoseColumns(
-        cells=dict(zip(names, cells, strict=True)),
-        units=frozenset(units) - {"", "s", "ns"},
-        convention=convention,
-    )
+) -> tuple[dict[str, tuple[Any, ...]], set[str], ConventionName]:
+    """Return cells by the usual names of their columns, the units in the names, and the convention that is certain.
 
-
-def _named(where: str, columns: list[tuple[Any, ...]], options: ReadOptions) -> dict[str, tuple[Any, ...]]:
-    """Name columns without a header: an image's name in front, or a stamp, and then those of the convention."""
+    Without a header an image's name or a stamp comes first, then the columns of the convention.
+    """
+    columns, convention = [tuple(column) for column in zip(*rows, strict=True)], options.pose_convention
+    if header is not None:
+        names, units = zip(*(_name_and_unit(cell) for cell in header), strict=True)
+        if twice := [name for name, count in Counter(names).items() if count > 1]:
+            raise InputError(f"{where}: two columns are named {', '.join(sorted(twice))}; keep one")
+        for cell in header if convention == "auto" else ():
+            convention = _EXPLICIT.get(cell, convention)
+        return dict(zip(names, columns, strict=True)), {*units} - {"", "s", "ns"}, convention
     named = dict[str, tuple[Any, ...]]()
     if _number(columns[0][0]) is None:
         named["image"] = columns.pop(0)
-    convention = options.pose_convention
-    if convention == "auto":
+    known = convention
+    if known == "auto":
         # Eight numbers are TUM's: timestamp tx ty tz qx qy qz qw.
-        convention = {8: "quat-xyzw", 12: "matrix", 16: "matrix"}.get(len(columns))
-    if convention is None:
+        known = {8: "quat-xyzw", 12: "matrix", 16: "matrix"}.get(len(columns))
+    if known is None:
         raise InputError(
             f"{where}: {len(columns)} columns of numbers without names; add a header (x,y,z,qx,qy,qz,qw) or say how "
             f"a pose is written with --pose-convention ({', '.join(CONVENTIONS)})"
         )
-    wanted = CONVENTIONS[convention].columns
+    wanted = CONVENTIONS[known].columns
     if len(wanted) == 16 and len(columns) in (12, 13):
         wanted = tuple(name for name in wanted if name not in _LAST_ROW)
     if len(columns) == len(wanted) + 1:
         named["timestamp"] = columns.pop(0)
     if len(columns) != len(wanted):
         raise InputError(
-            f"{where}: {len(columns)} columns of numbers; --pose-convention {convention} has {len(wanted)}: "
+            f"{where}: {len(columns)} columns of numbers; --pose-convention {known} has {len(wanted)}: "
             f"{', '.join(wanted)}"
         )
-    return named | dict(zip(wanted, columns, strict=True))
+    return named | dict(zip(wanted, columns, strict=True)), set(), convention
 
 
 def _read_rows(file: Path) -> tuple[Sequence[str] | None, Sequence[Sequence[Any]]]:
