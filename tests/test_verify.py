@@ -126,7 +126,7 @@ def test_joint_angles_show_a_drift_that_poses_of_a_bent_arm_hide():
         made = bent_problem(arm, "poor", OLD + 3, seed)
         gripper, camera = made.base_from_gripper, made.recon_from_camera
         covariances = arm_errors(*posed(arm, made.joints, gripper)), smooth_errors(gripper)
-        start = initial_estimate(gripper[of_old], camera[of_old], np.ones(OLD))
+        start = initial_estimate(gripper[of_old], camera[of_old])
         bumped = camera.copy()
         bumped[OLD:, :3, 3] += 1e-3 / made.scale * camera[OLD:, :3, 0]
         for systematic in covariances:

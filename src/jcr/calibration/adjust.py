@@ -268,7 +268,7 @@ def refined_by(case: Case, found: Solution) -> HandEye:
 
 def _leave_one_out(found: Solution) -> LeaveOneOut | None:
     """Return the mean error of gripper poses that are predicted by an adjustment without their image."""
-    left_out = found.leave_one_out()[0]
+    left_out = found.leave_one_out[0]
     m = len(left_out)
     if m < 4:
         return None

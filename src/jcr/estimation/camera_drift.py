@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from jcr.estimation.equation import pose_by_pose
 from jcr.estimation.pose_equations import pose_equations, reported_poses
-from jcr.estimation.robot_noise import growth_scores, log_evidence, most_likely
+from jcr.estimation.robot_noise import growth_scores, log_evidence, most_likely, solve_equations
 from jcr.estimation.wrist import Start, pose_problem
 from jcr.geometry import Poses, skew
 
@@ -57,11 +57,11 @@ def drift_covariance(
     before, size_information = most_likely(plain)
     if growth_scores(plain, before, parts).max() < SUSPICIOUS:
         return None
-    best, found = log_evidence(plain, before, size_information) + CLEAR, None
+    best, found = log_evidence(plain, solve_equations(plain, before), size_information) + CLEAR, None
     for count in (2, 3):
         free = replace(plain, walks=tuple(parts[:count]))
         sizes, information = most_likely(free)
-        evidence = log_evidence(free, sizes, information)
+        evidence = log_evidence(free, solve_equations(free, sizes), information)
         if evidence > best:
             best, found = evidence, np.tensordot(free.variances(sizes)[3:], walks[:count], 1)
     return found

@@ -41,14 +41,12 @@ def closed_form(
 def initial_estimate(
     base_from_gripper: Float[ndarray, "n 4 4"],
     recon_from_camera: Float[ndarray, "n 4 4"],
-    weights: Float[ndarray, " n"] | None = None,
 ) -> tuple[Transform, float, Transform]:
     """Return `closed_form` with a positive scale, that of the extents where the motions do not determine it."""
-    x, scale, z = closed_form(base_from_gripper, recon_from_camera, weights)
+    x, scale, z = closed_form(base_from_gripper, recon_from_camera)
     if scale <= 0:
-        w = np.ones(len(base_from_gripper)) if weights is None else weights
         way, center = base_from_gripper[:, :3, 3], recon_from_camera[:, :3, 3]
-        extent, seen = (np.linalg.norm(_centred(of, w)) for of in (way, center))
+        extent, seen = (np.linalg.norm(of - of.mean(0)) for of in (way, center))
         # Every scale fits a camera that only rotates.
         scale = extent / seen if seen > RELATIVE_CUT * np.linalg.norm(center) else 1.0
     return x, float(scale) or 1.0, z
@@ -81,7 +79,7 @@ def rotations(
     batch, n = weights.shape[:-1], weights.shape[-1]
     gripper, camera = gripper.reshape(-1, n, 3, 3), camera.reshape(-1, n, 3, 3)
     weights = weights.reshape(-1, n)
-    a, b = (np.swapaxes(of, -1, -2)[:, :, None] @ of[:, None] for of in (gripper, camera))
+    a, b = (_between(of) for of in (gripper, camera))
     pairs = (weights[:, :, None] * weights[:, None]).reshape(-1, 1, n * n)
     of_a, of_b = (sine_axis(of).reshape(-1, n * n, 3) for of in (a, b))
     rotation = nearest_rotation(np.swapaxes(of_a, 1, 2) * pairs @ of_b)
@@ -98,6 +96,14 @@ def rotations(
         rows = np.flatnonzero(near)[better]
         rotation[rows], base[rows] = rival[0][better], rival[1][better]
     return rotation.reshape(*batch, 3, 3), base.reshape(*batch, 3, 3)
+
+
+def _between(rotation: Float[ndarray, "h n 3 3"]) -> Float[ndarray, "h n n 3 3"]:
+    """Return R_iᵀ R_j of all pairs, by one product for each problem."""
+    h, n = rotation.shape[:2]
+    transposed = np.swapaxes(rotation, -1, -2).reshape(h, 3 * n, 3)
+    product = transposed @ np.moveaxis(rotation, 1, 2).reshape(h, 3, 3 * n)
+    return product.reshape(h, n, 3, n, 3).swapaxes(2, 3)
 
 
 def _polished(

@@ -249,7 +249,7 @@ def _leave_one_out(fit: Solution, used: Bool[ndarray, " n"]) -> LeaveOneOut | No
     """Return the error of each used image's prediction by a fit to the others; None where too few are left to fit."""
     if used.sum() < 4:
         return None
-    metres, radians = np.linalg.norm(fit.leave_one_out()[0][used].reshape(-1, 2, 3), axis=2).mean(0)
+    metres, radians = np.linalg.norm(fit.leave_one_out[0][used].reshape(-1, 2, 3), axis=2).mean(0)
     return LeaveOneOut(
         1e3 * float(metres), float(np.degrees(radians)), None, "each image predicted by the others"
     )

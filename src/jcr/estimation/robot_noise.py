@@ -287,17 +287,16 @@ def most_likely(
     return at, information
 
 
-def log_evidence(equations: Equations, log_sizes: LogSizes, information: Information) -> float:
+def log_evidence(equations: Equations, at_mode: LinearSolution, information: Information) -> float:
     """Return the log density of the residuals, averaged over unknowns and sizes, up to a common constant.
 
-    Laplace's method is used about the mode of the sizes, where the expected information is `information`. The factor
+    Laplace's method is used about the mode of the sizes, where `information` is the expected one. The factor
     (2π)^(−s/2) of s residuals is left out.
     """
     gradient = equations.prior_gradient
     against_prior = gradient @ np.linalg.lstsq(equations.prior_information, gradient, rcond=None)[0]
     volumes = np.linalg.slogdet(information)[1] / 2 + np.log(equations.prior[1]).sum()
-    log_posterior = solve_equations(equations, log_sizes).log_posterior
-    return float(log_posterior - against_prior / 2 - volumes)
+    return float(at_mode.log_posterior - against_prior / 2 - volumes)
 
 
 def growth_scores(

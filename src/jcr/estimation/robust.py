@@ -23,8 +23,6 @@ from jcr.estimation.wrist import pose_problem
 from jcr.geometry import ARM, Poses, rotation_angle, transform
 
 Images = Bool[ndarray, " n"]
-Fit = tuple[float, Float[ndarray, "n 6"], Float[ndarray, "n 6 6"]]
-"""Log evidence of a fit, and the leave-one-out residuals of all poses with their covariances."""
 
 SHARE_RIGHT = 0.65
 """Share of images that the trimmed fit relies on; up to the rest may be wrong."""
@@ -77,17 +75,13 @@ def robust_fit(
         noise_floor=noise,
         priors=priors,
     )
-    fits: dict[bytes, Fit] = {}
+    fits: dict[bytes, Solution] = {}
 
-    def fit_to(used: Images, averaged: bool = False) -> Solution:
-        x, scale, z = initial_estimate(base_from_gripper, recon_from_camera, used.astype(float))
-        start = replace(state, x=x[None], scale=scale, z=z[None])
-        return solve(replace(every, used=used), start, averaged=averaged)
-
-    def fitted(used: Images) -> Fit:
+    def fitted(used: Images) -> Solution:
         if used.tobytes() not in fits:
-            found = fit_to(used)
-            fits[used.tobytes()] = found.log_evidence, *found.leave_one_out()
+            x, scale, z = initial_estimate(base_from_gripper[used], recon_from_camera[used])
+            start = replace(state, x=x[None], scale=scale, z=z[None])
+            fits[used.tobytes()] = solve(replace(every, used=used), start, averaged=False)
         return fits[used.tobytes()]
 
     used = np.ones(n, dtype=bool)
@@ -96,14 +90,16 @@ def robust_fit(
         used = max(
             _improved(fitted, used, _fewer), _improved(fitted, fewest, _more), key=lambda found: found[1]
         )[0]
-    fit = fit_to(used, averaged=True)
+    fit = solve(replace(every, used=used), fitted(used).most_likely)
     scale, z = fit.state.scale / unit, fit.state.z[0]
     z = transform(z[:3, :3], z[:3, 3] - z[:3, :3] @ (scale * middle))
     return replace(fit, state=replace(fit.state, scale=scale, z=z[None]))
 
 
 def _improved(
-    fitted: Callable[[Images], Fit], used: Images, changes: Callable[[Fit, Images], Iterator[Images]]
+    fitted: Callable[[Images], Solution],
+    used: Images,
+    changes: Callable[[Solution, Images], Iterator[Images]],
 ) -> tuple[Images, float]:
     """Return the images to use and their log evidence, after `changes` of `used` while the evidence grew."""
     fit = fitted(used)
@@ -119,37 +115,37 @@ def _improved(
             return used, best
 
 
-def _more(fit: Fit, used: Images) -> Iterator[Images]:
+def _more(fit: Solution, used: Images) -> Iterator[Images]:
     """Yield the used images with those that are likelier right than wrong, then with the likeliest one."""
-    _, spread = np.linalg.slogdet(fit[2])
+    _, spread = np.linalg.slogdet(fit.leave_one_out[1])
     likelier = np.where(used, -np.inf, -(_distance(fit) + spread) / 2 - _log_wrong(fit))
     if not used.all():
         yield from (used | joining for joining in (likelier > 0, likelier == likelier.max()) if joining.any())
 
 
-def _fewer(fit: Fit, used: Images) -> Iterator[Images]:
+def _fewer(fit: Solution, used: Images) -> Iterator[Images]:
     """Yield the used images without the farthest one; at least four stay."""
     if used.sum() > 4:
         yield used & (np.arange(len(used)) != np.where(used, _distance(fit), -np.inf).argmax())
 
 
-def _evidence(fit: Fit, used: Images) -> float:
-    return fit[0] + float(_log_wrong(fit)[~used].sum())
+def _evidence(fit: Solution, used: Images) -> float:
+    return fit.log_evidence + float(_log_wrong(fit)[~used].sum())
 
 
-def _distance(fit: Fit) -> Float[ndarray, " n"]:
+def _distance(fit: Solution) -> Float[ndarray, " n"]:
     """Return the squared distance of each pose from a fit without it, in the expected covariance."""
-    _, left_out, covariance = fit
+    left_out, covariance = fit.leave_one_out
     gap = np.linalg.solve(covariance, left_out[..., None])[..., 0]
     return np.einsum("ni,ni->n", left_out, gap)
 
 
-def _log_wrong(fit: Fit) -> Float[ndarray, " n"]:
+def _log_wrong(fit: Solution) -> Float[ndarray, " n"]:
     """Return the log density of the error of each pose if it is wrong, times (2π)^3, and the odds that it is wrong.
 
     Wrong poses have errors of any size and direction alike.
     """
-    off = np.linalg.norm(fit[1].reshape(-1, 2, 3), axis=2)
+    off = np.linalg.norm(fit.leave_one_out[0].reshape(-1, 2, 3), axis=2)
     least, most = np.array(LEAST_WRONG), np.array(MOST_WRONG)
     density = -np.log(4 * np.pi * np.log(most / least)) - 3 * np.log(np.maximum(off, least))
     odds = np.log(WRONG / (1 - WRONG)) + 3 * np.log(2 * np.pi)
@@ -175,7 +171,7 @@ def least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> tuple[I
             if chosen.tobytes() in tried:
                 break
             tried.add(chosen.tobytes())
-            found = closed_form(base_from_gripper, recon_from_camera, chosen.astype(float))
+            found = closed_form(base_from_gripper[chosen], recon_from_camera[chosen])
             subset = _squared_error(*found, base_from_gripper, recon_from_camera)
             cost = float(np.sort(subset)[:keep].sum())
             if cost < best_cost:

@@ -9,6 +9,7 @@ result is averaged over the sizes of the robot's errors (covariance.py).
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -44,6 +45,7 @@ from jcr.estimation.projection import view_of
 from jcr.estimation.robot_noise import (
     Equations,
     Information,
+    LinearSolution,
     LogSizes,
     left_out,
     log_evidence,
@@ -87,6 +89,8 @@ class Solution:
     most_likely: State
     """State before the averaging, about which the equations are linear."""
     poses: PoseEquations
+    at_mode: LinearSolution
+    """Solution of the mixed model at the most likely sizes of the robot's errors."""
     size_information: Information
     """Expected information of the log sizes of the robot's errors."""
     evidence: ImageEvidence | None = None
@@ -118,15 +122,15 @@ class Solution:
         assert self.evidence is not None
         return self.evidence
 
-    @property
+    @cached_property
     def log_evidence(self) -> float:
         """Log density of the used residuals, averaged over unknowns and sizes, times (2π)^(3m)."""
-        return log_evidence(self.equations, self.log_sizes, self.size_information)
+        return log_evidence(self.equations, self.at_mode, self.size_information)
 
+    @cached_property
     def leave_one_out(self) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 6"]]:
-        """Return each pose's residual from a solution without it (m, rad; base axes), and its whole covariance."""
-        poses, noise = self.poses, self.noise
-        solution = solve_equations(self.equations, self.log_sizes)
+        """Each pose's residual from a solution without it (m, rad; base axes), and its whole covariance."""
+        poses, noise, solution = self.poses, self.noise, self.at_mode
         random = noise.translation, noise.rotation
         found, covariance = np.empty_like(poses.residual), np.empty((len(poses.used), 6, 6))
         found[poses.used], covariance[poses.used] = left_out(solution, random)
@@ -230,6 +234,7 @@ def expected_solution(
         budget=budget,
         most_likely=state,
         poses=poses,
+        at_mode=solve_equations(poses.equations, log_sizes),
         size_information=np.eye(len(log_sizes)),
         evidence=images,
     )
@@ -324,11 +329,11 @@ def _with_covariance(
     poses = pose_equations(problem, state, images)
     log_sizes, information = most_likely(poses.equations, state.robot_log_sizes)
     state = likeliest = replace(state, robot_log_sizes=log_sizes)
+    at_mode = solve_equations(poses.equations, log_sizes)
+    covariance, budget = at_mode.covariance, None
     if averaged:
         step, covariance, budget = posterior(poses.equations, log_sizes, information, poses.region)
         state = full_step(problem, state, step)
-    else:
-        covariance, budget = solve_equations(poses.equations, log_sizes).covariance, None
     return Solution(
         problem=problem,
         state=state,
@@ -336,6 +341,7 @@ def _with_covariance(
         budget=budget,
         most_likely=likeliest,
         poses=poses,
+        at_mode=at_mode,
         size_information=information,
         evidence=images,
     )
