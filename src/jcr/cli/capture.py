@@ -119,7 +119,7 @@ def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
 
     with locked(out), open_camera(arguments.camera, arguments.settings) as camera:
         folder = LiveFolder(out, given or camera.intrinsics, robot)
-        calibration = LiveCalibration(folder, options={"require": options.require}, reach=options.reach_m)
+        calibration = LiveCalibration(folder, options={"require": options.require}, reach=options.reach)
         gripper = None if states is None else lambda: next(states())
         convention = arguments.pose_convention
         if convention == "auto":

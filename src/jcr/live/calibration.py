@@ -59,7 +59,7 @@ class LiveCalibration:
         intrinsics: Intrinsics | None = None,
         robot: str | None = None,
         options: CalibrateOptions | Mapping[str, Any] | None = None,
-        reach: Float[ndarray, "2 3"] | None = None,
+        reach: ArrayLike | None = None,
         exclusive: bool = False,
     ) -> None:
         """Open or begin a capture; raise InputError where it cannot be continued, or an option is wrong.
@@ -80,7 +80,8 @@ class LiveCalibration:
         self._options = checked_options(options, CalibrateOptions)
         check_options(self._options)
         name = self._options.robot or folder.robot
-        self.arm, self._box = None if name is None else arm_named(name), reach
+        self.arm = None if name is None else arm_named(name)
+        self._box = None if reach is None else np.reshape(np.asarray(reach, np.float64), (2, 3))
         """Arm that the user or the capture named, and the box of the gripper positions."""
         self._map: LiveMap | None = None
         self._mapped: tuple[str, ...] = ()

@@ -79,8 +79,6 @@ def page_content(
     progress = state.progress
     kind, *lines = _verdict(state)
     has_next = _is_proposed(state)
-    # The lines of a program would repeat the pose.
-    lines_of_next = next_lines(progress, notation) if has_next else []
     headline, *below = (line[:1].upper() + line[1:] for line in lines)
     return {
         "kind": kind,
@@ -91,7 +89,8 @@ def page_content(
         "can_undo": state.can_undo,
         "tiles": _tiles(state, required),
         "next_pose": next_sentence(progress) if has_next else "",
-        "next_lines": [line for line in lines_of_next if not line.startswith(("URScript", "joints, rad"))],
+        # The lines of a program would repeat the pose.
+        "next_lines": next_lines(progress, notation, for_program=False) if has_next else [],
         "courses": _courses(progress, required),
         "images": _cards(state)[::-1],
     }

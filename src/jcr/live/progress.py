@@ -42,7 +42,6 @@ class Accuracy:
     rotation_deg: float
     """95 % of the errors are smaller."""
     accepted: bool
-    """Whether the calibration was accepted."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,13 +141,10 @@ def faults(state: Progress) -> list[Finding]:
 
 def finding_lines(state: Progress) -> list[str]:
     """Return each fault in a sentence, with the commands for its image; these count images from 1."""
-    lines = []
+    lines, numbers = [], {name: number for number, name in enumerate(state.images, start=1)}
     for one in faults(state):
-        number = (
-            state.images.index(one.images[0]) + 1 if one.images and one.images[0] in state.images else None
-        )
-        commands = f" (retake {number}, or remove {number})" if number and len(one.images) == 1 else ""
-        lines.append(f"{sentence(one)}{commands}")
+        number = numbers.get(one.images[0]) if len(one.images) == 1 else None
+        lines.append(sentence(one) + (f" (retake {number}, or remove {number})" if number else ""))
     return lines
 
 
@@ -178,10 +174,10 @@ def next_sentence(state: Progress) -> str:
     return f"{moved:.0f} mm and {rotated:.0f}° from {state.next_like}; {then}"
 
 
-def next_lines(state: Progress, notation: Notation) -> list[str]:
-    """Return the next pose in the notation of the arm."""
+def next_lines(state: Progress, notation: Notation, for_program: bool = True) -> list[str]:
+    """Return the next pose and its joint angles in the notation of the arm, as `pose_lines`."""
     assert state.next_pose is not None
-    lines = pose_lines(state.next_pose.base_from_gripper, notation, state.next_joints)
+    lines = pose_lines(state.next_pose.base_from_gripper, notation, state.next_joints, for_program)
     is_used = all(one.kind is not FindingKind.ROBOT_UNUSED for one in state.findings)
     if notation.arm is not None and state.next_joints is None and is_used:
         lines.append(f"a {notation.arm.name} cannot reach this pose within its joint limits: go near it")
@@ -208,37 +204,42 @@ def accuracy_line(state: Progress) -> str:
 
 
 def pose_lines(
-    pose: Float[ndarray, "4 4"], notation: Notation, joints: Float[ndarray, " dof"] | None = None
+    pose: Float[ndarray, "4 4"],
+    notation: Notation,
+    joints: Float[ndarray, " dof"] | None = None,
+    for_program: bool = True,
 ) -> list[str]:
-    """Return the pose as the arm's pendant or program writes it, and its joint angles (rad) where they are known."""
+    """Return the pose as the arm's pendant writes it, and its joint angles (rad) where they are known.
+
+    `for_program`: a UR's pose also as URScript, and joint angles also in radians.
+    """
     convention = "quat-xyzw" if notation.convention == "auto" else notation.convention
-    if convention == "ur":
-        row = numbers_from_poses(pose[None], "ur")[0]
-        shown = ", ".join(f"{name} {1e3 * value:.1f}" for name, value in zip("xyz", row[:3], strict=True))
-        rotation = ", ".join(
-            f"{name} {value:.4f}" for name, value in zip(("rx", "ry", "rz"), row[3:], strict=True)
-        )
-        numbers = ", ".join(f"{value:.5f}" for value in row)
-        lines = [f"pendant: {shown} mm, {rotation} rad", f"URScript: movel(p[{numbers}], a=0.3, v=0.1)"]
-    elif convention in ("franka", "matrix"):
-        row = numbers_from_poses(pose[None], convention, notation.units)[0]
+    units: UnitsName = "mm-rad" if convention == "ur" else notation.units
+    row = numbers_from_poses(pose[None], convention, units)[0]
+    if convention in ("franka", "matrix"):
         order = "O_T_EE, by columns" if convention == "franka" else "base_from_gripper, by rows"
-        lines = [f"{order}: [{', '.join(f'{value:.5f}' for value in row)}]"]
+        lines = [f"{order}: [{_joined(row, 5)}]"]
     else:
-        lines = [named_numbers(pose, convention, notation.units)]
+        form = CONVENTIONS[convention]
+        length, angle = form.units(units)
+        digits = 5 if not form.has_angles else 2 if angle == "deg" else 4
+        named = [
+            f"{name} {value:.{(1 if length == 'mm' else 4) if k < 3 else digits}f}"
+            for k, (name, value) in enumerate(zip(form.columns, row, strict=True))
+        ]
+        unit = f" {angle.replace('deg', '°')}" if form.has_angles else ""
+        lines = [f"{' '.join(named[:3])} {length}, {' '.join(named[3:])}{unit}"]
+    if convention == "ur":
+        lines = [f"pendant: {lines[0]}"]
+        if for_program:
+            metres = _joined(numbers_from_poses(pose[None], "ur")[0], 5)
+            lines.append(f"URScript: movel(p[{metres}], a=0.3, v=0.1)")
     if joints is not None:
-        degrees = ", ".join(f"{value:.2f}" for value in np.degrees(joints))
-        lines.append(f"joints, °: {degrees}")
-        lines.append(f"joints, rad: {', '.join(f'{value:.4f}' for value in joints)}")
+        lines.append(f"joints, °: {_joined(np.degrees(joints), 2)}")
+        lines += [f"joints, rad: {_joined(joints, 4)}"] if for_program else []
     return lines
 
 
-def named_numbers(pose: Float[ndarray, "4 4"], convention: ConventionName, units: UnitsName) -> str:
-    """Return the numbers of the pose, each with its name, and the units."""
-    form = CONVENTIONS[convention]
-    length, angle = form.units(units)
-    row = numbers_from_poses(pose[None], convention, units)[0]
-    digits = [1 if length == "mm" else 4] * 3 + [5 if not form.has_angles else 2 if angle == "deg" else 4] * 4
-    text = [f"{name} {value:.{k}f}" for name, value, k in zip(form.columns, row, digits, strict=False)]
-    unit = f" {angle.replace('deg', '°')}" if form.has_angles else ""
-    return f"{' '.join(text[:3])} {length}, {' '.join(text[3:])}{unit}"
+def _joined(numbers: Float[ndarray, " k"], digits: int) -> str:
+    """Return numbers with so many decimals, separated by commas."""
+    return ", ".join(f"{value:.{digits}f}" for value in numbers)

@@ -61,11 +61,6 @@ class SessionOptions:
         """Number of images with which the capture ends in any case."""
         return self.images or (MOST_IMAGES if self.until_accurate else ENOUGH_IMAGES)
 
-    @property
-    def reach_m(self) -> Float[ndarray, "2 3"] | None:
-        """Lower and upper corner of `reach`."""
-        return None if self.reach is None else np.array(self.reach).reshape(2, 3)
-
 
 @dataclass(frozen=True, kw_only=True)
 class SessionState:
@@ -137,12 +132,12 @@ class LiveSession:
 
         def request() -> None:
             """Run the source; its end is the end of the capture."""
+            error = None
             try:
                 source()  # pyright: ignore[reportOptionalCall]
-            except Exception as error:
-                self.end(error)
-            else:
-                self.end()
+            except Exception as raised:
+                error = raised
+            self.end(error)
 
         self._follow()
         self._show(is_over=len(self.folder.names) >= self.options.most)
@@ -179,7 +174,7 @@ class LiveSession:
     def take(
         self, state: RobotState, current: Callable[[], RobotState] | None = None, waits: bool = False
     ) -> Answer:
-        """Take an image where the arm rests, and return whether it is kept.
+        """Take an image where the arm rests, let its calibration follow, and return whether it is kept.
 
         `current` reads the arm once more after the image. With `waits` the answer has the calibration with that image
         and the next pose, seconds later.
@@ -187,7 +182,28 @@ class LiveSession:
         with self._lock:
             if self.state.is_over:
                 return {"accepted": False, "reason": "the capture has ended", "done": True}
-            answer = self._take(state, current)
+            name, why = "", None
+            try:
+                frame = self._frame(state, current)
+                name = self.folder.add(
+                    frame.image, state.base_from_gripper, state.joints, frame.time_s, frame.depth_mm
+                )
+            except StopIteration:
+                self.end()
+                why = "the video has ended"
+            except InputError as error:
+                why = str(error)
+            except OSError as error:
+                why = f"the image cannot be written ({error.strerror}); free the disk and take it again"
+            if why is not None:
+                answer = {"accepted": False, "reason": why, "done": self.state.is_over}
+                self._say(f"refused: {why}", answer)
+                self._follow(state.base_from_gripper)
+            else:
+                self._follow()
+                is_over = len(self.folder.names) >= self.options.most
+                answer = {"accepted": True, "image": name, "done": self.state.is_over or is_over}
+                self._say(f"kept {name}", answer, is_over=is_over)
             following = self._following
         if not waits:
             return answer
@@ -203,18 +219,19 @@ class LiveSession:
             number = len(names) if number is None else number
             if action == "finish":
                 self._show(is_over=True)
-            elif action == "undo" and self.folder.undo():
-                self._follow_removal(f"undone: {len(self.folder.names)} images")
-            elif action == "undo":
+            elif action == "undo" and not self.folder.undo():
                 self._refuse("refused: nothing to undo")
+            elif action == "undo":
+                self._say(f"undone: {len(self.folder.names)} images", {"images": self.folder.names})
+                self._follow()
             elif action != "take" and not 1 <= number <= len(names):
                 self._refuse(f"refused: there is no image {number}")
-            else:
-                if action != "take":
-                    self.folder.remove(names[number - 1])
-                    self._follow_removal(f"removed {names[number - 1]}")
-                if action != "remove":
-                    self._take_now()
+            elif action != "take":
+                self.folder.remove(names[number - 1])
+                self._say(f"removed {names[number - 1]}", {"images": self.folder.names})
+                self._follow()
+            if action == "take" or (action == "retake" and 1 <= number <= len(names)):
+                self._take_now()
 
     def finish(self) -> "RunResult | None":
         """Return the calibration of all images; None, with a line that says why, where there is none."""
@@ -226,31 +243,6 @@ class LiveSession:
                 self._refuse(f"no calibration: {error}")
         self._show(self.state.event, is_refusal=self.state.is_refusal, is_over=True, is_done=True)
         return self.state.result
-
-    def _take(self, state: RobotState, current: Callable[[], RobotState] | None) -> Answer:
-        """Take an image, let its calibration follow, and return the answer."""
-        try:
-            frame = self._frame(state, current)
-            name = self.folder.add(
-                frame.image, state.base_from_gripper, state.joints, frame.time_s, frame.depth_mm
-            )
-        except StopIteration:
-            self.end()
-            why = "the video has ended"
-        except InputError as error:
-            why = str(error)
-        except OSError as error:
-            why = f"the image cannot be written ({error.strerror}); free the disk and take it again"
-        else:
-            self._follow()
-            self._show(f"kept {name}", is_over=len(self.folder.names) >= self.options.most)
-            answer: Answer = {"accepted": True, "image": name, "done": self.state.is_over}
-            self._tell(answer, [f"kept {name}"])
-            return answer
-        answer = {"accepted": False, "reason": why, "done": self.state.is_over}
-        self._refuse(f"refused: {why}", answer)
-        self._follow(state.base_from_gripper)
-        return answer
 
     def _frame(self, state: RobotState, current: Callable[[], RobotState] | None) -> Frame:
         """Return a frame at rest; raise InputError with the reason why none is kept, StopIteration at a video's end."""
@@ -269,10 +261,10 @@ class LiveSession:
         if current is None:
             return found
         try:
-            has_moved = is_farther(pose, current().base_from_gripper, REST)
+            now = current().base_from_gripper
         except (InputError, StopIteration) as error:
             raise InputError(f"the pose cannot be read after the image: {error}") from None
-        if has_moved:
+        if is_farther(pose, now, REST):
             raise InputError("the arm moved while the image was taken; let it rest")
         return found
 
@@ -285,16 +277,9 @@ class LiveSession:
         except InputError as error:
             self._refuse(f"refused: {error}")
 
-    def _follow_removal(self, event: str) -> None:
-        """Show and tell a removal or its undoing, and let the calibration follow."""
-        self._show(event)
-        self._follow()
-        self._tell({"images": self.folder.names}, [event])
-
-    def _refuse(self, why: str, answer: Answer | None = None) -> None:
+    def _refuse(self, why: str) -> None:
         """Show and tell why something was not done."""
-        self._show(why, is_refusal=True)
-        self._tell(answer or {"accepted": False, "reason": why.removeprefix("refused: ")}, [why])
+        self._say(why, {"accepted": False, "reason": why.removeprefix("refused: ")})
 
     def _follow(self, refused: Float[ndarray, "4 4"] | None = None) -> None:
         """Let the worker calibrate the images where they changed, and propose a pose away from a refused one."""
@@ -326,9 +311,14 @@ class LiveSession:
         """Show and tell a state of the calibration."""
         with self._changed:
             state = self.state
-            is_done = not state.is_refusal and progress.images == state.names
-            self._show("" if is_done else state.event, is_refusal=state.is_refusal, progress=progress)
+            is_shown = not state.is_refusal and progress.images == state.names
+            self._show("" if is_shown else state.event, is_refusal=state.is_refusal, progress=progress)
         self._tell({"calibration": progress.as_json()}, progress_lines(progress, self.notation))
+
+    def _say(self, event: str, answer: Answer, **changes: Any) -> None:
+        """Show and tell an event; an answer that accepts nothing is a refusal."""
+        self._show(event, is_refusal=not answer.get("accepted", True), **changes)
+        self._tell(answer, [event])
 
     def _show(self, event: str = "", *, is_refusal: bool = False, **changes: Any) -> None:
         """Replace the state by one with an event and other fields."""

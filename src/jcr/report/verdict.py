@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from jcr.calibration.record import Calibration
 from jcr.calibration.words import leave_one_out_text
-from jcr.findings import FindingKind, remedy, sentence, text, verdict_of
+from jcr.findings import FindingKind, remedy, sentence, text
 from jcr.findings.sentences import SHORT, reached_in_words
 from jcr.report.render import Section
 from jcr.rounding import significant
@@ -50,20 +50,18 @@ def failure_section(calibration: Calibration) -> Section:
 
 def _verdict(calibration: Calibration) -> dict[str, str]:
     """Return the verdict, its reason and colour, and a sentence on the leave-one-out error."""
-    required, short = calibration.requirement, calibration.short
+    required, short, verdict = calibration.requirement, calibration.short, calibration.verdict
+    kind = {"accepted": "good", "rejected": "bad"}.get(verdict, "fair")
     if calibration.doubt is not None:
-        kind, reason = "bad", calibration.doubt
+        reason = calibration.doubt
     elif short is not None:
-        found = "" if required is None else f"{reached_in_words(required)}; {remedy(short)}"
-        kind, reason = "fair", f"{SHORT}: {found}"
+        reason = f"{SHORT}: {'' if required is None else f'{reached_in_words(required)}; {remedy(short)}'}"
     else:
-        kind = "good"
         reason = "nothing contradicts it" if required is None else reached_in_words(required)
     evidence = _leave_one_out(calibration)
     if calibration.uncertainty is not None:
         evidence += f" Largest uncertainty of the translation: {calibration.uncertainty.worst} (1 σ)."
-    verdict = verdict_of(calibration.findings).capitalize()
-    return {"kind": kind, "verdict": verdict, "reason": reason, "evidence": evidence}
+    return {"kind": kind, "verdict": verdict.capitalize(), "reason": reason, "evidence": evidence}
 
 
 def _leave_one_out(calibration: Calibration) -> str:
