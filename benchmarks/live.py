@@ -25,7 +25,7 @@ from jcr.live.calibration import LiveCalibration
 from jcr.live.progress import Progress
 from jcr.pipeline.run import calibrate
 from jcr.records import Intrinsics
-from jcr.run_folder import RunResult
+from jcr.result import RunResult
 from simulation.arms import (
     EFFECTIVE_POSES,
     PRESETS,

@@ -37,7 +37,7 @@ from jcr.geometry import inverse, nearest_to_lines, retract, rotation_exp, rotat
 from jcr.pipeline.run import RunOptions, calibrate
 from jcr.reconstruct import ReconstructOptions
 from jcr.records import Capture, HandEye, Intrinsics
-from jcr.run_folder import RunResult
+from jcr.result import RunResult
 
 WORST_PX = 2.0
 """rms misfit above which an image shows another thing than the board."""

@@ -26,7 +26,7 @@ from jcr.depth.depth_npz import DepthHeader as DepthAbout
 from jcr.findings import FindingKind
 from jcr.findings.table import GROUPS, KindRow
 from jcr.reconstruct import BACKENDS
-from jcr.run_folder import RunState
+from jcr.result import RunState
 
 REFERENCE = Path(__file__).parent / "reference"
 SCHEMAS = REFERENCE / "schemas"

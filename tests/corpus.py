@@ -45,7 +45,7 @@ from jcr.records import (
     Tracks,
 )
 from jcr.records.npz import read_reconstruction, write_reconstruction
-from jcr.run_folder import RunResult
+from jcr.result import RunResult
 from jcr.scene.cloud import read_cloud, write_cloud
 from jcr.scene.map_file import load_map
 from jcr.scene.options import MapOptions
@@ -369,7 +369,7 @@ def sound_run(out: Path) -> Path:
     options["calibrate"] |= {"robot_noise": [0.1, 0.05], "known_length": ["0.png", 1.0, 2.0, 30.0, 4.0, 50.0]}
     state = {
         "capture": str(out / "capture"),
-        "reconstruction": "0",
+        "made": {"reconstruct": "0"},
         "options": options,
         "attempts": [asdict(attempt)],
     }

@@ -21,7 +21,7 @@ from jcr.capture.images import encode_png
 from jcr.capture.options import ReadOptions
 from jcr.geometry import apply, rotation_exp, transform
 from jcr.options import checked_options
-from jcr.run_folder import RunOptions
+from jcr.result import RunOptions
 from places import ROOT
 
 

@@ -22,6 +22,7 @@ from jcr.geometry import rotation_exp, transform
 from jcr.pipeline import selection
 from jcr.reconstruct import Backend, ReconstructOptions
 from jcr.records import Capture, HandEye, Intrinsics, Pointmaps, Reconstruction, Tracks
+from jcr.result import RunOptions, RunResult
 from simulation.problems import HandEyeProblem, hand_eye_problem
 
 GARBAGE = {
@@ -104,7 +105,7 @@ def auto_result(
         return reconstruction(options.backend, answer, observations)
 
     monkeypatch.setattr(selection, "reconstruct", answered)
-    choice = selection.choose(capture_of(problem), ReconstructOptions(), CalibrateOptions())
+    choice = selection.choose(capture_of(problem), RunOptions())
     assert [attempt.backend for attempt in choice.attempts] == tried
     kept = [attempt for attempt in choice.attempts if attempt.why_not is None]
     assert [attempt.backend for attempt in kept] == [choice.reconstruction.backend]
@@ -235,8 +236,7 @@ def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
     present: set[str], tmp_path: Path, tabletop: Path, monkeypatch: pytest.MonkeyPatch
 ):
     from jcr.capture.read import read_capture
-    from jcr.pipeline.run import RunOptions, calibrate
-    from jcr.run_folder import RunResult
+    from jcr.pipeline.run import calibrate
 
     problem = hand_eye_problem(np.random.default_rng(3), 12)
     capture = replace(read_capture(tabletop), base_from_gripper=problem.base_from_gripper)
@@ -286,7 +286,6 @@ def test_where_nothing_is_found_each_attempt_reports_why(
 ):
     from jcr.capture.read import read_capture
     from jcr.pipeline.run import calibrate
-    from jcr.run_folder import RunResult
 
     def door(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
         raise RejectedError(f"{options.backend} saw nothing")
@@ -308,7 +307,7 @@ def test_input_that_calibration_cannot_use_is_no_reason_for_another_back_end(
     present: set[str], tmp_path: Path, tabletop: Path, monkeypatch: pytest.MonkeyPatch
 ):
     from jcr.capture.read import read_capture
-    from jcr.pipeline.run import RunOptions, calibrate
+    from jcr.pipeline.run import calibrate
 
     problem = hand_eye_problem(np.random.default_rng(3), 12)
     capture, made = read_capture(tabletop), []
@@ -344,12 +343,12 @@ def test_a_known_length_ends_on_surfaces_and_nothing_else_needs_depth_before_the
     )
     monkeypatch.setattr(selection, "densify", deeper)
     capture = capture_of(problem)
-    choice = selection.choose(capture, ReconstructOptions(), CalibrateOptions())
+    choice = selection.choose(capture, RunOptions())
     assert not densified and choice.reconstruction.pointmaps is None
     for length, why in (("nowhere.png", "nowhere"), ("00.png", "no surface was found")):
         lost = CalibrateOptions(known_length=(length, 0.0, 0.0, 9.0, 9.0, 50.0))
         with pytest.raises(InputError, match=why):
-            selection.choose(capture, ReconstructOptions(), lost)
+            selection.choose(capture, RunOptions(calibrate=lost))
     assert densified == ["colmap", "colmap"]
 
 

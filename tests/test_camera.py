@@ -35,16 +35,7 @@ RATIONAL = Intrinsics(
     612.4, 612.2, 636.8, 367.2, 1280, 720, (0.45, -2.6, 4e-4, -2e-4, 1.6, 0.33, -2.4, 1.5), "rational"
 )
 """About an Azure Kinect's colour camera."""
-PRISM = Intrinsics(
-    612.4,
-    612.2,
-    636.8,
-    367.2,
-    1280,
-    720,
-    (0.45, -2.6, 4e-4, -2e-4, 1.6, 0.33, -2.4, 1.5, 0.02, -0.004, -0.01, 0.003),
-    "thin_prism",
-)
+PRISM = replace(RATIONAL, distortion=(*RATIONAL.distortion, 0.02, -0.004, -0.01, 0.003), model="thin_prism")
 """The same camera with a tilted sensor."""
 FISHEYE = Intrinsics(286.0, 286.5, 423.0, 399.0, 848, 800, (-0.0078, 0.045, -0.042, 0.008), "fisheye")
 """About a tracking camera's: its corners see 80° off the axis."""
@@ -78,20 +69,15 @@ def pixels(draw, camera: Intrinsics) -> np.ndarray:
 
 
 @repeatable
-@given(st.data(), cameras(), between(0.05, 20))
-def test_projection_undoes_unprojection_at_every_depth(data, camera, depth):
-    x_px = pixels(data.draw, camera)
-    ray = unproject(camera, x_px)
-    assert ray.shape == (*x_px.shape[:-1], 3) and (ray[..., 2] == 1).all()
-    np.testing.assert_allclose(project(camera, depth * ray), x_px, rtol=0, atol=1e-7)
-    np.testing.assert_allclose(unproject(camera, project(camera, depth * ray)), ray, rtol=0, atol=1e-10)
-
-
-@repeatable
 @given(st.data(), cameras(), st.integers(1, 3000), st.integers(1, 3000), between(0.1, 5))
-def test_resized_cropped_and_zoomed_images_show_the_same_point(data, camera, width, height, factor):
-    x = unproject(camera, pixels(data.draw, camera))
-    x_px = project(camera, x)
+def test_unprojection_is_undone_and_resized_cropped_and_zoomed_images_show_the_same_point(
+    data, camera, width, height, factor
+):
+    first_px = pixels(data.draw, camera)
+    x = unproject(camera, first_px)
+    x_px = project(camera, factor * x)
+    assert x.shape == (*x_px.shape[:-1], 3) and (x[..., 2] == 1).all()
+    np.testing.assert_allclose(x_px, first_px, rtol=0, atol=1e-7)
     ratio = np.array([width, height]) / [camera.width, camera.height]
     small = resized(camera, width, height)
     np.testing.assert_allclose(project(small, x), (x_px + 0.5) * ratio - 0.5, rtol=0, atol=1e-7 * width)
@@ -121,12 +107,8 @@ def test_fold_is_found_where_the_radius_stops_growing() -> None:
     assert fold == pytest.approx(400 * 2 / 3 / np.sqrt(1.2), rel=1e-3)
     # The same fold is harmless when it lies outside the frame: a crop of the same camera.
     assert fold_distance_px(replace(intrinsics, width=300, height=200, cx=149.5, cy=99.5)) is None
-
-
-def test_a_frame_wider_than_the_model_reaches_counts_as_folded() -> None:
-    # Its corners are seen at 87°, beyond the 84° to which rays are followed.
-    intrinsics = Intrinsics(20.0, 20.0, 319.5, 239.5, 640, 480)
-    assert fold_distance_px(intrinsics) is not None
+    # Corners at 87° are beyond the 84° to which rays are followed.
+    assert fold_distance_px(Intrinsics(20.0, 20.0, 319.5, 239.5, 640, 480)) is not None
 
 
 @pytest.mark.parametrize("intrinsics", [WIDE, BARREL, PINCUSHION])
@@ -136,17 +118,15 @@ def test_pinhole_grid_stays_inside_the_frame_and_touches_it(intrinsics: Intrinsi
     edges = [-0.5, pinhole.width - 0.5], [-0.5, pinhole.height - 0.5]
     u, v = np.meshgrid(np.linspace(*edges[0], 50), np.linspace(*edges[1], 50))
     x_px = project(intrinsics, unproject(pinhole, np.stack([u, v], axis=-1)))
-    package = np.minimum(x_px + 0.5, [intrinsics.width - 0.5, intrinsics.height - 0.5] - x_px)
-    assert package.min() > -0.01
-    assert package.min() < 0.5
+    inside = np.minimum(x_px + 0.5, [intrinsics.width - 0.5, intrinsics.height - 0.5] - x_px)
+    assert -0.01 < inside.min() < 0.5
+    straight = replace(intrinsics, distortion=(0.0,) * 5)
+    grid = pinhole_inside(straight, 320)
+    small = resized(straight, grid.width, grid.height)
+    assert parameters(grid) == pytest.approx(parameters(small))
 
 
-def test_without_distortion_the_grid_is_the_frame_resized() -> None:
-    intrinsics = Intrinsics(600.0, 590.0, 300.0, 250.0, 640, 480)
-    assert pinhole_inside(intrinsics, 320) == pytest.approx(resized(intrinsics, 320, 240))
-
-
-@pytest.mark.parametrize("factor", [1, 2, 3])
+@pytest.mark.parametrize("factor", [1, 3])
 def test_resampled_pixels_show_what_their_rays_see(factor: int) -> None:
     intrinsics = Intrinsics(220.0, 220.0, 120.0, 90.0, 252, 192, (-0.1, 0.02, 0.001, 0.001, 0.0))
     u, v = np.meshgrid(np.arange(252), np.arange(192))
@@ -166,33 +146,25 @@ def reaching(camera: Intrinsics) -> np.ndarray:
 
 
 @pytest.mark.parametrize("camera", MODELS)
-def test_each_model_is_opencvs(camera: Intrinsics):
-    x = 1.7 * reaching(camera).reshape(-1, 1, 3)
-    project_by = cv2.fisheye.projectPoints if camera.model == "fisheye" else cv2.projectPoints
-    expected = project_by(x, np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.distortion))[0]
-    np.testing.assert_allclose(project(camera, x[:, 0]), expected[:, 0], atol=1e-6)
-
-
-@pytest.mark.parametrize("camera", MODELS)
-def test_each_model_has_its_inverse_and_derivatives(camera: Intrinsics):
+def test_each_model_is_opencvs_and_has_its_inverse_and_derivatives(camera: Intrinsics):
     x = 0.8 * reaching(camera)
+    project_by = cv2.fisheye.projectPoints if camera.model == "fisheye" else cv2.projectPoints
+    flat, origin = x.reshape(-1, 1, 3), np.zeros(3)
+    expected = project_by(flat, origin, origin, camera.matrix, np.array(camera.distortion))[0]
+    np.testing.assert_allclose(project(camera, flat[:, 0]), expected[:, 0], atol=1e-6)
     np.testing.assert_allclose(0.8 * unproject(camera, project(camera, x)), x, atol=1e-8)
-    step = 1e-6
-    for k in range(3):
-        ahead, behind = (project(camera, x + sign * step * np.eye(3)[k]) for sign in (1, -1))
-        np.testing.assert_allclose(
-            by_point(camera, x)[..., k], (ahead - behind) / (2 * step), rtol=1e-5, atol=1e-4
-        )
+
+    def slope(function, step: np.ndarray) -> np.ndarray:
+        return (function(1e-6 * step) - function(-1e-6 * step)) / 2e-6
+
+    for k, axis in enumerate(np.eye(3)):
+        numeric = slope(lambda step: project(camera, x + step), axis)
+        np.testing.assert_allclose(by_point(camera, x)[..., k], numeric, rtol=1e-5, atol=1e-4)
     values = parameters(camera)
     assert with_parameters(camera, values) == camera
-    for k in range(len(values)):
-        ahead, behind = (
-            project(with_parameters(camera, values + sign * step * np.eye(len(values))[k]), x)
-            for sign in (1, -1)
-        )
-        np.testing.assert_allclose(
-            by_parameters(camera, x)[..., k], (ahead - behind) / (2 * step), rtol=1e-4, atol=1e-4
-        )
+    for k, axis in enumerate(np.eye(len(values))):
+        numeric = slope(lambda step: project(with_parameters(camera, values + step), x), axis)
+        np.testing.assert_allclose(by_parameters(camera, x)[..., k], numeric, rtol=1e-4, atol=1e-4)
 
 
 def test_a_fisheye_is_smooth_on_its_axis_and_its_pinhole_grid_ends_before_its_border():

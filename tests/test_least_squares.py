@@ -63,15 +63,10 @@ def test_steps_that_overshoot_are_damped():
     """Rosenbrock's valley: the first undamped step makes the cost seventy times as large."""
 
     def at(p):
-        x, y = p
-        residual = np.array([[10 * (y - x * x)], [1 - x]])
-        return residual, np.array([[[-20 * x, 10.0]], [[-1.0, 0.0]]])
+        residual = np.array([[10 * (p[1] - p[0] ** 2)], [1 - p[0]]])
+        return residual, np.array([[[-20 * p[0], 10.0]], [[-1.0, 0.0]]])
 
-    start = np.array([-1.2, 1.0])
-    residual, jacobian = at(start)
-    full = start - np.linalg.solve(jacobian[:, 0], residual[:, 0])
-    assert (at(full)[0] ** 2).sum() > 70 * (residual**2).sum()
-    found = minimise(at, start, plus)
+    found = minimise(at, np.array([-1.2, 1.0]), plus)
     assert found.settled
     np.testing.assert_allclose(found.unknowns, [1.0, 1.0], atol=1e-9)
 
@@ -97,20 +92,16 @@ def test_losses_tame_whole_residuals_not_their_components():
     assert found.cost == pytest.approx(0.5 * np.log1p(length**2).sum())
 
 
-def test_exact_data_settle_at_zero(observed):
+def test_exact_data_settle_at_zero_and_an_unobserved_parameter_stays():
     true = np.array([3.0, 0.4, 2.5, 0.01])
-    found = minimise(linearised(curve(true)), np.array([2.0, 0.2, 2.2, 0.0]), plus)
-    assert found.settled and found.cost < 1e-20
-    np.testing.assert_allclose(found.unknowns, true, rtol=1e-9)
 
-
-def test_what_no_residual_sees_stays(observed):
     def at(p):
-        residual, jacobian = linearised(observed)(p[:4])
+        residual, jacobian = linearised(curve(true))(p[:4])
         return residual, np.concatenate([jacobian, np.zeros((60, 1, 1))], axis=2)
 
     found = minimise(at, np.array([2.0, 0.2, 2.2, 0.0, 7.0]), plus)
-    assert found.settled and found.unknowns[4] == 7.0
+    assert found.settled and found.cost < 1e-20
+    np.testing.assert_allclose(found.unknowns, [*true, 7.0], rtol=1e-9)
 
 
 def test_weights_are_the_losses_slopes():

@@ -13,6 +13,7 @@ import pytest
 from jcr import reconstruct as backends
 from jcr.cli import dispatch
 from jcr.errors import InputError
+from jcr.pipeline.stages import begun
 from jcr.reconstruct import (
     BACKENDS,
     Backend,
@@ -22,7 +23,7 @@ from jcr.reconstruct import (
     with_cameras_of,
 )
 from jcr.records import Capture
-from jcr.run_folder import RunOptions, state_of
+from jcr.result import RunOptions
 
 
 @pytest.fixture
@@ -190,10 +191,10 @@ def test_a_changed_file_of_predictions_is_another_input(tmp_path: Path) -> None:
         path = tmp_path / name
         path.write_text("one")
         options = RunOptions(reconstruct=ReconstructOptions(**{name: path}))
-        before = state_of(capture, options).reconstruction
-        assert state_of(capture, options).reconstruction == before
+        before = begun(tmp_path, capture, options).state.made
+        assert begun(tmp_path, capture, options).state.made == before
         path.write_text("another")
-        assert state_of(capture, options).reconstruction != before
+        assert begun(tmp_path, capture, options).state.made != before
 
 
 def test_models_are_listed_with_licence_scale_and_what_is_present(capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,9 +13,10 @@ import pytest
 from corpus import sound_run
 from jcr.cli import dispatch
 from jcr.errors import InputError
-from jcr.pipeline.run import _is_complete, _write_complete
+from jcr.files import locked
+from jcr.pipeline.stages import begun, complete, is_unchanged
 from jcr.records import Capture, CellCamera
-from jcr.run_folder import RunOptions, RunResult, locked, state_of
+from jcr.result import RunOptions
 
 
 @pytest.fixture(scope="module")
@@ -48,11 +49,11 @@ def test_a_run_with_files_beside_its_images_is_complete_in_relative_folders(
         depths=("0.depth.png",),
         others=(other,),
     )
-    run, state = RunResult("out", capture=capture), state_of(capture, RunOptions(map=None))
-    _write_complete(state, run.out, capture)
-    assert _is_complete(run, state)
+    run = begun(Path("out"), capture, RunOptions(map=None))
+    complete(run)
+    assert is_unchanged(run)
     Path("cell/fixed/0.png").write_bytes(b"another image")
-    assert not _is_complete(run, state)
+    assert not is_unchanged(run)
 
 
 Content = dict[str, Any]
@@ -70,7 +71,7 @@ STATES: dict[str, Callable[[Content], Any]] = {
     "capture with NUL": lambda c: c.update(capture="a\0b"),
     "capture of a name too long": lambda c: c.update(capture="/tmp/" + "x" * 300),
     "capture gone": lambda c: c.update(capture="/nowhere"),
-    "no fingerprint": lambda c: c.pop("reconstruction"),
+    "no fingerprint": lambda c: c.update(made=None),
 }
 
 CALIBRATIONS: dict[str, Callable[[Content], Any]] = {
@@ -135,7 +136,7 @@ def test_a_capture_in_a_folder_whose_name_is_not_utf8_is_refused_before_any_work
         folder=Path("caf\udce9"), images=("a.png",), base_from_gripper=np.eye(4)[None], image_size=(640, 480)
     )
     with pytest.raises(InputError, match="not UTF-8; rename it"):
-        state_of(capture, RunOptions())
+        begun(Path("out"), capture, RunOptions())
 
 
 def test_memory_that_ends_is_one_line(capsys, monkeypatch: pytest.MonkeyPatch):

@@ -9,7 +9,7 @@ import pytest
 from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.pipeline.touch import touch
-from jcr.run_folder import RunResult
+from jcr.result import RunResult
 
 pytestmark = pytest.mark.slow
 

@@ -22,9 +22,9 @@ from jcr.estimation.solve import solve
 from jcr.estimation.systematic import arm_errors, posed, smooth_errors
 from jcr.estimation.wrist import pose_problem
 from jcr.geometry import inverse, rotation_exp, scale_translation, transform
-from jcr.pipeline.run import _keep_reconstruction
+from jcr.pipeline.stages import begun, keep_reconstruction
 from jcr.records import Capture, Reconstruction, Tracks
-from jcr.run_folder import RunOptions, state_of
+from jcr.result import RunOptions
 from jcr.sfm.register import register
 from simulation.capture import with_robot_noise
 from simulation.problems import bent_problem
@@ -184,8 +184,8 @@ def out(tmp_path_factory: pytest.TempPathFactory, capture: Capture, reconstructi
     hand_eye = calibrate(old, reconstruction)
     assert hand_eye.converged
     write_calibration(folder / "out/calibration.json", calibration_of(old, reconstruction, hand_eye, {}, "0"))
-    state = state_of(jcr.read_capture(old.folder), RunOptions())
-    _keep_reconstruction(folder / "out", reconstruction, state)
+    begin = begun(folder / "out", jcr.read_capture(old.folder), RunOptions())
+    keep_reconstruction(begin, reconstruction)
     return folder / "out"
 
 

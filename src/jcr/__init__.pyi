@@ -64,9 +64,9 @@ from .records import Reconstruction as Reconstruction
 from .records import Requirement as Requirement
 from .records import RobotNoise as RobotNoise
 from .records.json_fields import IntrinsicsAndStd as IntrinsicsAndStd
-from .run_folder import RunOptions as RunOptions
-from .run_folder import RunResult as RunResult
-from .run_folder import load_run as load_run
+from .result import RunOptions as RunOptions
+from .result import RunResult as RunResult
+from .result import load_run as load_run
 from .scene.distance import DistanceGrid as DistanceGrid
 from .scene.map_file import load_map as load_map
 from .scene.options import CloudOptions as CloudOptions

@@ -1,12 +1,19 @@
-"""Files are written whole or not at all: a temporary name beside the target, fsync, rename; and only files are read."""
+"""Writing of whole files, by a temporary name beside the target, fsync and rename; locking of folders."""
 
+import fcntl
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from jcr.errors import InputError
+
+LOCK = ".lock"
+"""File of a folder that the process which writes there has locked."""
+COPIES = "capture", "added"
+"""Subfolders of a run folder into which images are copied."""
 
 
 @contextmanager
@@ -42,9 +49,38 @@ def require_file(path: Path) -> None:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Delete what writers that were killed had begun in a folder."""
+    """Delete the files of a folder that killed processes had begun to write."""
     for begun in folder.glob(".*.????????.part*"):
         begun.unlink()
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Make and lock the folder, so that a second process writes nothing between the files of the first.
+
+    Files that a killed process had begun to write are removed, and so is a new folder into which nothing came.
+    """
+    new = not path.exists()
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        lock = (path / LOCK).open("w", encoding="utf-8")
+    except (FileExistsError, NotADirectoryError):
+        file = next(part for part in (path, *path.parents) if part.is_file())
+        raise InputError(f"{file}: is a file; name a folder for the results") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another folder") from None
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"{path}: another jcr is writing there; wait for it or choose another") from None
+        for folder in (path, *(sub for name in COPIES for sub in (path / name).rglob("."))):
+            remove_unfinished(folder)
+        try:
+            yield
+        finally:
+            if new and os.listdir(path) == [LOCK]:
+                shutil.rmtree(path)
 
 
 def write_new(path: Path, data: bytes) -> None:

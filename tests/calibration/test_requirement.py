@@ -23,7 +23,7 @@ from jcr.geometry import inverse, scale_translation, step_between
 from jcr.pipeline import run
 from jcr.records import HandEye, PosePairs
 from jcr.report.html import poses_report_html
-from jcr.run_folder import RunOptions, RunResult
+from jcr.result import RunOptions, RunResult
 from simulation.problems import HandEyeProblem, disturbed, hand_eye_problem
 
 DISAGREE = Finding(
@@ -223,7 +223,7 @@ def _first(given: PosePairs, count: int) -> tuple[np.ndarray, np.ndarray]:
 def test_options_that_cannot_be_are_refused_before_any_work(
     options: CalibrateOptions, message: str, tabletop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(run, "choose", lambda *_: pytest.fail("images were reconstructed"))
+    monkeypatch.setattr("jcr.pipeline.stages.choose", lambda *_: pytest.fail("images were reconstructed"))
     with pytest.raises(InputError, match=message):
         run.calibrate(read_capture(tabletop), tmp_path / "out", RunOptions(calibrate=options))
     assert not (tmp_path / "out").exists()

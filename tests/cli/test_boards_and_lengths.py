@@ -29,7 +29,7 @@ def test_a_board_or_a_length_that_cannot_be_is_refused_before_any_work(
     arguments: list[str],
     words: str,
 ):
-    monkeypatch.setattr(run, "_calibrated", lambda *_: pytest.fail("the capture was worked on"))
+    monkeypatch.setattr(run, "begun", lambda *_: pytest.fail("the capture was worked on"))
     found = run_jcr("run", tabletop, tmp_path / "out", *arguments)
     assert found.returncode == 2 and words in found.stderr, found.stderr
     assert len(found.stderr.splitlines()) == 1 and not (tmp_path / "out" / "calibration.json").exists()

@@ -27,9 +27,9 @@ from jcr.calibration.record import read_calibration
 from jcr.cli import dispatch
 from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import forward_kinematics
-from jcr.pipeline import run
+from jcr.pipeline import stages
 from jcr.records import Reconstruction
-from jcr.run_folder import RunResult
+from jcr.result import RunResult
 from simulation.problems import hand_eye_problem
 
 SIZE = (96, 72)
@@ -495,9 +495,9 @@ def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(
     def killed(*_) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run, "write_reconstruction", killed)
+    monkeypatch.setattr(stages, "write_reconstruction", killed)
     with pytest.raises(KeyboardInterrupt):
-        run._keep_reconstruction(out, made.reconstruction, made.state)
+        stages.keep_reconstruction(made.with_parts(out=out), made.reconstruction)
     assert not (out / "run.json").exists()
 
 

@@ -16,7 +16,7 @@ from safetensors.numpy import load_file
 from jcr.calibration.record import read_calibration
 from jcr.cli import dispatch, main
 from jcr.records.npz import read_reconstruction
-from jcr.run_folder import RunResult
+from jcr.result import RunResult
 from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import load_map
 

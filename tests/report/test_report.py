@@ -42,8 +42,8 @@ from jcr.report.html import failed_report_html, report_html
 from jcr.report.images import MAGNIFIED
 from jcr.report.motion import excitation_bars
 from jcr.report.transform import sketch
+from jcr.result import RunResult
 from jcr.rounding import decimals_of, significant
-from jcr.run_folder import RunResult
 from jcr.scene.cloud import point_cloud
 from jcr.scene.options import MapOptions
 from jcr.segments.tabletop import label_tabletop

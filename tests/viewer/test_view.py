@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from chromium import Chromium
 from jcr.errors import InputError
 from jcr.records import Capture
-from jcr.run_folder import RunResult
+from jcr.result import RunResult
 from simulation.truth import Truth, read_truth
 from waiting import until
 

@@ -18,7 +18,7 @@ from jcr.geometry import require_rigid, step_between
 from jcr.records.json_fields import Matrix, Spread3
 
 if TYPE_CHECKING:
-    from jcr.run_folder import RunResult
+    from jcr.result import RunResult
 
     Comparable = RunResult | Calibration | str | Path | ArrayLike
 else:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from jcr.live.server import LiveServer
     from jcr.live.session import Answer, LiveSession
     from jcr.records.capture_json import IntrinsicsEntry
-    from jcr.run_folder import RunResult
+    from jcr.result import RunResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +92,7 @@ class CaptureCommand:
 
 def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
     """Take images until there are enough, or the calibration is as accurate as required; calibrate all of them."""
+    from jcr.files import locked
     from jcr.live.arms import NOTATIONS, address_of, states_of
     from jcr.live.calibration import LiveCalibration
     from jcr.live.cameras import open_camera
@@ -99,7 +100,6 @@ def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
     from jcr.live.progress import Notation
     from jcr.live.server import Listen, LiveServer
     from jcr.live.session import LiveSession
-    from jcr.run_folder import locked
 
     options, token = arguments.session, arguments.token or os.environ.get("JCR_TOKEN") or None
     if options.until_accurate and options.require is None:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from jcr.pipeline.batch import BatchRow
     from jcr.progress import Progress
     from jcr.records import Capture, PosePairs
-    from jcr.run_folder import RunOptions, RunResult
+    from jcr.result import RunOptions, RunResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,7 +194,7 @@ class AddCameraCommand:
 
 def run_options(arguments: Any, **chosen: Any) -> "RunOptions":
     """Return the options of the stages among a command's arguments, `chosen` ones in their place."""
-    from jcr.run_folder import RunOptions
+    from jcr.result import RunOptions
 
     given = {
         one.name: getattr(arguments, one.name) for one in fields(RunOptions) if hasattr(arguments, one.name)
@@ -213,7 +213,8 @@ def _source(command: CalibrateCommand, progress: "Progress") -> "Capture | PoseP
     """Read the capture of a command; the frames of a recording are put in the run folder."""
     _announce(command.capture)
     from jcr.capture.read import read_source
-    from jcr.run_folder import CAPTURE, locked
+    from jcr.files import locked
+    from jcr.result import CAPTURE
 
     with locked(command.out):
         return read_source(command.capture, command.read, into=command.out / CAPTURE, progress=progress)
@@ -253,7 +254,7 @@ def _run(
     """
     from jcr.pipeline.run import run
     from jcr.pipeline.selection import NothingFoundError
-    from jcr.run_folder import load_run
+    from jcr.result import load_run
 
     out, shown = command.out, list[object]()
 

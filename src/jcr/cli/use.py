@@ -244,7 +244,7 @@ class MeasureCommand:
     def main(self) -> int:
         """Print the sizes; 3 when the calibration they rest on is rejected."""
         from jcr.pipeline.run import measure
-        from jcr.run_folder import load_run
+        from jcr.result import load_run
 
         measured = measure(self.out)
         # Metres, base frame, one sigma; `on_plane` is a flag for each point of the cloud.
@@ -302,7 +302,7 @@ class ViewCommand:
     def main(self) -> int:
         """Serve the page until Ctrl-C."""
         from jcr.extras import extra
-        from jcr.run_folder import load_run
+        from jcr.result import load_run
 
         run = load_run(self.out)  # raises at once where there is none
         for package in ("viser", "torch"):

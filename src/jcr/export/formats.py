@@ -18,7 +18,7 @@ from jcr.export.options import ExportName, ExportOptions, Provenance
 from jcr.files import write_text
 from jcr.geometry import apply_similarity, scale_translation, transform
 from jcr.options import checked_options
-from jcr.run_folder import CLOUD, RunResult
+from jcr.result import CLOUD, RunResult
 from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import load_map
 

@@ -33,7 +33,7 @@ from jcr.records.capture_json import IntrinsicsEntry
 from jcr.sfm.live_map import LiveMap
 
 if TYPE_CHECKING:
-    from jcr.run_folder import RunResult
+    from jcr.result import RunResult
 
 OBSERVATIONS = 300, 8000
 """Observations per image and in all that are used while images are taken; the calibration at the end uses all."""
@@ -69,7 +69,7 @@ class LiveCalibration:
         self._opened = ExitStack()
         if not isinstance(folder, LiveFolder):
             if exclusive:
-                from jcr.run_folder import locked
+                from jcr.files import locked
 
                 self._opened.enter_context(locked(Path(folder)))
             given = None if intrinsics is None else IntrinsicsEntry.of(intrinsics)
@@ -135,7 +135,7 @@ class LiveCalibration:
         `out` is the run folder; None: the folder `result` of the capture. Raises as `jcr.calibrate` does.
         """
         from jcr.pipeline.run import calibrate
-        from jcr.run_folder import RunOptions
+        from jcr.result import RunOptions
 
         with self._lock:
             options = RunOptions(calibrate=self._options)

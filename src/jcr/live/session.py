@@ -23,7 +23,7 @@ from jcr.records.capture_json import FrameEntry
 
 if TYPE_CHECKING:
     from jcr.live.calibration import LiveCalibration
-    from jcr.run_folder import RunResult
+    from jcr.result import RunResult
 
 SAME_PLACE = (0.005, np.radians(1.0))
 """m, rad: a second image from within this adds nothing."""

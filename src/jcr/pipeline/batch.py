@@ -22,13 +22,13 @@ from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, RejectedError
 from jcr.extras import extra
-from jcr.files import write_text
+from jcr.files import locked, write_text
 from jcr.findings import Verdict, sentence, verdict_of
 from jcr.pipeline.options import BatchOptions
 from jcr.pipeline.run import run
 from jcr.progress import Progress, silent
 from jcr.report.render import render
-from jcr.run_folder import CAPTURE, RunOptions, load_run, locked
+from jcr.result import CAPTURE, RunOptions, load_run
 
 RETRIES = 3
 """Number of times a task is started again whose Ray node died."""

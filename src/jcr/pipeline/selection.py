@@ -7,12 +7,10 @@ from functools import partial
 
 from jcr.allocator import give_back
 from jcr.calibration.checks.capture import as_causes, view_findings
-from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate
 from jcr.calibration.words import leave_one_out_text
 from jcr.depth.densify import densify
-from jcr.depth.options import DepthOptions
 from jcr.errors import InputError, RejectedError
 from jcr.findings import (
     Concerns,
@@ -27,6 +25,7 @@ from jcr.findings import (
 from jcr.progress import Progress, silent
 from jcr.reconstruct import BACKENDS, ReconstructOptions, reconstruct, tries
 from jcr.records import Attempt, Capture, HandEye, Reconstruction
+from jcr.result import RunOptions
 
 HELPS: tuple[Concerns, ...] = ("reconstruction", "images")
 """Concerns of a rejection against which another reconstruction of the same images may help."""
@@ -130,21 +129,22 @@ def is_textured(trial: Trial, images: int) -> bool:
 
 def choose(
     capture: Capture,
-    options: ReconstructOptions,
-    calibrate_options: CalibrateOptions,
+    options: RunOptions,
     progress: Progress | None = None,
-    depth_options: DepthOptions | None = None,
+    keep: Callable[[Reconstruction], None] | None = None,
 ) -> Selection:
     """Reconstruct and calibrate a capture by the back ends of `reconstruct.tries`, and keep the one of highest rank.
 
     Another is tried as long as the best one failed, or is rejected for a reason that another may not have; a note says
-    which was kept and why. `depth_options` are for a known length. Raises InputError as the back end does, and where
-    gripper poses and joint angles contradict each other; NothingFoundError where no back end gave anything.
+    which was kept and why. `keep` is called with the reconstruction of the only back end before its calibration. Raises
+    InputError as the back end does, and where gripper poses and joint angles contradict each other; NothingFoundError
+    where no back end gave anything.
     """
-    robot_errors(capture, calibrate_options)  # refuses before the images cost time
+    robot_errors(capture, options.calibrate)  # refuses before the images cost time
     trials, notes = list[Trial](), list[str]()
     of_images: tuple[Finding, ...] | None = None
-    for one in tries(options):
+    candidates = tries(options.reconstruct)
+    for one in candidates:
         if trials:
             of_images = _of_images(capture, trials[-1]) if of_images is None else of_images
             reason, goes_on = _why_untried(one, trials, len(capture), of_images)
@@ -154,8 +154,8 @@ def choose(
                     continue
                 break
         make = partial(reconstruct, capture, one, progress)
-        trial = _try(capture, make, calibrate_options, progress, depth_options, one)
-        is_own = not BACKENDS[one.backend].hub_id or options.weights is not None
+        trial = _try(capture, make, options, progress, one, keep if len(candidates) == 1 else None)
+        is_own = not BACKENDS[one.backend].hub_id or one.weights is not None
         if isinstance(trial.failure, InputError) and is_own:
             raise trial.failure
         trials.append(trial)
@@ -165,12 +165,11 @@ def choose(
 def again(
     capture: Capture,
     read: Callable[[], Reconstruction],
-    options: CalibrateOptions,
+    options: RunOptions,
     progress: Progress | None = None,
-    depth_options: DepthOptions | None = None,
 ) -> Selection:
     """Calibrate again a reconstruction that was selected before, and that `read` returns; raise as `choose`."""
-    trial = _try(capture, read, options, progress, depth_options)
+    trial = _try(capture, read, options, progress)
     return _select([trial], [], _of_images(capture, trial))
 
 
@@ -269,12 +268,12 @@ def timings_of(attempts: Sequence[Attempt]) -> dict[str, float]:
 def _try(
     capture: Capture,
     make: Callable[[], Reconstruction],
-    calibrate_options: CalibrateOptions,
+    options: RunOptions,
     progress: Progress | None,
-    depth_options: DepthOptions | None,
-    options: ReconstructOptions | None = None,
+    candidate: ReconstructOptions | None = None,
+    keep: Callable[[Reconstruction], None] | None = None,
 ) -> Trial:
-    """Make a reconstruction with these options, None where it is read from a file, and calibrate.
+    """Make a reconstruction by a candidate, None where it is read from a file, and calibrate.
 
     A known length ends on surfaces: with one, dense depth comes first, from cameras and tracks alone. Raises InputError
     of the calibration, which no other back end avoids.
@@ -287,21 +286,27 @@ def _try(
     except (InputError, RejectedError) as error:
         failure = error.with_traceback(None)
     give_back()  # memory of the back end
-    if reconstruction is not None and calibrate_options.known_length is not None:
-        reconstruction = densify(capture, reconstruction, depth_options, progress)
+    if reconstruction is not None and keep is not None:
+        keep(reconstruction)
+    if reconstruction is not None and options.calibrate.known_length is not None:
+        reconstruction = densify(capture, reconstruction, options.depth, progress)
     reconstruct_s = time.perf_counter() - start
     if reconstruction is not None:
         report("calibrate", 0.0)
         start = time.perf_counter()
         try:
-            hand_eye = calibrate(capture, reconstruction, calibrate_options)
+            hand_eye = calibrate(capture, reconstruction, options.calibrate)
         except RejectedError as error:
             failure = error.with_traceback(None)
         calibrate_s = time.perf_counter() - start
         give_back()
         report("calibrate", 1.0)
     backend = (
-        options.backend if options is not None else "" if reconstruction is None else reconstruction.backend
+        candidate.backend
+        if candidate is not None
+        else ""
+        if reconstruction is None
+        else reconstruction.backend
     )
     account = Attempt(
         backend=backend,
@@ -309,6 +314,6 @@ def _try(
         reconstruct_s=round(reconstruct_s, 3),
         calibrate_s=round(calibrate_s, 3),
         why_not=None if failure is None else str(failure),
-        features=None if options is None or options.features == "auto" else options.features,
+        features=None if candidate is None or candidate.features == "auto" else candidate.features,
     )
     return Trial(account=account, reconstruction=reconstruction, hand_eye=hand_eye, failure=failure)

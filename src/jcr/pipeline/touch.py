@@ -12,7 +12,7 @@ from jcr.calibration.cues import surface_at
 from jcr.distributions import chi2
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, skew
-from jcr.run_folder import RunResult
+from jcr.result import RunResult
 
 COLUMNS = ("image", "x_px", "y_px", "x_m", "y_m", "z_m")
 LEAST = 3

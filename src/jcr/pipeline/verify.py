@@ -27,7 +27,7 @@ from jcr.pipeline.options import VerifyOptions
 from jcr.progress import Progress, silent
 from jcr.reconstruct import reconstruct
 from jcr.records import Capture, CellCamera
-from jcr.run_folder import RunResult
+from jcr.result import RunResult
 from jcr.sfm.register import register
 
 ROUNDING = 1e-9

@@ -17,8 +17,8 @@ from jcr.report.residuals import residuals_section
 from jcr.report.scene3d import scene_section
 from jcr.report.transform import transform_section
 from jcr.report.verdict import failure_section, head, notes_section
+from jcr.result import RunResult
 from jcr.rounding import significant
-from jcr.run_folder import RunResult
 
 UNNAMED = {Path(name).stem for name in (*TABLES, "capture.json", "metadata.yaml")}
 """Files that are called so in every capture."""

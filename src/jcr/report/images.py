@@ -13,8 +13,8 @@ from jcr.capture.images import read_image
 from jcr.geometry import apply, inverse
 from jcr.records import Capture, ImageVerdict, Intrinsics
 from jcr.report.render import Section, image_url
+from jcr.result import RunResult
 from jcr.rounding import significant
-from jcr.run_folder import RunResult
 
 LARGEST, SMALLEST, PIXELS = 1024, 160, 6e6
 """Pixels across of the images, and of all together at most, which is about a megabyte; they open large."""

@@ -11,8 +11,8 @@ from jcr.capture.controllers import CONVENTIONS, OF_ARM, numbers_from_poses, uni
 from jcr.estimation.observability import WEAK
 from jcr.records import Capture, Excitation, NextPose
 from jcr.report.render import Section
+from jcr.result import RunResult
 from jcr.rounding import significant
-from jcr.run_folder import RunResult
 
 ANY_CONVENTION = "quat-xyzw"
 MATRICES = {"franka": "the matrix by columns", "matrix": "the matrix by rows"}

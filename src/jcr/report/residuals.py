@@ -5,8 +5,8 @@ import numpy as np
 from jcr.calibration.words import leave_one_out_text
 from jcr.report.images import shown_names
 from jcr.report.render import Section
+from jcr.result import RunResult
 from jcr.rounding import significant
-from jcr.run_folder import RunResult
 
 NOTICEABLE = 1.05
 """Times the random noise, from which the noise with systematic errors is named beside it."""

@@ -13,7 +13,7 @@ from jcr.geometry import apply_similarity, inverse, scale_translation
 from jcr.records import Intrinsics
 from jcr.report.images import image_numbers, shown_names
 from jcr.report.render import TRACK_COLOR, Section, label_colors
-from jcr.run_folder import RunResult
+from jcr.result import RunResult
 from jcr.scene.surface import point_size, sample_surface
 
 POINTS = 60_000

@@ -27,7 +27,7 @@ from jcr.progress import Progress, silent
 from jcr.records import Capture
 from jcr.report.render import TRACK_COLOR, label_colors, render
 from jcr.report.verdict import head
-from jcr.run_folder import RunResult
+from jcr.result import RunResult
 from jcr.scene.scene_map import SceneMap, Unknown
 from jcr.scene.surface import Slice, level_slice, sample_surface
 

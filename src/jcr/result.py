@@ -1,16 +1,9 @@
-"""Run folder: options and result of a run, the fingerprints of what its files were made from, and the lock of a writer.
+"""Options and result of a run: records that are read from the run folder when they are first used.
 
 A run folder is input like any other: it may have been edited or cut. An invalid file raises InputError of one line.
 """
 
-import fcntl
-import hashlib
-import json
-import os
-import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,22 +12,20 @@ from jaxtyping import Int
 from numpy import ndarray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from jcr import __version__
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration, read_calibration
-from jcr.capture.added import FOLDER as ADDED
 from jcr.capture.added import read_added
 from jcr.capture.read import read_capture
+from jcr.cell.added import read_added_cameras
 from jcr.cell.placement import CamerasFile, read_cameras
 from jcr.depth.depth_npz import FILE as DEPTH
-from jcr.depth.depth_npz import FORMAT as DEPTH_FORMAT
 from jcr.depth.depth_npz import read_depth
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError, first_fault
-from jcr.files import read_bytes, remove_unfinished
-from jcr.reconstruct import BACKENDS, ReconstructOptions, candidates, tries, with_cameras_of
-from jcr.records import Attempt, Capture, HandEye, Intrinsics, PointCloud, Reconstruction
-from jcr.records.npz import FORMAT, read_reconstruction
+from jcr.files import read_bytes
+from jcr.reconstruct import BACKENDS, ReconstructOptions, tries, with_cameras_of
+from jcr.records import Attempt, Capture, CellCamera, HandEye, Intrinsics, PointCloud, Reconstruction
+from jcr.records.npz import read_reconstruction
 from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import FILE as MAP
 from jcr.scene.map_file import load_map
@@ -45,16 +36,12 @@ if TYPE_CHECKING:
     from jcr.scene.scene_map import SceneMap
     from jcr.segments.measure import Measurement
 
-LOCK = ".lock"
-"""Locked by the run that writes there."""
-CAPTURE = "capture"
-"""Images and poses that were read from another format than capture.json."""
 STATE = "run.json"
-"""Capture, options and attempts of a run, and what reconstruction.npz was made from."""
+"""Capture, options and attempts of a run, and what its files were made from."""
 RECONSTRUCTION, CALIBRATION, LOG = "reconstruction.npz", "calibration.json", "log.txt"
 CLOUD, REPORT = "cloud.ply", "report.html"
-LARGE = 50_000_000
-"""Bytes. Size and date identify larger files, which are weights of networks; the content identifies others."""
+CAPTURE = "capture"
+"""Images and poses that were read from another format than capture.json."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,69 +77,10 @@ class RunState(BaseModel):
     options: RunOptions
     attempts: tuple[Attempt, ...] = ()
     """Attempts from which the reconstruction was selected."""
-    reconstruction: str
-    """Fingerprint of what reconstruction.npz was made from."""
-    run: str | None = None
-    """Fingerprint of the input and the files of a finished run; None of one that was not finished."""
-
-    @property
-    def depth(self) -> str:
-        """Fingerprint of the depth.npz that belongs to the reconstruction."""
-        # Whether depth is estimated changes nothing in it.
-        return fingerprint(self.reconstruction, replace(self.options.depth, dense=True), DEPTH_FORMAT)
-
-
-def state_of(capture: Capture, options: RunOptions) -> RunState:
-    """Return the state of a run before anything was tried; raise InputError for a name that is not UTF-8."""
-    folder = str(capture.folder.resolve())
-    try:
-        folder.encode()
-    except UnicodeEncodeError:
-        raise InputError(f"{capture.folder}: a folder whose name is not UTF-8; rename it") from None
-    made = options.reconstruct
-    # Back ends that `auto` means on this machine, and weights where they are files.
-    deciding = asdict(made) | {"backend": candidates(made)}
-    deciding["weights"] = Path(made.weights) if made.weights and Path(made.weights).exists() else made.weights
-    paths = {name: path.resolve() for name, path in vars(made).items() if isinstance(path, Path)}
-    images = [(name, capture.folder / name) for name in capture.images]
-    inputs = images, capture.base_from_gripper, capture.intrinsics
-    return RunState(
-        capture=folder,
-        options=replace(options, reconstruct=replace(made, **paths)),
-        reconstruction=fingerprint(*inputs, deciding, __version__, FORMAT),
-    )
-
-
-def fingerprint_of_run(out: Path, capture: Capture, state: RunState) -> str:
-    """Return the fingerprint of all that a run is made from, of its calibration.json, and of the files that exist."""
-    others = [
-        asdict(camera) | {"folder": [(camera.folder or capture.folder) / name for name in camera.images]}
-        for camera in capture.others
-    ]
-    files = [capture.folder / name for name in capture.depths or () if name is not None]
-    there = [name for name in (REPORT, RECONSTRUCTION, CLOUD, MAP) if (out / name).is_file()]
-    facts = vars(capture) | {"folder": files, "source": str(capture.source), "others": others}
-    return fingerprint(facts, state.reconstruction, state.options, there, out / CALIBRATION, out / ADDED)
-
-
-def fingerprint(*values: Any) -> str:
-    """Return a hash of values: records by their fields, arrays and files by their content."""
-    return hashlib.sha256(json.dumps(values, default=_identity).encode()).hexdigest()
-
-
-def _identity(value: Any) -> Any:
-    """Return what identifies an array, a file or a folder, or a record."""
-    if isinstance(value, ndarray):
-        return hashlib.sha256(value.tobytes()).hexdigest()
-    if not isinstance(value, Path):
-        return vars(value)
-    if value.is_dir():
-        return [(str(file), file) for file in sorted(value.rglob("*")) if file.is_file()]
-    if not value.exists():
-        return str(value)
-    if (stat := value.stat()).st_size > LARGE:
-        return stat.st_size, stat.st_mtime_ns
-    return hashlib.sha256(read_bytes(value)).hexdigest()
+    made: dict[str, str] = {}
+    """Fingerprint of what each stage that has finished made its files from, by the stage's name."""
+    files: dict[str, str] = {}
+    """Identity of each file of a run whose stages have all finished; empty of another."""
 
 
 class RunResult:
@@ -164,6 +92,8 @@ class RunResult:
     out: Path
     hand_eye: HandEye
     """State of the calibration, with the residuals of each image as arrays; only of a run of this process."""
+    timings: dict[str, float]
+    """Seconds of reconstruction and calibration by all back ends; only of a run of this process."""
     is_unchanged: bool = False
     """Whether the folder had the files of the same run already, and nothing was made."""
 
@@ -213,6 +143,13 @@ class RunResult:
     def added(self) -> Capture:
         """Images for the map alone that were added to the run later."""
         return read_added(self.out, self.capture)
+
+    @cached_property
+    def others(self) -> tuple[CellCamera, ...]:
+        """Other cameras of the cell, those of the capture and those added to the run."""
+        if self.capture.mount == "base":
+            return ()
+        return (*self.capture.others, *read_added_cameras(self.out, self.capture))
 
     @cached_property
     def reconstruction(self) -> Reconstruction:
@@ -302,32 +239,3 @@ class RunResult:
 def load_run(out: str | Path) -> RunResult:
     """Return the run in the folder `out`; InputError where there is none, or its calibration.json was damaged."""
     return RunResult(out, calibration=read_calibration(Path(out)))
-
-
-@contextmanager
-def locked(path: Path) -> Iterator[None]:
-    """Make and lock the folder, so that a second run on it writes nothing between the first one's files.
-
-    What a killed run had begun to write is removed, and so is a new folder into which nothing came.
-    """
-    new = not path.exists()
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        lock = (path / LOCK).open("w", encoding="utf-8")
-    except (FileExistsError, NotADirectoryError):
-        file = next(part for part in (path, *path.parents) if part.is_file())
-        raise InputError(f"{file}: is a file; name a folder for the results") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another folder") from None
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"{path}: another jcr is writing there; wait for it or choose another") from None
-        for place in (path, *(path / CAPTURE).rglob("."), path / ADDED):
-            remove_unfinished(place)
-        try:
-            yield
-        finally:
-            if new and os.listdir(path) == [LOCK]:
-                shutil.rmtree(path)

@@ -1,0 +1,443 @@
+"""Table of the stages of a run: each makes its files in the run folder from the records of the stages before it.
+
+capture -> reconstruct -> calibrate -> cameras -> densify -> map -> report
+"""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy import ndarray
+
+from jcr import __version__
+from jcr.allocator import give_back
+from jcr.boards.proposal import proposed_for
+from jcr.calibration.record import Calibration, calibration_of, failed_calibration, write_calibration
+from jcr.calibration.words import log
+from jcr.capture.added import FOLDER as ADDED
+from jcr.capture.added import write_added
+from jcr.cell.carried import carried_scene, refined
+from jcr.cell.placement import FILE as CAMERAS
+from jcr.cell.placement import CamerasFile, write_cameras
+from jcr.depth.densify import densify
+from jcr.depth.depth_npz import FORMAT as DEPTH_FORMAT
+from jcr.depth.depth_npz import is_made_from, write_depth
+from jcr.errors import InputError
+from jcr.files import read_bytes, write_text
+from jcr.findings import sentence
+from jcr.pipeline.selection import NothingFoundError, again, choose, timings_of
+from jcr.progress import Progress
+from jcr.reconstruct import candidates, device_of
+from jcr.records import Capture, Reconstruction
+from jcr.records.npz import FORMAT, write_reconstruction
+from jcr.result import (
+    CALIBRATION,
+    CLOUD,
+    DEPTH,
+    LOG,
+    MAP,
+    RECONSTRUCTION,
+    REPORT,
+    STATE,
+    RunOptions,
+    RunResult,
+    RunState,
+)
+from jcr.scene.cloud import write_cloud
+
+MOVING = "moving"
+"""Images of a fixed camera without what stands still; a carried thing is reconstructed from them."""
+LIVE = "result"
+"""Run folder of all images, in the folder of a capture that was calibrated while it was taken."""
+LARGE = 50_000_000
+"""Bytes. Size and date identify larger files, which are weights of networks; the content identifies others."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Row of the table of stages."""
+
+    name: str
+    files: tuple[str, ...]
+    """Names of the files that the stage writes into the run folder."""
+    inputs: Callable[[RunResult], Any]
+    """Function of the result so far; returns values, arrays and paths of files that the stage reads."""
+    options: tuple[str, ...]
+    """Fields of RunOptions that the stage uses."""
+    make: Callable[[RunResult, Progress], RunResult]
+    """Function of the result so far; writes the files and returns the result with the records of the stage."""
+
+    def made_from(self, result: RunResult) -> str:
+        """Return the fingerprint of inputs, options and version."""
+        options = [getattr(result.state.options, name) for name in self.options]
+        return fingerprint(self.name, self.inputs(result), options, __version__)
+
+
+def begun(out: Path, capture: Capture, options: RunOptions) -> RunResult:
+    """Return the result of a run before its first stage; raise InputError for a name that is not UTF-8."""
+    folder = str(capture.folder.resolve())
+    try:
+        folder.encode()
+    except UnicodeEncodeError:
+        raise InputError(f"{capture.folder}: a folder whose name is not UTF-8; rename it") from None
+    own = options.reconstruct
+    paths = {name: path.resolve() for name, path in vars(own).items() if isinstance(path, Path)}
+    options = replace(options, reconstruct=replace(own, **paths))
+    result = RunResult(out, capture=capture, state=RunState(capture=folder, options=options))
+    return with_state(result, made={"reconstruct": STAGES[0].made_from(result)})
+
+
+def with_state(result: RunResult, **fields: Any) -> RunResult:
+    """Return the result with other fields of its state."""
+    return result.with_parts(state=result.state.model_copy(update=fields))
+
+
+def stages_of(result: RunResult) -> tuple[Stage, ...]:
+    """Return the stages of a run with these options."""
+    left_out = set() if result.others else {"cameras"}
+    if result.state.options.map is None:
+        left_out |= {"densify", "map"}
+    return tuple(stage for stage in STAGES if stage.name not in left_out)
+
+
+def made_of(result: RunResult) -> dict[str, str]:
+    """Return the fingerprint of what each stage of a run is made from."""
+    return {stage.name: stage.made_from(result) for stage in stages_of(result)[1:]} | result.state.made
+
+
+def is_unchanged(result: RunResult) -> bool:
+    """Test whether no stage has anything to make: inputs, options and files are those of a finished run."""
+    with suppress(InputError, OSError):
+        before = RunResult(result.out).state
+        return before.made == made_of(result) and before.files == files_of(result.out) != {}
+    return False
+
+
+def make(result: RunResult, stages: Sequence[Stage], progress: Progress) -> RunResult:
+    """Run stages in order, each timed; return the result with their records."""
+    for stage in stages:
+        start = time.perf_counter()
+        result = stage.make(result, progress)
+        give_back()
+        if stage.name not in ("reconstruct", "calibrate"):  # they have the seconds of all back ends
+            timings = result.calibration.timings_s | {stage.name: round(time.perf_counter() - start, 3)}
+            result = result.with_parts(
+                calibration=result.calibration.model_copy(update={"timings_s": timings})
+            )
+    return result
+
+
+def finished(result: RunResult, stages: Sequence[Stage], progress: Progress) -> RunResult:
+    """Run the stages after the calibration, and note in run.json that all files of the run are there."""
+    if "cameras" not in [stage.name for stage in stages]:
+        (result.out / CAMERAS).unlink(missing_ok=True)
+        result = result.with_parts(cameras=None)
+    result = make(result, stages, progress)
+    rewrite_calibration(result.out, result.calibration)
+    return complete(result)
+
+
+def complete(result: RunResult) -> RunResult:
+    """Note in run.json that all files of a run are there, and what they were made from."""
+    result = with_state(result, made=made_of(result), files=files_of(result.out))
+    write_state(result)
+    return result
+
+
+def files_of(out: Path) -> dict[str, str]:
+    """Return the files of the stages that a run folder has, and images added to it, each with its identity.
+
+    The content identifies calibration.json and added images; others count where they exist.
+    """
+    names = [*(name for stage in STAGES for name in stage.files), ADDED]
+    return {
+        name: fingerprint(out / name) if name in (CALIBRATION, ADDED) else ""
+        for name in names
+        if (out / name).exists()
+    }
+
+
+def fingerprint(*values: Any) -> str:
+    """Return a hash of values: records by their fields, arrays and files by their content."""
+    return hashlib.sha256(json.dumps(values, default=_identity).encode()).hexdigest()
+
+
+def _identity(value: Any) -> Any:
+    """Return what identifies an array, a file or a folder, or a record."""
+    if isinstance(value, ndarray):
+        return hashlib.sha256(value.tobytes()).hexdigest()
+    if not isinstance(value, Path):
+        return vars(value)
+    if value.is_dir():
+        return [(str(file.relative_to(value)), file) for file in sorted(value.rglob("*")) if file.is_file()]
+    if not value.exists():
+        return str(value)
+    if (stat := value.stat()).st_size > LARGE:
+        return stat.st_size, stat.st_mtime_ns
+    return hashlib.sha256(read_bytes(value)).hexdigest()
+
+
+def _images(result: RunResult) -> Any:
+    """Return images, gripper poses and intrinsics, and the back ends and weights that the options mean here."""
+    capture, options = result.capture, result.state.options.reconstruct
+    weights = Path(options.weights) if options.weights and Path(options.weights).exists() else None
+    images = [(name, capture.folder / name) for name in capture.images]
+    return images, capture.base_from_gripper, capture.intrinsics, candidates(options), weights, FORMAT
+
+
+def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
+    """Select a reconstruction among the back ends, with its calibration; or read the one of the same inputs.
+
+    Where the camera watches the gripper, the carried object is the scene.
+    """
+    capture, out, options = result.capture, result.out, result.state.options
+    seen = capture
+    if capture.mount == "base":
+        # The arm's kinematics are those of the reported poses, and not of their inverses.
+        seen, own = carried_scene(capture, out / MOVING), replace(options.calibrate, robot=None)
+        options = replace(options, calibrate=own)
+    before = _with_same_reconstruction(result, seen)
+    try:
+        if before is None:
+            found = choose(seen, options, progress, partial(keep_reconstruction, result))
+        else:
+            found = again(seen, lambda: before.reconstruction, options, progress)
+    except NothingFoundError as error:
+        if _with_same_reconstruction(result, seen) is None:
+            forget_reconstruction(out)
+        raise _failed(result, error) from None
+    attempts = found.attempts if before is None else before.state.attempts or found.attempts
+    result = with_state(result, attempts=attempts).with_parts(
+        reconstruction=found.reconstruction, hand_eye=found.hand_eye, timings=timings_of(found.attempts)
+    )
+    there = _with_same_reconstruction(result, seen)
+    if there is None or there.out != out:
+        keep_reconstruction(result, found.reconstruction)
+    else:
+        write_state(result)
+    _keep_depth(result)
+    return result
+
+
+def _with_same_reconstruction(result: RunResult, seen: Capture) -> RunResult | None:
+    """Return the earlier run of the folder, or of `jcr capture`, whose reconstruction was made from the same inputs.
+
+    A state that cannot be read proves nothing: to make every stage again is always right.
+    """
+    out, made = result.out, result.state.made
+    for folder in (out, result.capture.folder / LIVE):
+        before, is_same = RunResult(folder, capture=seen), False
+        with suppress(InputError):
+            is_same = before.state.made.get("reconstruct") == made["reconstruct"]
+        if is_same and (folder / RECONSTRUCTION).is_file():
+            if folder == out and not is_made_from(out / DEPTH, _depth_made_from(result)):
+                (out / DEPTH).unlink(missing_ok=True)
+            return before
+    return None
+
+
+def keep_reconstruction(result: RunResult, reconstruction: Reconstruction) -> None:
+    """Write a reconstruction, then its fingerprint; pointmaps that were estimated become depth.npz."""
+    forget_reconstruction(result.out)
+    pointmaps = reconstruction.pointmaps
+    predicted = pointmaps if pointmaps is not None and pointmaps.is_predicted else None
+    write_reconstruction(result.out / RECONSTRUCTION, replace(reconstruction, pointmaps=predicted))
+    write_state(result)
+
+
+def forget_reconstruction(out: Path) -> None:
+    """Remove the reconstruction of other inputs, its state first: a kill leaves no file with the state of another."""
+    for name in (STATE, DEPTH, RECONSTRUCTION):
+        (out / name).unlink(missing_ok=True)
+
+
+def _failed(result: RunResult, error: NothingFoundError) -> NothingFoundError:
+    """Return the error, with the --board that the images show, after its reason is written to the folder."""
+    from jcr.report.html import failed_report_html
+
+    capture, tried = result.capture, error.attempts
+    board = proposed_for(capture, result.state.options.reconstruct.board)
+    content = failed_calibration(
+        capture, tried[-1].backend, error.findings, timings_of(tried), __version__, tried
+    )
+    content = content if board is None else content.with_findings(board)
+    keep_calibration(result.out, content)
+    write_text(result.out / REPORT, failed_report_html(capture, content, for_report(result.state.options)))
+    complete(result)
+    return error if board is None else NothingFoundError(error.with_more(sentence(board)), tried)
+
+
+def _poses_and_robot(result: RunResult) -> Any:
+    """Return all facts of the capture, with the depth images that the calibration compares."""
+    capture = result.capture
+    depths = [capture.folder / name for name in capture.depths or () if name is not None]
+    return vars(capture) | {"folder": depths, "source": str(capture.source), "others": None}
+
+
+def _calibrate(result: RunResult, progress: Progress) -> RunResult:
+    """Write the calibration of the reconstruction that was selected."""
+    capture, reconstruction, hand_eye = result.capture, result.reconstruction, result.hand_eye
+    if capture.mount == "base":
+        hand_eye = refined(capture, reconstruction, hand_eye, result.state.options.calibrate)
+    parts = capture, reconstruction, hand_eye, result.timings, __version__
+    content = calibration_of(*parts, result.state.attempts)
+    if content.verdict == "rejected" or content.short is not None:
+        board = proposed_for(capture, result.state.options.reconstruct.board)
+        content = content if board is None else content.with_findings(board)
+    keep_calibration(result.out, content)
+    return result.with_parts(calibration=content, hand_eye=hand_eye)
+
+
+def keep_calibration(out: Path, content: Calibration) -> None:
+    """Write calibration.json and log.txt; what was made from another one goes first, so that the two never mix."""
+    same = False
+    with suppress(InputError):
+        before = RunResult(out).calibration
+        same = (before.mount, before.scale) == (content.mount, content.scale)
+        same = same and np.array_equal(before.parent_from_camera, content.parent_from_camera)  # pyright: ignore[reportArgumentType]
+    for name in () if same else (CLOUD, MAP, REPORT, CAMERAS):
+        (out / name).unlink(missing_ok=True)
+    rewrite_calibration(out, content)
+
+
+def rewrite_calibration(out: Path, content: Calibration) -> None:
+    """Write calibration.json and log.txt."""
+    write_calibration(out / CALIBRATION, content)
+    write_text(out / LOG, log(content))
+
+
+def write_state(result: RunResult) -> None:
+    """Write run.json."""
+    content = result.state.model_dump(mode="json", warnings=False)
+    write_text(result.out / STATE, json.dumps(content, indent=2) + "\n")
+
+
+def _other_cameras(result: RunResult) -> Any:
+    """Return the other cameras of the cell with their images."""
+    folder = result.capture.folder
+    return [
+        vars(one) | {"folder": [(one.folder or folder) / name for name in one.images]}
+        for one in result.others
+    ]
+
+
+def place(result: RunResult, progress: Progress) -> CamerasFile:
+    """Return the other cameras of the cell as cameras.json has them."""
+    from jcr.cell.stage import place_cameras
+
+    parts = result.capture, result.others, result.reconstruction, result.hand_eye
+    return place_cameras(*parts, result.state.options.calibrate, progress).file(__version__)
+
+
+def _cameras(result: RunResult, progress: Progress) -> RunResult:
+    """Locate the other cameras of the cell."""
+    found = place(result, progress)
+    write_cameras(result.out, found)
+    return result.with_parts(cameras=found)
+
+
+def _depth_made_from(result: RunResult) -> str:
+    """Return the fingerprint of the depth.npz that belongs to the reconstruction."""
+    # Whether depth is estimated changes nothing in it.
+    depth = replace(result.state.options.depth, dense=True)
+    return fingerprint(result.state.made["reconstruct"], depth, DEPTH_FORMAT)
+
+
+def _densify(result: RunResult, progress: Progress) -> RunResult:
+    """Add the dense depth of the map: predicted, in the folder, or estimated now."""
+    options = result.state.options.depth
+    result = result.with_parts(
+        reconstruction=densify(result.capture, result.reconstruction, options, progress)
+    )
+    _keep_depth(result)
+    return result
+
+
+def _keep_depth(result: RunResult) -> None:
+    """Write depth.npz, where the reconstruction has estimated pointmaps and they are not there already."""
+    pointmaps, file, made = result.reconstruction.pointmaps, result.out / DEPTH, _depth_made_from(result)
+    if pointmaps is not None and not pointmaps.is_predicted and not is_made_from(file, made):
+        write_depth(file, result.reconstruction, made)
+
+
+def _map(result: RunResult, progress: Progress) -> RunResult:
+    """Add cloud, map and measured objects, with the images that were added later.
+
+    Raises InputError where no point is confident enough, or the options leave nothing to map.
+    """
+    # Labels and sizes need half of SciPy, the map torch, which takes seconds; a calibration does not.
+    from jcr.depth.added import extend
+    from jcr.depth.measured import with_measured_depth
+    from jcr.scene.build import build_scene
+    from jcr.scene.cloud import point_cloud
+    from jcr.segments.measure import measure_objects
+    from jcr.segments.segments import image_labels, label_cloud
+    from jcr.segments.tabletop import fit_support
+
+    options, capture, hand_eye, added = result.state.options, result.capture, result.hand_eye, result.added
+    assert options.map is not None  # or this stage is left out
+    made = result.reconstruction
+    if len(added):
+        made = extend(made, hand_eye, len(capture), added, progress)
+    made, remarks = with_measured_depth(capture, made, hand_eye)
+    given = image_labels(capture, made, hand_eye, options.segment, progress)
+    labels, names = (None, ("none",)) if given is None else (given.labels, given.names)
+    cloud, support = point_cloud(capture, made, hand_eye, labels, options.cloud, names), None
+    with suppress(InputError):
+        support = fit_support(cloud)
+    cloud, more = label_cloud(cloud, options.segment, support)
+    notes = [*remarks, *more]
+    if len(added) and options.segment.segments in ("auto", "labels") and given is not None:
+        notes.append(
+            "images added later have no label images; --segments tabletop labels what they show, too"
+        )
+    give_back()
+    with ThreadPoolExecutor(1) as beside:
+        sizes = None if support is None else beside.submit(measure_objects, cloud, result.scale_std, support)
+        scene = build_scene(cloud, options.map, progress, device=device_of(options.reconstruct))
+        measured = None if sizes is None else sizes.result()
+    write_cloud(result.out / CLOUD, cloud)
+    scene.save(result.out / MAP)
+    if len(added):
+        write_added(added, capture)
+    return noted(result.with_parts(cloud=cloud, scene=scene, measured=measured), *notes)
+
+
+def _report(result: RunResult, progress: Progress) -> RunResult:
+    """Write the report."""
+    from jcr.report.html import report_html
+
+    progress("report", 0.0)
+    write_text(result.out / REPORT, report_html(result, for_report(result.state.options)))
+    progress("report", 1.0)
+    return result
+
+
+def for_report(options: RunOptions) -> dict[str, Mapping[str, Any]]:
+    """Return the options of the stages up to the map, which has its own history."""
+    stages = {"reconstruct": options.reconstruct, "calibrate": options.calibrate, "densify": options.depth}
+    return {stage: asdict(own) for stage, own in stages.items()}
+
+
+def noted(result: RunResult, *notes: str | None) -> RunResult:
+    """Return the result with more notes."""
+    every = [*result.calibration.notes, *filter(None, notes)]
+    return result.with_parts(calibration=result.calibration.model_copy(update={"notes": every}))
+
+
+STAGES = (
+    Stage("reconstruct", (RECONSTRUCTION,), _images, ("reconstruct",), _reconstruct),
+    Stage("calibrate", (CALIBRATION,), _poses_and_robot, ("calibrate",), _calibrate),
+    Stage("cameras", (CAMERAS,), _other_cameras, (), _cameras),
+    Stage("densify", (DEPTH,), _depth_made_from, (), _densify),
+    Stage("map", (CLOUD, MAP), lambda result: (), ("cloud", "map", "segment"), _map),
+    Stage("report", (REPORT,), lambda result: (), (), _report),
+)
