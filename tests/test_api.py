@@ -5,14 +5,12 @@ import re
 import shutil
 import subprocess
 import sys
-from io import BytesIO
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
 
 import jcr
 from corpus import sound_run
@@ -23,10 +21,6 @@ from jcr.geometry import apply, rotation_exp, transform
 from jcr.options import checked_options
 from jcr.result import RunOptions
 from places import ROOT
-
-
-def python(code: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
 
 
 def test_the_api_is_listed_and_every_name_of_it_is_there():
@@ -48,50 +42,41 @@ def _own_types(value: Any) -> set[type]:
     return {kind for kind in found if kind.__module__.startswith("jcr")}
 
 
-def _functions_of(record: type) -> list[Any]:
-    """Its methods and properties as functions, without those of other packages' bases."""
-    members = [vars(record)[name] for name in vars(record) if not name.startswith("_")]
-    functions = [getattr(member, "fget", None) or getattr(member, "__func__", member) for member in members]
-    return [one for one in functions if inspect.isfunction(one) and one.__module__.startswith("jcr")]
-
-
 def test_every_type_of_a_public_function_has_a_public_name():
     """Of functions, and of the methods and properties of what they take and return."""
     pytest.importorskip("torch")
     public = {getattr(jcr, name) for name in jcr.__all__}
-    records = [one for one in public if inspect.isclass(one)]
-    functions = [
-        *filter(inspect.isfunction, public),
-        *(one for each in records for one in _functions_of(each)),
-    ]
+    functions = [*filter(inspect.isfunction, public)]
+    for record in filter(inspect.isclass, public):
+        members = [value for name, value in vars(record).items() if not name.startswith("_")]
+        own = [getattr(one, "fget", None) or getattr(one, "__func__", one) for one in members]
+        functions += [one for one in own if inspect.isfunction(one) and one.__module__.startswith("jcr")]
     assert len(functions) > 80, "the annotations are read"
     for value in (*functions, jcr.RunOptions, jcr.RunResult, jcr.SegmentOptions):
         assert _own_types(value) <= public, value
 
 
 @pytest.mark.slow
-def test_others_write_pngs_and_archives_where_jcr_came_first():
+def test_others_write_pngs_and_archives_where_jcr_came_first_and_a_later_import_is_warned_of():
     write = "Image.effect_noise((640, 480), 50).save(io.BytesIO(), 'PNG'); zlib.compress(b'a' * 10000)"
-    done = python(f"import jcr, pycolmap, io, zlib; from PIL import Image; {write}")
-    assert done.returncode == 0, done.stderr
+    code = f"import jcr, pycolmap, io, zlib; from PIL import Image; {write}", "import pycolmap, jcr"
+    first, second = (
+        subprocess.run([sys.executable, "-c", one], capture_output=True, text=True, timeout=120)
+        for one in code
+    )
+    assert first.returncode == 0, first.stderr
+    assert "import jcr first" in second.stderr and "import jcr first" not in first.stderr
 
 
-@pytest.mark.slow
-def test_an_import_of_pycolmap_before_jcr_is_warned_of():
-    assert "import jcr first" in python("import pycolmap, jcr").stderr
-    assert "import jcr first" not in python("import jcr, pycolmap").stderr
-
-
-@pytest.mark.parametrize("shape", [(7, 5, 3), (480, 640), (1, 1)])
-@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+@pytest.mark.parametrize(
+    ("shape", "kind"),
+    [((7, 5, 3), np.uint8), ((480, 640), np.uint8), ((480, 640), np.uint16), ((1, 1), np.uint16)],
+)
 def test_a_png_holds_the_same_pixels(shape: tuple[int, ...], kind: type):
-    if kind == np.uint16 and len(shape) == 3:
-        pytest.skip("depth is grey")
     pixels = np.random.default_rng(1).integers(0, np.iinfo(kind).max, shape, kind, endpoint=True)
     file = encode_png(pixels[::-1])
     read = np.asarray(cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_UNCHANGED))
     np.testing.assert_array_equal(read[..., ::-1] if pixels.ndim == 3 else read, pixels[::-1])
-    np.testing.assert_array_equal(np.asarray(Image.open(BytesIO(file))), pixels[::-1])
 
 
 @pytest.mark.parametrize(
@@ -109,25 +94,22 @@ def test_wrong_options_are_input_errors_before_any_work(options, message: str, t
     assert not (tmp_path / "out").exists()
 
 
-def test_conventions_and_formats_are_checked_and_named(tabletop: Path):
-    with pytest.raises(jcr.InputError, match="pose_convention: 'kukka'.*did you mean kuka"):
-        jcr.read_capture(tabletop, {"pose_convention": "kukka"})
-    assert jcr.read_capture(str(tabletop), {"frames": 12}).images
-    with pytest.raises(jcr.InputError, match="give jcr.RunOptions"):
-        checked_options(ReadOptions(), RunOptions)  # pyright: ignore[reportArgumentType]
-
-
-def test_options_take_text_for_paths_and_lists_for_tuples():
+def test_options_take_text_for_paths_lists_for_tuples_and_name_what_they_are(tabletop: Path):
     found = checked_options({"poses": "poses.csv", "episode": [0, 2]}, ReadOptions)
     assert found == ReadOptions(poses=Path("poses.csv"), episode=(0, 2))
     assert checked_options(None, RunOptions) == RunOptions()
+    assert jcr.read_capture(str(tabletop), {"frames": 12}).images
+    with pytest.raises(jcr.InputError, match="pose_convention: 'kukka'.*did you mean kuka"):
+        jcr.read_capture(tabletop, {"pose_convention": "kukka"})
+    with pytest.raises(jcr.InputError, match="give jcr.RunOptions"):
+        checked_options(ReadOptions(), RunOptions)  # pyright: ignore[reportArgumentType]
 
 
 def test_a_run_is_loaded_and_compared_by_path_record_and_matrix(tmp_path: Path):
     out = sound_run(tmp_path)
     loaded = jcr.load_run(str(out))
     assert loaded.verdict == loaded.calibration.verdict and loaded.converged == loaded.calibration.converged
-    assert loaded.covariance.shape == (7, 7) and loaded.capture.images == loaded.capture.images
+    assert loaded.covariance.shape == (7, 7)
     with pytest.raises(jcr.InputError, match="the camera's mount is gripper: read gripper_from_camera and"):
         _ = loaded.base_from_camera
     matrix = loaded.gripper_from_camera.tolist()

@@ -7,16 +7,19 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from conftest import shrunk_capture
 from dying_process import copies_a_run, dies_on_bad
 from jcr.calibration.options import CalibrateOptions
+from jcr.capture.images import encode_png
 from jcr.capture.options import ReadOptions
 from jcr.cli import dispatch
 from jcr.pipeline import batch as module
 from jcr.pipeline.batch import BatchRow, Task, batch, run_one
 from jcr.pipeline.options import BatchOptions
-from jcr.pipeline.run import RunOptions
+from jcr.result import RunOptions
 
 pytestmark = pytest.mark.slow
 
@@ -26,31 +29,30 @@ COMPLETE = BatchOptions(calibrate_only=True, processes=2)
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> list[Path]:
     """Four and five small images of the table, one folder with a broken image, one with no features."""
-    from PIL import Image
-
     root = tmp_path_factory.mktemp("captures")
-    content = json.loads((tabletop / "capture.json").read_text())
-    intrinsics = content["intrinsics"] | {key: content["intrinsics"][key] / 2 for key in ("fx", "fy")}
-    intrinsics |= {"cx": 159.5, "cy": 119.5}
-    for name, rows in (("a", range(4)), ("b", range(5)), ("broken", range(4)), ("plain", range(4))):
-        (root / name / "images").mkdir(parents=True)
-        frames = [content["frames"][k] for k in rows]
-        for k, frame in enumerate(frames):
-            image = Image.open(tabletop / frame["image"]).resize((320, 240), Image.Resampling.BOX)
-            if name == "plain":
-                image = Image.new("RGB", (320, 240), (90 + 8 * k, 90, 90))
-            image.save(root / name / frame["image"], quality=95)
-        (root / name / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": intrinsics}))
+    folders = [
+        shrunk_capture(tabletop, root / name, count, 320)
+        for name, count in (("a", 4), ("b", 5), ("broken", 4), ("plain", 4))
+    ]
     for name in ("01.jpg", "02.jpg"):  # two that are left are too few
         (root / "broken" / "images" / name).write_bytes(b"no picture")
-    return [root / name for name in ("a", "b", "broken", "plain")]
+    for k, image in enumerate((root / "plain" / "images").iterdir()):
+        image.write_bytes(encode_png(np.full((240, 320, 3), 90 + 8 * k, np.uint8)))
+    return folders
+
+
+def edit(capture: Path, **values: object) -> None:
+    """Change keys of capture.json, or move the first gripper pose."""
+    content = json.loads((capture / "capture.json").read_text()) | values
+    if not values:
+        content["frames"][0]["base_from_gripper"][0][3] += 1e-4
+    (capture / "capture.json").write_text(json.dumps(content))
 
 
 def test_a_bad_capture_fails_alone_and_what_is_finished_is_not_run_again(
     captures: list[Path], tmp_path: Path, capsys
 ):
-    out = tmp_path / "all"
-    names = [str(path) for path in captures]
+    out, names = tmp_path / "all", [str(path) for path in captures]
     command = ["batch", *names, str(out), "--calibrate-only", "--processes", "2", "--quiet"]
     assert dispatch([*command, "--json"]) == 3
     printed = capsys.readouterr()
@@ -59,42 +61,66 @@ def test_a_bad_capture_fails_alone_and_what_is_finished_is_not_run_again(
     assert rows["broken"].status == "failed" and "not a readable image" in rows["broken"].reason
     assert rows["plain"].status == "rejected" and "registered" in rows["plain"].reason
     assert rows["a"].images == 4 and rows["b"].images == 5 and rows["b"].offset_std_mm is not None
-
     with (out / "summary.csv").open() as file:
         table = list(csv.DictReader(file))
     assert len(table) == 4 and table[-1]["status"] == "failed"
     page = (out / "summary.html").read_text()
     assert page.count("<tr>") == 5 and "not a readable image" in page
 
-    stamps = {name: (out / name / "calibration.json").stat().st_mtime_ns for name in ("a", "b", "plain")}
-    content = json.loads((captures[0] / "capture.json").read_text())
-    content["frames"][0]["base_from_gripper"][0][3] += 1e-4
-    (captures[0] / "capture.json").write_text(json.dumps(content))
+    def stamps() -> dict[str, int]:
+        return {name: (out / name / "calibration.json").stat().st_mtime_ns for name in ("a", "b", "plain")}
+
+    before = stamps()
+    edit(captures[0])
     assert dispatch(command) == 3
     assert str(out / "summary.html") in capsys.readouterr().out
-    again = {name: (out / name / "calibration.json").stat().st_mtime_ns for name in stamps}
-    assert again["a"] > stamps["a"] and again["b"] == stamps["b"] and again["plain"] == stamps["plain"]
+    after = stamps()
+    assert after["a"] > before["a"] and after["b"] == before["b"] and after["plain"] == before["plain"]
 
 
-def test_deleted_results_and_changed_facts_of_a_capture_are_made_again(tmp_path: Path, captures: list[Path]):
-    """Joints, the robot and a result that is gone count as the images and poses do."""
-    capture, out = tmp_path / "capture", tmp_path / "all"
-    shutil.copytree(captures[1], capture)
+def test_deleted_results_and_changed_facts_of_a_capture_are_made_again(
+    tmp_path: Path, captures: list[Path], monkeypatch: pytest.MonkeyPatch
+):
+    """Robot, URDF, joints, depth, further cameras and a result that is gone count as the images and poses do."""
+    capture, report = shutil.copytree(captures[1], tmp_path / "capture"), tmp_path / "all/capture/report.html"
+    shutil.copytree(capture / "images", capture / "other")
+    depth = [f"{k}.png" for k in range(5)]
+    for name in depth:
+        (capture / name).write_bytes(encode_png(np.full((240, 320), 600, np.uint16)))
+    (capture / "robot.urdf").write_text('<robot name="r"><link name="base"/></robot>')
+    frames = json.loads((capture / "capture.json").read_text())["frames"]
 
-    def stamp() -> int:
-        (row,) = batch([capture], out, RunOptions(), replace(COMPLETE, processes=1))
-        assert row.status != "failed", row.reason
-        return (out / "capture" / "calibration.json").stat().st_mtime_ns
+    def is_made() -> bool:
+        """Run the batch, with a stage in place of the work, and return whether it was called."""
+        called = []
 
-    first = stamp()
-    assert stamp() == first
-    (out / "capture" / "report.html").unlink()
-    second = stamp()
-    assert second > first and (out / "capture" / "report.html").is_file()
-    content = json.loads((capture / "capture.json").read_text())
-    content["robot"] = "ur5e"
-    (capture / "capture.json").write_text(json.dumps(content))
-    assert stamp() > second
+        def noted(result: object, stages: object, progress: object) -> None:
+            called.append(result)
+            raise module.InputError("no work here")
+
+        with monkeypatch.context() as patched:
+            patched.setattr("jcr.pipeline.run.make", noted)
+            run_one(task)
+        return bool(called)
+
+    read = ReadOptions()
+    task = Task(capture=capture, out=report.parent, run=RunOptions(), calibrate_only=True, read=read)
+    assert run_one(task).status != "failed" and not is_made()
+    for changed in (
+        {"robot": "ur5e"},
+        {"intrinsics_std": [1.0, 1.0, 1.0, 1.0]},
+        {"cameras": {"fixed": {"mount": "base", "intrinsics": None, "images": ["other/00.jpg"]}}},
+        {"frames": [frame | {"depth": name} for frame, name in zip(frames, depth, strict=True)]},
+        {"frames": [frame | {"joints": [0.1 * k] * 6} for k, frame in enumerate(frames)]},
+        {"urdf": "robot.urdf"},
+    ):
+        before = (capture / "capture.json").read_text()
+        edit(capture, **changed)
+        assert is_made(), changed
+        (capture / "capture.json").write_text(before)
+        assert not is_made(), changed
+    report.unlink()
+    assert is_made()
 
 
 def test_cores_are_counted_where_processes_cannot_be_bound_to_them(
@@ -105,12 +131,26 @@ def test_cores_are_counted_where_processes_cannot_be_bound_to_them(
     assert row.status == "failed" and "not a readable image" in row.reason
 
 
-def test_a_process_that_dies_takes_no_other_capture_with_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_a_recording_is_not_extracted_into_a_folder_where_another_process_writes(
+    tmp_path: Path, captures: list[Path]
+):
+    read = ReadOptions()
+    with module.locked(tmp_path):
+        task = Task(capture=captures[0], out=tmp_path, run=RunOptions(), calibrate_only=True, read=read)
+        row = run_one(task)
+    assert row.status == "failed" and "another jcr is writing there" in row.reason
+    assert not (tmp_path / "capture").exists()
+
+
+def test_a_process_that_dies_takes_no_other_capture_with_it_and_names_are_kept_apart(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
     monkeypatch.setattr(module, "run_one", dies_on_bad)
-    paths = [tmp_path / name for name in ("one", "bad", "two", "three")]
+    paths = [tmp_path / name for name in ("one", "bad", "two", "a/two", "two-2")]
     rows = batch(paths, tmp_path / "out", RunOptions(), COMPLETE)
-    assert [row.status for row in rows] == ["accepted", "accepted", "accepted", "failed"]
+    assert [row.status for row in rows] == ["accepted"] * 4 + ["failed"]
     assert "process died" in rows[-1].reason
+    assert {Path(row.out).name for row in rows} == {"one", "bad", "two", "two-2", "two-2-2"}
 
 
 def test_the_episode_whose_camera_moved_is_named(
@@ -127,22 +167,11 @@ def test_the_episode_whose_camera_moved_is_named(
 
 def test_a_capture_that_falls_short_of_what_is_required_is_rejected(tmp_path: Path, captures: list[Path]):
     options = RunOptions(calibrate=CalibrateOptions(require=(0.001, 0.001)))
-    row = run_one(
-        Task(capture=captures[1], out=tmp_path / "b", run=options, calibrate_only=True, read=ReadOptions())
-    )
+    out, read = tmp_path / "b", ReadOptions()
+    row = run_one(Task(capture=captures[1], out=out, run=options, calibrate_only=True, read=read))
     assert row.status == "rejected" and row.reason, row
 
 
-def test_folders_of_one_name_are_kept_apart(tmp_path: Path):
-    assert module._names([tmp_path / "a/x", tmp_path / "b/x", tmp_path / "x-2", tmp_path / "b/x"]) == [
-        "x",
-        "x-2",
-        "x-2-2",
-        "x-3",
-    ]
-
-
-@pytest.mark.slow
 def test_a_node_of_a_ray_cluster_that_dies_loses_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     pytest.importorskip("ray", reason="the extra jcr-handeye[cluster] is not installed")
     from ray.cluster_utils import Cluster
@@ -167,9 +196,8 @@ def test_a_node_of_a_ray_cluster_that_dies_loses_nothing(monkeypatch: pytest.Mon
                 removed.touch()
 
         options = replace(COMPLETE, ray=cluster.address)
-        greedy = replace(options, cpus_per_task=64)
         with pytest.raises(module.InputError, match="no node has the 64 cores"):
-            batch([tmp_path / "0"], tmp_path / "none", RunOptions(), greedy)
+            batch([first], tmp_path / "none", RunOptions(), replace(options, cpus_per_task=64))
         rows = batch([tmp_path / f"{k}" for k in range(6)], tmp_path / "out", RunOptions(), options, kill)
     finally:
         cluster.shutdown()

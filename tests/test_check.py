@@ -3,8 +3,10 @@
 import json
 import re
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +16,7 @@ import capture_writers as writers
 import jcr
 from conftest import shrunk_capture
 from jcr.calibration.checks.left_out import left_out_poses
-from jcr.capture.images import BLURRED_EDGE, edge_width, read_image
+from jcr.capture.images import BLURRED_EDGE, edge_width, encode_png, read_image
 from jcr.cli import dispatch
 from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.findings import FindingKind
@@ -22,22 +24,23 @@ from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 from simulation.problems import hand_eye_problem
 
 RNG = np.random.default_rng(0)
-INTRINSICS = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480)
 
 
-def written(folder: Path, images: list[np.ndarray], frames: list[dict]) -> Path:
-    (folder / "images").mkdir(parents=True)
-    for image, frame in zip(images, frames, strict=True):
-        cv2.imwrite(str(folder / frame["image"]), image)
-    (folder / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": None}))
+def changed(source: Path, folder: Path, change: Callable[[dict[str, Any]], None]) -> Path:
+    """Copy a capture with a change of its capture.json."""
+    shutil.copytree(source / "images", folder / "images")
+    content = json.loads((source / "capture.json").read_text())
+    change(content)
+    (folder / "capture.json").write_text(json.dumps(content))
     return folder
 
 
-def test_a_camera_at_rest_is_named_before_anything_is_matched(tabletop: Path, tmp_path: Path, capsys):
-    frames = json.loads((tabletop / "capture.json").read_text())["frames"][:4]
-    one = cv2.imread(str(tabletop / frames[0]["image"])).astype(float)
-    noisy = [np.clip(one + RNG.normal(0, 6, one.shape), 0, 255).astype(np.uint8) for _ in frames]
-    assert dispatch(["check", str(written(tmp_path / "still", noisy, frames)), "--json"]) == 3
+def test_a_camera_at_rest_is_named_before_anything_is_matched(small_capture: Path, tmp_path: Path, capsys):
+    folder = shutil.copytree(small_capture, tmp_path / "still")
+    one = read_image(folder / "images/00.jpg").astype(float)
+    for file in (folder / "images").iterdir():
+        file.write_bytes(encode_png(np.clip(one + RNG.normal(0, 6, one.shape), 0, 255).astype(np.uint8)))
+    assert dispatch(["check", str(folder), "--json"]) == 3
     said = capsys.readouterr()
     found = json.loads(said.out)
     assert found["verdict"] == "rejected" and "all images show the same view" in found["warnings"][0]
@@ -58,10 +61,11 @@ def test_blur_is_measured_by_the_image_itself(tabletop: Path):
 @pytest.mark.slow
 def test_a_wrong_focal_length_is_named_before_what_follows_from_it(tabletop: Path, tmp_path: Path, capsys):
     """Half as long again: 303.9 px are true."""
-    folder = shrunk_capture(tabletop, tmp_path / "capture", 8, 320)
-    content = json.loads((folder / "capture.json").read_text())
-    content["intrinsics"] |= {name: 1.5 * content["intrinsics"][name] for name in ("fx", "fy")}
-    (folder / "capture.json").write_text(json.dumps(content))
+
+    def change(content: dict[str, Any]) -> None:
+        content["intrinsics"] |= {name: 1.5 * content["intrinsics"][name] for name in ("fx", "fy")}
+
+    folder = changed(shrunk_capture(tabletop, tmp_path / "shrunk", 8, 320), tmp_path / "capture", change)
     assert dispatch(["check", str(folder)]) == 0  # the calibration estimates it
     said = capsys.readouterr().out
     first = next(line for line in said.splitlines() if line.startswith("WARNING"))
@@ -74,54 +78,42 @@ def test_a_wrong_focal_length_is_named_before_what_follows_from_it(tabletop: Pat
 
 def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():
     problem = hand_eye_problem(np.random.default_rng(1), 12, robot_noise=(2e-4, 5e-4))
-    gripper = problem.base_from_gripper.copy()
+    right = problem.base_from_gripper
+    gripper = right.copy()
     gripper[[3, 8]] = gripper[[8, 3]]
     gripper[5, :3, 3] += 0.08
     names = tuple(f"{k}.png" for k in range(12))
+    capture = Capture(folder=Path(), images=names, base_from_gripper=gripper, image_size=(640, 480))
+    none = np.zeros(0, int)
     made = Reconstruction(
         image_index=np.arange(12),
         recon_from_camera=problem.recon_from_camera,
-        intrinsics=INTRINSICS,
-        tracks=Tracks(
-            image=np.zeros(0, int),
-            x_px=np.zeros((0, 2)),
-            point=np.zeros(0, int),
-            points_in_recon=np.zeros((0, 3)),
-        ),
+        intrinsics=Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480),
+        tracks=Tracks(image=none, x_px=np.zeros((0, 2)), point=none, points_in_recon=np.zeros((0, 3))),
         backend="given",
     )
     hand_eye = fit_hand_eye(gripper, problem.recon_from_camera)
     assert hand_eye.converged and not hand_eye.inliers[[3, 5, 8]].any()
-    found = left_out_poses(
-        Capture(folder=Path(), images=names, base_from_gripper=gripper, image_size=(640, 480)), made, hand_eye
-    )
+    found = left_out_poses(capture, made, hand_eye)
     assert [(one.kind, one.severity, one.images) for one in found] == [
         (FindingKind.POSES_SWAPPED, "rejects", ("3.png", "8.png")),
         (FindingKind.POSE_CONTRADICTS_IMAGE, "warns", ("5.png",)),
     ]
     assert found[1].value == pytest.approx(0.08 * np.sqrt(3), rel=0.05)
-    right = problem.base_from_gripper
-    of_right = fit_hand_eye(right, problem.recon_from_camera)
-    assert not left_out_poses(
-        Capture(folder=Path(), images=names, base_from_gripper=right, image_size=(640, 480)),
-        made,
-        replace(of_right, inliers=np.arange(12) != 4),
-    )
+    of_right = replace(fit_hand_eye(right, problem.recon_from_camera), inliers=np.arange(12) != 4)
+    assert not left_out_poses(replace(capture, base_from_gripper=right), made, of_right)
 
 
 @pytest.mark.slow
 def test_exchanged_poses_are_found_where_the_matching_leaves_their_images_out(
     tabletop: Path, tmp_path: Path, capsys
 ):
-    content = json.loads((tabletop / "capture.json").read_text())
-    frames = content["frames"]
-    first, second = (frames[k]["base_from_gripper"] for k in (3, 8))
-    frames[3]["base_from_gripper"], frames[8]["base_from_gripper"] = second, first
-    shutil.copytree(tabletop / "images", tmp_path / "images")
-    (tmp_path / "capture.json").write_text(
-        json.dumps({"frames": frames, "intrinsics": content["intrinsics"]})
-    )
-    assert dispatch(["check", str(tmp_path)]) == 3
+    def change(content: dict[str, Any]) -> None:
+        one, other = (content["frames"][k] for k in (3, 8))
+        key = "base_from_gripper"
+        one[key], other[key] = other[key], one[key]
+
+    assert dispatch(["check", str(changed(tabletop, tmp_path / "capture", change))]) == 3
     said = capsys.readouterr()
     assert "\nCause       images/03.jpg and images/08.jpg have each other's gripper pose" in said.out
     assert "Agreement" not in said.out and "Expected" not in said.out

@@ -26,7 +26,8 @@ from jcr.records.capture_json import CameraEntry, CaptureFile, FrameEntry, Intri
 from places import ROOT
 from simulation.__main__ import Arguments as SimulationArguments
 
-SOURCE = ROOT / "src" / "jcr"
+TEXTS = [file.read_text() for file in sorted((ROOT / "src" / "jcr").rglob("*.py"))]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 # Pages of results show the command of the day on which they were measured.
 MADE = {"api.md", "cli.md", "findings.md", "formats.md"}
 MANUAL = [
@@ -84,31 +85,17 @@ def test_help_of_a_command_is_printed(name: str, capsys: pytest.CaptureFixture[s
     assert f"jcr {name}" in capsys.readouterr().out
 
 
-def test_files_of_the_project_that_the_documents_name_exist():
+def test_files_and_imports_that_the_documents_name_exist():
     pattern = r"`(?:python )?((?:src|tests|simulation|benchmarks|examples|docs)/[\w/.-]+)"
-    named = {(page.name, path) for page in PAGES for path in re.findall(pattern, page.read_text())}
-    assert sorted(one for one in named if not (ROOT / one[1]).exists()) == []
-
-
-def test_imports_of_the_examples_in_the_documents_exist():
     missing = []
     for page in PAGES:
-        for code in re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL):
-            for module, names in re.findall(r"^from (jcr[\w.]*) import (.+)$", code, flags=re.MULTILINE):
-                there = vars(import_module(module))
-                missing += [
-                    f"{page.name}: {module}.{name}" for name in names.split(", ") if name not in there
-                ]
+        text = page.read_text()
+        missing += [(page.name, path) for path in re.findall(pattern, text) if not (ROOT / path).exists()]
+        code = "\n".join(re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL))
+        for module, names in re.findall(r"^from (jcr[\w.]*) import (.+)$", code, flags=re.MULTILINE):
+            there = vars(import_module(module))
+            missing += [(page.name, f"{module}.{name}") for name in names.split(", ") if name not in there]
     assert missing == []
-
-
-def test_pages_that_messages_name_exist():
-    named = {
-        name
-        for file in SOURCE.rglob("*.py")
-        for name in re.findall(r"jcr docs ([a-z][\w/-]*)", file.read_text())
-    }
-    assert named and named <= pages().keys()
 
 
 def test_pages_of_the_reference_are_made_from_the_source():
@@ -124,23 +111,30 @@ def test_pages_of_the_reference_are_made_from_the_source():
     assert made["backends.md"] == (ROOT / "docs" / "reference" / "backends.md").read_text()
 
 
-def test_pages_are_printed_and_listed(capsys: pytest.CaptureFixture[str]):
+def test_pages_are_installed_printed_listed_and_named_by_messages(capsys: pytest.CaptureFixture[str]):
     assert dispatch(["docs", "captures"]) == 0
     assert capsys.readouterr().out == (ROOT / "docs" / "reference" / "captures.md").read_text()
     assert dispatch(["docs"]) == 0
     assert "results/speed" in capsys.readouterr().out
-    with pytest.raises(InputError, match="no such page; there are: .*captures"):
-        page_named("nonsense")
-    with pytest.raises(InputError, match="did you mean troubleshooting?"):
-        page_named("troubleshoot")
+    for name, said in (
+        ("nonsense", "there are: .*captures"),
+        ("troubleshoot", "did you mean troubleshooting?"),
+    ):
+        with pytest.raises(InputError, match=said):
+            page_named(name)
+    named = {name for text in TEXTS for name in re.findall(r"jcr docs ([a-z][\w/-]*)", text)}
+    assert named and named <= pages().keys()
+    data_files = PROJECT["tool"]["setuptools"]["data-files"]
+    shipped = {file for globs in data_files.values() for glob in globs for file in ROOT.glob(glob)}
+    assert set(pages().values()) <= shipped
 
 
 def test_symptoms_are_in_the_words_of_messages():
     page = (ROOT / "docs" / "how-to" / "troubleshooting.md").read_text()
     constants = (
         node.value
-        for file in SOURCE.rglob("*.py")
-        for node in ast.walk(ast.parse(file.read_text()))
+        for text in TEXTS
+        for node in ast.walk(ast.parse(text))
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
     )
     said = "\n".join(constants)
@@ -148,14 +142,6 @@ def test_symptoms_are_in_the_words_of_messages():
     pieces = [piece.strip() for quote in quotes for piece in re.split(r"…|\d+(?:\.png)?|ur5e", quote)]
     long_enough = [piece for piece in pieces if len(piece) > 8]
     assert len(long_enough) > 10 and [piece for piece in long_enough if piece not in said] == []
-
-
-def test_every_page_that_a_checkout_has_is_installed():
-    import tomllib
-
-    tool = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    shipped = {file for globs in tool["data-files"].values() for glob in globs for file in ROOT.glob(glob)}
-    assert set(pages().values()) <= shipped
 
 
 def test_the_schema_of_captures_takes_ours_and_knows_every_key_that_is_read():
@@ -169,19 +155,13 @@ def test_the_schema_of_captures_takes_ours_and_knows_every_key_that_is_read():
     content["cameras"]["right"]["frames"][0]["base_from_gripper"] = content["frames"][0]["base_from_gripper"]
     valid.validate(content)
     assert not valid.is_valid({"frames": [{"image": "a.png"}]})
-    read = {
-        key for entry in (CaptureFile, FrameEntry, CameraEntry, IntrinsicsEntry) for key in entry.model_fields
-    }
-    known = set(schema["properties"]).union(
-        *(part.get("properties", {}) for part in schema["$defs"].values())
-    )
+    read = set().union(*(one.model_fields for one in (CaptureFile, FrameEntry, CameraEntry, IntrinsicsEntry)))
+    known = set().union(*(part.get("properties", {}) for part in (schema, *schema["$defs"].values())))
     assert len(read) > 10 and read <= known
 
 
 def test_version_and_date_of_the_release_are_the_same_everywhere():
-    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     latest = re.search(r"^## (\S+) — (\S+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
-    assert latest is not None
+    assert latest is not None and latest[1] == PROJECT["project"]["version"]
     assert (cited["version"], str(cited["date-released"])) == latest.groups()
-    assert latest[1] == version

@@ -17,21 +17,13 @@ def test_the_extras_that_are_named_exist():
     assert PROJECT["name"] == DISTRIBUTION
     named = set()
     for folder in ("src", "benchmarks", "docs", "examples"):
-        for file in (ROOT / folder).rglob("*.*"):
-            if file.suffix in (".py", ".md"):
-                text = file.read_text()
-                assert not re.search(r"pip\s+install\s+'?jcr\b(?!-)", text), file
-                named |= {(name, file.name) for name in re.findall(r'\bextra\("[\w.]+", "(\w+)"', text)}
-                for names in re.findall(rf"{DISTRIBUTION}\[([\w,]+)\]", text):
-                    named |= {(name, file.name) for name in names.split(",")}
-    assert {name for name, _ in named} >= {
-        "networks",
-        "view",
-        "sam",
-        "ros",
-        "lerobot",
-        "planning",
-    }
+        for file in (one for one in (ROOT / folder).rglob("*.*") if one.suffix in (".py", ".md")):
+            text = file.read_text()
+            assert not re.search(r"pip\s+install\s+'?jcr\b(?!-)", text), file
+            several = ",".join(re.findall(rf"{DISTRIBUTION}\[([\w,]+)\]", text)).split(",")
+            every = [*re.findall(r'\bextra\("[\w.]+", "(\w+)"', text), *filter(None, several)]
+            named |= {(name, file.name) for name in every}
+    assert {name for name, _ in named} >= {"networks", "view", "sam", "ros", "lerobot", "planning"}
     assert not {(name, file) for name, file in named if name not in PROJECT["optional-dependencies"]}
 
 

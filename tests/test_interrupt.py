@@ -1,4 +1,4 @@
-"""Ctrl-C at any moment: one line, status 130, nothing half-written, and the same command resumes."""
+"""One answer whatever the number of threads, and Ctrl-C at any moment: one line, nothing half-written, a run resumes."""
 
 import json
 import os
@@ -8,8 +8,11 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from in_process import run_jcr
+from jcr.result import RunResult
 from waiting import until
 
 pytestmark = pytest.mark.slow
@@ -27,10 +30,13 @@ def test_an_interrupted_run_reports_it_in_one_line_and_resumes(
 ):
     out, temporary = tmp_path / "out", tmp_path / "temporary"
     temporary.mkdir()
-    command = [sys.executable, "-m", "jcr", "calibrate", str(small_capture), str(out), "--quiet", "--json"]
-    environment = os.environ | {"TMPDIR": str(temporary)}
+    words = ["calibrate", str(small_capture), str(out), "--quiet", "--json"]
     with subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "jcr", *words],
+        env=os.environ | {"TMPDIR": str(temporary)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     ) as running:
         until(lambda: running.poll() is not None or MOMENTS[moment](running.pid, temporary))
         running.send_signal(signal.SIGINT)
@@ -40,8 +46,26 @@ def test_an_interrupted_run_reports_it_in_one_line_and_resumes(
     assert running.returncode in (130, -signal.SIGINT), printed
     assert printed.startswith("error: interrupted") and printed.count("\n") == 1
     assert not out.exists() and not list(temporary.iterdir()), "nothing came of it"
-    if moment == "while libraries load":  # nothing is there that could be resumed
-        return
-    finished = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert finished.returncode in (0, 3), finished.stderr
-    assert len(json.loads(finished.stdout)["images"]) == 5
+    if moment == "while COLMAP works":
+        finished = run_jcr(*words)
+        assert finished.returncode in (0, 3), finished.stderr
+        assert len(json.loads(finished.stdout)["images"]) == 5
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be bound to cores here")
+def test_two_threads_on_one_core_find_what_one_thread_finds_on_all_of_them(
+    small_capture: Path, small_done: Path, tmp_path: Path
+):
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    core = {min(os.sched_getaffinity(0))}
+    subprocess.run(
+        [sys.executable, "-m", "jcr", "calibrate", str(small_capture), str(tmp_path), "--quiet"],
+        env=os.environ | dict.fromkeys(names, "2"),
+        preexec_fn=lambda: os.sched_setaffinity(0, core),
+        timeout=300,
+    )
+    one, two = (RunResult(out).calibration for out in (small_done, tmp_path))
+    assert [image.used for image in one.images] == [image.used for image in two.images]
+    for name in ("gripper_from_camera", "scale"):
+        assert np.allclose(getattr(one, name), getattr(two, name), rtol=0, atol=1e-6), name
+    assert np.allclose(one.covariance, two.covariance, rtol=1e-6, atol=1e-12)

@@ -30,13 +30,8 @@ def test_a_run_with_files_beside_its_images_is_complete_in_relative_folders(
 ):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(sound, "out")
-    for file in (
-        "cell/images/0.png",
-        "cell/0.depth.png",
-        "cell/fixed/0.png",
-        "cell/robot.urdf",
-        "out/added/0.png",
-    ):
+    beside = "images/0.png", "0.depth.png", "fixed/0.png", "robot.urdf"
+    for file in (*(f"cell/{name}" for name in beside), "out/added/0.png"):
         Path(file).parent.mkdir(parents=True, exist_ok=True)
         Path(file).write_bytes(b"image")
     other = CellCamera(name="fixed", mount="base", images=("fixed/0.png",), image_size=(64, 48))
@@ -50,31 +45,31 @@ def test_a_run_with_files_beside_its_images_is_complete_in_relative_folders(
         others=(other,),
     )
     run = begun(Path("out"), capture, RunOptions(map=None))
+    Path("out/report.html").write_text("")
     complete(run)
     assert is_unchanged(run)
-    Path("cell/fixed/0.png").write_bytes(b"another image")
+    for file in (*(f"cell/{name}" for name in beside), "out/added/0.png", "out/calibration.json"):
+        before = Path(file).read_bytes()
+        Path(file).write_bytes(before + b" ")
+        assert not is_unchanged(begun(Path("out"), capture, RunOptions(map=None))), file
+        Path(file).write_bytes(before)
+    Path("out/report.html").unlink()
     assert not is_unchanged(run)
 
 
-Content = dict[str, Any]
+Change = Callable[[dict[str, Any]], Any]
 
-
-def options(content: Content) -> Content:
-    return content["options"]
-
-
-STATES: dict[str, Callable[[Content], Any]] = {
+STATES: dict[str, Change] = {
     "no options": lambda c: c.pop("options"),
-    "unknown option": lambda c: options(c)["reconstruct"].update(magic=1),
-    "no such back end": lambda c: options(c)["reconstruct"].update(backend="magic"),
-    "NaN": lambda c: options(c)["reconstruct"].update(seed=float("nan")),
+    "unknown option": lambda c: c["options"]["reconstruct"].update(magic=1),
+    "no such back end": lambda c: c["options"]["reconstruct"].update(backend="magic"),
+    "NaN": lambda c: c["options"]["reconstruct"].update(seed=float("nan")),
     "capture with NUL": lambda c: c.update(capture="a\0b"),
     "capture of a name too long": lambda c: c.update(capture="/tmp/" + "x" * 300),
     "capture gone": lambda c: c.update(capture="/nowhere"),
-    "no fingerprint": lambda c: c.update(made=None),
+    "no fingerprints": lambda c: c.update(made=None),
 }
-
-CALIBRATIONS: dict[str, Callable[[Content], Any]] = {
+CALIBRATIONS: dict[str, Change] = {
     "scale NaN": lambda c: c.update(scale=float("nan")),
     "scale null": lambda c: c.update(scale=None),
     "covariance of six": lambda c: c["uncertainty"]["covariance"].pop(),
@@ -85,50 +80,42 @@ CALIBRATIONS: dict[str, Callable[[Content], Any]] = {
     "no reason": lambda c: c.update(converged=False, warnings=[]),
     "unknown key": lambda c: c.update(magic=1),
 }
+FILES = [("run.json", STATES), ("calibration.json", CALIBRATIONS)]
 
 
-def edited(sound: Path, out: Path, name: str, change: Callable[[Content], Any]) -> Path:
-    shutil.copytree(sound, out)
-    content = json.loads((out / name).read_text())
-    change(content)
-    (out / name).write_text(json.dumps(content))
-    return out
-
-
-def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """What is said where a command ends with status 2 and one line."""
-    assert dispatch(arguments) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("error: ") and said.count("\n") == 1 and len(said) < 500
-    return said
-
-
-@pytest.mark.parametrize("variant", STATES)
-def test_an_edited_run_json_is_refused_in_one_line(sound: Path, tmp_path: Path, variant: str, capsys):
-    out = edited(sound, tmp_path / "out", "run.json", STATES[variant])
-    said = refused(["map", str(out), "--quiet"], capsys)
-    assert "run.json" in said or "/nowhere" in said
-
-
-@pytest.mark.parametrize("variant", CALIBRATIONS)
-def test_an_edited_calibration_is_refused_in_one_line(sound: Path, tmp_path: Path, variant: str, capsys):
-    out = edited(sound, tmp_path / "out", "calibration.json", CALIBRATIONS[variant])
-    for command in (
-        ["compare", str(out), str(sound)],
-        ["export", str(out), "ros2", str(tmp_path / "made.xml")],
-        ["verify", str(out), str(sound / "capture"), "--quiet"],
-    ):
-        assert "calibration.json" in refused(command, capsys)
-    assert not (tmp_path / "made.xml").exists()
-
-
-@pytest.mark.parametrize("name", ["run.json", "calibration.json"])
-@pytest.mark.parametrize("length", [0, 1, 40])
-def test_a_cut_file_is_refused(sound: Path, tmp_path: Path, name: str, length: int, capsys):
-    out = edited(sound, tmp_path / "out", name, lambda content: None)
-    (out / name).write_text((out / name).read_text()[:length])
-    command = ["map", str(out)] if name == "run.json" else ["compare", str(out), str(out)]
-    assert name in refused([*command, "--quiet"] if name == "run.json" else command, capsys)
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        pytest.param(name, change, id=f"{name} {about}")
+        for name, table in FILES
+        for about, change in table.items()
+    ]
+    + [
+        pytest.param(name, length, id=f"{name} cut to {length}") for name, _ in FILES for length in (0, 1, 40)
+    ],
+)
+def test_an_edited_or_cut_file_is_refused_in_one_line(
+    sound: Path, tmp_path: Path, name: str, change: Change | int, capsys
+):
+    out, made = shutil.copytree(sound, tmp_path / "out"), tmp_path / "made.xml"
+    text = (out / name).read_text()
+    if isinstance(change, int):
+        text = text[:change]
+    else:
+        content = json.loads(text)
+        change(content)
+        text = json.dumps(content)
+    (out / name).write_text(text)
+    commands = [["map", str(out), "--quiet"]]
+    if name == "calibration.json":
+        verify = ["verify", str(out), str(sound / "capture"), "--quiet"]
+        commands = [["compare", str(out), str(sound)], ["export", str(out), "ros2", str(made)], verify]
+    for command in commands:
+        assert dispatch(command) == 2
+        said = capsys.readouterr().err
+        assert said.startswith("error: ") and said.count("\n") == 1 and len(said) < 500
+        assert name in said or "/nowhere" in said
+    assert not made.exists()
 
 
 def test_a_capture_in_a_folder_whose_name_is_not_utf8_is_refused_before_any_work():
