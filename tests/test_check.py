@@ -115,7 +115,7 @@ def test_exchanged_poses_are_found_where_the_matching_leaves_their_images_out(
 
     assert dispatch(["check", str(changed(tabletop, tmp_path / "capture", change))]) == 3
     said = capsys.readouterr()
-    assert "\nCause       images/03.jpg and images/08.jpg have each other's gripper pose" in said.out
+    assert "\nCause       images/03.jpg and images/08.jpg have each other's gripper poses" in said.out
     assert "Agreement" not in said.out and "Expected" not in said.out
 
 

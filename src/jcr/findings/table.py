@@ -310,7 +310,7 @@ class FindingKind(StrEnum):
         "avoid patterns that repeat, as of a board alone, or name the board (--board); let the views overlap more",
         explains=MISFIT, evidence="images of the further pieces")
     POSES_SWAPPED = "gripper poses exchanged", KindRow("single",
-        "{images[0]} and {images[1]} have each other's gripper pose", "exchange the two poses",
+        "{images} have each other's gripper poses", "correct the pairing of images and poses",
         explains=MISFIT)
     POSE_CONTRADICTS_IMAGE = "gripper pose contradicts its image", KindRow("single",
         "the gripper pose of {images[0]} is {mm:.0f} mm and {deg:.1f}° from where its image shows the "

@@ -4,44 +4,58 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.calibration.case import Case
 from jcr.calibration.checks.capture import SAME
 from jcr.capture.images import read_image
 from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.equation import predict
 from jcr.findings import Finding, FindingKind
-from jcr.geometry import step_between
+from jcr.geometry import ARM, step_between
 from jcr.records import Capture, HandEye, Reconstruction
 from jcr.sfm.register import register
+
+NEARER = 0.1
+"""Share of the distance to an image's own pose within which the pose listed at another image is the one it shows."""
+
+
+def check_pairing(case: Case) -> Case:
+    """Report images whose gripper poses are those of one another, where the poses of the other images agree.
+
+    Such poses are left out one by one, so that a calibration of the others may be accepted.
+    """
+    found = left_out_poses(case.capture, case.reconstruction, case.hand_eye)
+    return case.after(tuple(one for one in found if one.kind is FindingKind.POSES_SWAPPED))
 
 
 def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: HandEye) -> tuple[Finding, ...]:
     """Return the findings of exchanged poses and of poses that their images contradict.
 
     The matching leaves out images whose poses contradict it; registered by their features alone, they show the gripper
-    pose. Images that cannot be registered have no finding.
+    pose. Poses are exchanged where two or more images show poses that are listed at others that are left out. Images
+    that cannot be registered have no finding.
     """
-    shown = _shown_poses(capture, made, hand_eye)
-    is_pose_of: dict[int, int] = {}
-    findings = []
-    for row, pose in shown.items():
-        metres, radians = np.linalg.norm(
-            step_between(capture.base_from_gripper, pose).reshape(-1, 2, 3), axis=2
-        ).T
-        fits = (metres < SAME[0]) & (radians < SAME[1])
-        if fits[row]:
+    metres, radians, belongs_to = dict[int, float](), dict[int, float](), dict[int, int]()
+    right = set(made.image_index[hand_eye.inliers].tolist())
+    for row, pose in _shown_poses(capture, made, hand_eye).items():
+        by = np.linalg.norm(step_between(capture.base_from_gripper, pose).reshape(-1, 2, 3), axis=2)
+        if (by[row] < SAME).all():
+            right.add(row)
             continue
-        if fits.any():
-            is_pose_of[row] = int(np.where(fits, metres, np.inf).argmin())
-        off = {"value": float(metres[row]), "rotation": float(radians[row])}
+        metres[row], radians[row] = by[row].tolist()
+        distance = by @ (1.0, ARM)
+        if distance.min() < NEARER * distance[row]:
+            belongs_to[row] = int(distance.argmin())
+    shown = {row: other for row, other in belongs_to.items() if other not in right}
+    exchanged = {*shown, *shown.values()} if len(shown) >= 2 else set[int]()
+    findings = []
+    if exchanged:
+        names = [capture.images[row] for row in sorted(exchanged)]
+        findings.append(Finding.of(FindingKind.POSES_SWAPPED, "rejects", "poses", *names))
+    for row in sorted(set(metres) - exchanged):
+        off = {"value": metres[row], "rotation": radians[row]}
         image = capture.images[row]
         findings.append(Finding.of(FindingKind.POSE_CONTRADICTS_IMAGE, "warns", "poses", image, **off))
-    pairs = [(i, j) for i, j in is_pose_of.items() if i < j and is_pose_of.get(j) == i]
-    swapped = [
-        Finding.of(FindingKind.POSES_SWAPPED, "rejects", "poses", capture.images[i], capture.images[j])
-        for i, j in pairs
-    ]
-    named = {image for one in swapped for image in one.images}
-    return (*swapped, *(finding for finding in findings if finding.images[0] not in named))
+    return tuple(findings)
 
 
 def _shown_poses(

@@ -12,6 +12,7 @@ import numpy as np
 from jcr.calibration.case import Case
 from jcr.calibration.checks.capture import check_convention, check_pieces, check_registered, check_remarks
 from jcr.calibration.checks.effects import check_effects
+from jcr.calibration.checks.left_out import check_pairing
 from jcr.calibration.checks.lengths import check_boards, check_lengths
 from jcr.estimation.hypotheses import joint_offsets
 from jcr.estimation.intrinsics_prior import MEASURED, camera_with_prior
@@ -83,6 +84,13 @@ def _is_open(case: Case) -> bool:
     return case.hand_eye.observability.observable and not is_explained(case.hand_eye.findings)
 
 
+def _has_left_out(case: Case) -> bool:
+    """Return whether two or more images are left out, and the gripper poses of the others agree."""
+    kinds = {one.kind for one in case.hand_eye.findings}
+    agree = not kinds & {FindingKind.FEW_AGREE, FindingKind.POSES_CONTRADICT_IMAGES}
+    return agree and len(case.capture) - len(case.used) >= 2
+
+
 def _always(_case: Case) -> bool:
     return True
 
@@ -90,6 +98,7 @@ def _always(_case: Case) -> bool:
 CHECKS = (
     (check_registered, _always),
     (check_convention, _fit_was_rejected),
+    (check_pairing, _has_left_out),
     (check_effects, _is_open),
     (check_pieces, _is_open),
     (check_predicted_focal, _always),
