@@ -54,7 +54,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-SLOW_FIXTURES = {"done", "small_done", "opengl", "real_captures", "tiny_sam", "garbage_weights"}
+SLOW_FIXTURES = {"done", "small_done", "opengl", "real_captures", "attacks", "tiny_sam", "garbage_weights"}
 """Fixtures that run the command line, draw, reconstruct from images, or load a network."""
 
 
@@ -182,6 +182,15 @@ def true_mesh(tabletop: Path) -> "trimesh.Trimesh":
     return trimesh.util.concatenate(
         [trimesh.Trimesh(apply(where, mesh.vertices), mesh.faces, process=False) for where, mesh in placed]
     )
+
+
+@pytest.fixture(scope="session")
+def attacks() -> Path:
+    """Return rendered captures with one fault each, which are beside the project and not in it."""
+    folder = SHARED / "attacks"
+    if not folder.is_dir():
+        pytest.skip(f"the captures with faults are not at {folder}")
+    return folder
 
 
 @pytest.fixture(scope="session")

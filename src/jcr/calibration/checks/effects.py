@@ -52,7 +52,7 @@ from jcr.estimation.solve import Solution
 from jcr.estimation.systematic import Region
 from jcr.estimation.wrist import pose_problem
 from jcr.findings import Finding, FindingKind, kinds_of
-from jcr.geometry import Poses
+from jcr.geometry import Poses, step_between
 from jcr.records import HandEye
 
 AT_ONCE = 3
@@ -289,12 +289,25 @@ def _size_of_strain(test: Test) -> dict[str, Any]:
 
 
 def _adopted(case: Case, state: EffectsState, findings: tuple[Finding, ...]) -> Case:
-    """Return the calibration with the effects that its model can carry; one that is rejected stays."""
+    """Return the calibration with the effects that its model can carry; one that is rejected stays.
+
+    The effects were found with some of the points. Effects on the camera that do not move the calibration by all points
+    are not reported.
+    """
     adjusted, adopted = with_effects(case, state, findings)
     if adjusted is None:
         return case.after(findings)
-    refined = judged(refined_by(case, adjusted))
-    return case.after(adopted, refined, adjusted) if refined.converged else case.after(findings)
+    before, refined = case.hand_eye, judged(refined_by(case, adjusted))
+    if not refined.converged:
+        return case.after(findings)
+    of_camera = {one.kind for one in findings if one.kind.row.group == "camera"} - {FindingKind.INTRINSICS}
+    moved = np.abs(step_between(before.gripper_from_camera, refined.gripper_from_camera))
+    std = np.sqrt(np.diag(before.covariance)[:6]) * before.converged
+    if of_camera and not (moved > MATERIAL * std).any():
+        rest = tuple(one for one in state.found if one.kind not in of_camera)
+        kept = tuple(one for one in findings if one.kind not in of_camera)
+        return _adopted(case, replace(state, found=rest), kept)
+    return case.after(adopted, refined, adjusted)
 
 
 def with_effects(
