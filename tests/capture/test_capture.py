@@ -14,41 +14,36 @@ from PIL import Image
 import jcr
 from jcr.capture.formats import capture_json
 from jcr.capture.images import read_image
+from jcr.geometry import scale_translation
 
 
 @pytest.fixture
 def capture(tmp_path: Path, tabletop: Path) -> Path:
+    """Four frames of the bundled capture."""
     folder = tmp_path / "capture"
-    folder.mkdir()
-    (folder / "images").mkdir()
-    for name in ("00.jpg", "01.jpg", "02.jpg", "03.jpg"):
-        shutil.copy(tabletop / "images" / name, folder / "images" / name)
+    (folder / "images").mkdir(parents=True)
     content = json.loads((tabletop / "capture.json").read_text())
-    content["frames"] = content["frames"][:4]
-    (folder / "capture.json").write_text(json.dumps(content))
+    for frame in content["frames"][:4]:
+        shutil.copy(tabletop / frame["image"], folder / frame["image"])
+    (folder / "capture.json").write_text(json.dumps(content | {"frames": content["frames"][:4]}))
     return folder
 
 
 def edit(folder: Path, change) -> None:
-    file = folder / "capture.json"
-    content = json.loads(file.read_text())
+    content = json.loads((folder / "capture.json").read_text())
     change(content)
-    file.write_text(json.dumps(content))
+    (folder / "capture.json").write_text(json.dumps(content))
 
 
-def pose(content: dict, k: int = 1) -> np.ndarray:
-    return np.array(content["frames"][k]["base_from_gripper"])
+def change_poses(folder: Path, change, rows=(1,)) -> None:
+    """Replace the gripper poses of some frames by a function of them."""
 
+    def changed(content: dict) -> None:
+        for k in rows:
+            pose = np.array(content["frames"][k]["base_from_gripper"])
+            content["frames"][k]["base_from_gripper"] = change(pose).tolist()
 
-def set_pose(content: dict, matrix: np.ndarray, k: int = 1) -> None:
-    content["frames"][k]["base_from_gripper"] = np.asarray(matrix).tolist()
-
-
-def scale_all(content: dict, factor: float) -> None:
-    for k in range(4):
-        matrix = pose(content, k)
-        matrix[:3, 3] *= factor
-        set_pose(content, matrix, k)
+    edit(folder, changed)
 
 
 def test_a_sound_capture_is_read_as_it_is(capture: Path):
@@ -66,13 +61,9 @@ def test_a_sound_capture_is_read_as_it_is(capture: Path):
     assert jcr.read_capture(capture).intrinsics is None
 
 
-def test_standard_deviations_of_intrinsics_are_read_as_far_as_they_are_stated_and_written_again(
-    capture: Path, tmp_path: Path
-):
-    edit(
-        capture,
-        lambda content: content.update(intrinsics_std={"fx": 2.0, "fy": 3.0, "distortion": [0.01, 0]}),
-    )
+def test_standard_deviations_that_are_stated_are_read_and_written_again(capture: Path):
+    stated = {"fx": 2.0, "fy": 3.0, "distortion": [0.01, 0]}
+    edit(capture, lambda content: content.update(intrinsics_std=stated))
     read = jcr.read_capture(capture)
     expected = [2.0, 3.0, np.nan, np.nan, 0.01, 0.0, np.nan, np.nan, np.nan]
     np.testing.assert_array_equal(read.intrinsics_std, expected)
@@ -152,7 +143,7 @@ FAULTS = {
     "key twice": (lambda c: (c / "capture.json").write_text('{"frames": [], "frames": []}'), "appears twice"),
     "two frames": (lambda c: edit(c, lambda j: j.update(frames=j["frames"][:2])), "2 frames; at least 3"),
     "image name missing": (lambda c: edit(c, lambda j: j["frames"][1].pop("image")), 'frame 1 has no "image"'),
-    "millimetres": (lambda c: edit(c, lambda j: scale_all(j, 1000)), "look like millimetres"),
+    "millimetres": (lambda c: change_poses(c, lambda pose: scale_translation(pose, 1e3), range(4)), "like millimetres"),
     "intrinsics outside": (lambda c: edit(c, lambda j: j["intrinsics"].update(cx=900)), "outside the 640x480"),
     "intrinsics short": (lambda c: edit(c, lambda j: j["intrinsics"].update(distortion=[0, 0])),
         "not the 5 of a pinhole"),
@@ -170,11 +161,11 @@ FRAME_FAULTS = {
         r"01\.jpg: the same image as images/00\.jpg"),
     "pose missing": (lambda c: edit(c, lambda j: j["frames"][1].pop("base_from_gripper")),
         r"frame 1 \(images/01\.jpg\): base_from_gripper: is missing"),
-    "pose of NaN": (lambda c: edit(c, lambda j: set_pose(j, np.full((4, 4), np.nan))), "frame 1 .*NaN"),
-    "pose scaled": (lambda c: edit(c, lambda j: set_pose(j, pose(j) @ np.diag([2, 2, 2, 1]))), "frame 1 .*scaled by 2"),
-    "pose reflected": (lambda c: edit(c, lambda j: set_pose(j, pose(j) @ np.diag([1, 1, -1, 1]))),
+    "pose of NaN": (lambda c: change_poses(c, lambda pose: np.nan * pose), "frame 1 .*NaN"),
+    "pose scaled": (lambda c: change_poses(c, lambda pose: pose @ np.diag([2, 2, 2, 1])), "frame 1 .*scaled by 2"),
+    "pose reflected": (lambda c: change_poses(c, lambda pose: pose @ np.diag([1, 1, -1, 1])),
         "frame 1 .*reflection"),
-    "pose transposed": (lambda c: edit(c, lambda j: set_pose(j, pose(j).T)), "frame 1 .*transposed"),
+    "pose transposed": (lambda c: change_poses(c, np.transpose), "frame 1 .*transposed"),
     "pose of words": (lambda c: edit(c, lambda j: j["frames"][1].update(base_from_gripper="here")), "frame 1 .*4x4"),
 }  # fmt: skip
 """Faults of frame 1 alone."""
@@ -201,14 +192,22 @@ def test_a_frame_that_cannot_be_used_is_left_out_with_its_place_and_remedy(captu
     assert re.search(f"left out: .*{words}", note) and "\n" not in note and str(capture) in note
 
 
+def test_several_frames_that_cannot_be_used_are_named_in_one_message(capture: Path):
+    truncate(capture)
+    change_poses(capture, lambda pose: np.nan * pose, (2,))
+    (capture / "images/03.jpg").unlink()
+    named = r"\(3 of 4 frames cannot be used: images/02\.jpg, images/01\.jpg, images/03\.jpg\)"
+    with pytest.raises(jcr.InputError, match=r"01\.jpg: not a readable image.* " + named) as error:
+        jcr.read_capture(capture)
+    assert "\n" not in str(error.value)
+
+
 def test_joints_and_other_cameras_stay_with_the_frames_that_are_used(capture: Path):
-    content = json.loads((capture / "capture.json").read_text())
-    set_joints(content, JOINTS)
-    set_pose(content, np.full((4, 4), np.nan), 1)
     for k in range(4):
         Image.new("RGB", (32, 24), (60 * k, 0, 0)).save(capture / f"{k}.png")
-    content["cameras"] = {"second": {"mount": "gripper", "images": ["0.png", "1.png", None, "3.png"]}}
-    (capture / "capture.json").write_text(json.dumps(content))
+    cameras = {"second": {"mount": "gripper", "images": ["0.png", "1.png", None, "3.png"]}}
+    edit(capture, lambda c: (set_joints(c, JOINTS), c.update(cameras=cameras)))
+    change_poses(capture, lambda pose: np.nan * pose)
     read = jcr.read_capture(capture)
     assert read.joints is not None and read.joints.tolist() == [JOINTS[k] for k in (0, 2, 3)]
     (second,) = read.others
