@@ -13,10 +13,11 @@ import jcr
 from jcr.capture.images import encode_png, read_depth
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import NEVER, pose_track
-from jcr.capture.recording import best_frames
+from jcr.capture.recording import Recording, best_frames, capture_of_recording
 from jcr.capture.ros_image import image_of, read_ros_depth
 from jcr.files import write_bytes
 from jcr.geometry import rotation_exp, transform
+from jcr.progress import silent
 from jcr.records import Capture
 from simulation.problems import hand_eye_problem
 from simulation.ros_bag import nearest_view, write_bag
@@ -244,6 +245,24 @@ def test_the_best_frames_are_still_sharp_and_spread():
     assert len(rows) == 8 and "stands still at 0 different views where 8" in notes[-1]
 
 
+def test_images_that_the_index_lists_and_the_recording_lacks_are_counted(tmp_path: Path):
+    image = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
+    recording = Recording(
+        source=Path("scan.mcap"),
+        options=ReadOptions(frames=6),
+        names=[str(row) for row in range(12)],
+        base_from_gripper=hand_eye_problem(np.random.default_rng(1), 12).base_from_gripper,
+        speed=np.tile([0.0, 0.1], 6),
+        gap_ns=np.zeros(12, np.int64),
+        images_of_rows=lambda rows: ((row, image, ".png") for row in rows[:-2].tolist()),
+        intrinsics_of_size=lambda size: None,
+    )
+    with pytest.raises(
+        jcr.InputError, match="scan.mcap: 2 of 6 images that it lists are not where its index"
+    ):
+        capture_of_recording(recording, tmp_path, silent)
+
+
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "mono8", "bayer_rggb8", "bayer_gbrg8", "yuv422_yuy2"])
 def test_colours_of_raw_images(encoding: str):
     """An image that is red above and blue below stays so, with rows padded to a multiple of 64 bytes."""
@@ -268,12 +287,8 @@ def test_colours_of_raw_images(encoding: str):
     padded = np.zeros((height, 64), np.uint8)
     padded[:, : rows.shape[1]] = rows
 
-    class Message:
-        pass
-
-    message = Message()
-    fields = {"encoding": encoding, "height": height, "width": width, "step": 64, "data": padded.ravel()}
-    vars(message).update(fields)
+    fields = {"height": height, "width": width, "step": 64, "data": padded.ravel()}
+    message = SimpleNamespace(encoding=encoding, **fields)
     pixels, ending = image_of(message, "bag")
     assert ending == ".png" and isinstance(pixels, np.ndarray)
     if encoding == "mono8":
@@ -281,6 +296,6 @@ def test_colours_of_raw_images(encoding: str):
         return
     assert np.abs(pixels[1, 2:-2].mean(0) - [200, 0, 0]).max() < 20
     assert np.abs(pixels[6, 2:-2].mean(0) - [0, 0, 200]).max() < 20
-    vars(message).update(encoding="16UC1")
+    message.encoding = "16UC1"
     with pytest.raises(jcr.InputError, match="encoding '16UC1' is no colour image"):
         image_of(message, "bag")

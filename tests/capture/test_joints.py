@@ -8,7 +8,7 @@ import pytest
 import jcr
 from capture_writers import LIMIT, URDF, arm_poses
 from jcr.capture.options import ReadOptions
-from jcr.capture.urdf_chain import read_arm
+from jcr.capture.urdf_chain import read_arm, read_chain
 
 MIMIC = URDF.replace(
     f'<axis xyz="1 0 0"/>{LIMIT}</joint>',
@@ -32,6 +32,7 @@ def test_forward_kinematics_agree_with_a_hand_computation(tmp_path: Path):
     ("options", "words"),
     [
         ({}, "--gripper-frame is not given; its links are base_link, upper"),
+        ({"gripper_frame": "nose"}, "--gripper-frame nose is not in it; its links are base_link, upper"),
         ({"gripper_frame": "base_link"}, "nothing moves between base_link and base_link"),
         ({"gripper_frame": "tool0", "base_frame": "finger"}, "no joints lead from finger to tool0"),
     ],
@@ -73,7 +74,37 @@ def test_a_joint_that_mimics_another_follows_it(tmp_path: Path):
     np.testing.assert_allclose(arm.poses(np.hstack([pan, lift])), expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("joint", ["roll", "nose"])
-def test_mimics_that_lead_nowhere_are_refused(tmp_path: Path, joint: str):
-    with pytest.raises(jcr.InputError, match=f"mimics {joint}, which is not an independent joint"):
-        arm_of(tmp_path, MIMIC.replace('mimic joint="lift"', f'mimic joint="{joint}"'))
+CHAINED = MIMIC.replace(
+    f'<axis xyz="0 1 0"/>{LIMIT}</joint>\n  <joint name="roll"',
+    f'<axis xyz="0 1 0"/>{LIMIT}<mimic joint="pan"/></joint>\n  <joint name="roll"',
+)
+"""Joint roll mimics lift, which mimics pan."""
+
+
+@pytest.mark.parametrize(
+    ("text", "leader"),
+    [
+        (MIMIC.replace('mimic joint="lift"', 'mimic joint="roll"'), "roll"),
+        (MIMIC.replace('mimic joint="lift"', 'mimic joint="nose"'), "nose"),
+        (CHAINED, "lift"),
+    ],
+    ids=["itself", "unknown", "mimic of a mimic"],
+)
+def test_mimics_that_lead_nowhere_are_refused(tmp_path: Path, text: str, leader: str):
+    assert text != MIMIC
+    with pytest.raises(jcr.InputError, match=f"mimics {leader}, which is not an independent joint"):
+        arm_of(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    ("text", "dof", "words"),
+    [
+        (URDF, 5, "no chain with 5 joints; give as many joints per frame as the arm has"),
+        (URDF, 4, "joint grip is prismatic; errors of arms are modelled for rotating joints only"),
+        (MIMIC, 3, "joint roll is coupled to another"),
+    ],
+)
+def test_joints_that_are_no_chain_of_the_urdf_are_refused(tmp_path: Path, text: str, dof: int, words: str):
+    (tmp_path / "arm.urdf").write_text(text)
+    with pytest.raises(jcr.InputError, match=rf"arm\.urdf: {words}"):
+        read_chain(tmp_path / "arm.urdf", dof)
