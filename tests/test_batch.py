@@ -108,7 +108,7 @@ def test_deleted_results_and_changed_facts_of_a_capture_are_made_again(
     assert run_one(task).status != "failed" and not is_made()
     for changed in (
         {"robot": "ur5e"},
-        {"intrinsics_std": [1.0, 1.0, 1.0, 1.0]},
+        {"intrinsics_std": {"fx": 1.0, "fy": 1.0, "cx": 1.0, "cy": 1.0, "distortion": [0.1] * 5}},
         {"cameras": {"fixed": {"mount": "base", "intrinsics": None, "images": ["other/00.jpg"]}}},
         {"frames": [frame | {"depth": name} for frame, name in zip(frames, depth, strict=True)]},
         {"frames": [frame | {"joints": [0.1 * k] * 6} for k, frame in enumerate(frames)]},
