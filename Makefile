@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: env demo test test-fast test-lowest lint audit docs dist
+.PHONY: env demo test test-fast test-long test-lowest lint audit docs dist
 env: .venv/ready
 
 # torch first and pinned: an open range pulls several GB of CUDA packages.
@@ -20,13 +20,17 @@ demo: .venv/ready
 # Files in the order of tests/conftest.py, slow ones first.
 TWO_WORKERS := -n 2 --dist loadfile --no-loadscope-reorder
 # Where bytecode is not kept, each of the many processes that tests start compiles all of jcr: a second, half of a start.
-test test-fast test-lowest: export PYTHONDONTWRITEBYTECODE :=
+test test-fast test-long test-lowest: export PYTHONDONTWRITEBYTECODE :=
 
 test: .venv/ready
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(TWO_WORKERS)
 
 test-fast: .venv/ready
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(TWO_WORKERS) -m "not slow"
+
+# Fuzzing, kills and repeats of more than ten seconds each.
+test-long: .venv/ready
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(TWO_WORKERS) -m long
 
 # The core with the lowest versions of its packages, and without torch. Left out: OpenCV before 4.14 finds a few of the
 # corners of a board that was drawn over, and says that this is too little; and with OpenCV 4.10 one real board comes out

@@ -84,8 +84,10 @@ def test_images_that_are_added_live_have_the_findings_of_a_batch(real_captures: 
     capture = replace(whole, images=whole.images[:13], base_from_gripper=whole.base_from_gripper[:13])
     batch = calibrate(capture, reconstruct_colmap(capture))
     live = jcr.LiveCalibration(tmp_path / "live", intrinsics=capture.intrinsics)
-    for name, pose in zip(capture.images, capture.base_from_gripper, strict=True):
-        live.add(read_image(capture.folder / name), pose)
+    for k, (name, pose) in enumerate(zip(capture.images, capture.base_from_gripper, strict=True)):
+        live.keep(read_image(capture.folder / name), pose)
+        if k % 4 == 0:
+            live.update()
     progress = live.progress
     live.close()
     assert progress.hand_eye is not None and batch.verdict == progress.hand_eye.verdict == "accepted"
