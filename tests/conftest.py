@@ -69,11 +69,8 @@ those that take long and would come last, when one worker has nothing left."""
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark slow tests by their fixtures, and put files with slow tests first: short ones are left for the end."""
     for item in items:
-        if (
-            item.get_closest_marker("gl")
-            or item.get_closest_marker("long")
-            or SLOW_FIXTURES & set(getattr(item, "fixturenames", ()))
-        ):
+        marks = {mark.name for mark in item.iter_markers()} & {"gl", "long"}
+        if marks or SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
     rank = {ROOT / "tests" / name: k for k, name in enumerate(FIRST)}
     slow = {item.path for item in items if item.get_closest_marker("slow")}

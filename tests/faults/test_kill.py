@@ -20,7 +20,7 @@ from jcr.result import RunResult
 from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import load_map
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 KILLS = int(os.environ.get("JCR_TEST_KILLS", "2"))
 WRITES = 10

@@ -87,6 +87,7 @@ def test_every_target_reads_as_it_is(readers: dict[str, Target]):
             assert name == "weights.pth"  # of no network
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_changed_bytes_are_read_or_refused(name: str, readers: dict[str, Target]):
     target = readers[name]

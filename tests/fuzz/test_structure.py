@@ -85,6 +85,7 @@ def targets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Target,
     }
 
 
+@pytest.mark.long
 def test_no_value_of_another_kind_makes_a_traceback_or_takes_long(targets: dict[str, tuple[Target, Any]]):
     cases = [
         (name, place, value)

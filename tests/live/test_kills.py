@@ -18,7 +18,7 @@ from jcr.capture.images import read_image
 from jcr.live.calibration import LiveCalibration
 from jcr.live.folder import LiveFolder
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 KILLS = int(os.environ.get("JCR_TEST_KILLS", "2"))
 IMAGES = 5
