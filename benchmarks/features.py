@@ -17,9 +17,8 @@ from jcr.features.matchers import FeatureName, Matcher
 from jcr.features.pairs import all_pairs
 from jcr.features.stage import Matched
 from jcr.records import Intrinsics
-from jcr.sfm import mapping
+from jcr.sfm import colmap
 from jcr.sfm.colmap import reconstruct_colmap
-from jcr.sfm.options import ColmapOptions
 
 WAYS: tuple[tuple[FeatureName, bool], ...] = (("sift", True), ("sift", False), ("xfeat", True))
 """Features, and whether the robot checks the pairs."""
@@ -54,8 +53,8 @@ def _row(folder: Path, features: FeatureName, gate: bool, way: str) -> tuple[boo
     capture, count, hand_eye = read_capture(folder), 0, None
     begun = time.perf_counter()
     try:
-        with nullcontext() if gate else patch.object(mapping, "match_with_robot", _match_all):
-            made = reconstruct_colmap(capture, ColmapOptions(features=features))
+        with nullcontext() if gate else patch.object(colmap, "match_with_robot", _match_all):
+            made = reconstruct_colmap(capture, features)
         count = len(made.image_index)
         hand_eye = calibrate(capture, made)
     except RejectedError:

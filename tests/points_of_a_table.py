@@ -12,7 +12,7 @@ from jcr.features.matchers import Matcher
 from jcr.features.stage import Matched, match_with_robot
 from jcr.geometry import Transforms, apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics
-from jcr.sfm.mapping import camera_of
+from jcr.sfm.model import camera_of
 
 INTRINSICS = Intrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
 IMAGES, STEP_M, HEIGHT_M = 30, 0.1, 0.5

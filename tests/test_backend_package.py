@@ -1,4 +1,4 @@
-"""Test the example of a back end of another package: installed into an environment of its own, listed and run."""
+"""Test back ends of other packages: the example, installed into an environment of its own, and one that is broken."""
 
 import json
 import subprocess
@@ -72,6 +72,10 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (source / path.name).write_text(path.read_text())
     done = subprocess.run([*install, source], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+    broken = packages / "broken-0.1.dist-info"
+    broken.mkdir()
+    (broken / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 0.1\n")
+    (broken / "entry_points.txt").write_text("[jcr.backends]\nbroken = jcr_mapanything:NO_ROW\n")
     return made
 
 
@@ -105,8 +109,13 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_example_is_listed_and_names_what_it_lacks(python: Path, capture: Path, tmp_path: Path) -> None:
-    rows = json.loads(run(python, "models", "--json").stdout)["models"]
-    assert [row["licence"] for row in rows if row["backend"] == "mapanything"] == ["Apache-2.0"]
+    listed = run(python, "models", "--json")
+    rows = {row["backend"]: row for row in json.loads(listed.stdout)["models"]}
+    assert rows["mapanything"]["licence"] == "Apache-2.0"
+    names = list(rows)
+    assert names.index("da3-small") < names.index("mapanything") < names.index("direct")
+    assert "broken" not in names
+    assert "back end broken (jcr_mapanything:NO_ROW) cannot be loaded" in listed.stderr
     done = run(python, "calibrate", capture, tmp_path / "out", "--backend", "mapanything")
     assert done.returncode == 2
     assert "needs mapanything, which is not installed: pip install git" in done.stderr

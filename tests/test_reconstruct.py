@@ -1,9 +1,6 @@
 """The table of back ends: a row is all that a new one takes, and no option that it does not use passes silently."""
 
 import json
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,57 +30,6 @@ def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     monkeypatch.setattr(Backend, "has_weights", lambda self: not self.hub_id or self.name in names)
     monkeypatch.setattr(Backend, "is_installed", lambda self: True)
     return names
-
-
-MINE = """
-from jcr.reconstruct import Backend
-
-ROW = Backend(
-    name="mine",
-    reconstruct=lambda capture, options, progress: (options.backend, capture.images),
-    licence="MIT",
-    metric=True,
-    auto=True,
-    options=("weights",),
-    accuracy="9 mm",
-)
-"""
-USES = """
-import json, sys
-import numpy as np
-from pathlib import Path
-import jcr.reconstruct as table
-from jcr.cli import dispatch
-from jcr.records import Capture
-
-table._of_capture = lambda found, order: (found, order.tolist())
-poses = np.stack([np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0])])
-capture = Capture(folder=Path(), images=("a", "b"), base_from_gripper=poses, image_size=(64, 48))
-options = table.ReconstructOptions(backend="mine")
-print(json.dumps([list(table.BACKENDS), table.reconstruct(capture, options)]))
-dispatch(["models", "--json"])
-"""
-
-
-@pytest.mark.slow
-def test_another_package_adds_a_row_by_an_entry_point(tmp_path: Path) -> None:
-    (tmp_path / "mine.py").write_text(MINE)
-    folder = tmp_path / "mine-0.1.dist-info"
-    folder.mkdir()
-    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 0.1\n")
-    (folder / "entry_points.txt").write_text("[jcr.backends]\nmine = mine:ROW\nbroken = mine:NO_ROW\n")
-    path = os.pathsep.join([str(tmp_path), *sys.path])
-    done = subprocess.run(
-        [sys.executable, "-c", USES], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}
-    )
-    assert done.returncode == 0, done.stderr
-    first, rest = done.stdout.split("\n", 1)
-    names, found = json.loads(first)
-    assert names.index("da3-small") < names.index("mine") < names.index("direct") and "broken" not in names
-    assert found == [["mine", ["b", "a"]], [1, 0]], "images come in the order of their poses"
-    row = next(row for row in json.loads(rest)["models"] if row["backend"] == "mine")
-    assert (row["accuracy"], row["licence"], row["present"]) == ("9 mm", "MIT", "yes")
-    assert "back end broken (mine:NO_ROW) cannot be loaded" in done.stderr
 
 
 def test_colmap_comes_first_then_networks_whose_weights_are_here_then_direct_alignment(
@@ -190,7 +136,7 @@ def test_a_changed_file_of_predictions_is_another_input(tmp_path: Path) -> None:
     for name in ("predictions", "cameras"):
         path = tmp_path / name
         path.write_text("one")
-        options = RunOptions(reconstruct=ReconstructOptions(**{name: path}))
+        options = RunOptions(reconstruct=replace(ReconstructOptions(), **{name: path}))
         before = begun(tmp_path, capture, options).state.made
         assert begun(tmp_path, capture, options).state.made == before
         path.write_text("another")

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from importlib.metadata import entry_points
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -30,78 +31,32 @@ GROUP = "jcr.backends"
 """Group of the entry points of back ends from other packages."""
 MARKER = "marker"
 """Name of the back end that uses the board and nothing else."""
+NEEDED = {
+    "board": "the board with --board, such as chessboard:9x6:0.025",
+    "predictions": "the file with --predictions FILE.npz (jcr docs predictions)",
+    "cameras": "the COLMAP model with --cameras PATH",
+}
+"""Options without which a back end cannot run, in words."""
 
 logger = logging.getLogger(__name__)
 
 
-def _colmap(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    """Reconstruct by structure from motion."""
-    from jcr.sfm.colmap import reconstruct_colmap
-    from jcr.sfm.options import ColmapOptions
+def _lazy(function: str, *arguments: str) -> Callable[..., Reconstruction]:
+    """Return a back end by "module:function", imported when it runs, and the options that it takes beside the capture.
 
-    features = "sift" if options.features == "auto" else options.features
-    if features != "sift":
-        extra("torch", "match", f"--features {features}")
-    return reconstruct_colmap(capture, ColmapOptions(seed=options.seed, features=features), progress)
+    Of these, `weights` are found and `device` is chosen first; both are of networks, which need torch.
+    """
 
+    def reconstruct(
+        capture: Capture, options: "ReconstructOptions", progress: Progress | None
+    ) -> Reconstruction:
+        if "device" in arguments:
+            extra("torch", "networks", f"--backend {options.backend}")
+        chosen = {"weights": weights_of, "device": device_of}
+        values = [chosen[a](options) if a in chosen else getattr(options, a) for a in arguments]
+        return resolve_name(function)(capture, *values, progress)
 
-def _direct(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    """Reconstruct by photometric alignment."""
-    from jcr.photometric.direct import reconstruct_direct
-
-    return reconstruct_direct(capture, progress)
-
-
-def _dust3r(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    """Reconstruct by DUSt3R or MASt3R, whose files have one more head, which is left out, and points in metres."""
-    extra("torch", "networks", f"--backend {options.backend}")
-    from jcr.pointmaps.dust3r.dust3r import reconstruct_dust3r
-
-    weights, device = weights_of(options), device_of(options)
-    return reconstruct_dust3r(capture, weights, device, options.pair_graph, options.backend, progress)
-
-
-def _da3(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    """Reconstruct by Depth Anything 3."""
-    extra("torch", "networks", f"--backend {options.backend}")
-    from jcr.pointmaps import da3
-    from jcr.pointmaps.any_view import reconstruct_any_view
-
-    weights, device = weights_of(options), device_of(options)
-    return reconstruct_any_view(capture, da3.load, weights, device, options.backend, progress)
-
-
-def _marker(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    """Reconstruct by the corners of a board alone."""
-    from jcr.boards.marker import reconstruct_marker
-
-    if options.board is None:
-        raise InputError("--backend marker: name the board with --board, such as chessboard:9x6:0.025")
-    return reconstruct_marker(capture, options.board, progress)
-
-
-def _predictions(
-    capture: Capture, options: "ReconstructOptions", progress: Progress | None
-) -> Reconstruction:
-    """Reconstruct from a file of predictions."""
-    from jcr.pointmaps.predictions import reconstruct_predictions
-
-    if options.predictions is None:
-        raise InputError(
-            "--backend predictions: name the file with --predictions FILE.npz (jcr docs predictions)"
-        )
-    return reconstruct_predictions(capture, options.predictions, progress)
-
-
-def _given(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    """Reconstruct with the camera poses of a COLMAP model."""
-    from jcr.sfm.given import reconstruct_given
-    from jcr.sfm.options import ColmapOptions
-
-    if options.cameras is None:
-        raise InputError("--backend given: name the COLMAP model with --cameras PATH")
-    made = ColmapOptions(seed=options.seed)
-    return reconstruct_given(capture, options.cameras, made, progress)
+    return reconstruct
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,6 +79,8 @@ class Backend:
     """Fields of ReconstructOptions that it uses and not every back end does."""
     selected_by: str = ""
     """The one of these by which `auto` takes it."""
+    needs: str = ""
+    """The one of these without which it cannot run, a key of NEEDED."""
     hub_id: str = ""
     """Hub id of its published weights; empty: it needs none."""
     package: str = ""
@@ -159,85 +116,77 @@ class Backend:
         return not self.hub_id or bool(cached_files(self.hub_id, self.revision or None))
 
 
+_DUST3R = Backend(
+    name="dust3r",
+    reconstruct=_lazy(
+        "jcr.pointmaps.dust3r.dust3r:reconstruct_dust3r", "weights", "device", "pair_graph", "backend"
+    ),
+    licence=CC_BY_NC_SA,
+    auto=True,
+    tests_camera=False,
+    options=("weights", "pair_graph"),
+    selected_by="weights",
+    hub_id="naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt",
+    revision="61c57447d7b0adc8a1a30b2b0adec7a8935aa2a3",
+    keeps_order=True,
+    package="torch",
+    install=install("networks"),
+    parameters=571,
+    download_gb=2.3,
+    commercial=False,
+)
+_DA3 = Backend(
+    name="da3",
+    reconstruct=_lazy("jcr.pointmaps.da3:reconstruct_da3", "weights", "device", "backend"),
+    licence="Apache-2.0",
+    auto=True,
+    tests_camera=False,
+    options=("weights",),
+    hub_id="depth-anything/DA3-BASE",
+    revision="f4a6c9b3c95e41c82048423d3493a81ec3fa810e",
+    package="depth_anything_3",
+    install=INSTALL_DA3,
+    parameters=135,
+    download_gb=0.5,
+    sees_all_views=True,
+)
 _FIRST = (
     Backend(
         name="colmap",
-        reconstruct=_colmap,
+        reconstruct=_lazy("jcr.sfm.colmap:reconstruct_colmap", "features", "seed"),
         licence="BSD-3-Clause; XFeat and LightGlue Apache-2.0",
         auto=True,
         options=("features", "board"),
         selected_by="features",
         accuracy="0.02 mm and 0.002° on the bundled capture (jcr docs results/speed)",
     ),
-    Backend(
+    # Its files have one more head, which is left out, and points in metres.
+    replace(
+        _DUST3R,
         name="mast3r",
-        reconstruct=_dust3r,
         licence=f"{CC_BY_NC_SA}, and the licences of its training data (its CHECKPOINTS_NOTICE)",
         metric=True,
-        auto=True,
-        tests_camera=False,
-        options=("weights", "pair_graph"),
+        selected_by="",
         hub_id="naver/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric",
         revision="06e7259f34c3060f322df5cb0c7b9094f57e41fc",
-        keeps_order=True,
-        package="torch",
-        install=install("networks"),
         parameters=689,
         download_gb=2.8,
-        commercial=False,
     ),
-    Backend(
-        name="dust3r",
-        reconstruct=_dust3r,
-        licence=CC_BY_NC_SA,
-        auto=True,
-        tests_camera=False,
-        options=("weights", "pair_graph"),
-        selected_by="weights",
-        hub_id="naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt",
-        revision="61c57447d7b0adc8a1a30b2b0adec7a8935aa2a3",
-        keeps_order=True,
-        package="torch",
-        install=install("networks"),
-        parameters=571,
-        download_gb=2.3,
-        commercial=False,
-    ),
-    Backend(
-        name="da3",
-        reconstruct=_da3,
-        licence="Apache-2.0",
-        auto=True,
-        tests_camera=False,
-        options=("weights",),
-        hub_id="depth-anything/DA3-BASE",
-        revision="f4a6c9b3c95e41c82048423d3493a81ec3fa810e",
-        package="depth_anything_3",
-        install=INSTALL_DA3,
-        parameters=135,
-        download_gb=0.5,
-        sees_all_views=True,
-    ),
-    Backend(
+    _DUST3R,
+    _DA3,
+    replace(
+        _DA3,
         name="da3-small",
-        reconstruct=_da3,
-        licence="Apache-2.0",
-        auto=True,
-        tests_camera=False,
-        options=("weights",),
         hub_id="depth-anything/DA3-SMALL",
         revision="e08cab65ca0ec38e7826075418411ab90cab4da3",
-        package="depth_anything_3",
-        install=INSTALL_DA3,
         parameters=34,
         download_gb=0.14,
-        sees_all_views=True,
     ),
 )
 _LAST = (
     Backend(
         name="direct",
-        reconstruct=_direct,
+        reconstruct=_lazy("jcr.photometric.direct:reconstruct_direct"),
         licence="Apache-2.0",
         auto=True,
         tests_camera=False,
@@ -245,30 +194,33 @@ _LAST = (
         "(jcr docs plain-tables)",
     ),
     Backend(
-        name="marker",
-        reconstruct=_marker,
+        name=MARKER,
+        reconstruct=_lazy("jcr.boards.marker:reconstruct_marker", "board"),
         licence="Apache-2.0",
         metric=True,
         options=("board",),
+        needs="board",
         accuracy="0.7 mm and 0.20° from the reference of a real capture (jcr docs results/real)",
     ),
     Backend(
         name="predictions",
-        reconstruct=_predictions,
+        reconstruct=_lazy("jcr.pointmaps.predictions:reconstruct_predictions", "predictions"),
         licence="your network's",
         metric=None,
         tests_camera=False,
         options=("predictions",),
         selected_by="predictions",
+        needs="predictions",
         keeps_order=True,
         accuracy="0.74 mm and 0.047° from simulated predictions (jcr docs results/pointmaps)",
     ),
     Backend(
         name="given",
-        reconstruct=_given,
+        reconstruct=_lazy("jcr.sfm.given:reconstruct_given", "cameras", "seed"),
         licence="your reconstruction's",
         options=("cameras", "board"),
         selected_by="cameras",
+        needs="cameras",
     ),
 )
 
@@ -334,14 +286,12 @@ def reconstruct(
     options = options or ReconstructOptions()
     row = BACKENDS[candidates(options)[0]]
     if not row.is_installed():
+        more = ", or choose another" if row.has_weights() else f"; then {weights_command(row)}"
         raise InputError(
-            f"--backend {row.name} needs {row.package}, which is not installed: {row.install}"
-            + (
-                f"; then {weights_command(row)}"
-                if row.hub_id and not row.has_weights()
-                else ", or choose another"
-            )
+            f"--backend {row.name} needs {row.package}, which is not installed: {row.install}{more}"
         )
+    if row.needs and getattr(options, row.needs) is None:
+        raise InputError(f"--backend {row.name}: name {NEEDED[row.needs]}")
     order = np.arange(len(capture)) if row.keeps_order else order_by_pose(capture.base_from_gripper)
     in_order = capture.of_rows(order)
     made = row.reconstruct(in_order, replace(options, backend=row.name), progress)

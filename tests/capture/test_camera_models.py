@@ -44,7 +44,7 @@ def test_intrinsics_survive_capture_json_camera_info_and_calibration_json(
 def test_intrinsics_survive_colmap(intrinsics: Intrinsics, tmp_path: Path):
     import pycolmap
 
-    from jcr.sfm.mapping import camera_of
+    from jcr.sfm.model import camera_of
 
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(camera_of(intrinsics, known=True))

@@ -27,9 +27,7 @@ WRITES = 10
 """Times that a run writes a file."""
 PROCESSES = multiprocessing.get_context("forkserver")
 # What a run imports is imported once: what is killed before it works has done nothing.
-PROCESSES.set_forkserver_preload(
-    ["jcr.cli.run", "jcr.pipeline.run", "jcr.sfm.colmap", "jcr.sfm.mapping", "jcr.report.html"]
-)
+PROCESSES.set_forkserver_preload(["jcr.cli.run", "jcr.pipeline.run", "jcr.sfm.colmap", "jcr.report.html"])
 
 
 def is_locked(path: Path) -> bool:

@@ -1,13 +1,13 @@
-"""What the robot says of pairs of images: right ones pass, wrong ones do not, planar ones get their second reading."""
+"""Two-view geometries and X's rotation by the robot: right pairs pass, wrong ones do not, planes have two readings."""
 
 import numpy as np
 import pytest
 
 from jcr.estimation.closed_form import motions
-from jcr.features.gate import Pair, judge, rolls
+from jcr.features.gate import Pair, judge, rolls, rotation_of_x
 from jcr.features.pairs import translation_of_x
 from jcr.features.stage import hidden, still_cells
-from jcr.features.two_view import TwoViewMotion, readings
+from jcr.features.two_view import TwoViewMotion, _by_step, _retracted, readings, sampson_px
 from jcr.geometry import rotation_angle, rotation_exp, transform
 from simulation.problems import HandEyeProblem, hand_eye_problem
 
@@ -135,3 +135,72 @@ def test_what_keeps_its_pixel_while_the_gripper_moves_is_hidden():
     moving = [rng.uniform(0, [640, 480], (300, 2)) for _ in range(6)]
     few = {key: rows[:300] for key, rows in raw.items()}
     assert not still_cells(moving, few, (640, 480), few).any()
+
+
+def test_the_derivatives_are_those_of_the_distances():
+    rng = np.random.default_rng(0)
+    rotation, direction = rotation_exp(0.3 * rng.normal(size=3)), rng.normal(size=3)
+    direction /= np.linalg.norm(direction)
+    ray_i, ray_j = 0.5 * rng.normal(size=(2, 40, 2))
+    for column, unit in zip(_by_step(rotation, direction, ray_i, ray_j, 600.0).T, np.eye(5), strict=True):
+        ahead, behind = (
+            sampson_px(*_retracted(rotation, direction, sign * unit), ray_i, ray_j, 600.0)
+            for sign in (1e-6, -1e-6)
+        )
+        assert (ahead - behind) / 2e-6 == pytest.approx(column, rel=1e-4, abs=1e-2)
+
+
+def rotations(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Relative rotations of gripper and camera of all pairs, and X's."""
+    problem, pairs = problem_and_pairs(seed)
+    gripper = motions(problem.base_from_gripper)
+    return (
+        np.stack([gripper[pair.key][:3, :3] for pair in pairs]),
+        np.stack([pair.readings[0].rotation for pair in pairs]),
+        problem.gripper_from_camera[:3, :3],
+    )
+
+
+def test_exact_pairs_give_the_exact_rotation():
+    gripper, camera, x = rotations(0)
+    found = rotation_of_x(gripper, camera, np.full(len(gripper), 0.05))
+    assert found is not None and found.agreeing.all()
+    assert rotation_angle(found.rotation.T @ x) < 1e-9
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_wrong_pairs_are_found_out(seed: int):
+    """Half of the pairs rotated by the angle of the gripper about an axis of chance, which the angle does not show."""
+    rng = np.random.default_rng(seed)
+    gripper, camera, x = rotations(seed)
+    camera = rotation_exp(rng.normal(scale=2e-3, size=(len(camera), 3))) @ camera
+    wrong = rng.permutation(len(camera))[: len(camera) // 2]
+    axis = rng.normal(size=(len(wrong), 3))
+    axis /= np.linalg.norm(axis, axis=1)[:, None]
+    camera[wrong] = rotation_exp(axis * np.asarray(rotation_angle(gripper[wrong]))[:, None])
+    found = rotation_of_x(gripper, camera, np.full(len(gripper), 0.02))
+    assert found is not None
+    assert rotation_angle(found.rotation.T @ x) < 5e-3
+    right = np.setdiff1d(np.arange(len(camera)), wrong)
+    assert found.agreeing[right].mean() > 0.9
+    assert found.agreeing[wrong].mean() < 0.25
+
+
+def test_the_covariance_is_that_of_many_draws():
+    rng = np.random.default_rng(0)
+    gripper, camera, x = rotations(1)
+    errors, stds = [], []
+    for _ in range(60):
+        noisy = rotation_exp(rng.normal(scale=3e-3, size=(len(camera), 3))) @ camera
+        found = rotation_of_x(gripper, noisy, np.full(len(gripper), 0.05))
+        assert found is not None
+        errors.append(rotation_angle(found.rotation.T @ x))
+        stds.append(np.sqrt(np.trace(found.covariance)))
+    ratio = np.sqrt(np.mean(np.square(errors))) / np.mean(stds)
+    assert 0.7 < ratio < 1.3
+
+
+def test_one_axis_fixes_nothing():
+    x = rotation_exp(np.array([0.3, -0.2, 1.0]))
+    gripper = rotation_exp(np.linspace(0.2, 1.5, 10)[:, None] * np.array([0.0, 0.0, 1.0]))
+    assert rotation_of_x(gripper, x.T @ gripper @ x, np.full(10, 0.02)) is None

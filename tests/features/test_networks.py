@@ -82,10 +82,9 @@ def test_a_chessboard_before_a_plain_background(real_captures: Path):
     from jcr.calibration.stage import calibrate
     from jcr.geometry import rotation_between_deg
     from jcr.sfm.colmap import reconstruct_colmap
-    from jcr.sfm.options import ColmapOptions
 
     capture = read_capture(real_captures / "franka_plain_background")
-    made = reconstruct_colmap(capture, ColmapOptions(features="xfeat"))
+    made = reconstruct_colmap(capture, "xfeat")
     assert len(made.image_index) == 8
     hand_eye = calibrate(capture, made)
     reference = np.array(json.loads((capture.folder / "reference.json").read_text())["gripper_from_camera"])

@@ -139,7 +139,8 @@ def networks(scene: Scene, given_to_network: dict[str, Any]) -> dict[str, Callab
 @pytest.mark.parametrize("size", [(640, 480), (480, 640), (1000, 700)], ids=str)
 @pytest.mark.parametrize("name", ["da3", "mapanything"])
 def test_an_adapter_undoes_its_packages_conventions(name: str, size: tuple[int, int]) -> None:
-    from jcr.pointmaps.any_view import Views, rays_of
+    from jcr.camera import rays
+    from jcr.pointmaps.any_view import Views
 
     scene = Scene(*size)
     found = networks(scene, {})[name](Views(scene.colors, None))
@@ -150,10 +151,8 @@ def test_an_adapter_undoes_its_packages_conventions(name: str, size: tuple[int, 
 
     # The grid is where the adapter says, so that the true intrinsics on it give the true rays and depth.
     known = grid.grid_intrinsics(scene.pinhole)
-    expected = np.tile([known.fx, known.fy, known.cx, known.cy], (COUNT, 1))
-    rays = rays_of(expected, grid.size[1], grid.size[0]).astype(np.float64)
     depth = scene.depths(np.tile(known.matrix, (COUNT, 1, 1)), grid.size[1], grid.size[0])
-    off = np.linalg.norm(unit * found.x_in_camera - rays * depth[..., None], axis=-1) / depth
+    off = np.linalg.norm(unit * found.x_in_camera - rays(known) * depth[..., None], axis=-1) / depth
     there = found.confidence > 0
     assert np.median(off[there]) < 5e-4 and there.mean() > 0.99
     assert (found.confidence[0, 0, 0] == 0) == (name == "mapanything")
@@ -209,7 +208,7 @@ def test_depth_anything_3_agrees_with_its_package() -> None:
     import torch
 
     from jcr.pointmaps import da3
-    from jcr.pointmaps.any_view import Views, normalised, pinhole_of_edges, rays_of
+    from jcr.pointmaps.any_view import Views, normalised
 
     images = np.random.default_rng(0).integers(0, 256, (2, 300, 410, 3), np.uint8)
     torch.manual_seed(0)
@@ -228,7 +227,7 @@ def test_depth_anything_3_agrees_with_its_package() -> None:
     assert there.mean() > 0.99
     np.testing.assert_allclose(found.x_in_camera[..., 2][there], answer.depth[there], rtol=1e-5)
     np.testing.assert_allclose(found.confidence[there], answer.conf[there], rtol=1e-5)
-    expected = rays_of(pinhole_of_edges(answer.intrinsics), *answer.depth.shape[1:]) * answer.depth[..., None]
+    expected = da3.rays_of_edges(answer.intrinsics, *answer.depth.shape[1:]) * answer.depth[..., None]
     np.testing.assert_allclose(found.x_in_camera[there], expected[there], rtol=1e-5)
     assert found.recon_from_camera is not None
     np.testing.assert_allclose(inverse(found.recon_from_camera)[:, :3], answer.extrinsics, atol=1e-5)

@@ -12,7 +12,6 @@ from jcr.camera import project
 from jcr.capture.read import read_capture
 from jcr.geometry import apply, inverse
 from jcr.sfm.given import reconstruct_given
-from jcr.sfm.options import ColmapOptions
 
 pytestmark = pytest.mark.slow
 
@@ -23,7 +22,7 @@ def test_the_same_cameras_give_the_same_points(tabletop: Path, tmp_path: Path):
     x = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
     cameras = capture.base_from_gripper @ x
     model = write_colmap(tmp_path, capture, cameras) / "sparse" / "0"
-    first, second = (reconstruct_given(capture, model, ColmapOptions()) for _ in range(2))
+    first, second = (reconstruct_given(capture, model) for _ in range(2))
     np.testing.assert_allclose(first.recon_from_camera, cameras, atol=1e-9)
     for name in ("image", "x_px", "point", "points_in_recon"):
         np.testing.assert_array_equal(getattr(first.tracks, name), getattr(second.tracks, name))

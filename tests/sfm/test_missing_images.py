@@ -8,11 +8,17 @@ import numpy as np
 import pycolmap
 import pytest
 
-from jcr.features.matchers import write_matches
 from jcr.features.stage import Matched
 from jcr.geometry import nearest_rotation, rotation_between_deg
-from jcr.sfm.mapping import adjust_robustly, camera_of, enter, quiet_colmap
-from jcr.sfm.missing_images import poses_of, triangulated, with_missing_images
+from jcr.sfm.missing_images import with_missing_images
+from jcr.sfm.model import (
+    adjust_robustly,
+    camera_of,
+    poses_of,
+    quiet_colmap,
+    triangulated,
+    write_database,
+)
 from points_of_a_table import IMAGES, INTRINSICS, PointsOfATable, matched_pairs_of, matcher_of_points
 
 pytestmark = pytest.mark.slow
@@ -38,15 +44,10 @@ def begun(
     folder: Path, table: PointsOfATable, matched: Matched, missing: tuple[int, ...]
 ) -> tuple[Path, pycolmap.Reconstruction]:
     """Return a database of the matches and a map without some images."""
-    database = folder / "database.db"
-    enter(database, IMAGES, [INTRINSICS], True, 1600)
-    write_matches(database, table.x_px, matched.geometries)
+    camera = camera_of(INTRINSICS, True)
+    database = write_database(folder, camera, table.x_px, matched.geometries)
     cameras = {row: pose for row, pose in enumerate(table.base_from_camera) if row not in missing}
-    return database, triangulated(database, camera_of(INTRINSICS, True), cameras)
-
-
-def adjust(model: pycolmap.Reconstruction, scale_px: float) -> None:
-    adjust_robustly(model, True, 1e-3, scale_px)
+    return database, triangulated(database, camera, cameras)
 
 
 def off_mm(table: PointsOfATable, model: pycolmap.Reconstruction) -> float:
@@ -69,7 +70,7 @@ def test_missing_images_are_added_from_the_map_s_own_x(
     database, model = begun(tmp_path, table, matched, (4, 11, 12, 29))
     reported = table.base_from_gripper.copy()
     reported[11] = reported[25]  # a stale pose
-    whole = with_missing_images(database, model, reported, matcher_of_points(table), adjust)
+    whole = with_missing_images(database, model, reported, matcher_of_points(table))
     assert sorted(image_id - 1 for image_id in whole.reg_image_ids()) == [k for k in range(IMAGES) if k != 11]
     assert off_mm(table, whole) < 1.0
 
@@ -81,7 +82,7 @@ def test_images_that_nothing_ties_to_the_map_stay_out(
     apart = {key: one for key, one in matched.geometries.items() if (key[0] < 20) == (key[1] < 20)}
     database, model = begun(tmp_path, table, replace(matched, geometries=apart), tuple(range(20, 30)))
     reported = table.base_from_gripper
-    assert with_missing_images(database, model, reported, matcher_of_points(table), adjust) is model
+    assert with_missing_images(database, model, reported, matcher_of_points(table)) is model
 
 
 def test_an_image_of_few_matches_is_completed_by_points_of_the_map(
@@ -95,7 +96,7 @@ def test_an_image_of_few_matches_is_completed_by_points_of_the_map(
             few[key] = deepcopy(geometry)
             few[key].inlier_matches = geometry.inlier_matches[:40]
     database, model = begun(tmp_path, table, replace(matched, geometries=few), (11,))
-    model = with_missing_images(database, model, table.base_from_gripper, matcher_of_points(table), adjust)
+    model = with_missing_images(database, model, table.base_from_gripper, matcher_of_points(table))
     assert model.num_reg_images() == IMAGES
     ids = [
         {

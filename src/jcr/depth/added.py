@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 
 from jcr.camera import project
@@ -17,7 +17,7 @@ from jcr.depth.densify import choose_neighbours, dense_pointmaps, sweep_planes, 
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, scale_translation
 from jcr.progress import Progress
-from jcr.records import MATCHED, NO_DEPTH, Capture, HandEye, Intrinsics, Reconstruction, Tracks
+from jcr.records import MATCHED, NO_DEPTH, Capture, HandEye, Intrinsics, Pointmaps, Reconstruction, Tracks
 
 NEIGHBOURS = 6
 """Images that each is compared with; at most half of them are new ones."""
@@ -62,29 +62,13 @@ def extend(
     found = dense_pointmaps(colors, cameras, pinhole, neighbours, planes, report, before=dense).of_rows(
         np.arange(old, old + new)
     )
-    assert found.reason is not None and found.depth_std is not None
     for name, confidence in zip(added.images, found.confidence, strict=True):
         if (confidence > 0).mean() < LEAST_SHARE:
             raise InputError(
                 f"{added.folder / name}: no depth can be found in it; its pose may be wrong, or it shows nothing "
                 "that other images show"
             )
-    # In the unit of the back end's own confidence, so that one threshold serves both.
-    known = dense.confidence > 0
-    unit = (
-        np.median(dense.confidence[known]) / np.median(found.confidence[found.confidence > 0])
-        if known.any()
-        else 1
-    )
-    reason = np.where(known, MATCHED, NO_DEPTH).astype(np.uint8) if dense.reason is None else dense.reason
-    pointmaps = replace(
-        dense,
-        points_in_recon=np.concatenate([dense.points_in_recon, found.points_in_recon]),
-        confidence=np.concatenate([dense.confidence, unit * found.confidence]),
-        colors=colors,
-        reason=np.concatenate([reason, found.reason]),
-        depth_std=None if dense.depth_std is None else np.concatenate([dense.depth_std, found.depth_std]),
-    )
+    pointmaps = _joined(dense, found, colors)
     for later in range(old, old + new):
         for earlier in range(later):
             gone = _contradicted(
@@ -96,6 +80,24 @@ def extend(
         image_index=np.concatenate([reconstruction.image_index, capture_size + np.arange(new)]),
         recon_from_camera=cameras,
         pointmaps=pointmaps,
+    )
+
+
+def _joined(dense: Pointmaps, found: Pointmaps, colors: UInt8[ndarray, "m h w 3"]) -> Pointmaps:
+    """Return pointmaps with those of later images, whose confidence is brought to the unit of the earlier ones'."""
+    assert found.reason is not None and found.depth_std is not None
+    known, unit = dense.confidence > 0, 1.0
+    if known.any():
+        unit = np.median(dense.confidence[known]) / np.median(found.confidence[found.confidence > 0])
+    reason = np.where(known, MATCHED, NO_DEPTH).astype(np.uint8) if dense.reason is None else dense.reason
+    std = dense.depth_std
+    return replace(
+        dense,
+        points_in_recon=np.concatenate([dense.points_in_recon, found.points_in_recon]),
+        confidence=np.concatenate([dense.confidence, unit * found.confidence]),
+        colors=colors,
+        reason=np.concatenate([reason, found.reason]),
+        depth_std=None if std is None else np.concatenate([std, found.depth_std]),
     )
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ from numpy import ndarray
 
 from jcr.camera import rays
 from jcr.depth.consistency import agreement, evidence
-from jcr.depth.matched import grid, relative
+from jcr.depth.matched import Relative, grid, relative
 from jcr.depth.priors import ON_PLANE, evened, planar_prior, support_plane
 from jcr.geometry import apply
 from jcr.records import BOTH, MATCHED, NO_DEPTH, PRIOR, Intrinsics
@@ -58,25 +59,10 @@ def fused_depth(
     """
     views = [relative(i, others, recon_from_camera, pinhole) for i, others in enumerate(neighbours)]
     needed = np.array([1 if len(others) < 3 else 2 for others in neighbours])[:, None, None]
-    known, k, width = score >= LEAST_CORRELATION, grid(pinhole), pinhole.width
+    known = score >= LEAST_CORRELATION
     with ThreadPoolExecutor(threads) as pool:
-
-        def check(
-            depth: Float[ndarray, "m h w"],
-            known: Bool[ndarray, "m h w"],
-            sees: Bool[ndarray, "m h w"],
-            tolerance: float,
-        ) -> list[ndarray]:
-            """Return `agreement` of all images, (m,h,w) each; inverse depths that are not known stay as they are."""
-            compared = evidence(depth, known, sees)
-            found = pool.map(
-                lambda i: agreement(i, compared, *views[i], k, width, tolerance), range(len(views))
-            )
-            mean, *others = np.stack(list(found), 1)
-            return [np.where(known, mean, depth), *others]
-
-        count = through = information = np.zeros(0)
-        consistent = known
+        check = partial(_checked, pool, views, pinhole)
+        consistent, count, through, information = known, *[np.zeros(0)] * 3
         for tolerance in AGREEMENT:
             inverse_depth, count, through, information = check(inverse_depth, known, consistent, tolerance)
             consistent = known & (count >= needed)
@@ -86,19 +72,9 @@ def fused_depth(
         confidence = np.minimum(score, 1) * count
         if not priors or matched.sum() < FEWEST_MATCHED:
             return _chosen(inverse_depth, [matched], [confidence], [MATCHED], [std])
-
-        support = _support(inverse_depth, matched, recon_from_camera, pinhole)
-        even = evened(colors, inverse_depth, matched, views, pinhole)
-        smooth = np.stack([cv2.GaussianBlur(image, (0, 0), 1.0) for image in even])
-        surfaces = np.where(matched, inverse_depth, 0).astype(np.float32), smooth
-        report(0.4)
-
-        def prior(i: int) -> tuple[ndarray, ...]:
-            image = surfaces, inverse_depth[i], matched[i], views[i]
-            return planar_prior(i, *image, support, recon_from_camera[i], pinhole)
-
-        found = [np.stack(maps) for maps in zip(*pool.map(prior, range(len(colors))), strict=True)]
-        plane_depth, holds, confirms, agreeing, contradicts, plane_std = found
+        plane_depth, holds, confirms, agreeing, contradicts, plane_std = _priors(
+            pool, colors, inverse_depth, matched, views, recon_from_camera, pinhole
+        )
         report(0.8)
         plane_std = np.hypot(plane_std, PRIOR_FLOOR)
         on_plane = confirms & (np.abs(plane_depth / inverse_depth - 1) < ON_PLANE)
@@ -121,6 +97,46 @@ def fused_depth(
         [BOTH, MATCHED, PRIOR],
         [1 / np.sqrt(std**-2 + plane_std**-2), std, plane_std],
     )
+
+
+def _checked(
+    pool: ThreadPoolExecutor,
+    views: Sequence[Relative],
+    pinhole: Intrinsics,
+    depth: Float[ndarray, "m h w"],
+    known: Bool[ndarray, "m h w"],
+    sees: Bool[ndarray, "m h w"],
+    tolerance: float,
+) -> list[ndarray]:
+    """Return `agreement` of all images, (m,h,w) each; inverse depths that are not known stay as they are."""
+    compared, k = evidence(depth, known, sees), grid(pinhole)
+    found = pool.map(
+        lambda i: agreement(i, compared, *views[i], k, pinhole.width, tolerance), range(len(views))
+    )
+    mean, *others = np.stack(list(found), 1)
+    return [np.where(known, mean, depth), *others]
+
+
+def _priors(
+    pool: ThreadPoolExecutor,
+    colors: UInt8[ndarray, "m h w 3"],
+    inverse_depth: Float[ndarray, "m h w"],
+    matched: Bool[ndarray, "m h w"],
+    views: Sequence[Relative],
+    recon_from_camera: Float[ndarray, "m 4 4"],
+    pinhole: Intrinsics,
+) -> list[ndarray]:
+    """Return the maps of `planar_prior` of all images, (m,h,w) each."""
+    support = _support(inverse_depth, matched, recon_from_camera, pinhole)
+    even = evened(colors, inverse_depth, matched, views, pinhole)
+    smooth = np.stack([cv2.GaussianBlur(image, (0, 0), 1.0) for image in even])
+    surfaces = np.where(matched, inverse_depth, 0).astype(np.float32), smooth
+
+    def prior(i: int) -> tuple[ndarray, ...]:
+        image = surfaces, inverse_depth[i], matched[i], views[i]
+        return planar_prior(i, *image, support, recon_from_camera[i], pinhole)
+
+    return [np.stack(maps) for maps in zip(*pool.map(prior, range(len(colors))), strict=True)]
 
 
 def _chosen(

@@ -107,23 +107,7 @@ def region_planes(
     if n == 0:
         return found
 
-    share = np.random.default_rng(seed).random((n, TRIALS, 3))
-    corner = start[:, None, None] + (share * size[:, None, None]).astype(int)
-    (a, b, c), (ya, yb, yc) = np.moveaxis(ray[corner], 2, 0), np.moveaxis(depth[corner], 2, 0)[..., None]
-    ab = np.cross(a, b)
-    determinant = (ab * c).sum(-1, keepdims=True)
-    determinant[np.abs(determinant) < 1e-6] = np.inf
-    tried = (ya * np.cross(b, c) + yb * np.cross(c, a) + yc * ab) / determinant
-    tried = np.concatenate([tried, np.broadcast_to(support, (n, 1, 3))], 1)
-    relative = (ray / depth[:, None]).astype(np.float32)
-    best, on = np.empty((n, 3)), np.zeros(n, bool)
-    for r, (first, pixels) in enumerate(zip(start, size, strict=True)):
-        some = slice(first, first + pixels, -(-pixels // SAMPLED))
-        agree = np.count_nonzero(np.abs(relative[some] @ tried[r].T.astype(np.float32) - 1) < tolerance, 0)
-        most = agree[:-1].argmax()
-        on[r] = agree[-1] > 0 and agree[-1] >= 0.8 * agree[most]
-        best[r] = support if on[r] else tried[r, most]
-
+    best, on = _drawn_planes(ray, depth, (start, size), support, tolerance, seed)
     on_best = ray * (np.abs((ray * best[of]).sum(1) - depth) < tolerance * depth)[:, None]
     normal = np.add.reduceat(on_best[:, :, None] * ray[:, None], start)
     fitted = ~on & (np.abs(np.linalg.det(normal)) >= 1e-12)
@@ -140,6 +124,38 @@ def region_planes(
     rest[kept] = np.sqrt(np.bincount(of[carries], off[carries] ** 2, n)[good] / number[good])
     middle[kept], shape[kept] = mean[good], np.linalg.inv(covariance[good] + np.eye(2))
     return found
+
+
+def _drawn_planes(
+    ray: Float[ndarray, "k 3"],
+    depth: Float[ndarray, " k"],
+    of_region: tuple[Int[ndarray, " n"], Int[ndarray, " n"]],
+    support: Float[ndarray, "3"],
+    tolerance: float,
+    seed: int,
+) -> tuple[Float[ndarray, "n 3"], Bool[ndarray, " n"]]:
+    """Return the plane of most of each region's pixels among drawn ones, and whether it is the support's.
+
+    `of_region` are the first pixel and the number of pixels of each; `depth` is inverse depth.
+    """
+    start, size = of_region
+    share = np.random.default_rng(seed).random((len(start), TRIALS, 3))
+    corner = start[:, None, None] + (share * size[:, None, None]).astype(int)
+    (a, b, c), (ya, yb, yc) = np.moveaxis(ray[corner], 2, 0), np.moveaxis(depth[corner], 2, 0)[..., None]
+    ab = np.cross(a, b)
+    determinant = (ab * c).sum(-1, keepdims=True)
+    determinant[np.abs(determinant) < 1e-6] = np.inf
+    tried = (ya * np.cross(b, c) + yb * np.cross(c, a) + yc * ab) / determinant
+    tried = np.concatenate([tried, np.broadcast_to(support, (len(start), 1, 3))], 1)
+    relative = (ray / depth[:, None]).astype(np.float32)
+    best, on = np.empty((len(start), 3)), np.zeros(len(start), bool)
+    for r, (first, pixels) in enumerate(zip(start, size, strict=True)):
+        some = slice(first, first + pixels, -(-pixels // SAMPLED))
+        agree = np.count_nonzero(np.abs(relative[some] @ tried[r].T.astype(np.float32) - 1) < tolerance, 0)
+        most = agree[:-1].argmax()
+        on[r] = agree[-1] > 0 and agree[-1] >= 0.8 * agree[most]
+        best[r] = support if on[r] else tried[r, most]
+    return best, on
 
 
 def _moments(

@@ -21,7 +21,7 @@ from jcr.export.options import ExportOptions, Provenance
 from jcr.geometry import inverse
 from jcr.records import COEFFICIENTS, Intrinsics, PointCloud, Tracks
 from jcr.scene.cloud import write_cloud
-from jcr.sfm.mapping import camera_of
+from jcr.sfm.model import camera_of
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _ORIENTATION = 0x0112

@@ -3,9 +3,7 @@
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -18,7 +16,8 @@ from jcr.features.gate import Key, Pair
 from jcr.features.two_view import readings
 from jcr.records import Intrinsics
 
-FeatureName = Literal["sift", "xfeat"]
+FeatureName = Literal["auto", "sift", "xfeat"]
+"""Kinds of features; auto stands for sift, unless a rejected result is followed by xfeat."""
 Geometries = dict[Key, pycolmap.TwoViewGeometry]
 
 MIN_INLIERS = 25
@@ -178,12 +177,3 @@ def matrices(
     if essential is None and found.F is not None:
         essential = k.T @ found.F @ k
     return essential, None if homography is None else np.linalg.inv(k) @ homography @ k
-
-
-def write_matches(database: Path, x_px: Sequence[Float[ndarray, "_ 2"]], geometries: Geometries) -> None:
-    """Write keypoints and geometries into a database that has the images already and no geometries."""
-    with closing(pycolmap.Database.open(database)) as db:
-        for row, x in enumerate(x_px):
-            db.write_keypoints(row + 1, (x + HALF_PIXEL).astype(np.float32))
-        for (i, j), geometry in geometries.items():
-            db.write_two_view_geometry(i + 1, j + 1, geometry)

@@ -16,6 +16,8 @@ from PIL import Image
 from jcr.features.gate import Key
 from jcr.progress import Progress, steps
 
+WORKING_SIZE_PX = 1600
+"""Images whose long side is larger are reduced to this before features are found."""
 KEYPOINTS = 2000
 """Largest number of keypoints of an image, by contrast."""
 CONTRAST = 0.01

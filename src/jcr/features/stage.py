@@ -262,9 +262,8 @@ def match_with_robot(
     if found.of_x is None:
         search.match(dict.fromkeys(everything, as_taken))
         found = search.gate()
-    notes, warnings = (), ()
     if found.of_x is None:
-        kept = search.without_robot()
+        kept, notes, warnings = search.without_robot(), (), ()
     else:
         upright = rolls(base_from_gripper[:, :3, :3] @ found.of_x.rotation)
         found = search.match_upright(seen_in_common(search.view, found, motion) or everything, upright, found)
@@ -273,23 +272,7 @@ def match_with_robot(
         lonely = set(np.flatnonzero(np.bincount(rows, minlength=n) < 2).tolist())
         if lonely:
             found = search.match_upright([key for key in everything if lonely & set(key)], upright, found)
-        stale = _contradicted_by_all(found, motion)
-        believed = {pair.key for pair in found.confirmed}
-        believed |= {pair.key for pair in found.contradicted if stale & set(pair.key)}
-        # Of a pair whose rotation is not measured, only what the known rotation explains would be right.
-        believed |= set() if matcher.known else {pair.key for pair in found.undecided}
-        kept = {key: geometry for key, (_, geometry) in search.pairs.items() if key in believed}
-        count, total = len(found.contradicted), len(found.contradicted) + len(found.confirmed)
-        if count > WORTH_SAYING * total:
-            notes += (
-                f"the robot contradicts {count} of {total} matched pairs of images by their relative rotation: left out",
-            )
-        if stale:
-            listed = ", ".join(names[row] for row in sorted(stale))
-            warnings += (
-                f"the matches of {listed} agree with each other and contradict the reported gripper rotation; check its "
-                "pose",
-            )
+        kept, notes, warnings = _believed(search, found, names)
     if search.still is not None:
         place = _in_words(search.still, (intrinsics.width, intrinsics.height), original)
         notes += (
@@ -297,6 +280,30 @@ def match_with_robot(
         )
     report(1.0)
     return Matched(geometries=kept, intrinsics=search.view.intrinsics, notes=notes, warnings=warnings)
+
+
+def _believed(
+    search: _Search, found: Gate, names: Sequence[str]
+) -> tuple[Geometries, tuple[str, ...], tuple[str, ...]]:
+    """Return the pairs that the robot does not contradict, with notes and warnings on the others."""
+    notes, warnings = tuple[str, ...](), tuple[str, ...]()
+    stale = _contradicted_by_all(found, search.motion)
+    believed = {pair.key for pair in found.confirmed}
+    believed |= {pair.key for pair in found.contradicted if stale & set(pair.key)}
+    # Of a pair whose rotation is not measured, only what the known rotation explains would be right.
+    believed |= set() if search.matcher.known else {pair.key for pair in found.undecided}
+    count, total = len(found.contradicted), len(found.contradicted) + len(found.confirmed)
+    if count > WORTH_SAYING * total:
+        notes = (
+            f"the robot contradicts {count} of {total} matched pairs of images by their relative rotation: left out",
+        )
+    if stale:
+        listed = ", ".join(names[row] for row in sorted(stale))
+        warnings = (
+            f"the matches of {listed} agree with each other and contradict the reported gripper rotation; check its "
+            "pose",
+        )
+    return {key: one for key, (_, one) in search.pairs.items() if key in believed}, notes, warnings
 
 
 def _contradicted_by_all(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> set[int]:

@@ -26,6 +26,7 @@ from jcr.errors import InputError, RejectedError
 from jcr.estimation.hand_eye import SCALE_STD, fit_hand_eye
 from jcr.estimation.observability import observability
 from jcr.estimation.prediction import FEWEST, Assumptions, Prediction, assumed, typical_camera
+from jcr.features.sift import WORKING_SIZE_PX
 from jcr.findings import (
     Finding,
     FindingKind,
@@ -38,8 +39,6 @@ from jcr.findings import (
 from jcr.geometry import ARM, largest_motion
 from jcr.progress import Progress
 from jcr.records import Capture, HandEye, NextPose, Observability, PosePairs
-from jcr.sfm.colmap import reconstruct_colmap
-from jcr.sfm.options import ColmapOptions
 
 CLEARER = 3.0
 """Factor by which poses in one convention must fit the images better than in the others."""
@@ -184,28 +183,32 @@ def _compare_with_images(
     """Compare the gripper poses with few small images and, where that is not enough, with all of them."""
     if not thorough and len(capture) > QUICK:
         rows = spread_rows(len(capture))
-        quick = ColmapOptions(seed=seed, working_size_px=QUICK_SIZE_PX)
         few = replace(capture.of_rows(rows), depths=None)
-        shown = _compare_registered(few, robot.of(rows), options, quick, progress)
+        shown = _compare_registered(few, robot.of(rows), options, seed, progress, quick=True)
         is_sound = verdict_of(shown.findings) != "rejected"
         if is_sound and shown.registered is not None and len(shown.registered) == QUICK:
             return replace(shown, registered=None)
-    return _compare_registered(capture, robot, options, ColmapOptions(seed=seed), progress)
+    return _compare_registered(capture, robot, options, seed, progress, quick=False)
 
 
 def _compare_registered(
     capture: Capture,
     robot: RobotErrors,
     options: CalibrateOptions,
-    colmap: ColmapOptions,
+    seed: int,
     progress: Progress | None,
+    *,
+    quick: bool,
 ) -> _Comparison:
     """Compare the gripper poses with cameras from features, by a calibration and the poses that it left out."""
+    from jcr.sfm.colmap import reconstruct_colmap
+
     try:
-        made = reconstruct_colmap(capture, colmap, progress)
+        size_px = QUICK_SIZE_PX if quick else WORKING_SIZE_PX
+        made = reconstruct_colmap(capture, "sift", seed, progress, size_px)
     except RejectedError as error:
         board = None
-        if colmap.working_size_px != QUICK_SIZE_PX:
+        if not quick:
             board = proposed([read_image(capture.folder / name) for name in capture.images])
         return _Comparison(findings=(*no_reconstruction(error), *(() if board is None else (board,))))
     case = checked(capture, made, options, robot.of(made.image_index))
@@ -268,12 +271,14 @@ def read_and_compare(
 
 def _best_fit(read: list[tuple[Capture, ReadOptions]], progress: Progress | None) -> Capture | None:
     """Return the capture whose poses agree with the images far better than those of the others, with a note."""
+    from jcr.sfm.colmap import reconstruct_colmap
+
     if not read:
         return None
     rows = spread_rows(len(read[0][0]))
     few = read[0][0].of_rows(rows)
     try:
-        found = reconstruct_colmap(few, ColmapOptions(working_size_px=QUICK_SIZE_PX), progress)
+        found = reconstruct_colmap(few, "sift", 0, progress, QUICK_SIZE_PX)
     except RejectedError:
         return None
     fits = []

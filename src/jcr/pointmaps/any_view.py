@@ -93,20 +93,6 @@ def checked(maps: PosedPointmaps, model: str) -> PosedPointmaps:
     )
 
 
-def pinhole_of_edges(matrix: Float[ndarray, "*n 3 3"]) -> Float[ndarray, "*n 4"]:
-    """Return fx, fy, cx, cy with pixel (0, 0) a centre from matrices whose origin is the image's corner."""
-    fx, fy, cx, cy = matrix[..., 0, 0], matrix[..., 1, 1], matrix[..., 0, 2], matrix[..., 1, 2]
-    return np.stack([fx, fy, cx - 0.5, cy - 0.5], axis=-1)
-
-
-def rays_of(pinholes: Float[ndarray, "n 4"], height: int, width: int) -> Float[ndarray, "n h w 3"]:
-    """Return the directions of unit depth through the pixels' centres of each view."""
-    v, u = np.mgrid[:height, :width]
-    fx, fy, cx, cy = (pinholes[:, k, None, None] for k in range(4))
-    x, y = (u - cx) / fx, (v - cy) / fy
-    return np.stack([x, y, np.ones_like(x)], axis=-1).astype(np.float32)
-
-
 def normalised(colors: UInt8[ndarray, "n h w 3"], device: str) -> torch.Tensor:
     """Return images (n,3,h,w) in the normalisation of encoders that were trained on ImageNet."""
     mean, deviation = (

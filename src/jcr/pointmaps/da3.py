@@ -15,17 +15,34 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from numpy import ndarray
 from torch import nn
 
 from jcr.errors import InputError
 from jcr.geometry import inverse
-from jcr.pointmaps.any_view import Predict, Views, normalised, output, pinhole_of_edges, rays_of, rigid
+from jcr.hub import Weights
+from jcr.pointmaps.any_view import (
+    Predict,
+    Views,
+    normalised,
+    output,
+    reconstruct_any_view,
+    rigid,
+)
 from jcr.pointmaps.grid import ImageGrid
 from jcr.pointmaps.posed import PosedPointmaps
+from jcr.progress import Progress
+from jcr.records import Capture, Reconstruction
 
 LONG_EDGE, PATCH = 504, 14
+
+
+def reconstruct_da3(
+    capture: Capture, weights: Weights, device: str, backend: str, progress: Progress | None = None
+) -> Reconstruction:
+    """Reconstruct a capture by Depth Anything 3; raise InputError for weights that are missing or damaged."""
+    return reconstruct_any_view(capture, load, weights, device, backend, progress)
 
 
 def load(weights: Path, device: str) -> Predict:
@@ -69,15 +86,23 @@ def predict(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) -> Pos
         answer = network(normalised(colors, device)[None], None, None)
     count, height, width = colors.shape[:3]
     depth = output(answer, "depth", (count, height, width), "Depth Anything 3")
-    pinholes = pinhole_of_edges(output(answer, "intrinsics", (count, 3, 3), "Depth Anything 3"))
+    matrices = output(answer, "intrinsics", (count, 3, 3), "Depth Anything 3")
     camera_from_recon = rigid(output(answer, "extrinsics", (count, 3, 4), "Depth Anything 3"))
     return PosedPointmaps(
         grid=grid,
-        x_in_camera=depth[..., None] * rays_of(pinholes, height, width),
+        x_in_camera=depth[..., None] * rays_of_edges(matrices, height, width),
         confidence=output(answer, "depth_conf", (count, height, width), "Depth Anything 3"),
         recon_from_camera=inverse(camera_from_recon),
         is_metric=False,
     )
+
+
+def rays_of_edges(matrices: Float[ndarray, "n 3 3"], height: int, width: int) -> Float[ndarray, "n h w 3"]:
+    """Return the directions of unit depth through pixels' centres, by matrices that count from the corner."""
+    pixel = np.stack(
+        [*np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), np.ones((height, width))], -1
+    )
+    return np.einsum("nij,hwj->nhwi", np.linalg.inv(matrices), pixel).astype(np.float32)
 
 
 def grid_of(size: tuple[int, int], long_edge: int = LONG_EDGE) -> ImageGrid:

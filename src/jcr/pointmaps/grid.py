@@ -47,14 +47,6 @@ class ImageGrid:
         """Return the grid of the whole image resized to `size`."""
         return cls(original_size, size, (0, 0), size)
 
-    @classmethod
-    def shrunk(cls, original_size: tuple[int, int], long_edge: int) -> "ImageGrid":
-        """Return the grid of the whole image, its long edge reduced to `long_edge` where it is longer."""
-        scale = min(1.0, long_edge / max(original_size))
-        return cls.uncropped(
-            original_size, (round(original_size[0] * scale), round(original_size[1] * scale))
-        )
-
     @property
     def scale(self) -> Float[ndarray, "2"]:
         """Resized over original, for x and y (they differ by the rounding of the sizes)."""
@@ -124,14 +116,10 @@ class PreparedImages:
 
     def original_px(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
         """Map pixels (...,2) of the grid to the capture's distorted images."""
-        undistorted_px = self.grid.original_from_grid(x_px)
-        if (
-            self.pinhole is None
-            or self.intrinsics_of_capture is None
-            or not is_distorted(self.intrinsics_of_capture)
-        ):
+        undistorted_px, camera = self.grid.original_from_grid(x_px), self.intrinsics_of_capture
+        if self.pinhole is None or camera is None or not is_distorted(camera):
             return undistorted_px
-        return project(self.intrinsics_of_capture, unproject(self.pinhole, undistorted_px))
+        return project(camera, unproject(self.pinhole, undistorted_px))
 
 
 def prepare_images(

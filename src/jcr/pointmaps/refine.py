@@ -77,7 +77,9 @@ def refine(
 
     `pinhole` belongs to the undistorted images; it is fixed where `images` has it, else its focal length is adjusted.
     """
-    work = ImageGrid.shrunk(maps.grid.original_size, LONG_EDGE)
+    width, height = maps.grid.original_size
+    scale = min(1.0, LONG_EDGE / max(width, height))
+    work = ImageGrid.uncropped((width, height), (round(width * scale), round(height * scale)))
     colors = read_colors(capture, work, images.intrinsics_of_capture, images.pinhole)
     gray = np.stack([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in colors])
     camera, poses = work.grid_intrinsics(pinhole), maps.recon_from_camera
@@ -190,15 +192,11 @@ def _textured_both_ways(gray: UInt8[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
     structure tensor), whose share of noise is taken off.
     """
     image = gray.astype(np.float32)
-    by_x, by_y = (cv2.Sobel(image, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1)))
     # A Laplacian of white noise has 6 times its deviation (Immerkær, 1996).
     kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
     noise = max(float(np.median(np.abs(cv2.filter2D(image, -1, kernel)))) / 0.6745 / 6, 0.5)
-    xx, xy, yy = (
-        cv2.boxFilter(a * b, -1, WINDOW, normalize=False)
-        for a, b in ((by_x, by_x), (by_x, by_y), (by_y, by_y))
-    )
-    least = (xx + yy) / 2 - np.sqrt((xx - yy) ** 2 / 4 + xy**2)
+    # OpenCV divides Sobel's gradients by 4 and by the side of the window, where their weights add up to 8.
+    least = cv2.cornerMinEigenVal(image, WINDOW[0], ksize=3) * (WINDOW[0] / 2) ** 2
     # Sobel's weights of white noise: 12 of the 64 parts.
     least -= noise**2 * 12 / 64 * WINDOW[0] * WINDOW[1]
     return least > 2 * (noise / LARGEST_STD_PX) ** 2

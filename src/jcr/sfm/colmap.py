@@ -1,52 +1,113 @@
-"""The COLMAP back end: structure from motion; no network, no weights."""
+"""The COLMAP back end: structure from motion by matching, mapping, bundle adjustment, alignment of the observations.
+
+Method: Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016.
+"""
 
 import math
+import os
+import tempfile
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
+import pycolmap
+from jaxtyping import Float, UInt8
+from numpy import ndarray
 from PIL import ExifTags, Image
 
-from jcr.camera import usable_intrinsics
+from jcr.allocator import give_back
+from jcr.camera import HALF_PIXEL, fold_distance_px, resized, usable_intrinsics
 from jcr.capture.images import read_image
 from jcr.errors import RejectedError
+from jcr.extras import extra
+from jcr.features.matchers import FeatureName, Matcher
+from jcr.features.sift import WORKING_SIZE_PX, SiftFeatures, grey_of
+from jcr.features.stage import Matched, match_with_robot
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction
-from jcr.sfm.options import ColmapOptions
+from jcr.sfm.missing_images import with_missing_images
+from jcr.sfm.model import (
+    ENOUGH,
+    adjust_robustly,
+    camera_of,
+    intrinsics_of,
+    observations,
+    poses_of,
+    quiet_colmap,
+    reconstruction_of,
+    rows_of,
+    tracks_of,
+    working_cameras,
+    write_database,
+)
+from jcr.sfm.track_refinement import align_tracks
 
 _FILM_DIAGONAL_MM = 43.27
 """Diagonal of the 36 x 24 mm frame that EXIF's equivalent focal length refers to."""
 _START_FOCALS = (0.8, 0.5, 1.2)
 """Initial focal lengths in long sides, without known intrinsics. COLMAP's 1.2 alone fails on two of three real wrist
 cameras (true values 0.5 to 0.7); from 0.8 all three converge."""
+_MIN_REGISTERED = 3
+_MANY, _GROWN = 40, 1.3
+"""Number of images above which COLMAP adjusts all only after growth by the second (its default is 1.1)."""
+_ROUGHLY = 1e-3
+"""Relative change of the cost that ends the adjustment before the last one."""
+_MOST_OBSERVATIONS = 60_000
+"""Largest number of observations of a map; the robot's errors limit what more could add."""
+_SIFT_THREADS = 8
+"""Largest number of images whose features are found at once; each takes 240 bytes a pixel while it is worked on."""
+_FEW_FEATURES = 1000
+"""Per image; textured tabletops give 1500 to 5000, a chessboard before a plain background 400."""
 
 
 def reconstruct_colmap(
-    capture: Capture, options: ColmapOptions | None = None, progress: Progress | None = None
+    capture: Capture,
+    features: FeatureName = "sift",
+    seed: int = 0,
+    progress: Progress | None = None,
+    working_size_px: int = WORKING_SIZE_PX,
 ) -> Reconstruction:
-    """Camera poses and tracks of a capture, up to one similarity.
+    """Reconstruct camera poses and tracks of a capture, up to one similarity; one seed gives one result, bit for bit.
 
-    Known intrinsics are held, unknown ones are estimated. Raises RejectedError when fewer than three images
-    register: how many did, the likely reason, and what to do instead.
+    The gripper poses check the matches (`features.stage`). Known intrinsics are held, unknown ones are estimated. Raises
+    RejectedError when fewer than three images register: how many did, the likely reason, and what to do instead.
     """
-    from jcr.sfm.mapping import structure_from_motion
-
-    options = options or ColmapOptions()
     report = progress or silent
     images = [read_image(capture.folder / name) for name in capture.images]
-    cameras, is_known, warnings = starting_intrinsics(capture)
-    try:
-        sparse = structure_from_motion(
-            images, cameras, is_known, options, report, capture.base_from_gripper, capture.images
-        )
-    except RejectedError as error:
-        raise error.with_more(*warnings) from None
-    notes, registered = sparse.notes, sparse.image_index
-    if missing := [name for row, name in enumerate(capture.images) if row not in registered]:
-        notes += (f"{len(registered)} of {len(capture)} images registered; not {', '.join(missing)}",)
-    return replace(sparse, notes=notes, warnings=(*warnings, *sparse.warnings))
+    all_intrinsics, known, warnings = starting_intrinsics(capture)
+    like = all_intrinsics[0]
+    with quiet_colmap():
+        cameras = working_cameras(all_intrinsics, known, working_size_px)
+        matcher = matcher_of(images, cameras[0], known, features, seed, report)
+        matched, model = map_images(matcher, capture.base_from_gripper, like, cameras, capture.images, report)
+        if model is None or model.num_reg_images() < _MIN_REGISTERED:
+            raise _not_registered(matcher, matched, model).with_more(*warnings)
+        _thin(model, seed)
+        adjust_robustly(model, known, _ROUGHLY)
+        std_px = _align_observations(model, images, intrinsics_of(model.camera(1), like, known))
+        adjust_robustly(model, known)
+        intrinsics, notes = intrinsics_of(model.camera(1), like, known), matched.notes
+        if not known and fold_distance_px(intrinsics) is not None:
+            notes += ("the views do not determine the distortion: it is taken as zero",)
+            model.camera(1).params = [*model.camera(1).params[:3], 0.0, 0.0]
+            adjust_robustly(model, fix_intrinsics=True)
+            intrinsics = intrinsics_of(model.camera(1), intrinsics, known)
+    report("mapping", 1.0)
+    made = reconstruction_of(model, rows_of(model), intrinsics)
+    if missing := [name for row, name in enumerate(capture.images) if row not in made.image_index]:
+        notes += (f"{len(made.image_index)} of {len(capture)} images registered; not {', '.join(missing)}",)
+    tracks = replace(made.tracks, std_px=std_px)
+    return replace(made, tracks=tracks, notes=notes, warnings=(*warnings, *matched.warnings))
 
 
 def starting_intrinsics(capture: Capture) -> tuple[list[Intrinsics], bool, tuple[str, ...]]:
-    """Return the initial intrinsics, tried in turn; whether they are given; and warnings about them."""
+    """Return the initial intrinsics, tried in turn; whether they are given; and warnings about them.
+
+    Given ones are the only ones, and do not fold over; else these are initial values of a focal length and two radial
+    coefficients.
+    """
     given, warnings = usable_intrinsics(capture.intrinsics)
     if given:
         return [given], True, warnings
@@ -59,3 +120,184 @@ def starting_intrinsics(capture: Capture) -> tuple[list[Intrinsics], bool, tuple
     focals += [factor * max(width, height) for factor in _START_FOCALS]
     guesses = [Intrinsics(f, f, (width - 1) / 2, (height - 1) / 2, width, height) for f in focals]
     return guesses, False, warnings
+
+
+def map_images(
+    matcher: Matcher,
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    intrinsics: Intrinsics,
+    cameras: Sequence[pycolmap.Camera],
+    names: Sequence[str],
+    report: Progress,
+    begun: pycolmap.Reconstruction | None = None,
+) -> tuple[Matched, pycolmap.Reconstruction | None]:
+    """Match the images, and map the pairs by COLMAP's mapper, then by predicted cameras of the images it left out.
+
+    `cameras` are tried in turn, after the intrinsics by the gripper's angles where none are given. A map that is `begun`
+    is continued with the images that it lacks and that match others.
+    """
+    report("matching", 0.0)
+    working = resized(intrinsics, cameras[0].width, cameras[0].height)
+    matched = match_with_robot(
+        matcher,
+        base_from_gripper,
+        working,
+        names,
+        (intrinsics.width, intrinsics.height),
+        lambda fraction: report("matching", fraction),
+    )
+    if matched.intrinsics != working:
+        cameras = [camera_of(matched.intrinsics, matcher.known), *cameras]
+    model, matching = begun, len({row for key in matched.geometries for row in key})
+    with tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
+        database = write_database(Path(folder), cameras[0], matcher.x_px, matched.geometries)
+        report("matching", 1.0)
+        if model is None or model.num_reg_images() < matching:
+            some = cameras if model is None else [model.camera(1)]
+            model = _map_incrementally(database, some, matcher, report, model)
+        if model is not None and model.num_reg_images() < matching:
+            model = with_missing_images(database, model, base_from_gripper, matcher)
+    return matched, model
+
+
+def matcher_of(
+    images: Sequence[UInt8[ndarray, "h w 3"]],
+    camera: pycolmap.Camera,
+    known: bool,
+    features: FeatureName,
+    seed: int,
+    report: Progress,
+) -> Matcher:
+    """Return the matcher of some kind of features; SIFT is found here, networks find theirs when they match."""
+    if features != "xfeat":
+        give_back()
+        size, threads = (camera.width, camera.height), min(os.cpu_count() or 1, _SIFT_THREADS)
+        found = SiftFeatures(images, size, threads, report)
+        give_back()
+        return Matcher(found, np.ones(2), camera, known, seed)
+    extra("torch", "match", f"--features {features}")
+    from jcr.features.xfeat import LearnedFeatures
+
+    height, width = images[0].shape[:2]
+    scale = np.array([camera.width / width, camera.height / height])
+    return Matcher(LearnedFeatures(images, report), scale, camera, known, seed)
+
+
+def _map_incrementally(
+    database: Path,
+    cameras: Sequence[pycolmap.Camera],
+    matcher: Matcher,
+    report: Progress,
+    begun: pycolmap.Reconstruction | None,
+) -> pycolmap.Reconstruction | None:
+    """Return the model with most images over all initial cameras, with relaxed thresholds if it has fewer than three.
+
+    A model that is `begun` is resumed with the images that it lacks. The share of images in the model is reported; it
+    falls back where another start is tried.
+    """
+    n_images, pipeline = len(matcher.x_px), _pipeline_options(matcher.known, matcher.seed)
+    if n_images > _MANY:
+        pipeline.ba_global_frames_ratio = pipeline.ba_global_points_ratio = _GROWN
+    mapper, folder = pipeline.mapper, database.parent
+    best, registered, done = None, 0, 0
+    if begun is not None:
+        (folder / "begun").mkdir(exist_ok=True)
+        begun.write(folder / "begun")
+
+    def add(count: int) -> None:
+        nonlocal done
+        done += count
+        report("mapping", min(done / n_images, 1.0))  # COLMAP may begin again with another pair
+
+    for init_inliers, init_angle_deg, inliers in ((100, 16.0, 30), (50, 8.0, 15)):
+        mapper.init_min_num_inliers, mapper.init_min_tri_angle = init_inliers, init_angle_deg
+        mapper.abs_pose_min_num_inliers = inliers
+        for camera in cameras:
+            with closing(pycolmap.Database.open(database)) as db:
+                db.update_camera(camera)
+            done = 0
+            add(0 if begun is None else begun.num_reg_images())
+            models = pycolmap.incremental_mapping(
+                database,
+                folder,
+                folder,
+                pipeline,
+                "" if begun is None else folder / "begun",
+                initial_image_pair_callback=lambda: add(2),
+                next_image_callback=lambda: add(1),
+            )
+            for model in models.values():
+                if model.num_reg_images() > registered:
+                    best, registered = model, model.num_reg_images()
+            if registered == n_images:
+                return best
+        if registered >= _MIN_REGISTERED:
+            return best
+    return best
+
+
+def _pipeline_options(known: bool, seed: int) -> pycolmap.IncrementalPipelineOptions:
+    """Return the options of COLMAP's incremental mapping; one seed gives one result."""
+    pipeline = pycolmap.IncrementalPipelineOptions()
+    mapper = pipeline.mapper
+    pipeline.min_model_size = 2
+    pipeline.extract_colors = False
+    # A first pair may bend unknown intrinsics until no third image fits: others are tried, the largest model counts.
+    pipeline.multiple_models, pipeline.max_num_models = not known, 3
+    pipeline.random_seed = mapper.random_seed = pipeline.triangulation.random_seed = seed
+    pipeline.num_threads = mapper.num_threads = 1  # sums over threads differ in the last bits
+    pipeline.ba_global_function_tolerance = pipeline.ba_local_function_tolerance = ENOUGH
+    if known:
+        pipeline.ba_refine_focal_length = pipeline.ba_refine_extra_params = False
+        mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = False
+    return pipeline
+
+
+def _thin(model: pycolmap.Reconstruction, seed: int) -> None:
+    """Delete points at random until the model has at most _MOST_OBSERVATIONS observations."""
+    if model.compute_num_observations() <= _MOST_OBSERVATIONS:
+        return
+    order = np.random.default_rng(seed).permutation(sorted(model.point3D_ids()))
+    count = np.cumsum([model.point3D(int(point)).track.length() for point in order])
+    for point in order[count > _MOST_OBSERVATIONS]:
+        model.delete_point3D(int(point))
+
+
+def _align_observations(
+    model: pycolmap.Reconstruction, images: Sequence[UInt8[ndarray, "h w 3"]], intrinsics: Intrinsics
+) -> Float[ndarray, " k"] | None:
+    """Align the model's observations by least-squares matching, in the images that features were found in.
+
+    The standard deviation of each is returned in pixels of the original images, in the order of `tracks_of`.
+    """
+    camera, rows = model.camera(1), rows_of(model)
+    size, image_ids = (camera.width, camera.height), [row + 1 for row in rows]
+    greys = np.stack([grey_of(images[row], size) for row in rows])
+    tracks, poses = tracks_of(model, image_ids, size), poses_of(model, rows)
+    aligned = align_tracks(greys, tracks, poses, resized(intrinsics, *size))
+    for (row, index, _), x_px in zip(observations(model, image_ids), aligned.x_px, strict=True):
+        model.image(image_ids[row]).point2D(index).xy = x_px + HALF_PIXEL
+    return None if aligned.std_px is None else intrinsics.width / camera.width * aligned.std_px
+
+
+def _not_registered(
+    matcher: Matcher, matched: Matched, model: pycolmap.Reconstruction | None
+) -> RejectedError:
+    """Return the error: number of registered images, likely reason and remedy."""
+    x_px, pairs = matcher.x_px, len(matched.geometries)
+    features = int(np.median([len(x) for x in x_px]))
+    if features < _FEW_FEATURES:
+        reason = f"too little texture, {features} features in the median image where {_FEW_FEATURES} are few"
+    elif pairs < len(x_px) - 1:
+        reason = f"only {pairs} of {math.comb(len(x_px), 2)} pairs of images share features"
+    else:
+        reason = (
+            "the matches agree on no common scene: a repeated pattern, things that moved, or wrong intrinsics"
+        )
+    registered = model.num_reg_images() if model else 0
+    return RejectedError(
+        f"structure from motion registered {registered} of {len(x_px)} images ({reason})",
+        "put textured objects or a newspaper on the table, let the views overlap more, or use a foundation-model back "
+        "end or a marker",
+        despite_texture=features >= _FEW_FEATURES,
+    )

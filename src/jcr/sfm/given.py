@@ -14,19 +14,17 @@ from numpy import ndarray
 from jcr.capture.formats import colmap
 from jcr.capture.images import read_image
 from jcr.errors import InputError, RejectedError
-from jcr.features.matchers import Matcher, write_matches
 from jcr.features.pairs import all_pairs
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
-from jcr.sfm.mapping import enter, quiet_colmap, sift_features, tracks_of
-from jcr.sfm.missing_images import triangulated
-from jcr.sfm.options import ColmapOptions
+from jcr.sfm.colmap import matcher_of
+from jcr.sfm.model import quiet_colmap, tracks_of, triangulated, working_cameras, write_database
 
 MIN_POINTS = 50
 
 
 def reconstruct_given(
-    capture: Capture, cameras: Path, options: ColmapOptions, progress: Progress | None = None
+    capture: Capture, cameras: Path, seed: int = 0, progress: Progress | None = None
 ) -> Reconstruction:
     """Reconstruct the images that the model at `cameras` contains, with its poses fixed.
 
@@ -46,7 +44,7 @@ def reconstruct_given(
     tracks = _own_tracks(cameras, [names[row] for row in rows], capture.image_size)
     if len(tracks.points_in_recon) < MIN_POINTS:
         images = [read_image(capture.folder / capture.images[k]) for k in known]
-        tracks = _triangulated(images, intrinsics, recon_from_camera, options, report)
+        tracks = _triangulated(images, intrinsics, recon_from_camera, seed, report)
     if len(tracks.points_in_recon) < MIN_POINTS:
         raise RejectedError(
             f"{cameras}: with its camera poses only {len(tracks.points_in_recon)} points can be triangulated",
@@ -88,17 +86,16 @@ def _triangulated(
     images: Sequence[UInt8[ndarray, "h w 3"]],
     intrinsics: Intrinsics,
     recon_from_camera: Float[ndarray, "m 4 4"],
-    options: ColmapOptions,
+    seed: int,
     report: Progress,
 ) -> Tracks:
     """Triangulate points of matched features, with intrinsics and cameras fixed."""
     with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
-        database = Path(folder) / "database.db"
-        cameras = enter(database, len(images), [intrinsics], True, options.working_size_px)
-        found = sift_features(images, cameras[0], report)
-        matcher = Matcher(found, np.ones(2), cameras[0], True, options.seed)
+        (camera,) = working_cameras([intrinsics], True)
+        matcher = matcher_of(images, camera, True, "sift", seed, report)
         report("matching", 0.0)
         pairs = all_pairs(len(images))
-        write_matches(database, matcher.x_px, matcher.geometries(pairs, np.zeros((len(pairs), 2))))
-        model = triangulated(database, cameras[0], dict(enumerate(recon_from_camera)))
+        geometries = matcher.geometries(pairs, np.zeros((len(pairs), 2)))
+        database = write_database(Path(folder), camera, matcher.x_px, geometries)
+        model = triangulated(database, camera, dict(enumerate(recon_from_camera)))
         return tracks_of(model, range(1, len(images) + 1), (intrinsics.width, intrinsics.height))

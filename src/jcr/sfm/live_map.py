@@ -3,10 +3,8 @@
 COLMAP's mapper continues the last map with the new images.
 """
 
-import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -17,22 +15,16 @@ from jcr.features.matchers import Geometries, Matcher
 from jcr.features.sift import SiftFeatures
 from jcr.progress import silent
 from jcr.records import Capture, Reconstruction
-from jcr.sfm.colmap import starting_intrinsics
-from jcr.sfm.mapping import (
+from jcr.sfm.colmap import map_images, starting_intrinsics
+from jcr.sfm.model import (
     adjust_robustly,
-    enter,
     intrinsics_of,
-    map_of_pairs,
-    matched_pairs,
     quiet_colmap,
     reconstruction_of,
+    rows_of,
     working_cameras,
 )
-from jcr.sfm.missing_images import rows_of
-from jcr.sfm.options import ColmapOptions
 
-OPTIONS = ColmapOptions()
-"""Options of a calibration without options."""
 FEW = 5
 """Number of images up to which COLMAP maps all with each new one; the first pair may have been an unlucky one."""
 
@@ -43,9 +35,10 @@ class LiveMap:
     def __init__(self, capture: Capture) -> None:
         """Begin a map without images; the intrinsics are those of the capture, or estimated."""
         self._all_intrinsics, self._known, _ = starting_intrinsics(capture)
-        camera = working_cameras(self._all_intrinsics, self._known, OPTIONS.working_size_px)[0]
+        self._cameras = working_cameras(self._all_intrinsics, self._known)
+        camera = self._cameras[0]
         self._features = SiftFeatures([], (camera.width, camera.height), 1, silent)
-        self._matcher = Matcher(self._features, np.ones(2), camera, self._known, OPTIONS.seed)
+        self._matcher = Matcher(self._features, np.ones(2), camera, self._known, seed=0)
         self._names: list[str] = []
         self._geometries: Geometries = {}
         self._model: pycolmap.Reconstruction | None = None
@@ -74,16 +67,18 @@ class LiveMap:
                 self._features.add(new[name])
                 self._names.append(name)
         self._places = [capture.images.index(name) for name in self._names]
-        with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-live-") as folder:
-            database, intrinsics = Path(folder) / "database.db", self._all_intrinsics
-            cameras = enter(database, len(capture), intrinsics, self._known, OPTIONS.working_size_px)
-            poses = capture.base_from_gripper[self._places]
-            matched = matched_pairs(
-                database, self._matcher, poses, intrinsics[0], cameras, self._names, silent
+        begun = self._model if len(self._names) > FEW else None
+        with quiet_colmap():
+            matched, self._model = map_images(
+                self._matcher,
+                capture.base_from_gripper[self._places],
+                self._all_intrinsics[0],
+                self._cameras,
+                self._names,
+                silent,
+                begun,
             )
             self._geometries = matched.geometries
-            begun = self._model if len(self._names) > FEW else None
-            self._model = map_of_pairs(database, self._matcher, matched, cameras, poses, silent, begun)
             if self._model is not None and self._model is not begun:
                 adjust_robustly(self._model, fix_intrinsics=self._known)
 

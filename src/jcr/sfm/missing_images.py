@@ -5,10 +5,7 @@ of whole images loses features that resemble others of the image; near a point's
 more points of the map are searched there.
 """
 
-import tempfile
 from collections import Counter
-from collections.abc import Callable, Sequence
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +17,14 @@ from scipy.spatial import KDTree
 from jcr.camera import HALF_PIXEL
 from jcr.estimation.robust import robust_fit
 from jcr.features.matchers import Matcher
-from jcr.geometry import inverse, transform
+from jcr.geometry import inverse
+from jcr.sfm.model import adjust_robustly, poses_of, rows_of, triangulated
 
 PASSES = ((32.0, 1, 4.0), (8.0, 1, 1.0), (4.0, 5, 0.5))
 """Largest reprojection error of a point (px), refinements of each triangulation, and scale (px) of the loss of the
 adjustment after it."""
+ROUGHLY = 1e-3
+"""Relative change of the cost that ends these adjustments."""
 LEAST_POINTS = 15
 """Least number of points of an image that images of the map see, too."""
 LEAST_MAPPED = 4
@@ -36,31 +36,12 @@ RATIO = 0.85
 LARGEST_PX = 4.0
 """Reprojection error above which an observation is a mismatch, as COLMAP's."""
 
-Adjust = Callable[[pycolmap.Reconstruction, float], None]
-"""Bundle adjustment of a model, free of the gripper poses, with the scale of the loss (px)."""
-Cameras = dict[int, Float[ndarray, "4 4"]]
-"""recon_from_camera by row of the image."""
-
-
-def rows_of(model: pycolmap.Reconstruction) -> list[int]:
-    """Return the rows of a model's images."""
-    return sorted(image_id - 1 for image_id in model.reg_image_ids())
-
-
-def poses_of(model: pycolmap.Reconstruction, rows: Sequence[int]) -> Float[ndarray, "m 4 4"]:
-    """Return recon_from_camera of mapped images."""
-    mapped = [model.image(row + 1).cam_from_world() for row in rows]
-    if not mapped:
-        return np.zeros((0, 4, 4))
-    return inverse(np.stack([transform(m.rotation.matrix(), m.translation) for m in mapped]))
-
 
 def with_missing_images(
     database: Path,
     model: pycolmap.Reconstruction,
     base_from_gripper: Float[ndarray, "n 4 4"],
     matcher: Matcher,
-    adjust: Adjust,
 ) -> pycolmap.Reconstruction:
     """Return the model with the images that it lacks, where points confirm the cameras that its own X predicts."""
     rows = rows_of(model)
@@ -87,7 +68,7 @@ def with_missing_images(
                 larger.deregister_frame(larger.image(row + 1).frame_id)
         if larger.num_reg_images() <= len(rows):
             return model
-        adjust(larger, scale_px)
+        adjust_robustly(larger, matcher.known, ROUGHLY, scale_px)
         cameras = dict(zip(rows_of(larger), poses_of(larger, rows_of(larger)), strict=True))
     images = {row + 1 for row in cameras if row not in rows}
     filters = pycolmap.ObservationManager(larger)
@@ -95,41 +76,9 @@ def with_missing_images(
         for image_id in sorted(images):
             _complete(larger, image_id, matcher, radius_px)
         filters.filter_points3D_in_images(LARGEST_PX, 0.0, images)
-        adjust(larger, PASSES[-1][2])
+        adjust_robustly(larger, matcher.known, ROUGHLY, PASSES[-1][2])
         filters.filter_points3D_in_images(LARGEST_PX, 0.0, images)
     return larger
-
-
-def triangulated(
-    database: Path,
-    camera: pycolmap.Camera,
-    recon_from_camera: Cameras,
-    largest_px: float = 4.0,
-    refinements: int = 5,
-) -> pycolmap.Reconstruction:
-    """Return a model of fixed cameras with points from all verified matches; the same, bit for bit, for the same input.
-
-    Points with a reprojection error above `largest_px` are left out.
-    """
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = options.mapper.num_threads = 1
-    options.ba_global_max_refinements = refinements
-    options.random_seed = options.triangulation.random_seed = 0
-    options.mapper.filter_max_reproj_error = largest_px
-    options.triangulation.merge_max_reproj_error = largest_px
-    options.triangulation.complete_max_reproj_error = largest_px
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(camera)
-    with closing(pycolmap.Database.open(database)) as db:
-        for row, pose in sorted(recon_from_camera.items()):
-            image = db.read_image(row + 1)
-            keypoints = [pycolmap.Point2D(xy) for xy in db.read_keypoints(row + 1)[:, :2]]
-            image.points2D = pycolmap.Point2DList(keypoints)
-            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(inverse(pose)[:3]))
-    with tempfile.TemporaryDirectory(prefix="jcr-points-") as folder:
-        return pycolmap.triangulate_points(
-            model, database, folder, Path(folder), refine_intrinsics=False, options=options
-        )
 
 
 def _complete(model: pycolmap.Reconstruction, image_id: int, matcher: Matcher, radius_px: float) -> None:

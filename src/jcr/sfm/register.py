@@ -14,12 +14,10 @@ from numpy import ndarray
 
 from jcr.camera import NORMALIZED, project, resized, unproject
 from jcr.estimation.absolute_pose import CameraPose, absolute_pose
-from jcr.features.sift import detect, grey_of, matches
+from jcr.features.sift import WORKING_SIZE_PX, detect, grey_of, matches
 from jcr.geometry import across_lines
 from jcr.records import Intrinsics, Reconstruction
 
-WORKING_SIZE_PX = 1600
-"""Larger images are reduced to this long side before features are found."""
 GATE_PX = 3.0
 """Reprojection error beyond which an observation is a mismatch."""
 MIN_PARALLAX = np.radians(1.5)
@@ -61,7 +59,7 @@ class KnownImages:
 
 @dataclass(frozen=True, kw_only=True)
 class SharedPoints:
-    """Features of a new image triangulated from images with known poses."""
+    """Features of a new image on whose point two or more rays of images with known poses agree."""
 
     known: KnownImages
     x_px: Float[ndarray, "n 2"]
@@ -69,10 +67,8 @@ class SharedPoints:
     points: Float[ndarray, "n 3"]
     spread: Float[ndarray, "n 3 3"]
     """Covariance of the points for rays of 1 rad noise."""
-    good: Bool[ndarray, " n"]
-    """Whether two or more rays agree on the point."""
-    feature: Int[ndarray, " c"]
-    """Feature of each observation in the known images."""
+    point: Int[ndarray, " c"]
+    """Point of each observation in the known images."""
     row: Int[ndarray, " c"]
     row_x_px: Float[ndarray, "c 2"]
 
@@ -126,15 +122,15 @@ def shared_points(known: KnownImages, new: ImageFeatures) -> SharedPoints:
     rays = np.concatenate([one.rays[rows] for one, rows in theirs])
     gate = GATE_PX / known.camera.fx
     points, spread, good = triangulated(feature, row, rays, known.recon_from_camera, gate, len(new.rays))
+    seen = good[feature]
     return SharedPoints(
         known=known,
-        x_px=new.x_px,
-        points=points,
-        spread=spread,
-        good=good,
-        feature=feature,
-        row=row,
-        row_x_px=np.concatenate([one.x_px[rows] for one, rows in theirs]),
+        x_px=new.x_px[good],
+        points=points[good],
+        spread=spread[good],
+        point=(np.cumsum(good) - 1)[feature[seen]],
+        row=row[seen],
+        row_x_px=np.concatenate([one.x_px[rows] for one, rows in theirs])[seen],
     )
 
 
@@ -145,36 +141,32 @@ def registration(
     gate_px: float = GATE_PX,
 ) -> Registration | int:
     """Return the pose on which the shared points agree, or their number where fewer than MIN_POINTS do."""
-    candidates, known = np.flatnonzero(shared.good), shared.known
-    if len(candidates) < MIN_POINTS:
-        return len(candidates)
-    points, std_px, pose = shared.points[candidates], 1.0, None
+    known, std_px, pose = shared.known, 1.0, None
+    if len(shared.points) < MIN_POINTS:
+        return len(shared.points)
     for _ in range(2):  # the known images have the noise that is found in the new one
-        covariance = (std_px / known.camera.fx) ** 2 * shared.spread[candidates]
-        pose = absolute_pose(shared.x_px[candidates], points, camera, covariance, gate_px, focal)
+        covariance = (std_px / known.camera.fx) ** 2 * shared.spread
+        pose = absolute_pose(shared.x_px, shared.points, camera, covariance, gate_px, focal)
         if pose is None or pose.inlier.sum() < MIN_POINTS:
             return 0 if pose is None else int(pose.inlier.sum())
         std_px = pose.std_px
     assert pose is not None
-    agreed = candidates[pose.inlier]
     # Observations of the known images count where their point projects.
     rotation, centre = (
         part[shared.row] for part in (known.recon_from_camera[:, :3, :3], known.recon_from_camera[:, :3, 3])
     )
-    in_camera = np.einsum("cji,cj->ci", rotation, shared.points[shared.feature] - centre)
+    in_camera = np.einsum("cji,cj->ci", rotation, shared.points[shared.point] - centre)
     ahead = in_camera[:, 2] > 1e-6
     projected = project(known.camera, np.where(ahead[:, None], in_camera, [0.0, 0.0, 1.0]))
     miss_px = np.linalg.norm(projected - shared.row_x_px, axis=1)
-    kept = ahead & (miss_px < GATE_PX) & np.isin(shared.feature, agreed)
-    number = np.zeros(len(shared.x_px), int)
-    number[agreed] = np.arange(len(agreed))
+    kept = ahead & (miss_px < GATE_PX) & pose.inlier[shared.point]
     return Registration(
         pose=pose,
-        points_in_recon=shared.points[agreed],
-        x_px=shared.x_px[agreed],
+        points_in_recon=shared.points[pose.inlier],
+        x_px=shared.x_px[pose.inlier],
         row=shared.row[kept],
         row_x_px=shared.row_x_px[kept],
-        row_point=number[shared.feature[kept]],
+        row_point=(np.cumsum(pose.inlier) - 1)[shared.point[kept]],
     )
 
 

@@ -62,8 +62,8 @@ def predict_pairs(
 
     Where CUDA runs out of memory the batch is halved. Raises InputError where the memory does not suffice for one pair.
     """
-    network, report, notes = loaded.network, progress or silent, tuple[str, ...]()
-    batch, features = MAX_BATCH[network.device.type], dict[int, EncodedImages]()
+    network, report = loaded.network, progress or silent
+    features, sizes = dict[int, EncodedImages](), [MAX_BATCH[network.device.type]]
     height, width = images.colors.shape[1:3]
     arrays = [np.empty((len(edges), height, width, *point), np.float32) for point in ((3,), ()) * 2]
 
@@ -83,29 +83,9 @@ def predict_pairs(
         for array, values in zip(arrays, (*view1, *view2), strict=True):
             array[rows] = values.cpu().numpy()
 
-    def in_batches(stage: str, count: int, work: Callable[[Int[ndarray, " b"]], None]) -> None:
-        nonlocal batch, notes
-        done = 0
-        while done < count:
-            rows = np.arange(done, min(done + batch, count))
-            try:
-                with torch.inference_mode():
-                    work(rows)
-                done += len(rows)
-                report(stage, done / count)
-                continue
-            except torch.cuda.OutOfMemoryError:
-                batch //= 2
-            # Outside of the except clause, whose traceback keeps the tensors of the failed batch alive.
-            torch.cuda.empty_cache()
-            if batch == 0:
-                raise InputError(
-                    "out of memory with one pair of images; close other programs, or use --device cpu"
-                )
-            notes += (f"out of memory on the {network.device}: {batch} pairs at a time",)
-
-    in_batches("encode images", len(images.colors), encode)
-    in_batches("predict pairs", len(edges), decode)
+    _in_batches(encode, len(images.colors), sizes, lambda share: report("encode images", share))
+    _in_batches(decode, len(edges), sizes, lambda share: report("predict pairs", share))
+    notes = tuple(f"out of memory on the {network.device}: {size} pairs at a time" for size in sizes[1:])
     pts3d, conf, pts3d_in_other_view, conf2 = arrays
     predictions = PairPredictions(
         edges=edges,
@@ -120,3 +100,29 @@ def predict_pairs(
         is_metric=loaded.is_metric,
     )
     return predictions, notes
+
+
+def _in_batches(
+    work: Callable[[Int[ndarray, " b"]], None],
+    count: int,
+    sizes: list[int],
+    report: Callable[[float], None],
+) -> None:
+    """Do `work` on all rows in batches of the last of `sizes`, to which half of it is added where memory ends."""
+    done = 0
+    while done < count:
+        rows = np.arange(done, min(done + sizes[-1], count))
+        try:
+            with torch.inference_mode():
+                work(rows)
+            done += len(rows)
+            report(done / count)
+            continue
+        except torch.cuda.OutOfMemoryError:
+            sizes.append(sizes[-1] // 2)
+        # Outside of the except clause, whose traceback keeps the tensors of the failed batch alive.
+        torch.cuda.empty_cache()
+        if sizes[-1] == 0:
+            raise InputError(
+                "out of memory with one pair of images; close other programs, or use --device cpu"
+            )

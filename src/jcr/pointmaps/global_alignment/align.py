@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from jcr.camera import rays
 from jcr.errors import InputError
@@ -85,16 +87,12 @@ def global_align(
 
 def _check_connected(predictions: PairPredictions) -> None:
     """Raise InputError naming the images that no chain of pairs joins to the first."""
-    count = predictions.image_count
-    if len(predictions.edges) == 0:
+    count, edges = predictions.image_count, predictions.edges
+    if len(edges) == 0:
         raise InputError("the predictions have no pair; predict at least one")
-    reached = np.zeros(count, dtype=bool)
-    reached[predictions.edges[0, 0]] = True
-    for _ in range(count):
-        joined = reached[predictions.edges].any(axis=1)
-        reached[predictions.edges[joined].ravel()] = True
-    if not reached.all():
-        names = ", ".join(predictions.names[k] for k in np.flatnonzero(~reached))
+    _, part = connected_components(csr_array((np.ones(len(edges)), edges.T), (count, count)), directed=False)
+    if part.any():
+        names = ", ".join(predictions.names[k] for k in np.flatnonzero(part != part[edges[0, 0]]))
         raise InputError(
             f"no chain of pairs joins {names} to the other images; predict pairs between them, "
             "or leave these images out"

@@ -208,101 +208,78 @@ def image_equations(
     """Return the Gauss-Newton equations of one image's pointmaps with residuals `r` of spread `noise`.
 
     With v the change of a modelled point, the change of (across, along) has the squared norm
-    vᵀ (α I + β x̂ x̂ᵀ) v, α = w_across/|x|², β = w_along/|x|² − α; every block below is that form for two of
-    the directions an unknown moves the point in: twist (I, −[X]), depth (the arm), focal. Raises LinAlgError where the
-    errors of the pairs cannot be eliminated.
+    vᵀ (α I + β x̂ x̂ᵀ) v, α = w_across/|x|², β = w_along/|x|² − α. Raises LinAlgError where the errors of the pairs cannot
+    be eliminated.
     """
-    n, maps = o.second_count, len(o.pair)
+    n, count, maps = o.second_count, 6 * o.second_count, len(o.pair)
     # Of mean 1, so that the hessian is the information in the pointmaps.
     robust = o.weight / np.maximum(o.weight.mean(), np.float32(1e-12)) * agreement(r, noise)
     w_across = robust / (noise.across**2 * noise.across_inflation)[:, None]
     w_along = robust / (noise.along**2 * noise.along_inflation)[:, None]
     alpha = w_across / r.distance**2
     beta = w_along / r.distance**2 - alpha
-    toward, arm, focal_arm = r.toward, r.depth_arm, r.focal_arm
-    arm_along, focal_along = (np.einsum("kcm,cm->km", toward, v) for v in (arm, focal_arm))
-    depth_pull = alpha[:, None] * arm + (beta * arm_along)[:, None] * toward
-    focal_pull = alpha[:, None] * focal_arm + (beta * focal_along)[:, None] * toward
+    # The directions in which a point moves: by the twist (I, −[X]), the focal and its depth.
+    v = np.zeros((8, *r.x_in_recon.shape), np.float32)
+    v[(0, 1, 2), (0, 1, 2)] = 1.0
+    v[3:6] = skew(np.eye(3)) @ r.x_in_recon
+    v[6], v[7] = r.focal_arm, r.depth_arm
+    products, along = np.einsum("icm,jcm->ijm", v, v), np.einsum("kcm,jcm->kjm", r.toward, v)
+    by_pair = (alpha @ products.reshape(64, -1).T).reshape(maps, 8, 8)
+    by_pair += (along * beta[:, None]) @ along.transpose(0, 2, 1)
+    by_depth = alpha[:, None] * products[7] + (beta * along[:, 7])[:, None] * along
     scale_pull = -w_along / r.distance
-    residual_force = (w_along * r.along / r.distance)[:, None] * toward
-    residual_force -= (w_across / r.distance)[:, None] * r.across
-    screw = _moments(r.x_in_recon, toward[:n])
+    by_scale = np.einsum("km,kjm->kj", scale_pull, along)
+    force = -(scale_pull * r.along)[:, None] * r.toward - (w_across / r.distance)[:, None] * r.across
+    gradients = np.einsum("kcm,jcm->kj", force, v)
 
-    count = 6 * n
     twists, scales = np.arange(count).reshape(n, 6), count + np.arange(maps)
-    blocks = twists[:, :, None], twists[:, None, :]
     hessian = np.zeros((count + maps + 1,) * 2)
-    hessian[blocks] = (screw * beta[:n, None]) @ screw.transpose(0, 2, 1)
-    hessian[blocks] += _isotropic(alpha[:n], r.x_in_recon)
-    hessian[twists, scales[:n, None]] = np.einsum("km,kcm->kc", scale_pull[:n], screw)
-    hessian[twists, -1] = _moments(r.x_in_recon, focal_pull[:n]).sum(axis=2)
-    hessian[scales, scales] = w_along.sum(axis=1)
-    hessian[scales, -1] = np.einsum("km,km->k", scale_pull, focal_along)
-    hessian[-1, -1] = np.vdot(focal_pull.sum(axis=0), focal_arm)
-    hessian[scales[:n, None], twists] = hessian[twists, scales[:n, None]]
+    hessian[twists[:, :, None], twists[:, None, :]] = by_pair[:n, :6, :6]
+    hessian[twists, scales[:n, None]] = hessian[scales[:n, None], twists] = by_scale[:n, :6]
+    hessian[twists, -1], hessian[scales, -1] = by_pair[:n, :6, 6], by_scale[:, 6]
     hessian[-1, :-1] = hessian[:-1, -1]
-    gradient = np.concatenate(
-        [
-            _moments(r.x_in_recon, residual_force[:n]).sum(axis=2).ravel(),
-            -(w_along * r.along).sum(axis=1),
-            [np.vdot(residual_force.sum(axis=0), focal_arm)],
-        ]
-    )
-    coupling = np.concatenate(
-        [
-            _moments(r.x_in_recon, depth_pull[:n]).reshape(count, arm.shape[1]),
-            scale_pull * arm_along,
-            (depth_pull.sum(axis=0) * focal_arm).sum(axis=0)[None],
-        ]
-    )
-    depth_gradient = (residual_force.sum(axis=0) * arm).sum(axis=0)
-    depth_hessian = (depth_pull.sum(axis=0) * arm).sum(axis=0)
+    hessian[scales, scales], hessian[-1, -1] = w_along.sum(axis=1), by_pair[:, 6, 6].sum()
+    of_scales = -(w_along * r.along).sum(axis=1)
+    gradient = np.r_[gradients[:n, :6].ravel(), of_scales, gradients[:, 6].sum()].astype(np.float64)
+    twist_and_scale = by_depth[:n, :6].reshape(count, alpha.shape[1]), scale_pull * along[:, 7]
+    coupling = np.concatenate([*twist_and_scale, by_depth[:, 6].sum(axis=0)[None]])
+    depth_gradient = (force.sum(axis=0) * r.depth_arm).sum(axis=0)
+    depth_hessian = by_depth[:, 7].sum(axis=0)
     # A pixel without weight keeps its depth.
     depth_hessian += np.float32(1e-6) * depth_hessian.max() + np.float32(1e-30)
     scaled = coupling / depth_hessian
     hessian -= (scaled @ coupling.T).astype(np.float64)
     gradient -= (scaled @ depth_gradient).astype(np.float64)
+    of_pairs = _eliminated(hessian, gradient, o, state, pair_spread)
+    depths = {"depth_hessian": depth_hessian, "depth_gradient": depth_gradient, "coupling": coupling}
+    return ImageEquations(**of_pairs, **depths, selection=_selection(o, state))
 
+
+def _eliminated(
+    hessian: Float[ndarray, "c c"],
+    gradient: Float[ndarray, " c"],
+    o: ImageObservations,
+    state: AlignmentState,
+    pair_spread: Float[ndarray, "6"],
+) -> dict[str, ndarray]:
+    """Return the equations without the errors of the pairs, whose twists come first, and what gives their steps."""
+    n, count = o.second_count, 6 * o.second_count
     axes = adjoint(inverse(state.recon_from_camera[o.observer[:n]]))
+    twists = np.arange(count).reshape(n, 6)
+    blocks = twists[:, :, None], twists[:, None, :]
     tied = hessian[:count, :count].copy()
     tied[blocks] += axes.transpose(0, 2, 1) @ (axes / pair_spread[:, None] ** 2)
     covariance = np.linalg.inv(tied)
     pull = np.einsum("kji,kj->ki", axes, state.pair_error[o.pair[:n]] / pair_spread**2)
     gain, offset = covariance @ hessian[:count], covariance @ (gradient[:count] - pull.ravel())
-    return ImageEquations(
-        hessian=hessian - hessian[:, :count] @ gain,
-        gradient=gradient - hessian[:, :count] @ offset,
-        selection=_selection(o, state),
-        gain=gain,
-        offset=offset,
-        axes=axes,
-        error_variance=np.einsum("kij,kjl,kil->ki", axes, covariance[blocks], axes),
-        depth_hessian=depth_hessian,
-        depth_gradient=depth_gradient,
-        coupling=coupling,
-    )
-
-
-def _moments(x: Float[ndarray, "3 m"], force: Float[ndarray, "n 3 m"]) -> Float[ndarray, "n 6 m"]:
-    """Return (I, −[X])ᵀ applied to forces at points X: force and moment."""
-    out = np.empty((len(force), 6, x.shape[1]), np.float32)
-    out[:, :3] = force
-    for row, (a, b) in enumerate(((1, 2), (2, 0), (0, 1)), start=3):
-        out[:, row] = x[a] * force[:, b] - x[b] * force[:, a]
-    return out
-
-
-def _isotropic(alpha: Float[ndarray, "n m"], x: Float[ndarray, "3 m"]) -> Float[ndarray, "n 6 6"]:
-    """Return Σ α (I, −[X])ᵀ (I, −[X]) over the pixels, from the weights' moments of X."""
-    products = (x[:, None] * x).reshape(9, -1)
-    moments = alpha @ np.concatenate([np.ones_like(x[:1]), x, products]).T
-    second = moments[:, 4:].reshape(-1, 3, 3)
-    out = np.zeros((len(alpha), 6, 6))
-    out[:, :3, :3] = moments[:, :1, None] * np.eye(3)
-    out[:, 3:, :3] = skew(moments[:, 1:4].astype(np.float64))
-    out[:, :3, 3:] = out[:, 3:, :3].transpose(0, 2, 1)
-    out[:, 3:, 3:] = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
-    return out
+    return {
+        "hessian": hessian - hessian[:, :count] @ gain,
+        "gradient": gradient - hessian[:, :count] @ offset,
+        "gain": gain,
+        "offset": offset,
+        "axes": axes,
+        "error_variance": np.einsum("kij,kjl,kil->ki", axes, covariance[blocks], axes),
+    }
 
 
 def _selection(o: ImageObservations, state: AlignmentState) -> csr_array:
