@@ -23,11 +23,7 @@ FIRST = "images/00.jpg"
     ],
 )
 def test_a_board_or_a_length_that_cannot_be_is_refused_before_any_work(
-    tabletop: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    arguments: list[str],
-    words: str,
+    tabletop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], words: str
 ):
     monkeypatch.setattr(run, "begun", lambda *_: pytest.fail("the capture was worked on"))
     found = run_jcr("run", tabletop, tmp_path / "out", *arguments)

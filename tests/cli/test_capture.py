@@ -47,12 +47,7 @@ RESUME = "the same command resumes; 3 or more images are needed"
     ],
 )
 def test_a_rejected_result_exits_with_three_and_the_last_line_is_a_command_that_works(
-    images: int,
-    found: Any,
-    until_accurate: bool,
-    status: int,
-    last: str,
-    capsys: pytest.CaptureFixture[str],
+    images: int, found: Any, until_accurate: bool, status: int, last: str, capsys: pytest.CaptureFixture[str]
 ):
     options = SessionOptions(until_accurate=until_accurate, require=(2.0, 0.3))
     facts = {"capture": "captures/live", "images": images * ["0.png"], "answers": []}

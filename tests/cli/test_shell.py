@@ -71,11 +71,7 @@ def test_errors_are_named_quiet_or_not(tmp_path: Path, capsys: pytest.CaptureFix
     assert printed.out == "" and printed.err.startswith("error: ") and printed.err.count("\n") == 1
 
 
-TYPED = {
-    "jcr ru": {"run"},
-    "jcr run --backe": {"--backend"},
-    "jcr run --backend col": {"colmap"},
-}
+TYPED = {"jcr ru": {"run"}, "jcr run --backe": {"--backend"}, "jcr run --backend col": {"colmap"}}
 """Typed words, and what Tab offers for the last one."""
 
 

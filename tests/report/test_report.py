@@ -28,14 +28,7 @@ from jcr.errors import RejectedError
 from jcr.estimation.observability import excitation
 from jcr.findings import no_reconstruction
 from jcr.geometry import inverse, rotation_exp, transform
-from jcr.records import (
-    COVARIANCE_ORDER,
-    BoardFound,
-    Capture,
-    CellCamera,
-    Reconstruction,
-    Tracks,
-)
+from jcr.records import COVARIANCE_ORDER, BoardFound, Capture, CellCamera, Reconstruction, Tracks
 from jcr.records.json_fields import IntrinsicsAndStd
 from jcr.report.details import details_section
 from jcr.report.html import failed_report_html, report_html

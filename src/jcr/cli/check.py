@@ -229,10 +229,11 @@ class CompareCommand:
         apart = f"{facts['translation_mm']:.3f} mm, {facts['rotation_deg']:.4f}° apart"
         lines = [f"{verdict}: {apart}{explained}", *labelled("Remedy", *remedy)]
         lines += labelled("Difference", offset)
-        causes = [
-            f"{name.replace('_', ' ')} {100 * share:.0f} %" for name, share in found.explained_by.items()
-        ]
-        lines += labelled("Causes", f"would be {', '.join(causes)}") if len(causes) > 1 else []
+        shares = {name.replace("_", " "): 100 * share for name, share in found.explained_by.items()}
+        causes = ", ".join(f"{name} {share:.0f} %" for name, share in shares.items() if share >= 0.5)
+        if len(shares) > 1:
+            condition = "if the errors were larger than reported: " if is_contradiction else ""
+            lines += labelled("Causes", condition + causes)
         if self.output.verbose and found.sigmas is not None:
             lines.append(f"χ² {found.chi2:.1f} of 6, p = {found.p_value:.2g}")
         lines += [line for path, why in rejected.items() for line in labelled("Rejected", f"{path}: {why}")]
@@ -266,10 +267,7 @@ class VerifyCommand:
         """Verify and print what to do."""
         from jcr.pipeline.verify import verify_run
 
-        with (
-            progress_bars() as progress,
-            looked_at(self.capture, self.read, progress, at_least=1) as new,
-        ):
+        with progress_bars() as progress, looked_at(self.capture, self.read, progress, at_least=1) as new:
             capture = with_images(new, self.capture, "which verify needs")
             found = verify_run(self.out, capture, self.verify, progress)
         cameras = (found, *found.others)
