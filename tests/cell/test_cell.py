@@ -264,7 +264,6 @@ def test_a_zoom_of_a_second_camera_is_named_with_its_size_and_none_where_there_i
         adjust=lambda prior, free, bent: images.with_freed(prior, 1, free).adjusted(),
         arm=None,
         names=[f"{k}.png" for k in range(COUNT)],
-        start=camera,
         is_given=True,
         prior=images.problem.cameras[1],
         std=np.sqrt(np.diag(answer.transform(place)[1])),

@@ -32,6 +32,9 @@ MIN_IMAGES = 3
 MOST_OBSERVATIONS = 60_000
 """Most observations that are adjusted: the robot limits what more could add, and 25 images of 640x480 have as many."""
 
+WELL_SEEN = 3
+"""Images that show a point well."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
@@ -95,7 +98,8 @@ class Case:
         """Observations in the used images, at most MOST_OBSERVATIONS."""
         if self.chosen_tracks is not None:
             return self.chosen_tracks
-        return some_of_many(of_images(self.reconstruction.tracks, self.hand_eye.inliers), MOST_OBSERVATIONS)
+        found = of_images(self.reconstruction.tracks, self.hand_eye.inliers)
+        return found if len(found.image) <= MOST_OBSERVATIONS else some_points(found, MOST_OBSERVATIONS)
 
     @property
     def scene_distance_m(self) -> float | None:
@@ -169,12 +173,16 @@ def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
     return replace(kept, image=row[kept.image])
 
 
-def some_of_many(tracks: Tracks, most: int) -> Tracks:
-    """Return all observations, or, of more than `most`, those of randomly chosen points and of all board corners."""
-    if len(tracks.image) <= most:
-        return tracks
+def some_points(tracks: Tracks, most: int, most_points: int | None = None) -> Tracks:
+    """Return the observations of all board corners and of randomly chosen points, at most `most`.
+
+    Of at most `most_points` those that WELL_SEEN or more images show are chosen first.
+    """
     count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
     order = np.random.default_rng(0).permutation(len(count))
+    if most_points is not None:
+        order = order[np.argsort(count[order] < WELL_SEEN, kind="stable")]
+        order = order[count[order] >= 2][:most_points]
     chosen = tracks.on_board
     chosen[order[np.cumsum(count[order]) <= most]] = True
     return of_points(tracks, chosen)

@@ -167,7 +167,6 @@ def _imaged(
         ),
         arm=arm,
         names=[image.image for image in found.images if image.used],
-        start=images.problem.cameras[c].intrinsics,
         is_given=is_given,
         prior=images.problem.cameras[c],
         std=np.sqrt(np.diag(found.covariance)) * found.converged,

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.calibration.adjust import adjust_case, focal_of_each
-from jcr.calibration.case import Case, of_points
+from jcr.calibration.case import Case, some_points
 from jcr.camera import parameter_names, parameters
 from jcr.distributions import f as f_distribution
 from jcr.estimation.hypotheses import Row
@@ -36,7 +36,7 @@ from jcr.estimation.solve import Solution
 from jcr.estimation.wrist import estimate_of
 from jcr.findings import Concerns, Finding, FindingKind
 from jcr.geometry import step_between
-from jcr.records import Intrinsics, Tracks
+from jcr.records import Intrinsics
 
 LOG_P = float(np.log(1e-6))
 """Logarithm of the probability of a false alarm of one effect, over all places of a change."""
@@ -46,8 +46,8 @@ MATERIAL = 0.5
 """Standard deviations by which a fault must move the camera on some axis to be reported."""
 OF_FIRST_STEP = 0.2
 """Share of MATERIAL that the first step towards a fault must reach before it is adjusted."""
-MOST_POINTS, WELL_SEEN = 800, 3
-"""Largest number of points that take part, first those in this many images: more show a fault no better."""
+MOST_POINTS = 800
+"""Largest number of points that take part: more show a fault no better."""
 MOST_BYTES, BYTES_PER_IMAGE = 100_000_000, 16 * OF_IMAGE
 """Limits on the derivatives of all observations by the nuisances of each image: 58 000 observations of 200 images need
 740 MB, and the equations several times that."""
@@ -63,6 +63,8 @@ OFF, OFF_CENTRE = 0.01, 0.015
 and calibrations of another day are off by 0.3 to 0.9 % and a few pixels."""
 OF_EACH = {FindingKind.FOCUS_BY_IMAGE, FindingKind.ROLLING_SHUTTER_BY_IMAGE}
 """Effects that differ from image to image."""
+SIGNED = {FindingKind.FOCUS_BY_DISTANCE, FindingKind.ZOOM}
+"""Effects whose size has a sign."""
 SURE = 2.0
 """Smallest size, in standard deviations, of effects that differ from image to image: of many images smaller ones
 are improbable wherever the noise is estimated a little too small."""
@@ -98,9 +100,8 @@ class CameraAdjustment:
     errors of one standard deviation of the gripper poses."""
     names: Sequence[str]
     """Names of its images."""
-    start: Intrinsics
-    """Intrinsics that were given, or that the reconstruction estimated."""
     is_given: bool
+    """Whether the intrinsics were given; else the reconstruction estimated them."""
     prior: CameraPrior
     std: Float[ndarray, "6"]
     """Standard deviations of the camera's pose; 0 where it is rejected."""
@@ -149,7 +150,6 @@ def of_case(case: Case) -> CameraAdjustment:
             case, prior=prior, combinations=combinations, confirmed_errors=bent
         ),
         names=[case.names[row] for row in case.used],
-        start=case.reconstruction.intrinsics,
         is_given=case.capture.intrinsics is not None,
         prior=case.camera,
         std=np.sqrt(np.diag(case.hand_eye.covariance)[:6]) * case.hand_eye.converged,
@@ -168,6 +168,8 @@ class CameraEffect:
     beside: Float[ndarray, "e q"]
     """Combinations that are free beside it and are no part of it."""
     _: KW_ONLY
+    unit: float = 1.0
+    """Factor from the estimates to the size that is reported."""
     places: int = 1
     """Number of places that were searched."""
     after: int = 0
@@ -251,7 +253,7 @@ def of_fewer_points(case: Case) -> Case:
     few = len(np.unique(tracks.point)) <= MOST_POINTS and len(tracks.image) <= most
     if len(case.used) < MIN_IMAGES or few:
         return case
-    fewer = replace(case, chosen_tracks=of_some(tracks, most))
+    fewer = replace(case, chosen_tracks=some_points(tracks, most, MOST_POINTS))
     free = focal_of_each(case) if case.options.focus == "varies" else None
     return replace(fewer, adjusted=adjust_case(fewer, combinations=free))
 
@@ -300,7 +302,7 @@ def is_far_off(state: EffectsState) -> bool:
     """Return whether focal length or principal point differ from given ones by OFF."""
     if not state.imaged.is_given:
         return False
-    given = state.imaged.start
+    given = state.imaged.prior.intrinsics
     off = np.abs(parameters(state.camera) - parameters(given))[:4]
     return bool((off > given.fx * np.array([OFF, OFF, OFF_CENTRE, OFF_CENTRE])).any())
 
@@ -309,7 +311,7 @@ def _log_p_of_given(state: EffectsState) -> float:
     """Return the logarithm of the probability of the estimated intrinsics if the given ones were exact; 0 near them."""
     if not is_far_off(state):
         return 0.0
-    by = (parameters(state.camera) - parameters(state.imaged.start))[:4]
+    by = (parameters(state.camera) - parameters(state.imaged.prior.intrinsics))[:4]
     covariance = state.adjusted.intrinsics_covariance(state.imaged.camera)[:4, :4]
     size = np.sqrt(np.diag(covariance))
     ratio = (by / size) @ np.linalg.pinv(covariance / np.outer(size, size), rcond=1e-9) @ (by / size) / 4
@@ -336,17 +338,6 @@ def camera_finding(after: EffectsState, before: EffectsState) -> Finding:
         intrinsics_shift=tuple(moved.tolist()),
         **size,
     )
-
-
-def of_some(tracks: Tracks, most: int) -> Tracks:
-    """Return randomly chosen points that most images see, of at most `most` observations, and all board corners."""
-    count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
-    order = np.random.default_rng(0).permutation(len(count))
-    enough = order[np.argsort(count[order] < WELL_SEEN, kind="stable")]
-    chosen = tracks.on_board
-    shown = enough[count[enough] >= 2][:MOST_POINTS]
-    chosen[shown[np.cumsum(count[shown]) <= most]] = True
-    return of_points(tracks, chosen)
 
 
 def _all(state: EffectsState) -> Float[ndarray, "e r"]:
@@ -411,33 +402,34 @@ def _value(fault: CameraEffect, total: Float[ndarray, " e"]) -> Float[ndarray, "
 
 
 def _hypotheses(state: EffectsState) -> list[CameraEffect]:
+    """Return the effects that are tested, with a focal length that is wrong in all images free beside them."""
     equations = state.equations
-    m = equations.images
-    far = np.log(equations.distance)
-    far = far - far.mean()
-    steps = np.arange(LEAST_PART, m - LEAST_PART + 1)
-    common, nothing = (
-        equations.of_camera(("fx", "fy")).sum(1, keepdims=True),
-        np.zeros((equations.columns, 0)),
-    )
+    m, far = equations.images, np.log(equations.distance)
+    focal_px, width = state.imaged.prior.intrinsics.fx, state.camera.width
+    common = equations.of_camera(("fx", "fy")).sum(1, keepdims=True)
     # Intrinsics that are wrong in all images include the focal length that shows nothing in the others.
+    nothing = np.zeros((equations.columns, 0))
     intrinsics = CameraEffect(FindingKind.INTRINSICS, equations.of_camera(_freed(state)), nothing)
     if m < MIN_IMAGES:
         return [intrinsics]
-    x, y = equations.down_in_camera[:, :2].T
-    sag = [equations.of_images("x", x[:, None]), equations.of_images("y", y[:, None])]
+    of_centre = np.concatenate([common, equations.of_camera(("cx", "cy"))], axis=1)
+    down = equations.down_in_camera[:, :, None]
+    sag = [equations.of_images("x", down[:, 0]), equations.of_images("y", down[:, 1])]
+    by_distance = equations.of_images("focal", (far - far.mean())[:, None])
+    spread = float(np.ptp(far))
+    sheared, each_sheared = (equations.of_images("shear", shares) for shares in (np.ones((m, 1)), np.eye(m)))
     found = [
-        CameraEffect(FindingKind.FOCUS_BY_DISTANCE, equations.of_images("focal", far[:, None]), common),
+        CameraEffect(FindingKind.FOCUS_BY_DISTANCE, by_distance, common, unit=spread),
         CameraEffect(FindingKind.FOCUS_BY_IMAGE, equations.of_images("focal", differences(m)), common),
-        CameraEffect(FindingKind.ROLLING_SHUTTER, equations.of_images("shear", np.ones((m, 1))), common),
-        CameraEffect(FindingKind.ROLLING_SHUTTER_BY_IMAGE, equations.of_images("shear", np.eye(m)), common),
+        CameraEffect(FindingKind.ROLLING_SHUTTER, sheared, common, unit=focal_px),
+        CameraEffect(FindingKind.ROLLING_SHUTTER_BY_IMAGE, each_sheared, common, unit=focal_px),
+        CameraEffect(FindingKind.CENTRE_SAGS, np.concatenate(sag, axis=1), of_centre, unit=width),
     ]
+    steps = range(LEAST_PART, m - LEAST_PART + 1)
     for k in steps:
         after = (np.arange(m) >= k) - (m - k) / m
         free = equations.of_images("focal", after[:, None])
-        found.append(CameraEffect(FindingKind.ZOOM, free, common, places=len(steps), after=int(k) - 1))
-    of_centre = np.concatenate([common, equations.of_camera(("cx", "cy"))], axis=1)
-    found.append(CameraEffect(FindingKind.CENTRE_SAGS, np.concatenate(sag, axis=1), of_centre))
+        found.append(CameraEffect(FindingKind.ZOOM, free, common, places=len(steps), after=k - 1))
     if len(state.adjusted.problem.cameras) == 1:  # all images share the glass
         found.append(CameraEffect(FindingKind.THIN_PRISM, np.eye(equations.columns)[:, -PRISM:], of_centre))
     return [*found, intrinsics]
@@ -447,7 +439,7 @@ def _of_intrinsics(after: EffectsState, last: ScoreTest) -> dict[str, Any]:
     """Return the fields of a finding that state the intrinsics which the images show."""
     units = dict(zip(after.equations.names, after.equations.units, strict=True))
     std = np.sqrt(np.maximum(np.diag(last.covariance), 0.0))
-    given, now = parameters(after.imaged.start), parameters(after.camera)
+    given, now = parameters(after.imaged.prior.intrinsics), parameters(after.camera)
     found: dict[str, float] = {} if after.imaged.is_given else {"estimated": 1.0}
     for name, old, new in zip(parameter_names(after.camera), given, now, strict=True):
         if name in INTRINSICS:
@@ -457,29 +449,19 @@ def _of_intrinsics(after: EffectsState, last: ScoreTest) -> dict[str, Any]:
 
 
 def _size(after: EffectsState, last: ScoreTest) -> dict[str, Any]:
-    """Return the fields of a finding that state the size of the effect."""
-    fault, equations = after.found[-1], after.equations
-    value = _value(fault, after.total)
-    std = np.sqrt(np.maximum(np.diag(last.covariance), 0.0))
-    typical, each = float(np.sqrt(np.mean(value**2))), float(np.median(std))
-    spread = float(np.ptp(np.log(equations.distance)))
-    focal_px, width = after.imaged.start.fx, after.camera.width
-    match fault.kind:
-        case FindingKind.FOCUS_BY_DISTANCE:
-            size, error = spread * value[0], spread * std[0]
-        case FindingKind.FOCUS_BY_IMAGE:
-            size, error = np.sqrt(value @ value / equations.images), each
-        case FindingKind.ZOOM:
-            size, error = value[0], std[0]
-        case FindingKind.THIN_PRISM:
-            size, error = _largest_px(after, value, last.covariance)
-        case FindingKind.CENTRE_SAGS:
-            size, error = width * typical, width * each / np.sqrt(2)
-        case _:
-            size, error = focal_px * typical, focal_px * each
+    """Return the fields of a finding that state the size of the effect: of several estimates their rms."""
+    fault, value = after.found[-1], _value(after.found[-1], after.total)
+    std = float(np.median(np.sqrt(np.maximum(np.diag(last.covariance), 0.0))))
+    if fault.kind is FindingKind.THIN_PRISM:
+        size, error = _largest_px(after, value, last.covariance)
+    elif fault.kind in OF_EACH:
+        size, error = fault.unit * float(np.sqrt(value @ value / after.equations.images)), fault.unit * std
+    else:
+        rms = value[0] if fault.kind in SIGNED else np.sqrt(np.mean(value**2))
+        size, error = fault.unit * float(rms), fault.unit * std / float(np.sqrt(len(value)))
     changed = after.imaged.names[fault.after : fault.after + 2] if fault.kind is FindingKind.ZOOM else ()
     concerns = CONCERNS.get(fault.kind, "images")
-    return {"concerns": concerns, "value": float(size), "std": float(error), "images": tuple(changed)}
+    return {"concerns": concerns, "value": size, "std": error, "images": tuple(changed)}
 
 
 def _largest_px(
