@@ -25,33 +25,34 @@ def rows_as(convention: str, poses: np.ndarray) -> np.ndarray:
     x, y, z, w = rotation.as_quat().T
     yaw, pitch, roll = rotation.as_euler("ZYX").T
     rpy, vector = np.stack([roll, pitch, yaw], 1), rotation.as_rotvec()
-    return {
-        "matrix": lambda: poses.reshape(-1, 16),
-        "franka": lambda: np.swapaxes(poses, 1, 2).reshape(-1, 16),
-        "quat-xyzw": lambda: np.column_stack([position, x, y, z, w]),
-        "quat-wxyz": lambda: np.column_stack([position, w, x, y, z]),
-        "realman": lambda: np.column_stack([position, w, x, y, z]),
-        "abb": lambda: np.column_stack([mm, w, x, y, z]),
-        "rotation-vector": lambda: np.column_stack([position, vector]),
-        "ur": lambda: np.column_stack([position, vector]),
-        "xarm-axis-angle": lambda: np.column_stack([mm, np.degrees(vector)]),
-        "rpy": lambda: np.column_stack([position, rpy]),
-        "unitree": lambda: np.column_stack([position, rpy]),
-        "xarm": lambda: np.column_stack([mm, np.degrees(rpy)]),
-        "fanuc": lambda: np.column_stack([mm, np.degrees(rpy)]),
-        "yaskawa": lambda: np.column_stack([mm, np.degrees(rpy)]),
-        "kuka": lambda: np.column_stack([mm, np.degrees(np.stack([yaw, pitch, roll], 1))]),
-    }[convention]()
+    quaternion = {"xyzw": np.stack([x, y, z, w], 1), "wxyz": np.stack([w, x, y, z], 1)}
+    written = {
+        ("matrix",): poses.reshape(-1, 16),
+        ("franka",): np.swapaxes(poses, 1, 2).reshape(-1, 16),
+        ("quat-xyzw",): np.hstack([position, quaternion["xyzw"]]),
+        ("quat-wxyz", "realman"): np.hstack([position, quaternion["wxyz"]]),
+        ("abb",): np.hstack([mm, quaternion["wxyz"]]),
+        ("rotation-vector", "ur"): np.hstack([position, vector]),
+        ("xarm-axis-angle",): np.hstack([mm, np.degrees(vector)]),
+        ("rpy", "unitree"): np.hstack([position, rpy]),
+        ("xarm", "fanuc", "yaskawa"): np.hstack([mm, np.degrees(rpy)]),
+        ("kuka",): np.hstack([mm, np.degrees(rpy[:, ::-1])]),
+    }
+    return next(rows for conventions, rows in written.items() if convention in conventions)
 
 
-def copy_images(capture: Capture, folder: Path) -> None:
+def begin(folder: Path, capture: Capture) -> Path:
+    """Write the images and a camera_info.yaml with the intrinsics."""
     for name in capture.images:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(capture.folder / name, folder / name)
+    write_camera_info(capture, folder)
+    return folder
 
 
 def write_camera_info(capture: Capture, folder: Path) -> None:
     intrinsics = capture.intrinsics
+    assert intrinsics is not None
     content = {
         "image_width": intrinsics.width,
         "image_height": intrinsics.height,
@@ -71,24 +72,18 @@ def write_table(
     separator: str = ",",
 ) -> Path:
     """poses.csv with the images' names in front, or, without a header, in the order of the images."""
-    copy_images(capture, folder)
-    write_camera_info(capture, folder)
-    numbers = [
-        [repr(float(value)) for value in row] for row in rows_as(convention, capture.base_from_gripper)
-    ]
+    begin(folder, capture)
+    rows = [[*map(repr, row)] for row in rows_as(convention, capture.base_from_gripper).tolist()]
     if header is not None and header.startswith("image"):
-        numbers = [[name, *row] for name, row in zip(capture.images, numbers, strict=True)]
+        rows = [[name, *row] for name, row in zip(capture.images, rows, strict=True)]
     lines = [header.replace(",", separator)] if header else []
-    lines += [separator.join(row) for row in numbers]
     file = folder / {",": "poses.csv", "\t": "poses.tsv", " ": "poses.txt"}[separator]
-    file.write_text("\n".join(lines) + "\n")
+    file.write_text("\n".join([*lines, *(separator.join(row) for row in rows)]) + "\n")
     return file
 
 
 def write_npy(folder: Path, capture: Capture) -> Path:
-    copy_images(capture, folder)
-    write_camera_info(capture, folder)
-    np.save(folder / "poses.npy", capture.base_from_gripper)
+    np.save(begin(folder, capture) / "poses.npy", capture.base_from_gripper)
     return folder
 
 
@@ -103,14 +98,13 @@ def write_tum(
     write_camera_info(capture, folder)
     lines = [header] if header else []
     separator = ", " if "," in header else " "
-    for k, (name, row) in enumerate(
-        zip(capture.images, rows_as("quat-xyzw", capture.base_from_gripper), strict=True)
-    ):
+    rows = rows_as("quat-xyzw", capture.base_from_gripper).tolist()
+    for k, (name, row) in enumerate(zip(capture.images, rows, strict=True)):
         stamp = start + k * 10**9
         shutil.copy(capture.folder / name, folder / "images" / f"{stamp}{Path(name).suffix}")
         for at in (stamp - 10**7, stamp + 10**7):
             seconds = f"{at // 10**9}.{at % 10**9:09d}"
-            lines.append(separator.join([seconds, *(repr(float(value)) for value in row)]))
+            lines.append(separator.join([seconds, *map(repr, row)]))
     (folder / "poses.txt").write_text("\n".join(lines) + "\n")
     return folder
 
@@ -122,20 +116,12 @@ def write_colmap(folder: Path, capture: Capture, recon_from_camera: np.ndarray) 
     write_table(folder, capture)
     (folder / "camera_info.yaml").unlink()
     intrinsics = capture.intrinsics
-    params = [
-        intrinsics.fx,
-        intrinsics.fy,
-        intrinsics.cx + HALF_PIXEL,
-        intrinsics.cy + HALF_PIXEL,
-        *intrinsics.distortion,
-        0,
-        0,
-        0,
-    ]
+    assert intrinsics is not None
+    centre = intrinsics.cx + HALF_PIXEL, intrinsics.cy + HALF_PIXEL
+    params = [intrinsics.fx, intrinsics.fy, *centre, *intrinsics.distortion, 0, 0, 0]
     model = pycolmap.Reconstruction()
-    camera = pycolmap.Camera(
-        model="FULL_OPENCV", width=intrinsics.width, height=intrinsics.height, params=params, camera_id=1
-    )
+    width, height = capture.image_size
+    camera = pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params, camera_id=1)
     model.add_camera_with_trivial_rig(camera)
     for k, pose in enumerate(inverse(recon_from_camera), start=1):
         image = pycolmap.Image(name=Path(capture.images[k - 1]).name, camera_id=1, image_id=k)
@@ -160,17 +146,17 @@ def write_easy_handeye2(
 ) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
 
-    def parts(pose: np.ndarray) -> dict:
-        row = rows_as("quat-xyzw", pose[None])[0].tolist()
-        return {
-            "translation": dict(zip("xyz", row[:3], strict=True)),
-            "rotation": dict(zip("xyzw", row[3:], strict=True)),
-        }
+    def parts(poses: np.ndarray) -> list[dict]:
+        return [
+            {
+                "translation": dict(zip("xyz", row[:3], strict=True)),
+                "rotation": dict(zip("xyzw", row[3:], strict=True)),
+            }
+            for row in rows_as("quat-xyzw", poses).tolist()
+        ]
 
-    samples = [
-        {"robot": parts(gripper), "tracking": parts(marker)}
-        for gripper, marker in zip(base_from_gripper, inverse(recon_from_camera), strict=True)
-    ]
+    pairs = zip(parts(base_from_gripper), parts(inverse(recon_from_camera)), strict=True)
+    samples = [{"robot": gripper, "tracking": marker} for gripper, marker in pairs]
     content = {"parameters": {"name": "", "calibration_type": kind}, "samples": samples}
     (folder / "wrist.samples").write_text(yaml.safe_dump(content))
     return folder / "wrist.samples"
@@ -178,8 +164,7 @@ def write_easy_handeye2(
 
 def write_list(folder: Path, capture: Capture) -> Path:
     """poses.json with named images."""
-    copy_images(capture, folder)
-    write_camera_info(capture, folder)
+    begin(folder, capture)
     keys, rows = ("x", "y", "z", "qx", "qy", "qz", "qw"), rows_as("quat-xyzw", capture.base_from_gripper)
     named = zip(capture.images, rows.tolist(), strict=True)
     poses = [{"image": name, "pose": dict(zip(keys, row, strict=True))} for name, row in named]
@@ -270,24 +255,24 @@ def write_lerobot(
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    camera = "observation.images.wrist"
+    camera, v3 = "observation.images.wrist", version.startswith("v3")
+    shape, axes = [*episodes[0][0][0].shape], ["height", "width", "channels"]
     features = {
-        camera: {
-            "dtype": "video" if codec else "image",
-            "shape": [*episodes[0][0][0].shape],
-            "names": ["height", "width", "channels"],
-        },
+        camera: {"dtype": "video" if codec else "image", "shape": shape, "names": axes},
         key: {"dtype": "float32", "shape": [len(names)], "names": {"axes": names}},
         "timestamp": {"dtype": "float32", "shape": [1], "names": None},
     }
-    info = {"codebase_version": version, "robot_type": "arm", "fps": fps, "features": features}
+    paths = {
+        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+        "video_path": "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
+    }
+    if v3:
+        paths = {
+            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+            "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+        }
+    info = {"codebase_version": version, "robot_type": "arm", "fps": fps, "features": features} | paths
     info |= {"total_episodes": len(episodes), "chunks_size": 1000}
-    v3 = version.startswith("v3")
-    info["data_path"] = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-    info["video_path"] = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
-    if not v3:
-        info["data_path"] = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
-        info["video_path"] = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
     (folder / "meta").mkdir(parents=True)
     (folder / "meta" / "info.json").write_text(json.dumps(info))
 
@@ -310,17 +295,12 @@ def write_lerobot(
 
     every = list(range(len(episodes)))
     for number, group in enumerate([every] if v3 else [[k] for k in every]):
-        fields = {
-            "chunk_index": 0,
-            "file_index": 0,
-            "episode_chunk": 0,
-            "episode_index": number,
-            "video_key": camera,
-        }
-        save(table(group), folder / info["data_path"].format(**fields))
+        fields = dict.fromkeys(("chunk_index", "file_index", "episode_chunk"), 0)
+        fields |= {"episode_index": number, "video_key": camera}
+        save(table(group), folder / paths["data_path"].format(**fields))
         if codec:
             images = [image for k in group for image in episodes[k][0]]
-            write_video(folder / info["video_path"].format(**fields), images, fps, codec)
+            write_video(folder / paths["video_path"].format(**fields), images, fps, codec)
     if v3:
         zeros = [0] * len(episodes)
         columns = {"episode_index": every, "data/chunk_index": zeros, "data/file_index": zeros}

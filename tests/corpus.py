@@ -97,17 +97,20 @@ class Target:
         return self.read(self.file)
 
 
-def small_capture(folder: Path) -> Capture:
-    """Write four tiny images, and poses of a hand-eye problem."""
-    (folder / "images").mkdir(parents=True)
+def small_capture(folder: Path, size=SIZE, count: int = COUNT, place: str = "images/") -> Capture:
+    """Write tiny images, and poses of a hand-eye problem."""
+    (folder / place).mkdir(parents=True)
     draw = np.random.default_rng(0)
-    images = tuple(f"images/{k}.png" for k in range(COUNT))
+    images = tuple(f"{place}{k}.png" for k in range(count))
     for name in images:
-        Image.fromarray(draw.integers(0, 255, (SIZE[1], SIZE[0], 3), dtype=np.uint8)).save(folder / name)
-    poses = hand_eye_problem(draw, COUNT).base_from_gripper
-    intrinsics = Intrinsics(15.0, 15.0, 7.5, 5.5, *SIZE, (0.01, 0.0, 0.0, 0.0, 0.0))
+        Image.fromarray(draw.integers(0, 255, (*size[::-1], 3), dtype=np.uint8)).save(folder / name)
+    centre = (size[0] - 1) / 2, (size[1] - 1) / 2
     capture = Capture(
-        folder=folder, images=images, base_from_gripper=poses, image_size=SIZE, intrinsics=intrinsics
+        folder=folder,
+        images=images,
+        base_from_gripper=hand_eye_problem(np.random.default_rng(0), count).base_from_gripper,
+        image_size=size,
+        intrinsics=Intrinsics(0.94 * size[0], 0.94 * size[0], *centre, *size, (0.01, 0.0, 0.0, 0.0, 0.0)),
     )
     capture_json.write(folder, capture)
     return capture
@@ -184,9 +187,8 @@ def recordings(folder: Path, capture: Capture) -> dict[str, Target]:
     episode = [image for image in pixels for _ in range(3)], states
     names, found = ["x", "y", "z", "roll", "pitch", "yaw"], dict[str, Target]()
     for version in ("v2.1", "v3.0"):
-        place = writers.write_lerobot(
-            folder / version, [episode], version, "observation.state", names, codec=None
-        )
+        key = "observation.state"
+        place = writers.write_lerobot(folder / version, [episode], version, key, names, codec=None)
         found[f"info.json {version}"] = Target(place / "meta/info.json", source(place))
     place = folder / "v2.1"
     info = Info.model_validate_json((place / "meta/info.json").read_text())
@@ -195,11 +197,7 @@ def recordings(folder: Path, capture: Capture) -> dict[str, Target]:
         place / "data/chunk-000/episode_000000.parquet",
         lambda file: read_episode(place, info, camera, "observation.state", 0),
     )
-    kinds = (
-        ("mcap", "scan.mcap", "scan"),
-        ("ros1", "scan.bag", "scan.bag"),
-        ("sqlite3", "metadata.yaml", "s"),
-    )
+    kinds = ("mcap", "scan.mcap", "scan"), ("ros1", "scan.bag", "scan.bag"), ("sqlite3", "metadata.yaml", "s")
     for kind, name, bag in kinds:
         file = write_bag(folder / bag, capture, kind, 2.0, fps=4.0, tf_hz=10.0)
         inside = next(file.glob(f"*{Path(name).suffix}")) if file.is_dir() else file
@@ -212,8 +210,7 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
     from jcr.scene.build import build_scene
 
     folder.mkdir()
-    draw = np.random.default_rng(3)
-    height, width = SIZE[1], SIZE[0]
+    draw, shape = np.random.default_rng(3), (COUNT, SIZE[1], SIZE[0])
     assert capture.intrinsics is not None
     reconstruction = Reconstruction(
         image_index=np.arange(COUNT),
@@ -221,9 +218,9 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
         intrinsics=capture.intrinsics,
         pointmaps=Pointmaps(
             intrinsics=capture.intrinsics,
-            points_in_recon=draw.random((COUNT, height, width, 3)).astype(np.float32),
-            confidence=np.ones((COUNT, height, width), np.float32),
-            colors=np.zeros((COUNT, height, width, 3), np.uint8),
+            points_in_recon=draw.random((*shape, 3)).astype(np.float32),
+            confidence=np.ones(shape, np.float32),
+            colors=np.zeros((*shape, 3), np.uint8),
         ),
         tracks=Tracks(
             image=np.zeros(2, int),
@@ -234,15 +231,9 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
         backend="colmap",
     )
     write_reconstruction(folder / "reconstruction.npz", reconstruction)
-    dense = pointmaps_of(
-        draw.uniform(0.5, 1.0, (COUNT, height, width)).astype(np.float32),
-        np.full((COUNT, height, width), 0.01, np.float16),
-        np.ones((COUNT, height, width), np.float16),
-        np.ones((COUNT, height, width), np.uint8),
-        np.zeros((COUNT, height, width, 3), np.uint8),
-        cameras,
-        capture.intrinsics,
-    )
+    arrays = [np.full(shape, 0.01, np.float16), np.ones(shape, np.float16), np.ones(shape, np.uint8)]
+    depth, colors = draw.uniform(0.5, 1.0, shape).astype(np.float32), np.zeros((*shape, 3), np.uint8)
+    dense = pointmaps_of(depth, *arrays, colors, cameras, capture.intrinsics)
     write_depth(folder / "depth.npz", replace(reconstruction, pointmaps=dense), "y")
     ones = np.ones(200)
     cloud = PointCloud(
@@ -275,17 +266,12 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
 
     def read_about(file: Path) -> object:
         """Read a reconstruction whose JSON is that of a file."""
-        np.savez(
-            folder / "about.npz",
-            about=np.array(file.read_text(errors="replace")),
-            allow_pickle=False,
-            **arrays,
-        )
+        about = np.array(file.read_text(errors="replace"))
+        np.savez(folder / "about.npz", about=about, allow_pickle=False, **arrays)
         return read_reconstruction(folder / "about.npz")
 
-    return {
-        name: Target(folder / name, read) for name, read in (readers | {"about.json": read_about}).items()
-    }
+    readers["about.json"] = read_about
+    return {name: Target(folder / name, read) for name, read in readers.items()}
 
 
 def networks(folder: Path) -> dict[str, Target]:
@@ -333,45 +319,25 @@ def runs(folder: Path, capture: Capture) -> dict[str, Target]:
 
 def sound_run(out: Path) -> Path:
     """Write a run folder with calibration.json and run.json, of poses without noise; its capture lies in it."""
-    (out / "capture").mkdir(parents=True)
+    capture = small_capture(out / "capture", (96, 72), RUN_IMAGES, "")
     problem = hand_eye_problem(np.random.default_rng(0), RUN_IMAGES)
-    names = tuple(f"{k}.png" for k in range(RUN_IMAGES))
-    frames = []
-    for name, pose in zip(names, problem.base_from_gripper, strict=True):
-        Image.fromarray(np.random.default_rng(len(frames)).integers(0, 255, (72, 96, 3), np.uint8)).save(
-            out / "capture" / name
-        )
-        frames.append({"image": name, "base_from_gripper": pose.tolist()})
-    (out / "capture" / "capture.json").write_text(json.dumps({"frames": frames}))
     pairs = PosePairs(
         source=out,
-        images=names,
+        images=capture.images,
         base_from_gripper=problem.base_from_gripper,
         recon_from_camera=problem.recon_from_camera,
         is_metric=False,
     )
-    attempt = Attempt(
-        backend="colmap", images_registered=RUN_IMAGES, reconstruct_s=1.0, calibrate_s=0.5, why_not=None
-    )
+    seconds = {"reconstruct_s": 1.0, "calibrate_s": 0.5}
+    attempt = Attempt(backend="colmap", images_registered=RUN_IMAGES, why_not=None, **seconds)
     content = calibration_of(pairs, pairs, calibrate_poses(pairs), {}, "0", [attempt]).as_json()
-    intrinsics = {
-        "fx": 90.0,
-        "fy": 90.0,
-        "cx": 47.5,
-        "cy": 35.5,
-        "distortion": [0.0] * 5,
-        "width": 96,
-        "height": 72,
-    }
+    intrinsics = {"fx": 90.0, "fy": 90.0, "cx": 47.5, "cy": 35.5, "distortion": [0.0] * 5}
+    intrinsics |= {"width": 96, "height": 72}
     (out / "calibration.json").write_text(json.dumps(content | {"intrinsics": intrinsics}))
     write_calibration(out / "calibration.json", read_calibration(out))
     options = {"reconstruct": asdict(ReconstructOptions()), "calibrate": asdict(CalibrateOptions())}
     options["calibrate"] |= {"robot_noise": [0.1, 0.05], "known_length": ["0.png", 1.0, 2.0, 30.0, 4.0, 50.0]}
-    state = {
-        "capture": str(out / "capture"),
-        "made": {"reconstruct": "0"},
-        "options": options,
-        "attempts": [asdict(attempt)],
-    }
+    state = {"capture": str(out / "capture"), "made": {"reconstruct": "0"}, "options": options}
+    state |= {"attempts": [asdict(attempt)]}
     (out / "run.json").write_text(json.dumps(state))
     return out
