@@ -231,9 +231,9 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
         backend="colmap",
     )
     write_reconstruction(folder / "reconstruction.npz", reconstruction)
-    arrays = [np.full(shape, 0.01, np.float16), np.ones(shape, np.float16), np.ones(shape, np.uint8)]
+    layers = [np.full(shape, 0.01, np.float16), np.ones(shape, np.float16), np.ones(shape, np.uint8)]
     depth, colors = draw.uniform(0.5, 1.0, shape).astype(np.float32), np.zeros((*shape, 3), np.uint8)
-    dense = pointmaps_of(depth, *arrays, colors, cameras, capture.intrinsics)
+    dense = pointmaps_of(depth, *layers, colors, cameras, capture.intrinsics)
     write_depth(folder / "depth.npz", replace(reconstruction, pointmaps=dense), "y")
     ones = np.ones(200)
     cloud = PointCloud(

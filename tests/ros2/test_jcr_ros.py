@@ -19,7 +19,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 import jcr
-from jcr.capture.images import read_image
+from jcr.capture.images import read_depth, read_image
 from places import ROOT
 from waiting import until
 
@@ -88,9 +88,7 @@ def test_images_are_taken_by_service_and_at_rest_each_with_its_state_and_a_chang
     def session(**settings: Any) -> Calibrator:
         options = jcr.SessionOptions(images=6)
         given = Settings(folder=tmp_path / "c", options=options, **settings)
-        return Calibrator(
-            given, played.gripper, events.append, states.append, lambda gripper_from_camera: None
-        )
+        return Calibrator(given, played.gripper, events.append, states.append, lambda transform: None)
 
     at_rest = session()
     at_rest.intrinsics = jcr.read_ros_camera_info(camera_info())
@@ -140,12 +138,8 @@ def test_an_image_gets_the_depth_of_its_own_stamp():
     assert stream.latest() is None
     stream.push_depth(np.full((4, 6), 101, np.uint16), 0.105)
     frame = stream.latest()
-    assert (
-        frame is not None
-        and frame.time_s == 0.1
-        and frame.depth_mm is not None
-        and frame.depth_mm[0, 0] == 101
-    )
+    assert frame is not None and frame.depth_mm is not None
+    assert (frame.time_s, frame.depth_mm[0, 0]) == (0.1, 101)
     # The depth of an image that was dropped is not used for another one.
     stream.push_depth(np.full((4, 6), 100, np.uint16), 0.0)
     assert stream.latest() is frame
@@ -206,35 +200,36 @@ class FakeNode:
         return Message(now=lambda: Message(to_msg=Message))
 
 
+NAMES = {
+    "rclpy": (),
+    "rclpy.callback_groups": ("ReentrantCallbackGroup",),
+    "rclpy.executors": ("ExternalShutdownException", "MultiThreadedExecutor"),
+    "rclpy.node": (),
+    "rclpy.qos": ("qos_profile_sensor_data",),
+    "rclpy.time": ("Time",),
+    "tf2_ros": (),
+    "geometry_msgs.msg": ("PoseStamped", "TransformStamped"),
+    "sensor_msgs.msg": ("CameraInfo", "CompressedImage", "Image"),
+    "std_msgs.msg": ("String",),
+    "std_srvs.srv": ("Trigger",),
+}
+"""Modules of ROS that the node imports, and names in them for which any message will do."""
+
+
 @pytest.fixture
 def node_module(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    any_message = dict.fromkeys(
-        ("PoseStamped", "TransformStamped", "CameraInfo", "CompressedImage", "Image", "String", "Trigger"),
-        Message,
-    )
-    parts: dict[str, dict[str, Any]] = {
-        "rclpy": {},
-        "rclpy.callback_groups": {"ReentrantCallbackGroup": Message},
-        "rclpy.executors": {"ExternalShutdownException": Exception, "MultiThreadedExecutor": Message},
-        "rclpy.node": {"Node": FakeNode},
-        "rclpy.qos": {"qos_profile_sensor_data": None},
-        "rclpy.time": {"Time": Message},
-        "tf2_ros": {"TransformException": KeyError, "TransformListener": lambda buffer, node: None},
-    }
-    parts |= {
-        f"{name}.{kind}": any_message for name, kind in (("geometry_msgs", "msg"), ("sensor_msgs", "msg"))
-    }
-    parts |= {"std_msgs.msg": any_message, "std_srvs.srv": any_message}
-    parts |= {name.partition(".")[0]: {} for name in parts if "msgs" in name or "srvs" in name}
-    for name, content in parts.items():
+    for name in {*NAMES, *(name.partition(".")[0] for name in NAMES)}:
         module = ModuleType(name)
-        vars(module).update(content)
+        vars(module).update(dict.fromkeys(NAMES.get(name, ()), Message))
         monkeypatch.setitem(sys.modules, name, module)
     monkeypatch.delitem(sys.modules, "jcr_ros.node", raising=False)
     sent: list[Any] = []
+    vars(sys.modules["rclpy.node"]).update(Node=FakeNode)
     vars(sys.modules["tf2_ros"]).update(
         Buffer=lambda: SimpleNamespace(lookup_transform=None),
         StaticTransformBroadcaster=lambda node: SimpleNamespace(sendTransform=sent.append, sent=sent),
+        TransformException=KeyError,
+        TransformListener=lambda buffer, node: None,
     )
     return import_module("jcr_ros.node")
 
@@ -292,7 +287,10 @@ def test_the_node_broadcasts_the_transform_where_it_is_accepted_alone(
     position = np.array(states[-1]["next_base_from_gripper"])[:3, 3]
     place = next_pose.pose.position
     assert np.allclose([place.x, place.y, place.z], position)
-    assert read_depth(tmp_path / "c") == 500
+    capture = jcr.read_capture(tmp_path / "c")
+    assert capture.depths is not None
+    depth_m = read_depth(capture.folder / str(capture.depths[0]), capture.image_size)
+    assert np.median(depth_m) == 0.5
     if require_mm < 1:
         assert not answer.success and node.broadcaster.sent == []
         return
@@ -302,13 +300,6 @@ def test_the_node_broadcasts_the_transform_where_it_is_accepted_alone(
     truth = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
     place = sent.transform.translation
     assert np.linalg.norm(np.array([place.x, place.y, place.z]) - truth[:3, 3]) < 5e-3
-
-
-def read_depth(folder: Path) -> int:
-    import cv2
-
-    frame = json.loads((folder / "capture.json").read_text())["frames"][0]
-    return int(np.median(cv2.imread(str(folder / frame["depth"]), cv2.IMREAD_UNCHANGED)))
 
 
 def test_the_package_names_what_it_installs():

@@ -145,7 +145,7 @@ class Calibrator:
                 intrinsics=self.intrinsics,
                 robot=settings.robot or None,
                 options={"require": settings.options.require},
-                reach=settings.options.reach_m,
+                reach=settings.options.reach,
                 exclusive=True,
             )
             opened.callback(calibration.close)
