@@ -4,18 +4,22 @@ import json
 import shutil
 import subprocess
 import sys
-import types
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
+from unittest.mock import patch
 from xml.etree import ElementTree
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
+import trimesh
 import yaml
+import yourdfpy
 from PIL import Image
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 import analytic_scene
@@ -35,8 +39,6 @@ from simulation.scenes import make_scene, solid_labels
 from simulation.truth import read_truth
 
 if TYPE_CHECKING:
-    import trimesh
-
     from jcr.export.views import PosedImages
     from jcr.scene.scene_map import SceneMap
 
@@ -66,20 +68,19 @@ def of_publisher(words: list[str]) -> np.ndarray:
 
 def of_launch_xml(path: Path) -> np.ndarray:
     node = ElementTree.parse(path).getroot().find("node")
-    assert node is not None and node.get("pkg") == "tf2_ros"
-    assert node.get("exec") == "static_transform_publisher"
+    assert node is not None and (node.get("pkg"), node.get("exec")) == (
+        "tf2_ros",
+        "static_transform_publisher",
+    )
     return of_publisher(node.get("args", "").split())
 
 
 def of_launch_py(path: Path) -> np.ndarray:
     """The file run as ROS runs it, with stand-ins that keep what they are given."""
-    stand_ins = {name: types.ModuleType(name) for name in ("launch", "launch_ros", "launch_ros.actions")}
-    stand_ins["launch"].LaunchDescription = list  # pyright: ignore[reportAttributeAccessIssue]
-    stand_ins["launch_ros.actions"].Node = dict  # pyright: ignore[reportAttributeAccessIssue]
     content: dict = {}
-    with pytest.MonkeyPatch.context() as patch:
-        for name, module in stand_ins.items():
-            patch.setitem(sys.modules, name, module)
+    launch, actions = SimpleNamespace(LaunchDescription=list), SimpleNamespace(Node=dict)
+    stand_ins: dict = {"launch": launch, "launch_ros": SimpleNamespace(), "launch_ros.actions": actions}
+    with patch.dict(sys.modules, stand_ins):
         exec(path.read_text(), content)
         (node,) = content["generate_launch_description"]()
     assert (node["package"], node["executable"]) == ("tf2_ros", "static_transform_publisher")
@@ -87,8 +88,6 @@ def of_launch_py(path: Path) -> np.ndarray:
 
 
 def of_urdf(path: Path) -> np.ndarray:
-    import yourdfpy
-
     return yourdfpy.URDF.load(path).get_transform("optical", "tool0")
 
 
@@ -103,10 +102,9 @@ def of_snippet(path: Path) -> np.ndarray:
 
 def of_calib(path: Path) -> np.ndarray:
     content = yaml.safe_load(path.read_text())
-    named = content["parameters"]
-    assert named["calibration_type"] == "eye_in_hand" and named["name"] == path.stem
-    assert (named["robot_base_frame"], named["robot_effector_frame"]) == ("base_link", "tool0")
-    assert named["tracking_base_frame"] == "optical"
+    names = ("calibration_type", "name", "robot_base_frame", "robot_effector_frame", "tracking_base_frame")
+    expected = ["eye_in_hand", path.stem, "base_link", "tool0", "optical"]
+    assert [content["parameters"][name] for name in names] == expected
     at, rotation = content["transform"]["translation"], content["transform"]["rotation"]
     return of_quat(*(at[axis] for axis in "xyz"), *(rotation[axis] for axis in "xyzw"))
 
@@ -132,14 +130,6 @@ def test_ros_files_hold_the_transform_and_name_frames_and_units(name: str, doubt
     first = path.read_text()[:300]
     assert "optical in tool0" in first and "metres, radians" in first
     assert ("REJECTED: scale: every view" in first) == (doubt is not None)
-
-
-def test_root_link_has_the_axes_of_rep_103():
-    # Looking forward (x of the root), the optical frame has z there, x to the right (-y) and y down (-z).
-    np.testing.assert_array_equal(ros.ROOT_FROM_OPTICAL[:3, :3], [[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-    root = ros.on_root(mount(), "camera_link")
-    assert (root.parent, root.child) == ("tool0", "camera_link")
-    np.testing.assert_allclose(root.parent_from_child @ ros.ROOT_FROM_OPTICAL, PARENT_FROM_CHILD, atol=1e-12)
 
 
 def test_camera_info_is_what_image_proc_reads():
@@ -191,8 +181,6 @@ def test_files_name_the_intrinsics_that_their_transform_belongs_to(done: Path, t
 
 
 def test_urdf_of_wrist_and_fixed_cameras_of_two_arms_is_one_tree(tmp_path: Path):
-    import yourdfpy
-
     def camera(parent: str, child: str, arm: str = "") -> ros.CameraMount:
         return ros.CameraMount(
             parent=arm + parent, child=child, parent_from_child=PARENT_FROM_CHILD, base=f"{arm}base_link"
@@ -245,7 +233,7 @@ INTRINSICS = Intrinsics(300.0, 305.0, 161.0, 118.0, 320, 240, (-0.2, 0.06, 1e-3,
 
 @pytest.fixture
 def views(tmp_path: Path) -> "PosedImages":
-    """Three noisy images through a intrinsics with all five coefficients, and the exact pixels of 60 points."""
+    """Three noisy images through intrinsics with all five coefficients, and the exact pixels of 60 points."""
     from jcr.export.views import PosedImages
 
     rng = np.random.default_rng(5)
@@ -262,11 +250,7 @@ def views(tmp_path: Path) -> "PosedImages":
             for y in (-0.1, 0.0, 0.1)
         ]
     )
-    x_px = []
-    for base_from_camera in poses:
-        x = apply(inverse(base_from_camera), points)
-        x_px.append(project(INTRINSICS, x))
-    x_px = np.concatenate(x_px)
+    x_px = np.concatenate([project(INTRINSICS, apply(inverse(pose), points)) for pose in poses])
     inside = ((x_px > 0) & (x_px < [319, 239])).all(1)
     assert inside.sum() > 100
     tracks = Tracks(
@@ -286,13 +270,10 @@ def views(tmp_path: Path) -> "PosedImages":
     )
 
 
-@pytest.mark.parametrize("undistorted", [False, True])
-@pytest.mark.parametrize("read", ["read_binary", "read_text"])
+@pytest.mark.parametrize(("undistorted", "read"), [(False, "read_binary"), (True, "read_text")])
 def test_colmap_model_reprojects_its_points_exactly(
     views: "PosedImages", undistorted: bool, read: str, tmp_path: Path
 ):
-    import pycolmap
-
     from jcr.export.views import write_colmap
 
     out = tmp_path / "model"
@@ -303,7 +284,7 @@ def test_colmap_model_reprojects_its_points_exactly(
     model.update_point_3d_errors()
     assert model.compute_mean_reprojection_error() < 1e-6
     found = np.array([point.xyz for point in model.points3D.values()])
-    nearest, _ = cKDTree(views.points_in_base).query(found)
+    nearest, _ = KDTree(views.points_in_base).query(found)
     assert len(found) > 30 and nearest.max() < 1e-9
     for image in model.images.values():
         assert (out / "images" / image.name).is_file()
@@ -320,8 +301,6 @@ def test_colmap_model_reprojects_its_points_exactly(
 def test_nerfstudio_cameras_see_the_points_where_the_images_do(
     views: "PosedImages", undistorted: bool, tmp_path: Path
 ):
-    import trimesh
-
     from jcr.export.views import write_nerfstudio
 
     out = tmp_path / "splat"
@@ -374,8 +353,6 @@ def export(done: Path, name: str, path: Path, *options: object) -> Path:
 
 
 def test_ply_holds_points_colours_and_labels(done: Path, tmp_path: Path):
-    import trimesh
-
     path = export(done, "ply", tmp_path / "out.ply", "--base-frame", "arm_base")
     cloud, written = read_cloud(done / "cloud.ply"), read_cloud(path)
     np.testing.assert_array_equal(written.label, cloud.label)
@@ -389,8 +366,6 @@ def test_ply_holds_points_colours_and_labels(done: Path, tmp_path: Path):
 def test_mesh_lies_on_the_true_surface_and_faces_free_space(
     done: Path, true_mesh: "trimesh.Trimesh", tmp_path: Path
 ):
-    import trimesh
-
     loaded = trimesh.load_scene(export(done, "glb", tmp_path / "map.glb"))
     assert loaded.metadata["frame"] == "base_link" and loaded.metadata["unit"] == "m"
     mesh = loaded.to_geometry()
@@ -404,7 +379,7 @@ def test_mesh_lies_on_the_true_surface_and_faces_free_space(
     assert ((mesh.face_normals[rows] * true_mesh.face_normals[at]).sum(1) > 0).mean() > 0.9
     # The colours are those of the nearest points of the cloud.
     cloud = read_cloud(done / "cloud.ply")
-    near, at = cKDTree(cloud.points_in_base).query(mesh.vertices)
+    near, at = KDTree(cloud.points_in_base).query(mesh.vertices)
     colors = np.asarray(mesh.visual.vertex_colors)[:, :3].astype(float)  # pyright: ignore
     off = np.abs(colors - cloud.color[at]).mean(1)
     assert np.median(off[near < 0.003]) < 12
@@ -464,7 +439,7 @@ def test_spheres_cover_what_is_solid_and_little_else(done: Path, scene: "SceneMa
     x = np.random.default_rng(3).uniform(*scene.box, (100_000, 3))
     distance = scene.query(x, "free").distance
     covered = np.zeros(len(x), bool)
-    places = cKDTree(x)
+    places = KDTree(x)
     for center, radius in zip(centers, radii, strict=True):
         covered[places.query_ball_point(center, radius)] = True
     assert covered[distance <= 0].all() and (distance <= 0).sum() > 1000
@@ -473,8 +448,6 @@ def test_spheres_cover_what_is_solid_and_little_else(done: Path, scene: "SceneMa
 
 
 def test_run_exports_its_cameras_where_they_truly_were(done: Path, tabletop: Path, tmp_path: Path):
-    import pycolmap
-
     truth = read_truth(tabletop)
     out = export(done, "colmap", tmp_path / "colmap")
     model = pycolmap.Reconstruction(str(out / "sparse" / "0"))
@@ -490,8 +463,8 @@ def test_run_exports_its_cameras_where_they_truly_were(done: Path, tabletop: Pat
 def test_command_gives_the_root_link_asked_for(
     done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    import yourdfpy
-
+    # Looking forward (x of the root), the optical frame has z there, x to the right (-y) and y down (-z).
+    np.testing.assert_array_equal(ros.ROOT_FROM_OPTICAL[:3, :3], [[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     gripper_from_camera = np.array(json.loads((done / "calibration.json").read_text())["gripper_from_camera"])
     options = ["--to-root", "camera_link", "--parent-frame", "flange"]
     path = export(done, "urdf", tmp_path / "a.urdf", *options)
@@ -505,14 +478,18 @@ def test_command_gives_the_root_link_asked_for(
     assert "--frame-id flange --child-frame-id camera_link" in capsys.readouterr().out
 
 
-def test_a_file_with_other_frames_is_not_replaced_silently(
+def test_a_file_with_other_content_is_replaced_by_overwrite_alone(
     done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     path = export(done, "urdf", tmp_path / "a.urdf")
-    export(done, "urdf", path)
-    assert "replaced" not in capsys.readouterr().err
-    export(done, "urdf", path, "--child-frame", "left_optical")
-    assert f"{path}: replaced a file with other content" in capsys.readouterr().err
+    before = export(done, "urdf", path).read_text()
+    other = ["export", str(done), "urdf", str(path), "--child-frame", "left_optical"]
+    assert dispatch(other) == 2 and path.read_text() == before
+    assert f"{path}: is there with other content" in capsys.readouterr().err
+    with pytest.raises(InputError, match="--overwrite"):
+        export_run(done, "moveit", path)
+    assert dispatch([*other, "--overwrite"]) == 0 and "left_optical" in path.read_text()
+    assert [file.name for file in tmp_path.iterdir()] == ["a.urdf"]
 
 
 def test_a_rejected_calibration_is_exported_by_force_alone_with_its_reason_in_every_file(

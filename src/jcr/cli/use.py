@@ -101,10 +101,8 @@ class ExportCommand:
             lines = [f"{name:<14} {about}" for name, about in formats.items()]
             self.output.result([*lines, f"for one: jcr export {self.out} FORMAT"], {"formats": formats})
             return 0
-        run, row, path, replaced = write_run(self.out, self.format, self.path, self.export)
+        run, row, path = write_run(self.out, self.format, self.path, self.export)
         sys.stderr.write(f"wrote {path}: {row.about}\n")
-        if replaced:
-            warn(f"{path}: replaced a file with other content; name another PATH to keep both")
         lines, facts = list[str](), {"file": str(path), "format": row.name, "about": row.about}
         if row.name == "ros2":
             mount = run.mount

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from jcr.errors import InputError, RejectedError, did_you_mean
 from jcr.export import ros
 from jcr.export.options import ExportName, ExportOptions, Provenance
-from jcr.files import write_text
+from jcr.files import written_whole
 from jcr.geometry import apply_similarity, scale_translation, transform
 from jcr.options import checked_options
 from jcr.result import CLOUD, RunResult
@@ -82,11 +82,12 @@ def export_run(
 
 def write_run(
     out: Path, format: ExportName, path: Path | None, options: ExportOptions
-) -> "tuple[ExportedRun, ExportFormat, Path, bool]":
-    """Write a run folder in a format; return run, row of the table, path, and whether other content was replaced.
+) -> "tuple[ExportedRun, ExportFormat, Path]":
+    """Write a run folder in a format; return the run, the row of the table and the path.
 
-    Raises InputError for a format that does not exist, options that it cannot serve, and a run that lacks what it
-    needs; RejectedError for a calibration that is rejected, unless `options` force it.
+    Raises InputError for a format that does not exist, options that it cannot serve, a run that lacks what it needs,
+    and a path with other content unless `options` overwrite it; RejectedError for a calibration that is rejected,
+    unless `options` force it.
     """
     row = next((row for row in FORMATS if row.name == format), None)
     if row is None:
@@ -105,15 +106,23 @@ def write_run(
         )
     if path.is_dir() and not row.file.endswith("/"):
         raise InputError(f"{path}: is a folder; name a file for {row.name}")
-    before = path.read_bytes() if path.is_file() else None
     values = [attrgetter(content)(run) for content in row.contents.split()]
     module, function = row.writer.split(".")
     write: Any = getattr(import_module(f"jcr.export.{module}"), function)
-    if module == "ros":
-        write_text(path, write(*values))
-    else:
+    if row.file.endswith("/"):
         write(path, *values)
-    return run, row, path, before is not None and path.read_bytes() != before
+        return run, row, path
+    with written_whole(path) as temporary:
+        if module == "ros":
+            temporary.write_text(write(*values), "utf-8")
+        else:
+            write(temporary, *values)
+        if path.is_file() and not options.overwrite and path.read_bytes() != temporary.read_bytes():
+            raise InputError(
+                f"{path}: is there with other content (frames, options or another calibration); to replace it add "
+                "--overwrite, or name another PATH"
+            )
+    return run, row, path
 
 
 class ExportedRun:

@@ -47,6 +47,8 @@ class ExportOptions:
     """Resample the images of nerfstudio and colmap to a pinhole camera."""
     force: bool = False
     """Export a calibration that is rejected, too; the file then has the reason."""
+    overwrite: bool = False
+    """Replace a file of other content at the path."""
     link_images: bool = False
     """Link to the capture's images instead of copying them."""
 
