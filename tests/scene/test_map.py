@@ -58,9 +58,6 @@ def near_surface(count: int) -> np.ndarray:
     return x[np.abs(signed_distance(x)) < 0.06][:count]
 
 
-# What nobody has seen
-
-
 def test_what_no_ray_crossed_and_what_is_outside_is_unknown(scene: "SceneMap"):
     hidden = np.stack([INSIDE_BOX, BALL_CENTER, UNDER_TABLE, [0.0, 0.0, -0.02], OUTSIDE])
     sample = scene.query(hidden)
@@ -86,17 +83,10 @@ def test_the_planner_chooses_how_unknown_counts(scene: "SceneMap"):
 
     centers = np.stack([FREE_SPOT, UNDER_TABLE, BOX_CENTER + [0, 0, BOX_HALF[2]], OUTSIDE])
     radii = np.array([0.05, 0.01, 0.02, 0.05])
-    assert scene.check_spheres(centers, radii, unknown="report").tolist() == [
-        FREE,
-        UNKNOWN,
-        OCCUPIED,
-        UNKNOWN,
-    ]
+    state = scene.check_spheres(centers, radii, unknown="report").tolist()
+    assert state == [FREE, UNKNOWN, OCCUPIED, UNKNOWN]
     assert scene.check_spheres(centers, radii).tolist() == [False, True, True, True]
     assert scene.check_spheres(centers, radii, unknown="free").tolist() == [False, False, True, False]
-
-
-# Distance
 
 
 def test_distances_and_gradients_are_those_of_the_box_and_the_ball(scene: "SceneMap"):
@@ -121,9 +111,6 @@ def test_unknown_as_occupied_is_no_farther_than_unknown_as_free(scene: "SceneMap
     assert (careful <= bold + scene.cell / 2)[outside].all()
     assert (careful <= bold + 1e-6)[outside].mean() > 0.99
     assert (careful[scene.query(x).unknown] < scene.cell).mean() > 0.99
-
-
-# Spheres and segments
 
 
 def test_spheres_touch_what_they_reach_and_nothing_else(scene: "SceneMap"):
@@ -161,9 +148,6 @@ def test_a_segment_touches_where_its_middle_does(scene: "SceneMap"):
     assert both.tolist() == [True, False]
 
 
-# What is there
-
-
 def test_colours_labels_and_further_values_are_learnt(scene: "SceneMap", cloud: PointCloud):
     x = cloud.points_in_base
     sample = scene.query(x)
@@ -173,46 +157,38 @@ def test_colours_labels_and_further_values_are_learnt(scene: "SceneMap", cloud: 
     assert scene.label_names == analytic_scene.LABELS
 
 
-def test_the_papers_networks_learn_all_three(cloud: PointCloud):
-    from jcr.scene.build import build_scene
-
-    scene = build_scene(cloud, replace(OPTIONS, preset="paper", max_seconds=6.0))
-    x = uniform(100_000)
-    surface, free = cloud.points_in_base[:20_000], x[signed_distance(x) > 0.03]
-    known = ~scene.query(free).unknown
-    assert (scene.query(surface).occupancy > 0.5).mean() > 0.9
-    assert (scene.query(free).occupancy[known] < 0.5).mean() > 0.95
-    color_error = np.abs(scene.query(surface).color - analytic_scene.true_color(surface)).mean()
-    assert color_error < 0.1  # the mean colour alone is off by 0.29
-    assert (scene.query(surface).label == cloud.label[:20_000]).mean() > 0.97
-
-
 def test_the_published_representation_is_plain_torch_and_learns_the_scene(cloud: PointCloud):
     import torch
 
+    from jcr.scene.build import build_scene
     from jcr.scene.paper import PaperField, train_paper
 
     box = torch.tensor([[0.0, -1.0, 0.0], [2.0, 1.0, 1.0]])
-    field, x = PaperField(box, 3, torch.Generator().manual_seed(1)), torch.rand(50, 3)
+    field, x = PaperField(box, "color", 3, torch.Generator().manual_seed(1)), torch.rand(50, 3)
     # The longest side spans [-1, 1].
     angle = torch.cat([(x - box.mean(0)).T * np.pi * 2.0**k for k in range(10)])
-    plain = torch.nn.Sequential(field.hidden, torch.nn.ReLU(), field.output)
-    encoded = torch.cat([angle.sin(), angle.cos()]).T
-    torch.testing.assert_close(field(x), plain(encoded), rtol=1e-4, atol=1e-4)
-    assert field.hidden.weight.shape == (256, 60) and field.output.weight.shape == (3, 256)
+    plain = torch.nn.Sequential(field.hidden, torch.nn.ReLU(), field.heads["color"])
+    torch.testing.assert_close(
+        field(x)["color"], plain(torch.cat([angle.sin(), angle.cos()]).T), rtol=1e-4, atol=1e-4
+    )
+    assert field.hidden.weight.shape == (256, 60)
 
     fields = train_paper(cloud, steps=400)
     surface = torch.tensor(cloud.points_in_base[:20_000], dtype=torch.float32)
     points = uniform(100_000)
     free = torch.tensor(points[signed_distance(points) > 0.03], dtype=torch.float32)
-    assert (fields["occupancy"](surface) > 0).float().mean() > 0.85
-    assert (fields["occupancy"](free) < 0).float().mean() > 0.9
+    assert (fields["occupancy"](surface)["occupancy"] > 0).float().mean() > 0.85
+    assert (fields["occupancy"](free)["occupancy"] < 0).float().mean() > 0.9
     color = analytic_scene.true_color(cloud.points_in_base[:20_000])
-    assert np.abs(fields["color"](surface).numpy() - color).mean() < 0.12
-    assert (fields["label"](surface).argmax(1).numpy() == cloud.label[:20_000]).mean() > 0.95
+    assert np.abs(fields["color"](surface)["color"].numpy() - color).mean() < 0.12
+    assert (fields["label"](surface)["label"].argmax(1).numpy() == cloud.label[:20_000]).mean() > 0.95
     doubted = replace(cloud, confidence=np.where(np.arange(len(cloud.label)) < 100, 1.0, 1e-3))
-    one, other = (train_paper(of, True, 2)["color"](surface) for of in (doubted, cloud))
+    one, other = (train_paper(of, True, 2)["color"](surface)["color"] for of in (doubted, cloud))
     assert not torch.equal(one, other)
+    untrained = replace(OPTIONS, preset="paper", max_seconds=0.0)
+    assert [type(one) for one in build_scene(cloud, untrained).fields.of] == 3 * [PaperField]
+    with pytest.raises(InputError, match="leave the values out"):
+        build_scene(cloud, untrained, values={"warmth": warmth(cloud)})
 
 
 def test_the_same_seed_gives_the_same_map_and_torchs_own_state_stays():
@@ -257,9 +233,6 @@ def test_a_wrong_colour_that_nobody_trusts_does_not_stain_the_map(cloud: PointCl
     stain = np.abs(stained.color[:10_000] / 255 - analytic_scene.true_color(x)).mean()
     color = build_scene(stained, OPTIONS).query(x).color
     assert np.abs(color - analytic_scene.true_color(x)).mean() < 0.3 * stain
-
-
-# Torch, threads, files
 
 
 def test_torch_differentiates_every_answer(scene: "SceneMap"):
@@ -313,25 +286,16 @@ def test_a_loaded_map_gives_eight_threads_the_answers_of_the_saved_one(scene: "S
                 assert np.array_equal(answer, right, equal_nan=answer.dtype.kind == "f")
 
 
-# Faults
-
-
-@pytest.mark.parametrize(
-    ("points", "message"),
-    [
+def test_questions_that_make_no_sense_are_refused(scene: "SceneMap"):
+    for points, words in (
         (np.zeros(3), r"\(n, 3\)"),
         (np.zeros((4, 2)), r"\(n, 3\)"),
         (np.array([[0.0, 0, 0], [0, np.nan, 0]]), "row 1 is not finite"),
         (np.array([[np.inf, 0, 0]]), "row 0 is not finite"),
-    ],
-)
-def test_points_that_are_none_are_refused(scene: "SceneMap", points: np.ndarray, message: str):
-    # Past the shape checks of the test run, as a user's call comes.
-    with pytest.raises(InputError, match=message):
-        scene._points(points, "points")
-
-
-def test_questions_that_make_no_sense_are_refused(scene: "SceneMap"):
+    ):
+        # Past the shape checks of the test run, as a user's call comes.
+        with pytest.raises(InputError, match=words):
+            scene._points(points, "points")
     for words, centers, radii in (
         ("negative", np.zeros((2, 3)), np.array([0.1, -0.1])),
         ("does not fit", np.zeros((2, 3)), np.zeros(3)),
@@ -350,15 +314,16 @@ def test_clouds_that_make_no_map_are_refused(cloud: PointCloud):
     broken[7, 1] = np.nan
     damaged, nan = replace(cloud, points_in_base=broken), np.full((len(broken), 1), np.nan)
     inverted, far = (0.4, -0.4, 0.0, -0.4, 0.4, 0.6), (3.0, 3.0, 3.0, 4.0, 4.0, 4.0)
-    for words, *arguments in (
-        ("not finite", damaged, OPTIONS),
-        ("not finite", damaged),
-        ("points lie in the workspace", cloud, replace(OPTIONS, workspace=far)),
-        ("minimum below", cloud, replace(OPTIONS, workspace=inverted)),
-        ("one finite row per point", cloud, OPTIONS, None, {"warmth": nan}),
+    for words, points, options, values in (
+        ("not finite", damaged, OPTIONS, None),
+        ("not finite", damaged, None, None),
+        ("points lie in the workspace", cloud, replace(OPTIONS, workspace=far), None),
+        ("points lie in the workspace", cloud, replace(OPTIONS, workspace=far, preset="paper"), None),
+        ("minimum below", cloud, replace(OPTIONS, workspace=inverted), None),
+        ("one finite row per point", cloud, OPTIONS, {"warmth": nan}),
     ):
         with pytest.raises(InputError, match=words):
-            build_scene(*arguments)
+            build_scene(points, options, values=values)
 
 
 def test_damaged_and_foreign_map_files_are_named(scene: "SceneMap", tmp_path: Path):

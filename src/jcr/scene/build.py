@@ -16,9 +16,15 @@ from jcr.progress import Progress, silent
 from jcr.records import PointCloud
 from jcr.scene.fields import Field, Fields, FieldShape, Lattice
 from jcr.scene.options import MapOptions
+from jcr.scene.paper import train_paper
 from jcr.scene.scene_map import SceneMap
 from jcr.scene.seen import HIT, SeenGrid, carve, dilate, halve, without_doubts
-from jcr.scene.train import NEAR, RECIPES, train, workspace_box, workspace_rays
+from jcr.scene.train import NEAR, Rays, rows_inside, train, workspace_box, workspace_rays
+
+HIDDEN = 32
+"""Hidden units of a network."""
+OCCUPANCY_GRIDS, SURFACE_GRIDS = ((0, 4), (1, 2)), ((0, 4), (2, 4))
+"""(lattice of `feature_lattices`, features) in which occupancy and the properties of surfaces are interpolated."""
 
 
 def build_scene(
@@ -33,7 +39,6 @@ def build_scene(
     Raises InputError when hardly any point lies in the workspace, or a number is not finite.
     """
     options = options or MapOptions()
-    recipe = RECIPES[options.preset]
     for numbers in (cloud.points_in_base, cloud.camera_centers_in_base, cloud.confidence, cloud.margin):
         if not np.isfinite(numbers).all():
             raise InputError(
@@ -42,40 +47,47 @@ def build_scene(
     box = workspace_box(cloud, options.workspace)
     cell = max(options.cell, float(np.prod(box[1] - box[0]) / options.max_cells) ** (1 / 3))
     box[1] = box[0] + np.ceil((box[1] - box[0]) / cell - 1e-6) * cell
-    rays = workspace_rays(cloud, values or {}, box, cell, device)
-    report = progress or silent
-
-    def fit(field: Field) -> int:
-        """Train a field and return the number of steps."""
-        stage = f"map: {', '.join(field.heads)}"
-        return train(field, rays, seen, recipe, options.map_seed, options.max_seconds, partial(report, stage))
-
+    rows_inside(cloud, box)
+    report, start = progress or silent, time.perf_counter()
     with threads_of_one_core(torch.device(device)) as pool:
-        start = time.perf_counter()
         report("what was seen", 0.0)
         # Rays that end beyond the workspace cross it all the same.
         ends = cloud.points_in_base, cloud.image, cloud.camera_centers_in_base
         seen = carve(*ends, box, cell / 2, cloud.cleared, device)
         carved = time.perf_counter()
-        lattices = feature_lattices(seen) if recipe.grids else []
-        # Occupancy in one network, all properties of surfaces in another.
-        heads = {name: target.shape[-1] for name, target in rays.targets.items() if name != "label"}
-        if "label" in rays.targets:
-            heads["label"] = len(cloud.label_names)
-        shapes = [
-            FieldShape(group, recipe.hidden, recipe.frequencies, grids)
-            for group, grids in (({"occupancy": 1}, recipe.grids), (heads, recipe.surface_grids))
-        ]
-        generator = torch.Generator().manual_seed(options.map_seed)
-        fields = Fields(shapes, seen.box, lattices, generator).to(device)
-        steps = list(pool.map(fit, fields.of))
-        history = {
-            "preset": options.preset,
-            "steps": " + ".join(map(str, steps)),
-            "carving_s": f"{carved - start:.3f}",
-            "training_s": f"{time.perf_counter() - carved:.3f}",
-        }
+        history = {"preset": options.preset, "carving_s": f"{carved - start:.3f}"}
+        if options.preset == "paper":
+            if values:
+                raise InputError(
+                    "the preset paper has occupancy, colour and label alone; leave the values out"
+                )
+            learnt = train_paper(cloud, seed=options.map_seed, box=box, max_seconds=options.max_seconds)
+            fields = Fields(list(learnt.values())).to(device)
+        else:
+            rays = workspace_rays(cloud, values or {}, box, cell, device)
+            fields = _grid_fields(rays, seen, len(cloud.label_names), options.map_seed).to(device)
+
+            def fit(field: Field) -> int:
+                """Train a field and return the number of steps."""
+                stage = f"map: {', '.join(field.heads)}"
+                return train(field, rays, seen, options.map_seed, options.max_seconds, partial(report, stage))
+
+            history["steps"] = " + ".join(map(str, pool.map(fit, fields.of)))
+        history["training_s"] = f"{time.perf_counter() - carved:.3f}"
     return SceneMap(fields, without_doubts(seen), cloud.label_names, history)
+
+
+def _grid_fields(rays: Rays, seen: SeenGrid, labels: int, seed: int) -> Fields:
+    """Return untrained feature grids with two networks: occupancy, and all properties of surfaces."""
+    lattices = feature_lattices(seen)
+    heads = {name: target.shape[-1] for name, target in rays.targets.items() if name != "label"}
+    heads |= {"label": labels} if "label" in rays.targets else {}
+    shapes = (
+        FieldShape({"occupancy": 1}, HIDDEN, grids=OCCUPANCY_GRIDS),
+        FieldShape(heads, HIDDEN, grids=SURFACE_GRIDS),
+    )
+    generator = torch.Generator().manual_seed(seed)
+    return Fields([Field(shape, seen.box, lattices, generator) for shape in shapes], lattices)
 
 
 def feature_lattices(seen: SeenGrid) -> list[Lattice]:

@@ -22,6 +22,7 @@ _COLUMNS = {
     **{"label": "i4", "confidence": "f4", "margin": "f4", "image": "i4", "reason": "u1", "depth_std": "f4"},
 }
 """Properties of a point; the last two of clouds with a reason and a standard deviation (m) for each depth."""
+_AS_READ = {"f4": np.float64, "u1": np.uint8, "i4": int}
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 _FIRST = "comment jcr cloud in the base frame, metres"
 
@@ -152,39 +153,26 @@ def write_cloud(path: Path, cloud: PointCloud, notes: Mapping[str, str] | None =
 def read_cloud(path: Path) -> PointCloud:
     """Read a cloud that `write_cloud` wrote; raise InputError for any other file."""
     try:
-        header, separator, body = read_bytes(path).partition(b"end_header\n")
+        header, _, body = read_bytes(path).partition(b"end_header\n")
         lines = header.decode().splitlines()
+        names = [name for name, kind in _COLUMNS.items() if f"property {_PLY_TYPES[kind]} {name}" in lines]
+        vertices = np.frombuffer(body, [(name, f"<{_COLUMNS[name]}") for name in names])
+        columns = {name: vertices[name].astype(_AS_READ[_COLUMNS[name]]) for name in names}
+        is_whole = _FIRST in lines and len(names) >= len(_COLUMNS) - 2
+        if not is_whole or not all(np.isfinite(column).all() for column in columns.values()):
+            raise ValueError
+        words = [line.split(maxsplit=3) for line in lines]
+        centers = [[float(x) for x in word[3].split()] for word in words if word[:2] == ["comment", "camera"]]
+        return PointCloud(
+            points_in_base=np.stack([columns.pop(name) for name in "xyz"], 1),
+            color=np.stack([columns.pop(name) for name in ("red", "green", "blue")], 1),
+            camera_centers_in_base=np.array(centers, np.float64).reshape(-1, 3),
+            label_names=tuple(word[3] for word in words if word[:2] == ["comment", "label"]),
+            **columns,
+        )
     except OSError as error:
         raise InputError(f"{path}: no cloud here ({error.strerror}); make one with jcr map OUT") from None
-    except UnicodeDecodeError:
-        separator, lines, body = b"", [], b""
-    words = [line.split(maxsplit=3) for line in lines]
-    if not separator or _FIRST not in lines:
-        raise InputError(f"{path}: is no cloud of jcr; make it again with jcr map OUT")
-    names = [name for name, kind in _COLUMNS.items() if f"property {_PLY_TYPES[kind]} {name}" in lines]
-    vertex = np.dtype([(name, f"<{_COLUMNS[name]}") for name in names])
-    if len(names) < len(_COLUMNS) - 2 or len(body) % vertex.itemsize:
-        raise InputError(f"{path}: the cloud is cut short; make it again with jcr map OUT")
-    vertices = np.frombuffer(body, vertex)
-    if not all(np.isfinite(vertices[name]).all() for name in names):
-        raise InputError(
-            f"{path}: the cloud is damaged (a number is not finite); make it again with jcr map OUT"
-        )
-    try:
-        centers = [[float(x) for x in word[3].split()] for word in words if word[:2] == ["comment", "camera"]]
-        label_names = tuple(word[3] for word in words if word[:2] == ["comment", "label"])
-        camera_centers = np.array(centers, np.float64).reshape(-1, 3)
     except (ValueError, IndexError):
-        raise InputError(f"{path}: the cloud's header is damaged; make it again with jcr map OUT") from None
-    return PointCloud(
-        points_in_base=np.stack([vertices[name] for name in "xyz"], 1).astype(np.float64),
-        color=np.stack([vertices[name] for name in ("red", "green", "blue")], 1),
-        confidence=vertices["confidence"].astype(np.float64),
-        margin=vertices["margin"].astype(np.float64),
-        label=vertices["label"].astype(int),
-        image=vertices["image"].astype(int),
-        camera_centers_in_base=camera_centers,
-        label_names=label_names,
-        reason=vertices["reason"].copy() if "reason" in names else None,
-        depth_std=vertices["depth_std"].astype(np.float64) if "depth_std" in names else None,
-    )
+        raise InputError(
+            f"{path}: is no cloud of jcr, or was damaged; make it again with jcr map OUT"
+        ) from None

@@ -1,7 +1,6 @@
 """The networks of the map: an encoding of position, one hidden layer, one linear head per property.
 
-`SinusoidalEncoding` with 256 hidden units is the paper's network, `GridEncoding` with 32 the default. Positions
-are metres of the base frame; each encoding scales them by itself.
+Positions are metres of the base frame; each encoding scales them by itself.
 """
 
 import itertools
@@ -187,6 +186,7 @@ class Field(nn.Module):
     ) -> None:
         """Initialise the layers from `generator`."""
         super().__init__()
+        self.shape = shape
         self.encoding = (
             SinusoidalEncoding(shape.frequencies, box)
             if shape.frequencies
@@ -228,18 +228,15 @@ class Field(nn.Module):
 class Fields(nn.Module):
     """All fields of a map, one for all properties or one for each, and the lattices they share."""
 
-    def __init__(
-        self,
-        shapes: Sequence[FieldShape],
-        box: Float[Tensor, "2 3"],
-        lattices: Sequence[Lattice],
-        generator: torch.Generator | None = None,
-    ) -> None:
-        """Initialise the layers from `generator`, field by field."""
+    def __init__(self, fields: Sequence[Field], lattices: Sequence[Lattice] = ()) -> None:
         super().__init__()
-        self.shapes = tuple(shapes)
         self.lattices = nn.ModuleList(lattices)
-        self.of = nn.ModuleList(Field(shape, box, lattices, generator) for shape in shapes)
+        self.of = nn.ModuleList(fields)
+
+    @property
+    def shapes(self) -> list[FieldShape]:
+        """Architecture of each field."""
+        return [cast(Field, field).shape for field in self.of]
 
     def forward(self, x_in_base: Float[Tensor, "n 3"], names: Collection[str]) -> dict[str, Tensor]:
         """Return the outputs (n, outputs) of the named heads at points (n,3)."""

@@ -25,8 +25,8 @@ class MapOptions:
     """Workspace, resolution and training of the map."""
 
     preset: Literal["default", "paper"] = "default"
-    """default: feature grids, free space learnt along the rays; paper: the paper's sinusoidal network with uniform
-    negatives, slower and coarser."""
+    """default: feature grids, free space learnt along the rays; paper: the published networks and their training, with
+    uniform negatives (scene/paper.py), slower and coarser."""
     workspace: Annotated[
         tuple[float, float, float, float, float, float] | None,
         tyro.conf.arg(metavar="XMIN YMIN ZMIN XMAX YMAX ZMAX"),

@@ -23,7 +23,7 @@ from jcr.files import write_bytes
 from jcr.geometry import apply, require_rigid
 from jcr.records.notebook import table
 from jcr.scene.distance import DistanceGrid, distance_grid
-from jcr.scene.fields import Fields, FieldShape, Lattice, in_chunks
+from jcr.scene.fields import Field, Fields, FieldShape, Lattice, in_chunks
 from jcr.scene.robot import JointValues, RobotSpheres, load_robot
 from jcr.scene.seen import CROSSED, HIT, SeenGrid, dilate, halve
 
@@ -379,7 +379,7 @@ def map_from_tensors(tensors: dict[str, Tensor], about: dict[str, Any]) -> Scene
         FieldShape(**shape | {"grids": tuple((lattice, n) for lattice, n in shape["grids"])})
         for shape in about["fields"]
     ]
-    fields = Fields(shapes, seen.box, lattices)
+    fields = Fields([Field(shape, seen.box, lattices) for shape in shapes], lattices)
     fields.load_state_dict({name.removeprefix("fields."): value for name, value in tensors.items()})
     return SceneMap(fields, seen, tuple(about["label_names"]), about["history"])
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 from torch.nn import functional as F
@@ -28,53 +28,10 @@ GAIN = 0.03
 """Share by which the loss must fall from look to look, or the learning rate falls."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Recipe:
-    """Networks and samples of a preset.
-
-    The preset "paper" has the encoding, the hidden layer and the uniform negatives of the paper (`scene/paper.py`), but
-    one network for all properties of surfaces, points weighted by confidence, and a learning rate that falls until the
-    validation loss stops falling.
-    """
-
-    hidden: int
-    frequencies: int
-    grids: tuple[tuple[int, int], ...]
-    """(lattice of `feature_lattices`, features) that occupancy interpolates in."""
-    surface_grids: tuple[tuple[int, int], ...]
-    """(lattice, features) of the properties of surfaces."""
-    along_rays: bool
-    """Samples along the rays, instead of uniform negatives alone."""
-    rates: tuple[float, float]
-    """Learning rates of Adam for layers and grids."""
-    look: int
-    """Steps between looks at the validation rays."""
-    falls: int
-    """Falls of the learning rate at which the training ends."""
-
-
-RECIPES = {
-    "default": Recipe(
-        hidden=32,
-        frequencies=0,
-        grids=((0, 4), (1, 2)),
-        surface_grids=((0, 4), (2, 4)),
-        along_rays=True,
-        rates=(3e-2, 0.3),
-        look=6,
-        falls=2,
-    ),
-    "paper": Recipe(
-        hidden=256,
-        frequencies=10,
-        grids=(),
-        surface_grids=(),
-        along_rays=False,
-        rates=(5e-3, 0.0),
-        look=100,
-        falls=3,
-    ),
-}
+RATES = (3e-2, 0.3)
+"""Learning rates of Adam for layers and grids."""
+LOOK, FALLS = 6, 2
+"""Steps between looks at the validation rays, and falls of the learning rate at which the training ends."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,6 +79,18 @@ def workspace_box(
     return np.stack([np.minimum(lower, cameras.min(0)) - 0.05, np.maximum(upper, cameras.max(0)) + 0.05])
 
 
+def rows_inside(cloud: PointCloud, box: Float[ndarray, "2 3"]) -> Int[ndarray, " n"]:
+    """Return the rows of the points in the box; raise InputError where these are hardly any."""
+    x = cloud.points_in_base
+    inside = np.flatnonzero(((x > box[0]) & (x < box[1])).all(1))
+    if len(inside) < 100:
+        raise InputError(
+            f"only {len(inside)} of {len(x)} points lie in the workspace {box.round(3).tolist()}; give a --workspace "
+            "around the scene, in metres of the base frame"
+        )
+    return inside
+
+
 def workspace_rays(
     cloud: PointCloud,
     values: dict[str, Float[ndarray, "n d"]],
@@ -134,14 +103,8 @@ def workspace_rays(
     A point counts by its confidence (relative to the median, within a factor of four) and by how small its
     `margin` and the depth's sigma are against a cell: there is no use in sharpness that the measurement does not have.
     """
-    x = cloud.points_in_base
-    inside = np.flatnonzero(((x > box[0]) & (x < box[1])).all(1))
-    if len(inside) < 100:
-        raise InputError(
-            f"only {len(inside)} of {len(x)} points lie in the workspace {box.round(3).tolist()}; give a --workspace "
-            "around the scene, in metres of the base frame"
-        )
-    x, origin = x[inside], cloud.camera_centers_in_base[cloud.image[inside]]
+    inside = rows_inside(cloud, box)
+    x, origin = cloud.points_in_base[inside], cloud.camera_centers_in_base[cloud.image[inside]]
     toward = origin - x
     distance = np.linalg.norm(toward, axis=1, keepdims=True)
     leave = np.full_like(toward, np.inf)  # a ray along a wall of the box never meets it
@@ -175,37 +138,31 @@ Samples = tuple[Float[Tensor, "_ 3"], Float[Tensor, " _"], Float[Tensor, " _"]]
 """Places, their known occupancy (0 or 1) and weight; the first are surface points, which carry other properties."""
 
 
-def draw_samples(rays: Rays, seen: SeenGrid, along_rays: bool, generator: torch.Generator) -> Samples:
-    """Return positives and negatives of occupancy for a batch of rays.
+def draw_samples(rays: Rays, seen: SeenGrid, generator: torch.Generator) -> Samples:
+    """Return positives and negatives of occupancy along a batch of rays.
 
-    The paper's: the points, and as many places drawn uniformly in the box (noise-contrastive estimation). Along
-    the rays: all from the camera to shortly before the point is free, half of it drawn close to the surface; and
-    behind the point, where no ray passed, the surface goes on for some cells. So the field crosses one half at
-    the surface itself, not at some distance that the density of the points sets.
+    All from the camera to shortly before the point is free, half of it drawn close to the surface; behind the point,
+    where no ray passed, the surface goes on for some cells. So the field crosses one half at the surface itself. With
+    uniform negatives, as in the paper, the density of the points sets the distance at which it does.
     """
     device, cell, n = rays.x.device, 2 * seen.cell, len(rays.x)
 
     def uniform(rows: int, columns: int = 1) -> Tensor:
         return torch.rand(rows, columns, generator=generator, device=device)
 
-    def anywhere(rows: int) -> tuple[Tensor, Tensor]:
-        return seen.lower + seen.size * uniform(rows, 3), torch.ones(rows, device=device)
-
-    if not along_rays:
-        positives, negatives = [(rays.x, rays.weight)], [anywhere(n)]
-    else:
-        a, b = rays[: n // 2], rays[n // 2 :]
-        behind = a.x - BEHIND * cell * uniform(len(a.x)) * a.ahead
-        # What is behind one point may lie before another: thin walls, seen from both sides.
-        state = seen.at(behind)
-        solid = ((state & CROSSED) == 0) | ((state & HIT) != 0)
-        near = b.x + cell * (CLEARANCE + NEAR * uniform(len(b.x)).square()) * b.ahead
-        far = a.x + (CLEARANCE * cell + a.reach * uniform(len(a.x))) * a.ahead
-        # Before a prior only what other rays crossed is free. Close to it the field learns where the surface ends
-        # all the same: what it says there counts only where the seen grid was crossed.
-        free_far = torch.maximum(a.measured, ((seen.at(far) & CROSSED) != 0).float())
-        positives = [(rays.x, rays.weight), (behind, a.weight * solid)]
-        negatives = [(near, b.weight), (far, a.weight * free_far), anywhere(n // 8)]
+    a, b = rays[: n // 2], rays[n // 2 :]
+    behind = a.x - BEHIND * cell * uniform(len(a.x)) * a.ahead
+    # What is behind one point may lie before another: thin walls, seen from both sides.
+    state = seen.at(behind)
+    solid = ((state & CROSSED) == 0) | ((state & HIT) != 0)
+    near = b.x + cell * (CLEARANCE + NEAR * uniform(len(b.x)).square()) * b.ahead
+    far = a.x + (CLEARANCE * cell + a.reach * uniform(len(a.x))) * a.ahead
+    # Before a prior only what other rays crossed is free. Close to it the field learns where the surface ends all the
+    # same: what it says there counts only where the seen grid was crossed.
+    free_far = torch.maximum(a.measured, ((seen.at(far) & CROSSED) != 0).float())
+    anywhere = seen.lower + seen.size * uniform(n // 8, 3)
+    positives = [(rays.x, rays.weight), (behind, a.weight * solid)]
+    negatives = [(near, b.weight), (far, a.weight * free_far), (anywhere, torch.ones(n // 8, device=device))]
     x, weight = (torch.cat(parts) for parts in zip(*positives, *negatives, strict=True))
     occupied = torch.zeros(len(x), device=device)
     occupied[: sum(len(places) for places, _ in positives)] = 1.0
@@ -216,7 +173,6 @@ def train(
     field: Field,
     rays: Rays,
     seen: SeenGrid,
-    recipe: Recipe,
     seed: int,
     max_seconds: float,
     report: Callable[[float], None],
@@ -226,14 +182,14 @@ def train(
     generator = torch.Generator(device).manual_seed(seed)
     field.standardise(rays.targets)
     learnt = [
-        (p, recipe.rates["tables" in name], torch.zeros_like(p), torch.zeros_like(p))
+        (p, RATES["tables" in name], torch.zeros_like(p), torch.zeros_like(p))
         for name, p in field.named_parameters()
         if p.requires_grad
     ]
 
     def draw(batch: Rays) -> Samples:
         if "occupancy" in field.heads:
-            return draw_samples(batch, seen, recipe.along_rays, generator)
+            return draw_samples(batch, seen, generator)
         return batch.x, torch.ones_like(batch.weight), batch.weight  # all else is known on surfaces only
 
     # Shuffled once, so that batches are slices and nothing is gathered again.
@@ -241,7 +197,7 @@ def train(
     leave_one_out, rays = rays[: len(rays.x) // 50], rays[len(rays.x) // 50 :]
     test = draw(leave_one_out)
     best, falls, step = float("inf"), 0, 0
-    while falls < recipe.falls and time.perf_counter() - start < max_seconds:
+    while falls < FALLS and time.perf_counter() - start < max_seconds:
         first = step * BATCH % max(len(rays.x) - BATCH, 1)
         batch = rays[first : first + BATCH]
         total_loss(field, batch, draw(batch)).backward()
@@ -255,12 +211,12 @@ def train(
                 spread = (square / (1 - 0.999**step)).sqrt_().add_(1e-8)
                 p.addcdiv_(mean, spread, value=-rate * 0.3**falls / (1 - 0.9**step))
                 p.grad = None
-        if step % recipe.look == 0:
+        if step % LOOK == 0:
             with torch.no_grad():
                 now = float(total_loss(field, leave_one_out, test))
             falls += now > (1 - GAIN) * best
             best = min(best, now)
-            report(falls / recipe.falls)
+            report(falls / FALLS)
     return step
 
 
