@@ -17,10 +17,10 @@ from jcr.camera import parameters, with_parameters
 from jcr.capture.read import read_capture
 from jcr.cell.stage import place_cameras
 from jcr.errors import RejectedError
-from jcr.estimation.intrinsics_prior import camera_with_prior
+from jcr.estimation.intrinsics_prior import CameraPrior, camera_with_prior
 from jcr.estimation.problem import Problem, State, with_observations
 from jcr.estimation.solve import Solution, solve
-from jcr.geometry import inverse, scale_translation, step_between
+from jcr.geometry import apply, inverse, scale_translation, step_between
 from jcr.reconstruct import ReconstructOptions, reconstruct
 from jcr.records import CellCamera
 from simulation.arms import PresetName
@@ -31,6 +31,7 @@ DRAWS, COUNT = 10, 10
 PRESET_NAMES: tuple[PresetName, ...] = ("white", "typical")
 WITHHELD = 4
 """Every this many of a real capture's images are declared images of fixed cameras, one each."""
+UNMOVED = np.eye(4)
 Of = Callable[[State], Float[ndarray, "4 4"]]
 
 
@@ -60,10 +61,26 @@ def wanted(problem: CellProblem) -> dict[str, Of]:
             "gripper_from_second": lambda p: p.x[1],
             "base1_from_base2": lambda p: p.z[0] @ inverse(p.z[1]),
         }
-    return {"base_from_camera": lambda p: p.z[0] @ scale_translation(p.world_from_rig[COUNT], p.scale)}
+    return {"base_from_camera": lambda p: p.z[0] @ scale_translation(p.world_from_rig[-1], p.scale)}
 
 
-def answered(problem: CellProblem, seed: int) -> Solution:
+def cell_of(
+    problem: CellProblem, cameras: Sequence[CameraPrior], world: Float[ndarray, "4 4"] = UNMOVED
+) -> tuple[Problem, State]:
+    """Return the problem without its observations, and its initial state, in a world that is moved by `world`."""
+    unmove = scale_translation(inverse(world), problem.scale)
+    state = State(
+        x=np.stack([x for x, _ in problem.starts]),
+        scale=1.0,
+        z=np.stack([z @ unmove for _, z in problem.starts]),
+        world_from_rig=world @ problem.world_from_rig,
+        rig_from_camera=problem.rig_from_camera,
+        points_in_world=apply(world, problem.points_in_world),
+    )
+    return Problem(arms=tuple(problem.arms), n_rigs=len(state.world_from_rig), cameras=tuple(cameras)), state
+
+
+def answered(problem: CellProblem, seed: int, world: Float[ndarray, "4 4"] = UNMOVED) -> Solution:
     """Adjust a cell by its images and poses; intrinsics are off by the usual error of given ones."""
     rng = np.random.default_rng([seed, 17])
     cameras = []
@@ -72,16 +89,7 @@ def answered(problem: CellProblem, seed: int) -> Solution:
         off = free.directions @ (free.std * rng.normal(size=len(free.std)))
         free = camera_with_prior(with_parameters(camera, parameters(camera) + off))
         cameras.append(replace(free, mount_free=problem.kind == "wrists" and k > 0))
-    state = State(
-        x=np.stack([x for x, _ in problem.starts]),
-        scale=1.0,
-        z=np.stack([z for _, z in problem.starts]),
-        world_from_rig=problem.world_from_rig,
-        rig_from_camera=problem.rig_from_camera,
-        points_in_world=problem.points_in_world,
-    )
-    cell = Problem(arms=tuple(problem.arms), n_rigs=len(problem.world_from_rig), cameras=tuple(cameras))
-    return solve(*with_observations(cell, state, problem.observations))
+    return solve(*with_observations(*cell_of(problem, cameras, world), problem.observations))
 
 
 def run(captures: Path) -> str:

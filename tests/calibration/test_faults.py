@@ -14,7 +14,7 @@ from jcr.calibration.poses import calibrate_poses
 from jcr.calibration.record import calibration_of
 from jcr.calibration.stage import calibrate
 from jcr.camera import project, unproject
-from jcr.cell.carried import exchanged, refined
+from jcr.cell.carried import eye_to_hand, refined
 from jcr.estimation.arms import RobotName, arm_named
 from jcr.findings import FindingKind, kinds_of, sentence
 from jcr.geometry import apply, inverse, step_between
@@ -226,8 +226,8 @@ def test_the_parts_of_the_uncertainty_of_a_fixed_camera_are_the_whole_with_its_f
     found = faulty_capture(np.random.default_rng(3), 12, NAMED["zoom"][0])
     seen, reconstruction = reconstructed(found, estimated=False)
     capture = replace(seen, base_from_gripper=inverse(seen.base_from_gripper), mount="base")
-    assert np.allclose(exchanged(capture).base_from_gripper, seen.base_from_gripper)
-    hand_eye = refined(capture, reconstruction, calibrate(exchanged(capture), reconstruction))
+    assert np.allclose(eye_to_hand(capture).base_from_gripper, seen.base_from_gripper)
+    hand_eye = refined(capture, reconstruction, calibrate(eye_to_hand(capture), reconstruction))
     assert hand_eye.converged and hand_eye.budget is not None
     parts = np.sum(list(vars(hand_eye.budget).values()), axis=0)
     assert np.allclose(parts, hand_eye.covariance, rtol=0, atol=1e-9)

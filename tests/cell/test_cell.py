@@ -1,7 +1,6 @@
 """Further cameras of a cell: the truth of simulated cells within sigma, images placed or refused with the reason."""
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,70 +9,28 @@ import numpy as np
 import pytest
 
 import jcr
+from benchmarks.cameras import answered, cell_of, wanted
 from jcr.calibration.checks.camera import CameraAdjustment
 from jcr.calibration.checks.effects import effects
 from jcr.calibration.stage import calibrate
-from jcr.camera import parameters, with_parameters
 from jcr.capture.added import read_added
 from jcr.capture.formats.capture_json import read, write
 from jcr.cell.added import camera_of, read_added_cameras
-from jcr.cell.carried import carried_scene, refined
+from jcr.cell.carried import eye_to_hand, refined
 from jcr.cell.images import CellImages
 from jcr.cell.placement import CameraPlacement, CellPlacement, read_cameras, write_cameras
 from jcr.cell.stage import place_cameras
-from jcr.estimation.intrinsics_prior import FIXED, CameraPrior, camera_with_prior
-from jcr.estimation.problem import Problem, State, with_observations
-from jcr.estimation.solve import Solution, solve
+from jcr.estimation.intrinsics_prior import camera_with_prior
 from jcr.findings import Finding, FindingKind
-from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
+from jcr.geometry import inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.records import Capture, CellCamera, HandEye, Reconstruction, Tracks
 from jcr.sfm.colmap import reconstruct_colmap
-from simulation.cells import CellProblem, Kind, cell_problem
+from simulation.cells import Kind, cell_problem
 
 COUNT = 8
 OLD = 9
 """Images of the bundled capture that calibrate; another is the fixed camera's."""
 SCALE = 0.37
-
-
-def adjusted(problem: CellProblem, world: np.ndarray | None = None, intrinsics_off: bool = True) -> Solution:
-    """As the stage does it, from starts that are near; intrinsics off by what is usual."""
-    rng = np.random.default_rng(5)
-    cameras = []
-    for k, camera in enumerate(problem.cameras):
-        free = camera_with_prior(camera)
-        off = free.std * rng.normal(size=len(free.std)) if intrinsics_off else 0 * free.std
-        moved = with_parameters(camera, parameters(camera) + free.directions @ off)
-        free = camera_with_prior(moved) if intrinsics_off else camera_with_prior(moved, FIXED)
-        cameras.append(replace(free, mount_free=problem.kind == "wrists" and k > 0))
-    move = np.eye(4) if world is None else world
-    return solve(*with_observations(*cell_of(problem, cameras, move), problem.observations))
-
-
-def cell_of(
-    problem: CellProblem, cameras: Sequence[CameraPrior], move: np.ndarray | None = None
-) -> tuple[Problem, State]:
-    """The problem without its observations, in a world that is moved."""
-    move = np.eye(4) if move is None else move
-    unmove = scale_translation(inverse(move), problem.scale)
-    state = State(
-        x=np.stack([x for x, _ in problem.starts]),
-        scale=1.0,
-        z=np.stack([z @ unmove for _, z in problem.starts]),
-        world_from_rig=move @ problem.world_from_rig,
-        rig_from_camera=problem.rig_from_camera,
-        points_in_world=apply(move, problem.points_in_world),
-    )
-    rigs = len(problem.world_from_rig)
-    return Problem(arms=tuple(problem.arms), n_rigs=rigs, cameras=tuple(cameras)), state
-
-
-WANTED = {
-    "fixed": ("base_from_camera", lambda p: p.z[0] @ scale_translation(p.world_from_rig[COUNT], p.scale)),
-    "wrists": ("gripper_from_second", lambda p: p.x[0] @ scale_translation(p.rig_from_camera[1], p.scale)),
-    "arms": ("base1_from_base2", lambda p: p.z[0] @ inverse(p.z[1])),
-    "carried": ("base_from_camera", lambda p: p.x[0]),
-}
 
 
 @pytest.mark.slow
@@ -82,9 +39,8 @@ WANTED = {
 )
 def test_the_truth_lies_within_what_is_said_of_the_error(kind: Kind, preset):
     problem = cell_problem(kind, preset, COUNT, seed=3, points=200)
-    answer = adjusted(problem)
-    name, of = WANTED[kind]
-    found, covariance = answer.transform(of)
+    name, of = list(wanted(problem).items())[-1]
+    found, covariance = answered(problem, 5).transform(of)
     error = step_between(found, problem.truth[name])
     assert error @ np.linalg.solve(covariance, error) < 16.8  # 99 % of chi2 of 6
     assert np.linalg.norm(error[:3]) < 0.012
@@ -94,9 +50,9 @@ def test_the_truth_lies_within_what_is_said_of_the_error(kind: Kind, preset):
 def test_the_frame_of_the_images_does_not_matter():
     problem = cell_problem("fixed", "typical", COUNT, seed=6, points=150)
     elsewhere = transform(rotation_exp(np.array([0.4, -1.0, 0.3])), np.array([3.0, -2.0, 1.0]))
-    of = WANTED["fixed"][1]
-    one, covariance = adjusted(problem).transform(of)
-    other, of_other = adjusted(problem, elsewhere).transform(of)
+    of = wanted(problem)["base_from_camera"]
+    one, covariance = answered(problem, 5).transform(of)
+    other, of_other = answered(problem, 5, elsewhere).transform(of)
     std = np.sqrt(np.diag(covariance))
     assert np.abs(step_between(one, other) / std).max() < 0.02
     assert np.allclose(np.sqrt(np.diag(of_other)), std, rtol=0.02)
@@ -145,11 +101,11 @@ def fixed(capture: Capture, *images: str, known: bool = True) -> CellCamera:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False])
-def test_a_image_of_the_scene_places_a_fixed_camera(tabletop: Path, calibrated, known: bool):
+def test_an_image_of_the_scene_places_a_fixed_camera(tabletop: Path, calibrated, known: bool, tmp_path: Path):
     old, reconstruction, hand_eye = calibrated
     capture = jcr.read_capture(tabletop)
     image, intrinsics = tabletop / capture.images[10], capture.intrinsics if known else None
-    added = replace(camera_of("camera", [image], None, (old.camera_name,)), intrinsics=intrinsics)
+    added = replace(camera_of("camera", [image], None, (old.camera_name,), tmp_path), intrinsics=intrinsics)
     camera = place_cameras(old, [added], reconstruction, hand_eye).cameras[0]
     x = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
     assert camera.converged and camera.parent_from_camera is not None and camera.covariance is not None
@@ -166,7 +122,7 @@ def test_a_fixed_camera_is_calibrated_by_what_the_gripper_carries(tabletop: Path
     carried = replace(
         capture, base_from_gripper=inverse(capture.base_from_gripper), mount="base", joints=None, robot=None
     )
-    seen = carried_scene(carried, tmp_path)
+    seen = eye_to_hand(carried, tmp_path)
     made = reconstruct_colmap(seen)
     found = refined(carried, made, calibrate(seen, made))
     x = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
@@ -258,10 +214,10 @@ def test_a_zoom_of_a_second_camera_is_named_with_its_size_and_none_where_there_i
     own, other = (camera_with_prior(one) for one in problem.cameras)
     cell, state = cell_of(problem, [own, replace(other, mount_free=True)])
     images = CellImages(problem=cell, state=state, observations=replace(seen, x_px=x_px))
-    answer, place = images.adjusted(), WANTED["wrists"][1]
+    answer, place = images.adjusted(), wanted(problem)["gripper_from_second"]
     second = CameraAdjustment(
         adjusted=answer,
-        adjust=lambda prior, free, bent: images.with_freed(prior, 1, free).adjusted(),
+        adjust=lambda prior, free, bent: images.adjusted(1, prior, free),
         arm=None,
         names=[f"{k}.png" for k in range(COUNT)],
         is_given=True,

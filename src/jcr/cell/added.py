@@ -32,8 +32,10 @@ def read_added_cameras(run_folder: Path, capture: Capture) -> tuple[CellCamera, 
     return tuple(replace(camera, folder=folder) for camera in read.others)
 
 
-def camera_of(name: str, files: Sequence[Path], intrinsics: Path | None, taken: Sequence[str]) -> CellCamera:
-    """Return a fixed camera of image files; raise InputError for images that cannot be those of one camera.
+def camera_of(
+    name: str, files: Sequence[Path], intrinsics: Path | None, taken: Sequence[str], folder: Path
+) -> CellCamera:
+    """Return a fixed camera of image files, copied to `folder`; raise InputError where they cannot be of one camera.
 
     `intrinsics` is a JSON file as capture.json has them, or one that holds them as "intrinsics"; `taken` are names
     that other cameras have.
@@ -49,24 +51,21 @@ def camera_of(name: str, files: Sequence[Path], intrinsics: Path | None, taken: 
         if isinstance(content, dict) and isinstance(content.get("intrinsics"), dict):
             content = content["intrinsics"]
         known = validated(IntrinsicsEntry, content, str(intrinsics)).record(size, f"{files[0]}, {intrinsics}")
-    images = tuple(str(file.resolve()) for file in files)
+    images = tuple(f"{name}/{k:03d}{file.suffix.lower()}" for k, file in enumerate(files))
+    for image, file in zip(images, files, strict=True):
+        write_bytes(folder / image, file.read_bytes())
     return CellCamera(
-        name=name, mount="base", images=images, image_size=size, intrinsics=known, folder=Path("/")
+        name=name, mount="base", images=images, image_size=size, intrinsics=known, folder=folder
     )
 
 
-def keep_camera(run_folder: Path, capture: Capture, camera: CellCamera) -> CellCamera:
+def keep_camera(run_folder: Path, capture: Capture, camera: CellCamera) -> None:
     """Make the camera part of the run: its images copied, its entry written."""
     folder = run_folder / FOLDER
-    images = []
-    for k, image in enumerate(camera.images):
-        source = (camera.folder or capture.folder) / image
-        images.append(f"{camera.name}/{k:03d}{source.suffix.lower()}")
-        write_bytes(folder / images[-1], source.read_bytes())
-    kept = replace(camera, images=tuple(images), folder=folder)
-    every = (*read_added_cameras(run_folder, capture), kept)
+    for image in camera.images:
+        write_bytes(folder / image, ((camera.folder or capture.folder) / image).read_bytes())
+    every = (*read_added_cameras(run_folder, capture), camera)
     entries = camera_entries(replace(capture, others=every))
     del entries[capture.camera_name]
     content = {name: entry.model_dump(mode="json", exclude_unset=True) for name, entry in entries.items()}
     write_text(folder / FILE, json.dumps(content, indent=1) + "\n")
-    return kept

@@ -23,13 +23,17 @@ from jcr.geometry import inverse
 from jcr.records import Capture, HandEye, Reconstruction
 
 
-def exchanged(capture: Capture) -> Capture:
-    """Return the capture with base and gripper exchanged, for the calibration of a fixed camera.
+def eye_to_hand(capture: Capture, moving: Path | None = None) -> Capture:
+    """Return the capture of a fixed camera as that of a camera that moves about the carried object.
 
-    The arm's name, URDF and joints are left out, for the kinematics are those of the poses as they were.
+    Base and gripper are exchanged. The arm's name, URDF and joints are left out, for the kinematics are those of the
+    poses as they were. Images without the static background are written to the folder `moving`, and taken from there.
     """
+    if moving is not None:
+        write_moving_parts(capture.folder, capture.images, moving)
     return replace(
         capture,
+        folder=moving or capture.folder,
         base_from_gripper=inverse(capture.base_from_gripper),
         mount="gripper",
         others=(),
@@ -39,32 +43,26 @@ def exchanged(capture: Capture) -> Capture:
     )
 
 
-def carried_scene(capture: Capture, moving: Path) -> Capture:
-    """Return the capture of a fixed camera as that of a camera that moves about the carried object.
-
-    Images without the static background are written to the folder `moving`.
-    """
-    write_moving_parts(capture.folder, capture.images, moving)
-    return replace(exchanged(capture), folder=moving)
-
-
 def refined(
     capture: Capture, reconstruction: Reconstruction, found: HandEye, options: CalibrateOptions | None = None
 ) -> HandEye:
     """Refine the calibration of the exchanged capture with the errors of the reported gripper poses.
 
     Its gripper_from_camera is base_from_camera, its base_from_recon gripper_from_recon; residuals are of the gripper
-    poses as they were reported. One that is rejected stays as it was, with what explains it where that is known.
+    poses as they were reported. One that is rejected stays as it was, or is named as a camera on the gripper.
     """
-    options = options or CalibrateOptions()
+    options, rows = options or CalibrateOptions(), reconstruction.image_index
     if not found.is_sound:
-        return _explained(capture, reconstruction, found)
-    robot = robot_errors(capture, options).of(reconstruction.image_index)
+        on_gripper = fit_hand_eye(
+            capture.base_from_gripper[rows], reconstruction.recon_from_camera, in_sequence=False
+        )
+        why = Finding.of(FindingKind.WRONG_MOUNT, "rejects", "mount", camera=capture.camera_name)
+        return found.with_findings(why) if on_gripper.converged else found
     case = Case(
         capture=capture,
         reconstruction=reconstruction,
         options=options,
-        robot=robot,
+        robot=robot_errors(capture, options).of(rows),
         priors=(),
         hand_eye=found,
         carries="scene",
@@ -84,15 +82,3 @@ def refined(
         findings=tuple(one for one in found.findings if one.kind not in EFFECTS),
     )
     return judged(with_findings(judged(again), effects_found))
-
-
-def _explained(capture: Capture, reconstruction: Reconstruction, found: HandEye) -> HandEye:
-    """Return a failed calibration, with the reason where the camera is on the gripper."""
-    rows = reconstruction.image_index
-    on_gripper = fit_hand_eye(
-        capture.base_from_gripper[rows], reconstruction.recon_from_camera, in_sequence=False
-    )
-    if not on_gripper.converged:
-        return found
-    why = Finding.of(FindingKind.WRONG_MOUNT, "rejects", "mount", camera=capture.camera_name)
-    return found.with_findings(why)

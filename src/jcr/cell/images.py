@@ -7,30 +7,18 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.case import MIN_OBSERVATIONS, of_images
-from jcr.calibration.options import CalibrateOptions
-from jcr.cell.camera_views import CameraViews
-from jcr.cell.rigs import Rigs
+from jcr.calibration.case import MIN_OBSERVATIONS, Case
+from jcr.cell.rigs import CameraViews, Rigs
 from jcr.estimation.intrinsics_prior import CameraPrior, camera_about
 from jcr.estimation.observations import Observations
 from jcr.estimation.problem import Problem, RigGaussian, State, with_observations
 from jcr.estimation.score_test import freed, with_camera
 from jcr.estimation.solve import Solution, solve
 from jcr.findings import FindingKind
-from jcr.records import Capture, HandEye, Intrinsics, Reconstruction
-from jcr.sfm.register import KnownImages
 from jcr.sfm.track_refinement import KEYPOINT_STD_PX
 
 EXACT = 1e-6
-"""m, rad: of poses that were given, beside what is known of their errors."""
-NOTHING: dict[str, ndarray] = {
-    "image": np.zeros(0, int),
-    "x_px": np.zeros((0, 2)),
-    "point": np.zeros(0, int),
-    "points_in_recon": np.zeros((0, 3)),
-    "std_px": np.ones(0),
-}
-"""Fields of tracks without an observation."""
+"""Standard deviation (m, rad) of given poses, beside what is known of their errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,56 +30,56 @@ class CellImages:
     state: State
     observations: Observations
 
-    def adjusted(self) -> Solution:
-        """Adjust images and arms together."""
-        return solve(*with_observations(self.problem, self.state, self.observations))
+    def adjusted(
+        self,
+        camera: int = 0,
+        prior: CameraPrior | None = None,
+        combinations: Float[ndarray, "e p"] | None = None,
+        arm: int | None = None,
+        errors: Float[ndarray, "s b"] | None = None,
+    ) -> Solution:
+        """Adjust images and arms together; the arguments are those of `with_freed`."""
+        cell = self if prior is None else self.with_freed(camera, prior, combinations, arm, errors)
+        return solve(*with_observations(cell.problem, cell.state, cell.observations))
 
     def with_freed(
-        self, prior: CameraPrior, camera: int, combinations: Float[ndarray, "e p"] | None = None
+        self,
+        camera: int,
+        prior: CameraPrior,
+        combinations: Float[ndarray, "e p"] | None,
+        arm: int | None = None,
+        errors: Float[ndarray, "s b"] | None = None,
     ) -> "CellImages":
         """Return the cell with another prior of a camera's intrinsics.
 
-        `combinations` of the columns of its score_test.Alternatives are free too.
+        `combinations` of the columns of its score_test.Alternatives are free too, and the poses of an arm have confirmed
+        `errors` of one standard deviation each.
         """
         problem = with_camera(self.problem, prior, camera)
         if combinations is not None:
             mine = np.flatnonzero(self.observations.camera == camera)
             problem = freed(problem, combinations, mine, len(self.observations.rig), camera)
+        if arm is not None and errors is not None:
+            arms = list(problem.arms)
+            arms[arm] = replace(arms[arm], confirmed_errors=errors)
+            problem = replace(problem, arms=tuple(arms))
         return replace(self, problem=problem)
 
-    def with_confirmed(self, arm: int | None, errors: Float[ndarray, "s b"] | None) -> "CellImages":
-        """Return the cell with confirmed errors of the poses of an arm, of one standard deviation each."""
-        if arm is None or errors is None:
-            return self
-        arms = list(self.problem.arms)
-        arms[arm] = replace(arms[arm], confirmed_errors=errors)
-        return replace(self, problem=replace(self.problem, arms=tuple(arms)))
 
-
-def cell_images(
-    capture: Capture,
-    reconstruction: Reconstruction,
-    hand_eye: HandEye,
-    known: KnownImages,
-    members: Sequence[CameraViews],
-    rigs: Rigs,
-    options: CalibrateOptions,
-) -> CellImages:
-    """All images; those of the further cameras follow the own camera's, camera by camera, as they are used."""
-    m = len(known.recon_from_camera)
-    own = of_images(reconstruction.tracks, hand_eye.inliers)
-    prior = None
+def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
+    """Return all images; those of the further cameras follow the own camera's, camera by camera, as they are used."""
+    case, hand_eye = rigs.case, rigs.case.hand_eye
+    tracks, prior = case.tracks, None
     # Where bundle adjustment did not decide the calibration, the images' own geometry is not used here either.
-    if hand_eye.before is None or own.from_pointmaps or len(own.image) < MIN_OBSERVATIONS:
-        prior, own = _as_given(reconstruction, hand_eye, known), replace(own, **NOTHING)
-    rig, camera = list(range(m)), [0] * m
-    image, x_px, point = [own.image], [own.x_px], [own.point]
-    std_px = [np.full(len(own.image), KEYPOINT_STD_PX) if own.std_px is None else own.std_px]
-    points = [hand_eye.scale * own.points_in_recon.astype(float)]
-    count = len(own.points_in_recon)
+    if hand_eye.before is None or tracks.from_pointmaps or len(tracks.image) < MIN_OBSERVATIONS:
+        prior, tracks = _given_poses(rigs), tracks.only(np.zeros(len(tracks.image), bool))
+    rig, camera = list(range(len(rigs.rows))), [0] * len(rigs.rows)
+    image, x_px, point = [tracks.image], [tracks.x_px], [tracks.point]
+    std_px = [np.full(len(tracks.image), KEYPOINT_STD_PX) if tracks.std_px is None else tracks.std_px]
+    points = [hand_eye.scale * tracks.points_in_recon.astype(float)]
+    count = len(tracks.points_in_recon)
     for c, member in enumerate(members, start=1):
-        assert member.rig is not None
-        for k, one in member.used.items():
+        for at, one in zip(member.rig.tolist(), member.used.values(), strict=True):
             n = len(one.x_px)
             image += [np.full(n, len(rig)), one.row]
             x_px += [one.x_px, one.row_x_px]
@@ -99,17 +87,17 @@ def cell_images(
             std_px.append(np.full(n + len(one.row), KEYPOINT_STD_PX))
             points.append(one.points_in_recon)
             count += n
-            rig.append(int(member.rig[k]))
+            rig.append(at)
             camera.append(c)
     mounts = [np.eye(4) if one.rig_from_camera is None else one.rig_from_camera for one in members]
-    arms, starts = rigs.arm_poses(options)
+    arms, starts = rigs.arm_poses()
     return CellImages(
         problem=Problem(
             arms=tuple(arms),
             n_rigs=len(rigs.poses),
-            cameras=_cameras(capture, reconstruction.intrinsics, hand_eye, members),
+            cameras=_cameras(case, members),
             known_rigs=prior,
-            robot_noise_floor=options.robot_noise_m_rad,
+            robot_noise_floor=case.options.robot_noise_m_rad,
         ),
         state=State(
             x=np.stack([x for x, _ in starts]),
@@ -130,16 +118,15 @@ def cell_images(
     )
 
 
-def _cameras(
-    capture: Capture, own: Intrinsics, hand_eye: HandEye, members: Sequence[CameraViews]
-) -> tuple[CameraPrior, ...]:
+def _cameras(case: Case, members: Sequence[CameraViews]) -> tuple[CameraPrior, ...]:
     """Return the cameras with the prior of their intrinsics; a mount is free only beside another camera on its rig.
 
     Given intrinsics that the own camera's images contradict count as estimated.
     """
-    contradicted = any(one.kind is FindingKind.INTRINSICS and one.shift is None for one in hand_eye.findings)
+    capture, found = case.capture, case.hand_eye.findings
+    contradicted = any(one.kind is FindingKind.INTRINSICS and one.shift is None for one in found)
     given = capture.intrinsics is not None and not contradicted
-    cameras = [camera_about(own, given, capture.intrinsics_std)]
+    cameras = [camera_about(case.reconstruction.intrinsics, given, capture.intrinsics_std)]
     for member in members:
         known = member.camera.intrinsics is not None
         camera = camera_about(member.intrinsics, known, member.camera.intrinsics_std)
@@ -147,12 +134,12 @@ def _cameras(
     return tuple(cameras)
 
 
-def _as_given(reconstruction: Reconstruction, hand_eye: HandEye, known: KnownImages) -> RigGaussian:
+def _given_poses(rigs: Rigs) -> RigGaussian:
     """Return the distribution of the used images' poses, where other than features found in the images decided them."""
-    rows = np.flatnonzero(hand_eye.inliers)
-    spread_of = np.zeros((6 * len(rows), 6 * len(rows)))
-    if (evidence := reconstruction.evidence) is not None:
-        unit = np.tile(np.repeat([hand_eye.scale, 1.0], 3), len(rows))
+    rows = rigs.case.used
+    covariance = EXACT**2 * np.eye(6 * len(rows))
+    if (evidence := rigs.case.reconstruction.evidence) is not None:
+        unit = np.tile(np.repeat([rigs.case.hand_eye.scale, 1.0], 3), len(rows))
         among = (6 * rows[:, None] + np.arange(6)).ravel()
-        spread_of = unit[:, None] * evidence.covariance[np.ix_(among, among)] * unit
-    return RigGaussian(known.recon_from_camera, spread_of + EXACT**2 * np.eye(len(spread_of)))
+        covariance += unit[:, None] * evidence.covariance[np.ix_(among, among)] * unit
+    return RigGaussian(rigs.known.recon_from_camera, covariance)

@@ -109,41 +109,29 @@ class CameraPlacement(Part):
     def of(
         cls,
         camera: CellCamera,
-        images: Sequence[ImageUse],
         findings: Sequence[Finding],
-        parent_from_camera: Float[ndarray, "4 4"] | None = None,
-        uncertainty: TransformUncertainty | None = None,
-        intrinsics: IntrinsicsAndStd | None = None,
+        points: Sequence[int] = (),
+        reasons: Mapping[int, str] = {},
+        px: Mapping[int, float] = {},
+        **placed: Any,
     ) -> "CameraPlacement":
-        """Return the placement of a camera with its findings."""
-        content: dict[str, Any] = {
-            "uncertainty": uncertainty,
-            "intrinsics": intrinsics,
-            "pictures": list(images),
-        }
-        if parent_from_camera is not None:
-            content[f"{camera.mount}_from_camera"] = parent_from_camera.tolist()
-        content |= derived(strongest_first(findings))
-        return cls(name=camera.name, mount=camera.mount, arm=camera.arm, **content)
+        """Return the placement of a camera with its findings; `placed` are transform, uncertainty and intrinsics.
 
-    @classmethod
-    def rejected(
-        cls,
-        camera: CellCamera,
-        why: Sequence[Finding],
-        counts: Sequence[int] | None = None,
-        reasons: Sequence[str | None] | None = None,
-    ) -> "CameraPlacement":
-        """Return a camera that was not placed, with the shared points of each image and why it was not used."""
-        n = len(camera.images)
-        unused = {"used": False, "reprojection_px": None}
+        `points` are the shared points of each image, `px` the reprojection errors of the used ones, and `reasons` why
+        others are not used.
+        """
         images = [
-            ImageUse(image=image, points=count, reason=reason or "the camera was not placed", **unused)
-            for image, count, reason in zip(
-                camera.images, counts or [0] * n, reasons or [None] * n, strict=True
+            ImageUse(
+                image=image,
+                used=k in px,
+                points=points[k] if points else 0,
+                reprojection_px=px.get(k),
+                reason=None if k in px else reasons.get(k, "the camera was not placed"),
             )
+            for k, image in enumerate(camera.images)
         ]
-        return cls.of(camera, images, why)
+        content = {"pictures": images, **placed, **derived(strongest_first(findings))}
+        return cls(name=camera.name, mount=camera.mount, arm=camera.arm, **content)
 
     @model_validator(mode="after")
     def _is_whole(self) -> "CameraPlacement":

@@ -1,27 +1,37 @@
-"""Rigs of a cell: images that move as one with the capture's own camera, its gripper, or another arm.
+"""Images of further cameras, localised in the reconstruction, and the rigs on which they move.
 
-A camera whose images contradict how it is mounted is refused here, before anything is adjusted.
+Rigs are the places of the capture's own camera, of fixed cameras, and of the cameras of other arms. A camera whose
+images contradict how it is mounted is refused here, before anything is adjusted.
 """
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.robot_errors import robot_errors
-from jcr.cell.camera_views import CameraViews
+from jcr.calibration.case import Case
+from jcr.calibration.checks.effects import MIN_IMAGES, effects_of_fit, with_rejected_runs
+from jcr.camera import usable_intrinsics
+from jcr.capture.images import read_image
 from jcr.cell.placement import CameraPlacement
 from jcr.distributions import chi2
 from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.estimation.hypotheses import arm_rows
-from jcr.estimation.problem import ReportedPoses
+from jcr.estimation.problem import ReportedPoses, scale_prior
 from jcr.estimation.systematic import smooth_errors
-from jcr.findings import Finding, FindingKind
-from jcr.geometry import Transform, inverse, motion_length, step_between
-from jcr.records import Capture, HandEye
+from jcr.estimation.wrist import pose_problem
+from jcr.findings import Concerns, Finding, FindingKind
+from jcr.geometry import Transform, inverse, motion_length, scale_translation, step_between
+from jcr.records import CellCamera, HandEye, Intrinsics
+from jcr.sfm.register import GATE_PX, KnownImages, Registration, features, registration, shared_points
 
+FOCAL_OF_WIDTH = 0.9
+"""Initial focal length of a camera without given intrinsics, in widths of the image."""
+CLEARLY_MORE = 1.1
+"""Factor of the points that agree with given intrinsics, from which RANSAC alone does not explain more."""
 SAME_PLACE = (0.02, np.radians(2.0))
 """m, rad: gripper poses that differ by less are one."""
 MAP_STD = (4e-3, np.radians(0.25))
@@ -34,119 +44,229 @@ LEAST_POSES = 3
 """Fewest images of another arm, or of another camera on the gripper."""
 
 
-class Rigs:
-    """Rigs: the capture's own camera at each used image, then those that other cameras add."""
+def localise(
+    known: KnownImages, image: UInt8[ndarray, "h w 3"], camera: CellCamera
+) -> tuple[Registration | None, int]:
+    """Return the registration of an image, None where too few points are shared, and the number of shared points.
 
-    def __init__(
-        self, capture: Capture, hand_eye: HandEye, own: Float[ndarray, "m 4 4"], rows: Int[ndarray, " m"]
-    ) -> None:
-        self._capture, self._hand_eye, self._rows = capture, hand_eye, rows
-        self.poses = list(own)
+    A focal length is estimated where none is given, or where another one explains clearly more points: wrong intrinsics
+    leave the points that agree with a wrong pose.
+    """
+    given, _ = usable_intrinsics(camera.intrinsics)
+    width, height = camera.image_size
+    focal = FOCAL_OF_WIDTH * max(width, height)
+    start = given or Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
+    gate_px = 2 * GATE_PX * max(1.0, start.width / 1600)
+    shared = shared_points(known, features(image, start))
+    found = registration(shared, start, "free", gate_px)
+    if given is not None:
+        by_given = registration(shared, start, "given", gate_px)
+        found = found if _count(found) > CLEARLY_MORE * _count(by_given) else by_given
+    return found if isinstance(found, Registration) else None, _count(found)
+
+
+def _count(found: Registration | int) -> int:
+    """Return the number of shared points."""
+    return len(found.x_px) if isinstance(found, Registration) else found
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraViews:
+    """Used images of one camera by their numbers, the rigs that they belong to, and why others are not used."""
+
+    camera: CellCamera
+    points: Sequence[int]
+    """Number of points that each image shares with the scene."""
+    used: Mapping[int, Registration]
+    reasons: Mapping[int, str]
+    """Reasons why images are not used, by their numbers."""
+    rig: Int[ndarray, " k"] = field(default_factory=lambda: np.zeros(0, int))
+    """Rig of each used image, once the camera is mounted."""
+    rig_from_camera: Float[ndarray, "4 4"] | None = None
+    """Pose on the rig; None for the rig's first camera."""
+    arm: int | None = None
+    """Number of its arm; None for a fixed camera."""
+    findings: tuple[Finding, ...] = ()
+
+    @classmethod
+    def of(cls, camera: CellCamera, found: Sequence[tuple[Registration | None, int]]) -> "CameraViews":
+        """Return the images of a camera as they were localised."""
+        return cls(
+            camera=camera,
+            points=[count for _, count in found],
+            used={k: one for k, (one, _) in enumerate(found) if one is not None},
+            reasons={
+                k: f"shares {count} points with the mapped scene"
+                for k, (one, count) in enumerate(found)
+                if one is None
+            },
+        )
+
+    @property
+    def rows(self) -> Int[ndarray, " k"]:
+        """Numbers of the used images."""
+        return np.array(list(self.used), dtype=int)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the used images."""
+        return [self.camera.images[k] for k in self.used]
+
+    @property
+    def places(self) -> Float[ndarray, "k 4 4"]:
+        """recon_from_camera of the used images."""
+        return np.stack([one.pose.a_from_camera for one in self.used.values()])
+
+    @property
+    def covariances(self) -> Float[ndarray, "k 6 6"]:
+        """Covariances of the steps of `places`."""
+        return np.stack([one.pose.covariance[:6, :6] for one in self.used.values()])
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Given intrinsics, or those of the image with most points."""
+        given, _ = usable_intrinsics(self.camera.intrinsics)
+        return given or max(self.used.values(), key=_count).pose.camera
+
+    def without(self, reasons: Mapping[int, str]) -> "CameraViews":
+        """Return the views without further images, which are not used for these reasons."""
+        used = {k: one for k, one in self.used.items() if k not in reasons}
+        return replace(self, used=used, reasons={**self.reasons, **reasons})
+
+    def refused(self, *why: Finding) -> CameraPlacement:
+        """Return the camera with the findings for which it is not placed."""
+        return CameraPlacement.of(self.camera, why, self.points, self.reasons)
+
+    def refused_for(
+        self, kind: FindingKind, concerns: Concerns = "none", *images: str, **numbers: Any
+    ) -> CameraPlacement:
+        """Return the camera rejected for a finding, as Finding.of makes it."""
+        return self.refused(Finding.of(kind, "rejects", concerns, *images, **numbers))
+
+
+def known_images(case: Case) -> KnownImages:
+    """Return the used images of the own camera with their features and their poses.
+
+    Their poses are in metres: the equations that follow are better for it, and distances can be spoken of.
+    """
+    capture, reconstruction, used = case.capture, case.reconstruction, case.used
+    images = [read_image(capture.folder / capture.images[row]) for row in reconstruction.image_index[used]]
+    places = scale_translation(reconstruction.recon_from_camera[used], case.hand_eye.scale)
+    return KnownImages.of(images, reconstruction.intrinsics, places)
+
+
+class Rigs:
+    """Rigs: the capture's own camera at each used image, then those that other cameras add.
+
+    `case` is the calibration of the own camera, `known` its used images with poses in metres.
+    """
+
+    def __init__(self, case: Case, known: KnownImages) -> None:
+        self.case, self.known, self.rows = case, known, case.reconstruction.image_index[case.used]
+        self.poses = list(known.recon_from_camera)
         self.arms: list[str] = []
         self._of_arms: list[tuple[Int[ndarray, " n"], Float[ndarray, "n 4 4"], HandEye]] = []
 
     def add(self, seen: CameraViews) -> CameraViews | CameraPlacement:
         """Add the images of a camera to the rigs; return a rejected placement where it cannot be placed."""
-        if not seen.registered:
-            most = int(np.argmax(seen.counts))
-            best, count = seen.camera.images[most], float(seen.counts[most])
-            return seen.refused(FindingKind.FEW_POINTS_SHARED, "images", best, value=count)
+        if not seen.used:
+            most = int(np.argmax(seen.points))
+            best, count = seen.camera.images[most], float(seen.points[most])
+            return seen.refused_for(FindingKind.FEW_POINTS_SHARED, "images", best, value=count)
         if seen.camera.arm is not None:
             return self._on_other_arm(seen, seen.camera.arm)
         return self._on_same_gripper(seen) if seen.camera.mount == "gripper" else self._fixed(seen)
 
-    def _fixed(self, seen: CameraViews) -> CameraViews | CameraPlacement:
-        places, covariances = seen.places, seen.covariances
-        names = [seen.camera.images[k] for k in seen.rows]
-        squared = _squared(places[:, None], covariances[:, None], places, covariances)
-        if squared.max() > APART:
-            a, b = np.unravel_index(squared.argmax(), squared.shape)
-            metres, radians = _apart(places[[a]], places[[b]])
-            apart = {"value": float(metres[0]), "rotation": float(radians[0])}
-            return seen.refused(FindingKind.NOT_FIXED, "mount", names[a], names[b], **apart)
-        middle = places[int(squared.sum(1).argmin())]
-        rig = np.full(len(seen.found), -1)
-        rig[seen.rows] = len(self.poses)
-        metres, radians = _apart(np.stack(self.poses[: len(self._rows)]), middle)
-        near = np.flatnonzero((metres < AT_A_FRAME[0]) & (radians < AT_A_FRAME[1]))
-        images = [self._capture.images[self._rows[row]] for row in near[:1]]
-        own = self._capture.camera_name
-        at_own = [
-            Finding.of(FindingKind.AT_ANOTHER_CAMERA, "warns", "mount", one, camera=own) for one in images
-        ]
+    def _fixed(self, seen: CameraViews) -> CameraViews:
+        squared = _squared(seen.places[:, None], seen.covariances[:, None], seen.places, seen.covariances)
+        middle = seen.places[int(squared.sum(1).argmin())]
+        rig = np.full(len(seen.used), len(self.poses))
         self.poses.append(middle)
-        return replace(seen, rig=rig, findings=tuple(at_own))
+        metres, radians = _apart(self.known.recon_from_camera, middle)
+        near = np.flatnonzero((metres < AT_A_FRAME[0]) & (radians < AT_A_FRAME[1]))
+        if not len(near):
+            return replace(seen, rig=rig)
+        image, own = self.case.capture.images[self.rows[near[0]]], self.case.capture.camera_name
+        at_own = Finding.of(FindingKind.AT_ANOTHER_CAMERA, "warns", "mount", image, camera=own)
+        return replace(seen, rig=rig, findings=(*seen.findings, at_own))
 
     def _on_same_gripper(self, seen: CameraViews) -> CameraViews | CameraPlacement:
         assert seen.camera.frame is not None
-        rig, unused = np.full(len(seen.found), -1), dict[int, str]()
-        for k in seen.rows.tolist():
-            frame = int(seen.camera.frame[k])
-            at = np.flatnonzero(self._rows == frame)
-            if len(at):
-                rig[k] = at[0]
-            else:
-                unused[k] = f"{self._capture.images[frame]}, taken with it, is not used"
-        seen = seen.without(unused)
-        taken = np.flatnonzero(rig >= 0)
-        if not len(taken):
-            return seen.refused(FindingKind.NO_COMMON_POSE, "images")
-        wrist = np.stack(self.poses)[rig[taken]]
+        capture, rig_of = self.case.capture, {int(row): k for k, row in enumerate(self.rows)}
+        frame = {k: int(seen.camera.frame[k]) for k in seen.used}
+        seen = seen.without(
+            {
+                k: f"{capture.images[row]}, taken with it, is not used"
+                for k, row in frame.items()
+                if row not in rig_of
+            }
+        )
+        if not seen.used:
+            return seen.refused_for(FindingKind.NO_COMMON_POSE, "images")
+        rig = np.array([rig_of[frame[k]] for k in seen.used])
+        wrist = self.known.recon_from_camera[rig]
         metres, radians = _apart(wrist[:, None], wrist)
         if not ((metres > SAME_PLACE[0]) | (radians > SAME_PLACE[1])).any():
-            return seen.refused(
-                FindingKind.ONE_GRIPPER_POSE, "images", *(seen.camera.images[k] for k in taken)
-            )
-        among = np.isin(seen.rows, taken)
-        places, covariances = seen.places[among], seen.covariances[among]
+            return seen.refused_for(FindingKind.ONE_GRIPPER_POSE, "images", *seen.names)
+        moved = self._order_effects(seen, wrist, 1e-4)
+        if any(one.severity == "rejects" for one in moved):
+            return seen.refused(*moved)
+        places, covariances = seen.places, seen.covariances
         on_rig = inverse(wrist) @ places
         between = np.asarray(motion_length(inverse(on_rig)[:, None] @ on_rig[None]))
         middle = int(np.median(between, axis=1).argmin())
         expected = wrist @ on_rig[middle]
         astray = _squared(places, covariances, expected, covariances[middle]) > APART
         if astray.mean() > 0.4:
-            most_m, own = float(_apart(places, expected)[0].max()), self._capture.camera_name
-            return seen.refused(FindingKind.NOT_RIGID, "mount", value=most_m, camera=own)
-        rig[taken[astray]] = -1
+            most_m, own = float(_apart(places, expected)[0].max()), capture.camera_name
+            return seen.refused_for(FindingKind.NOT_RIGID, "mount", value=most_m, camera=own)
         why = "its place on the gripper is not that of its other images"
-        seen = seen.without(dict.fromkeys(taken[astray].tolist(), why))
-        return replace(seen, rig=rig, rig_from_camera=on_rig[middle], arm=0)
+        kept = seen.without(dict.fromkeys(seen.rows[astray].tolist(), why))
+        return replace(kept, rig=rig[~astray], rig_from_camera=on_rig[middle], arm=0, findings=moved)
+
+    def _order_effects(
+        self, seen: CameraViews, carrier: Float[ndarray, "k 4 4"], scale_std: float
+    ) -> tuple[Finding, ...]:
+        """Return the effect of the order, such as a slip, of a camera that moves with the poses `carrier`."""
+        if len(seen.used) < MIN_IMAGES:
+            return ()
+        found = fit_hand_eye(carrier, seen.places, scale=1.0, scale_std=scale_std, in_sequence=False)
+        start = found.gripper_from_camera, found.scale, found.base_from_recon
+        problem, state = pose_problem(carrier, seen.places, start, priors=(scale_prior(1.0, scale_std),))
+        used = with_rejected_runs(found.inliers)
+        return effects_of_fit(replace(problem, used=used), state, found, seen.names)
 
     def _on_other_arm(self, seen: CameraViews, arm: str) -> CameraViews | CameraPlacement:
         assert seen.camera.base_from_gripper is not None
         if arm in self.arms:
-            return seen.refused(FindingKind.SECOND_ON_ARM, arm=arm)
-        if len(seen.rows) < LEAST_POSES:
-            counts = {"value": float(len(seen.rows)), "needed": float(LEAST_POSES)}
-            return seen.refused(FindingKind.FEW_LOCALISED, "images", **counts)
-        places, gripper = seen.places, seen.camera.base_from_gripper[seen.rows]
-        std = max(float(np.sqrt(self._hand_eye.covariance[6, 6])), 1e-4)
-        found = fit_hand_eye(gripper, places, scale=1.0, scale_std=std, in_sequence=False)
+            return seen.refused_for(FindingKind.SECOND_ON_ARM, arm=arm)
+        if len(seen.used) < LEAST_POSES:
+            counts = {"value": float(len(seen.used)), "needed": float(LEAST_POSES)}
+            return seen.refused_for(FindingKind.FEW_LOCALISED, "images", **counts)
+        gripper = seen.camera.base_from_gripper[seen.rows]
+        std = max(float(np.sqrt(self.case.hand_eye.covariance[6, 6])), 1e-4)
+        found = fit_hand_eye(gripper, seen.places, scale=1.0, scale_std=std, in_sequence=False)
         if not found.converged:
-            return seen.not_placed(*found.findings)
-        rig = np.full(len(seen.found), -1)
-        used = np.flatnonzero(found.inliers)
-        rig[seen.rows[used]] = len(self.poses) + np.arange(len(used))
-        why = {int(seen.rows[k]): str(found.reasons[k]) for k in np.flatnonzero(~found.inliers)}
-        self.poses += list(places[used])
+            return seen.refused(*found.findings)
+        used = found.inliers
+        kept = seen.without({int(seen.rows[k]): str(found.reasons[k]) for k in np.flatnonzero(~used)})
+        rig = len(self.poses) + np.arange(used.sum())
+        self.poses += list(kept.places)
         self.arms.append(arm)
-        self._of_arms.append((rig[seen.rows[used]], gripper[used], found))
-        return replace(seen.without(why), rig=rig, arm=len(self.arms))
+        self._of_arms.append((rig, gripper[used], found))
+        return replace(kept, rig=rig, arm=len(self.arms))
 
-    def arm_poses(
-        self, options: CalibrateOptions
-    ) -> tuple[list[ReportedPoses], list[tuple[Transform, Transform]]]:
+    def arm_poses(self) -> tuple[list[ReportedPoses], list[tuple[Transform, Transform]]]:
         """Return the arms, the capture's own first, and initial X and base_from_world of each."""
-        robot = robot_errors(self._capture, options).of(self._rows)
-        hand_eye = self._hand_eye
-        poses = self._capture.base_from_gripper[self._rows]
-        kinds = {one.kind for one in hand_eye.findings if one.kind.row.group == "strain"}
+        case = self.case
+        poses = case.capture.base_from_gripper[self.rows]
+        kinds = {one.kind for one in case.hand_eye.findings if one.kind.row.group == "strain"}
         bent = [row.prior_std * row.columns for row in arm_rows(poses) if row.kind in kinds]
         arms = [
             ReportedPoses(
-                rigs=np.arange(len(self._rows)),
+                rigs=np.arange(len(poses)),
                 base_from_gripper=poses,
-                error_covariance=robot.systematic,
+                error_covariance=case.systematic,
                 confirmed_errors=np.concatenate(bent, axis=1) if bent else None,
             )
         ]
@@ -154,7 +274,7 @@ class Rigs:
             arms.append(
                 ReportedPoses(rigs=rigs, base_from_gripper=gripper, error_covariance=smooth_errors(gripper))
             )
-        found = [hand_eye, *(one for _, _, one in self._of_arms)]
+        found = [case.hand_eye, *(one for _, _, one in self._of_arms)]
         return arms, [(one.gripper_from_camera, one.base_from_recon) for one in found]
 
 

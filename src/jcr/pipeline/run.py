@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from jcr import __version__
@@ -18,6 +19,7 @@ from jcr.capture.formats.capture_json import kept
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
 from jcr.cell.added import camera_of, keep_camera
+from jcr.cell.placement import write_cameras
 from jcr.errors import InputError, RejectedError
 from jcr.extras import is_installed
 from jcr.files import locked, write_text
@@ -25,6 +27,7 @@ from jcr.options import checked_options
 from jcr.pipeline.selection import NothingFoundError
 from jcr.pipeline.stages import (
     begun,
+    complete,
     finished,
     forget_reconstruction,
     is_unchanged,
@@ -32,6 +35,7 @@ from jcr.pipeline.stages import (
     make,
     noted,
     place,
+    rewrite_calibration,
     stages_of,
 )
 from jcr.progress import Progress, silent
@@ -184,13 +188,19 @@ def add_camera(
         known = begun(before.out, before.capture, options)
         file = None if intrinsics is None else Path(intrinsics)
         taken = [known.capture.camera_name, *(one.name for one in known.others)]
-        camera = camera_of(name, files, file, taken)
-        result = make(known.with_parts(others=(*known.others, camera)), stages_of(known)[:2], report)
-        if (found := place(result, report).cameras[-1]).doubt is not None:
-            raise RejectedError(f"{name}: {found.doubt}")
-        keep_camera(before.out, known.capture, camera)
-        result = result.with_parts(others=RunResult(before.out, capture=known.capture).others)
-        return finished(result, stages_of(result)[2:], report)
+        with TemporaryDirectory() as scratch:
+            camera = camera_of(name, files, file, taken, Path(scratch))
+            result = make(known.with_parts(others=(*known.others, camera)), stages_of(known)[:2], report)
+            located = place(result, report)
+            if (found := located.cameras[-1]).doubt is not None:
+                raise RejectedError(f"{name}: {found.doubt}")
+            keep_camera(before.out, known.capture, camera)
+        write_cameras(before.out, located)
+        others = RunResult(before.out, capture=known.capture).others
+        result = result.with_parts(others=others, cameras=located)
+        result = make(result, stages_of(result)[3:], report)  # the report alone
+        rewrite_calibration(before.out, result.calibration)
+        return complete(result)
 
 
 def measure(out: str | Path) -> "Measurement":

@@ -24,7 +24,7 @@ from jcr.calibration.record import Calibration, calibration_of, failed_calibrati
 from jcr.calibration.words import log
 from jcr.capture.added import FOLDER as ADDED
 from jcr.capture.added import write_added
-from jcr.cell.carried import carried_scene, refined
+from jcr.cell.carried import eye_to_hand, refined
 from jcr.cell.placement import FILE as CAMERAS
 from jcr.cell.placement import CamerasFile, write_cameras
 from jcr.depth.densify import densify
@@ -202,7 +202,7 @@ def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
     seen = capture
     if capture.mount == "base":
         # The arm's kinematics are those of the reported poses, and not of their inverses.
-        seen, own = carried_scene(capture, out / MOVING), replace(options.calibrate, robot=None)
+        seen, own = eye_to_hand(capture, out / MOVING), replace(options.calibrate, robot=None)
         options = replace(options, calibrate=own)
     before = _with_same_reconstruction(result, seen)
     try:
