@@ -19,13 +19,23 @@ from jcr.cell.added import camera_of, read_added_cameras
 from jcr.cell.carried import eye_to_hand, refined
 from jcr.cell.images import CellImages
 from jcr.cell.placement import CameraPlacement, CellPlacement, read_cameras, write_cameras
+from jcr.cell.rigs import CameraViews, fit_views
 from jcr.cell.stage import place_cameras
+from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.intrinsics_prior import camera_with_prior
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.records import Capture, CellCamera, HandEye, Reconstruction, Tracks
 from jcr.sfm.colmap import reconstruct_colmap
-from simulation.cells import Kind, cell_problem
+from jcr.sfm.register import Registration
+from simulation.cells import FIXED_CAMERA, Kind, cell_problem
+from simulation.faults import Faults, moved_parts, reported_poses
+from simulation.motion import fixed_camera
+from simulation.poses import gripper_poses, random_hand_eye
+from simulation.problems import disturbed
+from simulation.render import render
+from simulation.scenes import make_scene
+from simulation.truth import read_truth
 
 COUNT = 8
 OLD = 9
@@ -231,6 +241,61 @@ def test_a_zoom_of_a_second_camera_is_named_with_its_size_and_none_where_there_i
     assert [(one.kind, one.images) for one in found] == [(FindingKind.ZOOM, ("3.png", "4.png"))] * (zoom != 1)
     for one in found:
         assert one.value == pytest.approx(zoom - 1, abs=0.004) and one.shift is not None
+
+
+@pytest.mark.parametrize(
+    ("faults", "kind", "size"),
+    [
+        (Faults(), None, 0.0),
+        (Faults(slip=(0.005, 0.0)), FindingKind.SLIP, 0.005),
+        (Faults(slip=(0.012, 0.07)), FindingKind.SLIP, 0.012),
+        (Faults(delay_s=0.05, view_s=1.0), FindingKind.DELAY, 0.05),
+    ],
+)
+def test_a_slip_and_late_poses_of_a_further_camera_are_named_with_their_size(faults, kind, size: float):
+    """Named "zoom", "principal point moves with gravity" and "poses contradict the images" without this test."""
+    rng = np.random.default_rng(901)
+    x = random_hand_eye(rng)
+    true = gripper_poses("varied", 12, np.array([0.5, 0.0, 0.0]), x, rng)
+    mounts, _ = moved_parts(x, 12, faults, rng)
+    reported = disturbed(reported_poses(true, faults), (3e-4, np.radians(0.05)), rng)
+    covariance = np.diag(np.repeat([3e-4, 3e-4], 3) ** 2)
+    poses = [CameraPose(a_from_camera=one, covariance=covariance, camera=FIXED_CAMERA, inlier=np.ones(1, bool),
+             std_px=0.3, rms_px=0.3) for one in true @ mounts]  # fmt: skip
+    rays: dict = {"x_px": np.zeros((1, 2)), "points_in_recon": np.zeros((1, 3)), "row": np.zeros(0, int),
+                  "row_x_px": np.zeros((0, 2)), "row_point": np.zeros(0, int)}  # fmt: skip
+    camera = CellCamera(
+        name="a", mount="gripper", images=tuple(f"{k}.png" for k in range(12)), image_size=(9, 9)
+    )
+    views = CameraViews.of(camera, [(Registration(pose=pose, **rays), 100) for pose in poses])
+    _, found = fit_views(views, reported, 1e-4)
+    assert [one.kind for one in found] == ([] if kind is None else [kind])
+    if kind is FindingKind.SLIP:
+        assert found[0].images == ("5.png", "6.png")
+    assert not found or found[0].value == pytest.approx(size, rel=0.2)
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_fixed_camera_that_was_bumped_between_its_images_is_named(
+    tabletop: Path, calibrated, tmp_path: Path, moved: bool
+):
+    truth, rng = read_truth(tabletop), np.random.default_rng(902)
+    scene = make_scene("tabletop", truth.seed)
+    place = fixed_camera(scene.table_center_in_base, 0.5, rng)
+    bump = transform(rotation_exp(np.radians([0.9, -1.2, 0.0])), np.array([0.012, 0.016, 0.0]))
+    places = np.stack([place, place @ bump if moved else place])
+    for k, view in enumerate(render(scene, truth.intrinsics, places, with_truth=False)):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), view.image[..., ::-1])
+    camera = replace(fixed(calibrated[0], "0.png", "1.png"), folder=tmp_path, intrinsics=truth.intrinsics)
+    (found,) = place_cameras(calibrated[0], [camera], *calibrated[1:]).cameras
+    if not moved:
+        assert found.verdict == "accepted" and found.parent_from_camera is not None
+        assert np.linalg.norm(step_between(found.parent_from_camera, place)[:3]) < 0.004
+        return
+    assert [one.kind for one in found.findings] == [FindingKind.NOT_FIXED] and not found.converged
+    assert found.findings[0].value == pytest.approx(0.02, abs=0.002)
+    assert found.findings[0].details["rotation"] == pytest.approx(np.radians(1.5), rel=0.1)
 
 
 @pytest.mark.slow

@@ -40,6 +40,8 @@ APART = float(chi2.isf(1e-6, 6))
 """Squared Mahalanobis distance from which two places of a camera differ."""
 AT_A_FRAME = (0.01, np.radians(1.0))
 """m, rad: nearer than this to where the wrist camera was, a fixed camera is likely to be that camera."""
+EXACT_SCALE = 1e-4
+"""Relative standard deviation of the scale between two cameras in one reconstruction."""
 LEAST_POSES = 3
 """Fewest images of another arm, or of another camera on the gripper."""
 
@@ -204,13 +206,21 @@ class Rigs:
         if not seen.used:
             return seen.refused_for(FindingKind.NO_COMMON_POSE, "images")
         rig = np.array([rig_of[frame[k]] for k in seen.used])
+        moved = ()
+        if len(seen.used) >= MIN_IMAGES:
+            moved = fit_views(seen, self.known.recon_from_camera[rig], EXACT_SCALE)[1]
+        if any(one.severity == "rejects" for one in moved):
+            return seen.refused(*moved)
+        for one in moved:
+            if one.kind is FindingKind.SLIP:
+                first, before = seen.names.index(one.images[1]), one.details["longer"] == "before"
+                part = seen.rows[first:] if before else seen.rows[:first]
+                rig = rig[:first] if before else rig[first:]
+                seen = seen.without(dict.fromkeys(part.tolist(), "the camera moved on the gripper"))
         wrist = self.known.recon_from_camera[rig]
         metres, radians = _apart(wrist[:, None], wrist)
         if not ((metres > SAME_PLACE[0]) | (radians > SAME_PLACE[1])).any():
             return seen.refused_for(FindingKind.ONE_GRIPPER_POSE, "images", *seen.names)
-        moved = self._order_effects(seen, wrist, 1e-4)
-        if any(one.severity == "rejects" for one in moved):
-            return seen.refused(*moved)
         places, covariances = seen.places, seen.covariances
         on_rig = inverse(wrist) @ places
         between = np.asarray(motion_length(inverse(on_rig)[:, None] @ on_rig[None]))
@@ -224,18 +234,6 @@ class Rigs:
         kept = seen.without(dict.fromkeys(seen.rows[astray].tolist(), why))
         return replace(kept, rig=rig[~astray], rig_from_camera=on_rig[middle], arm=0, findings=moved)
 
-    def _order_effects(
-        self, seen: CameraViews, carrier: Float[ndarray, "k 4 4"], scale_std: float
-    ) -> tuple[Finding, ...]:
-        """Return the effect of the order, such as a slip, of a camera that moves with the poses `carrier`."""
-        if len(seen.used) < MIN_IMAGES:
-            return ()
-        found = fit_hand_eye(carrier, seen.places, scale=1.0, scale_std=scale_std, in_sequence=False)
-        start = found.gripper_from_camera, found.scale, found.base_from_recon
-        problem, state = pose_problem(carrier, seen.places, start, priors=(scale_prior(1.0, scale_std),))
-        used = with_rejected_runs(found.inliers)
-        return effects_of_fit(replace(problem, used=used), state, found, seen.names)
-
     def _on_other_arm(self, seen: CameraViews, arm: str) -> CameraViews | CameraPlacement:
         assert seen.camera.base_from_gripper is not None
         if arm in self.arms:
@@ -245,9 +243,10 @@ class Rigs:
             return seen.refused_for(FindingKind.FEW_LOCALISED, "images", **counts)
         gripper = seen.camera.base_from_gripper[seen.rows]
         std = max(float(np.sqrt(self.case.hand_eye.covariance[6, 6])), 1e-4)
-        found = fit_hand_eye(gripper, seen.places, scale=1.0, scale_std=std, in_sequence=False)
+        found, effects = fit_views(seen, gripper, std)
         if not found.converged:
-            return seen.refused(*found.findings)
+            explained = tuple(replace(one, severity="rejects") for one in effects)
+            return seen.refused(*(explained or found.findings))
         used = found.inliers
         kept = seen.without({int(seen.rows[k]): str(found.reasons[k]) for k in np.flatnonzero(~used)})
         rig = len(self.poses) + np.arange(used.sum())
@@ -276,6 +275,17 @@ class Rigs:
             )
         found = [case.hand_eye, *(one for _, _, one in self._of_arms)]
         return arms, [(one.gripper_from_camera, one.base_from_recon) for one in found]
+
+
+def fit_views(
+    seen: CameraViews, carrier: Float[ndarray, "k 4 4"], scale_std: float
+) -> tuple[HandEye, tuple[Finding, ...]]:
+    """Return the fit of a camera to the poses of what carries it, and the effect of the order, such as a slip."""
+    found = fit_hand_eye(carrier, seen.places, scale=1.0, scale_std=scale_std, in_sequence=False)
+    start = found.gripper_from_camera, found.scale, found.base_from_recon
+    problem, state = pose_problem(carrier, seen.places, start, priors=(scale_prior(1.0, scale_std),))
+    used = with_rejected_runs(found.inliers)
+    return found, effects_of_fit(replace(problem, used=used), state, found, seen.names)
 
 
 def _squared(

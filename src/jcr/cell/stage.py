@@ -97,7 +97,8 @@ def place_cameras(
     for camera in others:
         views = CameraViews.of(camera, found[camera.name])
         moved = _moved(rigs, views) if camera.mount == "base" and len(views.used) > 1 else ()
-        views = rigs.add(replace(views, findings=moved))
+        refused = any(one.severity == "rejects" for one in moved)
+        views = views.refused(*moved) if refused else rigs.add(replace(views, findings=moved))
         if isinstance(views, CameraPlacement):
             cameras[camera.name] = views
         else:
