@@ -16,7 +16,7 @@ from jcr.capture.images import read_image
 from jcr.live import arms
 from jcr.live.cameras import Frame, ImageSummary, frame_at_rest, open_camera
 from jcr.live.folder import LiveFolder
-from jcr.live.robot import MOVED_ON, RobotState, next_rest, pose_of_numbers, typed_poses
+from jcr.live.robot import MOVED_ON, next_rest, pose_of_numbers, typed_poses
 from jcr.live.session import LiveSession, SessionOptions
 from scripted_capture import RATE, Scripted, poses, still, take_all, video
 from simulation.ur import SimulatedUr
@@ -103,23 +103,12 @@ def test_a_ur_arm_is_asked_for_wherever_it_rests(tabletop: Path, length: int):
             assert state.joints is not None and np.allclose(state.joints, joints)
 
 
-def test_an_arm_that_moves_while_the_image_is_taken_is_named(tmp_path: Path, tabletop: Path):
-    pose = poses(tabletop)
-    moved = pose[0].copy()
-    moved[0, 3] += 1e-3
-    scripted: Any = Scripted(LiveFolder(tmp_path / "c"))
-    with open_camera(str(video(tmp_path / "a.avi", tabletop, range(1)))) as opened:
-        session = LiveSession(scripted, opened)
-        answer = session.take(RobotState(0.0, pose[0]), current=lambda: RobotState(0.0, moved))
-    assert "moved" in answer["reason"] and not (tmp_path / "c" / "capture.json").exists()
-
-
 def test_what_is_no_ur_robot_is_one_line(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(arms, "UR_TIMEOUT_S", 0.2)
     server = socket.create_server(("127.0.0.1", 0))
-    port = server.getsockname()[1]
+    states = lambda: arms.ur_states("127.0.0.1", server.getsockname()[1])  # noqa: E731
     with pytest.raises(jcr.InputError, match="silent"):
-        next(arms.ur_states("127.0.0.1", port))
+        next(states())
 
     def greet() -> None:
         for _ in range(2):  # the first connection is the one that gave up
@@ -127,14 +116,14 @@ def test_what_is_no_ur_robot_is_one_line(monkeypatch: pytest.MonkeyPatch):
             connection.sendall(b"HTTP/1.1 400 Bad Request")
             connection.close()
 
-    thread = threading.Thread(target=greet)
+    thread, closed = threading.Thread(target=greet), states()
     thread.start()
     with pytest.raises(jcr.InputError, match="not come from a UR"):
-        next(arms.ur_states("127.0.0.1", port))
+        next(states())
     thread.join(5)
     server.close()
     with pytest.raises(jcr.InputError, match="check the address"):
-        next(arms.ur_states("127.0.0.1", port))
+        next(closed)
 
 
 def test_poses_are_typed_in_three_ways_and_mistakes_asked_again():

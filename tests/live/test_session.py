@@ -2,8 +2,8 @@
 
 import errno
 import json
-import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -80,22 +80,8 @@ def test_commands_are_distinguished_from_poses():
 
 def test_commands_take_retake_remove_and_undo(tmp_path: Path, tabletop: Path):
     taken = Stepped(tmp_path / "c", tabletop, has_gripper=False)
-    heard = taken.run(
-        [
-            0,
-            1,
-            2,
-            ("retake", 2),
-            3,
-            ("remove", 9),
-            ("remove", 1),
-            ("undo",),
-            ("undo",),
-            ("remove", 1),
-            ("undo",),
-            ("undo",),
-        ]
-    )
+    removed, undo = ("remove", 1), ("undo",)
+    heard = taken.run([0, 1, 2, ("retake", 2), 3, ("remove", 9), removed, undo, undo, removed, undo, undo])
     assert ({"images": ["images/000.png", "images/002.png"]}, ["removed images/001.png"]) in heard
     assert any(answer.get("reason") == "there is no image 9" for answer, _ in heard)
     assert ({"images": ["images/002.png", "images/003.png"]}, ["removed images/000.png"]) in heard
@@ -134,21 +120,23 @@ def test_requests_and_commands_of_several_threads_come_one_after_the_other(tmp_p
 
     def source() -> None:
         # All of them are at the same place: one image is kept, whoever comes first.
-        takers = [
-            threading.Thread(
-                target=lambda: answers.append(taken.session.take(RobotState(0.0, taken.poses[0])))
-            )
-            for _ in range(4)
-        ]
-        takers += [threading.Thread(target=taken.session.press, args=("take",)) for _ in range(4)]
-        for one in takers:
-            one.start()
-        for one in takers:
-            one.join()
+        state = RobotState(0.0, taken.poses[0])
+        with ThreadPoolExecutor(8) as threads:
+            for _ in range(4):
+                threads.submit(lambda: answers.append(taken.session.take(state)))
+                threads.submit(taken.session.press, "take")
 
     taken.session.run(source)
     assert frames_in(tmp_path / "c") == ["images/000.png"]
     assert all("where images/000.png" in one["reason"] for one in answers if not one["accepted"])
+
+
+def test_an_arm_that_moves_while_the_image_is_taken_is_named(tmp_path: Path, tabletop: Path):
+    taken = Stepped(tmp_path / "c", tabletop)
+    moved = taken.poses[0].copy()
+    moved[0, 3] += 1e-3
+    answer = taken.session.take(RobotState(0.0, taken.poses[0]), current=lambda: RobotState(0.0, moved))
+    assert "moved" in answer["reason"] and not (tmp_path / "c" / "capture.json").exists()
 
 
 def test_a_program_that_sends_poses_is_answered_with_the_calibration(tmp_path: Path, tabletop: Path):

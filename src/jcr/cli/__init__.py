@@ -22,41 +22,36 @@ from jcr.errors import InputError, RejectedError, did_you_mean, printable
 
 GROUPS = {
     "calibrate": {
-        "run": ("everything: reconstruct, calibrate, map, report", "run.RunCommand"),
-        "calibrate": ("reconstruct and calibrate only: calibration.json", "run.CalibrateCommand"),
-        "add-camera": ("locate a fixed camera from its images of a run's scene", "run.AddCameraCommand"),
-        "batch": ("run many captures, on this machine or a Ray cluster", "run.BatchCommand"),
+        "run.run": "everything: reconstruct, calibrate, map, report",
+        "run.calibrate": "reconstruct and calibrate only: calibration.json",
+        "run.add-camera": "locate a fixed camera from its images of a run's scene",
+        "run.batch": "run many captures, on this machine or a Ray cluster",
     },
     "use": {
-        "export": ("export to ROS, MoveIt, OctoMap, cuRobo, COLMAP, nerfstudio, …", "use.ExportCommand"),
-        "query": ("query the map at points: occupancy, distance, colour, label", "use.QueryCommand"),
-        "measure": ("measure the support plane and the objects on it", "use.MeasureCommand"),
-        "view": ("show a run in 3D, in the browser", "use.ViewCommand"),
-        "map": ("build or rebuild the map of a run", "use.MapCommand"),
+        "use.export": "export to ROS, MoveIt, OctoMap, cuRobo, COLMAP, nerfstudio, …",
+        "use.query": "query the map at points: occupancy, distance, colour, label",
+        "use.measure": "measure the support plane and the objects on it",
+        "use.view": "show a run in 3D, in the browser",
+        "use.map": "build or rebuild the map of a run",
     },
     "check": {
-        "check": ("check a capture before any heavy work", "check.CheckCommand"),
-        "verify": ("has the camera moved? test a calibration with a few new images", "check.VerifyCommand"),
-        "compare": (
-            "compare two calibrations: do their uncertainties explain the difference?",
-            "check.CompareCommand",
-        ),
-        "touch": (
-            "touch test: compare points touched with the robot's tip with the map",
-            "check.TouchCommand",
-        ),
+        "check.check": "check a capture before any heavy work",
+        "check.verify": "has the camera moved? test a calibration with a few new images",
+        "check.compare": "compare two calibrations: do their uncertainties explain the difference?",
+        "check.touch": "touch test: compare points touched with the robot's tip with the map",
     },
     "prepare": {
-        "capture": ("take a capture live, with advice on the next pose", "capture.CaptureCommand"),
-        "board": ("draw a calibration board to print, if you want one", "prepare.BoardCommand"),
+        "capture.capture": "take a capture live, with advice on the next pose",
+        "prepare.board": "draw a calibration board to print, if you want one",
     },
     "more": {
-        "models": ("list back ends with their licences; download weights", "prepare.ModelsCommand"),
-        "docs": ("print the pages of the manual", "prepare.DocsCommand"),
+        "prepare.models": "list back ends with their licences; download weights",
+        "prepare.docs": "print the pages of the manual",
     },
 }
-"""Commands by their group: what each does, and module and class of its arguments."""
-COMMANDS = {name: about for group in GROUPS.values() for name, (about, _) in group.items()}
+"""Commands by their group, each after its module, and what they do."""
+MODULES = {name: module for group in GROUPS.values() for module, name in (key.split(".") for key in group)}
+COMMANDS = {key.split(".")[1]: about for group in GROUPS.values() for key, about in group.items()}
 
 _OVERVIEW = """\
 usage: jcr COMMAND [ARGUMENTS]
@@ -147,8 +142,8 @@ def dispatch(arguments: Sequence[str]) -> int:
 def _dispatched(arguments: Sequence[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         groups = (
-            "\n".join([f"{group}:", *(f"  {name:<10} {about}" for name, (about, _) in commands.items())])
-            for group, commands in GROUPS.items()
+            "\n".join([f"{group}:", *(f"  {key.split('.')[1]:<10} {about}" for key, about in rows.items())])
+            for group, rows in GROUPS.items()
         )
         sys.stdout.write(_OVERVIEW.format(commands="\n\n".join(groups)))
         return 0
@@ -182,10 +177,9 @@ def _dispatched(arguments: Sequence[str]) -> int:
 
 
 def command(name: str) -> Any:
-    """Return the class of a command's arguments."""
-    (place,) = (group[name][1] for group in GROUPS.values() if name in group)
-    module, kind = place.split(".")
-    return getattr(import_module(f"jcr.cli.{module}"), kind)
+    """Return the class of a command's arguments: `add-camera` is AddCameraCommand."""
+    kind = name.title().replace("-", "") + "Command"
+    return getattr(import_module(f"jcr.cli.{MODULES[name]}"), kind)
 
 
 def _guarded(action: Callable[[], int]) -> int:
