@@ -46,7 +46,7 @@ def named_by(script: str, *words: object) -> Any:
 ASK = """
     import json, sys
     from jcr.errors import InputError
-    from jcr.live.arms import states_of
+    from jcr.live.robot import states_of
     from jcr.live.robot import MOVED_ON, next_rest
     ask = next_rest(states_of(f"{sys.argv[1]}:{sys.argv[2]}"), None, MOVED_ON)
     try:
@@ -83,7 +83,7 @@ def simulated_franka(host: str) -> Iterator[None]:
 MOVED_FRANKA = """
     import json, sys, franky
     import numpy as np
-    from jcr.live.arms import states_of
+    from jcr.live.robot import states_of
     from jcr.live.robot import MOVED_ON, next_rest
     states = states_of("franka:" + sys.argv[1])
     first = next_rest(states, None, MOVED_ON)

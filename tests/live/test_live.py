@@ -13,7 +13,7 @@ from numpy import ndarray
 
 import jcr
 from jcr.capture.images import read_image
-from jcr.live import arms
+from jcr.live import robot
 from jcr.live.cameras import Frame, ImageSummary, frame_at_rest, open_camera
 from jcr.live.folder import LiveFolder
 from jcr.live.robot import MOVED_ON, next_rest, pose_of_numbers, typed_poses
@@ -95,18 +95,18 @@ def test_a_ur_arm_is_asked_for_wherever_it_rests(tabletop: Path, length: int):
     goals = np.array(poses(tabletop)[:3])
     angles = np.linspace(-1, 1, 18).reshape(3, 6)
     last = None
-    with SimulatedUr(goals, length, angles) as robot:
+    with SimulatedUr(goals, length, angles) as simulated:
         for goal, joints in zip(goals, angles, strict=True):
-            state = next_rest(lambda: arms.ur_states("127.0.0.1", robot.port), last, MOVED_ON)
+            state = next_rest(lambda: robot.ur_states("127.0.0.1", simulated.port), last, MOVED_ON)
             last = state.base_from_gripper
             assert np.allclose(last, goal, atol=1e-9)
             assert state.joints is not None and np.allclose(state.joints, joints)
 
 
 def test_what_is_no_ur_robot_is_one_line(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(arms, "UR_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(robot, "UR_TIMEOUT_S", 0.2)
     server = socket.create_server(("127.0.0.1", 0))
-    states = lambda: arms.ur_states("127.0.0.1", server.getsockname()[1])  # noqa: E731
+    states = lambda: robot.ur_states("127.0.0.1", server.getsockname()[1])  # noqa: E731
     with pytest.raises(jcr.InputError, match="silent"):
         next(states())
 

@@ -93,11 +93,11 @@ class CaptureCommand:
 def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
     """Take images until there are enough, or the calibration is as accurate as required; calibrate all of them."""
     from jcr.files import locked
-    from jcr.live.arms import NOTATIONS, address_of, states_of
     from jcr.live.calibration import LiveCalibration
     from jcr.live.cameras import open_camera
     from jcr.live.folder import LiveFolder
     from jcr.live.progress import Notation
+    from jcr.live.robot import KINDS, address_of, states_of
     from jcr.live.server import Listen, LiveServer
     from jcr.live.session import LiveSession
 
@@ -121,9 +121,10 @@ def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
         folder = LiveFolder(out, given or camera.intrinsics, robot)
         calibration = LiveCalibration(folder, options={"require": options.require}, reach=options.reach)
         gripper = None if states is None else lambda: next(states())
-        convention = arguments.pose_convention
+        convention: ConventionName = arguments.pose_convention
         if convention == "auto":
-            convention = NOTATIONS.get(arguments.poses.partition(":")[0], "auto")
+            own = (kind for kind in KINDS if arguments.poses.startswith(f"{kind}:"))
+            convention = next(own, "auto")
         notation = Notation(convention, arguments.pose_units, calibration.arm)
         session = LiveSession(calibration, camera, options, tell, notation, gripper)
         try:
