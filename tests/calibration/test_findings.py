@@ -20,109 +20,43 @@ from jcr.geometry import rotation_exp, transform
 from jcr.records import Capture, HandEye, Intrinsics, PosePairs, Reconstruction, Tracks
 from simulation.problems import hand_eye_problem
 
-"""Files as the version before findings wrote them."""
-AT = {"frame": "gripper", "x": 0.0, "y": 0.6, "z": 0.8}
+DETAILS: dict[str, float | str] = {
+    **dict(frame="base", x=0.0, y=0.6, z=0.8, motion="planar", rotation=0.01, part="scale", unit="interval"),
+    **dict(reading="their inverses", fits="1 mm", given=1e-3, given_rotation=1e-3, residual=0.01),
+    **dict(translation_mm=5.0, rotation_deg=1.0, asked=0.0, distance_mm=0.0, reached_mm=9.0, reached_deg=0.1),
+    **dict(
+        longer="after", count=5.0, camera="overhead", joint_2=0.01, joint_2_std=0.001, of=12.0, arm="right"
+    ),
+    **dict(board="chessboard:9x6:SIDE", proposed="aruco:SIDE:DICT_4X4_50", one="board", other="known length"),
+    **dict(
+        needed=3.0, mount="base", focal_std=0.1, rotated="rotated by 90°", text="a thing is wrong", remedy=""
+    ),
+}
+"""Details of any kind."""
 INTRINSICS = {
-    f"{name}{of}": 600.0 + k for name in ("fx", "fy", "cx", "cy") for k, of in enumerate(("", "_given"))
+    f"{name}{of}": 600.0 + k
+    for name in ("fx", "fy", "cx", "cy")
+    for k, of in enumerate(("", "_given", "_std"))
 }
-SIZE = {"rotation": 0.01}
-EXAMPLES: dict[FindingKind, dict] = {
-    FindingKind.UNOBSERVABLE: {"details": {"motion": "planar"} | AT, "value": 0.01},
-    FindingKind.FEW_IMAGES: {"value": 3.0},
-    FindingKind.FEW_AGREE: {"value": 3.0, "details": {"images": 9.0}},
-    FindingKind.POSES_CONTRADICT_IMAGES: {"value": 0.1, "details": SIZE},
-    FindingKind.POSE_CONVENTION: {
-        "details": {
-            "reading": "their inverses (gripper_from_base was given)",
-            "fits": "1 mm",
-            "given": "90 mm",
-            "remedy": "add --pose-inverted",
-        }
-    },
-    FindingKind.NOISE_ABOVE_GIVEN: {"value": 0.01, "details": SIZE | {"given": 1e-3, "given_rotation": 1e-3}},
-    FindingKind.UNCERTAIN: {"value": 0.1, "details": {"part": "scale"}},
-    FindingKind.LEAVE_ONE_OUT: {"value": 0.1, "details": {"residual": 0.01}},
-    FindingKind.NOT_EXACT_ENOUGH: {
-        "details": {
-            "translation_mm": 5.0,
-            "rotation_deg": 1.0,
-            "asked": 0.0,
-            "distance_mm": 0.0,
-            "reached_mm": 9.0,
-            "reached_deg": 0.1,
-        }
-    },
-    FindingKind.ROLLING_SHUTTER: {"value": 6.0, "std": 0.5, "p": 1e-9},
-    FindingKind.ROLLING_SHUTTER_BY_IMAGE: {"value": 6.0, "p": 1e-9},
-    FindingKind.THIN_PRISM: {"value": 6.0, "std": 0.5, "p": 1e-9},
-    FindingKind.CENTRE_SAGS: {"value": 15.0, "std": 0.5, "p": 1e-9},
-    FindingKind.FAR_FROM_GRIPPER: {"value": 0.8},
-    FindingKind.POINTS_CROWDED: {"value": 0.01},
-    FindingKind.ZOOM: {"value": 0.01, "std": 0.001, "p": 1e-9, "images": ("a.png", "b.png")},
-    FindingKind.INTRINSICS: {
-        "p": 1e-9,
-        "details": INTRINSICS | {"fx_std": 0.1, "fy_std": 0.1, "cx_std": 0.1},
-    },
-    FindingKind.SLIP: {
-        "value": 0.01,
-        "p": 1e-9,
-        "images": ("a.png", "b.png"),
-        "details": SIZE | {"longer": "after", "count": 5.0},
-    },
-    FindingKind.BASE_MOVED: {
-        "value": 0.01,
-        "p": 1e-9,
-        "images": ("a.png", "b.png"),
-        "details": SIZE | {"longer": "after", "count": 5.0},
-    },
-    FindingKind.DRIFT: {"value": 0.01, "p": 1e-9, "details": SIZE},
-    FindingKind.DELAY: {"value": 0.41, "std": 0.03, "p": 1e-9, "details": {"unit": "interval"}},
-    FindingKind.WRONG_MOUNT: {"details": {"camera": "overhead"}},
-    FindingKind.JOINT_OFFSETS: {
-        "joints": (2,),
-        "p": 1e-9,
-        "details": {"joint_2": 0.01, "joint_2_std": 0.001},
-    },
-    FindingKind.LENGTHS: {"value": 0.02, "std": 0.002, "p": 1e-9, "details": AT | {"frame": "base"}},
-    FindingKind.IMAGES_ROTATED: {"value": 6.0, "details": {"rotated": "rotated by 90°"}},
-    FindingKind.BOARD_IN_VIEW: {"details": {"board": "chessboard:9x6:SIDE"}},
-    FindingKind.SCALES: {"value": 0.03, "std": 0.005, "details": {"one": "board", "other": "known length"}},
-    FindingKind.BOARD_SIDE: {"value": 0.0254, "std": 5e-5, "details": {"board": "chessboard:9x6:SIDE"}},
-    FindingKind.BOARD_MOVED: {"images": ("03.png",), "details": {"board": "chessboard:9x6:0.025"}},
-    FindingKind.BOARD_STRETCHED: {"value": 0.01, "details": {"board": "chessboard:9x6:0.025"}},
-    FindingKind.BOARD_NOT_FOUND: {
-        "details": {"board": "chessboard:9x6:0.025", "proposed": "aruco:SIDE:DICT_4X4_50"}
-    },
-    FindingKind.OWN_REJECTED: {"details": {"camera": "wrist"}},
-    FindingKind.FEW_POINTS_SHARED: {"value": 3.0, "images": ("a.png",)},
-    FindingKind.FEW_LOCALISED: {"value": 2.0, "details": {"needed": 3.0}},
-    FindingKind.SECOND_ON_ARM: {"details": {"arm": "right"}},
-    FindingKind.ONE_GRIPPER_POSE: {"images": ("a.png",)},
-    FindingKind.NOT_FIXED: {"value": 0.1, "images": ("a.png", "b.png"), "details": SIZE},
-    FindingKind.NOT_RIGID: {"value": 0.1, "details": {"camera": "wrist"}},
-    FindingKind.IMAGE_MISSES: {"value": 9.0, "images": ("a.png",), "details": {"mount": "base"}},
-    FindingKind.PLACE_UNCERTAIN: {
-        "value": 0.1,
-        "details": SIZE | {"focal_std": 0.1},
-        "concerns": "intrinsics",
-    },
-    FindingKind.AT_ANOTHER_CAMERA: {"images": ("a.png",), "details": {"camera": "wrist"}},
-    FindingKind.BLURRED: {"value": 14.0, "images": ("a.png", "b.png"), "details": {"of": 4.0}},
-    FindingKind.REPETITIVE: {"value": 0.95},
-    FindingKind.FEW_USED: {"value": 4.0, "details": {"of": 12.0}},
-    FindingKind.PIECES: {"value": 5.0, "images": ("a.png",), "details": {"of": 12.0}},
-    FindingKind.STATIC_IMAGES: {"value": 0.2, "details": SIZE},
-    FindingKind.POSES_SWAPPED: {"images": ("a.png", "b.png")},
-    FindingKind.POSE_CONTRADICTS_IMAGE: {"value": 0.1, "images": ("a.png",), "details": SIZE},
-    FindingKind.NOT_REGISTERED: {"images": ("a.png",), "details": {"text": "matches no other image"}},
-    FindingKind.CLOCK_JUMPS: {"value": 0.5, "images": ("a.png",)},
+OWN_DETAILS = {
+    FindingKind.FEW_AGREE: {"images": 9.0},
+    FindingKind.POSE_CONVENTION: DETAILS | {"given": "90 mm", "remedy": "add --pose-inverted"},
+    FindingKind.INTRINSICS: INTRINSICS,
 }
-"""What a kind needs to be said; the others a value with its sigma and chance, or words of their own."""
+"""Details of kinds that give a name another meaning."""
 
 
 def example(kind: FindingKind) -> Finding:
-    plain = {"value": 0.01, "std": 0.001, "p": 1e-9, "details": {"text": "a thing is wrong", "remedy": ""}}
-    return Finding(kind=kind, severity="warns", **EXAMPLES.get(kind, plain))
+    return Finding(
+        kind=kind,
+        severity="warns",
+        images=("a.png", "b.png"),
+        joints=(2,),
+        value=0.01,
+        std=0.001,
+        p=1e-9,
+        details=OWN_DETAILS.get(kind, DETAILS),
+    )
 
 
 @pytest.fixture(scope="module")

@@ -416,10 +416,9 @@ def _hypotheses(state: EffectsState) -> list[CameraEffect]:
     down = equations.down_in_camera[:, :, None]
     sag = [equations.of_images("x", down[:, 0]), equations.of_images("y", down[:, 1])]
     by_distance = equations.of_images("focal", (far - far.mean())[:, None])
-    spread = float(np.ptp(far))
     sheared, each_sheared = (equations.of_images("shear", shares) for shares in (np.ones((m, 1)), np.eye(m)))
     found = [
-        CameraEffect(FindingKind.FOCUS_BY_DISTANCE, by_distance, common, unit=spread),
+        CameraEffect(FindingKind.FOCUS_BY_DISTANCE, by_distance, common),
         CameraEffect(FindingKind.FOCUS_BY_IMAGE, equations.of_images("focal", differences(m)), common),
         CameraEffect(FindingKind.ROLLING_SHUTTER, sheared, common, unit=focal_px),
         CameraEffect(FindingKind.ROLLING_SHUTTER_BY_IMAGE, each_sheared, common, unit=focal_px),
@@ -451,14 +450,17 @@ def _of_intrinsics(after: EffectsState, last: ScoreTest) -> dict[str, Any]:
 def _size(after: EffectsState, last: ScoreTest) -> dict[str, Any]:
     """Return the fields of a finding that state the size of the effect: of several estimates their rms."""
     fault, value = after.found[-1], _value(after.found[-1], after.total)
+    unit = fault.unit
+    if fault.kind is FindingKind.FOCUS_BY_DISTANCE:
+        unit = float(np.ptp(np.log(after.equations.distance)))
     std = float(np.median(np.sqrt(np.maximum(np.diag(last.covariance), 0.0))))
     if fault.kind is FindingKind.THIN_PRISM:
         size, error = _largest_px(after, value, last.covariance)
     elif fault.kind in OF_EACH:
-        size, error = fault.unit * float(np.sqrt(value @ value / after.equations.images)), fault.unit * std
+        size, error = unit * float(np.sqrt(value @ value / after.equations.images)), unit * std
     else:
         rms = value[0] if fault.kind in SIGNED else np.sqrt(np.mean(value**2))
-        size, error = fault.unit * float(rms), fault.unit * std / float(np.sqrt(len(value)))
+        size, error = unit * float(rms), unit * std / float(np.sqrt(len(value)))
     changed = after.imaged.names[fault.after : fault.after + 2] if fault.kind is FindingKind.ZOOM else ()
     concerns = CONCERNS.get(fault.kind, "images")
     return {"concerns": concerns, "value": size, "std": error, "images": tuple(changed)}

@@ -85,9 +85,10 @@ def _is_open(case: Case) -> bool:
 
 
 def _has_left_out(case: Case) -> bool:
-    """Return whether two or more images are left out, and the gripper poses of the others agree."""
+    """Return whether two or more images are left out, and the others agree on one observable calibration."""
     kinds = {one.kind for one in case.hand_eye.findings}
     agree = not kinds & {FindingKind.FEW_AGREE, FindingKind.POSES_CONTRADICT_IMAGES}
+    agree = agree and not case.hand_eye.observability.findings
     return agree and len(case.capture) - len(case.used) >= 2
 
 
