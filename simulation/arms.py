@@ -30,7 +30,7 @@ from jcr.estimation.kinematics import (
     kinematic_jacobian,
     perpendicular,
 )
-from jcr.estimation.mounting import Fit, fit_known_scale
+from jcr.estimation.pose_equations import Fit, fit_known_scale
 from jcr.geometry import inverse, rotation_exp, skew, transform
 from simulation.poses import gripper_poses, random_hand_eye
 

@@ -13,9 +13,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.estimation.arms import arm_named
-from jcr.estimation.observations import Observations
-from jcr.estimation.problem import ReportedPoses
-from jcr.estimation.systematic import smooth_errors
+from jcr.estimation.problem import Observations, ReportedPoses
+from jcr.estimation.robot_noise import smooth_errors
 from jcr.geometry import apply_similarity, inverse, rotation_exp, scale_translation, transform
 from jcr.records import Intrinsics
 from simulation.arms import EFFECTIVE_POSES, PRESETS, PresetName, about_posture, bend, effective_fit

@@ -13,9 +13,8 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from jcr.camera import NO_DISTORTION, parameter_names, parameters, project, unproject, with_parameters, zoomed
-from jcr.estimation.equation import predict
 from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, camera_with_prior
-from jcr.estimation.mounting import fit_known_scale
+from jcr.estimation.pose_equations import fit_known_scale, predict
 from jcr.estimation.wrist import adjust_wrist
 from jcr.geometry import inverse, rotation_exp, transform
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks

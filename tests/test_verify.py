@@ -18,9 +18,10 @@ from jcr.cli import dispatch
 from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.arms import arm_named
 from jcr.estimation.closed_form import initial_estimate
+from jcr.estimation.inverse_kinematics import posed
+from jcr.estimation.problem import pose_problem
+from jcr.estimation.robot_noise import arm_errors, smooth_errors
 from jcr.estimation.solve import solve
-from jcr.estimation.systematic import arm_errors, posed, smooth_errors
-from jcr.estimation.wrist import pose_problem
 from jcr.geometry import inverse, rotation_exp, scale_translation, transform
 from jcr.pipeline.stages import begun, keep_reconstruction
 from jcr.records import Capture, Reconstruction, Tracks

@@ -9,7 +9,7 @@ from jcr.camera import parameters, with_parameters
 from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.estimation.intrinsics_prior import camera_with_prior
 from jcr.estimation.problem import scale_prior
-from jcr.estimation.systematic import smooth_errors
+from jcr.estimation.robot_noise import smooth_errors
 from jcr.geometry import inverse, transform
 from simulation.problems import INTRINSICS, error, hand_eye_problem, observed
 

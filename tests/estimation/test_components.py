@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 import jcr
-from jcr.estimation.equation import residuals
 from jcr.estimation.hand_eye import fit_hand_eye
-from jcr.estimation.robot_noise import Equations, most_likely
+from jcr.estimation.pose_equations import Region, residuals
+from jcr.estimation.robot_noise import Equations, arm_errors, most_likely, smooth_errors
 from jcr.estimation.robust import robust_fit
-from jcr.estimation.systematic import Region, arm_errors, smooth_errors
 from jcr.geometry import retract, rotation_exp, step_between, transform
 from simulation.problems import error, hand_eye_problem
 

@@ -6,9 +6,10 @@ import pytest
 from jcr.estimation.arms import arm_named
 from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.estimation.hypotheses import joint_offsets
+from jcr.estimation.inverse_kinematics import posed
 from jcr.estimation.pose_equations import pose_equations
-from jcr.estimation.systematic import arm_errors, posed
-from jcr.estimation.wrist import pose_problem
+from jcr.estimation.problem import pose_problem
+from jcr.estimation.robot_noise import arm_errors
 from simulation.arms import PresetName
 from simulation.problems import bent_problem
 

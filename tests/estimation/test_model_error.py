@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from jcr.estimation.hand_eye import fit_hand_eye
-from jcr.estimation.intrinsics_prior import ESTIMATED, camera_with_prior
-from jcr.estimation.model_error import TYPICAL
+from jcr.estimation.intrinsics_prior import ESTIMATED, TYPICAL, camera_with_prior
 from jcr.estimation.solve import Solution
 from jcr.estimation.wrist import adjust_wrist
 from jcr.records import Intrinsics

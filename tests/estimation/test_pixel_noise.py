@@ -7,9 +7,8 @@ import pytest
 
 from jcr.estimation.image_equations import adjust_images
 from jcr.estimation.intrinsics_prior import FIXED, camera_with_prior
-from jcr.estimation.observations import Observations
 from jcr.estimation.pixel_noise import PixelNoise
-from jcr.estimation.wrist import image_problem
+from jcr.estimation.problem import Observations, image_problem
 from jcr.records import Tracks
 from simulation.problems import INTRINSICS, hand_eye_problem, observed
 

@@ -7,9 +7,8 @@ from scipy.spatial.transform import Rotation
 from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
-from jcr.estimation.inverse_kinematics import inverse_kinematics, required_posture
+from jcr.estimation.inverse_kinematics import LengthError, inverse_kinematics, mounted_arm, required_posture
 from jcr.estimation.kinematics import error_jacobian, error_std, forward_kinematics, with_tool
-from jcr.estimation.mounting import LengthError, mounted_arm
 from jcr.geometry import inverse, rotation_exp, step_between, transform
 from simulation.arms import BentArm, error_names
 

@@ -8,10 +8,9 @@ from scipy.stats import chi2
 
 import jcr
 from jcr.estimation.closed_form import closed_form
-from jcr.estimation.equation import PRIOR_STD, residuals, residuals_by_camera
 from jcr.estimation.hand_eye import fit_hand_eye
-from jcr.estimation.robot_noise import Equations, left_out, solve_equations
-from jcr.estimation.systematic import smooth_errors
+from jcr.estimation.pose_equations import PRIOR_STD, residuals, residuals_by_camera
+from jcr.estimation.robot_noise import Equations, left_out, smooth_errors, solve_equations
 from jcr.findings import FindingKind
 from jcr.geometry import inverse, retract, rotation_exp, scale_translation, transform
 from simulation.problems import error, hand_eye_problem

@@ -8,7 +8,7 @@ import pytest
 import jcr
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.estimation.kinematics import forward_kinematics
-from jcr.estimation.mounting import fit_known_scale
+from jcr.estimation.pose_equations import fit_known_scale
 from jcr.geometry import apply, inverse, rotation_angle, rotation_log
 from simulation.arms import BentArm, error_names, hand_eye_on, table_center, views
 from simulation.capture import SimulateOptions, simulate

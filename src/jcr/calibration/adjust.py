@@ -13,15 +13,15 @@ from numpy import ndarray
 from jcr.calibration.case import Case
 from jcr.camera import by_parameters, by_point, parameter_names
 from jcr.estimation.closed_form import initial_estimate
-from jcr.estimation.equation import paper_residuals, predict
 from jcr.estimation.hand_eye import judged
+from jcr.estimation.hypotheses import focal_lengths
 from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.intrinsics_prior import CameraPrior, decentring
-from jcr.estimation.problem import LinearPrior
+from jcr.estimation.pose_equations import paper_residuals, predict
+from jcr.estimation.problem import LinearPrior, pose_problem, wrist_arm
 from jcr.estimation.projection import view_of
-from jcr.estimation.score_test import focal_lengths
 from jcr.estimation.solve import START_NOISE, Solution, solve
-from jcr.estimation.wrist import adjust_wrist, estimate_of, pose_problem, wrist_arm
+from jcr.estimation.wrist import adjust_wrist, estimate_of
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import (
     apply,

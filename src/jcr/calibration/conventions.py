@@ -15,11 +15,10 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from jcr.estimation.closed_form import closed_form
-from jcr.estimation.equation import Poses
 from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.estimation.robust import least_trimmed
 from jcr.findings import Finding, FindingKind, Severity
-from jcr.geometry import inverse, transform
+from jcr.geometry import Poses, inverse, transform
 from jcr.records import HandEye
 
 SOLVED = 24

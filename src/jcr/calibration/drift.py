@@ -14,12 +14,10 @@ from scipy.linalg import block_diag
 from scipy.optimize import root_scalar
 from scipy.stats import chi2, ncx2
 
-from jcr.estimation.equation import ROTATION, TRANSLATION, columns_of_arm
 from jcr.estimation.hypotheses import Row, Test, confirm
 from jcr.estimation.pose_equations import pose_equations
-from jcr.estimation.problem import Problem, State
+from jcr.estimation.problem import ROTATION, TRANSLATION, Problem, State, columns_of_arm, pose_problem
 from jcr.estimation.solve import Solution
-from jcr.estimation.wrist import pose_problem
 from jcr.findings import FindingKind
 from jcr.geometry import Poses, inverse, retract
 

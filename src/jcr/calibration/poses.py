@@ -21,7 +21,7 @@ from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.hand_eye import SCALE_STD, Offset, fit_hand_eye
 from jcr.estimation.kinematics import Arm
-from jcr.estimation.wrist import pose_problem
+from jcr.estimation.problem import pose_problem
 from jcr.findings import Finding, FindingKind, is_explained
 from jcr.records import HandEye, PosePairs
 

@@ -11,27 +11,24 @@ from numpy import ndarray
 from jcr.calibration.case import Case
 from jcr.calibration.options import GRASPING, MOST_POSES, CalibrateOptions
 from jcr.calibration.robot_errors import RobotErrors, of_poses
-from jcr.estimation.equation import Poses
-from jcr.estimation.next_poses import (
-    assumed_camera,
-    candidates,
-    choose,
-    median_distance,
-    nearest,
-    total_uncertainty,
-)
 from jcr.estimation.observability import excitation
 from jcr.estimation.point_uncertainty import in_use, within_95
 from jcr.estimation.prediction import (
     Assumptions,
     PredictedCamera,
     Prediction,
+    assumed_camera,
+    candidates,
+    choose,
+    median_distance,
+    nearest,
     predict,
     predict_covariance,
+    total_uncertainty,
     typical_noise,
 )
 from jcr.findings import Concerns, Finding, FindingKind
-from jcr.geometry import inverse, rotation_angle
+from jcr.geometry import Poses, inverse, rotation_angle
 from jcr.records import Estimate, HandEye, InUse, NextPose, Requirement, SceneUncertainty, Where
 
 PROPOSED = 2

@@ -10,13 +10,12 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
-from jcr.estimation.equation import Poses
-from jcr.estimation.inverse_kinematics import reach_toward
+from jcr.estimation.inverse_kinematics import LengthError, posed, reach_toward
 from jcr.estimation.kinematics import Arm, Joints
-from jcr.estimation.mounting import LengthError
-from jcr.estimation.next_poses import nearest
-from jcr.estimation.systematic import arm_errors, posed, smooth_errors
+from jcr.estimation.prediction import nearest
+from jcr.estimation.robot_noise import arm_errors, smooth_errors
 from jcr.findings import Finding, FindingKind
+from jcr.geometry import Poses
 from jcr.records import Capture
 
 

@@ -12,8 +12,8 @@ from jcr.capture.checks import checked_capture
 from jcr.capture.images import BLURRED, DEPTH, encode_png, sharpness
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.errors import InputError
-from jcr.estimation.equation import ASSUMED_NOISE, expected_covariance
-from jcr.estimation.next_poses import choose, pose_information, total_uncertainty
+from jcr.estimation.pose_equations import ASSUMED_NOISE, expected_covariance
+from jcr.estimation.prediction import choose, pose_information, total_uncertainty
 from jcr.files import write_bytes
 from jcr.geometry import inverse, motion_length
 from jcr.progress import Progress

@@ -9,10 +9,9 @@ from numpy import ndarray
 
 from jcr.calibration.case import MIN_OBSERVATIONS, Case
 from jcr.cell.rigs import CameraViews, Rigs
+from jcr.estimation.hypotheses import freed, with_camera
 from jcr.estimation.intrinsics_prior import CameraPrior, camera_about
-from jcr.estimation.observations import Observations
-from jcr.estimation.problem import Problem, RigGaussian, State, with_observations
-from jcr.estimation.score_test import freed, with_camera
+from jcr.estimation.problem import Observations, Problem, RigGaussian, State, with_observations
 from jcr.estimation.solve import Solution, solve
 from jcr.findings import FindingKind
 from jcr.sfm.track_refinement import KEYPOINT_STD_PX

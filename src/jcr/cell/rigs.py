@@ -20,9 +20,8 @@ from jcr.cell.placement import CameraPlacement
 from jcr.distributions import chi2
 from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.estimation.hypotheses import arm_rows
-from jcr.estimation.problem import ReportedPoses, scale_prior
-from jcr.estimation.systematic import smooth_errors
-from jcr.estimation.wrist import pose_problem
+from jcr.estimation.problem import ReportedPoses, pose_problem, scale_prior
+from jcr.estimation.robot_noise import smooth_errors
 from jcr.findings import Concerns, Finding, FindingKind
 from jcr.geometry import Transform, inverse, motion_length, scale_translation, step_between
 from jcr.records import CellCamera, HandEye, Intrinsics

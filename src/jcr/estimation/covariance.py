@@ -13,8 +13,9 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.distributions import chi2
-from jcr.estimation.cholesky import cholesky, lower
-from jcr.estimation.equation import UNKNOWNS
+from jcr.estimation.elimination import cholesky, lower
+from jcr.estimation.pose_equations import Region
+from jcr.estimation.problem import UNKNOWNS
 from jcr.estimation.robot_noise import (
     Each,
     Equations,
@@ -26,7 +27,6 @@ from jcr.estimation.robot_noise import (
     score,
     solve_equations,
 )
-from jcr.estimation.systematic import Region
 from jcr.records import Budget, RobotNoise
 
 COVERED = 0.99

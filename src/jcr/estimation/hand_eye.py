@@ -10,14 +10,15 @@ from numpy.typing import ArrayLike
 
 from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
-from jcr.estimation.camera_drift import drift_covariance
-from jcr.estimation.equation import paper_residuals, residuals
+from jcr.estimation.hypotheses import drift_covariance
+from jcr.estimation.inverse_kinematics import posed
 from jcr.estimation.kinematics import Arm, Joints
 from jcr.estimation.observability import observability
+from jcr.estimation.pose_equations import paper_residuals, residuals
 from jcr.estimation.problem import LinearPrior, offset_prior, scale_prior
+from jcr.estimation.robot_noise import arm_errors, smooth_errors
 from jcr.estimation.robust import robust_fit
 from jcr.estimation.solve import Solution
-from jcr.estimation.systematic import arm_errors, posed, smooth_errors
 from jcr.findings import Finding, FindingKind, strongest_first
 from jcr.geometry import Poses, require_rigid
 from jcr.least_squares import one_blas_thread

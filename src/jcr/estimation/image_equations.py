@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.estimation.cholesky import cholesky, inverse_of, over
-from jcr.estimation.elimination import Normal, with_fixed_points, without_points
-from jcr.estimation.model_error import size_of
+from jcr.estimation.elimination import Normal, cholesky, inverse_of, over, with_fixed_points, without_points
+from jcr.estimation.intrinsics_prior import size_of
 from jcr.estimation.pixel_noise import pixel_noise, refined_noise
 from jcr.estimation.problem import Problem, State, image_step, similarities, similarities_of_rigs
 from jcr.estimation.projection import (

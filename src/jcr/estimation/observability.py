@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.estimation.equation import BASE_ROTATION, ROTATION, SCALE, Poses, residuals
-from jcr.estimation.problem import LinearPrior
+from jcr.estimation.pose_equations import residuals
+from jcr.estimation.problem import BASE_ROTATION, ROTATION, SCALE, LinearPrior
 from jcr.findings import Finding, FindingKind
-from jcr.geometry import ARM, Transform, transform
+from jcr.geometry import ARM, Poses, Transform, transform
 from jcr.records import Excitation, Observability
 
 MIN_SPREAD = 0.1

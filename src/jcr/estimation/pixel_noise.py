@@ -10,17 +10,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.distributions import chi2
-from jcr.estimation.boards import BoardShapes
 from jcr.estimation.elimination import point_blocks
-from jcr.estimation.observations import Observations
 from jcr.least_squares import loss_weight
 
 LOSS_SCALE = 2.0
 """Cauchy loss: observations count half at this many sigma."""
-CELLS = 8
-"""Across the width of an image: so near each other features share errors, of a texture, a shadow or what the distortion
-model leaves."""
 MIN_SIGMA_PX = 0.02
 RATIOS = (0.25, 100.0)
 """Bounds of the ratio of the variances of other cameras' observations to those of the first camera. A camera whose few
@@ -90,30 +84,6 @@ class Layout:
     median_square: Float[ndarray, " p"]
     """Median of a point's sum of squared residuals where an image coordinate's variance is 1: of the 2n errors of n
     views its position takes up 3, but for a corner of a board, whose place is known."""
-
-    @staticmethod
-    def of(observations: Observations, widths: Int[ndarray, " c"], boards: BoardShapes | None) -> "Layout":
-        """Return the layout of observations in images of these widths (px), by camera."""
-        camera = observations.camera[observations.image]
-        column, row = (CELLS * observations.x_px / widths[camera, None]).astype(int).T
-        keys = np.stack([observations.rig[observations.image], camera, row, column])
-        _, cell = np.unique(keys, axis=1, return_inverse=True)
-        seen = np.bincount(observations.point)
-        corner = np.zeros(len(seen), bool)
-        if boards is not None:
-            corner[boards.point] = True
-        freedom = np.maximum(2 * seen - 3 * ~corner, 1)
-        cameras = len(widths)
-        stated = (observations.std_px / np.median(observations.std_px)) ** 2 if len(camera) else np.ones(0)
-        return Layout(
-            camera=camera,
-            group=np.where(corner[observations.point], cameras, camera),
-            groups=cameras + bool(corner.any()),
-            point=observations.point,
-            cell=cell.ravel(),
-            stated_variance=stated,
-            median_square=chi2.ppf(0.5, freedom),
-        )
 
     @property
     def states_variances(self) -> bool:

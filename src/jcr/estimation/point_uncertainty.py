@@ -14,11 +14,10 @@ from numpy import ndarray
 
 from jcr.camera import NORMALIZED, by_parameters, by_point, parameters, unproject, with_thin_prism
 from jcr.distributions import chi2
-from jcr.estimation.cholesky import cholesky, over
-from jcr.estimation.elimination import point_blocks
-from jcr.estimation.equation import BASE_ROTATION, BASE_TRANSLATION, SCALE, pose_by_pose
-from jcr.estimation.model_error import second_moment_px2
-from jcr.estimation.pose_equations import reported_poses
+from jcr.estimation.elimination import cholesky, over, point_blocks
+from jcr.estimation.intrinsics_prior import second_moment_px2
+from jcr.estimation.pose_equations import pose_by_pose, reported_poses
+from jcr.estimation.problem import BASE_ROTATION, BASE_TRANSLATION, SCALE
 from jcr.estimation.projection import derivatives
 from jcr.estimation.solve import Solution
 from jcr.geometry import apply, by_similarity, retract, skew

@@ -1,17 +1,203 @@
-"""Linear mixed model of the reported poses of all arms about a state, with the evidence of images about the rigs."""
+"""Equations of reported gripper poses, and their linear mixed model with the evidence of images about the rigs.
+
+Each image gives `base_from_gripper · X = Z · S_λ(world_from_rig)`. The first 13 unknowns are steps of
+geometry.retract: of X (6), of the logarithm of the scale λ, of Z (6). Each further arm adds 12.
+The result is the *effective* hand-eye transform: of all (X, Z) the one that best predicts the camera from the reported
+poses over the workspace of the capture, where 1 mm and 2 mrad count alike. A systematic error e leaves
+e' = (I − J A) e of itself, A = (JᵀWJ)⁻¹JᵀW.
+"""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy.linalg import block_diag
 
-from jcr.estimation.equation import SCALE, pose_by_pose, residuals, residuals_by_camera, weak_prior
 from jcr.estimation.image_equations import ImageEvidence
-from jcr.estimation.problem import Problem, State, columns_of_arm
+from jcr.estimation.problem import (
+    BASE_ROTATION,
+    BASE_TRANSLATION,
+    ROTATION,
+    SCALE,
+    TRANSLATION,
+    UNKNOWNS,
+    Problem,
+    State,
+    columns_of_arm,
+)
 from jcr.estimation.robot_noise import Equations
-from jcr.estimation.systematic import Region
+from jcr.geometry import (
+    Poses,
+    Transform,
+    Transforms,
+    by_inverse,
+    inverse,
+    retract,
+    scale_translation,
+    skew,
+    step_between,
+)
+from jcr.least_squares import minimise
+
+EFFECTIVE_WEIGHT = np.repeat([1 / 1e-3, 1 / 2e-3], 3)
+"""Weights of errors of position (1/m) and rotation (1/rad) in the effective transform."""
+LEAST_FREE = 0.4
+"""Least value of one minus the leverage of a pose: a fit to three or four images nearly follows each of them."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """Fit of an effective transform to the poses of a capture, s = 6n; the scale is not part of it."""
+
+    by_unknown: Float[ndarray, "s u"]
+    """J, without the scale: 12 unknowns, and of further arms 12 each."""
+    fit: Float[ndarray, "u s"]
+    """A = (JᵀWJ)⁻¹JᵀW; zero for poses that are not used."""
+    unknowns: int = 13
+    """Number of unknowns of the whole problem, which begin as those of equation.py."""
+
+    @staticmethod
+    def of_unknowns(by_unknown: Float[ndarray, "s u"], unknowns: int) -> "Region":
+        """Return the region of residuals with this derivative by the unknowns of the effective transform."""
+        root = np.tile(EFFECTIVE_WEIGHT, len(by_unknown) // 6)
+        fit = np.linalg.pinv(root[:, None] * by_unknown, rcond=1e-9) * root
+        return Region(by_unknown, fit, unknowns)
+
+    def left(self, systematic: Float[ndarray, "s s"]) -> Float[ndarray, "s s"]:
+        """Return the covariance of the part of a systematic error that the effective transform leaves."""
+        # (I − J A) S (I − J A)ᵀ, without a product of two matrices of the residuals' size.
+        half = systematic - self.by_unknown @ (self.fit @ systematic)
+        return half - (half @ self.fit.T) @ self.by_unknown.T
+
+    def spread(self, second_moment: Float[ndarray, "*k m 6 6"]) -> Float[ndarray, "*k p p"]:
+        """Return the covariance of the unknowns for other poses of the region, from E[e'e'ᵀ] of each used pose.
+
+        The poses of the capture are a sample of the region: a regression on them differs from one on the region by
+        what their residuals show, corrected for each pose's own leverage (MacKinnon and White, J. Econometrics 29,
+        1985, "HC3").
+        """
+        own, m = self._corrected, second_moment.shape[-3]
+        spread = (m - 1) / m * (own @ second_moment @ own.swapaxes(1, 2)).sum(-3)
+        out = np.zeros((*spread.shape[:-2], self.unknowns, self.unknowns))
+        rows = np.delete(np.arange(1 + self.by_unknown.shape[1]), SCALE)
+        out[..., rows[:, None], rows] = spread
+        return out
+
+    @cached_property
+    def _corrected(self) -> Float[ndarray, "m u 6"]:
+        """Gain with which each pose's residuals pass into the unknowns, without the pose's own leverage."""
+        m = len(self.by_unknown) // 6
+        u = self.by_unknown.shape[1]
+        own = self.fit.reshape(u, m, 6).swapaxes(0, 1)
+        leverage = EFFECTIVE_WEIGHT[:, None] * (self.by_unknown.reshape(m, 6, u) @ own) / EFFECTIVE_WEIGHT
+        values, vectors = np.linalg.eigh((leverage + leverage.swapaxes(1, 2)) / 2)
+        vectors = vectors / EFFECTIVE_WEIGHT[:, None]
+        return own @ (vectors / np.maximum(1 - values, LEAST_FREE)[:, None] @ np.linalg.inv(vectors))
+
+
+PRIOR_STD = np.array([1.0] * 3 + [np.pi] * 3 + [5.0])
+"""Standard deviations (m, rad, log scale) of a prior that only keeps unobservable directions finite."""
+LARGEST_ROTATION = 0.5
+"""Largest step of a rotation (rad) and of the logarithm of scale: a poor initial estimate of nearly unobservable
+motions must not rotate beyond a half turn."""
+ASSUMED_NOISE = (5e-4, np.radians(0.1))
+"""Assumed noise (m, rad) of a robot that has not been measured."""
+
+
+def predict(
+    x: Transforms,
+    scale: Float[ndarray, "*batch"] | np.floating | float,
+    z: Transforms,
+    recon_from_camera: Poses,
+) -> Float[ndarray, "*batch n 4 4"]:
+    """Return gripper poses (...,n,4,4): base_from_recon · S_λ(recon_from_camera) · X⁻¹, for one or many (X, λ, Z)."""
+    scaled = scale_translation(recon_from_camera, np.asarray(scale)[..., None])
+    return z[..., None, :, :] @ scaled @ inverse(x)[..., None, :, :]
+
+
+def residuals(
+    x: Transform,
+    scale: float,
+    z: Transform,
+    base_from_gripper: Poses,
+    recon_from_camera: Poses,
+    exchanged: bool = False,
+) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 13"]]:
+    """Return steps from the reported gripper poses to the predicted ones (base axes), and their Jacobian.
+
+    `exchanged`: the camera is fixed and the gripper carries the scene. X is then base_from_camera, Z
+    gripper_from_recon, and they predict gripper_from_base; the residuals are still those of base_from_gripper.
+    """
+    predicted = predict(x, scale, z, recon_from_camera)
+    rotation = predicted[:, :3, :3]
+    arm = scale * recon_from_camera[:, :3, 3] @ z[:3, :3].T
+    j = np.zeros((len(predicted), 6, UNKNOWNS))
+    j[:, :3, TRANSLATION] = -rotation
+    j[:, :3, ROTATION] = -rotation @ skew(x[:3, 3])
+    j[:, :3, 6] = arm
+    j[:, :3, BASE_TRANSLATION] = np.eye(3)
+    j[:, :3, BASE_ROTATION] = -skew(arm - rotation @ x[:3, 3])
+    j[:, 3:, ROTATION] = -rotation
+    j[:, 3:, BASE_ROTATION] = np.eye(3)
+    if exchanged:
+        return step_between(base_from_gripper, inverse(predicted)), by_inverse(predicted) @ j
+    return step_between(base_from_gripper, predicted), j
+
+
+def residuals_by_camera(
+    x: Transform, scale: float, z: Transform, recon_from_camera: Poses, exchanged: bool = False
+) -> Float[ndarray, "n 6 6"]:
+    """Return the derivative of `residuals` by a step of each camera."""
+    base_from_recon = z[:3, :3]
+    lever = recon_from_camera[:, :3, :3] @ x[:3, :3].T @ x[:3, 3]
+    j = np.zeros((len(lever), 6, 6))
+    j[:, :3, :3] = scale * base_from_recon
+    j[:, :3, 3:] = base_from_recon @ skew(lever)
+    j[:, 3:, 3:] = base_from_recon
+    return by_inverse(predict(x, scale, z, recon_from_camera)) @ j if exchanged else j
+
+
+def pose_by_pose(blocks: Float[ndarray, "n 6 6"], matrix: Float[ndarray, "r c"]) -> Float[ndarray, "r c"]:
+    """Return the product of a block-diagonal matrix, one block a pose, and a matrix of r = 6n rows."""
+    return (blocks @ matrix.reshape(len(blocks), 6, -1)).reshape(matrix.shape)
+
+
+def weak_prior(arms: int = 1) -> Float[ndarray, "u u"]:
+    """Return the information that keeps unobservable directions of the unknowns of some arms finite."""
+    std = np.full(12 * arms + 1, np.inf)
+    for arm in range(arms):
+        std[columns_of_arm(arm)[:6]] = PRIOR_STD[:6]
+    std[SCALE] = PRIOR_STD[SCALE]
+    return np.diag(std**-2.0)
+
+
+def share_within_limits(step: Float[ndarray, " u"]) -> float:
+    """Return the share of a step of the arms' unknowns that keeps all rotations within LARGEST_ROTATION."""
+    arms = range((len(step) - 1) // 12)
+    rotations = np.r_[SCALE, *(columns_of_arm(arm)[[3, 4, 5, 9, 10, 11]] for arm in arms)]
+    return min(1.0, LARGEST_ROTATION / max(float(np.abs(step[rotations]).max()), 1e-300))
+
+
+def expected_covariance(hessian: Float[ndarray, "*batch 13 13"]) -> Float[ndarray, "*batch 7 7"]:
+    """Return the covariance of X and scale that information and the weak prior leave, in COVARIANCE_ORDER."""
+    return np.linalg.inv(hessian + weak_prior())[..., :7, :7]
+
+
+def paper_residuals(
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    recon_from_camera: Float[ndarray, "n 4 4"],
+    gripper_from_camera: Transform,
+    scale: float,
+    used: Bool[ndarray, " n"],
+) -> tuple[float, float]:
+    """Return the mean δ_t (m) and δ_R (Frobenius norm) of A·X − X·B(λ) over consecutive used images (paper, eq. 16)."""
+    a, b = (inverse(of[used][:-1]) @ of[used][1:] for of in (base_from_gripper, recon_from_camera))
+    gap = a @ gripper_from_camera - gripper_from_camera @ scale_translation(b, scale)
+    translation = np.linalg.norm(gap[:, :3, 3], axis=1).mean()
+    return float(translation), float(np.linalg.norm(gap[:, :3, :3], axis=(1, 2)).mean())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -109,3 +295,37 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
             confirmed=region.left(columns @ columns.T) if columns.size else None,
         ),
     )
+
+
+class Fit(NamedTuple):
+    """Transforms with base_from_gripper · `gripper_from_camera` ≈ `base_from_recon` · recon_from_camera."""
+
+    gripper_from_camera: Transform
+    base_from_recon: Transform
+    residual: Float[ndarray, "n 6"]
+    """Steps of `equation.residuals` (m, rad)."""
+
+
+def fit_known_scale(
+    base_from_gripper: Poses,
+    recon_from_camera: Poses,
+    start: tuple[Transform, Transform],
+    noise: tuple[float, float],
+    exchanged: bool = False,
+) -> Fit:
+    """Return the weighted least-squares fit from `start` (gripper_from_camera, base_from_recon); `noise` in m, rad.
+
+    Directions that the motions do not determine stay as they are in `start`. `exchanged` is that of
+    `equation.residuals`.
+    """
+    weight, columns = 1 / np.repeat(noise, 3), columns_of_arm(0)
+
+    def linearised(at: tuple[Transform, Transform]) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 12"]]:
+        residual, jacobian = residuals(at[0], 1.0, at[1], base_from_gripper, recon_from_camera, exchanged)
+        return weight * residual, weight[:, None] * jacobian[:, :, columns]
+
+    def moved(at: tuple[Transform, Transform], step: Float[ndarray, "12"]) -> tuple[Transform, Transform]:
+        return retract(at[0], step[:6]), retract(at[1], step[6:])
+
+    x, z = minimise(linearised, start, moved).unknowns
+    return Fit(x, z, residuals(x, 1.0, z, base_from_gripper, recon_from_camera, exchanged)[0])

@@ -15,16 +15,89 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.camera import parameters, unproject, with_parameters
+from jcr.distributions import chi2
 from jcr.estimation.boards import BoardShapes
 from jcr.estimation.elimination import Sightings
-from jcr.estimation.equation import SCALE, UNKNOWNS, columns_of_arm
-from jcr.estimation.intrinsics_prior import CameraPrior
-from jcr.estimation.model_error import TYPICAL, displacements, polynomials_of
-from jcr.estimation.observations import Observations, sorted_by_point
+from jcr.estimation.intrinsics_prior import TYPICAL, CameraPrior, displacements, polynomials_of
 from jcr.estimation.pixel_noise import Layout, PixelNoise
-from jcr.geometry import Poses, retract, skew, step_between
-from jcr.records import Intrinsics
+from jcr.estimation.robot_noise import smooth_errors
+from jcr.geometry import (
+    Poses,
+    Transform,
+    retract,
+    skew,
+    step_between,
+)
+from jcr.records import Intrinsics, Tracks
 
+TRANSLATION, ROTATION, SCALE = slice(0, 3), slice(3, 6), slice(6, 7)
+BASE_TRANSLATION, BASE_ROTATION = slice(7, 10), slice(10, 13)
+"""Columns of the 13 unknowns; the first seven are records.COVARIANCE_ORDER."""
+UNKNOWNS = 13
+
+
+def columns_of_arm(arm: int) -> Int[ndarray, "12"]:
+    """Return the columns of X and Z of an arm among the unknowns."""
+    first = 12 * arm
+    return np.r_[:6, 7:13] if arm == 0 else np.arange(first + 1, first + 13)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Observations:
+    """Rig and camera of each image, and image, point and pixel of each observation."""
+
+    rig: Int[ndarray, " n"]
+    """Rig of each image."""
+    camera: Int[ndarray, " n"]
+    """Camera of each image."""
+    image: Int[ndarray, " k"]
+    x_px: Float[ndarray, "k 2"]
+    """Pixels of the original, distorted image."""
+    point: Int[ndarray, " k"]
+    std_px: Float[ndarray, " k"]
+    """Stated standard deviation of one coordinate, up to a common factor."""
+    point_rows: Int[ndarray, " p"] | None = None
+    """Row of each point among those that were given; None: all points."""
+
+    @staticmethod
+    def of_one_camera(tracks: Tracks, images: int) -> "Observations":
+        """Return the observations of one camera, each of whose images is a rig."""
+        each = np.arange(images)
+        return Observations(
+            rig=each,
+            camera=np.zeros_like(each),
+            image=tracks.image,
+            x_px=tracks.x_px,
+            point=tracks.point,
+            std_px=np.ones(len(tracks.image)) if tracks.std_px is None else tracks.std_px,
+        )
+
+
+def sorted_by_point(observations: Observations, points: int) -> Observations:
+    """Return the observations sorted by point and rig, without points that fewer than two show.
+
+    The first of several observations of one point in one image is kept; the points are counted again.
+    """
+    rig = observations.rig[observations.image]
+    order = np.lexsort((observations.image, rig, observations.point))
+    point, image = observations.point[order], observations.image[order]
+    order = order[np.r_[True, (np.diff(point) != 0) | (np.diff(image) != 0)][: len(order)]]
+    count = np.bincount(observations.point[order], minlength=points)
+    order = order[count[observations.point[order]] >= 2]
+    kept, point = np.unique(observations.point[order], return_inverse=True)
+    return replace(
+        observations,
+        image=observations.image[order],
+        x_px=observations.x_px[order],
+        point=point,
+        std_px=observations.std_px[order],
+        point_rows=kept,
+    )
+
+
+CELLS = 8
+"""Across the width of an image: so near each other features share errors, of a texture, a shadow or what the distortion
+model leaves."""
 OF_IMAGE, PRISM = 4, 4
 """Number of nuisance parameters of each image, and of those that all images share.
 
@@ -155,8 +228,25 @@ class Problem:
     def layout(self) -> Layout:
         """Groups and cells of the observations, for the estimate of their errors."""
         assert self.observations is not None
-        widths = np.array([camera.intrinsics.width for camera in self.cameras])
-        return Layout.of(self.observations, widths, self.boards)
+        observations, cameras = self.observations, len(self.cameras)
+        camera, rig = observations.camera[observations.image], observations.rig[observations.image]
+        widths = np.array([one.intrinsics.width for one in self.cameras])
+        column, row = (CELLS * observations.x_px / widths[camera, None]).astype(int).T
+        _, cell = np.unique(np.stack([rig, camera, row, column]), axis=1, return_inverse=True)
+        seen = np.bincount(observations.point)
+        corner = np.zeros(len(seen), bool)
+        if self.boards is not None:
+            corner[self.boards.point] = True
+        stated = (observations.std_px / np.median(observations.std_px)) ** 2 if len(camera) else np.ones(0)
+        return Layout(
+            camera=camera,
+            group=np.where(corner[observations.point], cameras, camera),
+            groups=cameras + bool(corner.any()),
+            point=observations.point,
+            cell=cell.ravel(),
+            stated_variance=stated,
+            median_square=chi2.ppf(0.5, np.maximum(2 * seen - 3 * ~corner, 1)),
+        )
 
     @cached_property
     def seen(self) -> Sightings:
@@ -395,3 +485,55 @@ def similarities_of_rigs(world_from_rig: Float[ndarray, "m 4 4"]) -> Float[ndarr
     rigs[:, :3, 0], rigs[:, :3, 1:4] = position, np.eye(3)
     rigs[:, :3, 4:], rigs[:, 3:, 4:] = -skew(position), np.eye(3)
     return rigs.reshape(-1, 7)
+
+
+Start = tuple[Transform, float, Transform]
+"""Initial estimate of gripper_from_camera, scale and base_from_recon."""
+
+
+def wrist_arm(
+    base_from_gripper: Poses, error_covariance: Float[ndarray, "s s"] | None = None
+) -> ReportedPoses:
+    """Return an arm that moves rig i at pose i; `error_covariance` None: errors that are smooth over the poses."""
+    if error_covariance is None:
+        error_covariance = smooth_errors(base_from_gripper)
+    rigs = np.arange(len(base_from_gripper))
+    return ReportedPoses(rigs=rigs, base_from_gripper=base_from_gripper, error_covariance=error_covariance)
+
+
+def pose_problem(
+    base_from_gripper: Poses,
+    recon_from_camera: Poses,
+    start: Start,
+    *,
+    camera_covariance: Float[ndarray, "r r"] | None = None,
+    error_covariance: Float[ndarray, "s s"] | None = None,
+    noise_floor: tuple[float, float] | None = None,
+    priors: tuple[LinearPrior, ...] = (),
+) -> tuple[Problem, State]:
+    """Return the problem of camera poses with the covariance of their steps (None: exact), and its initial state."""
+    x, scale, z = start
+    problem = Problem(
+        arms=(wrist_arm(base_from_gripper, error_covariance),),
+        n_rigs=len(base_from_gripper),
+        known_rigs=RigGaussian(recon_from_camera, camera_covariance),
+        priors=priors,
+        robot_noise_floor=noise_floor,
+    )
+    return problem, State(x=x[None], scale=scale, z=z[None], world_from_rig=recon_from_camera)
+
+
+def image_problem(
+    world_from_rig: Float[ndarray, "m 4 4"],
+    camera: CameraPrior,
+    observations: Observations,
+    points_in_world: Float[ndarray, "p 3"],
+    boards: BoardShapes | None = None,
+) -> tuple[Problem, State]:
+    """Return the problem of the images of one camera without an arm, and its initial state."""
+    nothing = np.zeros((0, 4, 4))
+    state = State(
+        x=nothing, scale=1.0, z=nothing, world_from_rig=world_from_rig, points_in_world=points_in_world
+    )
+    problem = Problem(arms=(), n_rigs=len(world_from_rig), cameras=(camera,), boards=boards)
+    return with_observations(problem, state, observations)

@@ -16,10 +16,9 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.estimation.closed_form import closed_form, initial_estimate, motions, sine_axis
-from jcr.estimation.equation import SCALE, predict
-from jcr.estimation.problem import LinearPrior
+from jcr.estimation.pose_equations import predict
+from jcr.estimation.problem import SCALE, LinearPrior, pose_problem
 from jcr.estimation.solve import Solution, solve
-from jcr.estimation.wrist import pose_problem
 from jcr.geometry import ARM, Poses, rotation_angle, transform
 
 Images = Bool[ndarray, " n"]

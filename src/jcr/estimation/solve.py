@@ -15,9 +15,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.estimation.cholesky import cholesky, inverse_of, lower, over
 from jcr.estimation.covariance import expected_posterior, posterior
-from jcr.estimation.equation import SCALE, pose_by_pose, share_within_limits, weak_prior
+from jcr.estimation.elimination import cholesky, inverse_of, lower, over
 from jcr.estimation.image_equations import (
     SIZES_SETTLED,
     ImageEvidence,
@@ -30,8 +29,16 @@ from jcr.estimation.image_equations import (
     with_model_error_of,
     with_pixel_noise,
 )
-from jcr.estimation.pose_equations import PoseEquations, pose_equations, reported_poses
+from jcr.estimation.pose_equations import (
+    PoseEquations,
+    pose_by_pose,
+    pose_equations,
+    reported_poses,
+    share_within_limits,
+    weak_prior,
+)
 from jcr.estimation.problem import (
+    SCALE,
     LinearPrior,
     Problem,
     State,

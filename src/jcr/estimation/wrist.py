@@ -1,78 +1,25 @@
-"""Estimation problems of one wrist camera, each of whose images is a rig, and of camera poses without images."""
+"""Estimation problem of one wrist camera, each of whose images is a rig, and its estimate."""
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.estimation.boards import BoardShapes, shapes_of
-from jcr.estimation.intrinsics_prior import FIXED, CameraPrior, camera_with_prior
-from jcr.estimation.model_error import expressed
-from jcr.estimation.observations import Observations
+from jcr.estimation.boards import shapes_of
+from jcr.estimation.hypotheses import freed
+from jcr.estimation.intrinsics_prior import FIXED, CameraPrior, camera_with_prior, expressed
 from jcr.estimation.problem import (
-    LinearPrior,
+    Observations,
     Problem,
     ReportedPoses,
-    RigGaussian,
+    Start,
     State,
     transferred,
     with_observations,
+    wrist_arm,
 )
-from jcr.estimation.score_test import freed
 from jcr.estimation.solve import START_NOISE, Solution, solve
-from jcr.estimation.systematic import smooth_errors
 from jcr.geometry import Poses, Transform, apply, fit_similarity, scale_translation
 from jcr.records import Estimate, Intrinsics, ModelError, Tracks
-
-Start = tuple[Transform, float, Transform]
-"""Initial estimate of gripper_from_camera, scale and base_from_recon."""
-
-
-def wrist_arm(
-    base_from_gripper: Poses, error_covariance: Float[ndarray, "s s"] | None = None
-) -> ReportedPoses:
-    """Return an arm that moves rig i at pose i; `error_covariance` None: errors that are smooth over the poses."""
-    if error_covariance is None:
-        error_covariance = smooth_errors(base_from_gripper)
-    rigs = np.arange(len(base_from_gripper))
-    return ReportedPoses(rigs=rigs, base_from_gripper=base_from_gripper, error_covariance=error_covariance)
-
-
-def pose_problem(
-    base_from_gripper: Poses,
-    recon_from_camera: Poses,
-    start: Start,
-    *,
-    camera_covariance: Float[ndarray, "r r"] | None = None,
-    error_covariance: Float[ndarray, "s s"] | None = None,
-    noise_floor: tuple[float, float] | None = None,
-    priors: tuple[LinearPrior, ...] = (),
-) -> tuple[Problem, State]:
-    """Return the problem of camera poses with the covariance of their steps (None: exact), and its initial state."""
-    x, scale, z = start
-    problem = Problem(
-        arms=(wrist_arm(base_from_gripper, error_covariance),),
-        n_rigs=len(base_from_gripper),
-        known_rigs=RigGaussian(recon_from_camera, camera_covariance),
-        priors=priors,
-        robot_noise_floor=noise_floor,
-    )
-    return problem, State(x=x[None], scale=scale, z=z[None], world_from_rig=recon_from_camera)
-
-
-def image_problem(
-    world_from_rig: Float[ndarray, "m 4 4"],
-    camera: CameraPrior,
-    observations: Observations,
-    points_in_world: Float[ndarray, "p 3"],
-    boards: BoardShapes | None = None,
-) -> tuple[Problem, State]:
-    """Return the problem of the images of one camera without an arm, and its initial state."""
-    nothing = np.zeros((0, 4, 4))
-    state = State(
-        x=nothing, scale=1.0, z=nothing, world_from_rig=world_from_rig, points_in_world=points_in_world
-    )
-    problem = Problem(arms=(), n_rigs=len(world_from_rig), cameras=(camera,), boards=boards)
-    return with_observations(problem, state, observations)
 
 
 def wrist_problem(
@@ -88,7 +35,7 @@ def wrist_problem(
     """Return the problem of images and reported poses together, and its initial state; the world is in metres.
 
     `arm` moves rig i at image i. `noise` is a lower bound on the random errors of the poses (m, rad), and
-    `combinations` of the columns of score_test.Alternatives are free.
+    `combinations` of the columns of hypotheses.Alternatives are free.
     """
     x, scale, z = start
     points_in_world = scale * tracks.points_in_recon.astype(float)

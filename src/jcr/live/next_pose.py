@@ -12,8 +12,7 @@ from jcr.calibration.requirement import Proposals, assumptions_of
 from jcr.calibration.robot_errors import errors_of
 from jcr.estimation.inverse_kinematics import FITS, inverse_kinematics, reach_toward
 from jcr.estimation.kinematics import Arm, forward_kinematics
-from jcr.estimation.next_poses import median_distance
-from jcr.estimation.prediction import Assumptions, assumed, typical_camera
+from jcr.estimation.prediction import Assumptions, assumed, median_distance, typical_camera
 from jcr.geometry import inverse, rotation_angle
 from jcr.records import Capture, HandEye
 

@@ -18,8 +18,8 @@ from jcr.cell.added import read_added_cameras
 from jcr.distributions import chi2
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.absolute_pose import CameraPose
+from jcr.estimation.problem import pose_problem
 from jcr.estimation.solve import solve
-from jcr.estimation.wrist import pose_problem
 from jcr.findings import Verdict, sentence
 from jcr.geometry import step_between
 from jcr.options import checked_options

@@ -17,8 +17,7 @@ from numpy import ndarray
 from jcr.camera import rays, unproject
 from jcr.estimation.image_equations import adjust_images
 from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, camera_with_prior
-from jcr.estimation.observations import Observations
-from jcr.estimation.wrist import image_problem
+from jcr.estimation.problem import Observations, image_problem
 from jcr.geometry import apply, inverse
 from jcr.pointmaps.grid import ImageGrid, PreparedImages, read_colors
 from jcr.pointmaps.posed import PosedPointmaps

@@ -262,7 +262,7 @@ class WithGivenIntrinsics:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelError:
-    """Distortion beyond the model: polynomials over the image, in its widths (estimation/model_error.py)."""
+    """Distortion beyond the model: polynomials over the image, in its widths (estimation/intrinsics_prior.py)."""
 
     likeliest: Float[ndarray, " e"]
     covariance: Float[ndarray, "e e"]

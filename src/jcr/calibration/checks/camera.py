@@ -1,6 +1,6 @@
 """Effects on one camera: a focal length that varies, a rolling shutter, a thin prism, intrinsics that are wrong.
 
-Each is a hypothesis of estimation/score_test.py, tested beside a focal length that is wrong by one factor in all images.
+Each is a hypothesis of estimation/hypotheses.py, tested beside a focal length that is wrong by one factor in all images.
 The images are adjusted with the effect free, which shows its size and the motion of the camera that comes with it.
 """
 
@@ -17,12 +17,9 @@ from jcr.calibration.adjust import adjust_case, focal_of_each
 from jcr.calibration.case import Case, some_points
 from jcr.camera import parameter_names, parameters
 from jcr.distributions import f as f_distribution
-from jcr.estimation.hypotheses import Row
-from jcr.estimation.intrinsics_prior import CameraPrior
-from jcr.estimation.model_error import TYPICAL
-from jcr.estimation.problem import OF_IMAGE, PRISM, State
-from jcr.estimation.score_test import (
+from jcr.estimation.hypotheses import (
     Alternatives,
+    Row,
     ScoreTest,
     alternatives,
     beyond_prior,
@@ -32,6 +29,8 @@ from jcr.estimation.score_test import (
     spanned,
     test_combinations,
 )
+from jcr.estimation.intrinsics_prior import TYPICAL, CameraPrior
+from jcr.estimation.problem import OF_IMAGE, PRISM, State
 from jcr.estimation.solve import Solution
 from jcr.estimation.wrist import estimate_of
 from jcr.findings import Concerns, Finding, FindingKind
@@ -87,7 +86,7 @@ INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
 Combinations = Float[ndarray, "e p"]
-"""Combinations of the columns of score_test.Alternatives."""
+"""Combinations of the columns of hypotheses.Alternatives."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,7 +159,7 @@ def of_case(case: Case) -> CameraAdjustment:
 
 @dataclass(frozen=True)
 class CameraEffect:
-    """Combinations of the columns of score_test.Alternatives that one effect frees."""
+    """Combinations of the columns of hypotheses.Alternatives that one effect frees."""
 
     kind: FindingKind
     free: Float[ndarray, "e p"]

@@ -13,8 +13,8 @@ from jcr.capture.checks import how_rotated
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image, show_one_view
 from jcr.capture.pairing import paired_by_name
 from jcr.estimation.closed_form import initial_estimate
-from jcr.estimation.equation import predict
 from jcr.estimation.observability import observability
+from jcr.estimation.pose_equations import predict
 from jcr.estimation.robust import least_trimmed
 from jcr.features.sift import FARTHEST, detect, grey_of
 from jcr.findings import Finding, FindingKind

@@ -33,7 +33,6 @@ from jcr.calibration.checks.camera import (
 )
 from jcr.calibration.options import GRASPING
 from jcr.camera import parameters, with_thin_prism
-from jcr.estimation.equation import SCALE, UNKNOWNS, columns_of_arm
 from jcr.estimation.hand_eye import judged, poses_agree
 from jcr.estimation.hypotheses import (
     PLAUSIBLE,
@@ -45,12 +44,10 @@ from jcr.estimation.hypotheses import (
     explains_by_order,
     order_rows,
 )
-from jcr.estimation.pose_equations import pose_equations
-from jcr.estimation.problem import Problem, State
+from jcr.estimation.pose_equations import Region, pose_equations
+from jcr.estimation.problem import SCALE, UNKNOWNS, Problem, State, columns_of_arm, pose_problem
 from jcr.estimation.robot_noise import Equations, LogSizes, most_likely, solve_equations
 from jcr.estimation.solve import Solution
-from jcr.estimation.systematic import Region
-from jcr.estimation.wrist import pose_problem
 from jcr.findings import Finding, FindingKind, kinds_of
 from jcr.geometry import Poses, step_between
 from jcr.records import HandEye

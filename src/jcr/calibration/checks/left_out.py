@@ -8,7 +8,7 @@ from jcr.calibration.case import Case
 from jcr.calibration.checks.capture import SAME
 from jcr.capture.images import read_image
 from jcr.estimation.absolute_pose import CameraPose
-from jcr.estimation.equation import predict
+from jcr.estimation.pose_equations import predict
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import ARM, step_between
 from jcr.records import Capture, HandEye, Reconstruction

@@ -18,9 +18,8 @@ from jcr.calibration.case import Case
 from jcr.calibration.cues import CONTRADICTED, length_cue
 from jcr.capture.images import read_depth
 from jcr.estimation.boards import FEWEST_CORNERS, STRETCH_STD
-from jcr.estimation.equation import SCALE
 from jcr.estimation.hand_eye import judged
-from jcr.estimation.problem import LinearPrior
+from jcr.estimation.problem import SCALE, LinearPrior
 from jcr.estimation.solve import Solution, size_of_boards, with_priors
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import apply, inverse

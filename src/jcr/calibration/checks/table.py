@@ -17,7 +17,7 @@ from jcr.calibration.checks.lengths import check_boards, check_lengths
 from jcr.estimation.hypotheses import joint_offsets
 from jcr.estimation.intrinsics_prior import MEASURED, camera_with_prior
 from jcr.estimation.pose_equations import pose_equations
-from jcr.estimation.wrist import pose_problem
+from jcr.estimation.problem import pose_problem
 from jcr.findings import Finding, FindingKind, is_explained
 
 OF_NETWORK = 1.64
