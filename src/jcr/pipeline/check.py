@@ -100,24 +100,19 @@ def check_capture(
 ) -> Examination:
     """Examine a capture, or what lies at its path.
 
-    With `look` its images are registered sparsely and compared with the poses. A few of them at a small size tell in
-    seconds; where these speak against the capture, or where it is to be `thorough`, all are registered as a calibration
-    does. Where the cameras' poses were given instead, the gripper's are compared with those.
-
-    `suggest` is how many gripper poses to propose, `robot_noise` (m, rad) one sigma per axis. InputError where gripper
-    poses and joint angles contradict each other.
+    With `look` the images are registered sparsely and compared with the poses: a few at a small size, and all of them
+    where these speak against the capture or `thorough` is set. Given camera poses are compared instead of images.
+    `suggest` is the number of gripper poses to propose, `robot_noise` (m, rad) one sigma per axis. Raises InputError
+    where gripper poses and joint angles contradict each other.
     """
     if isinstance(capture, str | Path):
         capture = read_and_compare(capture, progress=progress)
     given = capture.base_from_gripper
-    (move_m, rotation_rad), notes = largest_motion(given), list(capture.notes)
-    if move_m < 5e-3 and rotation_rad > np.radians(5):
-        notes.append(
-            f"the gripper moves by at most {1e3 * move_m:.2g} mm while it rotates by {np.degrees(rotation_rad):.0f}°: "
-            "the positions may have been divided by 1000"
-        )
-    noise = None if robot_noise is None else (1e3 * robot_noise[0], float(np.degrees(robot_noise[1])))
-    options, views, camera, sharpness = CalibrateOptions(robot_noise=noise), (), None, np.zeros(0)
+    (move_m, rotation_rad), notes = largest_motion(given), [*capture.notes, *_remark_on_units(given)]
+    options = CalibrateOptions()
+    if robot_noise is not None:
+        options = CalibrateOptions(robot_noise=(1e3 * robot_noise[0], float(np.degrees(robot_noise[1]))))
+    views, camera, sharpness, shown = (), None, np.zeros(0), _Comparison()
     if isinstance(capture, PosePairs):
         robot, clear, shown = errors_of(given), np.arange(len(capture)), _compare_pairs(capture, options)
     else:
@@ -125,21 +120,21 @@ def check_capture(
         clear, sharpness, remarks = _look(capture, views)
         notes += remarks
         camera = typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
-        shown = _Comparison()
         if look and verdict_of(views) != "rejected":
             shown = _compare_with_images(capture, robot, options, seed, progress, thorough)
     counted = clear if shown.registered is None else shown.registered
     rows = counted if len(counted) >= FEWEST else np.arange(len(capture))
     gripper, hand_eye, assumptions = given[rows], shown.hand_eye, shown.assumptions
-    x = None if assumptions is None else assumptions.gripper_from_camera
-    whole = None if shown.registered is None else hand_eye
-    seen = observability(gripper, x) if whole is None else whole.observability
+    if hand_eye is not None and shown.registered is not None:
+        seen = hand_eye.observability
+    else:
+        seen = observability(gripper, None if assumptions is None else assumptions.gripper_from_camera)
     found = [*shown.findings, *(() if hand_eye is not None else seen.findings)]
     found += [] if robot.unused is None else [robot.unused]
     found += as_causes(views) if verdict_of(found) == "rejected" else views
     box = None if reach is None else np.asarray(reach, float)
-    assumptions = assumptions or assumed(gripper, camera, robot_noise)
-    proposals = Proposals.of(assumptions, gripper, robot.of(rows), suggest, box, seed)
+    of_rows = assumptions or assumed(gripper, camera, robot_noise)
+    proposals = Proposals.of(of_rows, gripper, robot.of(rows), suggest, box, seed)
     return Examination(
         sharpness=sharpness,
         largest_move_m=move_m,
@@ -152,6 +147,17 @@ def check_capture(
         findings=strongest_first({sentence(one): one for one in found}.values()),
         notes=(*notes, *shown.notes),
     )
+
+
+def _remark_on_units(base_from_gripper: Float[ndarray, "n 4 4"]) -> list[str]:
+    """Return a remark where the gripper rotates far and moves so little that another unit is likely."""
+    move_m, rotation_rad = largest_motion(base_from_gripper)
+    if move_m >= 5e-3 or rotation_rad <= np.radians(5):
+        return []
+    return [
+        f"the gripper moves by at most {1e3 * move_m:.2g} mm while it rotates by {np.degrees(rotation_rad):.0f}°: "
+        "the positions may have been divided by 1000"
+    ]
 
 
 def _look(

@@ -79,7 +79,7 @@ def run(
         if is_unchanged(result):
             before = RunResult(out, capture=result.capture, is_unchanged=True)
             if before.parent_from_camera is None:
-                raise NothingFoundError(before.doubt)
+                raise NothingFoundError(RejectedError(before.doubt))
             return before
         if options.map is not None:
             # Torch takes more than a second to import, loops of depth as long to load; COLMAP leaves a core idle.

@@ -40,13 +40,9 @@ class NothingFoundError(RejectedError):
     """Error that no back end came to a calibration, with the attempts and the reasons, strongest first."""
 
     def __init__(
-        self,
-        failure: RejectedError | str,
-        attempts: tuple[Attempt, ...] = (),
-        causes: tuple[Finding, ...] = (),
+        self, failure: RejectedError, attempts: tuple[Attempt, ...] = (), causes: tuple[Finding, ...] = ()
     ) -> None:
         """Order `causes`, findings of the images alone, before the failure."""
-        failure = RejectedError(failure) if isinstance(failure, str) else failure
         self.attempts = attempts
         self.findings = strongest_first((*causes, *no_reconstruction(failure)))
         first = self.findings[0]
@@ -85,21 +81,20 @@ class Trial:
     @property
     def name(self) -> str:
         """Name of the back end with its features and, where there is a calibration, the leave-one-out error."""
-        features = self.account.features
-        name = self.account.backend + (f" with {features}" if features else "")
+        name = " with ".join(filter(None, (self.account.backend, self.account.features)))
         if self.hand_eye is None:
             return name
-        if self.hand_eye.leave_one_out is None:
+        error = self.hand_eye.leave_one_out
+        if error is None:
             return f"{name} (too few images to leave one out)"
-        return f"{name} (leave-one-out error {leave_one_out_text(self.hand_eye.leave_one_out)})"
+        return f"{name} (leave-one-out error {leave_one_out_text(error)})"
 
     @property
     def why_not(self) -> str:
         """Name of the back end, and the reason why the attempt is not kept."""
-        reason = (
-            f"failed ({self.failure})" if self.hand_eye is None else f"is rejected ({self.hand_eye.doubt})"
-        )
-        return f"{self.name} {reason}"
+        if self.hand_eye is None:
+            return f"{self.name} failed ({self.failure})"
+        return f"{self.name} is rejected ({self.hand_eye.doubt})"
 
 
 def rank(trial: Trial) -> tuple[bool, bool, bool, float]:
@@ -224,7 +219,12 @@ def _select(trials: Sequence[Trial], notes: list[str], of_images: tuple[Finding,
         failure = failure.with_more(*notes, *(f"back end {one.why_not}" for one in earlier))
         raise NothingFoundError(failure, tuple(one.account for one in trials), as_causes(of_images))
     if others := [one for one in trials if one is not kept]:
-        notes.insert(0, f"back end {'; '.join([*(one.why_not for one in others), _why_kept(kept, others)])}")
+        _, accepted, explained, _ = rank(kept)
+        why = f"{kept.name} was used"
+        if not accepted and any(one.hand_eye is not None for one in others):
+            reason = "it shows the cause" if explained else "its leave-one-out error is the smaller one"
+            why = f"{kept.name} is rejected, too, and was used: {reason}"
+        notes.insert(0, f"back end {'; '.join([*(one.why_not for one in others), why])}")
     found = of_images if hand_eye.is_sound else as_causes(of_images)
     return Selection(
         reconstruction=replace(reconstruction, notes=(*notes, *reconstruction.notes)),
@@ -236,15 +236,6 @@ def _select(trials: Sequence[Trial], notes: list[str], of_images: tuple[Finding,
             for one in trials
         ),
     )
-
-
-def _why_kept(kept: Trial, others: Sequence[Trial]) -> str:
-    """Return why one back end is kept and not the others, in words."""
-    _, accepted, explained, _ = rank(kept)
-    if accepted or not any(one.hand_eye is not None for one in others):
-        return f"{kept.name} was used"
-    reason = "it shows the cause" if explained else "its leave-one-out error is the smaller one"
-    return f"{kept.name} is rejected, too, and was used: {reason}"
 
 
 def _of_images(capture: Capture, trial: Trial) -> tuple[Finding, ...]:
@@ -301,15 +292,9 @@ def _try(
         calibrate_s = time.perf_counter() - start
         give_back()
         report("calibrate", 1.0)
-    backend = (
-        candidate.backend
-        if candidate is not None
-        else ""
-        if reconstruction is None
-        else reconstruction.backend
-    )
+    made = candidate or reconstruction
     account = Attempt(
-        backend=backend,
+        backend="" if made is None else made.backend,
         images_registered=None if reconstruction is None else len(reconstruction.image_index),
         reconstruct_s=round(reconstruct_s, 3),
         calibrate_s=round(calibrate_s, 3),
