@@ -23,7 +23,9 @@ from jcr.estimation.problem import pose_problem
 from jcr.estimation.robot_noise import arm_errors, smooth_errors
 from jcr.estimation.solve import solve
 from jcr.geometry import inverse, rotation_exp, scale_translation, transform
+from jcr.pipeline.options import VerifyOptions
 from jcr.pipeline.stages import begun, keep_reconstruction
+from jcr.pipeline.verify import _judged, _of_two
 from jcr.records import Capture, Reconstruction, Tracks
 from jcr.result import RunOptions
 from jcr.sfm.register import register
@@ -289,3 +291,12 @@ def test_a_new_image_of_a_fixed_camera_shows_whether_it_rotated(
         found = json.loads(capsys.readouterr().out)["cameras"]["overhead"]
         assert (status, found["moved"]) == ((3, True) if deg else (0, False))
         assert np.linalg.norm(found["drift_deg"]) == pytest.approx(deg, abs=0.06)
+
+
+@pytest.mark.parametrize(("std_mm", "is_blind"), [(0.5, False), (20.0, True)])
+def test_images_that_would_not_show_a_drift_that_matters_are_a_warning(std_mm: float, is_blind: bool):
+    covariance = np.diag([*3 * [(1e-3 * std_mm) ** 2], *3 * [np.radians(0.05) ** 2]])
+    found = _of_two(np.zeros(6), covariance, VerifyOptions())
+    judged = _judged(found, VerifyOptions(), ["0.png"], (), "in the old scene")
+    assert not judged.moved and (judged.verdict == "accepted with warnings") is is_blind
+    assert any("would not be noticed" in note for note in judged.notes) is is_blind

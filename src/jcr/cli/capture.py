@@ -121,10 +121,9 @@ def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
         folder = LiveFolder(out, given or camera.intrinsics, robot)
         calibration = LiveCalibration(folder, options={"require": options.require}, reach=options.reach)
         gripper = None if states is None else lambda: next(states())
-        convention: ConventionName = arguments.pose_convention
-        if convention == "auto":
-            own = (kind for kind in KINDS if arguments.poses.startswith(f"{kind}:"))
-            convention = next(own, "auto")
+        convention = arguments.pose_convention
+        for kind in KINDS if convention == "auto" else ():
+            convention = kind if arguments.poses.startswith(f"{kind}:") else convention
         notation = Notation(convention, arguments.pose_units, calibration.arm)
         session = LiveSession(calibration, camera, options, tell, notation, gripper)
         try:

@@ -287,8 +287,11 @@ def _drift_lines(found: "Verification", verbose: bool) -> list[str]:
     deg, deg_std = (numbers(np.degrees(part[3:]), 3) for part in (found.offset, found.std))
     parent = "gripper" if found.fixed is None else "base"
     noticed = f"{1e3 * found.detectable[0]:.1f} mm or {np.degrees(found.detectable[1]):.2f}°"
+    verdict, warnings = "REJECTED" if found.moved else "ACCEPTED", len(found.notes)
+    if warnings and not found.moved:
+        verdict += f" with {warnings} warning{'s' * (warnings > 1)}"
     return [
-        f"{found.verdict.upper()}: {found.finding}, {drift}",
+        f"{verdict}: {found.finding}, {drift}",
         *(labelled("Remedy", found.advice) if found.moved else ()),
         *labelled("Drift", f"{mm} ± {mm_std} mm, {deg} ± {deg_std}° (1σ, {parent} axes)"),
         *labelled("Images", f"{len(found.images)}, {found.how}; 9 of 10 drifts of {noticed} are noticed"),

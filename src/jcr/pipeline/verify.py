@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from jcr.calibration.drift import Cause, Drift, detectable, drift
+from jcr.calibration.options import GRASPING
 from jcr.calibration.robot_errors import of_poses, robot_errors
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
@@ -298,6 +299,13 @@ def _judged(
             "than when it was calibrated"
         )
         notes = [*notes, noisier]
+    unnoticed_mm, unnoticed_deg = 1e3 * found.detectable[0], float(np.degrees(found.detectable[1]))
+    if unnoticed_mm > GRASPING[0] or unnoticed_deg > GRASPING[1]:
+        notes = [
+            *notes,
+            f"drifts of less than {unnoticed_mm:.0f} mm or {unnoticed_deg:.1f}° would not be noticed; take more images, "
+            "with the wrist rotated and at other distances",
+        ]
     millimetres = 1e3 * float(np.linalg.norm(found.offset[:3]))
     degrees = float(np.degrees(np.linalg.norm(found.offset[3:])))
     matters = millimetres > options.tolerance[0] or degrees > options.tolerance[1]
