@@ -8,6 +8,7 @@ import os
 import tempfile
 from collections.abc import Sequence
 from contextlib import closing
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,13 +17,15 @@ import pycolmap
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 from PIL import ExifTags, Image
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from jcr.allocator import give_back
 from jcr.camera import HALF_PIXEL, fold_distance_px, resized, usable_intrinsics
 from jcr.capture.images import read_image
 from jcr.errors import RejectedError
 from jcr.extras import extra
-from jcr.features.matchers import FeatureName, Matcher
+from jcr.features.matchers import FeatureName, Geometries, Matcher
 from jcr.features.sift import WORKING_SIZE_PX, SiftFeatures, grey_of
 from jcr.features.stage import Matched, match_with_robot
 from jcr.progress import Progress, silent
@@ -56,6 +59,8 @@ _ROUGHLY = 1e-3
 """Relative change of the cost that ends the adjustment before the last one."""
 _MOST_OBSERVATIONS = 60_000
 """Largest number of observations of a map; the robot's errors limit what more could add."""
+_MOST_MATCHED = 120_000
+"""Largest number of matched keypoints that are mapped; adjusting a point costs the square of the images that see it."""
 _SIFT_THREADS = 8
 """Largest number of images whose features are found at once; each takes 240 bytes a pixel while it is worked on."""
 _FEW_FEATURES = 1000
@@ -138,7 +143,7 @@ def map_images(
     """
     report("matching", 0.0)
     working = resized(intrinsics, cameras[0].width, cameras[0].height)
-    matched = match_with_robot(
+    found = match_with_robot(
         matcher,
         base_from_gripper,
         working,
@@ -146,6 +151,7 @@ def map_images(
         (intrinsics.width, intrinsics.height),
         lambda fraction: report("matching", fraction),
     )
+    matched = replace(found, geometries=_thinned(found.geometries, len(names), matcher.seed))
     if matched.intrinsics != working:
         cameras = [camera_of(matched.intrinsics, matcher.known), *cameras]
     model, matching = begun, len({row for key in matched.geometries for row in key})
@@ -181,6 +187,29 @@ def matcher_of(
     height, width = images[0].shape[:2]
     scale = np.array([camera.width / width, camera.height / height])
     return Matcher(LearnedFeatures(images, report), scale, camera, known, seed)
+
+
+def _thinned(geometries: Geometries, images: int, seed: int) -> Geometries:
+    """Return the matches of a random part of the features, so that at most _MOST_MATCHED keypoints have some.
+
+    A feature is what matches join to each other; all its matches stay, or none.
+    """
+    rows = [np.asarray(one.inlier_matches, dtype=np.int64).reshape(-1, 2) for one in geometries.values()]
+    ends = [of_pair * images + key for key, of_pair in zip(geometries, rows, strict=True)]
+    keypoints, joined = np.unique(np.concatenate([np.zeros((0, 2), np.int64), *ends]), return_inverse=True)
+    count, joined = len(keypoints), joined.reshape(-1, 2)
+    if count <= _MOST_MATCHED:
+        return geometries
+    links = csr_array((np.ones(len(joined)), joined.T), (count, count))
+    _, feature = connected_components(links, directed=False)
+    size = np.minimum(np.bincount(feature), images)
+    order, kept = np.random.default_rng(seed).permutation(len(size)), np.zeros(len(size), bool)
+    kept[order[np.cumsum(size[order]) <= _MOST_MATCHED]] = True
+    of_pairs = np.split(kept[feature[joined[:, 0]]], np.cumsum([len(one) for one in rows])[:-1])
+    thinned = {key: deepcopy(one) for key, one in geometries.items()}
+    for one, of_pair, some in zip(thinned.values(), rows, of_pairs, strict=True):
+        one.inlier_matches = of_pair[some].astype(np.uint32)
+    return thinned
 
 
 def _map_incrementally(
