@@ -58,11 +58,6 @@ class PairPredictions:
         """Names of the images for messages, or their numbers."""
         return self.images or tuple(f"#{k}" for k in range(self.image_count))
 
-    @property
-    def pointmaps(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-        """Points and confidences of the first views, and of the second ones."""
-        return self.pts3d, self.conf, self.pts3d_in_other_view, self.conf2
-
 
 def read_pairs(path: Path) -> PairPredictions:
     """Read predictions from npz and check them.
