@@ -1,8 +1,4 @@
-"""Weights of networks in the local cache of the Hugging Face hub, and their download.
-
-Cache, mirror, proxy, token and offline mode are those of huggingface_hub (HF_HOME, HF_ENDPOINT, HTTPS_PROXY, HF_TOKEN,
-HF_HUB_OFFLINE). Only `jcr models get` calls `download`; a run looks into the cache.
-"""
+"""Weights of networks in the local cache of the Hugging Face hub, and their download by `jcr models get`."""
 
 import hashlib
 import re

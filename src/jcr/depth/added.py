@@ -1,9 +1,4 @@
-"""New images of a calibrated camera: their pointmaps, and what they contradict in the older ones.
-
-The camera's pose follows from the gripper's, so that nothing is calibrated again. Depth is matched, whichever back end
-made the reconstruction, and checked against the depth of the older images; no plane is assumed. A scene changes between
-images; what a later one sees through, or sees in the way of an older ray, is removed from the older pointmaps.
-"""
+"""Pointmaps of new images of a calibrated camera, and removal of older depth that the new images contradict."""
 
 from dataclasses import replace
 

@@ -1,6 +1,6 @@
-"""depth.npz: the depth that densify estimated for the pixels of each image, on the cameras of reconstruction.npz.
+"""Format depth.npz: the estimated depth of the pixels of each image, 8.25 bytes a pixel.
 
-Points follow from the depth and the camera, colours from the images of the capture: 8.25 bytes a pixel.
+Points follow from the depth and the cameras of reconstruction.npz, colours from the images of the capture.
 """
 
 from dataclasses import asdict

@@ -1,9 +1,4 @@
-"""Numbers in the lanes of a vector register, for loops whose order of sums must be that which is written.
-
-The compiler does not vectorise a loop that reads where numbers point, nor may it reorder a sum. Intrinsics of numba
-build such code from `Lanes`, whose operators emit one instruction for all lanes. Every machine then gives the same
-bits, whatever the width of its registers.
-"""
+"""Arithmetic of vector registers for numba intrinsics, with a fixed order of sums: the same bits on every machine."""
 
 from functools import partialmethod
 from typing import Any

@@ -1,11 +1,8 @@
 """Planes for regions without texture, supported by the matched depth around them.
 
-As in ACMP and ACMMP (Xu and Tao, "Planar prior assisted PatchMatch multi-view stereo", AAAI 2020; "Multi-scale geometric
-consistency guided and planar prior assisted multi-view stereo", PAMI 2022), depths that were matched and agree between
-views carry planes for the pixels that have none. Theirs are triangles between such pixels, which join things across
-their outlines; here a plane belongs to a region of one colour (as in Romanoni and Matteucci, "TAPA-MVS", ICCV 2019), and
-the support plane of the scene is known to be one. A plane is taken at a pixel where the other views show the point in
-the same colour and none of them sees through it.
+The method follows ACMP (Xu and Tao, "Planar prior assisted PatchMatch multi-view stereo", AAAI 2020), with a plane for
+each region of one colour (Romanoni and Matteucci, "TAPA-MVS", ICCV 2019) and one support plane of the scene. A plane
+is taken at a pixel where the other views show the point in the same colour and none of them sees through it.
 """
 
 from collections.abc import Sequence

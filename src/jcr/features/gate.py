@@ -1,9 +1,7 @@
-"""The robot's gate: which verified pairs of images the gripper poses confirm, and X's rotation from those.
+"""Verification of pairs of images by the gripper poses, and X's rotation from the confirmed pairs.
 
-Whatever X is, the angle between two cameras is the angle between two grippers (the screw congruence of Chen 1991). A
-pair whose angle differs by more than its own uncertainty and the robot's allow is not believed; before that its other
-readings are tried. Once enough pairs agree, X's rotation is known, and the whole relative rotation must agree,
-R_A R_X = R_X R_B.
+The angle between two cameras is the angle between two grippers, whatever X is (Chen 1991). Once enough pairs agree, X's
+rotation is known, and the whole relative rotation must agree, R_A R_X = R_X R_B.
 """
 
 import math

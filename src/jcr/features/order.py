@@ -1,7 +1,6 @@
-"""The order in which images are reconstructed: by their gripper poses, whatever they are called and however listed.
+"""Order in which images are reconstructed: by their gripper poses, independent of names and listing.
 
-Matches of a pair, RANSAC's draws and the first pair of a map depend on which image comes first. By names, 10.png came
-before 2.png, and the same images taken live before both: calibrations differed by up to 1.7 σ.
+Matches, RANSAC's draws and the first pair of a map depend on the order: by names, calibrations differed by up to 1.7 σ.
 """
 
 import numpy as np

@@ -1,8 +1,6 @@
-"""Search for the pairs of images that match and that the gripper poses confirm, for every kind of features.
+"""Search for pairs of images that match and that the gripper poses confirm.
 
-Pairs that the gripper rotates little against each other are matched as they are; those that the robot confirms give X's
-rotation, and with it every image is rotated upright before the others are matched. While too few agree, rotations by 90°
-are guessed.
+Pairs with little rotation between them are matched first; they give X's rotation, by which images are rotated upright.
 """
 
 import math

@@ -1,7 +1,6 @@
-"""The relative rotation of two cameras from matched directions, its alternatives, and how sure each is.
+"""Relative rotation of two cameras from matched directions, its alternatives and its covariance.
 
-A homography has two readings that put the scene in front of both cameras (Malis and Vargas, INRIA RR-6303, 2007), and
-the essential matrix of a nearly plane scene is loose along the way between them. Each is refined on the Sampson error
+A homography has two solutions (Malis and Vargas, INRIA RR-6303, 2007). Each motion is refined on the Sampson error
 (Hartley and Zisserman, section 11.4.3), whose curvature gives the covariance.
 """
 

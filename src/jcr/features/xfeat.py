@@ -1,6 +1,5 @@
-"""XFeat keypoints of images that are rotated upright first, matched by LightGlue: kornia's networks, inference only.
+"""XFeat keypoints of upright images, matched by LightGlue: inference by kornia's networks.
 
-The networks do not match images that are rotated against each other.
 Potje, Cadar, Araujo, Martins and Nascimento, "XFeat: Accelerated Features for Lightweight Image Matching", CVPR 2024.
 Lindenberger, Sarlin and Pollefeys, "LightGlue: Local Feature Matching at Light Speed", ICCV 2023.
 """

@@ -1,8 +1,4 @@
-"""Any-view models: networks that predict depth, confidence and a camera pose of all views at once.
-
-An adapter converts between the conventions of a model's package and those of this project: pixel (0, 0) is a centre,
-cameras look along +z with x right and y down, poses are recon_from_camera.
-"""
+"""Adapter of networks that predict depth, confidence and a camera pose of all views at once."""
 
 import sys
 from collections.abc import Callable

@@ -1,8 +1,7 @@
 """Depth Anything 3 (Lin et al. 2025, arXiv 2511.10647): depth, confidence and cameras of any number of views.
 
-Only the network of its package is used (`create_object(load_config(...))`), so that the package's other requirements
-need not be installed. Its conventions: cameras are camera_from_recon, x right, y down, z forward; depth is along z,
-not along the ray; intrinsics count from the image's corner; the unit is arbitrary.
+Its conventions: cameras are camera_from_recon, x right, y down, z forward; depth is along z; intrinsics count from the
+image's corner; the unit is arbitrary. Only the network of its package is used, not the package's other requirements.
 """
 
 import json

@@ -1,8 +1,6 @@
 """Images in the resolution of a network, and the intrinsics of their pixels.
 
-Pixel (0, 0) is the centre of the top-left pixel. A resize by s maps x' = (x + 0.5)·s − 0.5 (the image's outer
-edges stay its outer edges, which is what Pillow's resize does); a crop subtracts its corner. Forgetting the
-half pixel shifts the principal point by (1 − s)/2 pixels.
+Pixel (0, 0) is the centre of the top-left pixel: a resize by s maps x' = (x + 0.5)·s − 0.5, a crop subtracts its corner.
 """
 
 from collections.abc import Callable

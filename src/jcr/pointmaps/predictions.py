@@ -1,7 +1,4 @@
-"""The `predictions` back end: the output of any network from one npz file (jcr docs predictions).
-
-Either pairwise pointmaps, which are aligned here, or pointmaps that share one frame, with camera poses.
-"""
+"""The back end `predictions`: the output of any network from one npz file (jcr docs predictions)."""
 
 from dataclasses import replace
 from pathlib import Path

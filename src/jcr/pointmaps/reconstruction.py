@@ -1,10 +1,4 @@
-"""Reconstruction from pointmaps, whichever network predicted them: refined by matches of the images, or as predicted.
-
-A prediction is no measurement: networks invent geometry, and their metre and their focal length are off by several per
-cent. The pointmaps are therefore an initial estimate. Where the images match, bundle adjustment of the matches gives the
-cameras, and the calibration adjusts the same tracks with the robot. Where they do not match, the predicted cameras are
-used with their covariance, and the network's focal length with its standard deviation.
-"""
+"""Reconstruction from pointmaps: bundle adjustment of matches where the images match, else the predicted cameras."""
 
 from dataclasses import replace
 

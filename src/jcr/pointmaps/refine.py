@@ -1,10 +1,7 @@
-"""Refinement of predicted cameras and depth: photometric matches between the images, then bundle adjustment.
+"""Refinement of predicted cameras and depth by optical flow between the images and bundle adjustment.
 
-A pointmap predicts the position of each pixel of a view in another view to a few pixels. The other view is warped by
-this prediction, which removes rotation, scale and slant; the remaining optical flow (Lucas and Kanade, 1981; OpenCV's
-pyramid) is accurate to a fraction of a pixel of the camera's own images, independent of the network's resolution and
-predictions. The robot's poses are not used. Each view's depth is multiplied by a smooth factor that fits the adjusted
-points. Matching and adjustment are repeated, for better cameras predict better where to match.
+Each other view is warped by the predicted geometry; the remaining flow is found by OpenCV's pyramid of Lucas and Kanade
+(1981). The gripper poses are not used.
 """
 
 from dataclasses import dataclass, replace

@@ -1,7 +1,4 @@
-"""The `given` back end: camera poses of a COLMAP model.
-
-The model's own points are its tracks; where it has none, features are matched and triangulated with the cameras fixed.
-"""
+"""The back end `given`: camera poses of a COLMAP model, with its points or with triangulated features."""
 
 import tempfile
 from collections.abc import Callable, Sequence

@@ -1,7 +1,4 @@
-"""Map of a capture that is being taken: every image is matched as in a batch, with features and pairs kept in memory.
-
-COLMAP's mapper continues the last map with the new images.
-"""
+"""Map of a capture that is being taken: images are matched as in a batch, and COLMAP's mapper continues the last map."""
 
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,8 +1,6 @@
-"""Images that the mapper leaves out, registered where the gripper poses and the map's own X predict their cameras.
+"""Registration of images that the mapper left out, by the cameras that gripper poses and the map's own X predict.
 
-Predicted cameras are some millimetres and tenths of a degree off: points are triangulated and adjusted in turn. Matching
-of whole images loses features that resemble others of the image; near a point's projection few compete with them, and
-more points of the map are searched there.
+Points are triangulated and adjusted in turn, and more points of the map are searched near their projections.
 """
 
 from collections import Counter

@@ -1,8 +1,4 @@
-"""Registration of new images in a reconstruction: points of matched features, then the absolute pose of each camera.
-
-A feature that a new image shares with two or more older ones is triangulated from these. The cameras of any back
-end will do; the covariance of a new one includes that of the points.
-"""
+"""Registration of new images in a reconstruction: triangulated features, then the absolute pose of each camera."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

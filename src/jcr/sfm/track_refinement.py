@@ -1,12 +1,9 @@
-"""Least-squares matching: the observations of a track aligned to one of them, its reference, by their pixels.
+"""Least-squares matching of the observations of a track with one of them, its reference.
 
-A keypoint is found in each image by itself, to 0.2 to 0.5 px; aligned to one patch, the observations of a track agree
-within a tenth. Where the reference's own keypoint is off, the point is another one of the surface: cameras are not
-concerned. A patch is seen under the warp of a plane that faces the track's cameras, whose affine part is free, and
-so are gain and offset (Gruen, "Adaptive least squares correlation", 1985). The reference's derivatives serve every step
-(inverse composition; Baker and Matthews, IJCV 2004). The variance is that of the residuals times the inverse normal
-equations (Förstner, "On the geometric precision of digital correlation", 1982): of three sizes of the patch the one with
-the smallest counts, and an observation where none is small keeps its keypoint.
+Gruen, "Adaptive least squares correlation", 1985, with the derivatives of the reference (inverse composition; Baker and
+Matthews, IJCV 2004), under the warp of a plane that faces the cameras, a free affine part, gain and offset. Of three
+sizes of the patch the one with the smallest variance counts (Förstner, "On the geometric precision of digital
+correlation", 1982).
 """
 
 import os

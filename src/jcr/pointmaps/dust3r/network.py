@@ -1,10 +1,7 @@
 """Network of DUSt3R (Wang et al., CVPR 2024): pointmaps of two images in the first camera's frame.
 
-A ViT encodes each image on its own; two decoders read each other's tokens through cross-attention (CroCo v2,
-Weinzaepfel et al., ICCV 2023); a head per view maps tokens into a 3D point and a confidence per pixel,
-either linear or a dense prediction transformer (DPT, Ranftl et al., ICCV 2021). Attribute names are those of
-the published checkpoints, because they are the keys of the state dict.
-
+Encoder and decoders are those of CroCo v2 (Weinzaepfel et al., ICCV 2023), the head is linear or a dense prediction
+transformer (DPT, Ranftl et al., ICCV 2021). Attribute names are the keys of the published state dicts.
 Shapes: b images or pairs, n tokens = h/16 · w/16, c channels.
 """
 

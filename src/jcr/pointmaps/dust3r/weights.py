@@ -1,8 +1,4 @@
-"""Loading of published weights from .pth, safetensors or a folder, without executing a pickle.
-
-Weights come in two layouts: a .pth of {'args': Namespace(model="AsymmetricCroCo3DStereo(...)"), 'model':
-state dict}, and a folder of config.json with model.safetensors, which is also what the hub has.
-"""
+"""Loading of published weights from .pth, or config.json and safetensors, without executing a pickle."""
 
 import argparse
 import ast

@@ -1,14 +1,8 @@
-"""Global alignment by Gauss-Newton on a few thousand pixels per image.
+"""Global alignment by Gauss-Newton on a few thousand pixels per image (paper, eq. 1).
 
-It minimises what eq. 1 of the paper does, with three changes. Residuals are weighted by what they prove to
-be worth (residuals.py). The first view of a pair stands in its camera's own frame, as it was predicted,
-so that its rays give the focal length. And a pair's pose P_e, free in eq. 1, is its first camera's but for an
-error whose spread is measured over all pairs: where the network places second views well, pairs tie cameras
-firmly.
-
-Depths are eliminated pixel by pixel (Schur complement; Triggs et al., "Bundle adjustment: a modern synthesis", 2000,
-section 6), and so are the rigid errors of the pairs' second views. The reduced system has the steps of the cameras, the
-log focal and the log pair scales, in this order.
+The first view of a pair stands in its camera's own frame; the pair's pose P_e is its first camera's but for an error
+whose spread is estimated over all pairs. Depths and these errors are eliminated (Schur complement; Triggs et al.,
+"Bundle adjustment: a modern synthesis", 2000, section 6). Unknowns are steps of cameras, log focal and log pair scales.
 """
 
 from dataclasses import dataclass, replace

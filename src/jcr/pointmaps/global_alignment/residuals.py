@@ -1,15 +1,11 @@
 """Residuals of pairwise pointmaps against a reconstruction, their weights, and the depth that they give each pixel.
 
-A predicted point errs differently *across* its line of sight (where in the observer's image it appears) and
-*along* it (how far it is): networks know directions several times better than distances, and their errors in
-distance are smooth, so that a thousand pixels do not average them out. Each residual is therefore split,
+Networks predict directions several times better than distances, so that each residual has two parts,
 
     across = n − (n·x̂) x̂        along = log|x| − log|q| − log σ_e
 
-(x the modelled point seen from the observer, x̂ its direction; q the predicted point, n its direction, both
-rotated into the recon axes), and the two parts are weighted by variances measured on the residuals themselves:
-per pointmap by their median, and per kind of view by how far neighbouring residuals go together. Pairs that
-contradict the others get large variances and so little weight.
+(x the modelled point seen from the observer, x̂ its direction; q the predicted point, n its direction). Their variances
+are estimated from the residuals: per pointmap by their median, per kind of view by the correlation of neighbours.
 """
 
 from dataclasses import dataclass
