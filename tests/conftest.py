@@ -5,7 +5,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -17,6 +16,7 @@ from PIL import Image
 
 import shape_checks
 from chromium import Chromium
+from in_process import run_jcr
 from jcr.geometry import apply, transform
 from places import ROOT, SHARED
 from sift_once import find_sift_once
@@ -60,10 +60,12 @@ SLOW_FIXTURES = {"done", "small_done", "opengl", "real_captures", "attacks", "ti
 
 FIRST = (
     "faults/test_faults.py", "calibration/test_faults.py",
-    "viewer/test_view.py", "test_real_captures.py", "test_without_torch.py", "test_examples.py", "test_verify.py",
+    "live/test_calibration.py", "test_verify.py", "test_real_captures.py", "cell/test_cell.py", "test_batch.py",
+    "boards/test_marker.py", "test_examples.py", "scene/test_map.py", "cli/test_cli.py", "calibration/test_conventions.py",
+    "calibration/test_given_intrinsics.py", "scene/test_map_update.py", "report/test_report.py",
 )  # fmt: skip
-"""Files that the two workers begin with: one makes the run of `done`, the other takes longer and does without it; then
-those that take long and would come last, when one worker has nothing left."""
+"""Files by their processor seconds, longest first, after the two that the workers begin with: one makes the run of
+`done`, the other does without it."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -129,8 +131,7 @@ def made_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callabl
 
 
 def run_by_command(capture: Path, out: Path) -> None:
-    command = [sys.executable, "-m", "jcr", "run", str(capture), str(out), "--quiet"]
-    finished = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    finished = run_jcr("run", capture, out, "--quiet")
     assert finished.returncode == 0, finished.stderr
     assert "\nReport  " in finished.stdout
 

@@ -41,17 +41,7 @@ def captures(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> list[P
     return folders
 
 
-def edit(capture: Path, **values: object) -> None:
-    """Change keys of capture.json, or move the first gripper pose."""
-    content = json.loads((capture / "capture.json").read_text()) | values
-    if not values:
-        content["frames"][0]["base_from_gripper"][0][3] += 1e-4
-    (capture / "capture.json").write_text(json.dumps(content))
-
-
-def test_a_bad_capture_fails_alone_and_what_is_finished_is_not_run_again(
-    captures: list[Path], tmp_path: Path, capsys
-):
+def test_a_bad_capture_fails_alone(captures: list[Path], tmp_path: Path, capsys):
     out, names = tmp_path / "all", [str(path) for path in captures]
     command = ["batch", *names, str(out), "--calibrate-only", "--processes", "2", "--quiet"]
     assert dispatch([*command, "--json"]) == 3
@@ -66,16 +56,6 @@ def test_a_bad_capture_fails_alone_and_what_is_finished_is_not_run_again(
     assert len(table) == 4 and table[-1]["status"] == "failed"
     page = (out / "summary.html").read_text()
     assert page.count("<tr>") == 5 and "not a readable image" in page
-
-    def stamps() -> dict[str, int]:
-        return {name: (out / name / "calibration.json").stat().st_mtime_ns for name in ("a", "b", "plain")}
-
-    before = stamps()
-    edit(captures[0])
-    assert dispatch(command) == 3
-    assert str(out / "summary.html") in capsys.readouterr().out
-    after = stamps()
-    assert after["a"] > before["a"] and after["b"] == before["b"] and after["plain"] == before["plain"]
 
 
 def test_deleted_results_and_changed_facts_of_a_capture_are_made_again(
@@ -107,6 +87,7 @@ def test_deleted_results_and_changed_facts_of_a_capture_are_made_again(
     task = Task(capture=capture, out=report.parent, run=RunOptions(), calibrate_only=True, read=read)
     assert run_one(task).status != "failed" and not is_made()
     for changed in (
+        {"frames": frames[:4]},
         {"robot": "ur5e"},
         {"intrinsics_std": {"fx": 1.0, "fy": 1.0, "cx": 1.0, "cy": 1.0, "distortion": [0.1] * 5}},
         {"cameras": {"fixed": {"mount": "base", "intrinsics": None, "images": ["other/00.jpg"]}}},
@@ -115,7 +96,7 @@ def test_deleted_results_and_changed_facts_of_a_capture_are_made_again(
         {"urdf": "robot.urdf"},
     ):
         before = (capture / "capture.json").read_text()
-        edit(capture, **changed)
+        (capture / "capture.json").write_text(json.dumps(json.loads(before) | changed))
         assert is_made(), changed
         (capture / "capture.json").write_text(before)
         assert not is_made(), changed

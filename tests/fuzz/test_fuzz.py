@@ -129,6 +129,7 @@ def poses(draw: st.DrawFn) -> tuple[HandEyeProblem, bool]:
     return replace(problem, base_from_gripper=gripper, recon_from_camera=cameras), unit == 1.0
 
 
+@pytest.mark.long
 @settings(bounded, max_examples=60 * LONGER)
 @given(poses())
 def test_no_poses_make_the_solver_fail_or_trust_what_is_wrong(given_poses: tuple[HandEyeProblem, bool]):

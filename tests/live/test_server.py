@@ -220,7 +220,7 @@ def start(out: Path, camera: Path) -> tuple[subprocess.Popen[str], str]:
     return running, line.split()[3].removesuffix("/sample")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_interrupted_command_goes_on_and_the_example_client_talks_to_it(tmp_path: Path, tabletop: Path):
     out = tmp_path / "c"
     running, address = start(out, video(tmp_path / "a.avi", tabletop, range(1)))
