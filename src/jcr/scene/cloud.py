@@ -170,6 +170,8 @@ def read_cloud(path: Path) -> PointCloud:
             label_names=tuple(word[3] for word in words if word[:2] == ["comment", "label"]),
             **columns,
         )
+    except InputError:  # a pipe
+        raise
     except OSError as error:
         raise InputError(f"{path}: no cloud here ({error.strerror}); make one with jcr map OUT") from None
     except (ValueError, IndexError):
