@@ -5,7 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import UInt16
 from numpy import ndarray
 
 from jcr.camera import project, rays
@@ -28,23 +28,19 @@ def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages
     folder = capture.folder / "labels"
     if not any(folder.glob("*.png")):
         return None
-    stack = []
-    for row in reconstruction.image_index:
-        if row >= len(capture):  # added to the run later
-            stack.append(np.zeros(reconstruction.dense.confidence.shape[1:], np.int64))
-            continue
-        label = _read(folder / f"{Path(capture.images[row]).stem}.png", capture, capture.images[row])
-        stack.append(_on_pointmap(label, reconstruction))
-    labels = np.stack(stack)
-    names = (
-        {0: "none"}
-        | {k: str(k) for k in range(1, int(labels.max()) + 1)}
-        | _read_names(folder / "names.json")
-    )
-    return LabelImages(labels, tuple(names[k] for k in range(int(labels.max()) + 1)))
+    # The nearest label of the capture's image at each pixel of the pointmap.
+    at_px = project(reconstruction.intrinsics, rays(reconstruction.dense.intrinsics)).astype(np.float32)
+    labels = np.zeros(reconstruction.dense.confidence.shape, np.int64)
+    for k, row in enumerate(reconstruction.image_index):
+        if row < len(capture):  # others were added to the run later
+            label = _read(folder / f"{Path(capture.images[row]).stem}.png", capture, capture.images[row])
+            labels[k] = cv2.remap(label, at_px[..., 0], at_px[..., 1], cv2.INTER_NEAREST, borderValue=0)
+    count = int(labels.max()) + 1
+    names = {k: str(k) for k in range(1, count)} | {0: "none"} | _read_names(folder / "names.json")
+    return LabelImages(labels, tuple(names[k] for k in range(count)))
 
 
-def _read(path: Path, capture: Capture, image: str) -> Int[ndarray, "h w"]:
+def _read(path: Path, capture: Capture, image: str) -> UInt16[ndarray, "h w"]:
     """Read the labels of an image; raise InputError where they are missing or do not fit it."""
     if not path.is_file():
         raise InputError(
@@ -59,15 +55,7 @@ def _read(path: Path, capture: Capture, image: str) -> Int[ndarray, "h w"]:
         )
     if label.max() >= MOST:
         raise InputError(f"{path}: holds label {label.max()}; number the labels from 1, at most {MOST - 1}")
-    return label.astype(np.int64)
-
-
-def _on_pointmap(label: Int[ndarray, "h w"], reconstruction: Reconstruction) -> Int[ndarray, "r c"]:
-    """Return the nearest label of the capture's image at each pixel of the pointmap."""
-    camera, grid = reconstruction.intrinsics, reconstruction.dense.intrinsics
-    x_px, y_px = np.moveaxis(project(camera, rays(grid)).astype(np.float32), -1, 0)
-    nearest = cv2.remap(label.astype(np.uint16), x_px, y_px, cv2.INTER_NEAREST, borderValue=0)
-    return nearest.astype(np.int64)
+    return label.astype(np.uint16)
 
 
 def _read_names(path: Path) -> dict[int, str]:
