@@ -13,7 +13,6 @@ from benchmarks.cameras import answered, cell_of, wanted
 from jcr.calibration.checks.camera import CameraAdjustment
 from jcr.calibration.checks.effects import effects
 from jcr.calibration.stage import calibrate
-from jcr.capture.added import read_added
 from jcr.capture.formats.capture_json import read, write
 from jcr.cell.added import camera_of, read_added_cameras
 from jcr.cell.carried import eye_to_hand, refined
@@ -71,32 +70,23 @@ def test_the_frame_of_the_images_does_not_matter():
 @pytest.fixture(scope="module")
 def calibrated(tabletop: Path) -> tuple[Capture, Reconstruction, HandEye]:
     """The first images of the bundled capture, as a structure from motion without error would give them."""
-    capture = jcr.read_capture(tabletop)
-    x = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
+    capture, x = jcr.read_capture(tabletop), read_truth(tabletop).gripper_from_camera
     recon_from_base = transform(rotation_exp(np.array([0.3, -0.8, 0.5])), np.array([0.2, 0.1, -0.4]))
     poses = scale_translation(recon_from_base @ capture.base_from_gripper[:OLD] @ x, 1 / SCALE)
-    intrinsics = capture.intrinsics
-    assert intrinsics is not None
-    nothing = Tracks(
-        image=np.zeros(0, int),
-        x_px=np.zeros((0, 2)),
-        point=np.zeros(0, int),
-        points_in_recon=np.zeros((0, 3)),
-    )
+    none = np.zeros(0, int)
     reconstruction = Reconstruction(
         image_index=np.arange(OLD),
         recon_from_camera=poses,
-        intrinsics=intrinsics,
-        tracks=nothing,
+        intrinsics=read_truth(tabletop).intrinsics,
+        tracks=Tracks(image=none, x_px=np.zeros((0, 2)), point=none, points_in_recon=np.zeros((0, 3))),
         backend="test",
     )
-    old = replace(
-        capture,
-        images=capture.images[:OLD],
-        base_from_gripper=capture.base_from_gripper[:OLD],
-        joints=None if capture.joints is None else capture.joints[:OLD],
-    )
+    old = capture.of_rows(range(OLD))
     return old, reconstruction, calibrate(old, reconstruction)
+
+
+def placed(calibrated: tuple[Capture, Reconstruction, HandEye], *cameras: CellCamera) -> CellPlacement:
+    return place_cameras(calibrated[0], cameras, *calibrated[1:])
 
 
 def fixed(capture: Capture, *images: str, known: bool = True) -> CellCamera:
@@ -112,14 +102,11 @@ def fixed(capture: Capture, *images: str, known: bool = True) -> CellCamera:
 @pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False])
 def test_an_image_of_the_scene_places_a_fixed_camera(tabletop: Path, calibrated, known: bool, tmp_path: Path):
-    old, reconstruction, hand_eye = calibrated
-    capture = jcr.read_capture(tabletop)
-    image, intrinsics = tabletop / capture.images[10], capture.intrinsics if known else None
-    added = replace(camera_of("camera", [image], None, (old.camera_name,), tmp_path), intrinsics=intrinsics)
-    camera = place_cameras(old, [added], reconstruction, hand_eye).cameras[0]
-    x = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
+    truth, own = read_truth(tabletop), calibrated[0].camera_name
+    added = camera_of("camera", [tabletop / truth.images[10]], None, (own,), tmp_path)
+    (camera,) = placed(calibrated, replace(added, intrinsics=truth.intrinsics if known else None)).cameras
     assert camera.converged and camera.parent_from_camera is not None and camera.covariance is not None
-    error = step_between(camera.parent_from_camera, capture.base_from_gripper[10] @ x)
+    error = step_between(camera.parent_from_camera, truth.base_from_camera[10])
     assert np.linalg.norm(error[:3]) < (0.004 if known else 0.01)
     assert error @ np.linalg.solve(camera.covariance, error) < 16.8
     assert camera.uncertainty is not None and (camera.uncertainty.at_scene_mm or np.inf) < 20
@@ -135,8 +122,7 @@ def test_a_fixed_camera_is_calibrated_by_what_the_gripper_carries(tabletop: Path
     seen = eye_to_hand(carried, tmp_path)
     made = reconstruct_colmap(seen)
     found = refined(carried, made, calibrate(seen, made))
-    x = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
-    error = step_between(found.gripper_from_camera, x)
+    error = step_between(found.gripper_from_camera, read_truth(tabletop).gripper_from_camera)
     assert found.converged and len(made.image_index) == len(capture)
     assert error @ np.linalg.solve(found.covariance[:6, :6], error) < 16.8
 
@@ -149,19 +135,16 @@ def test_given_intrinsics_that_a_camera_s_image_contradicts_are_named_and_not_us
     tabletop: Path, calibrated, wrong: dict[str, float]
 ):
     """Used, 3 % too long are 10 mm off, 4.3 sigma; a centre 40 px off 2°, 6.8 sigma; another camera's do not fit."""
-    old, reconstruction, hand_eye = calibrated
-    capture = jcr.read_capture(tabletop)
-    true = capture.intrinsics
-    assert true is not None
+    truth = read_truth(tabletop)
+    true = truth.intrinsics
     given = replace(true, **{name: factor * getattr(true, name) for name, factor in wrong.items()})
-    overhead = replace(fixed(capture, capture.images[11]), intrinsics=given)
-    (camera,) = place_cameras(old, [overhead], reconstruction, hand_eye).cameras
+    overhead = replace(fixed(calibrated[0], truth.images[11]), intrinsics=given)
+    (camera,) = placed(calibrated, overhead).cameras
     is_far_off = wrong.get("fx") != 1.009
     assert [one.kind for one in camera.findings] == [FindingKind.INTRINSICS] * is_far_off
     assert camera.converged
     assert camera.parent_from_camera is not None and camera.covariance is not None
-    x = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
-    error = step_between(camera.parent_from_camera, capture.base_from_gripper[11] @ x)
+    error = step_between(camera.parent_from_camera, truth.base_from_camera[11])
     assert np.abs(error / np.sqrt(np.diag(camera.covariance))).max() < 3
     assert np.linalg.norm(error[:3]) < 0.004
     assert camera.intrinsics is not None and camera.intrinsics.fx == pytest.approx(true.fx, rel=0.01)
@@ -170,7 +153,7 @@ def test_given_intrinsics_that_a_camera_s_image_contradicts_are_named_and_not_us
 @pytest.mark.slow
 def test_a_second_camera_on_the_gripper_is_placed_by_images_of_two_gripper_poses(calibrated):
     """One image fits any frame: that of another was 0.35 m and 64° off, accepted with 0.2 mm."""
-    old, reconstruction, hand_eye = calibrated
+    old, _, hand_eye = calibrated
 
     def second(*frames: int) -> CameraPlacement:
         camera = CellCamera(
@@ -181,7 +164,7 @@ def test_a_second_camera_on_the_gripper_is_placed_by_images_of_two_gripper_poses
             intrinsics=old.intrinsics,
             frame=np.array(frames),
         )
-        return place_cameras(old, [camera], reconstruction, hand_eye).cameras[0]
+        return placed(calibrated, camera).cameras[0]
 
     for one in (second(5), second(4), second(4, 4)):
         assert not one.converged and one.findings[0].kind is FindingKind.ONE_GRIPPER_POSE
@@ -193,7 +176,6 @@ def test_a_second_camera_on_the_gripper_is_placed_by_images_of_two_gripper_poses
 
 @pytest.mark.slow
 def test_the_base_of_a_second_arm_is_found_from_its_wrist_camera(tabletop: Path, calibrated):
-    old, reconstruction, hand_eye = calibrated
     capture = jcr.read_capture(tabletop)
     base_from_other = transform(rotation_exp(np.array([0.1, -0.2, 2.8])), np.array([0.9, 0.3, 0.1]))
     rows = [2, 5, *range(OLD, len(capture))]
@@ -206,7 +188,7 @@ def test_the_base_of_a_second_arm_is_found_from_its_wrist_camera(tabletop: Path,
         intrinsics=capture.intrinsics,
         base_from_gripper=inverse(base_from_other) @ capture.base_from_gripper[rows],
     )
-    found = place_cameras(old, [camera], reconstruction, hand_eye)
+    found = placed(calibrated, camera)
     assert found.cameras[0].converged and found.arms[0].name == "other"
     off = step_between(np.array(found.arms[0].base_from_other_base), base_from_other)
     assert np.linalg.norm(off[:3]) < 0.01 and np.degrees(np.linalg.norm(off[3:])) < 1.0
@@ -288,7 +270,7 @@ def test_a_fixed_camera_that_was_bumped_between_its_images_is_named(
     for k, view in enumerate(render(scene, truth.intrinsics, places, with_truth=False)):
         cv2.imwrite(str(tmp_path / f"{k}.png"), view.image[..., ::-1])
     camera = replace(fixed(calibrated[0], "0.png", "1.png"), folder=tmp_path, intrinsics=truth.intrinsics)
-    (found,) = place_cameras(calibrated[0], [camera], *calibrated[1:]).cameras
+    (found,) = placed(calibrated, camera).cameras
     if not moved:
         assert found.verdict == "accepted" and found.parent_from_camera is not None
         assert np.linalg.norm(step_between(found.parent_from_camera, place)[:3]) < 0.004
@@ -306,7 +288,7 @@ def test_a_camera_that_moves_or_sees_another_scene_is_refused_with_the_reason(ca
     another = replace(fixed(old, "other.png"), name="other", folder=tmp_path)
     moving = fixed(old, old.images[2], old.images[5])
     unknown = replace(moving, name="unknown", intrinsics=None)
-    found = place_cameras(old, [another, moving, unknown], reconstruction, hand_eye)
+    found = placed(calibrated, another, moving, unknown)
     assert [camera.converged for camera in found.cameras] == [False, False, False]
     assert "must see the same scene" in found.cameras[0].warnings[0]
     assert all("it is not fixed" in camera.warnings[0] for camera in found.cameras[1:])
@@ -315,8 +297,8 @@ def test_a_camera_that_moves_or_sees_another_scene_is_refused_with_the_reason(ca
     uncertain = Finding(kind=FindingKind.UNCERTAIN, severity="rejects", value=0.1, details={"part": "scale"})
     untrusted = place_cameras(old, [moving], reconstruction, hand_eye.with_findings(uncertain))
     assert "rejected" in untrusted.cameras[0].warnings[0]
-    placed = place_cameras(old, [fixed(old, old.images[3])], reconstruction, hand_eye)
-    content = CellPlacement((*found.cameras, *placed.cameras)).file("0")
+    more = placed(calibrated, fixed(old, old.images[3])).cameras
+    content = CellPlacement((*found.cameras, *more)).file("0")
     write_cameras(tmp_path, content)
     assert read_cameras(tmp_path) == content
     written = json.loads((tmp_path / "cameras.json").read_text())["cameras"]
@@ -416,19 +398,17 @@ def test_cameras_that_cannot_be_are_refused_in_one_line(
     assert "\n" not in str(refusal.value)
 
 
-@pytest.mark.parametrize("name", ["added/capture.json", "cameras/cameras.json", "cameras.json"])
+@pytest.mark.parametrize(
+    ("name", "read_file"), [("cameras/cameras.json", read_added_cameras), ("cameras.json", None)]
+)
 @pytest.mark.parametrize("text", ["{", "7"])
-def test_a_damaged_file_of_the_run_is_refused(folder: Path, tmp_path: Path, name: str, text: str):
+def test_a_damaged_file_of_the_run_is_refused(folder: Path, tmp_path: Path, name: str, read_file, text: str):
     (folder / "capture.json").write_text(json.dumps(content()))
     capture, run = read(folder), tmp_path / "run"
-    readers = {
-        "added/capture.json": lambda: read_added(run, capture),
-        "cameras/cameras.json": lambda: read_added_cameras(run, capture),
-        "cameras.json": lambda: read_cameras(run),
-    }
-    assert not readers[name]()
+    arguments = (run, capture) if read_file else (run,)
+    assert not (read_file or read_cameras)(*arguments)
     (run / name).parent.mkdir(parents=True)
     (run / name).write_text(text)
     with pytest.raises(jcr.InputError) as refusal:
-        readers[name]()
+        (read_file or read_cameras)(*arguments)
     assert "\n" not in str(refusal.value) and "run" in str(refusal.value)

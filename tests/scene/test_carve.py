@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import analytic_scene
-from jcr.errors import InputError
 from jcr.records import BOTH, MATCHED, PRIOR
 
 pytestmark = pytest.mark.slow  # torch
@@ -74,8 +73,3 @@ def test_a_cloud_keeps_reasons_and_sigmas_on_disk(tmp_path: Path) -> None:
         for name in ("reason", "depth_std"):
             there, given = getattr(back, name), getattr(cloud, name)
             assert there is given is None or np.allclose(there, given, rtol=1e-6)
-    whole = (tmp_path / "cloud.ply").read_bytes()
-    for damage in (whole[:-5], b"", whole[:200], whole.replace(b"camera 0 ", b"camera 0 x")):
-        (tmp_path / "cloud.ply").write_bytes(damage)
-        with pytest.raises(InputError, match="or was damaged"):
-            read_cloud(tmp_path / "cloud.ply")
