@@ -23,7 +23,7 @@ from jcr.camera import project
 from jcr.capture.read import read_capture
 from jcr.depth.densify import densify
 from jcr.errors import InputError
-from jcr.export.options import ExportOptions, Provenance
+from jcr.export.options import ExportOptions, provenance
 from jcr.export.volume import write_octomap
 from jcr.geometry import apply, inverse
 from jcr.reconstruct import ReconstructOptions, reconstruct
@@ -265,7 +265,7 @@ def _fcl(
             "bench map: needs python-fcl and pyoctomap; pip install 'jcr-handeye[dev,planning]'"
         ) from None
     tree: Any = fcl
-    write_octomap(folder / "map.bt", scene, Provenance("base"), ExportOptions())
+    write_octomap(folder / "map.bt", scene, provenance("base"), ExportOptions())
     content = (folder / "map.bt").read_bytes()
     voxels = np.frombuffer(content[content.index(b"\ndata\n") + 6 :], np.int8)
     world = tree.CollisionObject(tree.OcTree(scene.cell, voxels.tolist()))

@@ -30,7 +30,7 @@ from jcr.cli import dispatch
 from jcr.errors import InputError, RejectedError
 from jcr.export import ros
 from jcr.export.formats import FORMATS, export_run
-from jcr.export.options import ExportOptions, Provenance
+from jcr.export.options import ExportOptions, provenance
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics, Tracks
 from jcr.scene.cloud import read_cloud
@@ -277,7 +277,7 @@ def test_colmap_model_reprojects_its_points_exactly(
     from jcr.export.views import write_colmap
 
     out = tmp_path / "model"
-    write_colmap(out, views, Provenance("base_link", DOUBT), ExportOptions(undistort=undistorted))
+    write_colmap(out, views, provenance("base_link", DOUBT), ExportOptions(undistort=undistorted))
     model = pycolmap.Reconstruction()
     getattr(model, read)(str(out / "sparse" / "0"))
     assert model.num_images() == 3
@@ -306,7 +306,7 @@ def test_nerfstudio_cameras_see_the_points_where_the_images_do(
     out = tmp_path / "splat"
     cloud = analytic_scene.cloud(300)
     options = ExportOptions(undistort=undistorted, link_images=not undistorted)
-    write_nerfstudio(out, views, cloud, Provenance("base_link"), options)
+    write_nerfstudio(out, views, cloud, provenance("base_link"), options)
     content = json.loads((out / "transforms.json").read_text())
     assert content["about"]["frame"] == "base_link" and content["about"]["unit"] == "m"
     assert len(content["frames"]) == 3
@@ -341,7 +341,7 @@ def test_images_rotated_by_a_tag_are_copied_upright(views: "PosedImages", tmp_pa
     source = views.folder / views.images[0]
     pixels = read_image(source)
     Image.fromarray(pixels).save(source, exif=tag)
-    write_colmap(tmp_path / "model", views, Provenance("base_link"), ExportOptions(link_images=True))
+    write_colmap(tmp_path / "model", views, provenance("base_link"), ExportOptions(link_images=True))
     copied = tmp_path / "model" / "images" / "left_0.png"
     assert not copied.is_symlink() and (copied.parent / "left_1.png").is_symlink()
     np.testing.assert_array_equal(read_image(copied), pixels[::-1, ::-1])

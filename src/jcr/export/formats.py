@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from jcr.errors import InputError, RejectedError, did_you_mean
 from jcr.export import ros
-from jcr.export.options import ExportName, ExportOptions, Provenance
+from jcr.export.options import ExportName, ExportOptions, provenance
 from jcr.files import written_whole
 from jcr.geometry import apply_similarity, scale_translation, transform
 from jcr.options import checked_options
@@ -50,15 +50,15 @@ moveit | hand_eye.launch.py | launch file as MoveIt Calibration saves it | ros.m
 urdf | hand_eye.urdf | camera link and fixed joint | ros.urdf | mount others
 easy_handeye2 | hand_eye.calib | .calib for its publisher | ros.easy_handeye2 | mount path.stem
 camera_info | camera_info.yaml | intrinsics for camera_info_manager | ros.camera_info | mount
-ply | cloud.ply | points, colours, labels | views.write_ply | cloud provenance
-glb | map.glb | mesh of the seen surface with colours | volume.write_glb | scene provenance
-octomap | map.bt | occupied, free and unknown voxels | volume.write_octomap | scene provenance options
-esdf | esdf.npz | voxels of signed distance | volume.write_esdf | scene provenance options
-spheres | spheres.npz | spheres that cover what is solid | volume.write_spheres | scene provenance options
+ply | cloud.ply | points, colours, labels | views.write_ply | cloud notes
+glb | map.glb | mesh of the seen surface with colours | volume.write_glb | scene notes
+octomap | map.bt | occupied, free and unknown voxels | volume.write_octomap | scene notes options
+esdf | esdf.npz | voxels of signed distance | volume.write_esdf | scene notes options
+spheres | spheres.npz | spheres that cover what is solid | volume.write_spheres | scene notes options
 nerfstudio | nerfstudio/ | transforms.json, images and first points for a splat or NeRF | views.write_nerfstudio | \
-    views cloud provenance options
-colmap | colmap/ | COLMAP model in the base frame, binary and text | views.write_colmap | views provenance options
-rerun | run.rrd | recording for the Rerun viewer | volume.write_rrd | views cloud scene provenance
+    views cloud notes options
+colmap | colmap/ | COLMAP model in the base frame, binary and text | views.write_colmap | views notes options
+rerun | run.rrd | recording for the Rerun viewer | volume.write_rrd | views cloud scene notes
 """
 FORMATS = tuple(
     ExportFormat(*map(str.strip, row.split("|"))) for row in _TABLE.replace("\\\n", "").strip().splitlines()
@@ -142,10 +142,10 @@ class ExportedRun:
             self.doubt = self.camera.doubt
 
     @property
-    def provenance(self) -> Provenance:
+    def notes(self) -> dict[str, str]:
         """Provenance of data in the base frame."""
         ros.require_frame_name(self.options.base_frame)
-        return Provenance(self.options.base_frame, self.doubt)
+        return provenance(self.options.base_frame, self.doubt)
 
     @property
     def mount(self) -> ros.CameraMount:

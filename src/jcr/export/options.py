@@ -53,18 +53,7 @@ class ExportOptions:
     """Link to the capture's images instead of copying them."""
 
 
-@dataclass(frozen=True)
-class Provenance:
-    """Frame of a file's numbers, and the reason of a rejection."""
-
-    frame: str
-    doubt: str | None = None
-    """The reason the calibration gives; None when it converged."""
-
-    @property
-    def notes(self) -> dict[str, str]:
-        """Frame, unit, version, and a warning where there is a doubt: each one line."""
-        about = {"frame": self.frame, "unit": "m", "made_by": f"jcr {__version__}"}
-        if self.doubt is None:
-            return about
-        return about | {"warning": f"REJECTED: {' '.join(self.doubt.split())}"}
+def provenance(frame: str, doubt: str | None = None) -> dict[str, str]:
+    """Return notes of one line each: frame, unit and version of a file, and the reason of a rejected calibration."""
+    about = {"frame": frame, "unit": "m", "made_by": f"jcr {__version__}"}
+    return about if doubt is None else about | {"warning": f"REJECTED: {' '.join(doubt.split())}"}

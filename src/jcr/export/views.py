@@ -3,7 +3,7 @@
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +17,7 @@ from PIL import Image
 from jcr.camera import pinhole_inside, project, undistort_image, unproject
 from jcr.capture.images import encode_png, read_image
 from jcr.errors import InputError
-from jcr.export.options import ExportOptions, Provenance
+from jcr.export.options import ExportOptions
 from jcr.geometry import inverse
 from jcr.records import COEFFICIENTS, Intrinsics, PointCloud, Tracks
 from jcr.scene.cloud import write_cloud
@@ -45,13 +45,13 @@ class PosedImages:
     """Points of the tracks (m)."""
 
 
-def write_ply(path: Path, cloud: PointCloud, provenance: Provenance) -> None:
+def write_ply(path: Path, cloud: PointCloud, notes: Mapping[str, str]) -> None:
     """Write the cloud as PLY with its provenance in the header."""
-    write_cloud(path, cloud, provenance.notes)
+    write_cloud(path, cloud, notes)
 
 
 def write_nerfstudio(
-    folder: Path, views: PosedImages, cloud: PointCloud, provenance: Provenance, options: ExportOptions
+    folder: Path, views: PosedImages, cloud: PointCloud, notes: Mapping[str, str], options: ExportOptions
 ) -> None:
     """Write transforms.json, images/ and points.ply (initial points of a splat) into a new folder.
 
@@ -67,11 +67,10 @@ def write_nerfstudio(
                 {"file_path": f"images/{name}", "transform_matrix": (pose @ _OPENGL_FROM_OPENCV).tolist()}
                 for name, pose in zip(names, views.base_from_camera, strict=True)
             ],
-            "about": provenance.notes
-            | {"axes": "camera x right, y up, z backward; world as the robot's base"},
+            "about": notes | {"axes": "camera x right, y up, z backward; world as the robot's base"},
         }
         (made / "transforms.json").write_text(json.dumps(content, indent=2) + "\n", "utf-8")
-        write_cloud(made / "points.ply", cloud, provenance.notes)
+        write_cloud(made / "points.ply", cloud, notes)
 
 
 def _nerfstudio_camera(intrinsics: Intrinsics) -> dict[str, str | float]:
@@ -96,7 +95,7 @@ def _nerfstudio_camera(intrinsics: Intrinsics) -> dict[str, str | float]:
     }
 
 
-def write_colmap(folder: Path, views: PosedImages, provenance: Provenance, options: ExportOptions) -> None:
+def write_colmap(folder: Path, views: PosedImages, notes: Mapping[str, str], options: ExportOptions) -> None:
     """Write images/ and sparse/0, as binary and as text, with every track into a new folder."""
     with _new_folder(folder) as made:
         names, intrinsics = _place_images(made / "images", views, options)
@@ -106,7 +105,7 @@ def write_colmap(folder: Path, views: PosedImages, provenance: Provenance, optio
         sparse.mkdir(parents=True)
         model.write_binary(str(sparse))
         model.write_text(str(sparse))
-        about = "".join(f"{name}: {text}\n" for name, text in provenance.notes.items())
+        about = "".join(f"{name}: {text}\n" for name, text in notes.items())
         (made / "README.txt").write_text(
             f"{about}COLMAP's world is that frame; cameras are world to camera.\n"
         )

@@ -3,6 +3,7 @@
 The first three query the map itself, so that they answer as `SceneMap.check_spheres` and `SceneMap.query` do.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.export.options import ExportOptions, Provenance
+from jcr.export.options import ExportOptions
 from jcr.extras import extra
 from jcr.files import write_bytes, written_whole
 from jcr.records import PointCloud
@@ -28,7 +29,7 @@ _GRIPPER_AXES_M = 0.05
 _SIGN = "positive outside of what is solid, negative inside, metres (cuRobo wants the negative)"
 
 
-def write_octomap(path: Path, scene: SceneMap, provenance: Provenance, options: ExportOptions) -> None:
+def write_octomap(path: Path, scene: SceneMap, notes: Mapping[str, str], options: ExportOptions) -> None:
     """Write a binary OctoMap (.bt) with voxels of side `voxel_size` m, by default the map's cell.
 
     A voxel is occupied when the sphere inscribed in it touches a seen surface, free when that sphere touches
@@ -46,11 +47,11 @@ def write_octomap(path: Path, scene: SceneMap, provenance: Provenance, options: 
     tree.updateNodes(centers[state == OCCUPIED], True, True)
     tree.updateInnerOccupancy()
     first, rest = tree.writeBinary().split(b"\n", 1)
-    comments = "".join(f"# {name}: {text}\n" for name, text in provenance.notes.items())
+    comments = "".join(f"# {name}: {text}\n" for name, text in notes.items())
     write_bytes(path, first + b"\n" + comments.encode() + rest)
 
 
-def write_esdf(path: Path, scene: SceneMap, provenance: Provenance, options: ExportOptions) -> None:
+def write_esdf(path: Path, scene: SceneMap, notes: Mapping[str, str], options: ExportOptions) -> None:
     """Write the signed distance at the centres of voxels of side `voxel_size` m, by default the map's cell, as .npz.
 
     Unseen space counts as occupied by default.
@@ -65,7 +66,7 @@ def write_esdf(path: Path, scene: SceneMap, provenance: Provenance, options: Exp
     dims = voxel * count
     _write_npz(
         path,
-        provenance,
+        notes,
         values=values.astype(np.float32),
         origin=centers[0, 0, 0],
         voxel_size=voxel,
@@ -76,15 +77,15 @@ def write_esdf(path: Path, scene: SceneMap, provenance: Provenance, options: Exp
     )
 
 
-def _write_npz(path: Path, provenance: Provenance, **arrays: object) -> None:
+def _write_npz(path: Path, notes: Mapping[str, str], **arrays: object) -> None:
     """Write arrays and provenance as .npz, whole or not at all."""
     with written_whole(path) as temporary, open(temporary, "wb") as stream:
         np.savez_compressed(
-            stream, allow_pickle=False, **{k: np.array(v) for k, v in (arrays | provenance.notes).items()}
+            stream, allow_pickle=False, **{k: np.array(v) for k, v in (arrays | notes).items()}
         )
 
 
-def write_spheres(path: Path, scene: SceneMap, provenance: Provenance, options: ExportOptions) -> None:
+def write_spheres(path: Path, scene: SceneMap, notes: Mapping[str, str], options: ExportOptions) -> None:
     """Write spheres that hold solid space and reach at most `excess` m beyond it as .npz: `centers` (n,3), `radii` (n,).
 
     Unseen space counts as free by default. The default excess is two of the map's cells; space is sampled in steps of
@@ -97,10 +98,10 @@ def write_spheres(path: Path, scene: SceneMap, provenance: Provenance, options: 
     points = _centers(scene.box[0], count, step)
     distance = scene.query(points.reshape(-1, 3), unknown).distance.reshape(count)
     index, radii = cover_with_spheres(distance, step, excess)
-    _write_npz(path, provenance, centers=points[tuple(index.T)], radii=radii, unknown=unknown)
+    _write_npz(path, notes, centers=points[tuple(index.T)], radii=radii, unknown=unknown)
 
 
-def write_glb(path: Path, scene: SceneMap, provenance: Provenance) -> None:
+def write_glb(path: Path, scene: SceneMap, notes: Mapping[str, str]) -> None:
     """Write the seen surface with vertex colours as binary glTF.
 
     Its vertices are those of the robot's frame, z up, as planners load them; glTF's own viewers take y for up and
@@ -109,7 +110,7 @@ def write_glb(path: Path, scene: SceneMap, provenance: Provenance) -> None:
     vertices, faces, colors = surface_mesh(scene)
     mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
     axes = {"axes": "the robot's, z up (not rotated to glTF's y up)"}
-    exported = trimesh.Scene({"map": mesh}, metadata=provenance.notes | axes).export(file_type="glb")
+    exported = trimesh.Scene({"map": mesh}, metadata=notes | axes).export(file_type="glb")
     assert isinstance(exported, bytes)
     write_bytes(path, exported)
 
@@ -138,7 +139,7 @@ def write_rrd(
     views: "PosedImages",
     cloud: PointCloud,
     scene: SceneMap,
-    provenance: Provenance,
+    notes: Mapping[str, str],
 ) -> None:
     """Write a .rrd; raise InputError without rerun-sdk, which is 500 MB and therefore an extra of its own."""
     rr: Any = extra("rerun", "rerun", "a .rrd file")
@@ -147,7 +148,7 @@ def write_rrd(
     with written_whole(path) as temporary:
         recording = rr.RecordingStream("jcr")
         recording.save(temporary)
-        about = "\n".join(f"{name}: {text}" for name, text in provenance.notes.items())
+        about = "\n".join(f"{name}: {text}" for name, text in notes.items())
         recording.log("about", rr.TextDocument(about), static=True)
         recording.log("base", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         recording.log("base/cloud", rr.Points3D(cloud.points_in_base, colors=cloud.color), static=True)
