@@ -35,8 +35,18 @@ from jcr.rounding import significant
 PACKAGE = "jcr.live"
 PARTS = ("head", "next", "course", "images")
 """Templates of the parts that change, each in an element of this name."""
+LAYERS = {
+    "cameras": "cameras",
+    "grippers": "grippers",
+    "grid": "base and grid",
+    "next": "next pose (green)",
+    "tracks": "points of the scene (red)",
+}
+"""Parts of the 3D view and their labels."""
 ANY_CAMERA = Intrinsics(600.0, 600.0, 320.0, 240.0, 640, 480)
 """Camera that is drawn where no intrinsics are known."""
+BOUNDS = ("Point uncertainty", " mm"), ("Direction", "°")
+"""Names and units of the two bounds of the errors."""
 NOW_PX, CARD_PX = 640, 330
 """Width of the camera's image and of the images in the list."""
 FEW_FEATURES = 150
@@ -45,9 +55,7 @@ FEW_FEATURES = 150
 
 def whole_page(session: LiveSession) -> str:
     """Return the page as a browser loads it; its script requests the parts after that."""
-    names = ("cameras", "grippers", "grid", "next", "tracks")
-    shown = ("cameras", "grippers", "base and grid", "next pose (green)", "points of the scene (red)")
-    checks = [(name, label, True) for name, label in zip(names, shown, strict=True)]
+    checks = [(name, label, True) for name, label in LAYERS.items()]
     view = {"layers": [], "checks": checks, "through": [], "labels": [], "data": _scene(session.state)}
     content = {"folder": str(session.folder.folder), "scene": Section("view", view)}
     return render("live.html", content, PACKAGE)
@@ -104,9 +112,10 @@ def _is_proposed(state: SessionState) -> bool:
 
 def _cards(state: SessionState) -> list[dict[str, Any]]:
     """Return the images of the list: number in commands, file, finding about it, and whether it is registered."""
-    progress = state.progress
-    one_image = [one for one in progress.findings if len(one.images) == 1 and one.severity != "informs"]
-    against = {one.images[0]: sentence(one) for one in one_image[::-1]}
+    progress, against = state.progress, dict[str, str]()
+    for one in progress.findings[::-1]:
+        if len(one.images) == 1 and one.severity != "informs":
+            against[one.images[0]] = sentence(one)
     registered = dict.fromkeys(progress.images, "not registered")
     registered |= dict.fromkeys(progress.registered, "registered")
     return [
@@ -149,17 +158,12 @@ def _tiles(state: SessionState, required: tuple[float, float]) -> list[Tile]:
     """Return the accuracies beside what is required, at the end those of all images, and the registered images."""
     if not state.images:
         return []
-    found = None if state.result is None else state.result.calibration.requirement
-    reached, now = (), state.progress.now
-    if found is not None:
+    tiles, now = list[Tile](), state.progress.now
+    reached = () if now is None else (now.translation_mm, now.rotation_deg)
+    if state.result is not None and (found := state.result.calibration.requirement) is not None:
         reached = found.reached_mm, found.reached_deg
-    elif now is not None:
-        reached = now.translation_mm, now.rotation_deg
-    names, units = ("Point uncertainty, 95 %", "Direction, 95 %"), (" mm", "°")
-    tiles: list[Tile] = [
-        (name, f"± {significant(value)}{unit}", f"required {limit:g}{unit}", True)
-        for name, value, limit, unit in zip(names, reached, required, units, strict=False)
-    ]
+    for (name, unit), value, limit in zip(BOUNDS, reached, required, strict=False):
+        tiles.append((f"{name}, 95 %", f"± {significant(value)}{unit}", f"required {limit:g}{unit}", True))
     count = f"{len(state.progress.registered)} of {len(state.images)}"
     tiles.append(("Images registered", count, "", False))
     if (error := state.progress.leave_one_out) is not None:
@@ -172,12 +176,11 @@ def _courses(progress: Progress, required: tuple[float, float]) -> list[Figure]:
     """Return figures of the accuracy after each image."""
     if len(history := progress.history) < 2:
         return []
-    count, mm, deg = zip(
-        *((one.images, one.translation_mm, one.rotation_deg) for one in history), strict=True
-    )
+    count = [one.images for one in history]
+    values = [one.translation_mm for one in history], [one.rotation_deg for one in history]
     return [
-        course_figure("Point uncertainty (mm)", list(count), list(mm), required[0], " mm"),
-        course_figure("Direction (°)", list(count), list(deg), required[1], "°"),
+        course_figure(f"{name} ({unit.strip()})", count, value, limit, unit)
+        for (name, unit), value, limit in zip(BOUNDS, values, required, strict=True)
     ]
 
 
@@ -186,16 +189,12 @@ def _scene(state: SessionState) -> dict[str, Any]:
     progress, found = state.progress, state.progress.hand_eye
     x = np.eye(4) if found is None else found.gripper_from_camera
     faults_of = {one["name"]: one["fault"] for one in _cards(state)}
-    views = [
-        scene_view(
-            Path(one.image).name,
-            faults_of[one.image] or one.image,
-            not faults_of[one.image],
-            one.base_from_gripper,
-            one.base_from_gripper @ x if found is not None and one.image in progress.registered else None,
-        )
-        for one in state.images
-    ]
+    views = []
+    for one, fault in ((one, faults_of[one.image]) for one in state.images):
+        is_placed = found is not None and one.image in progress.registered
+        camera = one.base_from_gripper @ x if is_placed else None
+        name = Path(one.image).name
+        views.append(scene_view(name, fault or one.image, not fault, one.base_from_gripper, camera))
     points = np.zeros((0, 3)) if progress.points_in_base is None else progress.points_in_base
     proposed = progress.next_pose if _is_proposed(state) else None
     next_poses = [] if proposed is None else [proposed.base_from_gripper]

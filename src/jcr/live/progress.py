@@ -152,12 +152,11 @@ def progress_lines(state: Progress, notation: Notation) -> list[str]:
     """Return the state as lines of the terminal, the next pose in the notation of the arm."""
     if state.hand_eye is None and len(state.images) <= 1:
         return [FIRST_ADVICE]
-    lines = [accuracy_line(state)]
+    below = finding_lines(state)
     if (error := state.leave_one_out) is not None:
-        lines.append(
-            f"  leave-one-out error {significant(error.translation_mm)} mm and {significant(error.rotation_deg)}°"
-        )
-    lines += [f"  {line}" for line in finding_lines(state)]
+        mm, deg = significant(error.translation_mm), significant(error.rotation_deg)
+        below.insert(0, f"leave-one-out error {mm} mm and {deg}°")
+    lines = [accuracy_line(state), *(f"  {line}" for line in below)]
     if state.requirement_met:
         return [*lines, REQUIREMENT_MET]
     if state.next_pose is not None:
