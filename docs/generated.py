@@ -37,7 +37,7 @@ FORMATS = {
         "The hand-eye transform, its covariance, and what was made of each image.",
     ),
     "cameras.json": (CamerasFile, "Further cameras and arms of the cell, where there are some."),
-    "run.json": (RunState, "The state of a run folder: capture, options, fingerprint of the reconstruction."),
+    "run.json": (RunState, "The state of a run folder: capture, options, and what each stage was made from."),
     "depth.npz": (
         DepthAbout,
         "The array `about` in it, as JSON; other arrays have the names of [Pointmaps](api.md#jcrpointmaps). "

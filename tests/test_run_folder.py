@@ -5,7 +5,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -14,9 +14,11 @@ from corpus import sound_run
 from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.files import locked
+from jcr.pipeline import selection
+from jcr.pipeline.run import calibrate
 from jcr.pipeline.stages import begun, complete, is_unchanged
 from jcr.records import Capture, CellCamera
-from jcr.result import RunOptions
+from jcr.result import RunOptions, RunResult
 
 
 @pytest.fixture(scope="module")
@@ -141,3 +143,24 @@ def test_a_second_run_in_the_same_folder_is_refused(tmp_path: Path):
         pytest.fail("two runs write the same folder")
     # The folder, into which nothing came, is gone with its lock.
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_kill_during_the_calibration_does_not_lose_the_reconstruction_of_a_named_back_end(
+    small_capture: Path, small_done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    made = RunResult(small_done).reconstruction
+
+    def killed(*_: object) -> NoReturn:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(selection, "reconstruct", lambda *_: made)
+        patched.setattr(selection, "calibrate", killed)
+        with pytest.raises(KeyboardInterrupt):
+            calibrate(str(small_capture), tmp_path / "out", backend="colmap")
+    assert (tmp_path / "out" / "reconstruction.npz").is_file()
+    monkeypatch.setattr(selection, "reconstruct", lambda *_: pytest.fail("reconstructed again"))
+    result = calibrate(str(small_capture), tmp_path / "out", backend="colmap")
+    before = RunResult(small_done).gripper_from_camera
+    np.testing.assert_allclose(result.gripper_from_camera, before, atol=1e-9)
