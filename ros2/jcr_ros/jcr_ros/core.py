@@ -239,7 +239,7 @@ class Calibrator:
             f"camera at {offset} mm on {self.settings.parent}, sigma {1e3 * std[:3].max():.2g} mm and "
             f"{np.degrees(std[3:6].max()):.2g} deg; {result.verdict}"
         )
-        reasons = "" if result.converged else f": {'; '.join(result.hand_eye.warnings)}"
+        reasons = "" if result.converged else f": {'; '.join(result.warnings)}"
         self.outcome = result.converged, line + reasons
         if result.converged:
             self.broadcast(x)

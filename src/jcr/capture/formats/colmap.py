@@ -25,25 +25,14 @@ if TYPE_CHECKING:
     import pycolmap
 
 _PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap")
-_COEFFICIENTS = {
-    "SIMPLE_PINHOLE": (),
-    "PINHOLE": (),
-    "SIMPLE_RADIAL": ("k1",),
-    "RADIAL": ("k1", "k2"),
-    "OPENCV": ("k1", "k2", "p1", "p2"),
-    "FULL_OPENCV": COEFFICIENTS["rational"],
-    "OPENCV_FISHEYE": COEFFICIENTS["fisheye"],
-}
-"""Coefficients in the parameters of the known camera models of COLMAP."""
+_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
+"""Camera models of COLMAP whose distortion is one of jcr's."""
 
 
 def find_model(path: Path) -> Path | None:
     """Return the folder of a COLMAP model in or at a folder; None where there is none."""
-    places = [path / place for place in _PLACES]
-    return next(
-        (place for place in places if any((place / f"cameras.{end}").is_file() for end in ("bin", "txt"))),
-        None,
-    )
+    files = (path / place / f"cameras.{end}" for place in _PLACES for end in ("bin", "txt"))
+    return next((file.parent for file in files if file.is_file()), None)
 
 
 def read(path: Path, options: ReadOptions) -> Capture:
@@ -111,24 +100,24 @@ def read_intrinsics(folder: Path, size: tuple[int, int], names: Collection[str] 
     model = read_model(folder)
     images = [model.image(k) for k in model.reg_image_ids()]
     cameras = [model.camera(one.camera_id) for one in images if names is None or one.name in names]
-    kinds = {(one.model.name, one.width, one.height, *map(float, one.params)) for one in cameras}
+    kinds = {
+        (one.model.name, one.params_info, one.width, one.height, *map(float, one.params)) for one in cameras
+    }
     if len(kinds) != 1:
         raise InputError(
             f"{folder}: {len(kinds)} different cameras; reconstruct with a single camera (--ImageReader.single_camera)"
         )
-    ((name, width, height, *params),) = kinds
-    if name not in _COEFFICIENTS:
+    ((name, names_of_params, width, height, *params),) = kinds
+    if name not in _MODELS:
         raise InputError(
             f"{folder}: camera model {name}, which jcr does not know; run colmap image_undistorter"
         )
-    if len(params) == 3 + len(_COEFFICIENTS[name]):  # one focal length
-        params = [params[0], *params]
-    fx, fy, cx, cy, *rest = params
-    value = dict(zip(_COEFFICIENTS[name], rest, strict=True))
+    value = dict(zip(names_of_params.split(", "), params, strict=True))
+    value = {"fx": value.get("f"), "fy": value.get("f"), "k1": value.get("k", 0.0)} | value
     distortion: DistortionModel = (
-        "fisheye" if "FISHEYE" in name else "rational" if any(rest[5:]) else "pinhole"
+        "fisheye" if "FISHEYE" in name else "rational" if any(params[9:]) else "pinhole"
     )
-    parameters = (fx, fy, cx - HALF_PIXEL, cy - HALF_PIXEL)
+    parameters = (value["fx"], value["fy"], value["cx"] - HALF_PIXEL, value["cy"] - HALF_PIXEL)
     coefficients = [value.get(key, 0.0) for key in COEFFICIENTS[distortion]]
     where = str(folder), "cameras"
     return checked_intrinsics(parameters, coefficients, distortion, (width, height), size, where)

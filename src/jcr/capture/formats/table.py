@@ -33,17 +33,12 @@ _STAMP = ("timestamp", "stamp", "time", "t")
 _SHOWN: tuple[ConventionName, ...] = ("quat-xyzw", "rpy", "kuka", "fanuc", "abb", "matrix")
 """Conventions that the names of columns give away; rx, ry, rz may be a rotation vector or angles."""
 _LAST_ROW = {"m30": "0", "m31": "0", "m32": "0", "m33": "1"}
-_PREFIXES = {
-    "{axis}": ("t", "t_", "p", "p_", "pos_", "position_", "translation_"),
-    "q{axis}": ("q_", "quat_", "quaternion_", "orientation_", "rotation_"),
-    "r{axis}": ("rvec_", "rotvec_", "r_", "ur_"),
-}
 _ALIASES = {
-    f"{prefix}{axis}": name.format(axis=axis)
-    for name, prefixes in _PREFIXES.items()
-    for prefix in prefixes
-    for axis in ("xyzw" if name == "q{axis}" else "xyz")
+    re.compile(r"(?:[tp]_?|pos_|position_|translation_)([xyz])"): r"\1",
+    re.compile(r"(?:q|quat|quaternion|orientation|rotation)_([xyzw])"): r"q\1",
+    re.compile(r"(?:rvec|rotvec|r|ur)_([xyz])"): r"r\1",
 }
+"""Usual names of the columns of a position, a quaternion and a rotation vector."""
 _EXPLICIT: dict[str, ConventionName] = {
     "ur_x": "ur", "rvec_x": "rotation-vector", "rotvec_x": "rotation-vector",
 }  # fmt: skip
@@ -304,7 +299,8 @@ def _name_and_unit(cell: str) -> tuple[str, str]:
     plain = re.sub(r"[\s.]+", "_", cell.strip().strip('"').lower()).strip("_")
     match = _UNIT.match(plain)
     name, unit = match.groups() if match else (plain, "")
-    return _ALIASES.get(name, name), unit
+    matches = ((pattern.fullmatch(name), usual) for pattern, usual in _ALIASES.items())
+    return next((match.expand(usual) for match, usual in matches if match), name), unit
 
 
 FORMAT = Format(
