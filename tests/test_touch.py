@@ -64,21 +64,18 @@ def test_a_tip_that_is_off_is_named_by_status_3_and_its_mean(
     assert printed["mean_mm"][2] == pytest.approx(20, abs=3) and printed["p"] < 1e-3
 
 
-@pytest.mark.parametrize(
-    ("text", "what"),
-    [
-        ("image, x_px\n", "has no column y_px, x_m"),
-        ("image, x_px, y_px, x_m, y_m, z_m\nimages/0.png, 1, 2, a, 0, 0\n", "line 2"),
-        ("image, x_px, y_px, x_m, y_m, z_m\nimages/0.png, 1, 2, 300, 0, 0\n", "in metres"),
-        ("image, x_px, y_px, x_m, y_m, z_m\n", "0 points; touch 3 or more"),
-        (
-            "image, x_px, y_px, x_m, y_m, z_m\n" + 3 * "nothing.png, 1, 2, 0, 0, 0\n",
-            "not among the registered",
-        ),
-    ],
-)
-def test_what_is_no_list_of_touched_points_is_refused(done: Path, tmp_path: Path, text: str, what: str):
-    path = tmp_path / "points.csv"
-    path.write_text(text)
-    with pytest.raises(InputError, match=what):
-        touch(done, path)
+HEADER = "image, x_px, y_px, x_m, y_m, z_m\n"
+FAULTS = {
+    "has no column y_px, x_m": "image, x_px\n",
+    "line 2": f"{HEADER}images/0.png, 1, 2, a, 0, 0\n",
+    "in metres": f"{HEADER}images/0.png, 1, 2, 300, 0, 0\n",
+    "0 points; touch 3 or more": HEADER,
+    "not among the registered": HEADER + 3 * "nothing.png, 1, 2, 0, 0, 0\n",
+}
+
+
+@pytest.mark.parametrize("words", FAULTS)
+def test_what_is_no_list_of_touched_points_is_refused(done: Path, tmp_path: Path, words: str):
+    (tmp_path / "points.csv").write_text(FAULTS[words])
+    with pytest.raises(InputError, match=words):
+        touch(done, tmp_path / "points.csv")
