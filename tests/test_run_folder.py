@@ -10,13 +10,18 @@ from typing import Any, NoReturn
 import numpy as np
 import pytest
 
+import capture_writers as writers
 from corpus import sound_run
+from jcr.capture.formats.capture_json import kept
+from jcr.capture.images import encode_png
+from jcr.capture.read import read_capture
 from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.files import locked
-from jcr.pipeline import selection
+from jcr.pipeline import selection, verify
 from jcr.pipeline.run import calibrate
 from jcr.pipeline.stages import begun, complete, is_unchanged
+from jcr.reconstruct import ReconstructOptions
 from jcr.records import Capture, CellCamera
 from jcr.result import RunOptions, RunResult
 
@@ -164,3 +169,45 @@ def test_a_kill_during_the_calibration_does_not_lose_the_reconstruction_of_a_nam
     result = calibrate(str(small_capture), tmp_path / "out", backend="colmap")
     before = RunResult(small_done).gripper_from_camera
     np.testing.assert_allclose(result.gripper_from_camera, before, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_verify_reconstructs_with_the_options_of_the_run(
+    small_capture: Path, small_done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    out = shutil.copytree(small_done, tmp_path / "out")
+    content = json.loads((out / "run.json").read_text())
+    content["options"]["reconstruct"] |= {"backend": "colmap", "seed": 7}
+    (out / "run.json").write_text(json.dumps(content))
+
+    def reconstruct(capture: Capture, options: ReconstructOptions, progress: object) -> NoReturn:
+        assert (options.backend, options.seed) == ("colmap", 7)
+        raise InterruptedError
+
+    monkeypatch.setattr(verify, "register", lambda made, then, now: [0] * len(now))  # another scene
+    monkeypatch.setattr(verify, "_new_images", lambda *_: ([None] * 5, [None] * 5))
+    monkeypatch.setattr(verify, "reconstruct", reconstruct)
+    with pytest.raises(InterruptedError):
+        verify.verify_run(out, small_capture)
+
+
+def test_a_table_with_depth_images_is_copied_once_and_read_again_where_one_changed(
+    small_capture: Path, tmp_path: Path
+):
+    table, out = tmp_path / "table", tmp_path / "out"
+    writers.write_table(table, read_capture(small_capture))
+    (table / "depth").mkdir()
+    for image in (small_capture / "images").iterdir():
+        (table / "depth" / f"{image.stem}.png").write_bytes(encode_png(np.full((150, 200), 600, np.uint16)))
+
+    def begin() -> RunResult:
+        return begun(out, kept(read_capture(table), out / "capture"), RunOptions(map=None))
+
+    complete(begin())
+    (depth,) = (out / "capture").rglob("00.png")
+    (out / "report.html").write_text("")
+    complete(begin())
+    stamp = depth.stat().st_mtime_ns
+    assert is_unchanged(begin()) and depth.stat().st_mtime_ns == stamp
+    (table / "depth" / "00.png").write_bytes(encode_png(np.full((150, 200), 700, np.uint16)))
+    assert not is_unchanged(begin()) and depth.stat().st_mtime_ns > stamp
