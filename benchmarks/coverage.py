@@ -17,20 +17,21 @@ from benchmarks.peers import opencv
 from benchmarks.references import nine_pixels, placed
 from jcr.calibration.adjust import adjust_images
 from jcr.calibration.case import of_images
+from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.record import Calibration
 from jcr.calibration.requirement import assumptions_of, reached
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate, fit_poses
 from jcr.camera import parameters, with_parameters
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
-from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.estimation.intrinsics_prior import ESTIMATED, camera_with_prior
 from jcr.estimation.point_uncertainty import point_covariance, within_95
 from jcr.estimation.prediction import predict
-from jcr.estimation.wrist import adjust_wrist, estimate_of
+from jcr.estimation.wrist import adjust_wrist, recon_frame, uncertainty_of
 from jcr.geometry import step_between
 from jcr.pipeline.check import spread_rows
-from jcr.records import Capture, HandEye, Intrinsics, Reconstruction
+from jcr.records import Capture, Intrinsics, Reconstruction
 from simulation.arms import PresetName
 from simulation.problems import INTRINSICS, BentProblem, bent_problem, error, observed
 
@@ -45,13 +46,13 @@ BENT = Intrinsics(450.0, 449.0, 322.0, 236.0, 640, 480, (0.1, -0.3, 0.5, -0.4), 
 FACTOR = 2.0
 """Ratio of predicted and reported uncertainty that counts as agreement."""
 WHITE, PEER = "white noise alone", "OpenCV Park, scale given"
-SOLVERS: dict[str, Callable[[BentProblem], HandEye]] = {
-    "joints known": lambda p: fit_hand_eye(
+SOLVERS: dict[str, Callable[[BentProblem], Calibration]] = {
+    "joints known": lambda p: solve_hand_eye(
         p.base_from_gripper, p.recon_from_camera, joints=p.joints, robot=p.bent.arm
     ),
-    "robot given": lambda p: fit_hand_eye(p.base_from_gripper, p.recon_from_camera, robot=p.bent.arm),
-    "nothing known": lambda p: fit_hand_eye(p.base_from_gripper, p.recon_from_camera),
-    WHITE: lambda p: fit_hand_eye(
+    "robot given": lambda p: solve_hand_eye(p.base_from_gripper, p.recon_from_camera, robot=p.bent.arm),
+    "nothing known": lambda p: solve_hand_eye(p.base_from_gripper, p.recon_from_camera),
+    WHITE: lambda p: solve_hand_eye(
         p.base_from_gripper, p.recon_from_camera, systematic=np.zeros((6 * len(p.joints), 6 * len(p.joints)))
     ),
 }
@@ -198,18 +199,17 @@ def _seen_row(preset: PresetName, count: int, known: Knowledge, draws: int) -> S
         tracks = observed(problem, rng, POINTS, PIXEL_STD, known.camera)
         if len(tracks.image) < 100 * count:
             continue
-        solved = fit_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
-        fit = solved.gripper_from_camera, solved.scale, solved.base_from_recon
+        solved = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+        fit = solved.gripper_from_camera, solved.scale, solved.base_from_recon.rigid
         start = known.start(rng)
         free = camera_with_prior(start) if known.is_given else camera_with_prior(start, ESTIMATED)
         found = adjust_wrist(problem.base_from_gripper, fit, problem.recon_from_camera, free, tracks)
-        estimate = estimate_of(found, tracks)
-        assert estimate.intrinsics is not None
+        scale, camera = recon_frame(found, tracks)[0], found.problem.intrinsics(found.state)[0]
         # Errors of points in axes of the estimated camera, and their stated covariance.
-        x, x_px = estimate.gripper_from_camera, nine_pixels(known.camera)
-        there = placed(x, estimate.intrinsics, x_px, DISTANCE_M * estimate.scale / problem.scale)
+        x, x_px = found.state.x[0], nine_pixels(known.camera)
+        there = placed(x, camera, x_px, DISTANCE_M * scale / problem.scale)
         off = (placed(problem.gripper_from_camera, known.camera, x_px, DISTANCE_M) - there) @ x[:3, :3]
-        covariance = point_covariance(estimate, estimate.intrinsics, x_px, DISTANCE_M)
+        covariance = point_covariance(x, uncertainty_of(found), camera, x_px, DISTANCE_M)
         three.append((np.abs(off) < 3 * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))).all(1))
         lengths.append(np.linalg.norm(off, axis=1))
         stated.append([within_95(one) for one in covariance])
@@ -231,12 +231,11 @@ def predicted(draws: int = PREDICTED_DRAWS) -> Float[ndarray, "k 3"]:
         robot, rows = robot_errors(capture, options), spread_rows(len(capture))
         case = adjust_images(fit_poses(capture, _only(reconstruction, rows), options, robot.of(rows)))
         hand_eye = calibrate(capture, reconstruction, options)
-        if not (hand_eye.converged and case.hand_eye.converged) or hand_eye.in_use is None:
+        if not (hand_eye.converged and case.hand_eye.converged):
             continue
         prediction = predict(assumptions_of(case), capture.base_from_gripper, robot.systematic)
         foretold, reported = (
-            (reached(one, use, "seen")[0], *reached(one, use, "camera"))
-            for one, use in ((prediction.estimate, prediction.in_use), (hand_eye, hand_eye.in_use))
+            (reached(one, "seen")[0], *reached(one, "camera")) for one in (prediction, hand_eye.uncertainty)
         )
         ratios.append(np.divide(foretold, reported))
     return np.reshape(ratios, (-1, 3))

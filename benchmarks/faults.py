@@ -20,11 +20,11 @@ from scipy.special import chdtrc
 import jcr
 from benchmarks.page import mm_deg, squared_distance, table
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.record import Calibration
 from jcr.calibration.stage import calibrate
 from jcr.errors import InputError, RejectedError
 from jcr.findings import FindingKind, kinds_of
 from jcr.geometry import step_between
-from jcr.records import HandEye
 from simulation import image_faults as make
 from simulation.faults import Faults, FaultyCapture, faulty_capture, reconstructed
 from simulation.image_faults import IMAGES as FEW_IMAGES
@@ -195,13 +195,13 @@ def calibrated(
     images: int = IMAGES,
     given: bool = True,
     options: CalibrateOptions | None = None,
-) -> tuple[FaultyCapture, HandEye]:
+) -> tuple[FaultyCapture, Calibration]:
     """Draw a capture of observations with these faults and calibrate it."""
     found = faulty_capture(np.random.default_rng([seed, images]), images, faults)
     return found, calibrate(*reconstructed(found, not given), options)
 
 
-def outcome(found: FaultyCapture, hand_eye: HandEye) -> Outcome:
+def outcome(found: FaultyCapture, hand_eye: Calibration) -> Outcome:
     """Compare a calibration with the camera's place before and after a slip, whichever is farther."""
     return _judged(hand_eye, (found.gripper_from_camera, found.gripper_from_camera_after), frozenset())
 
@@ -216,12 +216,14 @@ def through_images(seed: int, fault: ImageFault, given: bool) -> Outcome:
             return Outcome(False, refused=True)
         except RejectedError:
             return Outcome(False, frozenset({FindingKind.NO_RECONSTRUCTION}))
-    used = result.reconstruction.image_index[result.hand_eye.inliers].tolist()
+    used = result.reconstruction.image_index[result.found.inliers].tolist()
     left_out = frozenset(range(len(capture.images))) - set(used)
-    return _judged(result.hand_eye, capture.gripper_from_camera, left_out)
+    return _judged(result.found, capture.gripper_from_camera, left_out)
 
 
-def _judged(hand_eye: HandEye, truths: Iterable[Float[ndarray, "4 4"]], left_out: frozenset[int]) -> Outcome:
+def _judged(
+    hand_eye: Calibration, truths: Iterable[Float[ndarray, "4 4"]], left_out: frozenset[int]
+) -> Outcome:
     """Compare a calibration with the truth that is farthest from it."""
     covariance = hand_eye.covariance[:6, :6]
     std = np.sqrt(np.diag(covariance))

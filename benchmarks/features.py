@@ -61,7 +61,7 @@ def _row(folder: Path, features: FeatureName, gate: bool, way: str) -> tuple[boo
         pass
     seconds, numbers = time.perf_counter() - begun, ["", "", ""]
     if hand_eye is not None:
-        left_out = np.nan if hand_eye.leave_one_out is None else 1e3 * hand_eye.leave_one_out.length_m
+        left_out = np.nan if hand_eye.held_out is None else 1e3 * hand_eye.held_out.length_m
         numbers = [*map(number, (left_out, *largest_std(hand_eye.covariance)))]
     accepted = hand_eye is not None and hand_eye.converged
     verdict = "yes" if accepted else "no"

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from benchmarks.page import apart, squared_distance, table
-from jcr.estimation.hand_eye import fit_hand_eye
+from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.extras import extra
 from jcr.geometry import step_between
 
@@ -84,7 +84,7 @@ def _solved(recorded: object, monocular: bool) -> dict[str, Result]:
     data = gripper, camera, relative_motions(gripper, pairs), relative_motions(camera, pairs)
     true = recorded.X  # type: ignore[attr-defined]
     # Camera poses of boards are in metres.
-    own = fit_hand_eye(gripper, camera, scale=None if monocular else 1.0)
+    own = solve_hand_eye(gripper, camera, scale=None if monocular else 1.0)
     squared = squared_distance(step_between(own.gripper_from_camera, true), own.covariance[:6, :6])
     found = {OURS: Result(*apart(own.gripper_from_camera, true), float(squared), own.converged)}
     for name, solve in SOLVERS.items():

@@ -175,12 +175,12 @@ def run_of(cell: Cell, way: str) -> Run:
                 break
         live.close()
     found = state.hand_eye
-    assert found is not None and state.now is not None and found.in_use is not None
+    assert found is not None and state.now is not None and found.uncertainty.seen is not None
     # The truth is the effective transform about the postures of the capture.
     draw, each = np.random.default_rng([cell.seed, 80]), -(-EFFECTIVE_POSES // len(visited))
     around = np.concatenate([about_posture(arm, posture, each, draw) for posture in visited])
     effective = effective_fit(cell.arm, around, (cell.physical, np.eye(4))).gripper_from_camera
-    x, ahead = found.gripper_from_camera, np.array([0.0, 0.0, 1e-3 * found.in_use.seen.distance_mm])
+    x, ahead = found.gripper_from_camera, np.array([0.0, 0.0, 1e-3 * found.uncertainty.seen.distance_mm])
     mm = 1e3 * float(np.linalg.norm(apply(x, ahead) - apply(effective, ahead)))
     deg = float(np.degrees(rotation_angle(x[:3, :3].T @ effective[:3, :3])))
     is_true = mm <= REQUIRE[0] and deg <= REQUIRE[1]

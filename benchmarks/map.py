@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 
 from benchmarks.page import of_rows, table
 from benchmarks.peers import WEBCAM
+from jcr.calibration.record import Calibration
 from jcr.calibration.stage import calibrate
 from jcr.camera import project
 from jcr.capture.read import read_capture
@@ -27,7 +28,7 @@ from jcr.export.options import ExportOptions, provenance
 from jcr.export.volume import write_octomap
 from jcr.geometry import apply, inverse
 from jcr.reconstruct import ReconstructOptions, reconstruct
-from jcr.records import HandEye, PointCloud, Reconstruction
+from jcr.records import PointCloud, Reconstruction
 from jcr.scene.build import build_scene
 from jcr.scene.cloud import point_cloud
 from jcr.scene.options import MapOptions
@@ -305,7 +306,7 @@ def _depth(folder: Path) -> list[str]:
 
 
 def covered(
-    found: Reconstruction, hand_eye: HandEye, truth: Truth
+    found: Reconstruction, hand_eye: Calibration, truth: Truth
 ) -> tuple[Bool[ndarray, "k 3"], Bool[ndarray, " k"]]:
     """Return, of places that two images show, which are within each limit of a pointmap, and which are on the table."""
     surface = surface_in_workspace(truth)
@@ -313,7 +314,9 @@ def covered(
     x = surface.x_in_base[drawn]
     asked = np.sum([np.abs(z - depth) < SEES for z, depth in _depths(truth, x)], axis=0) > 1
     points = hand_eye.scale * found.dense.points_in_recon[found.dense.confidence > 0].astype(np.float64)
-    distance = KDTree(apply(hand_eye.base_from_recon, points)).query(x[asked], distance_upper_bound=0.011)[0]
+    distance = KDTree(apply(hand_eye.base_from_recon.rigid, points)).query(
+        x[asked], distance_upper_bound=0.011
+    )[0]
     return 1e3 * distance[:, None] <= LIMITS_MM, (surface.label[drawn] == 1)[asked]
 
 

@@ -14,10 +14,10 @@ from numpy import ndarray
 
 from benchmarks.page import apart, mm_deg, table
 from jcr.calibration.case import of_images
+from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
-from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.estimation.wrist import adjust_wrist, recon_frame
 from jcr.geometry import (
     apply_similarity,
@@ -121,11 +121,11 @@ PAPER_SOLVERS: dict[str, Callable[[Poses, Poses], Answer]] = {
 def _answers(problem: HandEyeProblem, seed: int) -> Iterator[tuple[str, Answer | None]]:
     """Yield the answer of every method, None where one of OpenCV's gives up, as some do with wrong poses."""
     gripper, camera = problem.base_from_gripper, problem.recon_from_camera
-    solved = fit_hand_eye(gripper, camera)
+    solved = solve_hand_eye(gripper, camera)
     yield "jcr, poses only", (solved.gripper_from_camera, solved.scale)
     used = solved.inliers
     tracks = of_images(observed(problem, np.random.default_rng(seed), 300, 0.3), used)
-    fit = solved.gripper_from_camera, solved.scale, solved.base_from_recon
+    fit = solved.gripper_from_camera, solved.scale, solved.base_from_recon.rigid
     adjusted = adjust_wrist(gripper[used], fit, camera[used], INTRINSICS, tracks)
     yield "jcr, bundle adjustment", (adjusted.state.x[0], recon_frame(adjusted, tracks)[0])
     for name, solve in PAPER_SOLVERS.items():

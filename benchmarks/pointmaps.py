@@ -74,7 +74,7 @@ def end_to_end(images: int, seed: int, noise: tuple[float, float]) -> EndToEnd:
     assert result.scene is not None
     distance = np.abs(np.asarray(result.scene.query(x[:: max(1, len(x) // 20_000)]).distance))
     centers = result.reconstruction.recon_from_camera[:, :3, 3]
-    true_scale, found = fit_similarity(truth.base_from_camera[:, :3, 3], centers)[1], result.hand_eye
+    true_scale, found = fit_similarity(truth.base_from_camera[:, :3, 3], centers)[1], result.found
     step = step_between(found.gripper_from_camera, truth.gripper_from_camera)
     off = np.r_[step, np.log(true_scale / found.scale)]
     return EndToEnd(

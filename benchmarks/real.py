@@ -29,14 +29,15 @@ from benchmarks.references import (
     placed_covariance,
     reference,
 )
+from jcr.calibration.record import Calibration
 from jcr.camera import parameters, project, unproject, with_parameters
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, RejectedError
-from jcr.estimation.point_uncertainty import joint_covariance, point_covariance, within_95
+from jcr.estimation.point_uncertainty import point_covariance, within_95
 from jcr.geometry import inverse, nearest_to_lines, retract, rotation_exp, rotation_log, transform
 from jcr.pipeline.run import RunOptions, calibrate
 from jcr.reconstruct import ReconstructOptions
-from jcr.records import Capture, HandEye, Intrinsics
+from jcr.records import Capture, Intrinsics
 from jcr.result import RunResult
 
 WORST_PX = 2.0
@@ -209,13 +210,13 @@ def _row(
             None,
             [*head, f"0 of {len(capture)}", "rejected", *[""] * 6, number(seconds)],
         )
-    found, held_out, verdict = result.hand_eye, result.calibration.held_out, result.calibration.verdict or ""
+    found, held_out, verdict = result.found, result.calibration.held_out, result.calibration.verdict or ""
     apart = None if known is None else _apart(found, known)
     if board is None:
         head[1] += f" ({result.calibration.backend})"
     values = (
         *((None, None) if apart is None else apart[:2]),
-        None if found.in_use is None else found.in_use.seen.within_95_mm,
+        None if found.uncertainty.seen is None else found.uncertainty.seen.within_95_mm,
         *largest_std(found.covariance),
         None if held_out is None else held_out.translation_mm,
         seconds,
@@ -231,26 +232,26 @@ def _halves(capture: Capture) -> Iterator[tuple[str, Apart]]:
         result, _ = _calibrated(of_rows(capture, range(first, len(capture), 2)))
         if result is None or not result.converged:
             return
-        results.append(result.hand_eye)
+        results.append(result.found)
     if (apart := _apart(*results)) is not None:
         yield capture.folder.name, apart
 
 
-def _apart(found: HandEye, other: HandEye | Reference) -> Apart | None:
+def _apart(found: Calibration, other: Calibration | Reference) -> Apart | None:
     """Compare a calibration with another one or a reference; None where one has no intrinsics."""
-    if found.in_use is None or found.intrinsics is None or other.intrinsics is None:
+    if found.uncertainty.seen is None or found.intrinsics is None or other.intrinsics is None:
         return None
-    camera, distance = found.intrinsics, 1e-3 * found.in_use.seen.distance_mm
+    camera, distance = found.intrinsics, 1e-3 * found.uncertainty.seen.distance_mm
     x_px = nine_pixels(camera)
     off = placed(found.gripper_from_camera, camera, x_px, distance)
     off = off - placed(other.gripper_from_camera, other.intrinsics, x_px, distance)
 
-    def stated(one: HandEye | Reference) -> Float[ndarray, "9 3 3"]:
+    def stated(one: Calibration | Reference) -> Float[ndarray, "9 3 3"]:
         """Return covariances of the points in gripper axes."""
         if isinstance(one, Reference):
             return placed_covariance(one, x_px, distance)
         turn, own = one.gripper_from_camera[:3, :3], one.intrinsics or camera
-        return turn @ point_covariance(one, own, x_px, distance) @ turn.T
+        return turn @ point_covariance(one.gripper_from_camera, one.uncertainty, own, x_px, distance) @ turn.T
 
     covariance = stated(found) + stated(other)
     sigmas = float(np.sqrt(squared_distance(off, covariance).mean() / 3))
@@ -276,10 +277,10 @@ class WristCamera:
 
 def _checked(name: str, result: RunResult, board: str) -> tuple[float, float, list[object]]:
     """Return scatter and predicted scatter (m) of a board that took no part in a calibration, and its row."""
-    rows = result.reconstruction.image_index[result.hand_eye.inliers].tolist()
+    rows = result.reconstruction.image_index[result.found.inliers].tolist()
     camera = WristCamera(
-        result.hand_eye.intrinsics or result.reconstruction.intrinsics,
-        result.hand_eye.gripper_from_camera,
+        result.found.intrinsics or result.reconstruction.intrinsics,
+        result.found.gripper_from_camera,
         result.capture.base_from_gripper[rows],
     )
     corners = find_corners(result.capture, board, rows)
@@ -293,7 +294,7 @@ def _checked(name: str, result: RunResult, board: str) -> tuple[float, float, li
     else:
         raise RejectedError("too few images share the corners of a board", "name it with --boards")
     found = measure(camera, corners)
-    draws = predicted(camera, result.hand_eye, corners, float(np.sqrt(off.mean() / 2)))
+    draws = predicted(camera, result.found, corners, float(np.sqrt(off.mean() / 2)))
     expected = float(np.sqrt((np.array(draws) ** 2).mean()))
     lengths = [number(1e3 * value) for value in (found.flat, found.scatter, expected)]
     counts = [len(np.unique(corners.image)), len(corners.x_in_board)]
@@ -372,17 +373,17 @@ def measure(camera: WristCamera, corners: Corners) -> CheckPoints:
     return CheckPoints(float((found[near] / stated[near]).mean()), float(flat), scatter)
 
 
-def predicted(camera: WristCamera, hand_eye: HandEye, corners: Corners, noise_px: float) -> list[float]:
+def predicted(camera: WristCamera, hand_eye: Calibration, corners: Corners, noise_px: float) -> list[float]:
     """Return the scatter in draws of the errors that the calibration states, of gripper poses and of pixels."""
     rng = np.random.default_rng(0)
     points = _triangulated(camera, corners)
-    values, vectors = np.linalg.eigh(joint_covariance(hand_eye))
+    values, vectors = np.linalg.eigh(hand_eye.uncertainty.whole)
     spread, of_pose = vectors * np.sqrt(values.clip(0)), np.repeat(hand_eye.robot_noise.together, 3)
     found = []
     for _ in range(DRAWS):
         step = spread @ rng.normal(size=len(spread))
         intrinsics = camera.intrinsics
-        if hand_eye.intrinsics_cross is not None:
+        if hand_eye.uncertainty.joint is not None:
             intrinsics = with_parameters(intrinsics, parameters(intrinsics) + step[7:])
         noise = of_pose * rng.normal(size=(len(camera.base_from_gripper), 6))
         poses = retract(camera.base_from_gripper, noise)

@@ -19,12 +19,12 @@ import numpy as np
 
 from benchmarks.cameras import COUNT, answered, wanted
 from benchmarks.faults import IMAGES, OBSERVED, calibrated
+from jcr.calibration.hand_eye import solve_hand_eye
+from jcr.calibration.record import Calibration
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.estimation.arms import arm_named
-from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.geometry import step_between
-from jcr.records import HandEye
 from jcr.records.npz import read_reconstruction
 from simulation.boards import Sheet, with_sheet
 from simulation.cells import Kind, cell_problem
@@ -39,7 +39,7 @@ TOLERANCE = 0.05
 """Largest accepted change of a result, in standard deviations of the state before."""
 
 
-def cases(captures: Path, runs: Path) -> Iterator[tuple[str, Callable[[], HandEye | Record]]]:
+def cases(captures: Path, runs: Path) -> Iterator[tuple[str, Callable[[], Calibration | Record]]]:
     """Yield the name of each problem and a function that solves it."""
     for folder in sorted(path.parent for path in runs.glob("*/reconstruction.npz")):
         yield f"capture {folder.name}", partial(_stored, captures / folder.name, folder)
@@ -125,7 +125,7 @@ def _count_calls(module: Any, name: str, calls: list[int]) -> None:
     setattr(module, name, counted)
 
 
-def _record(hand_eye: HandEye) -> Record:
+def _record(hand_eye: Calibration) -> Record:
     """Return verdict, findings and result of a calibration."""
     return {
         "verdict": hand_eye.verdict,
@@ -136,7 +136,7 @@ def _record(hand_eye: HandEye) -> Record:
     }
 
 
-def _stored(capture: Path, run: Path) -> HandEye:
+def _stored(capture: Path, run: Path) -> Calibration:
     """Calibrate a capture from a stored reconstruction."""
     return calibrate(read_capture(capture), read_reconstruction(run / "reconstruction.npz"))
 
@@ -149,7 +149,7 @@ def _cell(kind: Kind) -> Record:
     return {"verdict": "solved", "findings": [], "x": found.tolist(), "std": std}
 
 
-def _with_sheet(sheet: Sheet) -> HandEye:
+def _with_sheet(sheet: Sheet) -> Calibration:
     """Calibrate a simulated capture whose scene contains a printed sheet."""
     rng = np.random.default_rng([0, IMAGES])
     bare = faulty_capture(rng, IMAGES)
@@ -157,20 +157,20 @@ def _with_sheet(sheet: Sheet) -> HandEye:
     return calibrate(capture, replace(reconstruction, tracks=with_sheet(bare, rng, sheet).tracks))
 
 
-def _arm(arm: str, preset: Any, count: int) -> HandEye:
+def _arm(arm: str, preset: Any, count: int) -> Calibration:
     """Solve by poses of an arm with systematic errors, its joint angles known."""
     p = bent_problem(arm_named(arm), preset, count, 0)
-    return fit_hand_eye(p.base_from_gripper, p.recon_from_camera, joints=p.joints, robot=p.bent.arm)
+    return solve_hand_eye(p.base_from_gripper, p.recon_from_camera, joints=p.joints, robot=p.bent.arm)
 
 
-def _weighed_poses() -> HandEye:
+def _weighed_poses() -> Calibration:
     """Solve by camera poses with a stated covariance, one of 14 gripper poses being wrong."""
     rng = np.random.default_rng(5)
     problem = hand_eye_problem(rng, 14, robot_noise=(5e-4, 1e-3), camera_noise=(1e-3, 2e-3))
     gripper = problem.base_from_gripper.copy()
     gripper[3, :3, 3] += 0.1
     variance = np.tile(np.repeat([1e-3 / problem.scale, 2e-3], 3), 14) ** 2
-    return fit_hand_eye(gripper, problem.recon_from_camera, camera_covariance=np.diag(variance))
+    return solve_hand_eye(gripper, problem.recon_from_camera, camera_covariance=np.diag(variance))
 
 
 if __name__ == "__main__":

@@ -17,6 +17,8 @@ from dataclasses import MISSING, Field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter
+
 import jcr
 from jcr.calibration.record import Calibration
 from jcr.cell.placement import CamerasFile
@@ -202,7 +204,7 @@ def _fields(record: type) -> Iterator[tuple[Any, ast.stmt | None]]:
 
 def schema(model: Any) -> dict[str, Any]:
     """The JSON Schema of a pydantic model, with what the source says of each field."""
-    found = model.model_json_schema()
+    found = TypeAdapter(model).json_schema(mode="serialization")
     for name, part in [(model.__name__, found), *found.get("$defs", {}).items()]:
         kind = _class_named(name, part.get("properties", {}).keys())
         for field, text in ({} if kind is None else described(kind)).items():

@@ -38,8 +38,6 @@ for name, pose in zip(capture.images, capture.base_from_gripper, strict=True):
 # Before the half minute of a calibration: do these motions show everything, and how exact will it be?
 found = jcr.check_capture(capture, look=False)
 print(f"motions show everything: {found.observability.observable}")
-if found.expected is not None:
-    print(
-        f"to be expected: a seen point within {found.expected.in_use.seen.within_95_mm:.1f} mm (95 % of errors)"
-    )
+if found.expected is not None and (seen := found.expected.seen) is not None:
+    print(f"to be expected: a seen point within {seen.within_95_mm:.1f} mm (95 % of errors)")
 print(f"next: jcr run {out / 'capture'} {out / 'run'}")

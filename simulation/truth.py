@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 from PIL import Image
+from pydantic import TypeAdapter
 
 from jcr.camera import rays
 from jcr.capture.images import encode_png
 from jcr.files import write_bytes, write_text
 from jcr.geometry import apply
 from jcr.records import Intrinsics
-from jcr.records.json_fields import IntrinsicsJson
 
 DEPTH_UNIT_M = 1e-4
 """Metres per count of the 16-bit depth images."""
@@ -92,7 +92,7 @@ def read_truth(folder: Path) -> Truth:
     for one in content["objects"]:
         one |= {name: np.array(value, float) for name, value in one.items() if isinstance(value, list)}
     objects = tuple(TrueObject(**one) for one in content["objects"])
-    intrinsics = IntrinsicsJson.model_validate(content["intrinsics"]).record()
+    intrinsics = TypeAdapter(Intrinsics).validate_python(content["intrinsics"])
     return Truth(**content | {"folder": folder, "objects": objects, "intrinsics": intrinsics})
 
 

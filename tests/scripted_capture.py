@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 from numpy import ndarray
 
+from jcr.calibration.hand_eye import solve_hand_eye
+from jcr.calibration.record import Calibration
 from jcr.capture.images import read_image
-from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import rotation_exp, transform
 from jcr.live.cameras import Camera, Frame
@@ -20,18 +21,18 @@ from jcr.live.folder import LiveFolder
 from jcr.live.progress import Accuracy, Progress
 from jcr.live.robot import RobotState
 from jcr.live.session import Answer, LiveSession, SessionOptions
-from jcr.records import HandEye, Requirement
+from jcr.records import Requirement
 
 REQUIRED = (2.0, 0.3)
 RATE = 10
 """Images a second of a video."""
 
 
-def a_hand_eye(met: bool) -> HandEye:
+def a_hand_eye(met: bool) -> Calibration:
     """Return an accepted calibration that meets its requirement, or does not."""
     rng = np.random.default_rng(0)
     poses = transform(rotation_exp(0.5 * rng.normal(size=(10, 3))), 0.2 * rng.normal(size=(10, 3)))
-    found = fit_hand_eye(poses, poses @ transform(np.eye(3), np.array([0.05, 0.0, 0.1])))
+    found = solve_hand_eye(poses, poses @ transform(np.eye(3), np.array([0.05, 0.0, 0.1])))
     required = Requirement(
         translation_mm=REQUIRED[0],
         rotation_deg=REQUIRED[1],

@@ -13,15 +13,16 @@ import pytest
 from jcr import reconstruct as backends
 from jcr.calibration import stage as calibration_stage
 from jcr.calibration.checks import capture as capture_checks
+from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.record import Calibration
 from jcr.cli import dispatch
 from jcr.errors import InputError, RejectedError
-from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import rotation_exp, transform
 from jcr.pipeline import selection
 from jcr.reconstruct import Backend, ReconstructOptions
-from jcr.records import Capture, HandEye, Intrinsics, Pointmaps, Reconstruction, Tracks
+from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
 from jcr.result import RunOptions, RunResult
 from simulation.problems import HandEyeProblem, hand_eye_problem
 
@@ -158,7 +159,7 @@ def test_of_two_that_are_rejected_the_one_that_shows_the_cause_is_kept(
     """Whatever its leave-one-out error, which a cause makes large."""
     present.add("mast3r")
     problem = hand_eye_problem(np.random.default_rng(0), 8, robot_noise=(2e-4, 5e-4))
-    sound = fit_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    sound = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     uncertain = Finding(
         kind=FindingKind.UNCERTAIN,
         severity="rejects",
@@ -167,11 +168,11 @@ def test_of_two_that_are_rejected_the_one_that_shows_the_cause_is_kept(
         details={"part": "translation"},
     )
     sheared = Finding(kind=FindingKind.ROLLING_SHUTTER, severity="rejects", value=9.0, std=0.5, p=1e-9)
-    leave_one_out = sound.leave_one_out
-    assert leave_one_out is not None
+    held_out = sound.held_out
+    assert held_out is not None
     of_backend = {
         "colmap": sound.with_findings(uncertain),
-        "mast3r": replace(sound, leave_one_out=replace(leave_one_out, translation_mm=40.0)).with_findings(
+        "mast3r": replace(sound, held_out=replace(held_out, translation_mm=40.0)).with_findings(
             uncertain, sheared
         ),
     }
@@ -250,7 +251,7 @@ def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
         poses = {"colmap": shuffled, "direct": problem.recon_from_camera}[options.backend]
         return reconstruction(options.backend, poses)
 
-    def slow(*arguments: object) -> HandEye:
+    def slow(*arguments: object) -> Calibration:
         now_s[0] += 3.0
         return calibration_stage.calibrate(*arguments)
 

@@ -16,9 +16,9 @@ import capture_writers as writers
 import jcr
 from conftest import shrunk_capture
 from jcr.calibration.checks.left_out import left_out_poses
+from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.capture.images import BLURRED_EDGE, edge_width, encode_png, read_image
 from jcr.cli import dispatch
-from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.findings import FindingKind
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 from simulation.problems import hand_eye_problem
@@ -92,7 +92,7 @@ def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():
         tracks=Tracks(image=none, x_px=np.zeros((0, 2)), point=none, points_in_recon=np.zeros((0, 3))),
         backend="given",
     )
-    hand_eye = fit_hand_eye(gripper, problem.recon_from_camera)
+    hand_eye = solve_hand_eye(gripper, problem.recon_from_camera)
     assert hand_eye.converged and not hand_eye.inliers[[3, 5, 8]].any()
     found = left_out_poses(capture, made, hand_eye)
     assert [(one.kind, one.severity, one.images) for one in found] == [
@@ -100,7 +100,7 @@ def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():
         (FindingKind.POSE_CONTRADICTS_IMAGE, "warns", ("5.png",)),
     ]
     assert found[1].value == pytest.approx(0.08 * np.sqrt(3), rel=0.05)
-    of_right = replace(fit_hand_eye(right, problem.recon_from_camera), inliers=np.arange(12) != 4)
+    of_right = solve_hand_eye(right, problem.recon_from_camera).with_used(np.arange(12) != 4)
     assert not left_out_poses(replace(capture, base_from_gripper=right), made, of_right)
 
 

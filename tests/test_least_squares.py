@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from jcr.estimation import hand_eye
+from jcr.calibration import hand_eye
 from jcr.geometry import apply, retract, rotation_exp, skew, step_between, transform
 from jcr.least_squares import loss_weight, minimise
 from simulation.problems import hand_eye_problem
@@ -123,5 +123,5 @@ def test_small_systems_are_solved_by_one_blas_thread(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(hand_eye, "robust_fit", look)
     problem = hand_eye_problem(np.random.default_rng(0), 6)
     with threadpool_limits(2, user_api="blas"), pytest.raises(InterruptedError):
-        hand_eye.fit_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+        hand_eye.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     assert seen and set(seen) == {1}

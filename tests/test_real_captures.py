@@ -37,7 +37,7 @@ def test_within_reach_of_the_marker_reference(
     assert solved.converged and solved.inliers.sum() == len(found.image_index) == count
     assert 1e3 * np.linalg.norm(solved.gripper_from_camera[:3, 3] - reference[:3, 3]) < max_mm
     assert rotation_between_deg(solved.gripper_from_camera[:3, :3], reference[:3, :3]) < max_deg
-    assert solved.leave_one_out is not None and solved.leave_one_out.translation_mm < 6.0
+    assert solved.held_out is not None and solved.held_out.translation_mm < 6.0
     assert any("folds over" in text for text in found.warnings) == (name == "doosan_bench")
     # To within the few millimetres to which the references are good, and the poses of both robots.
     centers = (capture.base_from_gripper[found.image_index] @ reference)[:, :3, 3]
@@ -56,7 +56,7 @@ def test_nominal_intrinsics_are_contradicted_by_their_images(real_captures: Path
     found, given = solved.intrinsics, solved.with_given_intrinsics
     assert found is not None and found.fx == pytest.approx(found.fy, rel=2e-3)
     assert capture.intrinsics is not None and capture.intrinsics.fx > 1.005 * capture.intrinsics.fy
-    assert solved.leave_one_out is not None and solved.leave_one_out.translation_mm < 2.0
+    assert solved.held_out is not None and solved.held_out.translation_mm < 2.0
     assert given is not None
     reference, both = reference_of(capture), (given.gripper_from_camera, solved.gripper_from_camera)
     off_mm = [1e3 * np.linalg.norm(x[:3, 3] - reference[:3, 3]) for x in both]

@@ -11,7 +11,7 @@ import pytest
 
 import jcr
 from jcr.calibration.drift import drift
-from jcr.calibration.record import calibration_of, write_calibration
+from jcr.calibration.record import write_calibration
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
 from jcr.cli import dispatch
@@ -186,7 +186,7 @@ def out(tmp_path_factory: pytest.TempPathFactory, capture: Capture, reconstructi
     (folder / "out").mkdir()
     hand_eye = calibrate(old, reconstruction)
     assert hand_eye.converged
-    write_calibration(folder / "out/calibration.json", calibration_of(old, reconstruction, hand_eye, {}, "0"))
+    write_calibration(folder / "out/calibration.json", hand_eye)
     begin = begun(folder / "out", jcr.read_capture(old.folder), RunOptions())
     keep_reconstruction(begin, reconstruction)
     return folder / "out"

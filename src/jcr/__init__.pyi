@@ -2,8 +2,8 @@
 
 from .calibration.difference import Difference as Difference
 from .calibration.difference import compare as compare
+from .calibration.hand_eye import solve_hand_eye as solve_hand_eye
 from .calibration.options import CalibrateOptions as CalibrateOptions
-from .calibration.poses import solve_hand_eye as solve_hand_eye
 from .calibration.record import Calibration as Calibration
 from .capture.options import ReadOptions as ReadOptions
 from .capture.read import read_capture as read_capture
@@ -52,8 +52,8 @@ from .reconstruct import ReconstructOptions as ReconstructOptions
 from .records import Budget as Budget
 from .records import Capture as Capture
 from .records import CellCamera as CellCamera
-from .records import HandEye as HandEye
 from .records import Intrinsics as Intrinsics
+from .records import IntrinsicsAndStd as IntrinsicsAndStd
 from .records import LeaveOneOut as LeaveOneOut
 from .records import NextPose as NextPose
 from .records import Observability as Observability
@@ -62,8 +62,10 @@ from .records import Pointmaps as Pointmaps
 from .records import PosePairs as PosePairs
 from .records import Reconstruction as Reconstruction
 from .records import Requirement as Requirement
+from .records import RobotErrors as RobotErrors
 from .records import RobotNoise as RobotNoise
-from .records.json_fields import IntrinsicsAndStd as IntrinsicsAndStd
+from .records import Seen as Seen
+from .records import Uncertainty as Uncertainty
 from .result import RunOptions as RunOptions
 from .result import RunResult as RunResult
 from .result import load_run as load_run

@@ -13,7 +13,7 @@ from numpy import ndarray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.record import Calibration, read_calibration
+from jcr.calibration.record import AnyCalibration, Calibration, FailedCalibration, read_calibration
 from jcr.capture.added import read_added
 from jcr.capture.read import read_capture
 from jcr.cell.added import read_added_cameras
@@ -21,10 +21,10 @@ from jcr.cell.placement import CamerasFile, read_cameras
 from jcr.depth.depth_npz import FILE as DEPTH
 from jcr.depth.depth_npz import read_depth
 from jcr.depth.options import DepthOptions
-from jcr.errors import InputError, first_fault
+from jcr.errors import InputError, RejectedError, first_fault
 from jcr.files import read_bytes
 from jcr.reconstruct import BACKENDS, ReconstructOptions, tries, with_cameras_of
-from jcr.records import Attempt, Capture, CellCamera, HandEye, Intrinsics, PointCloud, Reconstruction
+from jcr.records import Attempt, Capture, CellCamera, PointCloud, Reconstruction
 from jcr.records.npz import read_reconstruction
 from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import FILE as MAP
@@ -90,10 +90,6 @@ class RunResult:
     """
 
     out: Path
-    hand_eye: HandEye
-    """State of the calibration, with the residuals of each image as arrays; only of a run of this process."""
-    timings: dict[str, float]
-    """Seconds of reconstruction and calibration by all back ends; only of a run of this process."""
     is_unchanged: bool = False
     """Whether the folder had the files of the same run already, and nothing was made."""
 
@@ -112,9 +108,16 @@ class RunResult:
         return getattr(self.calibration, name)
 
     @cached_property
-    def calibration(self) -> Calibration:
+    def calibration(self) -> AnyCalibration:
         """Content of calibration.json."""
         return read_calibration(self.out)
+
+    @property
+    def found(self) -> Calibration:
+        """The calibration; RejectedError where nothing was found."""
+        if isinstance(self.calibration, FailedCalibration):
+            raise RejectedError(f"no calibration was found: {self.calibration.doubt}")
+        return self.calibration
 
     @cached_property
     def state(self) -> RunState:
@@ -194,12 +197,6 @@ class RunResult:
         return self.reconstruction.image_index
 
     @property
-    def intrinsics(self) -> Intrinsics | None:
-        """Intrinsics that belong to the transform; None where camera poses were given."""
-        known = self.calibration.intrinsics
-        return None if known is None else known.record()
-
-    @property
     def scale_std(self) -> float:
         """Relative standard deviation of the scale."""
         uncertainty = self.calibration.uncertainty
@@ -215,7 +212,7 @@ class RunResult:
             raise InputError(
                 f"{self.out}: is for a camera that watches the gripper; this needs a camera on the gripper"
             )
-        if calibration.parent_from_camera is None:
+        if isinstance(calibration, FailedCalibration):
             raise InputError(
                 f"{self.out}: found no calibration ({calibration.doubt}); fix the capture, run it again"
             )
@@ -233,7 +230,7 @@ class RunResult:
 
     def _repr_html_(self) -> str:
         """Return a table for notebooks."""
-        return self.calibration.as_html(str(self.out / REPORT))
+        return self.found.as_html(str(self.out / REPORT))
 
 
 def load_run(out: str | Path) -> RunResult:

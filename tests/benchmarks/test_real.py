@@ -8,8 +8,8 @@ import pytest
 from benchmarks import real
 from benchmarks.real import WristCamera, measure, pixels_of, predicted
 from benchmarks.references import Corners, reference
+from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.camera import parameters
-from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.geometry import step_between
 from jcr.records import Intrinsics
 from simulation.problems import TARGET_IN_BASE, HandEyeProblem, hand_eye_problem
@@ -70,7 +70,7 @@ def test_the_scatter_is_predicted_from_what_a_calibration_states(monkeypatch: py
     ratios = []
     for seed in range(3):
         problem = hand_eye_problem(np.random.default_rng(seed), 12, robot_noise=(4e-4, 1e-3))
-        hand_eye = fit_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+        hand_eye = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
         camera, corners = seen(problem)
         found = replace(
             camera,

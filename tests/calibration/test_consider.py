@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from jcr.calibration.adjust import with_intrinsics_considered
+from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.camera import parameters, with_parameters
-from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.estimation.intrinsics_prior import camera_with_prior
 from jcr.estimation.problem import scale_prior
 from jcr.estimation.robot_noise import smooth_errors
@@ -33,7 +33,7 @@ def test_cameras_that_were_placed_with_a_wrong_focal_length_are_within_sigma_onc
                 tracks.points_in_recon[tracks.point[seen]], tracks.x_px[seen], k, np.array(given.distortion)
             )
             camera.append(inverse(transform(cv2.Rodrigues(rotation)[0], translation[:, 0])))
-        solved = fit_hand_eye(problem.base_from_gripper, camera, scale=problem.scale, scale_std=1e-3)
+        solved = solve_hand_eye(problem.base_from_gripper, camera, scale=problem.scale, scale_std=1e-3)
         whole = with_intrinsics_considered(
             solved,
             problem.base_from_gripper,

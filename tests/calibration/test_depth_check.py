@@ -9,17 +9,17 @@ import pytest
 
 from analytic_scene import FOCAL_PX, HEIGHT, WIDTH, cast_depth, looking_at_table
 from jcr.calibration.checks.lengths import depth_check
-from jcr.calibration.record import Calibration, calibration_of
+from jcr.calibration.hand_eye import solve_hand_eye
+from jcr.calibration.record import Calibration, validated
 from jcr.calibration.words import details
 from jcr.camera import rays
 from jcr.capture.images import encode_png, read_depth
 from jcr.capture.read import read_capture
 from jcr.depth.measured import with_measured_depth
 from jcr.errors import InputError
-from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.files import write_bytes
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.records import MATCHED, PRIOR, Capture, HandEye, Intrinsics, Pointmaps, Reconstruction, Tracks
+from jcr.records import MATCHED, PRIOR, Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
 
 INTRINSICS = Intrinsics(FOCAL_PX, FOCAL_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
 OFF, NOISE_PER_M, SCALE = 1.03, 0.004, 0.1
@@ -27,13 +27,15 @@ OFF, NOISE_PER_M, SCALE = 1.03, 0.004, 0.1
 X = transform(rotation_exp(np.array([0.1, -0.2, 1.5])), np.array([0.05, -0.02, 0.08]))
 
 
-def with_depth(capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye) -> HandEye:
+def with_depth(capture: Capture, reconstruction: Reconstruction, hand_eye: Calibration) -> Calibration:
     found = depth_check(capture, reconstruction, hand_eye)
-    return replace(hand_eye, depth=found)
+    return replace(hand_eye, depth_check=found)
 
 
 @pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, Reconstruction, HandEye, np.ndarray]:
+def measured(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[Capture, Reconstruction, Calibration, np.ndarray]:
     """A capture with depth images, its features, the calibration, and the true depth."""
     folder, draw = tmp_path_factory.mktemp("depth"), np.random.default_rng(0)
     base_from_camera = looking_at_table(12)
@@ -57,7 +59,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, Reconst
     base_from_recon = transform(rotation_exp(np.array([0.3, -2.0, 0.5])), np.array([0.4, 0.2, -0.7]))
     cameras = inverse(base_from_recon) @ base_from_camera
     cameras[:, :3, 3] /= SCALE
-    return capture, _reconstruction(cameras, true, draw), fit_hand_eye(gripper, cameras), true
+    return capture, _reconstruction(cameras, true, draw), solve_hand_eye(gripper, cameras), true
 
 
 def _reconstruction(cameras: np.ndarray, true: np.ndarray, draw: np.random.Generator) -> Reconstruction:
@@ -104,17 +106,17 @@ def test_the_robot_shows_that_the_depth_is_too_long_and_how_noisy(measured: tupl
     noise = np.hypot(check.noise_m, check.noise_per_m * depth**2)
     assert noise == pytest.approx(NOISE_PER_M * depth**2, rel=0.35)
     assert (check.std_m(depth) > noise).all()
-    content = calibration_of(capture, reconstruction, replace(hand_eye, depth=check), {}, "0")
+    content = replace(hand_eye, depth_check=check)
     said = f"depth camera: its lengths are {check.off_percent:.2g} ± {check.std_percent:.1g} % too long "
     assert any(line.startswith(said) for line in details(content))
-    assert Calibration.model_validate_json(json.dumps(content.as_json()), strict=True) == content
+    assert validated(json.loads(json.dumps(content.as_json())), Path("a")) == content
     assert depth_check(replace(capture, depths=None), reconstruction, hand_eye) is None
 
 
 def test_the_map_gets_the_depth_with_the_robots_scale_and_its_own_sigma(measured: tuple):
     capture, reconstruction, hand_eye, true = measured
     hand_eye = with_depth(capture, reconstruction, hand_eye)
-    mapped, notes = with_measured_depth(capture, reconstruction, hand_eye)
+    mapped, notes = with_measured_depth(capture, reconstruction, hand_eye.depth_check, hand_eye.scale)
     found = mapped.dense
     assert not notes and (found.reason == np.where(found.confidence > 0, MATCHED, 0)).all()
     there = found.confidence > 0
@@ -149,7 +151,9 @@ def test_what_several_images_show_stays_where_the_depth_camera_shows_otherwise(m
     dense = replace(
         reconstruction.dense, points_in_recon=points, confidence=matched, reason=reason, depth_std=std
     )
-    mapped, notes = with_measured_depth(capture, replace(reconstruction, pointmaps=dense), hand_eye)
+    mapped, notes = with_measured_depth(
+        capture, replace(reconstruction, pointmaps=dense), hand_eye.depth_check, hand_eye.scale
+    )
     found = mapped.dense
     assert notes and "differ" in notes[0]
     left = np.zeros(true.shape, bool)
@@ -165,10 +169,10 @@ def test_depth_of_another_unit_is_named_and_left_out(measured: tuple):
     check = depth_check(capture, reconstruction, hand_eye)
     assert check is not None
     found, notes = with_measured_depth(
-        capture, reconstruction, replace(hand_eye, depth=replace(check, off_percent=900.0))
+        capture, reconstruction, replace(check, off_percent=900.0), hand_eye.scale
     )
     assert found is reconstruction and "+900 % off by the robot" in notes[0]
-    _, notes = with_measured_depth(capture, reconstruction, hand_eye)
+    _, notes = with_measured_depth(capture, reconstruction, hand_eye.depth_check, hand_eye.scale)
     assert "the robot cannot tell" in notes[0]
 
 

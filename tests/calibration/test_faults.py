@@ -11,7 +11,6 @@ import jcr
 from benchmarks.faults import calibrated, outcome
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_poses
-from jcr.calibration.record import calibration_of
 from jcr.calibration.stage import calibrate
 from jcr.camera import project, unproject
 from jcr.cell.carried import eye_to_hand, refined
@@ -137,11 +136,11 @@ def test_a_silent_fault_is_named_with_its_size_and_counts_as_uncertainty(name: s
     assert said, hand_eye.warnings
     assert [float(size) for size in said[0].groups()] == pytest.approx(sizes, abs=within)
     assert outcome(found, hand_eye).is_sound
-    assert hand_eye.budget is not None
-    parts = np.sum(list(vars(hand_eye.budget).values()), axis=0)
+    assert hand_eye.uncertainty.budget is not None
+    parts = np.sum(list(vars(hand_eye.uncertainty.budget).values()), axis=0)
     assert np.allclose(parts, hand_eye.covariance, rtol=0, atol=1e-9)
     # An effect on the camera is part of the calibration, and its uncertainty is not that of a fault.
-    assert (np.trace(hand_eye.budget.faults) > 0) == (name not in OF_CAMERA)
+    assert (np.trace(hand_eye.uncertainty.budget.faults) > 0) == (name not in OF_CAMERA)
     # No one result is right on both sides of a motion beyond the requirement, and a delay of that size leaves ± 10 mm.
     assert hand_eye.converged is (name not in ("slip", "tool changed", "base pushed", "delay"))
 
@@ -192,8 +191,8 @@ def test_a_thin_prism_becomes_part_of_the_intrinsics():
     """Without it in the model, the rotation is 2.3° off: a prism and a rotated camera look alike."""
     found, hand_eye = calibrated(NAMED["thin prism"][0], 3)
     camera = hand_eye.intrinsics
-    assert camera is not None and camera.model == "thin_prism" and hand_eye.intrinsics_std is not None
-    std = hand_eye.intrinsics_std[-4:]
+    assert camera is not None and camera.model == "thin_prism" and camera.std is not None
+    std = np.array(camera.std[-4:])
     assert (np.abs(np.array(camera.distortion[-4:]) - [0.02, 0.0, 0.01, 0.0]) < 3 * std).all()
     assert outcome(found, hand_eye).is_sound
 
@@ -228,11 +227,11 @@ def test_the_parts_of_the_uncertainty_of_a_fixed_camera_are_the_whole_with_its_f
     capture = replace(seen, base_from_gripper=inverse(seen.base_from_gripper), mount="base")
     assert np.allclose(eye_to_hand(capture).base_from_gripper, seen.base_from_gripper)
     hand_eye = refined(capture, reconstruction, calibrate(eye_to_hand(capture), reconstruction))
-    assert hand_eye.converged and hand_eye.budget is not None
-    parts = np.sum(list(vars(hand_eye.budget).values()), axis=0)
+    assert hand_eye.converged and hand_eye.uncertainty.budget is not None
+    parts = np.sum(list(vars(hand_eye.uncertainty.budget).values()), axis=0)
     assert np.allclose(parts, hand_eye.covariance, rtol=0, atol=1e-9)
     # The zoom is part of the calibration, and adds no uncertainty of a fault.
-    assert hand_eye.findings[0].kind is FindingKind.ZOOM and np.trace(hand_eye.budget.faults) == 0
+    assert hand_eye.findings[0].kind is FindingKind.ZOOM and np.trace(hand_eye.uncertainty.budget.faults) == 0
     error = step_between(hand_eye.gripper_from_camera, found.gripper_from_camera)
     assert error @ np.linalg.solve(hand_eye.covariance[:6, :6], error) < 16.8  # 99 % of chi2 of 6
 
@@ -260,10 +259,10 @@ def test_positions_that_are_all_too_long_are_said_to_be_beyond_what_images_show_
     capture, reconstruction = reconstructed(found, False)
     unknown = calibrate(capture, reconstruction)
     assert unknown.converged and not unknown.warnings
-    file = calibration_of(capture, reconstruction, unknown, {}, "")
+    file = unknown
     (alone,) = (sentence(one) for one in file.findings if one.kind is FindingKind.SCALE_FROM_ROBOT)
     assert alone in file.notes
     # Simulated observations are metric as the scene is; the robot's positions are not.
     metric = calibrate(capture, replace(reconstruction, is_metric=True, metric_std=0.002))
     assert "4.8 ± 0.15 %" in metric.warnings[0] and "larger than given" in metric.warnings[0]
-    assert alone not in calibration_of(capture, reconstruction, metric, {}, "").notes
+    assert alone not in metric.notes

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from jcr.calibration.case import with_findings
+from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.poses import calibrate_poses
-from jcr.calibration.record import calibration_of, read_calibration
+from jcr.calibration.record import Calibration, read_calibration
 from jcr.calibration.stage import calibrate
 from jcr.calibration.words import summary
 from jcr.errors import InputError
-from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.findings import Finding, FindingKind, remedy, sentence, text
 from jcr.findings.table import GROUPS
 from jcr.geometry import rotation_exp, transform
-from jcr.records import Capture, HandEye, Intrinsics, PosePairs, Reconstruction, Tracks
+from jcr.records import Capture, Intrinsics, PosePairs, Reconstruction, Tracks
 from simulation.problems import hand_eye_problem
 
 DETAILS: dict[str, float | str] = {
@@ -60,9 +60,9 @@ def example(kind: FindingKind) -> Finding:
 
 
 @pytest.fixture(scope="module")
-def solved() -> HandEye:
+def solved() -> Calibration:
     problem = hand_eye_problem(np.random.default_rng(0), 12, robot_noise=(5e-4, 1e-3))
-    return fit_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    return solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
 
 
 @pytest.mark.parametrize("kind", FindingKind)
@@ -79,7 +79,7 @@ def test_what_a_kind_explains_are_kinds_and_its_group_has_a_title(kind: FindingK
     assert kind not in kind.row.explains
 
 
-def test_a_fault_that_is_too_much_rejects_and_comes_before_its_consequences(solved: HandEye):
+def test_a_fault_that_is_too_much_rejects_and_comes_before_its_consequences(solved: Calibration):
     assert solved.verdict == "accepted"
     shift = (0.05, 0.0, 0.0, 0.0, 0.0, 0.0, 0.01)
     fault = replace(example(FindingKind.DELAY), concerns="poses", shift=shift)
@@ -105,7 +105,7 @@ def test_what_a_cause_explains_is_not_another_fault():
         recon_from_camera=problem.recon_from_camera,
         is_metric=False,
     )
-    content = calibration_of(pairs, pairs, calibrate_poses(pairs), {}, "0")
+    content = calibrate_poses(pairs)
     assert content.findings[0].kind is FindingKind.POSE_CONVENTION and FindingKind.UNCERTAIN in {
         one.kind for one in content.findings
     }
@@ -169,7 +169,7 @@ def test_findings_are_in_the_file_and_come_back(tmp_path: Path):
     hand_eye = with_findings(
         hand_eye, (replace(example(FindingKind.SLIP), concerns="mount", shift=(1e-3,) * 7),)
     )
-    content = calibration_of(pairs, pairs, hand_eye, {}, "0")
+    content = hand_eye
     file = tmp_path / "calibration.json"
     file.write_text(json.dumps(content.as_json()))
     written = json.loads(file.read_text())

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.record import calibration_of
+from jcr.calibration.record import Calibration
 from jcr.calibration.stage import calibrate
-from jcr.records import Capture, HandEye, Intrinsics, Reconstruction
+from jcr.records import Capture, Intrinsics, Reconstruction
 from simulation.problems import INTRINSICS, HandEyeProblem, error, hand_eye_problem, observed
 
 
@@ -42,7 +42,7 @@ def pictured(
 
 def calibrated(
     seed: int, images: int, intrinsics: Intrinsics | None, options: CalibrateOptions | None = None, **motion
-) -> tuple[HandEyeProblem, HandEye]:
+) -> tuple[HandEyeProblem, Calibration]:
     problem, capture, reconstruction = pictured(seed, images, intrinsics, **motion)
     return problem, calibrate(capture, reconstruction, options)
 
@@ -51,7 +51,7 @@ def scaled(factor: float) -> Intrinsics:
     return replace(INTRINSICS, fx=INTRINSICS.fx * factor, fy=INTRINSICS.fy * factor)
 
 
-def said(hand_eye: HandEye) -> str:
+def said(hand_eye: Calibration) -> str:
     """What is said of the intrinsics."""
     return next((text for text in hand_eye.warnings if text.startswith("the images show ")), "")
 
@@ -89,7 +89,7 @@ def test_more_views_are_not_promised_to_make_up_for_a_wrong_intrinsics() -> None
     for intrinsics in (INTRINSICS, scaled(1.03), scaled(1.2)):
         _, capture, reconstruction = pictured(0, 5, intrinsics)
         hand_eye = calibrate(capture, reconstruction, CalibrateOptions(next_poses=2))
-        content = calibration_of(capture, reconstruction, hand_eye, {}, "")
+        content = hand_eye
         offset.append(hand_eye.gripper_from_camera[:3, 3])
         promised.append(np.linalg.norm(content.next_poses[-1].expected_std[:3]))
         reported.append(np.sqrt(np.trace(hand_eye.covariance[:3, :3])))

@@ -8,10 +8,11 @@ import pytest
 from jcr.calibration import stage
 from jcr.calibration.checks import lengths
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.record import Calibration
 from jcr.calibration.stage import calibrate
 from jcr.findings import Finding, FindingKind, sentence
 from jcr.geometry import step_between
-from jcr.records import DepthCheck, HandEye
+from jcr.records import DepthCheck
 from simulation.boards import Sheet, with_sheet
 from simulation.faults import Faults, faulty_capture, reconstructed
 
@@ -20,7 +21,7 @@ pytestmark = pytest.mark.slow
 
 def calibrated(
     sheet: Sheet | None, pose_scale: float = 1.0, seed: int = 0, options: CalibrateOptions | None = None
-) -> tuple[HandEye, np.ndarray]:
+) -> tuple[Calibration, np.ndarray]:
     """12 images, and the true transform."""
     rng = np.random.default_rng([seed, 12])
     bare = faulty_capture(rng, 12, Faults(pose_scale=pose_scale))
@@ -36,7 +37,7 @@ def of_pixels(monkeypatch: pytest.MonkeyPatch, metres_per_unit: float) -> None:
         monkeypatch.setattr(module, "length_cue", lambda *_: (metres_per_unit, 0.01))
 
 
-def of_kind(hand_eye: HandEye, kind: FindingKind) -> Finding:
+def of_kind(hand_eye: Calibration, kind: FindingKind) -> Finding:
     (found,) = (one for one in hand_eye.findings if one.kind is kind)
     return found
 
@@ -51,8 +52,10 @@ def test_a_board_that_agrees_with_the_robot_makes_the_scale_more_certain():
     assert both.converged and not both.warnings
     step = step_between(both.gripper_from_camera, x)
     assert (np.abs(step) < 3 * np.sqrt(np.diag(both.covariance)[:6])).all()
-    assert both.budget is not None
-    assert np.allclose(np.sum(list(vars(both.budget).values()), axis=0), both.covariance, rtol=0, atol=1e-9)
+    assert both.uncertainty.budget is not None
+    assert np.allclose(
+        np.sum(list(vars(both.uncertainty.budget).values()), axis=0), both.covariance, rtol=0, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("pose_scale", [1.015, 0.95])

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from jcr.calibration.checks.capture import REPETITIVE, share_of_twins
+from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.stage import calibrate
-from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.geometry import retract, step_between
 from places import ROOT
 from simulation.faults import faulty_capture, reconstructed
@@ -20,7 +20,7 @@ def test_the_adjustment_replaces_a_rejected_fit_from_poses():
     capture, reconstruction = reconstructed(faulty_capture(rng, 12), estimated=False)
     errors = rng.normal(size=(12, 6)) * np.repeat([0.04, np.radians(5.0)], 3)
     found = replace(reconstruction, recon_from_camera=retract(reconstruction.recon_from_camera, errors))
-    assert not fit_hand_eye(capture.base_from_gripper, found.recon_from_camera).converged
+    assert not solve_hand_eye(capture.base_from_gripper, found.recon_from_camera).converged
     calibrated, right = calibrate(capture, found), calibrate(capture, reconstruction)
     assert calibrated.converged and calibrated.inliers.all()
     step = step_between(right.gripper_from_camera, calibrated.gripper_from_camera)

@@ -12,6 +12,7 @@ import jcr
 from benchmarks.cameras import answered, cell_of, wanted
 from jcr.calibration.checks.camera import CameraAdjustment
 from jcr.calibration.checks.effects import effects
+from jcr.calibration.record import Calibration
 from jcr.calibration.stage import calibrate
 from jcr.capture.formats.capture_json import read, write
 from jcr.cell.added import camera_of, read_added_cameras
@@ -24,7 +25,7 @@ from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.intrinsics_prior import camera_with_prior
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import inverse, rotation_exp, scale_translation, step_between, transform
-from jcr.records import Capture, CellCamera, HandEye, Reconstruction, Tracks
+from jcr.records import Capture, CellCamera, Reconstruction, Tracks
 from jcr.sfm.colmap import reconstruct_colmap
 from jcr.sfm.register import Registration
 from simulation.cells import FIXED_CAMERA, Kind, cell_problem
@@ -68,7 +69,7 @@ def test_the_frame_of_the_images_does_not_matter():
 
 
 @pytest.fixture(scope="module")
-def calibrated(tabletop: Path) -> tuple[Capture, Reconstruction, HandEye]:
+def calibrated(tabletop: Path) -> tuple[Capture, Reconstruction, Calibration]:
     """The first images of the bundled capture, as a structure from motion without error would give them."""
     capture, x = jcr.read_capture(tabletop), read_truth(tabletop).gripper_from_camera
     recon_from_base = transform(rotation_exp(np.array([0.3, -0.8, 0.5])), np.array([0.2, 0.1, -0.4]))
@@ -85,7 +86,7 @@ def calibrated(tabletop: Path) -> tuple[Capture, Reconstruction, HandEye]:
     return old, reconstruction, calibrate(old, reconstruction)
 
 
-def placed(calibrated: tuple[Capture, Reconstruction, HandEye], *cameras: CellCamera) -> CellPlacement:
+def placed(calibrated: tuple[Capture, Reconstruction, Calibration], *cameras: CellCamera) -> CellPlacement:
     return place_cameras(calibrated[0], cameras, *calibrated[1:])
 
 

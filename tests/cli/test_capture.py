@@ -1,12 +1,13 @@
 """The end of `jcr capture`: its exit status, and the command that it names."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from jcr.calibration.record import read_calibration
+from jcr.calibration.record import Calibration, read_calibration
 from jcr.cli import dispatch
 from jcr.cli.capture import CaptureCommand, _conclude
 from jcr.estimation.arms import ROBOT_NAMES
@@ -21,7 +22,8 @@ def result(name: str, reached_mm: float) -> Any:
         translation_mm=2.0, rotation_deg=0.3, asked=True, distance_mm=500.0, reached_mm=reached_mm, reached_deg=0.1
     )  # fmt: skip
     content = read_calibration(ROOT / "tests" / "calibrations" / f"{name}.json")
-    content = content.model_copy(update={"requirement": required})
+    assert isinstance(content, Calibration)
+    content = replace(content, requirement=required)
     return SimpleNamespace(
         converged=content.converged,
         verdict=content.verdict,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jcr.estimation.hand_eye import fit_hand_eye
+from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.geometry import rotation_exp, transform
 from simulation.problems import HandEyeProblem, error, hand_eye_problem
 
@@ -29,7 +29,7 @@ def test_growing_errors_are_weighed_and_in_the_uncertainty():
     for seed in range(4):
         problem, camera = drifting(seed)
         for in_sequence in (False, True):
-            solved = fit_hand_eye(problem.base_from_gripper, camera, in_sequence=in_sequence)
+            solved = solve_hand_eye(problem.base_from_gripper, camera, in_sequence=in_sequence)
             off = error(problem, solved.gripper_from_camera, solved.scale)[:6]
             metres.setdefault(in_sequence, []).append(float(np.linalg.norm(off[:3])))
         squared.append(float(off @ np.linalg.solve(solved.covariance[:6, :6], off)))
@@ -43,5 +43,5 @@ def test_independent_errors_do_not_grow():
             np.random.default_rng(seed), 24, robot_noise=(3e-4, 1e-3), camera_noise=(5e-4, 1e-3)
         )
         poses = problem.base_from_gripper, problem.recon_from_camera
-        plain, either = (fit_hand_eye(*poses, in_sequence=flag) for flag in (False, True))
+        plain, either = (solve_hand_eye(*poses, in_sequence=flag) for flag in (False, True))
         assert np.array_equal(plain.covariance, either.covariance)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import jcr
-from jcr.estimation.hand_eye import fit_hand_eye
+from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.estimation.pose_equations import Region, residuals
 from jcr.estimation.robot_noise import Equations, arm_errors, most_likely, smooth_errors
 from jcr.estimation.robust import robust_fit
@@ -100,11 +100,11 @@ def test_a_named_arm_whose_joints_are_known_is_used_and_budgeted():
 
     problem = bent_problem(arm_named("panda"), "typical", 12, 1)
     poses = problem.base_from_gripper, problem.recon_from_camera
-    known = fit_hand_eye(*poses, joints=problem.joints, robot="panda")
-    named = fit_hand_eye(*poses, robot="panda")
-    nothing = fit_hand_eye(*poses)
+    known = solve_hand_eye(*poses, joints=problem.joints, robot="panda")
+    named = solve_hand_eye(*poses, robot="panda")
+    nothing = solve_hand_eye(*poses)
     for solved in (known, named, nothing):
-        parts = solved.budget
+        parts = solved.uncertainty.budget
         assert parts is not None and solved.converged
         whole = np.diag(parts.robot_random + parts.robot_systematic + parts.images)
         assert np.allclose(whole, np.diag(solved.covariance), rtol=1e-9)
@@ -117,7 +117,7 @@ def test_a_named_arm_whose_joints_are_known_is_used_and_budgeted():
     assert all(np.abs(one - other).max() > 1e-6 for one in answers for other in answers if one is not other)
     # Another order is the same problem.
     order = np.random.default_rng(0).permutation(12)
-    again = fit_hand_eye(*(stack[order] for stack in poses), joints=problem.joints[order], robot="panda")
+    again = solve_hand_eye(*(stack[order] for stack in poses), joints=problem.joints[order], robot="panda")
     assert np.allclose(again.gripper_from_camera, known.gripper_from_camera, atol=1e-7)
 
 
@@ -135,4 +135,4 @@ def test_a_named_arm_whose_joints_are_known_is_used_and_budgeted():
 def test_poses_and_angles_that_are_not_of_the_robot_are_an_input_error(joints, robot, words):
     problem = hand_eye_problem(np.random.default_rng(2), 8)
     with pytest.raises(jcr.InputError, match=words):
-        fit_hand_eye(problem.base_from_gripper, problem.recon_from_camera, joints=joints, robot=robot)
+        solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera, joints=joints, robot=robot)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.estimation.arms import arm_named
-from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.estimation.hypotheses import joint_offsets
 from jcr.estimation.inverse_kinematics import posed
 from jcr.estimation.pose_equations import pose_equations
@@ -19,8 +19,8 @@ def examined(preset: PresetName, seed: int):
     gripper, camera = problem.base_from_gripper, problem.recon_from_camera
     arm, joints = posed(problem.bent.arm, problem.joints, gripper)
     systematic = arm_errors(arm, joints)
-    solved = fit_hand_eye(gripper, camera, systematic=systematic)
-    start = solved.gripper_from_camera, solved.scale, solved.base_from_recon
+    solved = solve_hand_eye(gripper, camera, systematic=systematic)
+    start = solved.gripper_from_camera, solved.scale, solved.base_from_recon.rigid
     poses = pose_equations(*pose_problem(gripper, camera, start, error_covariance=systematic), None)
     return problem.bent.errors[:6], joint_offsets(poses, arm, joints)
 

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from jcr.estimation.hand_eye import fit_hand_eye
+from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.estimation.intrinsics_prior import ESTIMATED, TYPICAL, camera_with_prior
 from jcr.estimation.solve import Solution
 from jcr.estimation.wrist import adjust_wrist
@@ -22,11 +22,11 @@ def adjusted(warp_px: float) -> Solution:
     tracks = observed(problem, rng, 400, 0.1)
     u, v = (2 * np.pi * tracks.x_px / [INTRINSICS.width, INTRINSICS.height]).T
     tracks = replace(tracks, x_px=tracks.x_px + warp_px * np.stack([np.sin(v), np.sin(u)], axis=1))
-    start = fit_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    start = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     guess = Intrinsics(619.0, 619.0, 319.5, 239.5, 640, 480)
     return adjust_wrist(
         problem.base_from_gripper,
-        (start.gripper_from_camera, start.scale, start.base_from_recon),
+        (start.gripper_from_camera, start.scale, start.base_from_recon.rigid),
         problem.recon_from_camera,
         camera_with_prior(guess, ESTIMATED),
         tracks,

@@ -7,35 +7,35 @@ import numpy as np
 import pytest
 
 from benchmarks.coverage import BENT, WAYS, measure_seen
+from jcr.calibration.hand_eye import solve_hand_eye
+from jcr.calibration.record import Calibration
 from jcr.camera import parameters, unproject, with_parameters
-from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.estimation.intrinsics_prior import ESTIMATED, camera_with_prior
 from jcr.estimation.point_uncertainty import (
-    in_use,
-    joint_covariance,
     point_covariance,
     point_in_base,
     scene_points,
     scene_uncertainty,
+    seen_points,
     with_given_intrinsics,
     within_95,
 )
 from jcr.estimation.solve import Solution
-from jcr.estimation.wrist import adjust_wrist, estimate_of
+from jcr.estimation.wrist import adjust_wrist, uncertainty_of
 from jcr.geometry import apply, inverse, retract
-from jcr.records import Estimate, HandEye, Intrinsics, Tracks
+from jcr.records import Intrinsics, RobotNoise, Tracks, Uncertainty
 from simulation.problems import INTRINSICS, HandEyeProblem, hand_eye_problem, observed
 
 X_PX = np.array([[319.5, 239.5], [40.0, 30.0], [600.0, 450.0]])
 DISTANCE_M = 0.45
 
 
-def adjusted(problem: HandEyeProblem, seed: int) -> tuple[Solution, Tracks, HandEye]:
+def adjusted(problem: HandEyeProblem, seed: int) -> tuple[Solution, Tracks, Calibration]:
     tracks = observed(problem, np.random.default_rng([seed, 1]), 300, 0.3)
-    start = fit_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    start = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     found = adjust_wrist(
         problem.base_from_gripper,
-        (start.gripper_from_camera, start.scale, start.base_from_recon),
+        (start.gripper_from_camera, start.scale, start.base_from_recon.rigid),
         problem.recon_from_camera,
         camera_with_prior(INTRINSICS, ESTIMATED),
         tracks,
@@ -44,11 +44,12 @@ def adjusted(problem: HandEyeProblem, seed: int) -> tuple[Solution, Tracks, Hand
 
 
 @cache
-def estimated(seed: int = 0) -> tuple[Estimate, HandEye]:
+def estimated(seed: int = 0) -> tuple[np.ndarray, Uncertainty, Intrinsics, RobotNoise]:
     rng = np.random.default_rng(seed)
     problem = hand_eye_problem(rng, 10, robot_noise=(5e-4, np.radians(0.05)))
     found, tracks, start = adjusted(problem, seed)
-    return estimate_of(found, tracks), start
+    camera = found.problem.intrinsics(found.state)[0]
+    return found.state.x[0], uncertainty_of(found), camera, start.robot_noise
 
 
 def placed(x: np.ndarray, camera: Intrinsics, log_scale: float = 0.0) -> np.ndarray:
@@ -57,75 +58,69 @@ def placed(x: np.ndarray, camera: Intrinsics, log_scale: float = 0.0) -> np.ndar
 
 
 def test_covariance_of_a_seen_point_is_that_of_draws_of_all_that_places_it():
-    estimate, _ = estimated()
-    assert estimate.intrinsics is not None
-    steps = np.random.default_rng(0).multivariate_normal(
-        np.zeros(16), joint_covariance(estimate), 4000, method="eigh"
-    )
+    x, uncertainty, camera, _ = estimated()
+    steps = np.random.default_rng(0).multivariate_normal(np.zeros(16), uncertainty.whole, 4000, method="eigh")
     drawn = np.array(
         [
             placed(
-                retract(estimate.gripper_from_camera, step[:6]),
-                with_parameters(estimate.intrinsics, parameters(estimate.intrinsics) + step[7:]),
+                retract(x, step[:6]),
+                with_parameters(camera, parameters(camera) + step[7:]),
                 step[6],
             )
             for step in steps
         ]
     )
-    in_camera = drawn @ estimate.gripper_from_camera[:3, :3]
-    for k, covariance in enumerate(point_covariance(estimate, estimate.intrinsics, X_PX, DISTANCE_M)):
+    in_camera = drawn @ x[:3, :3]
+    for k, covariance in enumerate(point_covariance(x, uncertainty, camera, X_PX, DISTANCE_M)):
         assert np.cov(in_camera[:, k].T) == pytest.approx(covariance, abs=0.06 * np.trace(covariance))
 
 
 def test_intrinsics_and_transform_together_place_a_point_better_than_each_is_known():
-    estimate, _ = estimated()
-    assert estimate.intrinsics is not None
-    together = point_covariance(estimate, estimate.intrinsics, X_PX[0], DISTANCE_M)
-    apart = replace(estimate, intrinsics_cross=np.zeros_like(estimate.intrinsics_cross))
-    assert np.trace(together) < 0.7 * np.trace(
-        point_covariance(apart, estimate.intrinsics, X_PX[0], DISTANCE_M)
-    )
-    found = in_use(estimate, DISTANCE_M)
-    assert found.seen.within_95_mm == pytest.approx(1e3 * within_95(together))
-    assert found.seen.lateral_95_mm < found.seen.within_95_mm < found.corners.within_95_mm
+    x, uncertainty, camera, _ = estimated()
+    together = point_covariance(x, uncertainty, camera, X_PX[0], DISTANCE_M)
+    assert uncertainty.joint is not None
+    of_both = uncertainty.joint.covariance.copy()
+    of_both[:7, 7:] = of_both[7:, :7] = 0.0
+    apart = replace(uncertainty, joint=replace(uncertainty.joint, covariance=of_both))
+    assert np.trace(together) < 0.7 * np.trace(point_covariance(x, apart, camera, X_PX[0], DISTANCE_M))
+    found = seen_points(x, uncertainty, camera, DISTANCE_M)
+    assert found.within_95_mm == pytest.approx(1e3 * within_95(together))
+    assert found.lateral_95_mm < found.within_95_mm < found.corners.within_95_mm
 
 
 def test_errors_of_the_gripper_pose_stand_beside_those_of_the_calibration():
-    estimate, start = estimated()
-    assert estimate.intrinsics is not None
-    pose = inverse(np.linalg.inv(estimate.gripper_from_camera))
-    ray = unproject(estimate.intrinsics, X_PX)
+    x, uncertainty, camera, noise = estimated()
+    pose = inverse(np.linalg.inv(x))
+    ray = unproject(camera, X_PX)
     depth_m = DISTANCE_M * ray[:, 2] / np.linalg.norm(ray, axis=1)
-    x_in_base, found = point_in_base(estimate, start.robot_noise, X_PX, depth_m, pose)
-    assert x_in_base == pytest.approx(apply(pose, placed(estimate.gripper_from_camera, estimate.intrinsics)))
-    here = point_covariance(estimate, estimate.intrinsics, X_PX, DISTANCE_M)
-    on_gripper = placed(estimate.gripper_from_camera, estimate.intrinsics)[1]
-    noise, rng, drawn = start.robot_noise, np.random.default_rng(0), np.zeros((4000, 3))
+    x_in_base, found = point_in_base(x, uncertainty, camera, noise, X_PX, depth_m, pose)
+    assert x_in_base == pytest.approx(apply(pose, placed(x, camera)))
+    here = point_covariance(x, uncertainty, camera, X_PX, DISTANCE_M)
+    on_gripper = placed(x, camera)[1]
+    rng, drawn = np.random.default_rng(0), np.zeros((4000, 3))
     for metres, radians in ((noise.translation, noise.rotation), noise.systematic_left):
         steps = rng.normal(size=(4000, 6)) * np.repeat((metres, radians), 3)
         drawn += [apply(retract(pose, step), on_gripper) for step in steps]
-    to_base = pose[:3, :3] @ estimate.gripper_from_camera[:3, :3]
+    to_base = pose[:3, :3] @ x[:3, :3]
     expected = to_base @ here[1] @ to_base.T + np.cov(drawn.T)
     assert found[1] == pytest.approx(expected, abs=0.06 * np.trace(found[1]))
 
 
 def test_each_intrinsics_have_a_transform_of_their_own():
-    estimate, _ = estimated()
-    assert estimate.intrinsics is not None
-    off = parameters(estimate.intrinsics)
+    x, uncertainty, camera, _ = estimated()
+    off = parameters(camera)
     off[:4] += [3.0, 3.0, 3.0, -3.0]
-    given = with_parameters(estimate.intrinsics, off)
-    pair = with_given_intrinsics(estimate, given, DISTANCE_M)
+    given = with_parameters(camera, off)
+    pair = with_given_intrinsics(x, uncertainty, camera, given, DISTANCE_M)
     assert pair is not None and pair.intrinsics == given
-    here = placed(estimate.gripper_from_camera, estimate.intrinsics)[0]
+    here = placed(x, camera)[0]
     with_its_own, mixed = (
-        1e3 * np.linalg.norm(placed(x, given)[0] - here)
-        for x in (pair.gripper_from_camera, estimate.gripper_from_camera)
+        1e3 * np.linalg.norm(placed(x, given)[0] - here) for x in (pair.gripper_from_camera, x)
     )
     assert with_its_own < 0.5 * mixed and mixed > 2
     assert pair.differs_mm == pytest.approx(with_its_own, abs=0.1)
     assert pair.seen.within_95_mm > pair.differs_mm
-    assert with_given_intrinsics(replace(estimate, intrinsics_cross=None), given, DISTANCE_M) is None
+    assert with_given_intrinsics(x, replace(uncertainty, joint=None), camera, given, DISTANCE_M) is None
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.coverage import FACTOR, predicted
 from jcr.calibration.poses import calibrate_poses
-from jcr.calibration.record import Calibration, calibration_of
+from jcr.calibration.record import read_calibration
 from jcr.calibration.requirement import Proposals
 from jcr.calibration.robot_errors import errors_of
 from jcr.estimation.prediction import assumed, predict, typical_camera
@@ -29,11 +29,12 @@ def test_what_is_expected_is_what_is_reported():
 
 @pytest.mark.slow
 def test_check_expects_of_the_bundled_capture_what_its_run_reports(tabletop: Path, done: Path):
-    uncertainty = Calibration.model_validate_json((done / "calibration.json").read_text()).uncertainty
+    uncertainty = read_calibration(done).uncertainty
     found = check_capture(tabletop).expected
-    assert uncertainty is not None and uncertainty.seen is not None and found is not None
-    assert abs(np.log(found.in_use.seen.within_95_mm / uncertainty.seen.within_95_mm)) < WITHIN
-    assert abs(np.log(found.in_use.seen.rotation_95_deg / uncertainty.seen.rotation_95_deg)) < WITHIN
+    assert uncertainty is not None and uncertainty.seen is not None
+    assert found is not None and found.seen is not None
+    assert abs(np.log(found.seen.within_95_mm / uncertainty.seen.within_95_mm)) < WITHIN
+    assert abs(np.log(found.seen.rotation_95_deg / uncertainty.seen.rotation_95_deg)) < WITHIN
     assert (np.abs(np.log(found.std[:3] / (1e-3 * np.array(uncertainty.translation_std_mm)))) < WITHIN).all()
     assert (np.abs(np.log(np.degrees(found.std[3:6]) / uncertainty.rotation_std_deg)) < WITHIN).all()
 
@@ -56,7 +57,9 @@ def expected_with(
     """Standard deviations expected of a problem's poses, and the poses to add to them."""
     gripper, x = problem.base_from_gripper, problem.gripper_from_camera
     assumptions = replace(assumed(gripper, None, noise), gripper_from_camera=x)
-    proposals = Proposals.of(assumptions, gripper, errors_of(gripper), count, reach)
+    proposals = Proposals.of(
+        assumptions, gripper, [str(k) for k in range(len(gripper))], errors_of(gripper), count, reach
+    )
     return proposals.predict(0).std, proposals.next_poses(count)
 
 
@@ -98,6 +101,6 @@ def test_a_robot_that_is_found_worse_than_assumed_is_not_promised_away():
     )
     found = calibrate_poses(pairs)
     assert not found.converged
-    promised = calibration_of(pairs, pairs, found, {}, "").next_poses[-1].expected_std
+    promised = found.next_poses[-1].expected_std
     _, proposed = expected_with(problem, noise, 2)
     assert np.allclose(promised, proposed[-1].expected_std, rtol=0.5)

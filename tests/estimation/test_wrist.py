@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.camera import parameters, with_parameters
 from jcr.estimation import solve
-from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.intrinsics_prior import ESTIMATED, MEASURED, camera_with_prior
 from jcr.estimation.solve import Solution
@@ -19,10 +19,10 @@ from simulation.problems import INTRINSICS, HandEyeProblem, error, hand_eye_prob
 def solved(
     problem: HandEyeProblem, tracks: Tracks, intrinsics: Intrinsics = INTRINSICS, **options
 ) -> Solution:
-    start = fit_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    start = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     return adjust_wrist(
         problem.base_from_gripper,
-        (start.gripper_from_camera, start.scale, start.base_from_recon),
+        (start.gripper_from_camera, start.scale, start.base_from_recon.rigid),
         problem.recon_from_camera,
         intrinsics,
         tracks,
@@ -34,7 +34,7 @@ def test_camera_noise_is_beaten_by_the_images():
     rng = np.random.default_rng(1)
     problem = hand_eye_problem(rng, 10, camera_noise=(2e-3, np.radians(0.3)))
     tracks = observed(problem, rng, 400, 0.3)
-    start = fit_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    start = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     adjusted = solved(problem, tracks)
     before = error(problem, start.gripper_from_camera, start.scale)
     after = error(problem, adjusted.state.x[0], problem.scale)

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from numpy import ndarray
 
-from jcr.estimation.hand_eye import fit_hand_eye
+from jcr.calibration.hand_eye import solve_hand_eye
+from jcr.calibration.record import Calibration
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.live.next_pose import AIMED, ELSEWHERE_M, Reach, propose
-from jcr.records import Capture, HandEye
+from jcr.records import Capture, Uncertainty
 from simulation.poses import looking_at
 
 SCENE = np.array([0.5, 0.0, 0.1])
@@ -18,7 +19,7 @@ TILTED = transform(rotation_exp(np.array([0.6, 0.2, 0.0])), np.array([0.06, -0.0
 """gripper_from_camera of a camera that looks 36° past the gripper's axis."""
 
 
-def seen() -> tuple[Capture, HandEye]:
+def seen() -> tuple[Capture, Calibration]:
     """A capture of four views from one line, and the rejected calibration of it: rotations about one axis only."""
     rng = np.random.default_rng(0)
     facing = looking_at(SCENE + np.array([0.0, -0.3, 0.45]), SCENE, rng)
@@ -32,11 +33,14 @@ def seen() -> tuple[Capture, HandEye]:
         base_from_gripper=poses,
         image_size=(640, 480),
     )
-    return capture, fit_hand_eye(poses, cameras)
+    return capture, solve_hand_eye(poses, cameras)
 
 
 def next_pose(
-    capture: Capture, registered: int = 4, hand_eye: HandEye | None = None, refused: tuple[ndarray, ...] = ()
+    capture: Capture,
+    registered: int = 4,
+    hand_eye: Calibration | None = None,
+    refused: tuple[ndarray, ...] = (),
 ) -> ndarray:
     reach = Reach(refused=refused)
     return propose(capture, np.arange(registered), reach, hand_eye)["next_pose"].base_from_gripper
@@ -57,16 +61,17 @@ def test_a_rejected_calibration_that_knows_where_the_camera_looks_aims_the_next_
     capture, hand_eye = seen()
     assert not hand_eye.is_sound and not hand_eye.observability.observable
     # Of planar rotations the translation along their axis stays open; only the rotation is known here.
-    aimed = replace(hand_eye, gripper_from_camera=TILTED, covariance=np.diag(7 * [1e-6]))
+    aimed = replace(hand_eye, on_gripper=TILTED, uncertainty=Uncertainty(covariance=np.diag(7 * [1e-6])))
     assert past_scene(next_pose(capture, hand_eye=aimed)) < np.radians(8)
-    unknown = replace(aimed, covariance=np.diag([*3 * [AIMED[0] ** 2], *3 * [0.1], 1e-6]))
+    covariance = np.diag([*3 * [AIMED[0] ** 2], *3 * [0.1], 1e-6])
+    unknown = replace(aimed, uncertainty=Uncertainty(covariance=covariance))
     assert np.array_equal(next_pose(capture, hand_eye=unknown), next_pose(capture))
 
 
 @pytest.mark.parametrize("is_calibrated", [True, False])
 def test_each_refused_pose_is_followed_by_one_elsewhere_that_is_rotated_little(is_calibrated: bool):
     capture, hand_eye = seen()
-    aimed = replace(hand_eye, gripper_from_camera=TILTED, covariance=np.diag(7 * [1e-6]))
+    aimed = replace(hand_eye, on_gripper=TILTED, uncertainty=Uncertainty(covariance=np.diag(7 * [1e-6])))
     refused: tuple[ndarray, ...] = ()
     for _ in range(5):
         new = next_pose(capture, 4, aimed if is_calibrated else None, refused)

@@ -103,13 +103,18 @@ def test_the_page_says_when_the_requirement_is_met_and_stops_proposing(
     live, scripted = capture
     poses = jcr.read_capture(tabletop).base_from_gripper
     proposed = NextPose(
-        base_from_gripper=poses[11], expected_std=np.ones(7), within_95_mm=1.0, rotation_95_deg=0.1, like=0,
-        moved_m=0.1, rotation_rad=0.5,
-    )  # fmt: skip
+        base_from_gripper=poses[11],
+        expected_std=np.ones(7),
+        within_95_mm=1.0,
+        rotation_95_deg=0.1,
+        like="images/000.png",
+        moved_m=0.1,
+        rotation_rad=0.5,
+    )
     with LiveServer(live) as page:
         for count, is_met in ((4, False), (5, True)):
             add(live, scripted, tabletop, count)
-            live._report(replace(scripted.progress, next_pose=proposed, next_like="images/000.png"))
+            live._report(replace(scripted.progress, next_pose=proposed))
             shown = parts(page)
             assert ("verdict good" in shown["parts"]["head"]) is is_met
             assert ("Requirement met, press Finish" in shown["parts"]["head"]) is is_met

@@ -144,7 +144,7 @@ def test_matches_by_colour_put_predicted_cameras_right(capture: Capture, found: 
     assert np.abs(in_base[:, 2]).max() < 4e-3, "20 mm as predicted"
 
     hand_eye = calibrate(capture, found)
-    assert hand_eye.converged and hand_eye.intrinsics_covariance is not None
+    assert hand_eye.converged and hand_eye.uncertainty.joint is not None
     assert np.linalg.norm(hand_eye.gripper_from_camera[:3, 3] - X[:3, 3]) < 2e-3
     assert rotation_between_deg(hand_eye.gripper_from_camera[:3, :3], X[:3, :3]) < 0.1
     assert len(found.tracks.image) > 1000 and not found.tracks.from_pointmaps

@@ -18,7 +18,7 @@ import jcr
 from chromium import Chromium
 from conftest import shrunk_capture
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.record import calibration_of, failed_calibration
+from jcr.calibration.record import failed_calibration
 from jcr.calibration.stage import calibrate
 from jcr.capture.controllers import numbers_from_poses, poses_from_numbers
 from jcr.capture.formats.capture_json import kept, origin
@@ -29,7 +29,6 @@ from jcr.estimation.observability import excitation
 from jcr.findings import no_reconstruction
 from jcr.geometry import inverse, rotation_exp, transform
 from jcr.records import COVARIANCE_ORDER, BoardFound, Capture, CellCamera, Reconstruction, Tracks
-from jcr.records.json_fields import IntrinsicsAndStd
 from jcr.report.details import details_section
 from jcr.report.html import failed_report_html, report_html
 from jcr.report.images import MAGNIFIED
@@ -89,8 +88,7 @@ def run(done: Path, tabletop: Path, tmp_path_factory: pytest.TempPathFactory) ->
     return RunResult(
         out=folder,
         capture=capture,
-        calibration=calibration_of(capture, reconstruction, hand_eye, {"reconstruct": 1.0}, "0.0"),
-        hand_eye=hand_eye,
+        calibration=hand_eye,
         reconstruction=reconstruction,
         measured=None,
         cloud=cloud,
@@ -152,7 +150,7 @@ def test_numbers_are_those_of_the_calibration_file(run: RunResult, page: str):
 
     offered = json.loads(elements.copied("the covariance"))
     assert offered["order"] == list(COVARIANCE_ORDER)
-    assert np.array_equal(offered["covariance"], run.hand_eye.covariance)
+    assert np.array_equal(offered["covariance"], run.found.covariance)
     leave_one_out = written["held_out"]
     said = f"{significant(leave_one_out['translation_mm'])} mm, {significant(leave_one_out['rotation_deg'])}°"
     assert f"Leave-one-out error {said}" in elements.text
@@ -185,7 +183,7 @@ def test_headline_tiles_and_head_have_the_numbers_of_the_calibration(run: RunRes
     assert tiles[2][1] == "10 of 12"
     text, found = Elements(page).text, run.intrinsics
     assert f"within {tiles[0][1]}" in text and f"fx {found.fx:.2f}, fy {found.fy:.2f}" in text
-    assert f"{run.hand_eye.gripper_from_camera[0, 3]:.6f}" in text
+    assert f"{run.found.gripper_from_camera[0, 3]:.6f}" in text
     collapsed = re.findall(r'<details class="section" id="(\w+)"', page)
     assert collapsed == ["residuals", "uncertainty", "notes", "details"]
 
@@ -285,7 +283,7 @@ def test_every_camera_of_the_cell_is_in_the_scene(run: RunResult):
             (),
             mount,
             TransformUncertainty.of(1e-6 * np.eye(6), mount, 1.0),
-            IntrinsicsAndStd.of(run.intrinsics, None),
+            run.intrinsics,
         )
         for camera in (top, *others)
     ]
@@ -303,7 +301,7 @@ def test_every_camera_of_the_cell_is_in_the_scene(run: RunResult):
     assert np.allclose(drawn["top"][0], mount[:3], atol=1e-6)
     assert np.allclose(drawn["other"][0], (base @ poses[0] @ mount)[:3], atol=1e-6)
     camera = np.array(scene["views"][0]["camera"] + [[0, 0, 0, 1]])
-    expected = camera @ inverse(run.hand_eye.gripper_from_camera) @ mount
+    expected = camera @ inverse(run.found.gripper_from_camera) @ mount
     assert np.allclose(drawn["second"][0], expected[:3], atol=1e-5)
     assert scene["bases"][0]["name"] == "base of right"
 
@@ -325,22 +323,21 @@ def test_cameras_alone_are_reported_without_tracks_points_or_map(run: RunResult)
 def with_reconstruction(run: RunResult, reconstruction: Reconstruction) -> str:
     """Return the report of the calibration of another reconstruction, without a map."""
     hand_eye = calibrate(run.capture, reconstruction)
-    content = calibration_of(run.capture, reconstruction, hand_eye, {}, "0.0")
     found = run.with_parts(cloud=None, scene=None, reconstruction=reconstruction)
-    return report_html(found.with_parts(calibration=content, hand_eye=hand_eye))
+    return report_html(found.with_parts(calibration=hand_eye))
 
 
 def test_a_rejected_calibration_is_not_recommended(run: RunResult):
     still = run.capture.base_from_gripper.copy()
     still[:, :3, :3] = np.eye(3)
-    cameras = still @ run.hand_eye.gripper_from_camera
+    cameras = still @ run.found.gripper_from_camera
     of_sliding = run.with_parts(capture=replace(run.capture, base_from_gripper=still))
     page = with_reconstruction(
         of_sliding, replace(run.reconstruction, recon_from_camera=cameras[:UNREGISTERED])
     )
     text = Elements(page).text
     assert "Rejected:" in text and "does not support the result" in text and "Accepted:" not in text
-    bars = list(excitation_bars(excitation(still, run.hand_eye.gripper_from_camera)))
+    bars = list(excitation_bars(excitation(still, run.found.gripper_from_camera)))
     assert [kind for kind, *_ in bars] == ["rejected"] * 3 + ["used"] * 4
 
 
@@ -369,7 +366,7 @@ def test_poses_to_add_are_in_the_notation_of_the_robot(
 ):
     of_robot = run.with_parts(capture=replace(run.capture, pose_convention=convention, robot=robot))
     elements = Elements(report_html(of_robot))
-    for k, pose in enumerate(run.hand_eye.next_poses, start=1):
+    for k, pose in enumerate(run.found.next_poses, start=1):
         numbers = np.array([float(part) for part in elements.copied(f"pose {k}").split(",")])
         read = poses_from_numbers(numbers[None], as_written, "auto", "a test")[0]
         assert np.abs(read - pose.base_from_gripper).max() < 2e-4
@@ -391,7 +388,7 @@ def test_a_capture_that_was_copied_keeps_its_name_and_path(tmp_path: Path, table
     copied = kept(read, tmp_path / "out" / "capture")
     assert copied.folder.name == "capture" and copied.pose_convention == "ur"
     failed = failed_calibration(
-        copied, "colmap", no_reconstruction(RejectedError("nothing matched")), {"reconstruct": 1.0}, "0.0"
+        copied, "colmap", no_reconstruction(RejectedError("nothing matched")), {"reconstruct": 1.0}
     )
     elements = Elements(failed_report_html(copied, failed))
     assert "bin_picking" in elements.text
@@ -405,7 +402,7 @@ def test_a_run_without_camera_poses_reports_why_with_its_images(run: RunResult):
     capture = run.capture
     fault, remedy = "only 2 of 12 images share features", "lay <textured> things on the table"
     error = RejectedError(fault, remedy)
-    failed = failed_calibration(capture, "colmap", no_reconstruction(error), {"reconstruct": 2.0}, "0.0")
+    failed = failed_calibration(capture, "colmap", no_reconstruction(error), {"reconstruct": 2.0})
     elements = Elements(failed_report_html(capture, failed))
     assert f"No calibration: {fault}." in elements.text and f"{remedy.capitalize()}." in elements.text
     names = [a.get("alt") for tag, a in elements.found if tag == "img"]
@@ -437,7 +434,7 @@ def test_details_describe_the_board(run: RunResult, page: str):
         centres_in_base=((0.5, 0.1, 0.0),),
         tilts_deg=(0.4,),
     )
-    details = details_section(run.calibration.model_copy(update={"board": board}), {}).content["blocks"]
+    details = details_section(replace(run.found, board=board), {}).content["blocks"]
     assert details["Board"] == {
         "chessboard:9x6:0.025": "54 corners in 7 images, 0.10 px rms per axis",
         "side by the robot's positions": "25.12 ± 0.03 mm, 25 mm stated",

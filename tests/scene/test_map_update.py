@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from jcr.calibration.record import Calibration
 from jcr.camera import project, rays, resized, undistort_image
 from jcr.capture.added import read_added, with_images, write_added
 from jcr.capture.formats import capture_json
@@ -22,11 +23,11 @@ from jcr.records import (
     MATCHED,
     PRIOR,
     Capture,
-    HandEye,
     Pointmaps,
     Reconstruction,
     RobotNoise,
     Tracks,
+    Uncertainty,
 )
 from jcr.scene.cloud import LEAST_SURE, point_cloud
 from jcr.scene.options import CloudOptions, MapOptions
@@ -70,7 +71,7 @@ def whole(truth: Truth, capture: Capture) -> list[View]:
     return [View(image, true_depth(truth, k), None) for k, image in enumerate(images)]
 
 
-def known_reconstruction(truth: Truth, rendered: list[View]) -> tuple[Reconstruction, HandEye]:
+def known_reconstruction(truth: Truth, rendered: list[View]) -> tuple[Reconstruction, Calibration]:
     """What a back end would find of the first views of a scene, in a frame and unit of its own."""
     views = len(rendered)
     pinhole = resized(truth.intrinsics, *SIZE)
@@ -112,14 +113,12 @@ def known_reconstruction(truth: Truth, rendered: list[View]) -> tuple[Reconstruc
         tracks=tracks,
         backend="truth",
     )
-    hand_eye = HandEye(
-        gripper_from_camera=truth.gripper_from_camera,
+    hand_eye = Calibration(
+        on_gripper=truth.gripper_from_camera,
         scale=SCALE,
-        base_from_recon=base_from_recon,
-        covariance=1e-10 * np.eye(7),
-        inliers=np.ones(views, bool),
-        translation_residual_m=np.zeros(views),
-        rotation_residual_rad=np.zeros(views),
+        resting=base_from_recon,
+        uncertainty=Uncertainty(covariance=1e-10 * np.eye(7)),
+        images=(),
         robot_noise=RobotNoise(translation=0.0, rotation=0.0, estimated=False),
     )
     return reconstruction, hand_eye
@@ -146,7 +145,14 @@ def added_views(
     return with_images(read_added(folder, capture), new)
 
 
-def mapped(truth: Truth, capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye) -> "SceneMap":
+def extended(before: Reconstruction, hand_eye: Calibration, capture: Capture, new: Capture) -> Reconstruction:
+    x, base_from_recon = hand_eye.gripper_from_camera, hand_eye.base_from_recon
+    return extend(before, x, base_from_recon, len(capture), new, lambda stage, fraction: None)
+
+
+def mapped(
+    truth: Truth, capture: Capture, reconstruction: Reconstruction, hand_eye: Calibration
+) -> "SceneMap":
     from jcr.scene.build import build_scene
 
     box = tuple(truth.workspace_in_base.ravel().tolist())
@@ -194,7 +200,7 @@ def test_a_thing_that_was_taken_away_leaves_the_map(
     before, hand_eye = known_reconstruction(truth, whole[:6])
     places = np.concatenate([beside(truth, 0, 2), beside(truth, 4, 2)])
     new = added_views(tmp_path, truth, capture, scene_of(truth, without="toolbox"), places)
-    after = extend(before, hand_eye, len(capture), new, lambda stage, fraction: None)
+    after = extended(before, hand_eye, capture, new)
     assert len(after.recon_from_camera) == 10
     # The last images of the capture found no place; the new ones are no such image.
     assert after.image_index.tolist() == [0, 1, 2, 3, 4, 5, 10, 11, 12, 13]
@@ -212,7 +218,7 @@ def test_a_thing_that_was_put_down_enters_the_map(truth: Truth, capture: Capture
     before, hand_eye = known_reconstruction(truth, rendered)
     places = np.concatenate([beside(truth, 0, 3), beside(truth, 5, 3)])
     new = added_views(tmp_path, truth, capture, scene_of(truth), places)
-    after = extend(before, hand_eye, len(capture), new, lambda stage, fraction: None)
+    after = extended(before, hand_eye, capture, new)
     x, fresh = within(truth, "box"), mapped(truth, capture, after, hand_eye)
     assert (fresh.query(x, unknown="occupied").occupancy > 0.5).mean() > 0.75
     stayed = within(truth, "toolbox")
@@ -224,7 +230,7 @@ def test_an_unchanged_scene_loses_nothing_and_the_new_depth_is_right(
 ):
     before, hand_eye = known_reconstruction(truth, whole)
     new = added_views(tmp_path, truth, capture, scene_of(truth), truth.base_from_camera[8:9])
-    after = extend(before, hand_eye, len(capture), new, lambda stage, fraction: None)
+    after = extended(before, hand_eye, capture, new)
     known = before.dense.confidence > 0
     assert (after.dense.confidence[:8][known] > 0).mean() > 0.98
     depth = SCALE * apply(inverse(after.recon_from_camera[8]), after.dense.points_in_recon[8])[..., 2]

@@ -12,18 +12,19 @@ import pytest
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.calibration.record import Calibration
 from jcr.cli.use import sizes_lines
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import (
     Capture,
-    HandEye,
     Intrinsics,
     PointCloud,
     Pointmaps,
     Reconstruction,
     RobotNoise,
     Tracks,
+    Uncertainty,
 )
 from jcr.segments.measure import measure_objects
 from jcr.segments.options import SegmentOptions
@@ -326,15 +327,13 @@ def test_label_images_that_cannot_be_used_are_named(
     assert read_labels(*labelled_capture(tmp_path, rows=(0,))) is not None
 
 
-def hand_eye() -> HandEye:
-    return HandEye(
-        gripper_from_camera=np.eye(4),
+def hand_eye() -> Calibration:
+    return Calibration(
+        on_gripper=np.eye(4),
         scale=1.0,
-        base_from_recon=np.eye(4),
-        covariance=np.zeros((7, 7)),
-        inliers=np.ones(2, bool),
-        translation_residual_m=np.zeros(2),
-        rotation_residual_rad=np.zeros(2),
+        resting=np.eye(4),
+        uncertainty=Uncertainty(covariance=np.zeros((7, 7))),
+        images=(),
         robot_noise=RobotNoise(translation=0.0, rotation=0.0, estimated=False),
     )
 

@@ -11,17 +11,19 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.case import Case
+from jcr.calibration.hand_eye import image_verdicts, judged
+from jcr.calibration.record import Calibration
 from jcr.camera import by_parameters, by_point, parameter_names
 from jcr.estimation.closed_form import initial_estimate
-from jcr.estimation.hand_eye import judged
 from jcr.estimation.hypotheses import focal_lengths
 from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.intrinsics_prior import CameraPrior, decentring
+from jcr.estimation.point_uncertainty import joint_covariance
 from jcr.estimation.pose_equations import paper_residuals, predict
 from jcr.estimation.problem import LinearPrior, pose_problem, wrist_arm
 from jcr.estimation.projection import view_of
 from jcr.estimation.solve import START_NOISE, Solution, solve
-from jcr.estimation.wrist import adjust_wrist, estimate_of
+from jcr.estimation.wrist import adjust_wrist, recon_frame, uncertainty_of
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import (
     apply,
@@ -33,7 +35,7 @@ from jcr.geometry import (
     step_between,
     transform,
 )
-from jcr.records import Estimate, HandEye, Intrinsics, LeaveOneOut, PaperResiduals, Tracks
+from jcr.records import Intrinsics, LeaveOneOut, PaperResiduals, Tracks, Uncertainty
 
 FEWEST = 6
 """Fewest observations of an image from which the motion of its camera with the intrinsics is computed."""
@@ -61,10 +63,10 @@ def adjust_images(case: Case) -> Case:
     if not case.hand_eye.observability.observable:
         return case
     refined = judged(refined_by(case, found)).with_findings(*_not_settled(found))
-    nearer, than = refined.leave_one_out, case.hand_eye.leave_one_out
+    nearer, than = refined.held_out, case.hand_eye.held_out
     if case.tracks.from_pointmaps and (nearer is None or than is None or nearer.length_m >= than.length_m):
         return case
-    return replace(case, hand_eye=refined)
+    return replace(case, hand_eye=refined, fit=case.pose_fit)
 
 
 def _not_settled(found: Solution) -> Iterator[Finding]:
@@ -88,11 +90,11 @@ def adjust_case(
 
     `prior` takes the place of the case's camera; the rest is that of ReportedPoses and adjust_wrist.
     """
-    fit = case.hand_eye.before or case.hand_eye
+    fit = case.pose_fit
     arm = wrist_arm(case.base_from_gripper[case.used], case.systematic)
     return adjust_wrist(
         replace(arm, carries=case.carries, confirmed_errors=confirmed_errors),
-        (fit.gripper_from_camera, fit.scale, fit.base_from_recon),
+        (fit.gripper_from_camera, fit.scale, fit.base_from_recon.rigid),
         case.recon_from_camera[case.used],
         case.camera if prior is None else prior,
         case.tracks,
@@ -103,7 +105,7 @@ def adjust_case(
     )
 
 
-def _start_noise(fit: HandEye) -> tuple[float, float]:
+def _start_noise(fit: Calibration) -> tuple[float, float]:
     """Return the errors of gripper poses per axis (m, rad) that the fit to camera poses leaves, random and systematic.
 
     Images that are first adjusted to poses that contradict them take ten times the steps.
@@ -117,46 +119,32 @@ def focal_of_each(case: Case) -> Float[ndarray, "e p"]:
     return focal_lengths(case.reconstruction.intrinsics, len(case.used))
 
 
-def with_decentring(estimate: Estimate, camera: Intrinsics) -> Estimate:
-    """Return an estimate with the uncertainty of a thin prism that nobody measured and no image shows.
+def with_decentring(uncertainty: Uncertainty, camera: Intrinsics, x: Float[ndarray, "4 4"]) -> Uncertainty:
+    """Return an uncertainty with that of a thin prism that nobody measured and no image shows.
 
-    It moves the transform and the intrinsics together, and places no point elsewhere. Cameras of other models than the
-    pinhole have their own coefficients.
+    It moves the transform `x` and the intrinsics together, and places no point elsewhere. Cameras of other models than
+    the pinhole have their own coefficients.
     """
-    budget, cross, known = estimate.budget, estimate.intrinsics_cross, estimate.intrinsics_covariance
-    if camera.model != "pinhole" or budget is None or cross is None or known is None:
-        return estimate
-    steps = decentring(camera, estimate.gripper_from_camera)
-    of_x, of_camera = steps[:7], steps[7:]
-    return replace(
-        estimate,
-        covariance=estimate.covariance + of_x @ of_x.T,
-        budget=replace(budget, intrinsics=budget.intrinsics + of_x @ of_x.T),
-        intrinsics_cross=cross + of_x @ of_camera.T,
-        intrinsics_covariance=known + of_camera @ of_camera.T,
-    )
+    if camera.model != "pinhole":
+        return uncertainty
+    steps = decentring(camera, x)
+    return uncertainty.with_error(steps @ steps.T, "intrinsics")
 
 
-def with_prior_of_intrinsics(estimate: HandEye, camera: CameraPrior) -> HandEye:
-    """Return an estimate from a network's cameras with the prior uncertainty of the intrinsics.
+def with_prior_of_intrinsics(hand_eye: Calibration, camera: CameraPrior) -> Calibration:
+    """Return a calibration from a network's cameras with the prior uncertainty of the intrinsics.
 
     The focal length does not move these cameras. A wrong principal point rotates all of them, so that the transform and
     the principal point together place points where they are.
     """
     root, names = camera.directions * camera.std, parameter_names(camera.intrinsics)
-    x, by_camera = estimate.gripper_from_camera, np.zeros((7, len(root)))
+    x, by_camera = hand_eye.gripper_from_camera, np.zeros((7, len(root)))
     by_camera[3:6, names.index("cx")] = x[:3, 1] / camera.intrinsics.fx
     by_camera[3:6, names.index("cy")] = -x[:3, 0] / camera.intrinsics.fy
-    rotated, budget = by_camera @ root, estimate.budget
-    if budget is not None:
-        budget = replace(budget, intrinsics=budget.intrinsics + rotated @ rotated.T)
-    return replace(
-        estimate,
-        covariance=estimate.covariance + rotated @ rotated.T,
-        budget=budget,
-        intrinsics_cross=rotated @ root.T,
-        intrinsics_covariance=root @ root.T,
-    )
+    rotated = by_camera @ root
+    uncertainty = hand_eye.uncertainty.with_error(rotated @ rotated.T, "intrinsics")
+    joint = joint_covariance(uncertainty.covariance, rotated @ root.T, root @ root.T, camera.intrinsics)
+    return hand_eye.with_uncertainty(replace(uncertainty, joint=joint))
 
 
 def _considered(case: Case) -> Case:
@@ -180,14 +168,14 @@ def _considered(case: Case) -> Case:
 
 
 def with_intrinsics_considered(
-    hand_eye: HandEye,
+    hand_eye: Calibration,
     base_from_gripper: Float[ndarray, "m 4 4"],
     recon_from_camera: Float[ndarray, "m 4 4"],
     tracks: Tracks,
     camera: CameraPrior,
     priors: tuple[LinearPrior, ...],
     systematic: Float[ndarray, "s s"],
-) -> HandEye:
+) -> Calibration:
     """Return the calibration with the errors of its intrinsics in its covariance C and budget: C + S Φ Sᵀ.
 
     This is the consider covariance of Schmidt, Φ that of the intrinsics (Tapley, Schutz and Born, "Statistical Orbit
@@ -196,7 +184,7 @@ def with_intrinsics_considered(
     deviation of each parameter would give: cameras that keep the pixels of `tracks` in place.
     """
     seen = [np.flatnonzero(tracks.image == row) for row in range(len(recon_from_camera))]
-    if hand_eye.budget is None or min(map(len, seen)) < FEWEST:
+    if min(map(len, seen)) < FEWEST:
         return hand_eye
     each = zip(recon_from_camera, seen, strict=True)
     moved = np.array([_camera_with_other_intrinsics(one, tracks, rows, camera) for one, rows in each])
@@ -218,12 +206,7 @@ def with_intrinsics_considered(
     for k in range(len(camera.std)):
         x_k, scale_k = solved(moved[:, k])
         shifts[:, k] = np.append(step_between(x, x_k), np.log(scale_k / scale))
-    considered = shifts @ shifts.T
-    return replace(
-        hand_eye,
-        covariance=hand_eye.covariance + considered,
-        budget=replace(hand_eye.budget, intrinsics=hand_eye.budget.intrinsics + considered),
-    )
+    return hand_eye.with_uncertainty(hand_eye.uncertainty.with_error(shifts @ shifts.T, "intrinsics"))
 
 
 def _camera_with_other_intrinsics(
@@ -238,31 +221,34 @@ def _camera_with_other_intrinsics(
     return recon_from_camera @ inverse(transform(rotation_exp(steps[:, 3:]), steps[:, :3]))
 
 
-def refined_by(case: Case, found: Solution) -> HandEye:
+def refined_by(case: Case, found: Solution) -> Calibration:
     """Return the calibration of a case from an adjustment, without the findings that its numbers decide."""
-    before, used = case.hand_eye.before or case.hand_eye, case.used
-    estimate = estimate_of(found, case.tracks)
-    if case.capture.intrinsics is None and estimate.intrinsics is not None:
-        estimate = with_decentring(estimate, estimate.intrinsics)
-    x = estimate.gripper_from_camera
+    fit, used, x = case.pose_fit, case.used, found.state.x[0]
+    scale, base_from_recon = recon_frame(found, case.tracks)
+    uncertainty, intrinsics = uncertainty_of(found), found.problem.intrinsics(found.state)[0]
+    if case.capture.intrinsics is None:
+        uncertainty = with_decentring(uncertainty, intrinsics, x)
     gripper, camera = case.base_from_gripper, case.recon_from_camera
     # Rejected poses are measured against where their cameras show them.
-    predicted = estimate.base_from_recon @ scale_translation(camera, estimate.scale) @ inverse(x)
+    predicted = base_from_recon @ scale_translation(camera, scale) @ inverse(x)
     state, rigs = found.state, found.problem.arms[0].rigs
-    predicted[used] = predict(state.x[0], state.scale, state.z[0], state.world_from_rig[rigs])
+    predicted[used] = predict(x, state.scale, state.z[0], state.world_from_rig[rigs])
     metres, radians = np.linalg.norm(step_between(gripper, predicted).reshape(-1, 2, 3), axis=2).T
     reprojection = np.full(len(gripper), np.nan)
     reprojection[used] = median_reprojection_px(found.problem, found.images.view)
+    reasons = [image.reason for image in fit.images]
     return replace(
-        before,
-        **vars(estimate),
-        translation_residual_m=metres,
-        rotation_residual_rad=radians,
-        reprojection_px=reprojection,
-        residuals=PaperResiduals(*paper_residuals(gripper, camera, x, estimate.scale, before.inliers)),
+        fit,
+        on_gripper=x,
+        resting=base_from_recon,
+        scale=scale,
+        source="images",
+        uncertainty=uncertainty,
+        intrinsics=intrinsics.with_std(uncertainty.intrinsics_std),
+        images=image_verdicts(case.names, fit.inliers, reasons, metres, radians, reprojection),
+        residuals=PaperResiduals(*paper_residuals(gripper, camera, x, scale, fit.inliers)),
         robot_noise=found.noise,
-        leave_one_out=_leave_one_out(found),
-        before=before,
+        held_out=_leave_one_out(found),
     )
 
 

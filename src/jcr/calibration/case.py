@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from jcr.calibration.hand_eye import judged
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import RobotErrors, of_poses
-from jcr.estimation.hand_eye import judged
 from jcr.estimation.intrinsics_prior import (
     ESTIMATED,
     MEASURED,
@@ -23,7 +24,7 @@ from jcr.estimation.point_uncertainty import scene_points, scene_uncertainty
 from jcr.estimation.problem import LinearPrior
 from jcr.estimation.solve import Solution
 from jcr.findings import Finding, verdict_of
-from jcr.records import Capture, HandEye, Reconstruction, SceneUncertainty, Tracks
+from jcr.records import Capture, Reconstruction, SceneUncertainty, Tracks
 
 MIN_OBSERVATIONS = 200
 """Fewest observations with which images are adjusted; fewer do not refine what the poses show."""
@@ -47,8 +48,10 @@ class Case:
     """Systematic errors of the registered images' poses."""
     priors: tuple[LinearPrior, ...]
     """Measurements of scale and height beside the robot's poses."""
-    hand_eye: HandEye
-    """The calibration as it stands."""
+    hand_eye: Calibration
+    """The calibration as it stands; its images are the registered ones."""
+    fit: Calibration | None = None
+    """The fit to camera poses of which `hand_eye` was made by the images; None where `hand_eye` is that fit."""
     carries: Literal["camera", "scene"] = "camera"
     """Load of the gripper; the camera is fixed where the gripper carries the scene."""
     chosen_tracks: Tracks | None = None
@@ -71,6 +74,11 @@ class Case:
     def used(self) -> Int[ndarray, " u"]:
         """Rows of the registered images that are used."""
         return np.flatnonzero(self.hand_eye.inliers)
+
+    @property
+    def pose_fit(self) -> Calibration:
+        """The fit to camera poses, with which the adjustment of the images starts."""
+        return self.fit or self.hand_eye
 
     @property
     def names(self) -> list[str]:
@@ -104,7 +112,7 @@ class Case:
     @property
     def scene_distance_m(self) -> float | None:
         """Median distance from the camera to the scene; None where the images were not adjusted."""
-        if self.adjusted is None or self.hand_eye.before is None:
+        if self.adjusted is None or self.hand_eye.source == "poses":
             return None
         return float(np.median(self.adjusted.images.view.depth)) * self.adjusted.state.scale
 
@@ -140,14 +148,18 @@ class Case:
         )
 
     def after(
-        self, findings: tuple[Finding, ...], hand_eye: HandEye | None = None, adjusted: Solution | None = None
+        self,
+        findings: tuple[Finding, ...],
+        hand_eye: Calibration | None = None,
+        adjusted: Solution | None = None,
     ) -> "Case":
         """Return the case after a check: findings, and the calibration and adjustment that replace its own."""
         found = with_findings(hand_eye or self.hand_eye, findings)
-        return replace(self, hand_eye=found, adjusted=adjusted or self.adjusted)
+        fit = self.pose_fit if found.source == "images" else self.fit
+        return replace(self, hand_eye=found, fit=fit, adjusted=adjusted or self.adjusted)
 
 
-def with_findings(hand_eye: HandEye, findings: tuple[Finding, ...]) -> HandEye:
+def with_findings(hand_eye: Calibration, findings: tuple[Finding, ...]) -> Calibration:
     """Return a calibration with findings, and with their shifts in its covariance.
 
     A finding rejects the calibration where its shift makes it too uncertain, or where it explains a rejection.

@@ -14,12 +14,12 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
+from jcr.calibration.hand_eye import solve_hand_eye
+from jcr.calibration.record import Calibration
 from jcr.estimation.closed_form import closed_form
-from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.estimation.robust import least_trimmed
 from jcr.findings import Finding, FindingKind, Severity
 from jcr.geometry import Poses, inverse, transform
-from jcr.records import HandEye
 
 SOLVED = 24
 """Largest number of readings that are solved in full, the most congruent ones."""
@@ -91,7 +91,7 @@ class PoseConvention:
         return self.translation_mm + 5 * self.rotation_deg
 
     @classmethod
-    def of(cls, name: str, solved: HandEye) -> "PoseConvention":
+    def of(cls, name: str, solved: Calibration) -> "PoseConvention":
         """Return a reading with the misfit of its calibration."""
         metres, radians = solved.robot_noise.together
         return cls(name, 1e3 * metres, float(np.degrees(radians)), int(solved.inliers.sum()))
@@ -105,7 +105,7 @@ def better_reading(
     base_from_gripper: Poses,
     recon_from_camera: Poses,
     by_name: Mapping[bool, Poses] | None = None,
-    solved: HandEye | None = None,
+    solved: Calibration | None = None,
 ) -> tuple[PoseConvention, PoseConvention] | None:
     """Return the pose convention that fits far better than the given one, and the given one; None where none does.
 
@@ -157,7 +157,7 @@ def convention_finding(
 def _solved(candidate: _Candidate, recon_from_camera: Poses) -> PoseConvention:
     name, base_from_gripper, image = candidate
     return PoseConvention.of(
-        name, fit_hand_eye(base_from_gripper, recon_from_camera[image], in_sequence=False)
+        name, solve_hand_eye(base_from_gripper, recon_from_camera[image], in_sequence=False)
     )
 
 

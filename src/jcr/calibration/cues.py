@@ -5,11 +5,12 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.options import LengthInImage
+from jcr.calibration.record import Calibration
 from jcr.camera import project, unproject
 from jcr.errors import InputError
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import Poses, rotation_angle
-from jcr.records import Capture, HandEye, Reconstruction
+from jcr.records import Capture, Reconstruction
 
 LENGTH_STD = 0.01
 """Relative standard deviation of a length: one pixel at either end of a hundred pixels."""
@@ -94,7 +95,7 @@ def surface_at(
     return dense.points_in_recon[rows[0], row, column].astype(np.float64)
 
 
-def scale_contradiction(free: HandEye, metric_std: float) -> Finding | None:
+def scale_contradiction(free: Calibration, metric_std: float) -> Finding | None:
     """Return the finding that the robot's motion excludes that the reconstruction is in metres; None where it does not.
 
     `free` is a calibration without that scale; `metric_std` is the relative standard deviation of the metre.

@@ -11,7 +11,7 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from jcr.calibration.record import Calibration, read_content, validated
+from jcr.calibration.record import AnyCalibration, FailedCalibration, read_content, validated
 from jcr.distributions import chi2
 from jcr.errors import InputError, first_fault
 from jcr.geometry import require_rigid, step_between
@@ -20,7 +20,7 @@ from jcr.records.json_fields import Matrix, Spread3
 if TYPE_CHECKING:
     from jcr.result import RunResult
 
-    Comparable = RunResult | Calibration | str | Path | ArrayLike
+    Comparable = RunResult | AnyCalibration | str | Path | ArrayLike
 else:
     Comparable = object
 
@@ -83,7 +83,7 @@ def _stated(one: Comparable) -> StatedTransform:
     if isinstance(one, str | Path):
         return read_hand_eye(Path(one))
     record = getattr(one, "calibration", one)
-    if isinstance(record, Calibration):
+    if isinstance(record, AnyCalibration):
         return _of_calibration(record, "the calibration")
     matrix = np.asarray(one, float)
     if matrix.shape != (4, 4):
@@ -117,18 +117,14 @@ def read_hand_eye(path: Path) -> StatedTransform:
     return StatedTransform(found.gripper_from_camera, np.diag(std**2))
 
 
-def _of_calibration(calibration: Calibration, name: str) -> StatedTransform:
+def _of_calibration(calibration: AnyCalibration, name: str) -> StatedTransform:
     """Return the transform of a calibration with its covariance and the parts of it; raise InputError without one."""
-    if calibration.parent_from_camera is None or calibration.uncertainty is None:
+    if isinstance(calibration, FailedCalibration):
         raise InputError(f"{name}: has no {calibration.mount}_from_camera; that calibration failed")
     budget = calibration.uncertainty.budget
-    shares = {} if budget is None else {name: share for name, share in budget if share is not None}
-    return StatedTransform(
-        calibration.gripper_from_camera,
-        calibration.covariance[:6, :6],
-        {name: share.covariance[:6, :6] for name, share in shares.items() if share.covariance is not None},
-        calibration.doubt,
-    )
+    parts = {} if budget is None else {cause: part[:6, :6] for cause, part in vars(budget).items()}
+    covariance = calibration.covariance[:6, :6]
+    return StatedTransform(calibration.gripper_from_camera, covariance, parts, calibration.doubt)
 
 
 def difference(ours: StatedTransform, other: StatedTransform) -> Difference:

@@ -1,6 +1,6 @@
 """Required accuracy of a calibration, its accuracy in use, and the gripper poses to add until it is reached."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -10,13 +10,12 @@ from numpy import ndarray
 
 from jcr.calibration.case import Case
 from jcr.calibration.options import GRASPING, MOST_POSES, CalibrateOptions
+from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import RobotErrors, of_poses
-from jcr.estimation.observability import excitation
-from jcr.estimation.point_uncertainty import in_use, within_95
+from jcr.estimation.point_uncertainty import seen_points, within_95
 from jcr.estimation.prediction import (
     Assumptions,
     PredictedCamera,
-    Prediction,
     assumed_camera,
     candidates,
     choose,
@@ -29,7 +28,7 @@ from jcr.estimation.prediction import (
 )
 from jcr.findings import Concerns, Finding, FindingKind
 from jcr.geometry import Poses, inverse, rotation_angle
-from jcr.records import Estimate, HandEye, InUse, NextPose, Requirement, SceneUncertainty, Where
+from jcr.records import NextPose, Requirement, SceneUncertainty, Uncertainty, Where
 
 PROPOSED = 2
 """Number of gripper poses proposed after a calibration, if these are enough."""
@@ -45,12 +44,15 @@ class Proposals:
     base_from_gripper: Float[ndarray, "n 4 4"]
     robot: RobotErrors
     """Errors of the poses of the capture."""
+    names: Sequence[str]
+    """Names of the poses of the capture."""
     added: Float[ndarray, "c 4 4"]
 
     @staticmethod
     def of(
         assumptions: Assumptions,
         base_from_gripper: Poses,
+        names: Sequence[str],
         robot: RobotErrors,
         count: int,
         reach: Float[ndarray, "2 3"] | None = None,
@@ -59,11 +61,13 @@ class Proposals:
     ) -> "Proposals":
         """Return the `count` poses that reduce the predicted uncertainty most.
 
-        `robot` is of the poses of the capture, `reach` is that of `candidates`, drawn with `seed`. `is_likely` tells at
-        which poses an image is likely to register; other poses are taken only where there are none of these.
+        `names` and `robot` are of the poses of the capture, `reach` is that of `candidates`, drawn with `seed`.
+        `is_likely` tells at which poses an image is likely to register; others are taken only where there are none.
         """
         now, x = base_from_gripper, assumptions.gripper_from_camera
-        found = Proposals(assumptions=assumptions, base_from_gripper=now, robot=robot, added=now[:0])
+        found = Proposals(
+            assumptions=assumptions, base_from_gripper=now, robot=robot, names=names, added=now[:0]
+        )
         if count == 0:
             return found
         possible = candidates(now, x, reach, np.random.default_rng(seed))
@@ -81,22 +85,23 @@ class Proposals:
 
         return replace(found, added=possible[choose(count, len(possible), uncertainty_of)])
 
-    def predict(self, count: int) -> Prediction:
-        """Return the predicted result with the first `count` of the added poses."""
+    def predict(self, count: int) -> Uncertainty:
+        """Return the predicted uncertainty with the first `count` of the added poses."""
         now, added = self.base_from_gripper, self.added[:count]
         return predict(self.assumptions, np.concatenate([now, added]), self.robot.with_poses(now, added))
 
-    def next_pose(self, count: int, prediction: Prediction) -> NextPose:
-        """Return the last of the first `count` added poses with the prediction for these."""
-        pose, seen = self.added[count - 1], prediction.in_use.seen
+    def next_pose(self, count: int, predicted: Uncertainty) -> NextPose:
+        """Return the last of the first `count` added poses with the uncertainty predicted for these."""
+        pose, seen = self.added[count - 1], predicted.seen
+        assert seen is not None
         like = int(nearest(pose[None], self.base_from_gripper)[0])
         motion = inverse(self.base_from_gripper[like]) @ pose
         return NextPose(
             base_from_gripper=pose,
-            expected_std=prediction.std,
+            expected_std=predicted.std,
             within_95_mm=seen.within_95_mm,
             rotation_95_deg=seen.rotation_95_deg,
-            like=like,
+            like=self.names[like],
             moved_m=float(np.linalg.norm(motion[:3, 3])),
             rotation_rad=float(rotation_angle(motion[:3, :3])),
         )
@@ -116,7 +121,7 @@ def assumptions_of(case: Case) -> Assumptions:
 
 
 def assumptions_of_poses(
-    hand_eye: HandEye, used: Float[ndarray, "n 4 4"], scale_std: float | None = None
+    hand_eye: Calibration, used: Float[ndarray, "n 4 4"], scale_std: float | None = None
 ) -> Assumptions:
     """Return the same assumption for a calibration from given camera poses; `used` are its gripper poses."""
     return Assumptions(
@@ -127,36 +132,38 @@ def assumptions_of_poses(
     )
 
 
-def reached(estimate: Estimate, found: InUse, at: Where) -> tuple[float, float]:
+def reached(uncertainty: Uncertainty, at: Where) -> tuple[float, float]:
     """Return the bounds (mm, degrees) of 95 % of the errors at one place; without a scene at a seen point."""
-    translation, rotation = slice(0, 3), slice(3, 6)
+    covariance, scene, seen = uncertainty.covariance, uncertainty.scene, uncertainty.seen
     if at == "camera":
-        covariance = estimate.covariance
-        metres = within_95(covariance[translation, translation])
-    elif at == "scene" and found.scene is not None:
-        covariance = found.scene.covariance
-        metres = found.scene.within_95_m
+        metres = within_95(covariance[:3, :3])
+    elif at == "scene" and scene is not None:
+        covariance, metres = scene.covariance, scene.within_95_m
     else:
-        return found.seen.within_95_mm, found.seen.rotation_95_deg
-    return 1e3 * metres, float(np.degrees(within_95(covariance[rotation, rotation])))
+        assert seen is not None
+        return seen.within_95_mm, seen.rotation_95_deg
+    return 1e3 * metres, float(np.degrees(within_95(covariance[3:6, 3:6])))
 
 
 def advised(
-    hand_eye: HandEye,
+    hand_eye: Calibration,
     gripper: Float[ndarray, "m 4 4"],
     options: CalibrateOptions,
     robot: RobotErrors,
     assumptions: Assumptions,
     scene: SceneUncertainty | None = None,
-) -> HandEye:
-    """Return the calibration with its excitation, its accuracy in use, the requirement, and the poses to add.
+) -> Calibration:
+    """Return the calibration with its point uncertainty, the requirement, and the poses to add.
 
     Poses are proposed where the requirement is not met or the user asks: the prediction takes a third of a calibration.
     `gripper` are the poses that the solver was given, in its order, `robot` is of these; `assumptions` are those of the
     calibration, `scene` is the uncertainty of the scene, where images were adjusted.
     """
     used, robot = gripper[hand_eye.inliers], robot.of(np.flatnonzero(hand_eye.inliers))
-    hand_eye = replace(hand_eye, in_use=in_use(hand_eye, assumptions.distance_m, scene))
+    x, uncertainty = hand_eye.gripper_from_camera, hand_eye.uncertainty
+    seen = seen_points(x, uncertainty, hand_eye.intrinsics, assumptions.distance_m)
+    uncertainty = replace(uncertainty, seen=seen, scene=scene)
+    hand_eye, names = replace(hand_eye, uncertainty=uncertainty), hand_eye.names_used
     required = _required(hand_eye, options)
     # Wrong intrinsics and a strained robot stay the same with further images.
     lasting = [
@@ -178,13 +185,12 @@ def advised(
         sizes = ("translation", "rotation", "systematic")
         noise = replace(found, **{name: max(getattr(found, name), getattr(usual, name)) for name in sizes})
         assumptions = replace(assumptions, gripper_from_camera=assumed_camera(used), noise=noise, camera=None)
-        proposed = Proposals.of(assumptions, used, robot, PROPOSED).next_poses(PROPOSED)
-    seen = excitation(used, hand_eye.gripper_from_camera) if len(used) > 1 else None
+        proposed = Proposals.of(assumptions, used, names, robot, PROPOSED).next_poses(PROPOSED)
     earlier = tuple(one for one in hand_eye.findings if one.kind is not FindingKind.NOT_EXACT_ENOUGH)
-    hand_eye = replace(
-        hand_eye, excitation=seen, next_poses=tuple(proposed), requirement=required, findings=earlier
+    hand_eye = replace(hand_eye, next_poses=tuple(proposed), requirement=required, findings=earlier)
+    short = not_exact_enough(
+        required, uncertainty.budget is not None and uncertainty.budget.mostly_systematic
     )
-    short = not_exact_enough(required, hand_eye.budget is not None and hand_eye.budget.mostly_systematic)
     return hand_eye if short is None or not hand_eye.converged else hand_eye.with_findings(short)
 
 
@@ -205,17 +211,17 @@ def not_exact_enough(required: Requirement, systematic: bool) -> Finding | None:
     return replace(finding, value=1e-3 * required.reached_mm, details=numbers)
 
 
-def _required(hand_eye: HandEye, options: CalibrateOptions) -> Requirement:
+def _required(hand_eye: Calibration, options: CalibrateOptions) -> Requirement:
     """Return the requirement beside the accuracy in use of a calibration."""
-    found, at = hand_eye.in_use, options.require_at
-    assert found is not None
-    reached_mm, reached_deg = reached(hand_eye, found, at)
+    seen, at = hand_eye.uncertainty.seen, options.require_at
+    assert seen is not None
+    reached_mm, reached_deg = reached(hand_eye.uncertainty, at)
     translation_mm, rotation_deg = options.require or GRASPING
     return Requirement(
         translation_mm=translation_mm,
         rotation_deg=rotation_deg,
         asked=options.require is not None,
-        distance_mm=0.0 if at == "camera" else found.seen.distance_mm,
+        distance_mm=0.0 if at == "camera" else seen.distance_mm,
         reached_mm=reached_mm,
         reached_deg=reached_deg,
         at=at,
@@ -223,7 +229,7 @@ def _required(hand_eye: HandEye, options: CalibrateOptions) -> Requirement:
 
 
 def _worthwhile(
-    hand_eye: HandEye,
+    hand_eye: Calibration,
     used: Float[ndarray, "k 4 4"],
     required: Requirement,
     assumptions: Assumptions,
@@ -235,12 +241,14 @@ def _worthwhile(
     The reported uncertainty shrinks by the ratio by which the predicted one does: images and robot may be better or
     worse than predicted.
     """
-    proposals = Proposals.of(assumptions, used, robot, least if required.met else MOST_POSES)
+    proposals = Proposals.of(
+        assumptions, used, hand_eye.names_used, robot, least if required.met else MOST_POSES
+    )
     predicted = cache(proposals.predict)
 
     def shrunk(count: int, at: Where, mm: float, deg: float) -> tuple[float, float]:
         (now_mm, now_deg), (then_mm, then_deg) = (
-            reached(one.estimate, one.in_use, at) for one in (predicted(0), predicted(count))
+            reached(one, at) for one in (predicted(0), predicted(count))
         )
         return mm * then_mm / now_mm, deg * then_deg / now_deg
 
@@ -251,11 +259,11 @@ def _worthwhile(
     more = 0 if required.met else None
     if not required.met and is_met(MOST_POSES):
         more = next(count for count in range(1, MOST_POSES + 1) if is_met(count))
-    found, std = hand_eye.in_use, np.sqrt(np.diag(hand_eye.covariance))
-    assert found is not None
+    seen, std = hand_eye.uncertainty.seen, hand_eye.uncertainty.std
+    assert seen is not None
     proposed = []
     for count in range(1, max(least, more or 0) + 1):
-        mm, deg = shrunk(count, "seen", found.seen.within_95_mm, found.seen.rotation_95_deg)
+        mm, deg = shrunk(count, "seen", seen.within_95_mm, seen.rotation_95_deg)
         proposed.append(
             replace(
                 proposals.next_pose(count, predicted(count)),

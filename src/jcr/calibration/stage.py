@@ -3,29 +3,28 @@
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from jcr.calibration.adjust import adjust_images
 from jcr.calibration.case import Case
 from jcr.calibration.checks.table import CHECKS
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
+from jcr.calibration.hand_eye import SCALE_STD, Offset, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions, check_options
+from jcr.calibration.record import Calibration
 from jcr.calibration.requirement import advised, assumptions_of
 from jcr.calibration.robot_errors import RobotErrors, robot_errors
 from jcr.errors import RejectedError
-from jcr.estimation.hand_eye import SCALE_STD, Offset, fit_hand_eye
 from jcr.estimation.point_uncertainty import with_given_intrinsics
 from jcr.estimation.problem import offset_prior, scale_prior
 from jcr.least_squares import one_blas_thread
-from jcr.records import Capture, HandEye, Reconstruction
+from jcr.records import Capture, Reconstruction
 
 
 @one_blas_thread
 def calibrate(
     capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions | None = None
-) -> HandEye:
-    """Calibrate the registered images; per-pose fields are in the reconstruction's order.
+) -> Calibration:
+    """Calibrate the registered images of a capture.
 
     Camera poses with a covariance are weighed with it and not adjusted. Other images are adjusted with the poses; on
     correspondences between pointmaps, whose errors neighbours share, the adjustment stands only where its leave-one-out
@@ -35,10 +34,12 @@ def calibrate(
     check_options(options := options or CalibrateOptions())
     robot = robot_errors(capture, options).of(reconstruction.image_index)
     case = calibrate_case(capture, reconstruction, options, robot)
-    if capture.intrinsics is None or (distance_m := case.scene_distance_m) is None:
-        return case.hand_eye
-    pair = with_given_intrinsics(case.hand_eye, reconstruction.intrinsics, distance_m)
-    return replace(case.hand_eye, with_given_intrinsics=pair)
+    hand_eye = case.hand_eye
+    if capture.intrinsics is not None and (distance_m := case.scene_distance_m) is not None:
+        x, uncertainty, camera = hand_eye.gripper_from_camera, hand_eye.uncertainty, hand_eye.intrinsics
+        pair = with_given_intrinsics(x, uncertainty, camera, reconstruction.intrinsics, distance_m)
+        hand_eye = replace(hand_eye, with_given_intrinsics=pair)
+    return hand_eye.of_capture(capture, reconstruction)
 
 
 def calibrate_case(
@@ -82,19 +83,18 @@ def fit_poses(
             "overlap the views more",
             also=(*reconstruction.warnings, *reconstruction.notes),
         )
-    gripper = capture.base_from_gripper[reconstruction.image_index]
     (scale, offset), contradiction = _measured(capture, reconstruction, options), None
     if scale is not None and offset is None:
         # Where the motions determine the scale, it is compared with the length beside others (checks/lengths.py).
-        scale = None if _solved(gripper, reconstruction, options, robot).converged else scale
+        scale = None if _solved(capture, reconstruction, options, robot).converged else scale
     if scale is offset is None and (metric_std := reconstruction.metric_std) is not None:
-        free = _solved(gripper, reconstruction, options, robot)
+        free = _solved(capture, reconstruction, options, robot)
         contradiction = scale_contradiction(free, metric_std)
         scale = 1.0, metric_std
-    hand_eye = _solved(gripper, reconstruction, options, robot, scale, offset)
+    hand_eye = _solved(capture, reconstruction, options, robot, scale, offset)
     priors = () if scale is None else (scale_prior(*scale),)
     priors += () if offset is None else (offset_prior(*offset),)
-    hand_eye = replace(hand_eye, intrinsics=reconstruction.intrinsics)
+    hand_eye = replace(hand_eye, intrinsics=reconstruction.intrinsics.with_std(None))
     return Case(
         capture=capture,
         reconstruction=reconstruction,
@@ -106,16 +106,16 @@ def fit_poses(
 
 
 def _solved(
-    gripper: Float[ndarray, "m 4 4"],
+    capture: Capture,
     reconstruction: Reconstruction,
     options: CalibrateOptions,
     robot: RobotErrors,
     scale: tuple[float, float] | None = None,
     offset: Offset | None = None,
-) -> HandEye:
-    evidence = reconstruction.evidence
-    return fit_hand_eye(
-        gripper,
+) -> Calibration:
+    evidence, rows = reconstruction.evidence, reconstruction.image_index
+    return solve_hand_eye(
+        capture.base_from_gripper[rows],
         reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera,
         robot_noise=options.robot_noise_m_rad,
         scale=None if scale is None else scale[0],
@@ -124,6 +124,7 @@ def _solved(
         camera_covariance=None if evidence is None else evidence.covariance,
         systematic=robot.systematic,
         in_sequence=False,
+        names=[capture.images[row] for row in rows],
     )
 
 

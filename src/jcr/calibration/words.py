@@ -5,17 +5,22 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jcr.calibration.record import (
-    Calibration,
-    GivenIntrinsicsPair,
-    Proposal,
+from jcr.calibration.record import AnyCalibration, Calibration
+from jcr.findings import Finding, FindingKind, remedy, sentence, text, verdict_of, without_consequences
+from jcr.findings.sentences import network_scale, worst_direction
+from jcr.records import (
+    Attempt,
+    BoardFound,
+    Budget,
+    DepthCheck,
+    LeaveOneOut,
+    NextPose,
+    Requirement,
     SeenAndCorners,
     Uncertainty,
-    UncertaintyBudget,
+    WithGivenIntrinsics,
+    share_of,
 )
-from jcr.findings import Finding, FindingKind, remedy, sentence, text, verdict_of, without_consequences
-from jcr.findings.sentences import network_scale
-from jcr.records import Attempt, BoardFound, DepthCheck, LeaveOneOut, Requirement
 from jcr.rounding import significant, with_std
 
 NEGLIGIBLE = 0.02
@@ -31,7 +36,7 @@ def labelled(label: str, *lines: str) -> list[str]:
     return [f"{label if k == 0 else '':<12}{line}" for k, line in enumerate(lines)]
 
 
-def headline(content: Calibration) -> str:
+def headline(content: AnyCalibration) -> str:
     """Return the verdict, the required accuracy, the images used, the back end and the time, in one line."""
     verdict = verdict_in_words(content.findings)
     limit = "" if content.requirement is None else f" ({_limit(content, content.requirement)})"
@@ -50,7 +55,7 @@ def verdict_in_words(findings: Iterable[Finding]) -> str:
     return f"ACCEPTED with {warnings} warning{'s' * (warnings > 1)}"
 
 
-def _limit(content: Calibration, required: Requirement) -> str:
+def _limit(content: AnyCalibration, required: Requirement) -> str:
     """Return the requirement, and where in the image it is not met."""
     limit = f"limit {required.translation_mm:g} mm, {required.rotation_deg:g}°"
     if not required.met:
@@ -69,12 +74,14 @@ def _limit(content: Calibration, required: Requirement) -> str:
     return f"{limit} met at the image centre, not in the corner: {', '.join(exceeded)}" if exceeded else limit
 
 
-def summary(content: Calibration, most: int = MOST_LINES) -> str:
+def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
     """Return at most `most` lines, two of which are left to the caller: verdict, transform, accuracy, what to act on.
 
     A rejected calibration has its cause and remedy instead of the transform.
     """
-    lines = [headline(content), *(_transform(content) if content.converged else ())]
+    lines = [headline(content)]
+    if isinstance(content, Calibration) and content.converged:
+        lines += _transform(content)
     proposed = _proposed(content.next_poses)
     if content.converged and content.short is None and proposed:
         lines += labelled("To improve", proposed)
@@ -83,9 +90,7 @@ def summary(content: Calibration, most: int = MOST_LINES) -> str:
 
 def _transform(content: Calibration) -> list[str]:
     """Return the transform with its standard deviations, the accuracy and the intrinsics."""
-    uncertainty = content.uncertainty
-    assert uncertainty is not None and content.parent_from_camera is not None
-    matrix = np.array(content.parent_from_camera)
+    uncertainty, matrix = content.uncertainty, content.parent_from_camera
     quat_xyzw = Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True)
     x, q = (" ".join(f"{number:8.5f}" for number in part) for part in (matrix[:3, 3], quat_xyzw))
     offset = " ".join(significant(size) for size in uncertainty.translation_std_mm)
@@ -167,18 +172,17 @@ def _remedy(finding: Finding, proposed: str) -> str:
     return proposed if is_images and proposed else remedy(finding)
 
 
-def _proposed(poses: Sequence[Proposal]) -> str:
+def _proposed(poses: Sequence[NextPose]) -> str:
     """Return the gripper poses to add, and the accuracy expected with all of them; empty where none is proposed."""
     if not poses:
         return ""
-    last, then = poses[-1], ""
-    if last.within_95_mm is not None and last.rotation_95_deg is not None:
-        then = f"; expected {significant(last.within_95_mm)} mm, {significant(last.rotation_95_deg)}° (95 %)"
+    last = poses[-1]
+    then = f"; expected {significant(last.within_95_mm)} mm, {significant(last.rotation_95_deg)}° (95 %)"
     count = f"{len(poses)} image{'s' * (len(poses) > 1)}"
     return f"add {count} (poses in calibration.json, next_poses){then}"
 
 
-def details(content: Calibration) -> list[str]:
+def details(content: AnyCalibration) -> list[str]:
     """Return the lines of `--verbose` and log.txt: attempts, times, matrix, budget, comparisons, images, findings."""
     tried = (
         f"attempt {k}: {attempt_in_words(attempt, len(content.images))}"
@@ -200,15 +204,15 @@ def details(content: Calibration) -> list[str]:
     ]
 
 
-def _sizes(content: Calibration) -> list[str]:
+def _sizes(content: AnyCalibration) -> list[str]:
     """Return the matrix, the budget of its uncertainty, and the comparisons of lengths; nothing of a failure."""
-    uncertainty, scale = content.uncertainty, content.scale
-    if uncertainty is None or scale is None:
+    if not isinstance(content, Calibration):
         return []
+    uncertainty, scale = content.uncertainty, content.scale
     with np.printoptions(precision=6, suppress=True):
         matrix = str(np.array(content.parent_from_camera)).splitlines()
     lines = [f"{content.mount}_from_camera", *(f"  {row}" for row in matrix)]
-    lines.append(f"least certain {uncertainty.worst}")
+    lines.append(f"least certain {worst_direction(content.parent_from_camera, uncertainty.covariance)}")
     if uncertainty.budget is not None:
         parts = "; ".join(f"{name} {size}" for name, size in budget_in_words(uncertainty.budget).items())
         lines.append(f"1σ comes from {parts}")
@@ -228,7 +232,7 @@ def _sizes(content: Calibration) -> list[str]:
     return lines
 
 
-def log(content: Calibration) -> str:
+def log(content: AnyCalibration) -> str:
     """Return the text of log.txt: the summary with every warning, then the details."""
     return summary(content, 1000) + "\n" + "\n".join(details(content)) + "\n"
 
@@ -252,7 +256,7 @@ def seen_in_words(seen: SeenAndCorners) -> str:
     )
 
 
-def given_in_words(given: GivenIntrinsicsPair) -> str:
+def given_in_words(given: WithGivenIntrinsics) -> str:
     """Return how far apart the given and the estimated intrinsics place a point, each with its own transform."""
     return (
         f"with the given intrinsics and their transform (with_given_intrinsics) the same point is "
@@ -260,25 +264,22 @@ def given_in_words(given: GivenIntrinsicsPair) -> str:
     )
 
 
-def budget_in_words(budget: UncertaintyBudget) -> dict[str, str]:
+def budget_in_words(budget: Budget) -> dict[str, str]:
     """Return the size of each part of the uncertainty, largest first; negligible parts are left out."""
     named = {
         "random robot errors": budget.robot_random,
         "systematic robot errors": budget.robot_systematic,
         "intrinsics": budget.intrinsics,
         "images": budget.images,
+        "faults found": budget.faults,
     }
-    if budget.faults is not None:
-        named["faults found"] = budget.faults
-    ranked = sorted(named.items(), key=lambda item: -item[1].translation_mm)
-    least_mm, least_deg = (
-        NEGLIGIBLE * max(getattr(share, unit) for share in named.values())
-        for unit in ("translation_mm", "rotation_deg")
-    )
+    shares = ((name, share_of(part)) for name, part in named.items())
+    sizes = [(name, share.translation_mm, share.rotation_deg) for name, share in shares]
+    least_mm, least_deg = NEGLIGIBLE * np.array([size[1:] for size in sizes]).max(0)
     return {
-        name: f"{share.translation_mm:.2f} mm {share.rotation_deg:.3f}°"
-        for name, share in ranked
-        if share.translation_mm > least_mm or share.rotation_deg > least_deg
+        name: f"{mm:.2f} mm {deg:.3f}°"
+        for name, mm, deg in sorted(sizes, key=lambda size: -size[1])
+        if mm > least_mm or deg > least_deg
     }
 
 

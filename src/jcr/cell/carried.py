@@ -13,14 +13,15 @@ from jcr.calibration.adjust import adjust_case
 from jcr.calibration.case import MIN_OBSERVATIONS, Case, with_findings
 from jcr.calibration.checks.camera import of_case, of_fewer_points
 from jcr.calibration.checks.effects import EFFECTS, effects, with_effects
+from jcr.calibration.hand_eye import judged, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors
 from jcr.cell.background import write_moving_parts
-from jcr.estimation.hand_eye import fit_hand_eye, judged
-from jcr.estimation.wrist import estimate_of
+from jcr.estimation.wrist import recon_frame, uncertainty_of
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import inverse
-from jcr.records import Capture, HandEye, Reconstruction
+from jcr.records import Capture, Reconstruction
 
 
 def eye_to_hand(capture: Capture, moving: Path | None = None) -> Capture:
@@ -44,16 +45,26 @@ def eye_to_hand(capture: Capture, moving: Path | None = None) -> Capture:
 
 
 def refined(
-    capture: Capture, reconstruction: Reconstruction, found: HandEye, options: CalibrateOptions | None = None
-) -> HandEye:
+    capture: Capture,
+    reconstruction: Reconstruction,
+    found: Calibration,
+    options: CalibrateOptions | None = None,
+) -> Calibration:
     """Refine the calibration of the exchanged capture with the errors of the reported gripper poses.
 
-    Its gripper_from_camera is base_from_camera, its base_from_recon gripper_from_recon; residuals are of the gripper
-    poses as they were reported. One that is rejected stays as it was, or is named as a camera on the gripper.
+    The result is that of a camera mounted on the base; residuals are of the gripper poses as they were reported. One
+    that is rejected stays as it was, or is named as a camera on the gripper.
     """
-    options, rows = options or CalibrateOptions(), reconstruction.image_index
+    return _refined(capture, reconstruction, found, options or CalibrateOptions()).on_fixed_camera()
+
+
+def _refined(
+    capture: Capture, reconstruction: Reconstruction, found: Calibration, options: CalibrateOptions
+) -> Calibration:
+    """Return the refined calibration, whose gripper_from_camera is base_from_camera."""
+    rows = reconstruction.image_index
     if not found.is_sound:
-        on_gripper = fit_hand_eye(
+        on_gripper = solve_hand_eye(
             capture.base_from_gripper[rows], reconstruction.recon_from_camera, in_sequence=False
         )
         why = Finding.of(FindingKind.WRONG_MOUNT, "rejects", "mount", camera=capture.camera_name)
@@ -67,16 +78,23 @@ def refined(
         hand_eye=found,
         carries="scene",
     )
-    if found.before is None or case.tracks.from_pointmaps or len(case.tracks.image) < MIN_OBSERVATIONS:
+    if found.source == "poses" or case.tracks.from_pointmaps or len(case.tracks.image) < MIN_OBSERVATIONS:
         return found
     case = replace(case, adjusted=adjust_case(case))
     state, effects_found = effects(of_case(of_fewer_points(case)))
     adjusted, effects_found = with_effects(case, state, effects_found)
     answer = adjusted or case.adjusted
     assert answer is not None
+    scale, gripper_from_object = recon_frame(answer, case.tracks)
+    uncertainty = uncertainty_of(answer)
+    intrinsics = answer.problem.intrinsics(answer.state)[0].with_std(uncertainty.intrinsics_std)
     again = replace(
         found,
-        **vars(estimate_of(answer, case.tracks)),
+        on_gripper=answer.state.x[0],
+        resting=gripper_from_object,
+        scale=scale,
+        uncertainty=replace(uncertainty, seen=found.uncertainty.seen, scene=found.uncertainty.scene),
+        intrinsics=intrinsics,
         robot_noise=answer.noise,
         next_poses=(),
         findings=tuple(one for one in found.findings if one.kind not in EFFECTS),

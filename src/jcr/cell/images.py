@@ -70,7 +70,7 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
     case, hand_eye = rigs.case, rigs.case.hand_eye
     tracks, prior = case.tracks, None
     # Where bundle adjustment did not decide the calibration, the images' own geometry is not used here either.
-    if hand_eye.before is None or tracks.from_pointmaps or len(tracks.image) < MIN_OBSERVATIONS:
+    if hand_eye.source == "poses" or tracks.from_pointmaps or len(tracks.image) < MIN_OBSERVATIONS:
         prior, tracks = _given_poses(rigs), tracks.only(np.zeros(len(tracks.image), bool))
     rig, camera = list(range(len(rigs.rows))), [0] * len(rigs.rows)
     image, x_px, point = [tracks.image], [tracks.x_px], [tracks.point]

@@ -17,8 +17,8 @@ from jcr.errors import InputError
 from jcr.files import write_text
 from jcr.findings import Finding, Verdict, doubt_of, strongest_first
 from jcr.geometry import skew
-from jcr.records import CellCamera, Mount
-from jcr.records.json_fields import Covariance6, IntrinsicsAndStd, Matrix, Part, Spread, Spread3
+from jcr.records import CellCamera, IntrinsicsAndStd, Mount
+from jcr.records.json_fields import Covariance6, Matrix, Part, Spread, Spread3
 from jcr.rounding import significant
 
 if TYPE_CHECKING:

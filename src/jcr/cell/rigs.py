@@ -14,17 +14,18 @@ from numpy import ndarray
 
 from jcr.calibration.case import Case
 from jcr.calibration.checks.effects import MIN_IMAGES, effects_of_fit, with_rejected_runs
+from jcr.calibration.hand_eye import solve_hand_eye
+from jcr.calibration.record import Calibration
 from jcr.camera import usable_intrinsics
 from jcr.capture.images import read_image
 from jcr.cell.placement import CameraPlacement
 from jcr.distributions import chi2
-from jcr.estimation.hand_eye import fit_hand_eye
 from jcr.estimation.hypotheses import arm_rows
 from jcr.estimation.problem import ReportedPoses, pose_problem, scale_prior
 from jcr.estimation.robot_noise import smooth_errors
 from jcr.findings import Concerns, Finding, FindingKind
 from jcr.geometry import Transform, inverse, motion_length, scale_translation, step_between
-from jcr.records import CellCamera, HandEye, Intrinsics
+from jcr.records import CellCamera, Intrinsics
 from jcr.sfm.register import GATE_PX, KnownImages, Registration, features, registration, shared_points
 
 FOCAL_OF_WIDTH = 0.9
@@ -166,7 +167,7 @@ class Rigs:
         self.case, self.known, self.rows = case, known, case.reconstruction.image_index[case.used]
         self.poses = list(known.recon_from_camera)
         self.arms: list[str] = []
-        self._of_arms: list[tuple[Int[ndarray, " n"], Float[ndarray, "n 4 4"], HandEye]] = []
+        self._of_arms: list[tuple[Int[ndarray, " n"], Float[ndarray, "n 4 4"], Calibration]] = []
 
     def add(self, seen: CameraViews) -> CameraViews | CameraPlacement:
         """Add the images of a camera to the rigs; return a rejected placement where it cannot be placed."""
@@ -247,7 +248,7 @@ class Rigs:
             explained = tuple(replace(one, severity="rejects") for one in effects)
             return seen.refused(*(explained or found.findings))
         used = found.inliers
-        kept = seen.without({int(seen.rows[k]): str(found.reasons[k]) for k in np.flatnonzero(~used)})
+        kept = seen.without({int(seen.rows[k]): str(found.images[k].reason) for k in np.flatnonzero(~used)})
         rig = len(self.poses) + np.arange(used.sum())
         self.poses += list(kept.places)
         self.arms.append(arm)
@@ -273,15 +274,15 @@ class Rigs:
                 ReportedPoses(rigs=rigs, base_from_gripper=gripper, error_covariance=smooth_errors(gripper))
             )
         found = [case.hand_eye, *(one for _, _, one in self._of_arms)]
-        return arms, [(one.gripper_from_camera, one.base_from_recon) for one in found]
+        return arms, [(one.gripper_from_camera, one.base_from_recon.rigid) for one in found]
 
 
 def fit_views(
     seen: CameraViews, carrier: Float[ndarray, "k 4 4"], scale_std: float
-) -> tuple[HandEye, tuple[Finding, ...]]:
+) -> tuple[Calibration, tuple[Finding, ...]]:
     """Return the fit of a camera to the poses of what carries it, and the effect of the order, such as a slip."""
-    found = fit_hand_eye(carrier, seen.places, scale=1.0, scale_std=scale_std, in_sequence=False)
-    start = found.gripper_from_camera, found.scale, found.base_from_recon
+    found = solve_hand_eye(carrier, seen.places, scale=1.0, scale_std=scale_std, in_sequence=False)
+    start = found.gripper_from_camera, found.scale, found.base_from_recon.rigid
     problem, state = pose_problem(carrier, seen.places, start, priors=(scale_prior(1.0, scale_std),))
     used = with_rejected_runs(found.inliers)
     return found, effects_of_fit(replace(problem, used=used), state, found, seen.names)

@@ -16,13 +16,14 @@ from numpy import ndarray
 from jcr.calibration.case import Case
 from jcr.calibration.checks.camera import CameraAdjustment, all_combinations
 from jcr.calibration.checks.effects import LARGE_MOTION, MATERIAL, as_adopted, effects
+from jcr.calibration.hand_eye import MAX_STD
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors
 from jcr.capture.images import read_image
 from jcr.cell.images import CellImages, cell_images
 from jcr.cell.placement import ArmPlacement, CameraPlacement, CellPlacement, TransformUncertainty
 from jcr.cell.rigs import APART, CameraViews, Rigs, known_images, localise
-from jcr.estimation.hand_eye import MAX_STD
 from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.problem import State
 from jcr.estimation.solve import Solution
@@ -30,8 +31,7 @@ from jcr.findings import Finding, FindingKind
 from jcr.geometry import apply, inverse, scale_translation, step_between
 from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress, silent, steps
-from jcr.records import Capture, CellCamera, HandEye, Reconstruction
-from jcr.records.json_fields import IntrinsicsAndStd
+from jcr.records import Capture, CellCamera, Reconstruction
 from jcr.sfm.register import Registration
 
 CONTRADICTS = 5.0
@@ -64,7 +64,7 @@ def place_cameras(
     capture: Capture,
     others: Sequence[CellCamera],
     reconstruction: Reconstruction,
-    hand_eye: HandEye,
+    hand_eye: Calibration,
     options: CalibrateOptions | None = None,
     progress: Progress | None = None,
 ) -> CellPlacement:
@@ -144,7 +144,7 @@ def _moved(rigs: Rigs, views: CameraViews) -> tuple[Finding, ...]:
 
 
 def _examined(
-    images: CellImages, mounted: Sequence[MountedCamera], hand_eye: HandEye
+    images: CellImages, mounted: Sequence[MountedCamera], hand_eye: Calibration
 ) -> tuple[Solution, list[tuple[Finding, ...]]]:
     """Adjust all images, and test those of each camera (calibration/checks/effects.py).
 
@@ -191,7 +191,7 @@ def _examined(
 
 
 def _placement(
-    mounted: MountedCamera, solution: Solution, hand_eye: HandEye, faults: Sequence[Finding] = ()
+    mounted: MountedCamera, solution: Solution, hand_eye: Calibration, faults: Sequence[Finding] = ()
 ) -> CameraPlacement:
     """Return the placement of a camera with its findings; the shifts of `faults` add to its covariance."""
     views, c, problem = mounted.views, mounted.number, solution.problem
@@ -235,7 +235,7 @@ def _placement(
         px,
         **{f"{views.camera.mount}_from_camera": transform.tolist()},
         uncertainty=TransformUncertainty.of(covariance, transform, distance_m),
-        intrinsics=IntrinsicsAndStd.of(intrinsics, std),
+        intrinsics=intrinsics.with_std(std),
     )
 
 
@@ -258,7 +258,7 @@ def _spread(found: Registration) -> float:
     return float(sides.prod() / (found.pose.camera.width * found.pose.camera.height))
 
 
-def _by_faults(solution: Solution, mounted: MountedCamera, hand_eye: HandEye) -> Float[ndarray, "6 6"]:
+def _by_faults(solution: Solution, mounted: MountedCamera, hand_eye: Calibration) -> Float[ndarray, "6 6"]:
     """Return the covariance that faults of the capture's own calibration, such as a slip, add to a further camera.
 
     The part of its covariance beside images and robot moves everything that varies with it.

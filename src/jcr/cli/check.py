@@ -1,7 +1,7 @@
 """Commands that test a capture or a calibration: check, verify, compare and touch."""
 
 import shlex
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -115,7 +115,7 @@ def _check_lines(command: CheckCommand, capture: "Capture | PosePairs", found: "
     for k, pose in enumerate(found.suggestions, start=1):
         matrix = np.array2string(pose.base_from_gripper, precision=4, suppress_small=True).splitlines()
         then = f"{significant(pose.within_95_mm)} mm, {significant(pose.rotation_95_deg)}°"
-        near = f"{1e3 * pose.moved_m:.0f} mm, {np.degrees(pose.rotation_rad):.0f}° from {capture.images[pose.like]}"
+        near = f"{1e3 * pose.moved_m:.0f} mm, {np.degrees(pose.rotation_rad):.0f}° from {pose.like}"
         lines += labelled(f"Add pose {k}", f"{near}; then {then} (95 %); base_from_gripper:", *matrix)
     return [*lines, *labelled("Next", closing)]
 
@@ -127,8 +127,8 @@ def _expected(images: int, found: "Examination") -> list[str]:
     from jcr.rounding import significant
 
     lines, fitted = list[str](), found.hand_eye
-    if found.expected is not None:
-        seen, std = found.expected.in_use.seen, found.expected.std
+    if found.expected is not None and (seen := found.expected.seen) is not None:
+        std = found.expected.std
         sizes = (1e3 * std[:3], np.degrees(std[3:6]))
         offset, rotation = (" ".join(significant(float(value)) for value in part) for part in sizes)
         lines = labelled(
@@ -153,9 +153,10 @@ def _check_facts(capture: "Capture | PosePairs", found: "Examination") -> dict[s
     from jcr.findings import warnings_of
 
     noise = None if found.hand_eye is None else found.hand_eye.robot_noise
+    seen = None if found.expected is None else found.expected.seen
     sharpness = found.sharpness.tolist() or [None] * len(capture)
-    names = "base_from_gripper", "expected_std", "within_95_mm", "rotation_95_deg"
-    seen = ("observable", "unobservable", "advice")
+    names = "base_from_gripper", "like", "expected_std", "within_95_mm", "rotation_95_deg"
+    observed = ("observable", "unobservable", "advice")
     return {
         "verdict": found.verdict,
         "images": [
@@ -163,15 +164,12 @@ def _check_facts(capture: "Capture | PosePairs", found: "Examination") -> dict[s
         ],
         "largest_move_mm": 1e3 * found.largest_move_m,
         "largest_turn_deg": float(np.degrees(found.largest_rotation_rad)),
-        "observability": {name: getattr(found.observability, name) for name in seen},
+        "observability": {name: getattr(found.observability, name) for name in observed},
         "expected_std": None if found.expected is None else found.expected.std,
-        "expected_seen": None if found.expected is None else vars(found.expected.in_use.seen),
+        "expected_seen": seen and asdict(seen),
         "expected_images": [capture.images[row] for row in found.counted],
         "robot_noise": None if noise is None else mm_and_deg(noise.translation, noise.rotation),
-        "suggestions": [
-            {name: getattr(pose, name) for name in names} | {"like": capture.images[pose.like]}
-            for pose in found.suggestions
-        ],
+        "suggestions": [{name: getattr(pose, name) for name in names} for pose in found.suggestions],
         "findings": [as_json(one) for one in found.findings],
         "warnings": warnings_of(found.findings),
         "notes": found.notes,

@@ -67,7 +67,7 @@ class CalibrateCommand:
                 show_calibration(result, self.output)
             else:
                 result, is_marker = _run(self, capture, run_options(self, map=None), progress), False
-        if is_marker and result.converged and is_one(result.hand_eye):
+        if is_marker and result.converged and is_one(result.found):
             return show(result, self.output, *labelled("Scale", "1, as the marker's size says"))
         return show(result, self.output)
 

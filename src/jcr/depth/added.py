@@ -10,9 +10,9 @@ from numpy import ndarray
 from jcr.camera import project
 from jcr.depth.densify import choose_neighbours, dense_pointmaps, sweep_planes, undistorted
 from jcr.errors import InputError
-from jcr.geometry import apply, inverse, scale_translation
+from jcr.geometry import Similarity, apply, inverse, scale_translation
 from jcr.progress import Progress
-from jcr.records import MATCHED, NO_DEPTH, Capture, HandEye, Intrinsics, Pointmaps, Reconstruction, Tracks
+from jcr.records import MATCHED, NO_DEPTH, Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
 
 NEIGHBOURS = 6
 """Images that each is compared with; at most half of them are new ones."""
@@ -26,7 +26,8 @@ LEAST_SHARE = 0.005
 
 def extend(
     reconstruction: Reconstruction,
-    hand_eye: HandEye,
+    gripper_from_camera: Float[ndarray, "4 4"],
+    base_from_recon: Similarity,
     capture_size: int,
     added: Capture,
     report: Progress,
@@ -39,9 +40,9 @@ def extend(
     """
     dense, old, new = reconstruction.dense, len(reconstruction.recon_from_camera), len(added)
     pinhole = dense.intrinsics
-    base_from_camera = added.base_from_gripper @ hand_eye.gripper_from_camera
+    base_from_camera = added.base_from_gripper @ gripper_from_camera
     recon_from_new = scale_translation(
-        inverse(hand_eye.base_from_recon) @ base_from_camera, 1 / hand_eye.scale
+        inverse(base_from_recon.rigid) @ base_from_camera, 1 / base_from_recon.scale
     )
     cameras = np.concatenate([reconstruction.recon_from_camera, recon_from_new])
     images = undistorted(added.folder, added.images, reconstruction.intrinsics, pinhole)

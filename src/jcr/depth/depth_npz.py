@@ -11,8 +11,7 @@ from pydantic import BaseModel, ConfigDict
 
 from jcr.depth.densify import pointmaps_of, undistorted
 from jcr.geometry import apply, inverse
-from jcr.records import Capture, Pointmaps, Reconstruction
-from jcr.records.json_fields import IntrinsicsJson
+from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction
 from jcr.records.npz import check_arrays, read_npz, write_npz
 
 FILE = "depth.npz"
@@ -29,7 +28,7 @@ class DepthHeader(BaseModel):
     format: str
     made_from: str
     """The fingerprint of the reconstruction and of the options."""
-    intrinsics: IntrinsicsJson
+    intrinsics: Intrinsics
 
 
 def write_depth(path: Path, reconstruction: Reconstruction, made_from: str) -> None:
@@ -65,7 +64,7 @@ def read_depth(path: Path, reconstruction: Reconstruction, capture: Capture | No
     Raises InputError when the file is damaged, of another format, or of other images.
     """
     with read_npz(path, FORMAT) as (text, file):
-        pinhole = DepthHeader.model_validate_json(text, strict=True).intrinsics.record()
+        pinhole = DepthHeader.model_validate_json(text, strict=True).intrinsics
         shape = len(reconstruction.image_index), pinhole.height, pinhole.width
         depth, std, confidence = (file[name] for name in ("depth", "relative_std", "confidence"))
         check_arrays(

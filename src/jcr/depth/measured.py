@@ -9,7 +9,7 @@ from numpy import ndarray
 from jcr.camera import project, rays
 from jcr.capture.images import read_depth
 from jcr.geometry import apply, inverse
-from jcr.records import MATCHED, PRIOR, Capture, HandEye, Reconstruction
+from jcr.records import MATCHED, PRIOR, Capture, DepthCheck, Reconstruction
 
 TOO_WRONG = 20.0
 """Percent by which a depth camera's lengths may be off; more is another unit, or another camera's depth."""
@@ -24,17 +24,19 @@ REACH_M = (0.1, 6.0)
 
 
 def with_measured_depth(
-    capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye
+    capture: Capture, reconstruction: Reconstruction, check: DepthCheck | None, scale: float
 ) -> tuple[Reconstruction, tuple[str, ...]]:
     """Return the reconstruction with the depth images in its pointmaps, and notes about them.
+
+    `check` is the comparison of the depth images with the robot, None where there is none to rely on; `scale` is that of
+    the reconstruction (metres per unit).
 
     Depth is divided by what the robot says it is too long. Where images match a depth too, the two are averaged if they
     agree, and else the matched one stays, for several images say it; planes that were filled in give way.
     """
-    check = hand_eye.depth
     if capture.depths is None:
         return reconstruction, ()
-    if check is None or not hand_eye.is_sound:
+    if check is None:
         return reconstruction, ("the depth images are not used: the robot cannot tell their scale",)
     if abs(check.off_percent) > TOO_WRONG:
         return reconstruction, (
@@ -57,9 +59,9 @@ def with_measured_depth(
         z = depth / (1 + 0.01 * check.off_percent)
         sigma = check.std_m(z)
         recon_from_camera = reconstruction.recon_from_camera[k]
-        there = hand_eye.scale * apply(inverse(recon_from_camera), points[k].astype(float))[..., 2]
+        there = scale * apply(inverse(recon_from_camera), points[k].astype(float))[..., 2]
         matched = known[k] & (reason[k] != PRIOR)
-        of_matched = np.where(std[k] > 0, hand_eye.scale * std[k].astype(float), UNKNOWN * there)
+        of_matched = np.where(std[k] > 0, scale * std[k].astype(float), UNKNOWN * there)
         agrees = inside & matched & (np.abs(z - there) < AGREES * np.hypot(sigma, of_matched))
         against += int((inside & matched & ~agrees).sum())
         both += int((inside & matched).sum())
@@ -67,9 +69,9 @@ def with_measured_depth(
         z = share * there + (1 - share) * z
         sigma = np.where(agrees, of_matched * np.sqrt(share), sigma)
         new = agrees | (inside & ~matched)
-        x_in_recon = apply(recon_from_camera, (z / hand_eye.scale)[..., None] * ray)
+        x_in_recon = apply(recon_from_camera, (z / scale)[..., None] * ray)
         points[k][new] = x_in_recon[new]
-        std[k][new] = sigma[new] / hand_eye.scale
+        std[k][new] = sigma[new] / scale
         confidence[k][new & ~matched] = usual
         reason[k][new] = MATCHED
     measured = replace(dense, points_in_recon=points, confidence=confidence, depth_std=std, reason=reason)

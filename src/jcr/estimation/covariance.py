@@ -185,17 +185,16 @@ def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covari
     to_whole = _between(sum(parts[1:], parts[0]), whole)
     random, systematic, intrinsics, _ = (to_whole @ part @ to_whole.T for part in parts)
     images = whole - random - systematic - intrinsics
-    # With degenerate motions the numbers are so large that rounding leaves the products unsymmetric.
-    random, systematic, intrinsics, images = (
-        (part + part.T) / 2 for part in (random, systematic, intrinsics, images)
-    )
-    return Budget(
-        robot_random=random,
-        robot_systematic=systematic,
-        intrinsics=intrinsics,
-        images=images,
-        faults=np.zeros((7, 7)),
-    )
+    parts = [_positive((part + part.T) / 2) for part in (random, systematic, intrinsics, images)]
+    names = "robot_random", "robot_systematic", "intrinsics", "images"
+    return Budget(**dict(zip(names, parts, strict=True)), faults=np.zeros((7, 7)))
+
+
+def _positive(part: Square) -> Square:
+    """Return a symmetric part of a covariance without the negative rounding that degenerate motions leave."""
+    std = np.sqrt(np.maximum(np.diag(part), 0.0))
+    values, vectors = np.linalg.eigh(part / np.outer(*[np.where(std > 0, std, np.inf)] * 2))
+    return (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(std, std)
 
 
 def _between(one: Square, other: Square) -> Square:

@@ -6,13 +6,19 @@ estimated together: an error of the principal point that a rotation of the camer
 are used. Their joint covariance is therefore propagated (Kogan, mrcal, "Projection uncertainty").
 """
 
-from dataclasses import replace
-
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.camera import NORMALIZED, by_parameters, by_point, parameters, unproject, with_thin_prism
+from jcr.camera import (
+    NORMALIZED,
+    by_parameters,
+    by_point,
+    parameter_names,
+    parameters,
+    unproject,
+    with_thin_prism,
+)
 from jcr.distributions import chi2
 from jcr.estimation.elimination import cholesky, over, point_blocks
 from jcr.estimation.intrinsics_prior import second_moment_px2
@@ -21,8 +27,19 @@ from jcr.estimation.problem import BASE_ROTATION, BASE_TRANSLATION, SCALE
 from jcr.estimation.projection import derivatives
 from jcr.estimation.solve import Solution
 from jcr.geometry import apply, by_similarity, retract, skew
-from jcr.records import Estimate, Intrinsics, InUse, RobotNoise, SceneUncertainty, Seen, WithGivenIntrinsics
+from jcr.records import (
+    COVARIANCE_ORDER,
+    Intrinsics,
+    JointCovariance,
+    RobotNoise,
+    SceneUncertainty,
+    Seen,
+    SeenAndCorners,
+    Uncertainty,
+    WithGivenIntrinsics,
+)
 
+Transform = Float[ndarray, "4 4"]
 Pixels = Float[ndarray, "*points 2"]
 Distances = Float[ndarray, "*#points"] | float
 Covariances = Float[ndarray, "*points 3 3"]
@@ -34,20 +51,22 @@ SCENE_POINTS = 300
 
 
 def point_covariance(
-    estimate: Estimate, intrinsics: Intrinsics, x_px: Pixels, distance_m: Distances
+    x: Transform, uncertainty: Uncertainty, intrinsics: Intrinsics, x_px: Pixels, distance_m: Distances
 ) -> Covariances:
     """Return the covariance (m²) of points on the gripper, in camera axes, without the robot's pose errors.
 
-    `intrinsics` belong to the estimate, `x_px` (...,2) are pixels of the distorted image, `distance_m` (...) is along
-    the ray, in the metres of the reconstruction.
+    `x` is gripper_from_camera, whose uncertainty is joint with that of the `intrinsics`. `x_px` (...,2) are pixels of
+    the distorted image, `distance_m` (...) is along the ray, in the metres of the reconstruction.
     """
-    by_unknown, by_pixel = _derivatives(estimate, intrinsics, x_px, distance_m)
-    model_error = by_pixel @ _model_error_px2(estimate, intrinsics, x_px) @ np.swapaxes(by_pixel, -1, -2)
-    return by_unknown @ joint_covariance(estimate) @ np.swapaxes(by_unknown, -1, -2) + model_error
+    by_unknown, by_pixel = _derivatives(x, uncertainty, intrinsics, x_px, distance_m)
+    model_error = by_pixel @ _model_error_px2(uncertainty, intrinsics, x_px) @ np.swapaxes(by_pixel, -1, -2)
+    return by_unknown @ uncertainty.whole @ np.swapaxes(by_unknown, -1, -2) + model_error
 
 
-def point_in_base(
-    estimate: Estimate,
+def point_in_base(  # noqa: PLR0913 (the parts of a calibration, a pixel and a gripper pose)
+    x: Transform,
+    uncertainty: Uncertainty,
+    intrinsics: Intrinsics,
     noise: RobotNoise,
     x_px: Pixels,
     depth_m: Distances,
@@ -58,13 +77,11 @@ def point_in_base(
     `noise` is that of the reported gripper pose, in the region of the capture, whose errors add to those of intrinsics,
     X and scale.
     """
-    intrinsics, x = estimate.intrinsics, estimate.gripper_from_camera
-    assert intrinsics is not None
     ray = unproject(intrinsics, x_px)
     distance_m = np.asarray(depth_m) * np.linalg.norm(ray, axis=-1) / ray[..., 2]
     p_in_gripper = apply(x, np.asarray(depth_m)[..., None] * ray / ray[..., 2:])
     base_from_camera_axes = base_from_gripper[:3, :3] @ x[:3, :3]
-    in_camera = point_covariance(estimate, intrinsics, x_px, distance_m)
+    in_camera = point_covariance(x, uncertainty, intrinsics, x_px, distance_m)
     lever = skew(p_in_gripper @ base_from_gripper[:3, :3].T)
     square = lever @ np.swapaxes(lever, -1, -2)
     covariance = base_from_camera_axes @ in_camera @ base_from_camera_axes.T
@@ -74,21 +91,25 @@ def point_in_base(
 
 
 def bounds_at(
-    estimate: Estimate, intrinsics: Intrinsics, x_px: Float[ndarray, "2"], distance_m: float
+    x: Transform,
+    uncertainty: Uncertainty,
+    intrinsics: Intrinsics,
+    x_px: Float[ndarray, "2"],
+    distance_m: float,
 ) -> Seen:
     """Return the bounds of 95 % of the errors of a point: across the ray, along it, and in direction."""
-    by_unknown, by_pixel = _derivatives(estimate, intrinsics, x_px, distance_m)
+    by_unknown, by_pixel = _derivatives(x, uncertainty, intrinsics, x_px, distance_m)
     ray = unproject(intrinsics, x_px)
     # Two directions across the ray, and the ray: rows.
     axes = np.linalg.svd(ray[None] / np.linalg.norm(ray))[2][[1, 2, 0]]
-    moved = axes @ point_covariance(estimate, intrinsics, x_px, distance_m) @ axes.T
+    moved = axes @ point_covariance(x, uncertainty, intrinsics, x_px, distance_m) @ axes.T
     # The direction is not changed by a translation; the rotation about the ray takes the place of the distance.
     by_direction = axes @ by_unknown / distance_m
     by_direction[:, :3] = by_direction[2] = 0.0
-    by_direction[2, 3:6] = axes[2] @ estimate.gripper_from_camera[:3, :3].T
+    by_direction[2, 3:6] = axes[2] @ x[:3, :3].T
     by_pixel = axes @ by_pixel / distance_m
-    rotated = by_direction @ joint_covariance(estimate) @ by_direction.T
-    rotated += by_pixel @ _model_error_px2(estimate, intrinsics, x_px) @ by_pixel.T
+    rotated = by_direction @ uncertainty.whole @ by_direction.T
+    rotated += by_pixel @ _model_error_px2(uncertainty, intrinsics, x_px) @ by_pixel.T
     return Seen(
         distance_mm=1e3 * distance_m,
         within_95_mm=1e3 * within_95(moved),
@@ -99,62 +120,63 @@ def bounds_at(
     )
 
 
-def in_use(estimate: Estimate, distance_m: float, scene: SceneUncertainty | None = None) -> InUse:
-    """Return the accuracy of an estimate at the centre and the worst corner of the image, and in the scene.
+def seen_points(
+    x: Transform, uncertainty: Uncertainty, camera: Intrinsics | None, distance_m: float
+) -> SeenAndCorners:
+    """Return the uncertainty of points at the centre and the worst corner of the image.
 
     Camera poses that were given have no intrinsics; the ray along the optical axis is then exact.
     """
-    camera = estimate.intrinsics
     if camera is None:
-        at_centre = bounds_at(estimate, NORMALIZED, np.zeros(2), distance_m)
-        return InUse(seen=at_centre, corners=at_centre)
+        at_centre = bounds_at(x, uncertainty, NORMALIZED, np.zeros(2), distance_m)
+        return SeenAndCorners(**vars(at_centre), corners=at_centre)
     right, bottom = camera.width - 1.0, camera.height - 1.0
     centre, *corners = (
-        bounds_at(estimate, camera, np.array(x_px), distance_m)
+        bounds_at(x, uncertainty, camera, np.array(x_px), distance_m)
         for x_px in ((right / 2, bottom / 2), (0.0, 0.0), (0.0, bottom), (right, 0.0), (right, bottom))
     )
-    return InUse(seen=centre, corners=max(corners, key=lambda one: one.within_95_mm), scene=scene)
+    return SeenAndCorners(**vars(centre), corners=max(corners, key=lambda one: one.within_95_mm))
 
 
 def with_given_intrinsics(
-    estimate: Estimate, given: Intrinsics, distance_m: float
+    x: Transform, uncertainty: Uncertainty, camera: Intrinsics | None, given: Intrinsics, distance_m: float
 ) -> WithGivenIntrinsics | None:
     """Return the transform that belongs to given intrinsics, compared with the estimate at the centre of the image.
 
     The transform is the mean of the joint distribution where the intrinsics are `given`, with a thin prism of 0 where
     they have none. Its difference from the estimate counts as uncertainty. None where no intrinsics were estimated.
     """
-    camera, cross = estimate.intrinsics, estimate.intrinsics_cross
-    if camera is None or cross is None or estimate.intrinsics_covariance is None:
+    joint = uncertainty.joint
+    if camera is None or joint is None:
         return None
+    cross, of_camera = joint.covariance[:7, 7:], joint.covariance[7:, 7:]
     same_model = with_thin_prism(given) if camera.model == "thin_prism" else given
     off = parameters(same_model) - parameters(camera)
-    step = cross @ np.linalg.pinv(estimate.intrinsics_covariance, rcond=1e-12, hermitian=True) @ off
+    step = cross @ np.linalg.pinv(of_camera, rcond=1e-12, hermitian=True) @ off
     # The pair is used with other distances, and without the scale.
     step[6] = 0.0
-    pair = replace(
-        estimate,
-        covariance=estimate.covariance + np.outer(step, step),
-        intrinsics_cross=cross + np.outer(step, off),
-        intrinsics_covariance=estimate.intrinsics_covariance + np.outer(off, off),
-    )
+    moved = np.r_[step, off]
+    pair = uncertainty.with_error(np.outer(moved, moved))
     x_px = np.array([camera.width - 1.0, camera.height - 1.0]) / 2
-    apart = _derivatives(estimate, camera, x_px, distance_m)[0] @ np.r_[step, off]
+    apart = _derivatives(x, uncertainty, camera, x_px, distance_m)[0] @ moved
     return WithGivenIntrinsics(
-        gripper_from_camera=retract(estimate.gripper_from_camera, step[:6]),
+        gripper_from_camera=retract(x, step[:6]),
         covariance=pair.covariance,
         intrinsics=given,
-        seen=bounds_at(pair, camera, x_px, distance_m),
+        seen=bounds_at(x, pair, camera, x_px, distance_m),
         differs_mm=1e3 * float(np.linalg.norm(apart)),
     )
 
 
-def joint_covariance(estimate: Estimate) -> Float[ndarray, "j j"]:
-    """Return the covariance of COVARIANCE_ORDER and, where they were estimated, of the intrinsics."""
-    if estimate.intrinsics_covariance is None or estimate.intrinsics_cross is None:
-        return estimate.covariance
-    cross = estimate.intrinsics_cross
-    return np.block([[estimate.covariance, cross], [cross.T, estimate.intrinsics_covariance]])
+def joint_covariance(
+    covariance: Float[ndarray, "7 7"],
+    cross: Float[ndarray, "7 q"],
+    of_camera: Float[ndarray, "q q"],
+    camera: Intrinsics,
+) -> JointCovariance:
+    """Return the covariance of transform and scale together with that of the intrinsics, from its blocks."""
+    together = np.block([[covariance, cross], [cross.T, of_camera]])
+    return JointCovariance(covariance=together, order=(*COVARIANCE_ORDER, *parameter_names(camera)))
 
 
 def within_95(covariance: Float[ndarray, "n n"]) -> float:
@@ -257,17 +279,17 @@ def _rigs_given_unknowns(solution: Solution) -> tuple[Float[ndarray, "d p"], Flo
 
 
 def _model_error_px2(
-    estimate: Estimate, intrinsics: Intrinsics, x_px: Pixels
+    uncertainty: Uncertainty, intrinsics: Intrinsics, x_px: Pixels
 ) -> Float[ndarray, "*points 2 2"]:
     """Return the covariance of pixels by the remaining error of the camera model."""
     x_px = np.asarray(x_px, float)
-    if estimate.model_error is None:
+    if uncertainty.model_error is None:
         return np.zeros((*x_px.shape, 2))
-    return second_moment_px2(estimate.model_error, intrinsics, x_px)
+    return second_moment_px2(uncertainty.model_error, intrinsics, x_px)
 
 
 def _derivatives(
-    estimate: Estimate, intrinsics: Intrinsics, x_px: Pixels, distance_m: Distances
+    x: Transform, uncertainty: Uncertainty, intrinsics: Intrinsics, x_px: Pixels, distance_m: Distances
 ) -> tuple[Float[ndarray, "*points 3 j"], Float[ndarray, "*points 3 2"]]:
     """Return derivatives of points on the gripper, in camera axes, by the joint unknowns and by their pixels."""
     ray = unproject(intrinsics, np.asarray(x_px, float))
@@ -276,11 +298,11 @@ def _derivatives(
     across = np.eye(3) - unit[..., :, None] * unit[..., None, :]
     by_ray = np.linalg.inv(by_point(intrinsics, ray)[..., :2])
     by_pixel = distance[..., None] * across[..., :2] @ by_ray / length
-    camera_from_gripper_axes = estimate.gripper_from_camera[:3, :3].T
+    camera_from_gripper_axes = x[:3, :3].T
     by_unknown = by_similarity(distance * unit)
     by_unknown[..., :3] = camera_from_gripper_axes
     by_unknown[..., 3:6] = by_unknown[..., 3:6] @ camera_from_gripper_axes
-    if estimate.intrinsics_cross is None:
+    if uncertainty.joint is None:
         return by_unknown, by_pixel
     # The pixel is fixed: the ray compensates a change of the projection by the parameters.
     by_intrinsics = -by_pixel @ by_parameters(intrinsics, ray)

@@ -17,12 +17,12 @@ from jcr.estimation.covariance import expected_covariance_at
 from jcr.estimation.image_equations import evidence
 from jcr.estimation.intrinsics_prior import CameraPrior, camera_about
 from jcr.estimation.pixel_noise import PixelNoise
-from jcr.estimation.point_uncertainty import in_use
+from jcr.estimation.point_uncertainty import seen_points
 from jcr.estimation.pose_equations import pose_equations, residuals
 from jcr.estimation.problem import ROTATION, TRANSLATION, pose_problem, scale_prior, wrist_arm
 from jcr.estimation.robot_noise import GIVEN_SHARE, TYPICAL
 from jcr.estimation.solve import Solution, expected_solution
-from jcr.estimation.wrist import estimate_in, wrist_problem
+from jcr.estimation.wrist import uncertainty_of, wrist_problem
 from jcr.geometry import (
     Poses,
     Transform,
@@ -35,7 +35,7 @@ from jcr.geometry import (
     transform,
 )
 from jcr.least_squares import one_blas_thread
-from jcr.records import Estimate, Intrinsics, InUse, RobotNoise, Tracks
+from jcr.records import Intrinsics, RobotNoise, Tracks, Uncertainty
 
 FEWEST = 3
 """Smallest number of poses from which a calibration is predicted."""
@@ -98,19 +98,6 @@ class Assumptions:
     """Covariance that findings add; None: nothing."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Prediction:
-    """Result that a calibration is predicted to report."""
-
-    estimate: Estimate
-    in_use: InUse
-
-    @property
-    def std(self) -> Float[ndarray, "7"]:
-        """Standard deviations, in COVARIANCE_ORDER."""
-        return np.sqrt(np.diag(self.estimate.covariance))
-
-
 def assumed(
     base_from_gripper: Poses, camera: PredictedCamera | None, noise: tuple[float, float] | None = None
 ) -> Assumptions:
@@ -157,24 +144,21 @@ def typical_camera(
 @one_blas_thread
 def predict(
     assumptions: Assumptions, base_from_gripper: Poses, systematic: Float[ndarray, "s s"]
-) -> Prediction:
-    """Return the predicted result of a calibration from these gripper poses.
+) -> Uncertainty:
+    """Return the uncertainty that a calibration from these gripper poses is predicted to report.
 
     `systematic` is the covariance of their systematic errors at 1 rad.
     """
+    camera, x = None, assumptions.gripper_from_camera
     if assumptions.camera is None:
-        estimate = Estimate(
-            gripper_from_camera=assumptions.gripper_from_camera,
-            scale=1.0,
-            base_from_recon=np.eye(4),
-            covariance=predict_covariance(assumptions, base_from_gripper, systematic),
-        )
+        covariance = predict_covariance(assumptions, base_from_gripper, systematic)
+        uncertainty = Uncertainty(covariance=covariance)
     else:
         found = _predicted_solution(assumptions, assumptions.camera, base_from_gripper, systematic)
-        estimate = estimate_in(found, 1.0, np.eye(4))
+        uncertainty, camera = uncertainty_of(found), found.problem.intrinsics(found.state)[0]
     if assumptions.faults is not None:
-        estimate = estimate.with_fault(assumptions.faults)
-    return Prediction(estimate=estimate, in_use=in_use(estimate, assumptions.distance_m))
+        uncertainty = uncertainty.with_error(assumptions.faults)
+    return replace(uncertainty, seen=seen_points(x, uncertainty, camera, assumptions.distance_m))
 
 
 def predict_covariance(

@@ -7,6 +7,7 @@ from numpy import ndarray
 from jcr.estimation.boards import shapes_of
 from jcr.estimation.hypotheses import freed
 from jcr.estimation.intrinsics_prior import FIXED, CameraPrior, camera_with_prior, expressed
+from jcr.estimation.point_uncertainty import joint_covariance
 from jcr.estimation.problem import (
     Observations,
     Problem,
@@ -19,7 +20,7 @@ from jcr.estimation.problem import (
 )
 from jcr.estimation.solve import START_NOISE, Solution, solve
 from jcr.geometry import Poses, Transform, apply, fit_similarity, scale_translation
-from jcr.records import Estimate, Intrinsics, ModelError, Tracks
+from jcr.records import Intrinsics, ModelError, Tracks, Uncertainty
 
 
 def wrist_problem(
@@ -89,13 +90,8 @@ def adjust_wrist(  # noqa: PLR0913 (each is a fact about the capture)
     return solve(problem, state, start_noise=start_noise)
 
 
-def estimate_of(found: Solution, tracks: Tracks) -> Estimate:
-    """Return the estimate of an adjustment in the frame of the reconstruction whose tracks were adjusted."""
-    return estimate_in(found, *recon_frame(found, tracks))
-
-
-def estimate_in(found: Solution, scale: float, base_from_recon: Transform) -> Estimate:
-    """Return the estimate of an adjustment in a reconstruction with this scale and base_from_recon."""
+def uncertainty_of(found: Solution) -> Uncertainty:
+    """Return the uncertainty of the first arm's transform, of the scale, and of the first camera's intrinsics."""
     problem, (camera, *_), observations = found.problem, found.problem.cameras, found.problem.observations
     intrinsics = found.camera_unknowns(problem.columns.intrinsics[0])
     own, model_error = problem.columns.model_error[0], None
@@ -107,17 +103,10 @@ def estimate_in(found: Solution, scale: float, base_from_recon: Transform) -> Es
             covariance=found.covariance[unknowns, unknowns],
             expressed=expressed(camera, observations.x_px[problem.camera_rows[0]]),
         )
-    return Estimate(
-        gripper_from_camera=found.state.x[0],
-        scale=scale,
-        base_from_recon=base_from_recon,
-        covariance=found.covariance[:7, :7],
-        budget=found.budget,
-        intrinsics=problem.intrinsics(found.state)[0],
-        intrinsics_covariance=found.intrinsics_covariance(0),
-        intrinsics_cross=found.covariance[:7, intrinsics] @ camera.directions.T,
-        model_error=model_error,
-    )
+    covariance, cross = found.covariance[:7, :7], found.covariance[:7, intrinsics] @ camera.directions.T
+    known = problem.intrinsics(found.state)[0]
+    joint = joint_covariance(covariance, cross, found.intrinsics_covariance(0), known)
+    return Uncertainty(covariance=covariance, budget=found.budget, joint=joint, model_error=model_error)
 
 
 def recon_frame(solution: Solution, tracks: Tracks) -> tuple[float, Transform]:

@@ -154,7 +154,7 @@ class ExportedRun:
         if self.camera is not None:
             mount = self._mount_of(self.camera, options.child_frame)
         elif options.intrinsics == "estimated":
-            intrinsics = None if found.intrinsics is None else found.intrinsics.record()
+            intrinsics = found.intrinsics
             matrix = np.array(found.parent_from_camera)
             mount = self._named(found.mount, options.child_frame, matrix, self.doubt, intrinsics)
         elif (kept := found.with_given_intrinsics) is None:
@@ -163,7 +163,7 @@ class ExportedRun:
                 "none, or no others were estimated beside them; leave it out"
             )
         else:
-            pair = np.array(kept.gripper_from_camera), self.doubt, kept.intrinsics.record()
+            pair = np.array(kept.gripper_from_camera), self.doubt, kept.intrinsics
             mount = self._named(found.mount, options.child_frame, *pair)
         if options.to_root is None:
             return mount
@@ -216,7 +216,7 @@ class ExportedRun:
 
     def _mount_of(self, camera: "CameraPlacement", child: str) -> ros.CameraMount:
         """Return the mount of a further camera."""
-        intrinsics = None if camera.intrinsics is None else camera.intrinsics.record()
+        intrinsics = camera.intrinsics
         matrix = np.array(camera.parent_from_camera)
         return self._named(camera.mount, child, matrix, camera.doubt, intrinsics, camera.arm)
 

@@ -126,6 +126,7 @@ def unobservable(finding: "Finding") -> str:
 
 _TILT = "tilt the wrist by 20° or more away from {axis} in two images"
 _UNOBSERVABLE = {
+    "no camera poses": ("everything: no camera poses", "{advice}"),
     "two images": (
         "translation along, and rotation about, the one axis that two images share",
         "add one image or more, rotated by 20° or more about another axis",

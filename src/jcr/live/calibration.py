@@ -22,7 +22,6 @@ from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.prediction import FEWEST
 from jcr.findings import Finding, FindingKind, strongest_first
-from jcr.geometry import apply
 from jcr.least_squares import one_blas_thread
 from jcr.live.folder import Channels, LiveFolder
 from jcr.live.next_pose import Reach, propose
@@ -271,17 +270,16 @@ def _contradicting(case: Case) -> list[Finding]:
     hand_eye = case.hand_eye
     if not hand_eye.is_sound:
         return []
+    off = {
+        one.image: (1e-3 * (one.translation_residual_mm or 0.0), np.radians(one.rotation_residual_deg or 0.0))
+        for one in hand_eye.images
+        if not one.used
+    }
+    kind = FindingKind.POSE_CONTRADICTS_IMAGE
     return [
-        Finding.of(
-            FindingKind.POSE_CONTRADICTS_IMAGE,
-            "warns",
-            "poses",
-            case.names[row],
-            value=float(hand_eye.translation_residual_m[row]),
-            rotation=float(hand_eye.rotation_residual_rad[row]),
-        )
-        for row in np.flatnonzero(~hand_eye.inliers)
-        if hand_eye.translation_residual_m[row] > SAME[0] or hand_eye.rotation_residual_rad[row] > SAME[1]
+        Finding.of(kind, "warns", "poses", image, value=metres, rotation=float(radians))
+        for image, (metres, radians) in off.items()
+        if metres > SAME[0] or radians > SAME[1]
     ]
 
 
@@ -290,4 +288,4 @@ def _points(case: Case) -> Float[ndarray, "p 3"]:
     tracks, hand_eye = case.reconstruction.tracks, case.hand_eye
     seen = np.flatnonzero(np.bincount(tracks.point, minlength=len(tracks.points_in_recon)) >= 3)
     some = seen[:: max(1, len(seen) // MOST_POINTS)]
-    return apply(hand_eye.base_from_recon, hand_eye.scale * tracks.points_in_recon[some])
+    return hand_eye.base_from_recon(tracks.points_in_recon[some])

@@ -8,13 +8,14 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.calibration.case import Case
+from jcr.calibration.record import Calibration
 from jcr.calibration.requirement import Proposals, assumptions_of
 from jcr.calibration.robot_errors import errors_of
 from jcr.estimation.inverse_kinematics import FITS, inverse_kinematics, reach_toward
 from jcr.estimation.kinematics import Arm, forward_kinematics
 from jcr.estimation.prediction import Assumptions, assumed, median_distance, typical_camera
 from jcr.geometry import inverse, rotation_angle
-from jcr.records import Capture, HandEye
+from jcr.records import Capture
 
 PROPOSALS = 12
 """Number of poses that are compared; the first that the arm reaches is proposed."""
@@ -44,7 +45,7 @@ def propose(
     capture: Capture,
     registered: Int[ndarray, " m"],
     reach: Reach,
-    hand_eye: HandEye | None = None,
+    hand_eye: Calibration | None = None,
     case: Case | None = None,
 ) -> dict[str, Any]:
     """Return the next pose as fields of Progress; empty below two images.
@@ -83,7 +84,7 @@ def propose(
         and reach.box is None
         and is_wanted(best.base_from_gripper[None])[0]
     ):
-        return {"next_pose": best, "next_like": capture.images[rows[best.like]]}
+        return {"next_pose": best}
 
     def is_wanted_or_likely(added: Poses) -> Bool[ndarray, " k"]:
         """Test which poses are wanted, and where none is, which are likely to register."""
@@ -91,18 +92,20 @@ def propose(
         return wanted if wanted.any() else is_likely(added)
 
     count, joints = 1 if reach.arm is None else PROPOSALS, None
-    proposals = Proposals.of(assumptions, poses[rows], robot, count, reach.box, is_likely=is_wanted_or_likely)
+    names = [capture.images[row] for row in rows]
+    proposals = Proposals.of(
+        assumptions, poses[rows], names, robot, count, reach.box, is_likely=is_wanted_or_likely
+    )
     if reach.arm is not None:
         recorded = None if capture.joints is None else capture.joints[rows]
         for pose in proposals.added:
             if (joints := joints_at(reach.arm, poses[rows], recorded, pose)) is not None:
                 proposals = replace(proposals, added=pose[None])
                 break
-    best = proposals.next_poses(1)[0]
-    return {"next_pose": best, "next_joints": joints, "next_like": capture.images[rows[best.like]]}
+    return {"next_pose": proposals.next_poses(1)[0], "next_joints": joints}
 
 
-def _assumed(capture: Capture, poses: Float[ndarray, "m 4 4"], hand_eye: HandEye | None) -> Assumptions:
+def _assumed(capture: Capture, poses: Float[ndarray, "m 4 4"], hand_eye: Calibration | None) -> Assumptions:
     """Return a usual robot and camera at the gripper poses of the registered images.
 
     The camera is where a rejected calibration puts it, if that is exact enough to aim by, else at the gripper.

@@ -7,11 +7,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.calibration.record import Calibration
 from jcr.capture.controllers import CONVENTIONS, numbers_from_poses
 from jcr.capture.options import ConventionName, UnitsName
 from jcr.estimation.kinematics import Arm
 from jcr.findings import Finding, FindingKind, remedy, sentence, text, without_consequences
-from jcr.records import HandEye, LeaveOneOut, NextPose
+from jcr.records import LeaveOneOut, NextPose
 from jcr.rounding import significant
 
 CONFIRMING_IMAGES = 8
@@ -56,7 +57,7 @@ class Progress:
     """Images whose cameras are known."""
     findings: tuple[Finding, ...] = ()
     """Findings about single images and about the calibration, strongest first."""
-    hand_eye: HandEye | None = None
+    hand_eye: Calibration | None = None
     """Calibration; None while fewer than three images are registered."""
     history: tuple[Accuracy, ...] = ()
     """Accuracy after each image that gave a calibration."""
@@ -64,8 +65,6 @@ class Progress:
     """Gripper pose that improves the calibration most; None below two images."""
     next_joints: Float[ndarray, " dof"] | None = None
     """Joint angles (rad) of `next_pose`; None where the arm is not known, or does not reach it."""
-    next_like: str | None = None
-    """Image whose gripper pose is nearest to `next_pose`."""
     points_in_base: Float[ndarray, "p 3"] | None = None
     """Reconstructed points of the scene (m); None without a calibration."""
 
@@ -80,7 +79,7 @@ class Progress:
         found = self.hand_eye
         if found is None or found.inliers.sum() < CONFIRMING_IMAGES:
             return None
-        return found.leave_one_out
+        return found.held_out
 
     @property
     def requirement_met(self) -> bool:
@@ -170,7 +169,7 @@ def next_sentence(state: Progress) -> str:
     assert pose is not None
     moved, rotated = 1e3 * pose.moved_m, np.degrees(pose.rotation_rad)
     then = f"expected then: {significant(pose.within_95_mm)} mm and {significant(pose.rotation_95_deg)}°"
-    return f"{moved:.0f} mm and {rotated:.0f}° from {state.next_like}; {then}"
+    return f"{moved:.0f} mm and {rotated:.0f}° from {pose.like}; {then}"
 
 
 def next_lines(state: Progress, notation: Notation, for_program: bool = True) -> list[str]:

@@ -12,8 +12,10 @@ from numpy.typing import ArrayLike
 from jcr.boards.proposal import proposed
 from jcr.calibration.checks.capture import as_causes, view_findings
 from jcr.calibration.checks.left_out import left_out_poses
+from jcr.calibration.hand_eye import SCALE_STD, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_poses, is_one
+from jcr.calibration.record import Calibration
 from jcr.calibration.requirement import Proposals, assumptions_of, assumptions_of_poses
 from jcr.calibration.robot_errors import RobotErrors, errors_of, robot_errors
 from jcr.calibration.stage import checked
@@ -23,9 +25,8 @@ from jcr.capture.images import brightness_and_sharpness, exposure_fault, read_im
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture, read_source
 from jcr.errors import InputError, RejectedError
-from jcr.estimation.hand_eye import SCALE_STD, fit_hand_eye
 from jcr.estimation.observability import observability
-from jcr.estimation.prediction import FEWEST, Assumptions, Prediction, assumed, typical_camera
+from jcr.estimation.prediction import FEWEST, Assumptions, assumed, typical_camera
 from jcr.features.sift import WORKING_SIZE_PX
 from jcr.findings import (
     Finding,
@@ -38,7 +39,8 @@ from jcr.findings import (
 )
 from jcr.geometry import ARM, largest_motion
 from jcr.progress import Progress
-from jcr.records import Capture, HandEye, NextPose, Observability, PosePairs
+from jcr.records import Capture, NextPose, Observability, PosePairs, Uncertainty
+from jcr.sfm.colmap import reconstruct_colmap
 
 CLEARER = 3.0
 """Factor by which poses in one convention must fit the images better than in the others."""
@@ -56,12 +58,12 @@ class Examination:
     largest_rotation_rad: float
     """Largest angle between two gripper poses."""
     observability: Observability
-    expected: Prediction | None
-    """Accuracy that a calibration of the counted images would report; None of fewer than three."""
+    expected: Uncertainty | None
+    """Uncertainty that a calibration of the counted images would report; None of fewer than three."""
     counted: Int[ndarray, " c"]
     """Rows of the images that are expected to register: those that did; of images not tried, those that are clear."""
     suggestions: tuple[NextPose, ...]
-    hand_eye: HandEye | None
+    hand_eye: Calibration | None
     """The calibration by sparse features; None where the images were not registered."""
     findings: tuple[Finding, ...]
     """Findings of the calibration and of the images, strongest first."""
@@ -78,7 +80,7 @@ class Examination:
 class _Comparison:
     """Comparison of gripper poses with cameras."""
 
-    hand_eye: HandEye | None = None
+    hand_eye: Calibration | None = None
     """None where no cameras were found."""
     findings: tuple[Finding, ...] = ()
     notes: tuple[str, ...] = ()
@@ -134,7 +136,8 @@ def check_capture(
     found += as_causes(views) if verdict_of(found) == "rejected" else views
     box = None if reach is None else np.asarray(reach, float)
     of_rows = assumptions or assumed(gripper, camera, robot_noise)
-    proposals = Proposals.of(of_rows, gripper, robot.of(rows), suggest, box, seed)
+    names = [capture.images[row] for row in rows]
+    proposals = Proposals.of(of_rows, gripper, names, robot.of(rows), suggest, box, seed)
     return Examination(
         sharpness=sharpness,
         largest_move_m=move_m,
@@ -142,7 +145,7 @@ def check_capture(
         observability=seen,
         expected=proposals.predict(0) if len(counted) >= FEWEST else None,
         counted=counted,
-        suggestions=tuple(replace(one, like=int(rows[one.like])) for one in proposals.next_poses(suggest)),
+        suggestions=tuple(proposals.next_poses(suggest)),
         hand_eye=hand_eye,
         findings=strongest_first({sentence(one): one for one in found}.values()),
         notes=(*notes, *shown.notes),
@@ -207,8 +210,6 @@ def _compare_registered(
     quick: bool,
 ) -> _Comparison:
     """Compare the gripper poses with cameras from features, by a calibration and the poses that it left out."""
-    from jcr.sfm.colmap import reconstruct_colmap
-
     try:
         size_px = QUICK_SIZE_PX if quick else WORKING_SIZE_PX
         made = reconstruct_colmap(capture, "sift", seed, progress, size_px)
@@ -277,8 +278,6 @@ def read_and_compare(
 
 def _best_fit(read: list[tuple[Capture, ReadOptions]], progress: Progress | None) -> Capture | None:
     """Return the capture whose poses agree with the images far better than those of the others, with a note."""
-    from jcr.sfm.colmap import reconstruct_colmap
-
     if not read:
         return None
     rows = spread_rows(len(read[0][0]))
@@ -290,7 +289,7 @@ def _best_fit(read: list[tuple[Capture, ReadOptions]], progress: Progress | None
     fits = []
     for capture, options in read:
         gripper = capture.base_from_gripper[rows][found.image_index]
-        noise = fit_hand_eye(gripper, found.recon_from_camera, in_sequence=False).robot_noise
+        noise = solve_hand_eye(gripper, found.recon_from_camera, in_sequence=False).robot_noise
         off = f"{1e3 * noise.translation:.2g} mm and {np.degrees(noise.rotation):.2g}°"
         fits.append((float(noise.translation + ARM * noise.rotation), off, capture, options))
     (best, off, capture, options), *others = sorted(fits, key=lambda fit: fit[0])

@@ -9,11 +9,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from jcr import __version__
 from jcr.calibration.cues import check_known_length
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.poses import calibrate_poses as calibrate_poses_stage
-from jcr.calibration.record import calibration_of
 from jcr.capture.added import with_images
 from jcr.capture.formats.capture_json import kept
 from jcr.capture.options import ReadOptions
@@ -116,12 +114,11 @@ def calibrate_poses(pairs: PosePairs, out: str | Path, options: CalibrateOptions
     out = Path(out)
     with locked(out):
         start = time.perf_counter()
-        hand_eye = calibrate_poses_stage(pairs, options)
-        timings = {"calibrate": round(time.perf_counter() - start, 3)}
-        content = calibration_of(pairs, pairs, hand_eye, timings, __version__)
+        content = calibrate_poses_stage(pairs, options)
+        content = replace(content, timings_s={"calibrate": round(time.perf_counter() - start, 3)})
         forget_reconstruction(out)
         keep_calibration(out, content)
-        result = RunResult(out, capture=pairs, calibration=content, hand_eye=hand_eye, reconstruction=pairs)
+        result = RunResult(out, capture=pairs, calibration=content, reconstruction=pairs)
         page = poses_report_html(result, {"calibrate": asdict(options or CalibrateOptions())})
         write_text(out / REPORT, page)
         return result

@@ -7,6 +7,7 @@ from functools import partial
 
 from jcr.allocator import give_back
 from jcr.calibration.checks.capture import as_causes, view_findings
+from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate
 from jcr.calibration.words import leave_one_out_text
@@ -24,7 +25,7 @@ from jcr.findings import (
 )
 from jcr.progress import Progress, silent
 from jcr.reconstruct import BACKENDS, ReconstructOptions, reconstruct, tries
-from jcr.records import Attempt, Capture, HandEye, Reconstruction
+from jcr.records import Attempt, Capture, Reconstruction
 from jcr.result import RunOptions
 
 HELPS: tuple[Concerns, ...] = ("reconstruction", "images")
@@ -57,7 +58,7 @@ class Selection:
     """Reconstruction that is kept, its calibration, and the record of all attempts."""
 
     reconstruction: Reconstruction
-    hand_eye: HandEye
+    hand_eye: Calibration
     attempts: tuple[Attempt, ...]
 
 
@@ -68,7 +69,7 @@ class Trial:
     account: Attempt
     """Record for the files."""
     reconstruction: Reconstruction | None
-    hand_eye: HandEye | None
+    hand_eye: Calibration | None
     failure: InputError | RejectedError | None
 
     @property
@@ -84,7 +85,7 @@ class Trial:
         name = " with ".join(filter(None, (self.account.backend, self.account.features)))
         if self.hand_eye is None:
             return name
-        error = self.hand_eye.leave_one_out
+        error = self.hand_eye.held_out
         if error is None:
             return f"{name} (too few images to leave one out)"
         return f"{name} (leave-one-out error {leave_one_out_text(error)})"
@@ -105,7 +106,7 @@ def rank(trial: Trial) -> tuple[bool, bool, bool, float]:
     """
     if trial.hand_eye is None:
         return False, False, False, 0.0
-    rejection, error = trial.rejection, trial.hand_eye.leave_one_out
+    rejection, error = trial.rejection, trial.hand_eye.held_out
     is_explained = rejection is not None and is_lasting(rejection)
     return True, rejection is None, is_explained, -float("inf") if error is None else -error.length_m
 

@@ -20,7 +20,7 @@ from numpy import ndarray
 from jcr import __version__
 from jcr.allocator import give_back
 from jcr.boards.proposal import proposed_for
-from jcr.calibration.record import Calibration, calibration_of, failed_calibration, write_calibration
+from jcr.calibration.record import AnyCalibration, failed_calibration, write_calibration
 from jcr.calibration.words import log
 from jcr.capture.added import FOLDER as ADDED
 from jcr.capture.added import write_added
@@ -129,9 +129,7 @@ def make(result: RunResult, stages: Sequence[Stage], progress: Progress) -> RunR
         give_back()
         if stage.name not in ("reconstruct", "calibrate"):  # they have the seconds of all back ends
             timings = result.calibration.timings_s | {stage.name: round(time.perf_counter() - start, 3)}
-            result = result.with_parts(
-                calibration=result.calibration.model_copy(update={"timings_s": timings})
-            )
+            result = result.with_parts(calibration=replace(result.calibration, timings_s=timings))
     return result
 
 
@@ -216,7 +214,8 @@ def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
         raise _failed(result, error) from None
     attempts = found.attempts if before is None else before.state.attempts or found.attempts
     result = with_state(result, attempts=attempts).with_parts(
-        reconstruction=found.reconstruction, hand_eye=found.hand_eye, timings=timings_of(found.attempts)
+        reconstruction=found.reconstruction,
+        calibration=replace(found.hand_eye, timings_s=timings_of(found.attempts)),
     )
     there = _with_same_reconstruction(result, seen)
     if there is None or there.out != out:
@@ -265,10 +264,8 @@ def _failed(result: RunResult, error: NothingFoundError) -> NothingFoundError:
 
     capture, tried = result.capture, error.attempts
     board = proposed_for(capture, result.state.options.reconstruct.board)
-    content = failed_calibration(
-        capture, tried[-1].backend, error.findings, timings_of(tried), __version__, tried
-    )
-    content = content if board is None else content.with_findings(board)
+    content = failed_calibration(capture, tried[-1].backend, error.findings, timings_of(tried), tried)
+    content = content if board is None else content.with_findings(board).with_notes()
     keep_calibration(result.out, content)
     write_text(result.out / REPORT, failed_report_html(capture, content, for_report(result.state.options)))
     complete(result)
@@ -284,19 +281,19 @@ def _poses_and_robot(result: RunResult) -> Any:
 
 def _calibrate(result: RunResult, progress: Progress) -> RunResult:
     """Write the calibration of the reconstruction that was selected."""
-    capture, reconstruction, hand_eye = result.capture, result.reconstruction, result.hand_eye
+    capture, reconstruction, content = result.capture, result.reconstruction, result.found
     if capture.mount == "base":
-        hand_eye = refined(capture, reconstruction, hand_eye, result.state.options.calibrate)
-    parts = capture, reconstruction, hand_eye, result.timings, __version__
-    content = calibration_of(*parts, result.state.attempts)
+        content = refined(capture, reconstruction, content, result.state.options.calibrate)
+    content = replace(content, attempts=result.state.attempts, notes=reconstruction.notes)
     if content.verdict == "rejected" or content.short is not None:
         board = proposed_for(capture, result.state.options.reconstruct.board)
         content = content if board is None else content.with_findings(board)
+    content = content.with_notes()
     keep_calibration(result.out, content)
-    return result.with_parts(calibration=content, hand_eye=hand_eye)
+    return result.with_parts(calibration=content)
 
 
-def keep_calibration(out: Path, content: Calibration) -> None:
+def keep_calibration(out: Path, content: AnyCalibration) -> None:
     """Write calibration.json and log.txt; what was made from another one goes first, so that the two never mix."""
     same = False
     with suppress(InputError):
@@ -308,7 +305,7 @@ def keep_calibration(out: Path, content: Calibration) -> None:
     rewrite_calibration(out, content)
 
 
-def rewrite_calibration(out: Path, content: Calibration) -> None:
+def rewrite_calibration(out: Path, content: AnyCalibration) -> None:
     """Write calibration.json and log.txt."""
     write_calibration(out / CALIBRATION, content)
     write_text(out / LOG, log(content))
@@ -333,7 +330,7 @@ def place(result: RunResult, progress: Progress) -> CamerasFile:
     """Return the other cameras of the cell as cameras.json has them."""
     from jcr.cell.stage import place_cameras
 
-    parts = result.capture, result.others, result.reconstruction, result.hand_eye
+    parts = result.capture, result.others, result.reconstruction, result.found
     return place_cameras(*parts, result.state.options.calibrate, progress).file(__version__)
 
 
@@ -382,12 +379,15 @@ def _map(result: RunResult, progress: Progress) -> RunResult:
     from jcr.segments.segments import image_labels, label_cloud
     from jcr.segments.tabletop import fit_support
 
-    options, capture, hand_eye, added = result.state.options, result.capture, result.hand_eye, result.added
+    options, capture, hand_eye, added = result.state.options, result.capture, result.found, result.added
     assert options.map is not None  # or this stage is left out
     made = result.reconstruction
     if len(added):
-        made = extend(made, hand_eye, len(capture), added, progress)
-    made, remarks = with_measured_depth(capture, made, hand_eye)
+        x, base_from_recon = hand_eye.gripper_from_camera, hand_eye.base_from_recon
+        made = extend(made, x, base_from_recon, len(capture), added, progress)
+    made, remarks = with_measured_depth(
+        capture, made, hand_eye.depth_check if hand_eye.is_sound else None, hand_eye.scale
+    )
     given = image_labels(capture, made, hand_eye, options.segment, progress)
     labels, names = (None, ("none",)) if given is None else (given.labels, given.names)
     cloud, support = point_cloud(capture, made, hand_eye, labels, options.cloud, names), None
@@ -430,7 +430,7 @@ def for_report(options: RunOptions) -> dict[str, Mapping[str, Any]]:
 def noted(result: RunResult, *notes: str | None) -> RunResult:
     """Return the result with more notes."""
     every = [*result.calibration.notes, *filter(None, notes)]
-    return result.with_parts(calibration=result.calibration.model_copy(update={"notes": every}))
+    return result.with_parts(calibration=replace(result.calibration, notes=tuple(every)))
 
 
 STAGES = (

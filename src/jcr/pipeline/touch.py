@@ -68,10 +68,7 @@ def touch(out: str | Path, points: str | Path) -> TouchTest:
         arm = x[:3, :3] @ (base_from_recon.scale * in_camera)
         rotation = capture.base_from_gripper[reconstruction.image_index[row], :3, :3]
         jacobian[k] = rotation @ np.column_stack([np.eye(3), -skew(arm), arm])
-    noise, errors = calibration.robot_noise, calibration.robot_errors
-    assert noise is not None  # wherever there is a transform
-    systematic_mm = 0.0 if errors is None else errors.translation_mm
-    touch_variance = (noise.translation_mm**2 + systematic_mm**2) / 1e6
+    touch_variance = calibration.robot_noise.together[0] ** 2
     stacked = jacobian.reshape(-1, 7)
     covariance = stacked @ calibration.covariance @ stacked.T + touch_variance * np.eye(len(stacked))
     squared = float(error.ravel() @ np.linalg.solve(covariance, error.ravel()))

@@ -232,7 +232,7 @@ def _fixed_cameras(
     calibrate_options = run.state.options.calibrate
     others = {one.name: one for one in (*capture.others, *read_added_cameras(run.out, capture))}
     placed = {
-        one.name: one.intrinsics.record()
+        one.name: one.intrinsics
         for one in ([] if run.cameras is None else run.cameras.cameras)
         if one.converged and one.mount == "base" and one.intrinsics is not None and one.name in others
     }
@@ -266,14 +266,14 @@ def _by_recalibration(
     """Calibrate from the images of another scene, and test the difference against both covariances."""
     calibration, then = run.calibration, run.state.options
     if calibration.intrinsics is not None:
-        new = replace(new, intrinsics=calibration.intrinsics.record())
+        new = replace(new, intrinsics=calibration.intrinsics)
     reconstruction = reconstruct(new, then.reconstruct, progress)
     hand_eye = calibrate(new, reconstruction, then.calibrate)
     if not hand_eye.converged:
         raise RejectedError(f"cannot tell: a new calibration from these images failed ({hand_eye.doubt})")
     offset = step_between(calibration.gripper_from_camera, hand_eye.gripper_from_camera)
     found = _of_two(offset, calibration.covariance[:6, :6] + hand_eye.covariance[:6, :6], options)
-    images = [new.images[row] for row in reconstruction.image_index[hand_eye.inliers]]
+    images = list(hand_eye.names_used)
     return _judged(found, options, images, (), "against a calibration of its own in another scene")
 
 

@@ -1,25 +1,34 @@
-"""State of a calibration, with its uncertainty, and the records that it is made of."""
+"""Parts of the record of a calibration (calibration/record.py), each as it is in memory and in calibration.json.
+
+Arrays are lists in the file, and lengths and angles have the unit that their key states.
+"""
 
 from dataclasses import dataclass, replace
-from typing import Literal, TypeVar
+from typing import Annotated, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray
+from pydantic import AfterValidator, Field, PlainSerializer, computed_field, model_validator
 
-from jcr.findings import (
-    Finding,
-    FindingKind,
-    Verdict,
-    doubt_of,
-    remedy,
-    strongest_first,
-    verdict_of,
-    warnings_of,
-)
-from jcr.findings.requirement import Requirement
+from jcr.findings import Finding, remedy
 from jcr.findings.sentences import unobservable
 from jcr.records.capture import Intrinsics
+from jcr.records.json_fields import (
+    Covariance7,
+    Matrix,
+    Numbers,
+    Numbers3,
+    Numbers7,
+    PartCovariance7,
+    Spread,
+    Square,
+    in_json,
+    in_unit,
+)
+
+PER_RADIAN = 180 / np.pi
+"""Degrees in a radian."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,32 +36,38 @@ class ImageVerdict:
     """Use and residuals of one image of the capture."""
 
     image: str
+    """Path relative to the folder of the capture; the name of the sample where poses were given."""
     used: bool
     reason: str | None
     """Why it was not used; None when it was."""
     translation_residual_mm: float | None = None
+    """Distance of the reported gripper from where the fit puts it (mm); None of an image that is not registered."""
     rotation_residual_deg: float | None = None
+    """Angle of the reported gripper from where the fit puts it (degrees)."""
     reprojection_px: float | None = None
-    """Median reprojection error."""
+    """Median reprojection error (px); None of an image that was not adjusted."""
 
 
 @dataclass(frozen=True)
 class Observability:
     """Directions of (translation, rotation, scale) that the motions determine."""
 
-    findings: tuple[Finding, ...] = ()
+    findings: Annotated[tuple[Finding, ...], Field(exclude=True)] = ()
     """One of kind UNOBSERVABLE per direction that is unobservable, or nearly so."""
 
+    @computed_field
     @property
     def observable(self) -> bool:
         """Whether every direction is observed, however weakly."""
         return all("nearly" in finding.details for finding in self.findings)
 
+    @computed_field
     @property
     def unobservable(self) -> tuple[str, ...]:
         """Unobservable directions in words, e.g. "scale: every view rotates about one point fixed to the gripper"."""
         return tuple(unobservable(finding) for finding in self.findings)
 
+    @computed_field
     @property
     def advice(self) -> tuple[str, ...]:
         """One remedy per unobservable direction."""
@@ -74,33 +89,39 @@ class Excitation:
 class NextPose:
     """Gripper pose to add, and the expected accuracy of a calibration with it and those before it."""
 
-    base_from_gripper: Float[ndarray, "4 4"]
-    expected_std: Float[ndarray, "7"]
+    base_from_gripper: Matrix
+    like: str
+    """Image whose gripper pose is the nearest to it."""
+    expected_std: Numbers7
     """One standard deviation of each unknown once this pose is added, in COVARIANCE_ORDER."""
-    within_95_mm: float
-    """Distance that 95 % of the errors of a seen point stay below, as Seen has it."""
-    rotation_95_deg: float
+    within_95_mm: Spread
+    """Bound on 95 % of the errors of a seen point (mm), as Seen has it."""
+    rotation_95_deg: Spread
     """Bound on 95 % of the errors of directions there."""
-    like: int
-    """Row of the existing pose that it is nearest to."""
-    moved_m: float
-    """Distance of the gripper's origin from there (m)."""
-    rotation_rad: float
-    """Angle of the rotation from there (rad)."""
+    moved_m: Annotated[float, in_unit(1e3), Field(alias="moved_mm")] = 0.0
+    """Distance of the gripper's origin from its place at `like` (m)."""
+    rotation_rad: Annotated[float, in_unit(PER_RADIAN), Field(alias="rotated_deg")] = 0.0
+    """Angle of the rotation from that pose (rad)."""
+
+
+Metres = Annotated[float, in_unit(1e3)]
+"""Length (m); millimetres in files."""
+Radians = Annotated[float, in_unit(PER_RADIAN)]
+"""Angle (rad); degrees in files."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotNoise:
     """One-sigma noise of the gripper poses per axis."""
 
-    translation: float
-    rotation: float
+    translation: Annotated[Metres, Field(alias="translation_mm")]
+    rotation: Annotated[Radians, Field(alias="rotation_deg")]
     estimated: bool
-    given: tuple[float, float] | None = None
+    given: Annotated[tuple[Metres, Radians] | None, Field(alias="given_mm_deg")] = None
     """m, rad: what the user gave; used where the residuals determine no more."""
-    systematic: float = 0.0
+    systematic: Annotated[Radians, Field(alias="systematic_deg")] = 0.0
     """rad: size of the systematic errors; of joint offsets where the arm is known, else of the gripper's rotation."""
-    systematic_left: tuple[float, float] = (0.0, 0.0)
+    systematic_left: Annotated[tuple[Metres, Radians], Field(alias="systematic_left_mm_deg")] = (0.0, 0.0)
     """m, rad: systematic errors of these poses per axis, after the effective hand-eye transform took its part."""
 
     @property
@@ -112,26 +133,78 @@ class RobotNoise:
 
 @dataclass(frozen=True)
 class JointOffsets:
-    """Estimated offset of each joint of the arm."""
+    """Estimated offset of each joint of the arm, from the base on."""
 
-    offset: Float[ndarray, " dof"]
+    offset: Numbers
     """rad: true angle less the reported one."""
-    std: Float[ndarray, " dof"]
+    std: Numbers
+    """rad."""
     prior_std: float
     """rad: of any joint, before its own poses are asked."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointError:
+    """True angle of a joint less the reported one, and its standard deviation."""
+
+    offset_deg: float
+    std_deg: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotErrors:
+    """Systematic errors of the gripper poses, as estimated."""
+
+    systematic_deg: float
+    """One sigma of the joint offsets where the arm is known, else of the gripper's rotation."""
+    translation_mm: float
+    """Part that is left in the poses per axis, after the effective hand-eye transform took its own."""
+    rotation_deg: float
+    joints: tuple[JointError, ...] | None
+    """The joints from the base on; null where the arm is not known."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Share:
+    """Part of the uncertainty: one sigma, root mean square over the axes; squares of the parts add up to the whole."""
+
+    translation_mm: Spread
+    rotation_deg: Spread
+    covariance: PartCovariance7
+    """Covariance in the order of `uncertainty`; the parts' sum is the whole."""
+
+
+def share_of(covariance: Float[ndarray, "7 7"]) -> Share:
+    """Return a part of the covariance with its size."""
+    metres, radians = np.sqrt(np.diag(covariance)[:6].reshape(2, 3).mean(1)).tolist()
+    degrees = float(np.degrees(radians))
+    return Share(translation_mm=1e3 * metres, rotation_deg=degrees, covariance=covariance)
+
+
+def _covariance_of(share: Share | None) -> Float[ndarray, "7 7"]:
+    return np.zeros((7, 7)) if share is None else share.covariance
+
+
+PartOfBudget = Annotated[
+    Float[ndarray, "7 7"],
+    in_json(
+        Annotated[Share | None, AfterValidator(_covariance_of), PlainSerializer(share_of, return_type=Share)]
+    ),
+]
+"""Covariance in COVARIANCE_ORDER; in files a Share."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
     """Parts of the covariance of a calibration, by cause, in COVARIANCE_ORDER; their sum is the covariance."""
 
-    robot_random: Float[ndarray, "7 7"]
-    robot_systematic: Float[ndarray, "7 7"]
-    intrinsics: Float[ndarray, "7 7"]
+    robot_random: PartOfBudget
+    robot_systematic: PartOfBudget
+    intrinsics: PartOfBudget
     """Part that would vanish if the intrinsics were known."""
-    images: Float[ndarray, "7 7"]
+    images: PartOfBudget
     """Camera poses and features; and what is unobservable."""
-    faults: Float[ndarray, "7 7"]
+    faults: PartOfBudget
     """Part that findings and their uncertainty add."""
 
     @property
@@ -197,33 +270,41 @@ class DepthCheck:
 
 @dataclass(frozen=True, kw_only=True)
 class Seen:
-    """Point uncertainty: bounds on 95 % of the errors of a point that the camera sees."""
+    """Point uncertainty: bounds on 95 % of the errors of a point that the camera sees, exact gripper poses assumed."""
 
-    distance_mm: float
+    distance_mm: Spread
     """Distance of the point from the camera along its ray (mm)."""
-    within_95_mm: float
+    within_95_mm: Spread
     """Distance of the point from where it is, in three dimensions."""
-    lateral_95_mm: float
+    lateral_95_mm: Spread
     """Across the ray."""
-    along_95_mm: float
+    along_95_mm: Spread
     """95 % bound of the error along the ray (mm), for a distance that was measured in the reconstruction."""
-    ray_95_deg: float
+    ray_95_deg: Spread
     """Direction of the ray."""
-    rotation_95_deg: float
+    rotation_95_deg: Spread
     """Bound on directions there, the rotation about the ray included."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenAndCorners(Seen):
+    """Point uncertainty at the centre of the image, at the median distance of the scene, and at its worst corner."""
+
+    corners: Seen
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneUncertainty:
     """Uncertainty of the reconstructed scene in the base frame, every point by all images that see it."""
 
-    middle_in_base: Float[ndarray, "3"]
-    covariance: Float[ndarray, "7 7"]
+    middle_in_base: Numbers3
+    """Middle of the scene (m)."""
+    covariance: PartCovariance7
     """Covariance of steps of the scene as a whole (geometry.retract) about its middle, along axes of the base, and
     of the logarithm of its size."""
-    shape_m: float
+    shape_m: Spread
     """One sigma per axis of what else moves a point: the scene is bent."""
-    within_95_m: float
+    within_95_m: Spread
     """Distance that 95 % of a point's errors stay below, the median point; its own triangulation included."""
 
     def covariance_at(self, x_in_base: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3 3"]:
@@ -235,28 +316,16 @@ class SceneUncertainty:
 
 
 @dataclass(frozen=True, kw_only=True)
-class InUse:
-    """Point uncertainty by intrinsics, transform and scale together, without the robot's own pose errors."""
-
-    seen: Seen
-    """Uncertainty of a point at the centre of the image, at the median distance of the scene."""
-    corners: Seen
-    """Uncertainty of a point at the worst corner of the image."""
-    scene: SceneUncertainty | None = None
-    """None where no image was adjusted."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class WithGivenIntrinsics:
     """Transform for the intrinsics that were given: the likeliest one where these are exact."""
 
-    gripper_from_camera: Float[ndarray, "4 4"]
-    covariance: Float[ndarray, "7 7"]
+    gripper_from_camera: Matrix
+    covariance: Covariance7
     """Covariance in COVARIANCE_ORDER, with the distance from the transform of the estimated intrinsics."""
     intrinsics: Intrinsics
     seen: Seen
     """Uncertainty of a seen point with these intrinsics, what they place wrongly included."""
-    differs_mm: float
+    differs_mm: Spread
     """Distance between the places of a point at the image centre by the two pairs (mm)."""
 
 
@@ -264,56 +333,108 @@ class WithGivenIntrinsics:
 class ModelError:
     """Distortion beyond the model: polynomials over the image, in its widths (estimation/intrinsics_prior.py)."""
 
-    likeliest: Float[ndarray, " e"]
-    covariance: Float[ndarray, "e e"]
-    expressed: Float[ndarray, "q e"]
-    """By how much the parameters (camera.parameters) express each polynomial where the images have points."""
-
-
-AnyEstimate = TypeVar("AnyEstimate", bound="Estimate")
+    likeliest: Numbers
+    covariance: Square
+    expressed: Square
+    """By how much the parameters (camera.parameters) express each polynomial where the images have points, (q,e)."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Estimate:
-    """Estimated transform, scale and intrinsics, with their covariances."""
+class JointCovariance:
+    """Covariance of transform, scale and intrinsics together, from which the uncertainty of any point follows."""
 
-    gripper_from_camera: Float[ndarray, "4 4"]
-    scale: float
-    """Metres per unit of the reconstruction."""
-    base_from_recon: Float[ndarray, "4 4"]
-    """Rigid; maps recon coordinates *already multiplied by scale* to the base frame."""
-    covariance: Float[ndarray, "7 7"]
-    """Covariance of the estimate, in COVARIANCE_ORDER."""
+    covariance: Square
+    order: tuple[str, ...]
+    """Names of the rows: COVARIANCE_ORDER, then fx, fy, cx, cy and the distortion."""
+
+    @model_validator(mode="after")
+    def _is_square(self) -> "JointCovariance":
+        if self.covariance.shape != 2 * (len(self.order),):
+            raise ValueError(f"a covariance that is not {len(self.order)} x {len(self.order)}")
+        return self
+
+
+def _checked_order(names: tuple[str, ...]) -> tuple[str, ...]:
+    if names != COVARIANCE_ORDER:
+        raise ValueError(f"not {', '.join(COVARIANCE_ORDER)}")
+    return names
+
+
+@dataclass(frozen=True, kw_only=True)
+class Uncertainty:
+    """One-sigma uncertainty of transform, scale and intrinsics; axes of the gripper, of the base for a fixed camera."""
+
+    covariance: Covariance7
+    """Covariance in COVARIANCE_ORDER."""
+    order: Annotated[tuple[str, ...], AfterValidator(_checked_order)] = COVARIANCE_ORDER
+    """Names of the rows of the covariance, which are COVARIANCE_ORDER."""
     budget: Budget | None = None
-    """Parts of the covariance; None where it was not divided."""
-    intrinsics: Intrinsics | None = None
-    """Refined by bundle adjustment; None when poses alone were given."""
-    intrinsics_covariance: Float[ndarray, "q q"] | None = None
-    """Covariance of the intrinsics in the order of camera.parameters; None where they were not refined."""
-    intrinsics_cross: Float[ndarray, "7 q"] | None = None
-    """Covariance of COVARIANCE_ORDER (rows) with camera.parameters (columns); None where these were not refined."""
+    """Parts of the covariance by cause; None where it was not divided."""
+    joint: JointCovariance | None = None
+    """None where the intrinsics were not estimated."""
     model_error: ModelError | None = None
-    """None where the intrinsics were not refined."""
+    """Distortion that the model cannot express; None where the intrinsics were not estimated."""
+    seen: SeenAndCorners | None = None
+    """Point uncertainty at the working distance; None of a fit outside the stage calibrate."""
+    scene: SceneUncertainty | None = None
+    """Uncertainty of the whole reconstruction in the base frame; None where no image was adjusted."""
+
+    @computed_field
+    @property
+    def translation_std_mm(self) -> list[float]:
+        """Standard deviations of the translation (mm)."""
+        return (1e3 * self.std[:3]).tolist()
+
+    @computed_field
+    @property
+    def rotation_std_deg(self) -> list[float]:
+        """Standard deviations of the rotation vector (degrees)."""
+        return np.degrees(self.std[3:6]).tolist()
+
+    @computed_field
+    @property
+    def scale_std_percent(self) -> float:
+        """Relative standard deviation of the scale (percent)."""
+        return float(100 * self.std[6])
+
+    @computed_field
+    @property
+    def scene_95_mm(self) -> float | None:
+        """Bound on 95 % of the errors of reconstructed points in the base frame (mm), at the median point."""
+        return None if self.scene is None else 1e3 * self.scene.within_95_m
+
+    @property
+    def std(self) -> Float[ndarray, "7"]:
+        """Standard deviations in COVARIANCE_ORDER."""
+        return np.sqrt(np.diag(self.covariance))
 
     @property
     def intrinsics_std(self) -> Float[ndarray, " q"] | None:
-        """Standard deviation of each parameter, in the same order."""
-        known = self.intrinsics_covariance
-        return None if known is None else np.sqrt(np.diag(known))
+        """Standard deviation of each parameter of the intrinsics; None where they were not estimated."""
+        return None if self.joint is None else np.sqrt(np.diag(self.joint.covariance)[7:])
 
-    def with_fault(self: AnyEstimate, covariance: Float[ndarray, "7 7"]) -> AnyEstimate:
-        """Return the estimate, as uncertain as a fault with this covariance makes it."""
-        budget = None if self.budget is None else replace(self.budget, faults=self.budget.faults + covariance)
-        return replace(self, covariance=self.covariance + covariance, budget=budget)
+    @property
+    def whole(self) -> Float[ndarray, "j j"]:
+        """Covariance of COVARIANCE_ORDER and, where they were estimated, of the intrinsics."""
+        return self.covariance if self.joint is None else self.joint.covariance
 
-    def with_finding(self: AnyEstimate, finding: Finding) -> AnyEstimate:
-        """Return the estimate, as uncertain as the shifts of a finding make transform and intrinsics."""
-        cross, known = self.intrinsics_cross, self.intrinsics_covariance
-        if finding.intrinsics_shift is not None and cross is not None and known is not None:
-            shift, moved = np.array(finding.shift), np.array(finding.intrinsics_shift)
-            cross, known = cross + np.outer(shift, moved), known + np.outer(moved, moved)
-        faulty = self.with_fault(finding.covariance)
-        return replace(faulty, intrinsics_cross=cross, intrinsics_covariance=known)
+    @property
+    def corner(self) -> Seen | None:
+        """Point uncertainty in the worst corner of the image; None where the intrinsics were not estimated."""
+        return None if self.seen is None or self.joint is None else self.seen.corners
+
+    def with_error(
+        self, added: Float[ndarray, "k k"], cause: Literal["intrinsics", "faults"] = "faults"
+    ) -> "Uncertainty":
+        """Return the uncertainty with another error, whose covariance has 7 rows or those of `joint`."""
+        joint, budget, of_transform = self.joint, self.budget, added[:7, :7]
+        if joint is not None:
+            together = joint.covariance.copy()
+            together[: len(added), : len(added)] += added
+            joint = replace(joint, covariance=together)
+        if budget is not None:
+            budget = replace(budget, **{cause: getattr(budget, cause) + of_transform})
+        return replace(self, covariance=self.covariance + of_transform, joint=joint, budget=budget)
 
 
 @dataclass(frozen=True)
@@ -366,85 +487,6 @@ class BoardFound:
     """Angles of the bodies from the base's horizontal plane."""
     shape_mm: tuple[tuple[float, float, float], ...] = ()
     """Corners of the body that bends most: x and y on the body, and height above its plane, by the robot's positions."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class HandEye(Estimate):
-    """Numerical state of a calibration as it passes through fit, bundle adjustment and checks."""
-
-    inliers: Bool[ndarray, " n"]
-    """Whether each pose that the solver was given is used."""
-    translation_residual_m: Float[ndarray, " n"]
-    """Distance of each gripper from where the fit puts it."""
-    rotation_residual_rad: Float[ndarray, " n"]
-    reasons: tuple[str | None, ...] = ()
-    """Why each pose was rejected, None where it is used."""
-    reprojection_px: Float[ndarray, " n"] | None = None
-    """Median reprojection error after bundle adjustment; NaN of images that took no part."""
-    residuals: PaperResiduals = PaperResiduals(0.0, 0.0)
-    robot_noise: RobotNoise
-    joint_offsets: JointOffsets | None = None
-    """None where the arm is not known."""
-    leave_one_out: LeaveOneOut | None = None
-    network: ScaleCheck | None = None
-    """None where the reconstruction's unit is not meant to be the metre."""
-    depth: DepthCheck | None = None
-    """None without depth images, or where too few features have a depth."""
-    lengths: tuple[LengthCheck, ...] = ()
-    """Every length that was compared with the robot's positions."""
-    board: BoardFound | None = None
-    """None where no board took part beside features."""
-    excitation: Excitation | None = None
-    """Excitation by the used poses."""
-    next_poses: tuple[NextPose, ...] = ()
-    """Gripper poses that would shrink the reported uncertainty most; `like` counts the used poses."""
-    requirement: Requirement | None = None
-    """Required and reached accuracy; None of a fit outside the stage calibrate."""
-    in_use: InUse | None = None
-    """Point uncertainty; None of a fit outside the stage calibrate."""
-    with_given_intrinsics: WithGivenIntrinsics | None = None
-    """None where no intrinsics were given, or they were not estimated beside that."""
-    before: "HandEye | None" = None
-    """The fit to camera poses alone; None where that decided."""
-    findings: tuple[Finding, ...] = ()
-    """Findings, strongest first; of the same severity causes before consequences."""
-
-    def with_findings(self, *findings: Finding) -> "HandEye":
-        """Return the calibration with more findings, ordered from strongest to weakest."""
-        return replace(self, findings=strongest_first((*self.findings, *findings)))
-
-    @property
-    def verdict(self) -> Verdict:
-        """Verdict of the worst finding."""
-        return verdict_of(self.findings)
-
-    @property
-    def converged(self) -> bool:
-        """Whether it is accepted."""
-        return self.verdict != "rejected"
-
-    @property
-    def doubt(self) -> str | None:
-        """Reason of the rejection in words; None where it is accepted."""
-        return doubt_of(self.findings)
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Findings that reject or warn, in words."""
-        return warnings_of(self.findings)
-
-    @property
-    def observability(self) -> Observability:
-        """Directions that the motions determine."""
-        return Observability(tuple(one for one in self.findings if one.kind is FindingKind.UNOBSERVABLE))
-
-    @property
-    def is_sound(self) -> bool:
-        """Whether nothing but an unmet requirement rejects it: other stages can build on it."""
-        return (
-            verdict_of(one for one in self.findings if one.kind is not FindingKind.NOT_EXACT_ENOUGH)
-            != "rejected"
-        )
 
 
 @dataclass(frozen=True, kw_only=True)

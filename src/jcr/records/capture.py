@@ -3,12 +3,14 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
+from pydantic import ConfigDict, Field, model_validator
 
+from jcr.records.json_fields import Positive, Spread
 from jcr.records.notebook import table
 
 DistortionModel = Literal["pinhole", "rational", "thin_prism", "fisheye"]
@@ -28,6 +30,11 @@ Coefficients = (
 )
 
 
+LARGEST_PX = 100_000
+"""Width of the largest image; no camera's image is wider."""
+Pixels = Annotated[int, Field(ge=1, le=LARGEST_PX)]
+
+
 def coefficients_of(values: Iterable[float]) -> Coefficients:
     """Return four, five, eight or twelve numbers as a model has them."""
     return cast(Coefficients, tuple(float(value) for value in values))
@@ -37,12 +44,13 @@ def coefficients_of(values: Iterable[float]) -> Coefficients:
 class Intrinsics:
     """A camera with one of OpenCV's distortions, in pixels of a `width` x `height` image."""
 
-    fx: float
-    fy: float
+    __pydantic_config__ = ConfigDict(allow_inf_nan=False)
+    fx: Positive
+    fy: Positive
     cx: float
     cy: float
-    width: int
-    height: int
+    width: Pixels
+    height: Pixels
     distortion: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0)
     """Coefficients, as many as COEFFICIENTS has names for the model."""
     model: DistortionModel = "pinhole"
@@ -51,6 +59,35 @@ class Intrinsics:
     def matrix(self) -> Float[ndarray, "3 3"]:
         """K (3,3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def with_std(self, std: Float[ndarray, " q"] | None) -> "IntrinsicsAndStd":
+        """Return the intrinsics with standard deviations in the order of camera.parameters; None: not estimated."""
+        values: dict[str, Any] = vars(self) | {"std": None if std is None else tuple(std.tolist())}
+        return IntrinsicsAndStd(**values)
+
+    @model_validator(mode="after")
+    def _has_coefficients_of_model(self) -> "Intrinsics":
+        names = COEFFICIENTS[self.model]
+        if len(self.distortion) != len(names):
+            raise ValueError(f"{len(self.distortion)} coefficients, but a {self.model} model has {names}")
+        return self
+
+
+@dataclass(frozen=True)
+class IntrinsicsAndStd(Intrinsics):
+    """Intrinsics with their standard deviations."""
+
+    std: tuple[Spread, ...] | None = None
+    """Standard deviations of fx, fy, cx, cy (px) and the distortion; None where the intrinsics were not estimated."""
+
+    @model_validator(mode="after")
+    def _has_std_of_each(self) -> "IntrinsicsAndStd":
+        if self.std is not None and len(self.std) != 4 + len(self.distortion):
+            raise ValueError(
+                f"{len(self.std)} standard deviations, but a {self.model} model has "
+                f"{4 + len(self.distortion)} parameters"
+            )
+        return self
 
 
 Mount = Literal["gripper", "base"]

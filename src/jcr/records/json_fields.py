@@ -1,6 +1,6 @@
-"""Fields of the JSON files that jcr writes: arrays as lists, covariances, transforms and intrinsics, all checked."""
+"""Fields of the JSON files that jcr writes: arrays as lists, covariances, transforms and numbers in other units."""
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -11,12 +11,9 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    GetPydanticSchema,
     PlainSerializer,
-    model_validator,
 )
-
-from jcr.geometry import HUGE, require_rigid
-from jcr.records.capture import COEFFICIENTS, DistortionModel, Intrinsics, coefficients_of
 
 
 class Part(BaseModel):
@@ -43,6 +40,8 @@ def _listed(array: Any) -> Any:
 
 
 def _rigid(rows: list[list[float]]) -> Float[ndarray, "4 4"]:
+    from jcr.geometry import require_rigid  # SciPy, which help need not wait for
+
     matrix = np.array(rows)
     require_rigid(matrix, "the matrix")
     return matrix
@@ -83,92 +82,53 @@ def _least_eigenvalue(matrix: Float[ndarray, "n n"], std: Float[ndarray, " n"]) 
     return float(np.linalg.eigvalsh(matrix / np.outer(unit, unit))[0])
 
 
+def in_json(kind: Any) -> GetPydanticSchema:
+    """Return the annotation of a type that JSON has as `kind`."""
+    return GetPydanticSchema(lambda _source, handler: handler.generate_schema(kind))
+
+
+def rounded(value: float) -> float:
+    """Return a number with the 15 digits that survive a change of the unit and back."""
+    return float(f"{value:.15g}")
+
+
+def in_unit(per_unit: float) -> GetPydanticSchema:
+    """Return the annotation of a number in metres or radians that JSON has in another unit, `per_unit` in each."""
+
+    def from_unit(value: float) -> float:
+        return value / per_unit
+
+    def to_unit(value: float) -> float:
+        return rounded(value * per_unit)
+
+    return in_json(Annotated[float, AfterValidator(from_unit), PlainSerializer(to_unit, return_type=float)])
+
+
+def _arrays(kind: Any, made: Any = np.array, count: int | None = None) -> GetPydanticSchema:
+    """Return the annotation of arrays that JSON has as lists: of `count` times `kind`, made an array by `made`."""
+    lists: Any = Annotated[list[kind], Field(min_length=count, max_length=count)]
+    return in_json(
+        Annotated[lists, AfterValidator(made), BeforeValidator(_listed), PlainSerializer(_listed, lists)]
+    )
+
+
+HUGE = 1e15
+"""Largest number of a file."""
+Positive = Annotated[float, Field(gt=0, lt=HUGE)]
 Spread = Annotated[float, Field(ge=0)]
 """Standard deviation, or a size."""
-Listed = BeforeValidator(_listed)
-"""Validator that takes an array for the lists that stand for it in JSON."""
-AsArray = AfterValidator(np.array)
-AsLists = PlainSerializer(_listed, return_type=list)
-Spreads = Annotated[list[Spread], Listed]
-Spread3 = Annotated[list[Spread], Field(min_length=3, max_length=3), Listed]
-Numbers4 = Annotated[list[float], Field(min_length=4, max_length=4)]
-Numbers6 = Annotated[list[float], Field(min_length=6, max_length=6)]
-_Numbers7 = Annotated[list[float], Field(min_length=7, max_length=7)]
-if TYPE_CHECKING:
-    Numbers3 = Numbers7 = Numbers = Square = Matrix = Covariance6 = Covariance7 = PartCovariance7 = ndarray
-else:
-    Numbers = Annotated[list[float], AsArray, Listed, AsLists]
-    Numbers3 = Annotated[list[float], Field(min_length=3, max_length=3), AsArray, Listed, AsLists]
-    Numbers7 = Annotated[list[float], Field(min_length=7, max_length=7), AsArray, Listed, AsLists]
-    Square = Annotated[list[list[float]], AsArray, Listed, AsLists]
-    Matrix = Annotated[
-        list[Numbers4], Field(min_length=4, max_length=4), AfterValidator(_rigid), Listed, AsLists
-    ]
-    """Rigid transform."""
-    Covariance6 = Annotated[
-        list[Numbers6], Field(min_length=6, max_length=6), AfterValidator(_whole), Listed, AsLists
-    ]
-    Covariance7 = Annotated[
-        list[_Numbers7], Field(min_length=7, max_length=7), AfterValidator(_whole), Listed, AsLists
-    ]
-    """Covariance of everything that was estimated: positive definite."""
-    PartCovariance7 = Annotated[
-        list[_Numbers7], Field(min_length=7, max_length=7), AfterValidator(_part), Listed, AsLists
-    ]
-    """Part of a covariance that one cause adds, which may be nothing."""
-
-LARGEST = 100_000
-"""Pixels across; no camera's image is wider."""
-Pixels = Annotated[int, Field(ge=1, le=LARGEST)]
-Positive = Annotated[float, Field(gt=0, lt=HUGE)]
-
-
-class IntrinsicsJson(Part):
-    """Every number of an Intrinsics, in range."""
-
-    fx: Positive
-    fy: Positive
-    cx: float
-    cy: float
-    distortion: Annotated[list[float], Field(min_length=4, max_length=12)]
-    width: Pixels
-    height: Pixels
-    model: DistortionModel = "pinhole"
-
-    @model_validator(mode="after")
-    def _as_many_as_the_model_has(self) -> "IntrinsicsJson":
-        names = COEFFICIENTS[self.model]
-        if len(self.distortion) != len(names):
-            raise ValueError(f"{len(self.distortion)} coefficients, but a {self.model} model has {names}")
-        return self
-
-    def record(self) -> Intrinsics:
-        """Without what a file says beside it."""
-        given: dict[str, Any] = {name: getattr(self, name) for name in IntrinsicsJson.model_fields}
-        given["distortion"] = coefficients_of(self.distortion)
-        return Intrinsics(**given)
-
-
-class IntrinsicsAndStd(IntrinsicsJson):
-    """Intrinsics with their standard deviations."""
-
-    std: Spreads | None = None
-    """Standard deviations of fx, fy, cx, cy and the distortion; null where the intrinsics were not refined."""
-
-    @model_validator(mode="after")
-    def _one_of_each(self) -> "IntrinsicsAndStd":
-        if self.std is not None and len(self.std) != 4 + len(self.distortion):
-            raise ValueError(
-                f"{len(self.std)} standard deviations, but a {self.model} model has "
-                f"{4 + len(self.distortion)} parameters"
-            )
-        return self
-
-    @classmethod
-    def of(
-        cls, intrinsics: Intrinsics | None, std: Float[ndarray, " q"] | None = None
-    ) -> "IntrinsicsAndStd | None":
-        """Return the intrinsics of a record; None where there are none."""
-        if intrinsics is None:
-            return None
-        return cls.model_validate(vars(intrinsics) | {"std": std})
+Spread3 = Annotated[list[Spread], Field(min_length=3, max_length=3), BeforeValidator(_listed)]
+Numbers = Annotated[Float[ndarray, " _"], _arrays(float)]
+Numbers3 = Annotated[Float[ndarray, "3"], _arrays(float, count=3)]
+Numbers7 = Annotated[Float[ndarray, "7"], _arrays(float, count=7)]
+Square = Annotated[Float[ndarray, "_ _"], _arrays(list[float])]
+_Row4, _Row6, _Row7 = (
+    Annotated[list[float], Field(min_length=count, max_length=count)] for count in (4, 6, 7)
+)
+Matrix = Annotated[Float[ndarray, "4 4"], _arrays(_Row4, _rigid, 4)]
+"""Rigid transform."""
+Covariance6 = Annotated[Float[ndarray, "6 6"], _arrays(_Row6, _whole, 6)]
+Covariance7 = Annotated[Float[ndarray, "7 7"], _arrays(_Row7, _whole, 7)]
+"""Covariance of everything that was estimated: positive definite."""
+PartCovariance7 = Annotated[Float[ndarray, "7 7"], _arrays(_Row7, _part, 7)]
+"""Part of a covariance that one cause adds, which may be nothing."""

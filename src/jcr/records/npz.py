@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,6 @@ from jcr.allocator import require_memory
 from jcr.errors import InputError, first_fault, shown
 from jcr.files import require_file, written_whole
 from jcr.geometry import require_rigid
-from jcr.records.json_fields import IntrinsicsJson
 from jcr.records.reconstruction import Reconstruction
 
 FORMAT = "jcr.reconstruction/9"
@@ -138,14 +137,12 @@ def _check(found: Reconstruction) -> None:
         shapes["covariance"] = evidence.covariance, (6 * m, 6 * m)
         cameras += [*evidence.recon_from_camera]
     if maps is not None:
-        IntrinsicsJson.model_validate(asdict(maps.intrinsics))
         size = m, maps.intrinsics.height, maps.intrinsics.width
         shapes |= {
             name: (array, (*size, 3) if name in ("points_in_recon", "colors") else size)
             for name, array in vars(maps).items()
             if isinstance(array, np.ndarray)
         }
-    IntrinsicsJson.model_validate(asdict(found.intrinsics))
     check_arrays(shapes)
     if min(positive) <= 0:
         raise ValueError("a length or a standard deviation is not positive")

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.record import Calibration
+from jcr.calibration.record import AnyCalibration
 from jcr.calibration.words import attempt_in_words, budget_in_words
 from jcr.cell.placement import CamerasFile, TransformUncertainty
 from jcr.extras import is_installed
@@ -24,7 +24,7 @@ PACKAGES = ("numpy", "scipy", "torch", "pycolmap")
 
 
 def details_section(
-    calibration: Calibration, options: StageOptions, map_history: Mapping[str, str] | None = None
+    calibration: AnyCalibration, options: StageOptions, map_history: Mapping[str, str] | None = None
 ) -> Section:
     """Return blocks of names and values."""
     times, uncertainty = calibration.timings_s, calibration.uncertainty
@@ -76,7 +76,7 @@ def details_section(
     return Section("details", {"blocks": {title: rows for title, rows in blocks.items() if rows}})
 
 
-def _board(calibration: Calibration) -> dict[str, str]:
+def _board(calibration: AnyCalibration) -> dict[str, str]:
     """Return size, place and flatness of a board that took part beside features."""
     if (board := calibration.board) is None:
         return {}

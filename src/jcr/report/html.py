@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 
-from jcr.calibration.record import Calibration
+from jcr.calibration.record import AnyCalibration
 from jcr.capture.formats.capture_json import origin
 from jcr.capture.formats.table import TABLES
 from jcr.errors import printable
@@ -50,7 +50,7 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
     objects = None if scene is None or result.measured is None else (result.measured, scene.label_names)
     sections = [
         *head(calibration),
-        transform_section(result.hand_eye, capture.mount),
+        transform_section(result.found),
         None if fixed else scene_section(result),
         images_section(capture, result),
         None if result.cameras is None else cameras_section(result.cameras),
@@ -68,7 +68,7 @@ def poses_report_html(result: RunResult, options: StageOptions | None = None) ->
     calibration = result.calibration
     sections = [
         *head(calibration),
-        transform_section(result.hand_eye),
+        transform_section(result.found),
         residuals_section(result),
         motion_section(result),
         *notes_section(calibration),
@@ -78,7 +78,7 @@ def poses_report_html(result: RunResult, options: StageOptions | None = None) ->
 
 
 def failed_report_html(
-    capture: Capture, calibration: Calibration, options: StageOptions | None = None
+    capture: Capture, calibration: AnyCalibration, options: StageOptions | None = None
 ) -> str:
     """Return the report of a run that found no camera poses: reason, remedy and images."""
     sections = [
@@ -98,7 +98,7 @@ def _about_capture(capture: Capture, options: StageOptions) -> str:
     return f"{arm} · {capture.camera_name} camera, {width} × {height} px, intrinsics {given}"
 
 
-def _about_intrinsics(calibration: Calibration) -> list[str]:
+def _about_intrinsics(calibration: AnyCalibration) -> list[str]:
     """Return a line with the intrinsics that belong to the transform; none where they are unknown."""
     if (found := calibration.intrinsics) is None:
         return []
@@ -109,7 +109,7 @@ def _about_intrinsics(calibration: Calibration) -> list[str]:
     ]
 
 
-def _page(about: str, source: Path, calibration: Calibration, sections: Iterable[Section | None]) -> str:
+def _page(about: str, source: Path, calibration: AnyCalibration, sections: Iterable[Section | None]) -> str:
     """Return the whole page; `source` is the capture as the user named it."""
     # The table or the bag's metadata are called alike in every capture: their folder has the name.
     named = source.parent if source.stem in UNNAMED else source

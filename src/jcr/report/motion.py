@@ -8,7 +8,7 @@ import numpy as np
 
 from jcr.calibration.words import given_in_words, seen_in_words
 from jcr.capture.controllers import CONVENTIONS, OF_ARM, numbers_from_poses, units_of
-from jcr.estimation.observability import WEAK
+from jcr.estimation.observability import WEAK, excitation
 from jcr.records import Capture, Excitation, NextPose
 from jcr.report.render import Section
 from jcr.result import RunResult
@@ -31,7 +31,7 @@ Bar = tuple[str, float, float, str]
 def motion_section(result: RunResult) -> Section:
     """Return excitation of the seven directions, standard deviations of their parts, and the poses to add."""
     observed, uncertainty = result.calibration.observability, result.calibration.uncertainty
-    found = result.hand_eye.excitation
+    found = _excitation(result)
     content = {
         "unobservable": list(zip(observed.unobservable, observed.advice, strict=False)),
         "is_observable": observed.observable,
@@ -48,6 +48,13 @@ def motion_section(result: RunResult) -> Section:
         "next_poses": _next_poses(result),
     }
     return Section("uncertainty", content)
+
+
+def _excitation(result: RunResult) -> Excitation | None:
+    """Return the excitation by the gripper poses of the used images; None of one image."""
+    used = [image.used for image in result.calibration.images]
+    gripper = result.capture.base_from_gripper[used]
+    return excitation(gripper, result.found.gripper_from_camera) if len(gripper) > 1 else None
 
 
 def _seen(result: RunResult) -> list[str]:
@@ -78,15 +85,14 @@ def _spreads(name: str, std: Sequence[float], unit: str) -> Iterator[Bar]:
 
 def _next_poses(result: RunResult) -> dict[str, Any] | None:
     """Return the proposed gripper poses with their expected uncertainty, ready to copy; None without any."""
-    if not (poses := result.hand_eye.next_poses):
+    if not (poses := result.calibration.next_poses):
         return None
     convention = _convention(result)
     written = MATRICES.get(convention) or ", ".join(CONVENTIONS[convention].columns)
-    near = [one.like for one in result.calibration.next_poses]
     return {
         "in_the_3d_view": isinstance(result.capture, Capture),
         "notation": f"{written} ({units_of(convention)}), as {convention} writes poses",
-        "rows": [_next_pose(pose, like, convention) for pose, like in zip(poses, near, strict=True)],
+        "rows": [_next_pose(pose, convention) for pose in poses],
     }
 
 
@@ -98,7 +104,7 @@ def _convention(result: RunResult) -> str:
     return capture.pose_convention or OF_ARM.get(capture.robot or "") or ANY_CONVENTION
 
 
-def _next_pose(pose: NextPose, near: str, convention: str) -> dict[str, Any]:
+def _next_pose(pose: NextPose, convention: str) -> dict[str, Any]:
     """Return a proposed pose in the convention of the robot, with its expected uncertainty."""
     numbers = numbers_from_poses(pose.base_from_gripper[None], convention)[0]
     mm, deg = significant(1e3 * float(pose.expected_std[:3].max())), np.degrees(pose.expected_std[3:6].max())
@@ -108,7 +114,7 @@ def _next_pose(pose: NextPose, near: str, convention: str) -> dict[str, Any]:
         "is_short": len(numbers) < 16,
         "matrix": json.dumps(pose.base_from_gripper.round(6).tolist()),
         "cells": (
-            near,
+            pose.like,
             f"{1e3 * pose.moved_m:.0f}\u00a0mm, {np.degrees(pose.rotation_rad):.0f}°",
             f"{significant(pose.within_95_mm)}\u00a0mm, {significant(pose.rotation_95_deg)}°",
             f"±{mm}\u00a0mm, ±{significant(float(deg))}°, ±{percent}\u00a0%",

@@ -14,11 +14,13 @@ NOTICEABLE = 1.05
 
 def residuals_section(result: RunResult) -> Section:
     """Return residuals by image and of the whole fit."""
-    fit, names = result.hand_eye, shown_names(result.calibration.images)
+    fit = result.found
+    named = zip(shown_names(fit.images), fit.images, strict=True)
+    rows = [(name, one) for name, one in named if one.translation_residual_mm is not None]
     used, columns = fit.inliers, []
     for values, unit in (
-        (1e3 * fit.translation_residual_m, " mm"),
-        (np.degrees(fit.rotation_residual_rad), "°"),
+        (np.array([one.translation_residual_mm for _, one in rows], float), " mm"),
+        (np.array([one.rotation_residual_deg for _, one in rows], float), "°"),
     ):
         share = 100 * values / (float(values[used].max(initial=0.0)) or 1.0)
         columns.append(
@@ -27,17 +29,14 @@ def residuals_section(result: RunResult) -> Section:
     noise, together = fit.robot_noise.translation, fit.robot_noise.together[0]
     count = 6 * int(used.sum())
     content = {
-        "rows": [
-            (bool(used[k]), names[int(row)], [column[k] for column in columns])
-            for k, row in enumerate(result.image_index)
-        ],
+        "rows": [(one.used, name, [column[k] for column in columns]) for k, (name, one) in enumerate(rows)],
         "noise": {
             "mm": significant(1e3 * noise),
             "together_mm": significant(1e3 * together) if together > NOTICEABLE * noise else None,
             "count": count,
             "factor": f"{np.sqrt(count / max(count - 13, 1)):.2f}",
         },
-        "error": leave_one_out_text(fit.leave_one_out) if fit.leave_one_out else "–",
+        "error": leave_one_out_text(fit.held_out) if fit.held_out else "–",
         "translation": f"{significant(1e3 * fit.residuals.translation)} mm",
         "rotation": significant(fit.residuals.rotation),
     }

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from jcr.geometry import apply_similarity, inverse, scale_translation
+from jcr.geometry import inverse, scale_translation
 from jcr.records import Intrinsics
 from jcr.report.images import image_numbers, shown_names
 from jcr.report.render import TRACK_COLOR, Section, label_colors
@@ -29,10 +29,14 @@ squares that are drawn in their place."""
 
 def scene_section(result: RunResult) -> Section:
     """Return the section of the 3D view: cameras, grippers and points in the base frame."""
-    hand_eye, reconstruction = result.hand_eye, result.reconstruction
-    x, next_poses = hand_eye.gripper_from_camera, result.calibration.next_poses
-    base_from_camera = hand_eye.base_from_recon @ scale_translation(
-        reconstruction.recon_from_camera, hand_eye.scale
+    calibration, reconstruction = result.found, result.reconstruction
+    x, next_poses, base_from_recon = (
+        calibration.gripper_from_camera,
+        calibration.next_poses,
+        calibration.base_from_recon,
+    )
+    base_from_camera = base_from_recon.rigid @ scale_translation(
+        reconstruction.recon_from_camera, base_from_recon.scale
     )
     layers, labels = [], []
     if result.scene is not None:
@@ -47,8 +51,7 @@ def scene_section(result: RunResult) -> Section:
         some = np.random.default_rng(0).permutation(len(cloud.points_in_base))[:POINTS]
         at = cloud.points_in_base[some]
         layers.append(("points as measured", at, cloud.color[some], point_size(at)))
-    tracked = reconstruction.tracks.points_in_recon
-    tracked = apply_similarity(hand_eye.base_from_recon, hand_eye.scale, tracked)
+    tracked = base_from_recon(reconstruction.tracks.points_in_recon)
     row_of, images = {int(row): k for k, row in enumerate(result.image_index)}, result.calibration.images
     views = [
         scene_view(
@@ -154,7 +157,7 @@ def _others(result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]) -> lis
     """Return the cell's further cameras with their poses and intrinsics."""
     if result.cameras is None:
         return []
-    grippers = base_from_camera @ inverse(result.hand_eye.gripper_from_camera)
+    grippers = base_from_camera @ inverse(result.calibration.gripper_from_camera)
     by_row = dict(zip(result.image_index.tolist(), grippers, strict=True))
     known = {camera.name: camera for camera in result.capture.others}
     shown = []

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
+from jcr.calibration.record import Calibration
 from jcr.camera import unproject, without_distortion
 from jcr.export.ros import (
     BASE,
@@ -19,7 +20,7 @@ from jcr.export.ros import (
     urdf_origin,
 )
 from jcr.geometry import apply, roll_pitch_yaw
-from jcr.records import COVARIANCE_ORDER, HandEye, Intrinsics, Mount
+from jcr.records import COVARIANCE_ORDER, Intrinsics, Mount
 from jcr.report.figures import WIDTH, Figure, Shape, caption, line
 from jcr.report.render import Section
 from jcr.rounding import significant
@@ -33,10 +34,10 @@ FLANGE_M = 0.0315
 """Radius of the drawn flange: ISO 9409-1-50."""
 
 
-def transform_section(hand_eye: HandEye, mount: Mount = "gripper") -> Section:
+def transform_section(hand_eye: Calibration) -> Section:
     """Return the section of gripper_from_camera, or of base_from_camera for a fixed camera."""
-    x, parent = hand_eye.gripper_from_camera, PARENT if mount == "gripper" else BASE
-    std = np.sqrt(np.diag(hand_eye.covariance))
+    x, mount, std = hand_eye.parent_from_camera, hand_eye.mount, hand_eye.uncertainty.std
+    parent = PARENT if mount == "gripper" else BASE
     rotation = Rotation.from_matrix(x[:3, :3])
     rpy, order = roll_pitch_yaw(x[:3, :3]), list(COVARIANCE_ORDER)
     angles = ("roll", "pitch", "yaw")

@@ -2,10 +2,10 @@
 
 from collections.abc import Iterator
 
-from jcr.calibration.record import Calibration
+from jcr.calibration.record import AnyCalibration, Calibration
 from jcr.calibration.words import leave_one_out_text
 from jcr.findings import FindingKind, remedy, sentence, text
-from jcr.findings.sentences import SHORT, reached_in_words
+from jcr.findings.sentences import SHORT, reached_in_words, worst_direction
 from jcr.report.render import Section
 from jcr.rounding import significant
 
@@ -13,7 +13,7 @@ Tile = tuple[str, str, str, bool]
 """Name, number, remark, and whether it is one of the main numbers."""
 
 
-def head(calibration: Calibration) -> list[Section]:
+def head(calibration: AnyCalibration) -> list[Section]:
     """Return the sections of verdict, main numbers and warnings."""
     sections = [
         Section("verdict", _verdict(calibration)),
@@ -22,12 +22,12 @@ def head(calibration: Calibration) -> list[Section]:
     return sections + [Section("warnings", {"remarks": calibration.remarks})] * bool(calibration.remarks)
 
 
-def notes_section(calibration: Calibration) -> list[Section]:
+def notes_section(calibration: AnyCalibration) -> list[Section]:
     """Return the section of the notes; none where there are none."""
     return [Section("notes", {"remarks": calibration.notes})] * bool(calibration.notes)
 
 
-def failure_section(calibration: Calibration) -> Section:
+def failure_section(calibration: AnyCalibration) -> Section:
     """Return the fault, its remedies, and the reason why each back end failed."""
     failed, *others = calibration.findings
     remedies = [sentence(one) for one in others if one.kind is FindingKind.BOARD_IN_VIEW]
@@ -48,7 +48,7 @@ def failure_section(calibration: Calibration) -> Section:
     return Section("failure", content)
 
 
-def _verdict(calibration: Calibration) -> dict[str, str]:
+def _verdict(calibration: AnyCalibration) -> dict[str, str]:
     """Return the verdict, its reason and colour, and a sentence on the leave-one-out error."""
     required, short, verdict = calibration.requirement, calibration.short, calibration.verdict
     kind = {"accepted": "good", "rejected": "bad"}.get(verdict, "fair")
@@ -59,12 +59,13 @@ def _verdict(calibration: Calibration) -> dict[str, str]:
     else:
         reason = "nothing contradicts it" if required is None else reached_in_words(required)
     evidence = _leave_one_out(calibration)
-    if calibration.uncertainty is not None:
-        evidence += f" Largest uncertainty of the translation: {calibration.uncertainty.worst} (1 σ)."
+    if isinstance(calibration, Calibration):
+        worst = worst_direction(calibration.parent_from_camera, calibration.covariance)
+        evidence += f" Largest uncertainty of the translation: {worst} (1 σ)."
     return {"kind": kind, "verdict": verdict.capitalize(), "reason": reason, "evidence": evidence}
 
 
-def _leave_one_out(calibration: Calibration) -> str:
+def _leave_one_out(calibration: AnyCalibration) -> str:
     """Return a sentence on the leave-one-out error and its limits."""
     if (held_out := calibration.held_out) is None:
         return "There were too few images for a leave-one-out error."
@@ -79,7 +80,7 @@ def _leave_one_out(calibration: Calibration) -> str:
     )
 
 
-def _tiles(calibration: Calibration) -> Iterator[Tile]:
+def _tiles(calibration: AnyCalibration) -> Iterator[Tile]:
     """Yield four tiles: accuracy of a point at the image centre and in a corner, images used, scale."""
     uncertainty, required = calibration.uncertainty, calibration.requirement
     if required is not None:

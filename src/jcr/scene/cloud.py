@@ -7,10 +7,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer, UInt8
 from numpy import ndarray
 
+from jcr.calibration.record import Calibration
 from jcr.errors import InputError
 from jcr.files import read_bytes, write_bytes
 from jcr.geometry import apply, apply_similarity, by_similarity, inverse, scale_translation
-from jcr.records import MATCHED, PRIOR, Capture, HandEye, PointCloud, Reconstruction
+from jcr.records import MATCHED, PRIOR, Capture, PointCloud, Reconstruction
 from jcr.scene.options import CloudOptions
 
 LEAST_SURE = 40.0
@@ -30,7 +31,7 @@ _FIRST = "comment jcr cloud in the base frame, metres"
 def point_cloud(
     capture: Capture,
     reconstruction: Reconstruction,
-    hand_eye: HandEye,
+    hand_eye: Calibration,
     labels: Integer[ndarray, "m h w"] | None = None,
     options: CloudOptions | None = None,
     label_names: tuple[str, ...] = ("none",),
@@ -67,13 +68,13 @@ def point_cloud(
     x_in_recon = dense.points_in_recon.reshape(-1, 3)[pixel].astype(np.float64)
     recon_from_camera = scale_translation(reconstruction.recon_from_camera, hand_eye.scale)
     return PointCloud(
-        points_in_base=apply_similarity(hand_eye.base_from_recon, hand_eye.scale, x_in_recon),
+        points_in_base=apply_similarity(hand_eye.base_from_recon.rigid, hand_eye.scale, x_in_recon),
         color=dense.colors.reshape(-1, 3)[pixel],
         confidence=confident,
         margin=position_std(hand_eye, recon_from_camera, image, hand_eye.scale * x_in_recon),
         label=np.zeros(len(pixel), int) if labels is None else labels.reshape(-1)[pixel].astype(int),
         image=image,
-        camera_centers_in_base=apply(hand_eye.base_from_recon, recon_from_camera[:, :3, 3]),
+        camera_centers_in_base=apply(hand_eye.base_from_recon.rigid, recon_from_camera[:, :3, 3]),
         label_names=label_names,
         reason=reason,
         depth_std=None
@@ -99,7 +100,7 @@ def _clears(
 
 
 def position_std(
-    hand_eye: HandEye,
+    hand_eye: Calibration,
     recon_from_camera: Float[ndarray, "m 4 4"],
     image: Integer[ndarray, " n"],
     x_in_recon: Float[ndarray, "n 3"],
@@ -110,9 +111,9 @@ def position_std(
     frame. Of camera poses alone, a point that image i sees at x in its camera lies in the base frame at
     base_from_gripper[i] · gripper_from_camera · x, and errs as X and the scale do.
     """
-    placed = None if hand_eye.in_use is None else hand_eye.in_use.scene
+    placed = hand_eye.uncertainty.scene
     if placed is not None:
-        covariance = placed.covariance_at(apply(hand_eye.base_from_recon, x_in_recon))
+        covariance = placed.covariance_at(apply(hand_eye.base_from_recon.rigid, x_in_recon))
     else:
         recon_to_camera = inverse(recon_from_camera)
         x_in_camera = np.einsum("nij,nj->ni", recon_to_camera[image, :3, :3], x_in_recon)

@@ -15,12 +15,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch.nn import functional as F
 
+from jcr.calibration.record import Calibration
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.geometry import apply_similarity
 from jcr.hub import cached_files
 from jcr.progress import Progress
-from jcr.records import HandEye, Reconstruction
+from jcr.records import Reconstruction
 from jcr.segments.options import LabelImages
 
 if TYPE_CHECKING:
@@ -72,7 +73,10 @@ def load_sam(weights: str) -> "Sam2Model":
 
 
 def sam_labels(
-    model: "Sam2Model", reconstruction: Reconstruction, hand_eye: HandEye, progress: Progress | None = None
+    model: "Sam2Model",
+    reconstruction: Reconstruction,
+    hand_eye: Calibration,
+    progress: Progress | None = None,
 ) -> LabelImages:
     """Return labels at the pointmaps' pixels: masks of all images, merged into objects by their overlap in space."""
     masks, dense = [], reconstruction.dense
@@ -81,7 +85,7 @@ def sam_labels(
             progress("segment anything", k / len(dense.colors))
         masks.append(image_masks(model, image))
     x_in_base = apply_similarity(
-        hand_eye.base_from_recon, hand_eye.scale, dense.points_in_recon.astype(np.float64)
+        hand_eye.base_from_recon.rigid, hand_eye.scale, dense.points_in_recon.astype(np.float64)
     )
     return merged(masks, x_in_base, dense.confidence > 0)
 

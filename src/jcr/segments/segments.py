@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import UInt16
 from numpy import ndarray
 
+from jcr.calibration.record import Calibration
 from jcr.camera import project, rays
 from jcr.errors import InputError
 from jcr.progress import Progress
-from jcr.records import Capture, HandEye, PointCloud, Reconstruction
+from jcr.records import Capture, PointCloud, Reconstruction
 from jcr.segments.options import LabelImages, SegmentOptions
 from jcr.segments.tabletop import Support, label_tabletop
 
@@ -73,7 +74,7 @@ def _read_names(path: Path) -> dict[int, str]:
 def image_labels(
     capture: Capture,
     reconstruction: Reconstruction,
-    hand_eye: HandEye,
+    hand_eye: Calibration,
     options: SegmentOptions,
     progress: Progress | None = None,
 ) -> LabelImages | None:

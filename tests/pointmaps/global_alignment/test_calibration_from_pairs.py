@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jcr.calibration.record import calibration_of
+from jcr.calibration.record import Calibration
 from jcr.calibration.stage import calibrate
 from jcr.camera import unproject
 from jcr.estimation.point_uncertainty import point_covariance
@@ -21,7 +21,7 @@ from jcr.pointmaps.dust3r.pair_graph import complete_pairs
 from jcr.pointmaps.grid import ImageGrid, PreparedImages
 from jcr.pointmaps.pairs import PairPredictions
 from jcr.pointmaps.reconstruction import align_pairs, reconstruct_pointmaps
-from jcr.records import Capture, HandEye, Reconstruction
+from jcr.records import Capture, Reconstruction
 from jcr.records.npz import read_reconstruction, write_reconstruction
 from simulation.pairs import PairErrors, synthetic_pairs
 
@@ -59,7 +59,7 @@ class Case:
         maps = align_pairs(self.predictions, self.images, pixels=FEW_PIXELS)
         return reconstruct_pointmaps(self.capture, self.images, maps, "predictions")
 
-    def error(self, found: HandEye) -> np.ndarray:
+    def error(self, found: Calibration) -> np.ndarray:
         """True less found, in the order of the covariance."""
         rotation = self.gripper_from_camera[:3, :3] @ found.gripper_from_camera[:3, :3].T
         offset = self.gripper_from_camera[:3, 3] - found.gripper_from_camera[:3, 3]
@@ -160,8 +160,8 @@ def test_the_focal_length_of_a_network_is_a_measurement(off: float, given: bool)
     assert error @ np.linalg.solve(found.covariance, error) < 18.5
     used = reconstruction.intrinsics
     assert used.fx / truth.fx - 1 == pytest.approx(0 if given else off, abs=5e-3)
-    assert found.intrinsics_covariance is not None
-    std = np.sqrt(found.intrinsics_covariance[0, 0]) / used.fx
+    assert found.intrinsics is not None and found.intrinsics.std is not None
+    std = found.intrinsics.std[0] / used.fx
     contradicts = [one for one in found.findings if one.kind is FindingKind.INTRINSICS]
     assert len(contradicts) == (given and off == -0.1)
     if contradicts:
@@ -176,7 +176,7 @@ def test_the_focal_length_of_a_network_is_a_measurement(off: float, given: bool)
     offset -= (
         found.gripper_from_camera[:3, :3].T @ (made.gripper_from_camera - found.gripper_from_camera)[:3, 3]
     )
-    covariance = point_covariance(found, used, corner, 1.0)
+    covariance = point_covariance(found.gripper_from_camera, found.uncertainty, used, corner, 1.0)
     assert offset @ np.linalg.solve(covariance + 1e-12 * np.eye(3), offset) < 11.3
     assert std == pytest.approx(0.05 if not given else 0.1 if contradicts else 0.005, rel=0.1)
 
@@ -191,7 +191,7 @@ def test_reported_sigmas_are_those_of_the_errors(noise: tuple[float, float]):
         found = calibrate(made.capture, made.reconstruction())
         error = made.error(found)
         # The principal point is exact here, and the errors that it may have rotate the camera.
-        of_pointmaps = found.covariance - found.budget.intrinsics
+        of_pointmaps = found.covariance - found.uncertainty.budget.intrinsics
         squared.append(error @ np.linalg.solve(of_pointmaps, error))
     # Ten draws of a chi-squared with 7 degrees of freedom average 4.2 to 11.1 in 99 of 100 cases; covariances
     # widened for an estimated noise stay below.
@@ -211,12 +211,10 @@ def test_a_metric_network_is_fixed_against_the_robot(factor: float, off_percent:
     )
     reconstruction = replace(made, predictions=network).reconstruction()
     found = calibrate(made.capture, reconstruction)
-    check = found.network
+    check = found.scale_check
     assert abs(check.off_percent - off_percent) < 4 * check.std_percent * factor
     assert check.std_percent < 0.2 * factor
-    content = calibration_of(made.capture, reconstruction, found, {}, "0")
-    assert content.scale_check.off_percent == check.off_percent
-    assert any("check the unit of the gripper poses" in text for text in content.warnings) == (factor > 10)
+    assert any("check the unit of the gripper poses" in text for text in found.warnings) == (factor > 10)
     assert ("agrees with the robot's" in network_scale(check.off_percent, check.std_percent)) == (factor == 1)
     assert ("too long" in network_scale(check.off_percent, check.std_percent)) == (factor == 1.05)
     assert ("times the robot's" in network_scale(check.off_percent, check.std_percent)) == (factor == 1000)
@@ -224,7 +222,7 @@ def test_a_metric_network_is_fixed_against_the_robot(factor: float, off_percent:
 
 def test_a_network_without_a_metre_shows_nothing_of_the_scale():
     made = case(4, 3, (1e-4, 2e-4))
-    assert calibrate(made.capture, made.reconstruction()).network is None
+    assert calibrate(made.capture, made.reconstruction()).scale_check is None
 
 
 def test_evidence_survives_the_file(tmp_path: Path):

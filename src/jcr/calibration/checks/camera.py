@@ -32,7 +32,7 @@ from jcr.estimation.hypotheses import (
 from jcr.estimation.intrinsics_prior import TYPICAL, CameraPrior
 from jcr.estimation.problem import OF_IMAGE, PRISM, State
 from jcr.estimation.solve import Solution
-from jcr.estimation.wrist import estimate_of
+from jcr.estimation.wrist import recon_frame
 from jcr.findings import Concerns, Finding, FindingKind
 from jcr.geometry import step_between
 from jcr.records import Intrinsics
@@ -140,8 +140,7 @@ def of_case(case: Case) -> CameraAdjustment:
     assert case.adjusted is not None
 
     def answer(adjusted: Solution) -> tuple[Float[ndarray, "4 4"], float]:
-        estimate = estimate_of(adjusted, case.tracks)
-        return estimate.gripper_from_camera, estimate.scale
+        return adjusted.state.x[0], recon_frame(adjusted, case.tracks)[0]
 
     return CameraAdjustment(
         adjusted=case.adjusted,

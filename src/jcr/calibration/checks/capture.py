@@ -72,7 +72,7 @@ def check_convention(case: Case) -> Case:
     by_name = {by_number: poses[rows] for by_number, poses in by_name.items()}
     # Of other readings neither noise nor cues are known, nor are their camera poses weighed.
     alone = not case.priors and case.reconstruction.evidence is None
-    fit = case.hand_eye.before or case.hand_eye
+    fit = case.pose_fit
     solved = fit if alone and fit.robot_noise.given is None else None
     found = better_reading(case.base_from_gripper, case.recon_from_camera, by_name, solved)
     if found is None:

@@ -31,9 +31,10 @@ from jcr.calibration.checks.camera import (
     of_case,
     of_fewer_points,
 )
+from jcr.calibration.hand_eye import judged, poses_agree
 from jcr.calibration.options import GRASPING
+from jcr.calibration.record import Calibration
 from jcr.camera import parameters, with_thin_prism
-from jcr.estimation.hand_eye import judged, poses_agree
 from jcr.estimation.hypotheses import (
     PLAUSIBLE,
     STRAINS,
@@ -50,7 +51,6 @@ from jcr.estimation.robot_noise import Equations, LogSizes, most_likely, solve_e
 from jcr.estimation.solve import Solution
 from jcr.findings import Finding, FindingKind, kinds_of
 from jcr.geometry import Poses, step_between
-from jcr.records import HandEye
 
 AT_ONCE = 3
 """Largest number of effects that are named of one capture."""
@@ -371,9 +371,7 @@ def _with_rejected_runs(case: Case) -> Case:
     in_order = with_rejected_runs(case.hand_eye.inliers)
     if (in_order == case.hand_eye.inliers).all():
         return case
-    longer = replace(
-        case, hand_eye=replace(case.hand_eye, inliers=in_order), chosen_tracks=None, adjusted=None
-    )
+    longer = replace(case, hand_eye=case.hand_eye.with_used(in_order), chosen_tracks=None, adjusted=None)
     if case.adjusted is None:
         return longer
     try:
@@ -391,11 +389,11 @@ def with_rejected_runs(used: Bool[ndarray, " n"]) -> Bool[ndarray, " n"]:
 def _effects_of_poses(case: Case) -> tuple[Finding, ...]:
     """Return the most significant effect of the order where camera poses alone decide the calibration."""
     evidence = case.reconstruction.evidence
-    fit = case.hand_eye.before or case.hand_eye
+    fit = case.pose_fit
     problem, state = pose_problem(
         case.base_from_gripper,
         case.recon_from_camera,
-        (fit.gripper_from_camera, fit.scale, fit.base_from_recon),
+        (fit.gripper_from_camera, fit.scale, fit.base_from_recon.rigid),
         camera_covariance=None if evidence is None else evidence.covariance,
         error_covariance=case.robot.systematic,
         noise_floor=case.options.robot_noise_m_rad,
@@ -405,7 +403,7 @@ def _effects_of_poses(case: Case) -> tuple[Finding, ...]:
 
 
 def effects_of_fit(
-    problem: Problem, state: State, hand_eye: HandEye, names: Sequence[str]
+    problem: Problem, state: State, hand_eye: Calibration, names: Sequence[str]
 ) -> tuple[Finding, ...]:
     """Return the most significant effect of the order on a fit to camera poses; `names` are those of its poses."""
     found = pose_equations(problem, state, None)

@@ -6,12 +6,13 @@ from numpy import ndarray
 
 from jcr.calibration.case import Case
 from jcr.calibration.checks.capture import SAME
+from jcr.calibration.record import Calibration
 from jcr.capture.images import read_image
 from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.pose_equations import predict
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import ARM, step_between
-from jcr.records import Capture, HandEye, Reconstruction
+from jcr.records import Capture, Reconstruction
 from jcr.sfm.register import register
 
 NEARER = 0.1
@@ -24,12 +25,12 @@ def check_pairing(case: Case) -> Case:
     Such poses are left out one by one, so that a calibration of the others may be accepted.
     """
     # An adjustment bends the cameras towards wrong poses that it uses; the fit to the cameras of the images does not.
-    fit = case.hand_eye.before or case.hand_eye
+    fit = case.pose_fit
     found = left_out_poses(case.capture, case.reconstruction, fit)
     return case.after(tuple(one for one in found if one.kind is FindingKind.POSES_SWAPPED))
 
 
-def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: HandEye) -> tuple[Finding, ...]:
+def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: Calibration) -> tuple[Finding, ...]:
     """Return the findings of exchanged poses and of poses that their images contradict.
 
     The matching leaves out images whose poses contradict it; registered by their features alone, they show the gripper
@@ -61,7 +62,7 @@ def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: HandEye) ->
 
 
 def _shown_poses(
-    capture: Capture, made: Reconstruction, hand_eye: HandEye
+    capture: Capture, made: Reconstruction, hand_eye: Calibration
 ) -> dict[int, Float[ndarray, "4 4"]]:
     """Return base_from_gripper, by row, of each image that is left out, from its camera pose among the others."""
     used = set(made.image_index[hand_eye.inliers].tolist())
@@ -74,5 +75,5 @@ def _shown_poses(
         )
         places = zip(unseen, register(made, older, new), strict=True)
         camera |= {row: place.a_from_camera for row, place in places if isinstance(place, CameraPose)}
-    x, scale, z = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon
+    x, scale, z = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon.rigid
     return {row: predict(x, scale, z, one[None])[0] for row, one in camera.items() if row not in used}

@@ -16,9 +16,10 @@ from numpy import ndarray
 from jcr.calibration.adjust import refined_by
 from jcr.calibration.case import Case
 from jcr.calibration.cues import CONTRADICTED, length_cue
+from jcr.calibration.hand_eye import judged
+from jcr.calibration.record import Calibration
 from jcr.capture.images import read_depth
 from jcr.estimation.boards import FEWEST_CORNERS, STRETCH_STD
-from jcr.estimation.hand_eye import judged
 from jcr.estimation.problem import SCALE, LinearPrior
 from jcr.estimation.solve import Solution, size_of_boards, with_priors
 from jcr.findings import Finding, FindingKind
@@ -28,7 +29,6 @@ from jcr.records import (
     Boards,
     Capture,
     DepthCheck,
-    HandEye,
     LengthCheck,
     LengthName,
     Reconstruction,
@@ -79,7 +79,7 @@ def check_lengths(case: Case) -> Case:
     hand_eye, lengths = _measured(case)
     converged, robot = hand_eye.converged, Length("robot", 0.0, float(np.sqrt(hand_eye.covariance[6, 6])))
     pair = contradiction([robot, *lengths]) if lengths and converged else None
-    of_images = converged and case.adjusted is not None and hand_eye.before is not None
+    of_images = converged and case.adjusted is not None and hand_eye.source == "images"
     weighed = [
         one
         for one in lengths
@@ -108,11 +108,11 @@ def check_lengths(case: Case) -> Case:
     if weighed:
         return case.after(findings, *_fused(case, hand_eye, weighed, fault))
     if converged and fault.any():
-        hand_eye = judged(hand_eye.with_fault(fault))
+        hand_eye = judged(hand_eye.with_uncertainty(hand_eye.uncertainty.with_error(fault)))
     return case.after(findings, hand_eye)
 
 
-def _measured(case: Case) -> tuple[HandEye, list[Length]]:
+def _measured(case: Case) -> tuple[Calibration, list[Length]]:
     """Return the calibration with the measurements of lengths, and the lengths."""
     hand_eye, found = case.hand_eye, list[Length]()
     boards, adjusted = case.reconstruction.tracks.boards, case.adjusted
@@ -121,7 +121,7 @@ def _measured(case: Case) -> tuple[HandEye, list[Length]]:
         and adjusted.problem.boards is not None
         and boards is not None
         and boards.size_std is not None
-        and hand_eye.before is not None
+        and hand_eye.source == "images"
         and not board_faults(case)
     ):
         off, by_unknown = size_of_boards(adjusted)
@@ -137,16 +137,16 @@ def _measured(case: Case) -> tuple[HandEye, list[Length]]:
         of_depth = max((depth.std_percent / 100) ** 2 - hand_eye.covariance[6, 6], 0.0)
         std = float(np.hypot(DEPTH_STD, np.sqrt(of_depth)))
         found.append(Length("depth camera", -float(np.log1p(depth.off_percent / 100)), std))
-        hand_eye = replace(hand_eye, depth=depth)
+        hand_eye = replace(hand_eye, depth_check=depth)
     # A unit with a stated standard deviation was used for the scale, and is no check of it.
     if case.reconstruction.is_metric and case.reconstruction.metric_std is None:
         # A network's length of 1 is `scale` metres by the robot.
         found.append(Length("network", float(np.log(hand_eye.scale)), NETWORK_STD))
-        hand_eye = replace(hand_eye, network=_network_check(hand_eye))
+        hand_eye = replace(hand_eye, scale_check=_network_check(hand_eye))
     return hand_eye, found
 
 
-def _network_check(hand_eye: HandEye) -> ScaleCheck:
+def _network_check(hand_eye: Calibration) -> ScaleCheck:
     std_percent = 100 * float(np.sqrt(hand_eye.covariance[6, 6])) / hand_eye.scale
     return ScaleCheck(100 * (1 / hand_eye.scale - 1), std_percent)
 
@@ -161,7 +161,7 @@ def contradiction(lengths: list[Length]) -> tuple[Length, Length] | None:
     return worst if sigmas(worst) > SIGMAS and abs(worst[0].off - worst[1].off) > LEAST else None
 
 
-def finding_of(one: Length, other: Length, hand_eye: HandEye) -> Finding:
+def finding_of(one: Length, other: Length, hand_eye: Calibration) -> Finding:
     """Return the finding that two lengths contradict each other; the robot is the first where it is one of them."""
     off, std = other.off - one.off, float(np.hypot(one.std, other.std))
     of_robot = one.name == "robot"
@@ -184,12 +184,12 @@ def finding_of(one: Length, other: Length, hand_eye: HandEye) -> Finding:
     return replace(found, shift=tuple(_shift(off, hand_eye).tolist()))
 
 
-def _shift(off: float, hand_eye: HandEye) -> Float[ndarray, "7"]:
+def _shift(off: float, hand_eye: Calibration) -> Float[ndarray, "7"]:
     """Return the change of a calibration if the robot's positions were too long by exp(off)."""
     return -off * np.r_[hand_eye.gripper_from_camera[:3, 3], np.zeros(3), 1.0]
 
 
-def _fault(hand_eye: HandEye, lengths: list[Length]) -> Float[ndarray, "7 7"]:
+def _fault(hand_eye: Calibration, lengths: list[Length]) -> Float[ndarray, "7 7"]:
     """Return the covariance of the difference of the most exact length from the robot beyond their uncertainties."""
     best = min(lengths, key=lambda one: one.std, default=Length("robot", 0.0, EXACT))
     beyond = best.off**2 - best.std**2 - float(hand_eye.covariance[6, 6])
@@ -200,8 +200,8 @@ def _fault(hand_eye: HandEye, lengths: list[Length]) -> Float[ndarray, "7 7"]:
 
 
 def _fused(
-    case: Case, hand_eye: HandEye, lengths: list[Length], fault: Float[ndarray, "7 7"]
-) -> tuple[HandEye, Solution]:
+    case: Case, hand_eye: Calibration, lengths: list[Length], fault: Float[ndarray, "7 7"]
+) -> tuple[Calibration, Solution]:
     """Return calibration and adjustment with the lengths as priors of the scale."""
     assert case.adjusted is not None
     log_scale, boards = float(np.log(case.adjusted.most_likely.scale)), case.reconstruction.tracks.boards
@@ -215,16 +215,17 @@ def _fused(
         else:
             known.append(LinearPrior(by_scale, log_scale - one.off, float(np.hypot(one.std, ROBOT_STD))))
     adjusted = with_priors(case.adjusted, known)
-    refined = refined_by(case, adjusted).with_fault(fault)
+    refined = refined_by(case, adjusted)
+    refined = refined.with_uncertainty(refined.uncertainty.with_error(fault))
     for one in hand_eye.findings:
         refined = refined.with_finding(one)
-    depth = hand_eye.depth
+    depth = hand_eye.depth_check
     if depth is not None:
         # What is measured with depth images is in the metre that the map has.
         percent = 100 * ((1 + depth.off_percent / 100) * hand_eye.scale / refined.scale - 1)
         depth = replace(depth, off_percent=percent)
-    measured = {name: getattr(hand_eye, name) for name in ("findings", "network", "lengths", "board")}
-    return judged(replace(refined, depth=depth, **measured)), adjusted
+    measured = {name: getattr(hand_eye, name) for name in ("findings", "scale_check", "lengths", "board")}
+    return judged(replace(refined, depth_check=depth, **measured)), adjusted
 
 
 def check_boards(case: Case) -> Case:
@@ -247,7 +248,7 @@ def check_boards(case: Case) -> Case:
         return case.after(tuple(findings))
     findings += board_faults(case)
     found = board_found(case.adjusted, boards)
-    if boards.size_std is None and hand_eye.before is not None:
+    if boards.size_std is None and hand_eye.source == "images":
         side = 1e-3 * found.side_mm, 1e-3 * found.side_std_mm
         findings.append(
             Finding.of(FindingKind.BOARD_SIDE, "informs", value=side[0], std=side[1], board=boards.spec)
@@ -321,7 +322,7 @@ def _xyz(x: Float[ndarray, "3"]) -> tuple[float, float, float]:
     return float(x[0]), float(x[1]), float(x[2])
 
 
-def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye) -> DepthCheck | None:
+def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: Calibration) -> DepthCheck | None:
     """Return scale and noise of the depth images by the robot; None where too few features have a depth.
 
     Raises InputError where a depth image cannot be read.

@@ -52,11 +52,11 @@ def check_robot(case: Case) -> Case:
     used, arm, joints, hand_eye = case.used, case.robot.arm, case.robot.joints, case.hand_eye
     if len(used) < MIN_EXAMINED or arm is None or joints is None:
         return case
-    fit = hand_eye.before or hand_eye
+    fit = case.pose_fit
     problem, state = pose_problem(
         case.base_from_gripper[used],
         case.recon_from_camera[used],
-        (fit.gripper_from_camera, fit.scale, fit.base_from_recon),
+        (fit.gripper_from_camera, fit.scale, fit.base_from_recon.rigid),
         error_covariance=case.systematic,
         noise_floor=fit.robot_noise.given,
     )
@@ -74,7 +74,7 @@ def check_robot(case: Case) -> Case:
 
 def _fit_was_rejected(case: Case) -> bool:
     """Return whether the poses themselves are rejected, with and without the images, and not because of a board."""
-    fit = case.hand_eye.before or case.hand_eye
+    fit = case.pose_fit
     by_board = any(finding.kind is FindingKind.BOARD_SIZE for finding in case.hand_eye.findings)
     return not case.hand_eye.converged and not fit.converged and not by_board
 

@@ -1,6 +1,6 @@
 """Hand-eye calibration from poses: robust fit, uncertainty, observability, leave-one-out error and findings."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
+from jcr.calibration.record import Calibration
 from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.hypotheses import drift_covariance
@@ -22,7 +23,7 @@ from jcr.estimation.solve import Solution
 from jcr.findings import Finding, FindingKind, strongest_first
 from jcr.geometry import Poses, require_rigid
 from jcr.least_squares import one_blas_thread
-from jcr.records import HandEye, LeaveOneOut, PaperResiduals, RobotNoise
+from jcr.records import ImageVerdict, LeaveOneOut, PaperResiduals, RobotNoise, Uncertainty
 
 MAX_NOISE = (0.02, np.radians(3.0))
 """Largest noise (m, rad), beyond that of the worst servo arm; poses and images then do not belong together."""
@@ -44,7 +45,7 @@ Offset = tuple[Float[ndarray, "3"], float, float]
 
 
 @one_blas_thread
-def fit_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
+def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
     base_from_gripper: ArrayLike,
     recon_from_camera: ArrayLike,
     *,
@@ -57,11 +58,29 @@ def fit_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
     robot: str | Arm | None = None,
     systematic: Float[ndarray, "r r"] | None = None,
     in_sequence: bool = True,
-) -> HandEye:
-    """Return the fit of the hand-eye transform to gripper and camera poses (n,4,4), with the findings of its numbers.
+    names: Sequence[str] | None = None,
+) -> Calibration:
+    """Return the hand-eye calibration with unknown scale from camera poses of your own.
 
-    The arguments are those of `jcr.solve_hand_eye`; `systematic` is the covariance of the systematic errors of the poses
-    at 1 rad, if it is known already (systematic.py).
+    Takes two stacks (n,4,4), n ≥ 2, taken at the same instants and in the same order: gripper poses in the base frame
+    (m) and camera poses in any frame and unit. `robot_noise` is a lower bound on the noise of the gripper poses (1
+    sigma per axis: m, rad); the residuals may show more. `camera_covariance` (6n,6n) of the steps of
+    the cameras (geometry.retract; recon axes) is needed if these are not exact compared with the gripper poses.
+
+    `robot` names the arm (jcr.estimation.arms.ROBOT_NAMES) and `joints` (n,dof) are its angles (rad), starting at the
+    base: they determine how joint offsets and link errors affect the poses. With `robot` only, the angles are computed
+    from the poses; with neither, systematic errors are assumed to vary smoothly over the poses. `systematic` (6n,6n) is
+    the covariance of these errors at 1 rad where it is known already.
+
+    `scale` (metres per unit of the camera poses, 1 if these are metric) is known to `scale_std` (relative); without it
+    the scale is estimated. `offset` is an axis of the gripper frame, the position of the camera along it (m), and its
+    standard deviation (m), for motions that do not determine it.
+
+    `in_sequence`: the camera poses may have been found one after the other, as by visual odometry or SLAM. Errors that
+    add up along their order are then tested and included. `names` are those of the poses, for the result's `images`.
+
+    Raises InputError for shapes, values or counts that cannot be poses, and for poses or angles that do not fit the
+    robot. Degenerate motion raises nothing; it is in the result (`observability`, `converged`).
     """
     gripper, camera = _checked_pairs(base_from_gripper, recon_from_camera)
     priors, n = _checked_priors(offset, scale, scale_std), len(gripper)
@@ -81,7 +100,8 @@ def fit_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
         drift = drift_covariance(gripper, camera, start, used, systematic, robot_noise)
         if drift is not None:
             fit, distinct = _fit_distinct(gripper, camera, robot_noise, priors, drift, systematic)
-    return judged(_with_residuals(gripper, camera, fit, distinct))
+    named = [f"pose {k}" for k in range(len(gripper))] if names is None else names
+    return judged(_with_residuals(gripper, camera, fit, distinct, named))
 
 
 def _checked_priors(offset: Offset | None, scale: float | None, scale_std: float) -> tuple[LinearPrior, ...]:
@@ -117,7 +137,9 @@ def _fit_distinct(
     return robust_fit(gripper[order], camera[order], noise, priors, covariance, systematic[among]), back
 
 
-def _with_residuals(gripper: Poses, camera: Poses, fit: Solution, distinct: Int[ndarray, " n"]) -> HandEye:
+def _with_residuals(
+    gripper: Poses, camera: Poses, fit: Solution, distinct: Int[ndarray, " n"], names: Sequence[str]
+) -> Calibration:
     """Return the calibration of a fit to distinct images, without findings that its numbers decide."""
     assert fit.problem.used is not None
     x, scale, z = fit.state.x[0], fit.state.scale, fit.state.z[0]
@@ -125,20 +147,49 @@ def _with_residuals(gripper: Poses, camera: Poses, fit: Solution, distinct: Int[
     seen = observability(gripper[used], x, camera[used], fit.problem.priors)
     residual, _ = residuals(x, scale, z, gripper, camera)
     metres, radians = np.linalg.norm(residual.reshape(-1, 2, 3), axis=2).T
-    return HandEye(
-        gripper_from_camera=x,
+    reasons = _reasons(used, metres, radians, fit.noise)
+    return Calibration(
+        on_gripper=x,
         scale=scale,
-        base_from_recon=z,
-        covariance=fit.covariance[:7, :7],
-        budget=fit.budget,
-        inliers=used,
-        translation_residual_m=metres,
-        rotation_residual_rad=radians,
-        reasons=_reasons(used, metres, radians, fit.noise),
+        resting=z,
+        uncertainty=Uncertainty(covariance=fit.covariance[:7, :7], budget=fit.budget),
+        backend="poses given",
+        images=image_verdicts(names, used, reasons, metres, radians),
         residuals=PaperResiduals(*paper_residuals(gripper, camera, x, scale, used)),
         robot_noise=fit.noise,
-        leave_one_out=_leave_one_out(fit, fit.problem.used),
+        held_out=_leave_one_out(fit, fit.problem.used),
         findings=seen.findings,
+    )
+
+
+def image_verdicts(
+    names: Sequence[str],
+    used: Bool[ndarray, " n"],
+    reasons: Sequence[str | None],
+    metres: Float[ndarray, " n"],
+    radians: Float[ndarray, " n"],
+    reprojection_px: Float[ndarray, " n"] | None = None,
+) -> tuple[ImageVerdict, ...]:
+    """Return the use of each registered image, its residuals (m, rad) and its median reprojection error (px or NaN)."""
+    pixels = np.full(len(names), np.nan) if reprojection_px is None else reprojection_px
+    columns = (
+        names,
+        used.tolist(),
+        reasons,
+        (1e3 * metres).tolist(),
+        np.degrees(radians).tolist(),
+        pixels.tolist(),
+    )
+    return tuple(
+        ImageVerdict(
+            image=name,
+            used=is_used,
+            reason=reason,
+            translation_residual_mm=mm,
+            rotation_residual_deg=deg,
+            reprojection_px=None if np.isnan(px) else px,
+        )
+        for name, is_used, reason, mm, deg, px in zip(*columns, strict=True)
     )
 
 
@@ -155,7 +206,7 @@ JUDGED = frozenset(
 """Kinds of findings that the numbers of a calibration decide by themselves."""
 
 
-def judged(hand_eye: HandEye) -> HandEye:
+def judged(hand_eye: Calibration) -> Calibration:
     """Return the calibration with findings of the kinds JUDGED by its present numbers, after those of other kinds."""
     uncertain = tuple(_of_uncertainty(hand_eye))
     # A weakly observed direction explains an uncertainty that rejects, and is therefore named first.
@@ -175,7 +226,7 @@ def poses_agree(noise: RobotNoise) -> bool:
     return metres <= MAX_NOISE[0] and bool(radians <= MAX_NOISE[1])
 
 
-def _of_agreement(hand_eye: HandEye) -> Iterator[Finding]:
+def _of_agreement(hand_eye: Calibration) -> Iterator[Finding]:
     """Yield findings that too few images agree, or that poses contradict the images."""
     used, n = float(hand_eye.inliers.sum()), len(hand_eye.inliers)
     if used < max(3, MIN_SHARE_USED * n) and n > 2:
@@ -186,7 +237,7 @@ def _of_agreement(hand_eye: HandEye) -> Iterator[Finding]:
         yield Finding.of(kind, "rejects", "reconstruction", value=metres, rotation=radians)
 
 
-def _of_uncertainty(hand_eye: HandEye) -> Iterator[Finding]:
+def _of_uncertainty(hand_eye: Calibration) -> Iterator[Finding]:
     """Yield a finding for each part of the result that is too uncertain."""
     if not hand_eye.observability.observable:
         return
@@ -202,7 +253,7 @@ def _of_uncertainty(hand_eye: HandEye) -> Iterator[Finding]:
             )
 
 
-def _of_residuals(hand_eye: HandEye) -> Iterator[Finding]:
+def _of_residuals(hand_eye: Calibration) -> Iterator[Finding]:
     """Yield findings that do not reject: noise above the given one, leave-one-out error, few images."""
     noise = hand_eye.robot_noise
     metres, radians = _disagreement(hand_eye)
@@ -211,8 +262,8 @@ def _of_residuals(hand_eye: HandEye) -> Iterator[Finding]:
     ):
         details = {"rotation": radians, "given": noise.given[0], "given_rotation": noise.given[1]}
         yield Finding.of(FindingKind.NOISE_ABOVE_GIVEN, "warns", "none", value=metres, **details)
-    if (leave_one_out := hand_eye.leave_one_out) is not None:
-        leave_one_out_m, typical = 1e-3 * leave_one_out.translation_mm, float(np.sqrt(3)) * noise.together[0]
+    if (held_out := hand_eye.held_out) is not None:
+        leave_one_out_m, typical = 1e-3 * held_out.translation_mm, float(np.sqrt(3)) * noise.together[0]
         if leave_one_out_m > max(3 * typical, WELL_ABOVE):
             yield Finding.of(
                 FindingKind.LEAVE_ONE_OUT, "warns", "images", value=leave_one_out_m, residual=typical
@@ -221,16 +272,16 @@ def _of_residuals(hand_eye: HandEye) -> Iterator[Finding]:
         yield Finding.of(FindingKind.FEW_IMAGES, "warns", "images", value=float(len(hand_eye.inliers)))
 
 
-def _disagreement(hand_eye: HandEye) -> tuple[float, float]:
+def _disagreement(hand_eye: Calibration) -> tuple[float, float]:
     """Return the rms residual of the used images per axis (m, rad), corrected for the 13 fitted unknowns."""
-    used = hand_eye.inliers
-    count = 6 * int(used.sum())
-    fitted = count / max(count - 13, 1)
-    metres, radians = (
-        float(np.sqrt(fitted * (residual[used] ** 2).mean() / 3))
-        for residual in (hand_eye.translation_residual_m, hand_eye.rotation_residual_rad)
-    )
-    return metres, radians
+    used = [
+        (image.translation_residual_mm, image.rotation_residual_deg)
+        for image in hand_eye.images
+        if image.used
+    ]
+    fitted = 6 * len(used) / max(6 * len(used) - 13, 1)
+    mm, deg = np.sqrt(fitted * (np.array(used, float).reshape(-1, 2) ** 2).mean(0) / 3)
+    return 1e-3 * float(mm), float(np.radians(deg))
 
 
 def _reasons(
