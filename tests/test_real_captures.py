@@ -70,11 +70,14 @@ def test_a_plain_background_is_rejected(real_captures: Path):
 
 
 @pytest.mark.slow
-def test_another_first_pair_is_tried_where_the_first_bends_unknown_intrinsics(real_captures: Path):
-    """Of one model alone three images of this capture register."""
-    capture = jcr.read_capture(real_captures / "elephant_floor")
+@pytest.mark.parametrize(("name", "least"), [("elephant_floor", 15), ("ur_black_cloth", 18)])
+def test_another_first_pair_is_tried_where_the_first_bends_unknown_intrinsics(
+    real_captures: Path, name: str, least: int
+):
+    """Three images of the first register in one model alone, four of the second by the strict thresholds alone."""
+    capture = jcr.read_capture(real_captures / name)
     assert capture.intrinsics is None
-    assert len(reconstruct_colmap(capture).image_index) == len(capture)
+    assert len(reconstruct_colmap(capture).image_index) >= least
 
 
 @pytest.mark.slow

@@ -219,7 +219,7 @@ def _map_incrementally(
     report: Progress,
     begun: pycolmap.Reconstruction | None,
 ) -> pycolmap.Reconstruction | None:
-    """Return the model with most images over all initial cameras, with relaxed thresholds if it has fewer than three.
+    """Return the model with most images over all initial cameras, with relaxed thresholds if it lacks more than half.
 
     A model that is `begun` is resumed with the images that it lacks. The share of images in the model is reported; it
     falls back where another start is tried.
@@ -260,7 +260,7 @@ def _map_incrementally(
                     best, registered = model, model.num_reg_images()
             if registered == n_images:
                 return best
-        if registered >= _MIN_REGISTERED:
+        if 2 * registered >= n_images:
             return best
     return best
 
