@@ -35,6 +35,7 @@ from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics, Tracks
 from jcr.scene.cloud import read_cloud
 from places import ROOT
+from simulation.problems import shown_points
 from simulation.scenes import make_scene, solid_labels
 from simulation.truth import read_truth
 
@@ -250,15 +251,9 @@ def views(tmp_path: Path) -> "PosedImages":
             for y in (-0.1, 0.0, 0.1)
         ]
     )
-    x_px = np.concatenate([project(INTRINSICS, apply(inverse(pose), points)) for pose in poses])
-    inside = ((x_px > 0) & (x_px < [319, 239])).all(1)
-    assert inside.sum() > 100
-    tracks = Tracks(
-        image=np.repeat(np.arange(3), 60)[inside],
-        x_px=x_px[inside],
-        point=np.tile(np.arange(60), 3)[inside],
-        points_in_recon=points,
-    )
+    image, point, x_px = shown_points(points, poses, [INTRINSICS] * 3, 0.0, rng)
+    assert len(image) > 100
+    tracks = Tracks(image=image, x_px=x_px, point=point, points_in_recon=points)
     return PosedImages(
         folder=folder,
         images=images,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jcr.calibration.record import Calibration
-from jcr.camera import project, rays, resized, undistort_image
+from jcr.camera import rays, resized, undistort_image
 from jcr.capture.added import read_added, with_images, write_added
 from jcr.capture.formats import capture_json
 from jcr.capture.images import encode_png, read_image
@@ -32,6 +32,7 @@ from jcr.records import (
 from jcr.scene.cloud import LEAST_SURE, point_cloud
 from jcr.scene.options import CloudOptions, MapOptions
 from simulation.capture import SimulateOptions, simulate
+from simulation.problems import shown_points
 from simulation.render import View, render
 from simulation.scenes import Scene, make_scene
 from simulation.truth import Truth, read_truth, true_depth
@@ -90,16 +91,8 @@ def known_reconstruction(truth: Truth, rendered: list[View]) -> tuple[Reconstruc
     points_in_recon = np.stack(points)
     some = np.random.default_rng(0).choice(np.flatnonzero(np.ravel(confidence)), 2000, replace=False)
     x = points_in_recon.reshape(-1, 3)[some]
-    image, point, x_px = [], [], []
-    for k, camera_from_recon in enumerate(inverse(recon_from_camera)):
-        pixel = project(pinhole, apply(camera_from_recon, x))
-        inside = ((pixel > 0) & (pixel < np.array(SIZE) - 1)).all(1)
-        image.append(np.full(inside.sum(), k))
-        point.append(np.flatnonzero(inside))
-        x_px.append(pixel[inside])
-    tracks = Tracks(
-        image=np.concatenate(image), x_px=np.concatenate(x_px), point=np.concatenate(point), points_in_recon=x
-    )
+    image, point, x_px = shown_points(x, recon_from_camera, [pinhole] * views, 0.0, np.random.default_rng(0))
+    tracks = Tracks(image=image, x_px=x_px, point=point, points_in_recon=x)
     reconstruction = Reconstruction(
         image_index=np.arange(views),
         recon_from_camera=recon_from_camera,

@@ -180,11 +180,10 @@ class Rigs:
         return self._on_same_gripper(seen) if seen.camera.mount == "gripper" else self._fixed(seen)
 
     def _fixed(self, seen: CameraViews) -> CameraViews:
-        squared = _squared(seen.places[:, None], seen.covariances[:, None], seen.places, seen.covariances)
-        middle = seen.places[int(squared.sum(1).argmin())]
+        place = seen.places[int(np.trace(seen.covariances, axis1=1, axis2=2).argmin())]
         rig = np.full(len(seen.used), len(self.poses))
-        self.poses.append(middle)
-        metres, radians = _apart(self.known.recon_from_camera, middle)
+        self.poses.append(place)
+        metres, radians = _apart(self.known.recon_from_camera, place)
         near = np.flatnonzero((metres < AT_A_FRAME[0]) & (radians < AT_A_FRAME[1]))
         if not len(near):
             return replace(seen, rig=rig)
@@ -221,14 +220,14 @@ class Rigs:
         metres, radians = _apart(wrist[:, None], wrist)
         if not ((metres > SAME_PLACE[0]) | (radians > SAME_PLACE[1])).any():
             return seen.refused_for(FindingKind.ONE_GRIPPER_POSE, "images", *seen.names)
-        places, covariances = seen.places, seen.covariances
-        on_rig = inverse(wrist) @ places
+        on_rig = inverse(wrist) @ seen.places
         between = np.asarray(motion_length(inverse(on_rig)[:, None] @ on_rig[None]))
         middle = int(np.median(between, axis=1).argmin())
-        expected = wrist @ on_rig[middle]
-        astray = _squared(places, covariances, expected, covariances[middle]) > APART
+        step = step_between(seen.places, wrist @ on_rig[middle])
+        covariance = seen.covariances + seen.covariances[middle] + 2 * np.diag(np.repeat(MAP_STD, 3) ** 2)
+        astray = (step * np.linalg.solve(covariance, step[..., None])[..., 0]).sum(-1) > APART
         if astray.mean() > 0.4:
-            most_m, own = float(_apart(places, expected)[0].max()), capture.camera_name
+            most_m, own = float(np.linalg.norm(step[:, :3], axis=1).max()), capture.camera_name
             return seen.refused_for(FindingKind.NOT_RIGID, "mount", value=most_m, camera=own)
         why = "its place on the gripper is not that of its other images"
         kept = seen.without(dict.fromkeys(seen.rows[astray].tolist(), why))
@@ -286,18 +285,6 @@ def fit_views(
     problem, state = pose_problem(carrier, seen.places, start, priors=(scale_prior(1.0, scale_std),))
     used = with_rejected_runs(found.inliers)
     return found, effects_of_fit(replace(problem, used=used), state, found, seen.names)
-
-
-def _squared(
-    places: Float[ndarray, "*#k 4 4"],
-    covariances: Float[ndarray, "*#k 6 6"],
-    others: Float[ndarray, "*#k 4 4"],
-    covariances_of_others: Float[ndarray, "*#k 6 6"],
-) -> Float[ndarray, "..."]:
-    """Return the squared Mahalanobis distance between poses, which broadcast."""
-    step = step_between(places, others)
-    covariance = covariances + covariances_of_others + 2 * np.diag(np.repeat(MAP_STD, 3) ** 2)
-    return (step * np.linalg.solve(covariance, step[..., None])[..., 0]).sum(-1)
 
 
 def _apart(
