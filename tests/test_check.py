@@ -20,8 +20,10 @@ from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.capture.images import BLURRED_EDGE, edge_width, encode_png, read_image
 from jcr.cli import dispatch
 from jcr.findings import FindingKind
+from jcr.pipeline.check import read_and_compare, spread_rows
+from jcr.pointmaps.reconstruction import NO_TRACKS
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
-from simulation.problems import hand_eye_problem
+from simulation.problems import INTRINSICS, hand_eye_problem
 
 RNG = np.random.default_rng(0)
 
@@ -117,6 +119,27 @@ def test_exchanged_poses_are_found_where_the_matching_leaves_their_images_out(
     said = capsys.readouterr()
     assert "\nCause       images/03.jpg and images/08.jpg have each other's gripper poses" in said.out
     assert "Agreement" not in said.out and "Expected" not in said.out
+
+
+@pytest.mark.parametrize("convention", ["ur", "yaskawa"])
+def test_poses_that_are_as_noisy_as_is_assumed_show_their_convention(
+    convention: str, tabletop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The noise of a rejected fit is the assumed one, so that it does not tell a wrong convention."""
+    problem = hand_eye_problem(np.random.default_rng(0), 12, robot_noise=(3e-4, 7e-4))
+    capture = replace(jcr.read_capture(tabletop), base_from_gripper=problem.base_from_gripper)
+    writers.write_table(tmp_path, capture, convention, "image,x,y,z,rx,ry,rz")
+    made = Reconstruction(
+        image_index=np.arange(8),
+        recon_from_camera=problem.recon_from_camera[spread_rows(12)],
+        intrinsics=INTRINSICS,
+        tracks=NO_TRACKS,
+        backend="colmap",
+    )
+    monkeypatch.setattr("jcr.sfm.colmap.reconstruct_colmap", lambda *_: made)
+    found = read_and_compare(tmp_path)
+    assert isinstance(found, Capture) and found.pose_convention == convention
+    assert f"read with --pose-convention {convention}" in found.notes[-1]
 
 
 @pytest.mark.slow

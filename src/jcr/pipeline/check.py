@@ -289,9 +289,11 @@ def _best_fit(read: list[tuple[Capture, ReadOptions]], progress: Progress | None
     fits = []
     for capture, options in read:
         gripper = capture.base_from_gripper[rows][found.image_index]
-        noise = solve_hand_eye(gripper, found.recon_from_camera, in_sequence=False).robot_noise
-        off = f"{1e3 * noise.translation:.2g} mm and {np.degrees(noise.rotation):.2g}°"
-        fits.append((float(noise.translation + ARM * noise.rotation), off, capture, options))
+        fit = solve_hand_eye(gripper, found.recon_from_camera, in_sequence=False)
+        # The noise of a rejected fit is the assumed one, and says nothing of the poses.
+        metres, radians = np.median(fit.translation_residual_m), np.median(fit.rotation_residual_rad)
+        off = f"{1e3 * metres:.2g} mm and {np.degrees(radians):.2g}°"
+        fits.append((float(metres + ARM * radians), off, capture, options))
     (best, off, capture, options), *others = sorted(fits, key=lambda fit: fit[0])
     if others and others[0][0] < CLEARER * best:
         return None
@@ -299,7 +301,7 @@ def _best_fit(read: list[tuple[Capture, ReadOptions]], progress: Progress | None
     worse = "".join(f", those of {one.pose_convention} only to {text}" for _, text, _, one in others)
     note = (
         f"columns rx, ry, rz are read with --pose-convention {options.pose_convention}{units}: these poses agree with "
-        f"the images to {off} per axis{worse}; give these options to jcr run"
+        f"the images to {off} (median){worse}; give these options to jcr run"
     )
     return replace(capture, notes=(*capture.notes, note))
 
