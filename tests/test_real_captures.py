@@ -88,7 +88,7 @@ def test_images_that_are_added_live_have_the_findings_of_a_batch(real_captures: 
     batch = calibrate(capture, reconstruct_colmap(capture))
     live = jcr.LiveCalibration(tmp_path / "live", intrinsics=capture.intrinsics)
     for k, (name, pose) in enumerate(zip(capture.images, capture.base_from_gripper, strict=True)):
-        live.keep(read_image(capture.folder / name), pose)
+        live.live.add(read_image(capture.folder / name), pose)
         if k % 4 == 0:
             live.update()
     progress = live.progress
