@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from capture_writers import write_easy_handeye2
+from jcr.calibration.words import actions
 from jcr.cli import dispatch
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import scale_translation
 from places import ROOT
 from simulation.problems import hand_eye_problem
@@ -109,3 +111,10 @@ cli.main([])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (2, "half of a table")
     assert done.stderr == "error: row 3 is wrong\n"
+
+
+def test_no_more_images_are_asked_for_beside_another_cause():
+    apart = Finding.of(FindingKind.POSES_CONTRADICT_IMAGES, "rejects", "poses", value=0.06, rotation=0.4)
+    wide = Finding.of(FindingKind.UNCERTAIN, "rejects", "motion", value=0.1, part="translation")
+    assert [line.split()[0] for line in actions([apart, wide], 9)] == ["Cause", "Remedy"]
+    assert "add images" in actions([wide], 9)[1]

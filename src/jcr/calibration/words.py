@@ -27,6 +27,8 @@ NEGLIGIBLE = 0.02
 """Share of the largest part of a budget below which a part is left out: its square is 0.04 % of the whole."""
 MOST_LINES = 14
 """Lines of a summary on the terminal, with the two that name the report and the next command."""
+MORE_IMAGES = {FindingKind.UNCERTAIN, FindingKind.LEAVE_ONE_OUT}
+"""Kinds whose remedy is more images, which do not help where something else rejects the calibration."""
 BACKEND_NAMES = {"colmap": "COLMAP", "dust3r": "DUSt3R", "mast3r": "MASt3R", "da3": "Depth Anything 3"}
 SCALE_SOURCES = {"board": "the board", "known length": "the known length", "depth camera": "the depth camera"}
 
@@ -146,7 +148,8 @@ def actions(findings: Sequence[Finding], most: int, proposed: str = "") -> list[
     """
     findings, lines = without_consequences(findings), list[str]()
     if verdict_of(findings) == "rejected":
-        cause, *findings = findings
+        cause, *others = findings
+        findings = [one for one in others if cause.kind in MORE_IMAGES or one.kind not in MORE_IMAGES]
         lines = [
             *labelled("Cause", text(cause)),
             *labelled("Remedy", *filter(None, [_remedy(cause, proposed)])),
