@@ -136,7 +136,7 @@ def test_poses_that_are_as_noisy_as_is_assumed_show_their_convention(
         tracks=NO_TRACKS,
         backend="colmap",
     )
-    monkeypatch.setattr("jcr.sfm.colmap.reconstruct_colmap", lambda *_: made)
+    monkeypatch.setattr("jcr.pipeline.check.reconstruct_colmap", lambda *_: made)
     found = read_and_compare(tmp_path)
     assert isinstance(found, Capture) and found.pose_convention == convention
     assert f"read with --pose-convention {convention}" in found.notes[-1]

@@ -291,9 +291,10 @@ def _best_fit(read: list[tuple[Capture, ReadOptions]], progress: Progress | None
         gripper = capture.base_from_gripper[rows][found.image_index]
         fit = solve_hand_eye(gripper, found.recon_from_camera, in_sequence=False)
         # The noise of a rejected fit is the assumed one, and says nothing of the poses.
-        metres, radians = np.median(fit.translation_residual_m), np.median(fit.rotation_residual_rad)
-        off = f"{1e3 * metres:.2g} mm and {np.degrees(radians):.2g}°"
-        fits.append((float(metres + ARM * radians), off, capture, options))
+        residuals = [(one.translation_residual_mm, one.rotation_residual_deg) for one in fit.images]
+        mm, deg = np.median(np.array(residuals, dtype=float), axis=0)
+        off = f"{mm:.2g} mm and {deg:.2g}°"
+        fits.append((float(1e-3 * mm + ARM * np.radians(deg)), off, capture, options))
     (best, off, capture, options), *others = sorted(fits, key=lambda fit: fit[0])
     if others and others[0][0] < CLEARER * best:
         return None
