@@ -211,3 +211,14 @@ def test_a_table_with_depth_images_is_copied_once_and_read_again_where_one_chang
     assert is_unchanged(begin()) and depth.stat().st_mtime_ns == stamp
     (table / "depth" / "00.png").write_bytes(encode_png(np.full((150, 200), 700, np.uint16)))
     assert not is_unchanged(begin()) and depth.stat().st_mtime_ns > stamp
+
+
+@pytest.mark.slow
+def test_a_capture_whose_images_changed_is_not_read_with_the_run_of_the_earlier_ones(
+    small_capture: Path, small_done: Path
+):
+    capture = read_capture(small_capture)
+    assert len(RunResult(small_done, capture=capture).of_wrist_camera()[1]) == 5
+    for rows in ([1, 0, 2, 3, 4], [0, 1, 2, 3]):
+        with pytest.raises(InputError, match="has changed since"):
+            RunResult(small_done, capture=capture.of_rows(np.array(rows))).of_wrist_camera()

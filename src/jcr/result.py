@@ -216,11 +216,12 @@ class RunResult:
             raise InputError(
                 f"{self.out}: found no calibration ({calibration.doubt}); fix the capture, run it again"
             )
-        reconstruction, capture = self.reconstruction, self.capture
+        capture = self.capture
         if [image.image for image in calibration.images] != list(capture.images):
             raise InputError(
                 f"{capture.folder}: has changed since {self.out} was made; run `jcr calibrate` again"
             )
+        reconstruction = self.reconstruction
         if len(calibration.images) <= reconstruction.image_index.max(initial=-1):
             raise InputError(
                 f"{self.out / CALIBRATION}: names {len(calibration.images)} images and {RECONSTRUCTION} has more; "

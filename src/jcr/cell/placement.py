@@ -208,7 +208,8 @@ class CamerasFile(Part):
         `base_from_gripper` is that of the capture's own arm, by the row of the capture.
         """
         parent_from_camera = found.parent_from_camera
-        used = [k for k, image in enumerate(found.images) if image.used]
+        names = {image.image for image in found.images if image.used}
+        used = [k for k, name in enumerate(camera.images) if name in names]
         if parent_from_camera is None or camera.mount == "base":
             return [] if parent_from_camera is None else [parent_from_camera] * len(used)
         if camera.base_from_gripper is not None:
