@@ -23,7 +23,7 @@ from jcr.calibration.stage import calibrate
 from jcr.capture.controllers import numbers_from_poses, poses_from_numbers
 from jcr.capture.formats.capture_json import kept, origin
 from jcr.capture.options import ReadOptions
-from jcr.cell.placement import ArmPlacement, CameraPlacement, CellPlacement, ImageUse, TransformUncertainty
+from jcr.cell.placement import ArmPlacement, CameraPlacement, CellPlacement, TransformUncertainty
 from jcr.errors import RejectedError
 from jcr.estimation.observability import excitation
 from jcr.findings import no_reconstruction
@@ -276,14 +276,12 @@ def test_every_camera_of_the_cell_is_in_the_scene(run: RunResult):
     found = [
         CameraPlacement.of(
             camera,
-            [
-                ImageUse(image=i, used=i != "b", points=90, reprojection_px=0.3, reason=None)
-                for i in camera.images
-            ],
             (),
-            mount,
-            TransformUncertainty.of(1e-6 * np.eye(6), mount, 1.0),
-            run.intrinsics,
+            [90] * len(camera.images),
+            px={k: 0.3 for k, name in enumerate(camera.images) if name != "b"},
+            **{"base_from_camera" if camera.mount == "base" else "gripper_from_camera": mount},
+            uncertainty=TransformUncertainty.of(1e-6 * np.eye(6), mount, 1.0),
+            intrinsics=run.intrinsics,
         )
         for camera in (top, *others)
     ]
