@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jcr.calibration.conventions import BY_NUMBER, BY_TEXT, MIRRORED, better_reading, convention_finding
+from jcr.calibration.checks.convention import BY_NUMBER, BY_TEXT, MIRRORED, better_reading, convention_finding
 from jcr.capture.pairing import paired_by_name
 from jcr.findings import sentence
 from jcr.geometry import inverse, transform

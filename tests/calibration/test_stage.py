@@ -8,6 +8,7 @@ import numpy as np
 from jcr.calibration.checks.capture import REPETITIVE, share_of_twins
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.stage import calibrate
+from jcr.capture.images import read_image
 from jcr.geometry import retract, step_between
 from places import ROOT
 from simulation.faults import faulty_capture, reconstructed
@@ -32,5 +33,5 @@ def test_a_regular_tiling_is_repetitive_and_a_table_with_objects_is_not():
     tile = cv2.GaussianBlur(rng.uniform(0, 255, (60, 60, 3)), (0, 0), 2.0)
     tiled = 5 * (np.tile(tile, (8, 10, 1)) - tile.mean()) + rng.normal(scale=4, size=(480, 600, 3)) + 128
     assert share_of_twins(tiled.clip(0, 255).astype(np.uint8)) > REPETITIVE
-    table = cv2.imread(str(ROOT / "examples/tabletop/images/00.jpg"))
+    table = read_image(ROOT / "examples/tabletop/images/00.jpg")
     assert share_of_twins(table) < 0.5

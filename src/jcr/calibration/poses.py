@@ -6,8 +6,8 @@ from functools import partial
 import numpy as np
 
 from jcr.calibration.case import with_findings
+from jcr.calibration.checks.convention import better_reading, convention_finding
 from jcr.calibration.checks.effects import effects_of_fit, with_rejected_runs
-from jcr.calibration.conventions import better_reading, convention_finding
 from jcr.calibration.cues import height_cue
 from jcr.calibration.hand_eye import SCALE_STD, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions, check_options

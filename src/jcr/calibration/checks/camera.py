@@ -42,7 +42,7 @@ LOG_P = float(np.log(1e-6))
 LOG_P_GIVEN = float(np.log(1e-4))
 """LOG_P of given intrinsics: one hypothesis of a camera, whose finding also needs a difference that matters."""
 MATERIAL = 0.5
-"""Standard deviations by which a fault must move the camera on some axis to be reported."""
+"""Standard deviations by which an effect must move the camera on some axis to be reported."""
 OF_FIRST_STEP = 0.2
 """Share of MATERIAL that the first step towards a fault must reach before it is adjusted."""
 MOST_POINTS = 800
@@ -68,7 +68,7 @@ SURE = 2.0
 """Smallest size, in standard deviations, of effects that differ from image to image: of many images smaller ones
 are improbable wherever the noise is estimated a little too small."""
 MIN_IMAGES = 6
-"""Fewest images that show effects which differ between images; fewer show intrinsics that are wrong in all."""
+"""Fewest images with which effects of single images, and the sizes of errors beside effects of poses, are known."""
 LEAST_PART = 2
 """Fewest images before and after a change."""
 ASPECT = ("fx", "p1", "p2")
@@ -274,12 +274,21 @@ def freed(state: EffectsState, best: CameraEffect) -> EffectsState | None:
         return None
 
 
-def is_material(found: Finding, std: Float[ndarray, "6"]) -> bool:
-    """Return whether what was freed is large enough to be a fault, and moves the calibration."""
+def is_material(found: Finding, after: EffectsState) -> bool:
+    """Return whether an effect is large enough to be a fault and moves the camera.
+
+    Given intrinsics that are contradicted are a fault in any case: users have them elsewhere.
+    """
     if found.value is not None and found.std is not None:
         least = SURE * found.std if found.kind in OF_EACH else -np.inf
         if found.value < max(least, LEAST_PX.get(found.kind, -np.inf)):
             return False
+    if found.kind is FindingKind.INTRINSICS and is_far_off(after):
+        return True
+    std = after.imaged.std
+    if not std.any():
+        # A rejected calibration is uncertain by the effect: the uncertainty that remains beside the effects counts.
+        std = np.sqrt(np.diag(after.adjusted.transform(after.imaged.place)[1]))
     assert found.shift is not None
     return bool((np.abs(found.shift[:6]) > MATERIAL * std).any())
 
@@ -352,11 +361,13 @@ def best_camera_effect(
     The size of the camera-model error absorbs every effect until all of them gain as little: the effects are compared
     with that size at its typical value.
     """
+    excluded = {one.kind for one in (*state.found, *dismissed)}
+    excluded |= FOCUS if excluded & FOCUS else set()
+    limit = {FindingKind.INTRINSICS: LOG_P_GIVEN if state.imaged.is_given else LOG_P}
     likely = [
         one
         for one in _hypotheses(state)
-        if not any(_alike(one, other) for other in (*state.found, *dismissed))
-        and log_p(one, state, state.equations) <= _limit(one, state)
+        if one.kind not in excluded and log_p(one, state, state.equations) <= limit.get(one.kind, LOG_P)
     ]
     if not likely:
         return None, 0.0
@@ -365,20 +376,10 @@ def best_camera_effect(
     return best, log_p(best, state, state.equations)
 
 
-def _limit(one: CameraEffect, state: EffectsState) -> float:
-    """Return the logarithm of the probability up to which an effect is significant."""
-    is_given = one.kind is FindingKind.INTRINSICS and state.imaged.is_given
-    return LOG_P_GIVEN if is_given else LOG_P
-
-
 def log_p(one: CameraEffect, state: EffectsState, equations: Alternatives) -> float:
     """Return the logarithm of the probability of the effect's gain by chance, times the places searched."""
     beside = np.concatenate([_all(state), one.beside], axis=1)
     return test_combinations(equations, one.free, beside).log_p + float(np.log(one.places))
-
-
-def _alike(one: CameraEffect, other: CameraEffect) -> bool:
-    return one.kind == other.kind or {one.kind, other.kind} <= FOCUS
 
 
 def _simpler(state: EffectsState) -> CameraEffect | None:

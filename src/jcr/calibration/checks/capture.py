@@ -8,10 +8,8 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from jcr.calibration.case import MIN_IMAGES, Case
-from jcr.calibration.conventions import better_reading, convention_finding
 from jcr.capture.checks import how_rotated
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image, show_one_view
-from jcr.capture.pairing import paired_by_name
 from jcr.estimation.closed_form import initial_estimate
 from jcr.estimation.observability import observability
 from jcr.estimation.pose_equations import predict
@@ -60,25 +58,6 @@ def check_registered(case: Case) -> Case:
         replace(one, concerns="reconstruction") if one in unseen else one for one in hand_eye.findings
     )
     return case.after((few,), replace(hand_eye, findings=findings))
-
-
-def check_convention(case: Case) -> Case:
-    """Report the convention by which the gripper poses fit, where there is one.
-
-    Degenerate motions fit another convention by chance, and are reported first.
-    """
-    rows, capture = case.reconstruction.image_index, case.capture
-    by_name = paired_by_name(capture.images, capture.base_from_gripper)
-    by_name = {by_number: poses[rows] for by_number, poses in by_name.items()}
-    # Of other readings neither noise nor cues are known, nor are their camera poses weighed.
-    alone = not case.priors and case.reconstruction.evidence is None
-    fit = case.pose_fit
-    solved = fit if alone and fit.robot_noise.given is None else None
-    found = better_reading(case.base_from_gripper, case.recon_from_camera, by_name, solved)
-    if found is None:
-        return case
-    observable = case.hand_eye.observability.observable
-    return case.after((convention_finding(found, "rejects" if observable else "warns"),))
 
 
 def check_pieces(case: Case) -> Case:

@@ -17,6 +17,8 @@ from jcr.calibration.adjust import adjust_case, refined_by
 from jcr.calibration.case import Case
 from jcr.calibration.checks.camera import (
     LOG_P,
+    MATERIAL,
+    MIN_IMAGES,
     CameraAdjustment,
     CameraEffect,
     EffectsState,
@@ -25,7 +27,6 @@ from jcr.calibration.checks.camera import (
     camera_finding,
     contradicted_intrinsics,
     freed,
-    is_far_off,
     is_material,
     log_p,
     of_case,
@@ -63,10 +64,6 @@ SHARES = frozenset({FindingKind.SLIP, FindingKind.BASE_MOVED, FindingKind.DRIFT}
 """Effects of a motion that has a share in each image, tested against other orders of the images."""
 EFFECTS = kinds_of("camera", "strain") | SHARES | {FindingKind.DELAY}
 """Kinds of findings that these tests make."""
-MATERIAL = 0.5
-"""Standard deviations by which an effect must move the camera on some axis to be reported."""
-MIN_IMAGES = 6
-"""Fewest images with which the sizes of the errors are known beside an effect."""
 LARGE_MOTION = GRASPING[0] * 1e-3, float(np.radians(GRASPING[1]))
 """m, rad: beyond these a motion of the camera or the base rejects. A smaller one is part of the uncertainty, and the
 requirement decides."""
@@ -106,23 +103,12 @@ def effects(imaged: CameraAdjustment) -> tuple[EffectsState, tuple[Finding, ...]
             after = freed(state, of_camera)
             found = None if after is None else camera_finding(after, state)
             camera_explains = after is None or poses_agree(after.adjusted.noise)
-            if after is None or found is None or not camera_explains or not _matters(found, after):
+            if after is None or found is None or not camera_explains or not is_material(found, after):
                 dismissed.append(of_camera)
                 continue
             state = after
             findings.append(found)
     return state, tuple(findings)
-
-
-def _matters(found: Finding, after: EffectsState) -> bool:
-    """Return whether an effect moves the camera, or contradicts given intrinsics that users have elsewhere."""
-    if found.kind is FindingKind.INTRINSICS and is_far_off(after):
-        return True
-    std = after.imaged.std
-    if not std.any():
-        # A rejected calibration is uncertain by the effect: the uncertainty that remains beside the effects counts.
-        std = np.sqrt(np.diag(after.adjusted.transform(after.imaged.place)[1]))
-    return is_material(found, std)
 
 
 def _explains(state: EffectsState, test: Test, of_camera: CameraEffect, log_chance: float) -> bool:

@@ -14,8 +14,10 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
+from jcr.calibration.case import Case
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration
+from jcr.capture.pairing import paired_by_name
 from jcr.estimation.closed_form import closed_form
 from jcr.estimation.robust import least_trimmed
 from jcr.findings import Finding, FindingKind, Severity
@@ -99,6 +101,25 @@ class PoseConvention:
 
 _Candidate = tuple[str, Float[ndarray, "k 4 4"], Int[ndarray, " k"]]
 """Name of a reading, its gripper poses, and the rows of the cameras that they belong to."""
+
+
+def check_convention(case: Case) -> Case:
+    """Report the convention by which the gripper poses fit, where there is one.
+
+    Degenerate motions fit another convention by chance, and are reported first.
+    """
+    rows, capture = case.reconstruction.image_index, case.capture
+    by_name = paired_by_name(capture.images, capture.base_from_gripper)
+    by_name = {by_number: poses[rows] for by_number, poses in by_name.items()}
+    # Of other readings neither noise nor cues are known, nor are their camera poses weighed.
+    alone = not case.priors and case.reconstruction.evidence is None
+    fit = case.pose_fit
+    solved = fit if alone and fit.robot_noise.given is None else None
+    found = better_reading(case.base_from_gripper, case.recon_from_camera, by_name, solved)
+    if found is None:
+        return case
+    observable = case.hand_eye.observability.observable
+    return case.after((convention_finding(found, "rejects" if observable else "warns"),))
 
 
 def better_reading(

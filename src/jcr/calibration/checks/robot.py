@@ -1,0 +1,44 @@
+"""Check of the joints of a known arm."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from jcr.calibration.case import Case
+from jcr.estimation.hypotheses import joint_offsets
+from jcr.estimation.pose_equations import pose_equations
+from jcr.estimation.problem import pose_problem
+from jcr.findings import Finding, FindingKind
+
+MIN_EXAMINED = 4
+"""Fewest images from which joint offsets are estimated."""
+SURE = 2.5
+"""Standard deviations from which a joint's offset is named."""
+
+
+def check_robot(case: Case) -> Case:
+    """Estimate the offsets of a known arm's joints from the fit to poses, and name those that are surely off.
+
+    A camera that is not as its model has it changes the cameras' poses: then no joint is named.
+    """
+    used, arm, joints, hand_eye = case.used, case.robot.arm, case.robot.joints, case.hand_eye
+    if len(used) < MIN_EXAMINED or arm is None or joints is None:
+        return case
+    fit = case.pose_fit
+    problem, state = pose_problem(
+        case.base_from_gripper[used],
+        case.recon_from_camera[used],
+        (fit.gripper_from_camera, fit.scale, fit.base_from_recon.rigid),
+        error_covariance=case.systematic,
+        noise_floor=fit.robot_noise.given,
+    )
+    found = joint_offsets(pose_equations(problem, state, None), arm, joints[used])
+    hand_eye = replace(hand_eye, joint_offsets=found)
+    off = np.flatnonzero(np.abs(found.offset) > SURE * found.std).tolist()
+    if not off or any(one.kind.row.group == "camera" for one in hand_eye.findings):
+        return replace(case, hand_eye=hand_eye)
+    sizes = {f"joint_{k + 1}": float(found.offset[k]) for k in off}
+    stds = {f"joint_{k + 1}_std": float(found.std[k]) for k in off}
+    value = float(np.abs(found.offset[off]).max())
+    finding = Finding.of(FindingKind.JOINT_OFFSETS, "informs", "robot", value=value, **sizes, **stds)
+    return case.after((replace(finding, joints=tuple(k + 1 for k in off)),), hand_eye)
