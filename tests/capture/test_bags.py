@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,7 +39,7 @@ def mcap(tmp_path_factory: pytest.TempPathFactory, capture: Capture) -> Path:
 @pytest.mark.slow
 def test_the_stops_of_the_arm_are_found_in_every_storage(tmp_path: Path, capture: Capture, mcap: Path):
     """And the same poses, hence the same calibration, come from all three."""
-    rates = {"seconds": 12.0, "fps": 10.0, "tf_hz": 50.0}
+    rates: dict[str, Any] = {"seconds": 12.0, "fps": 10.0, "tf_hz": 50.0}
     bags = {
         "mcap": mcap,
         "sqlite3": write_bag(tmp_path / "sqlite3", capture, "sqlite3", compressed=False, **rates),
