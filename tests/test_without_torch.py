@@ -138,7 +138,7 @@ def test_help_and_a_calibration_import_nothing_heavy():
     code = """
 import contextlib, io
 from jcr.cli import dispatch
-heavy = {"torch", "pycolmap", "mujoco", "transformers", "viser", "scipy", "cv2", "PIL", "pydantic"}
+heavy = {"torch", "pycolmap", "mujoco", "transformers", "viser", "scipy", "cv2", "PIL"}
 for name in sys.argv[1:]:
     with contextlib.redirect_stdout(io.StringIO()):
         dispatch([name, "--help"] if name else ["--help"])

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from jcr.errors import InputError
-from jcr.records import Where
+from jcr.findings.requirement import Where
 
 GRASPING = (5.0, 1.0)
 """mm, degrees: a parallel gripper that opens 10 mm wider than its object has 5 mm to either side, and a degree moves the

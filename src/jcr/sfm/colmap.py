@@ -45,7 +45,6 @@ from jcr.sfm.model import (
     working_cameras,
     write_database,
 )
-from jcr.sfm.track_refinement import align_tracks
 
 _FILM_DIAGONAL_MM = 43.27
 """Diagonal of the 36 x 24 mm frame that EXIF's equivalent focal length refers to."""
@@ -303,6 +302,8 @@ def _align_observations(
     size, image_ids = (camera.width, camera.height), [row + 1 for row in rows]
     greys = np.stack([grey_of(images[row], size) for row in rows])
     tracks, poses = tracks_of(model, image_ids, size), poses_of(model, rows)
+    from jcr.sfm.track_refinement import align_tracks  # its loops take a second to load
+
     aligned = align_tracks(greys, tracks, poses, resized(intrinsics, *size))
     for (row, index, _), x_px in zip(observations(model, image_ids), aligned.x_px, strict=True):
         model.image(image_ids[row]).point2D(index).xy = x_px + HALF_PIXEL
