@@ -246,6 +246,9 @@ def test_joints_and_the_robot_are_kept_and_written_again(capture: Path, tmp_path
     np.testing.assert_array_equal(again.joints, JOINTS)
     assert again.robot == "ur5e" and again.urdf == tmp_path / "copy" / "robot.urdf"
     assert again.urdf.read_text() == "<robot/>"
+    edit(capture, lambda c: c.update(robot="panda"))
+    with pytest.raises(jcr.InputError, match="frames have 6 joints, but a panda has 7; correct either"):
+        jcr.read_capture(capture)
     edit(capture, lambda c: c.update(robot="cobot 9"))
     read = jcr.read_capture(capture)
     assert read.robot is None and "robot 'cobot 9' is not one of ur3e" in read.notes[0]
