@@ -145,9 +145,9 @@ def test_check_finds_the_bundled_capture_good_and_a_planted_mistake_bad(tabletop
         (["export", "a", "octomapp"], "did you mean octomap?"),
         (
             ["run", "a", "b", "--require", "2"],
-            "--require takes 2 values (number, number), not '2' (jcr run --help)",
+            "--require takes MM DEG, not '2' (jcr run --help)",
         ),
-        (["run", "a", "b", "--known-length", "0.jpg", "1"], "takes 6 values (text, number, number, number, "),
+        (["run", "a", "b", "--known-length", "0.jpg", "1"], "takes IMAGE X1 Y1 X2 Y2 MM, not '0.jpg', '1'"),
         (["run", "nowhere", "out"], "nowhere"),
         (["run", "nowhere", "out", "--backend", "magic"], "auto, colmap, da3, da3-small, direct, "),
         (["compare", "nowhere", "nowhere"], "nowhere"),
