@@ -232,7 +232,7 @@ def test_the_parts_of_the_uncertainty_of_a_fixed_camera_are_the_whole_with_its_f
     assert np.allclose(parts, hand_eye.covariance, rtol=0, atol=1e-9)
     # The zoom is part of the calibration, and adds no uncertainty of a fault.
     assert hand_eye.findings[0].kind is FindingKind.ZOOM and np.trace(hand_eye.uncertainty.budget.faults) == 0
-    error = step_between(hand_eye.gripper_from_camera, found.gripper_from_camera)
+    error = step_between(hand_eye.base_from_camera, found.gripper_from_camera)
     assert error @ np.linalg.solve(hand_eye.covariance[:6, :6], error) < 16.8  # 99 % of chi2 of 6
 
 

@@ -123,7 +123,7 @@ def test_a_fixed_camera_is_calibrated_by_what_the_gripper_carries(tabletop: Path
     seen = eye_to_hand(carried, tmp_path)
     made = reconstruct_colmap(seen)
     found = refined(carried, made, calibrate(seen, made))
-    error = step_between(found.gripper_from_camera, read_truth(tabletop).gripper_from_camera)
+    error = step_between(found.base_from_camera, read_truth(tabletop).gripper_from_camera)
     assert found.converged and len(made.image_index) == len(capture)
     assert error @ np.linalg.solve(found.covariance[:6, :6], error) < 16.8
 
