@@ -5,11 +5,16 @@ import pytest
 
 import jcr
 from jcr.calibration.hand_eye import solve_hand_eye
-from jcr.estimation.pose_equations import Region, residuals
+from jcr.estimation.arms import arm_named
+from jcr.estimation.hypotheses import joint_offsets
+from jcr.estimation.inverse_kinematics import posed
+from jcr.estimation.pose_equations import Region, pose_equations, residuals
+from jcr.estimation.problem import pose_problem
 from jcr.estimation.robot_noise import Equations, arm_errors, most_likely, smooth_errors
 from jcr.estimation.robust import robust_fit
 from jcr.geometry import retract, rotation_exp, step_between, transform
-from simulation.problems import error, hand_eye_problem
+from simulation.arms import PresetName
+from simulation.problems import bent_problem, error, hand_eye_problem
 
 WHITE = (2e-4, np.radians(0.03))
 
@@ -80,9 +85,6 @@ def test_constant_errors_of_base_and_gripper_are_part_of_the_answer():
 @pytest.mark.parametrize("joints_known", [False, True])
 def test_answers_of_a_bent_arm_are_within_their_sigma(joints_known: bool):
     """More images of an arm with joint offsets made answers of white noise alone worse: 12 of 24 beyond 3 sigma."""
-    from jcr.estimation.arms import arm_named
-    from simulation.problems import bent_problem
-
     arm, worst = arm_named("ur5e"), []
     for seed in range(12):
         problem = bent_problem(arm, "typical", 30, seed)
@@ -95,9 +97,6 @@ def test_answers_of_a_bent_arm_are_within_their_sigma(joints_known: bool):
 
 
 def test_a_named_arm_whose_joints_are_known_is_used_and_budgeted():
-    from jcr.estimation.arms import arm_named
-    from simulation.problems import bent_problem
-
     problem = bent_problem(arm_named("panda"), "typical", 12, 1)
     poses = problem.base_from_gripper, problem.recon_from_camera
     known = solve_hand_eye(*poses, joints=problem.joints, robot="panda")
@@ -136,3 +135,26 @@ def test_poses_and_angles_that_are_not_of_the_robot_are_an_input_error(joints, r
     problem = hand_eye_problem(np.random.default_rng(2), 8)
     with pytest.raises(jcr.InputError, match=words):
         solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera, joints=joints, robot=robot)
+
+
+def examined(preset: PresetName, seed: int):
+    problem = bent_problem(arm_named("ur5e"), preset, 12, seed)
+    gripper, camera = problem.base_from_gripper, problem.recon_from_camera
+    arm, joints = posed(problem.bent.arm, problem.joints, gripper)
+    systematic = arm_errors(arm, joints)
+    solved = solve_hand_eye(gripper, camera, systematic=systematic)
+    start = solved.gripper_from_camera, solved.scale, solved.base_from_recon.rigid
+    poses = pose_equations(*pose_problem(gripper, camera, start, error_covariance=systematic), None)
+    return problem.bent.errors[:6], joint_offsets(poses, arm, joints)
+
+
+@pytest.mark.slow
+def test_offsets_are_right_within_their_sigma():
+    off, printed = [], []
+    for seed in range(8):
+        true, found = examined("typical", seed)
+        off.append((found.offset - true) / found.std)
+        printed.append(found.std / found.prior_std)
+    assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.4
+    # The first and the last joint rotate base and gripper, which nothing shows.
+    assert (np.median(printed, axis=0)[[0, 5]] > 0.95).all() and (np.median(printed, axis=0)[1:5] < 0.7).all()

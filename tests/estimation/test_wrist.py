@@ -1,5 +1,8 @@
 """The adjustment of a wrist camera on simulated observations with a known answer."""
 
+from dataclasses import replace
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -7,8 +10,17 @@ from scipy.stats import chi2
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.camera import parameters, with_parameters
 from jcr.estimation import solve
-from jcr.estimation.image_equations import median_reprojection_px
-from jcr.estimation.intrinsics_prior import ESTIMATED, MEASURED, camera_with_prior
+from jcr.estimation.image_equations import adjust_images, median_reprojection_px
+from jcr.estimation.intrinsics_prior import (
+    ESTIMATED,
+    FIXED,
+    MEASURED,
+    TYPICAL,
+    CameraPrior,
+    camera_with_prior,
+)
+from jcr.estimation.pixel_noise import PixelNoise
+from jcr.estimation.problem import Observations, image_problem
 from jcr.estimation.solve import Solution
 from jcr.estimation.wrist import adjust_wrist, recon_frame
 from jcr.geometry import step_between
@@ -17,7 +29,7 @@ from simulation.problems import INTRINSICS, HandEyeProblem, error, hand_eye_prob
 
 
 def solved(
-    problem: HandEyeProblem, tracks: Tracks, intrinsics: Intrinsics = INTRINSICS, **options
+    problem: HandEyeProblem, tracks: Tracks, intrinsics: Intrinsics | CameraPrior = INTRINSICS, **options
 ) -> Solution:
     start = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     return adjust_wrist(
@@ -115,3 +127,70 @@ def test_an_adjustment_that_begins_near_ends_where_one_from_poses_does(monkeypat
     std = np.sqrt(np.diag(from_poses.intrinsics_covariance(0)))[:4]
     cameras = [parameters(one.problem.intrinsics(one.state)[0])[:4] for one in (from_poses, again)]
     assert (np.abs(cameras[0] - cameras[1]) < 0.1 * std).all()
+
+
+@cache
+def warped(warp_px: float) -> Solution:
+    """Of images whose pixels a wave over the image displaces, which no coefficient describes."""
+    rng = np.random.default_rng(3)
+    problem = hand_eye_problem(rng, 12, robot_noise=(1e-4, np.radians(0.01)))
+    tracks = observed(problem, rng, 400, 0.1)
+    u, v = (2 * np.pi * tracks.x_px / [INTRINSICS.width, INTRINSICS.height]).T
+    tracks = replace(tracks, x_px=tracks.x_px + warp_px * np.stack([np.sin(v), np.sin(u)], axis=1))
+    return solved(
+        problem, tracks, camera_with_prior(Intrinsics(619.0, 619.0, 319.5, 239.5, 640, 480), ESTIMATED)
+    )
+
+
+@pytest.mark.slow
+def test_the_error_that_the_model_leaves_has_its_size_and_makes_the_intrinsics_uncertain():
+    exact, some, much = (warped(warp_px) for warp_px in (0.0, 0.3, 1.0))
+    size = [one.state.model_error_std[0] for one in (exact, some, much)]
+    assert size[0] < 0.5 * TYPICAL
+    assert size[2] / size[1] == pytest.approx(1.0 / 0.3, rel=0.3)
+    std = [np.sqrt(np.diag(one.intrinsics_covariance(0)))[2] for one in (exact, some, much)]
+    assert std[0] < std[1] < std[2]
+
+
+def test_the_error_that_the_model_leaves_is_not_taken_for_pixel_noise():
+    noise = warped(0.3).images.state.pixel_noise
+    assert noise is not None and noise.sigma_px[0] == pytest.approx(0.1, rel=0.15) and noise.inflation < 1.5
+
+
+SEEDS = range(6)
+
+
+@cache
+def estimated_noise(seed: int, stated: str) -> PixelNoise:
+    """Return the pixel noise of 12 images with observations of 0.05 to 0.5 px.
+
+    `stated` is "nothing", "size" (up to a factor), or "chance": sizes that have nothing to do with the errors.
+    """
+    rng = np.random.default_rng(seed)
+    problem = hand_eye_problem(rng, 12)
+    exact = observed(problem, rng, 300, 0.0)
+    std_px = np.exp(rng.uniform(np.log(0.05), np.log(0.5), len(exact.image)))
+    x_px = exact.x_px + std_px[:, None] * rng.normal(size=exact.x_px.shape)
+    of = {"nothing": None, "size": 3 * std_px, "chance": rng.permutation(std_px)}
+    tracks = Tracks(
+        image=exact.image,
+        x_px=x_px,
+        point=exact.point,
+        points_in_recon=exact.points_in_recon,
+        std_px=of[stated],
+    )
+    camera, observations = camera_with_prior(INTRINSICS, FIXED), Observations.of_one_camera(tracks, 12)
+    given = image_problem(problem.recon_from_camera, camera, observations, exact.points_in_recon)
+    found = adjust_images(*given).state.pixel_noise
+    assert found is not None
+    return found
+
+
+@pytest.mark.slow
+def test_what_matches_state_is_believed_as_far_as_residuals_show_it():
+    common = {
+        name: [estimated_noise(seed, name).common for seed in SEEDS] for name in ("nothing", "size", "chance")
+    }
+    assert max(common["size"]) <= 0.06
+    assert common["chance"] == common["nothing"] == [1.0] * len(SEEDS)
+    assert estimated_noise(0, "size").sigma_px[0] == pytest.approx(np.sqrt(0.05 * 0.5), rel=0.2)

@@ -32,16 +32,14 @@ from jcr.records import Budget, RobotNoise
 COVERED = 0.99
 """Probability of the ellipsoid that is made to hold it."""
 HALVINGS = 40
-"""Number of halvings of the interval that contains the size of that ellipsoid, to 1e-11 of it; scipy.optimize takes
-longer to import than a calibration of a few images."""
+"""Number of halvings of the interval that contains the size of that ellipsoid, to 1e-11 of it."""
 
 Square = Float[ndarray, "p p"]
 Stack = Float[ndarray, "*k p p"]
 
 
 Posterior = tuple[Float[ndarray, " p"], Square, Budget]
-"""Step of the unknowns averaged over the sizes of the errors, their covariance, scaled so that its 99 % ellipsoid holds
-99 %, and its causes."""
+"""Step of the unknowns averaged over the sizes of the errors, their covariance, and its causes."""
 
 
 def posterior(

@@ -23,9 +23,7 @@ from jcr.estimation.pose_equations import PoseEquations, pose_by_pose, pose_equa
 from jcr.estimation.problem import OF_IMAGE, PRISM, UNKNOWNS, Problem, Start, State, pose_problem, with_free
 from jcr.estimation.robot_noise import (
     Equations,
-    LinearSolution,
     LogSizes,
-    growth_scores,
     log_evidence,
     most_likely,
     over_sizes,
@@ -56,9 +54,7 @@ PLAUSIBLE: dict[FindingKind, tuple[float, float]] = {
     FindingKind.BASE_LEANS: (0.3, 0.0),
     FindingKind.TOOL_SAGS: (0.3, 0.0),
 }
-"""Largest estimate that the cause can produce: m and rad of a motion, else the norm of the parameters. A clamped camera
-slips by centimetres, and another tool frame is rarely farther away; a delay of a whole interval is a wrong pairing. An
-estimate beyond these points to poses that contradict the images."""
+"""Largest estimate that the cause can produce: m and rad of a motion, else the norm of the parameters."""
 STRAINS = np.zeros((5, 3, 3))
 """Orthonormal basis of the symmetric strains without a common factor, which is the scale and unobservable."""
 STRAINS[0], STRAINS[1] = np.diag([1.0, -1.0, 0.0]) / np.sqrt(2), np.diag([-1.0, -1.0, 2.0]) / np.sqrt(6)
@@ -100,12 +96,14 @@ class Test:
         return bool((np.linalg.norm(self.estimate.reshape(2, 3), axis=1) <= limits).all())
 
 
-def _gain(
-    solution: LinearSolution, columns: Float[ndarray, "s d"], projection: Float[ndarray, "s s"]
-) -> float:
-    """Return the gain of the score test, gᵀS⁻¹g with g = Aᵀ V⁻¹(r + Jθ) and S = Aᵀ P A, P being the projection."""
-    pull = columns.T @ solution.weighed_left
-    return float(pull @ np.linalg.lstsq(columns.T @ projection @ columns, pull, rcond=1e-9)[0])
+def rank(equations: Equations, log_sizes: LogSizes, every: Sequence[Float[ndarray, "s d"]]) -> list[float]:
+    """Return the gain of the score test for each set of columns A: gᵀS⁻¹g, g = Aᵀ V⁻¹(r + Jθ), S = Aᵀ P A."""
+    solution = solve_equations(equations, log_sizes)
+    projection, gains = solution.projection, list[float]()
+    for columns in every:
+        pull = columns.T @ solution.weighed_left
+        gains.append(float(pull @ np.linalg.lstsq(columns.T @ projection @ columns, pull, rcond=1e-9)[0]))
+    return gains
 
 
 def best_tests(equations: Equations, log_sizes: LogSizes, rows: Sequence[Row]) -> list[Test]:
@@ -115,10 +113,9 @@ def best_tests(equations: Equations, log_sizes: LogSizes, rows: Sequence[Row]) -
     """
     if not rows:
         return []
-    solution = solve_equations(equations, log_sizes)
-    projection, penalty = solution.projection, np.log(len(equations.residual))
     # The penalty d · log(s) of Schwarz (1978).
-    gain = np.array([_gain(solution, r.columns, projection) - r.columns.shape[1] * penalty for r in rows])
+    penalty = [np.log(len(equations.residual)) * row.columns.shape[1] for row in rows]
+    gain = np.subtract(rank(equations, log_sizes, [row.columns for row in rows]), penalty)
     best: dict[FindingKind, int] = {}
     for k in np.argsort(-gain).tolist():
         best.setdefault(rows[k].kind, k)
@@ -173,24 +170,15 @@ def explains_by_order(
 
     A permutation test of the score gain: the errors of real arms have heavy tails, and one wrong pose is no motion.
     """
-    rng = np.random.default_rng(0)
-    solution = solve_equations(equations, log_sizes)
-    projection = solution.projection
-
-    def gain(of_image: Float[ndarray, " n"]) -> float:
-        return _gain(solution, _flat(by_motion * of_image[:, None, None]), projection)
-
-    found, shuffled, centred = gain(share), share.copy(), share[own] - share[own].mean()
-    as_much = others = 0
+    rng, centred, shares = np.random.default_rng(0), share[own] - share[own].mean(), [share]
     for _ in range(ORDERS):
         order = rng.permutation(centred)
         # The hand-eye transform takes up a constant, and the sign is free: such an order is the same one.
-        if np.allclose(order, centred) or np.allclose(order, -centred):
-            continue
-        others += 1
-        shuffled[own] = order
-        as_much += gain(shuffled) >= found - 1e-9
-    return as_much <= BY_CHANCE * others
+        if not (np.allclose(order, centred) or np.allclose(order, -centred)):
+            shares.append(share.copy())
+            shares[-1][own] = order
+    found, *others = rank(equations, log_sizes, [_flat(by_motion * s[:, None, None]) for s in shares])
+    return sum(one >= found - 1e-9 for one in others) <= BY_CHANCE * len(others)
 
 
 def order_rows(
@@ -581,9 +569,13 @@ def drift_covariance(
     plain = pose_equations(problem, state, None).equations
     parts = [pose_by_pose(by_camera, pose_by_pose(by_camera, walk[among]).T) for walk in walks]
     before, size_information = most_likely(plain)
-    if growth_scores(plain, before, parts).max() < SUSPICIOUS:
+    solution = solve_equations(plain, before)
+    left, by = solution.weighed_left, [solution.projection @ part for part in parts]
+    # Score test of each component at size 0, in standard deviations.
+    pull = [left @ part @ left - np.trace(one) for part, one in zip(parts, by, strict=True)]
+    if np.max(pull / np.sqrt([2 * (one * one.T).sum() for one in by])) < SUSPICIOUS:
         return None
-    best, found = log_evidence(plain, solve_equations(plain, before), size_information) + CLEAR, None
+    best, found = log_evidence(plain, solution, size_information) + CLEAR, None
     for count in (2, 3):
         free = replace(plain, walks=tuple(parts[:count]))
         sizes, information = most_likely(free)

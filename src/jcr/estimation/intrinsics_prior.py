@@ -28,8 +28,7 @@ MEASURED = {
     "s4": 1e-3,
 }
 """Standard deviations of intrinsics that were given without any: focal length and its aspect relative, principal point
-relative to the width, distortion absolute. Factory values and calibrations of another day are off by 0.3 to 0.9 % and a
-few pixels (jcr docs architecture)."""
+relative to the width, distortion absolute. Factory values are off by 0.3 to 0.9 % and a few pixels."""
 ESTIMATED = {
     "f": 0.5,
     "aspect": 3e-3,
@@ -43,11 +42,9 @@ ESTIMATED = {
 }
 """Standard deviations of intrinsics that a reconstruction estimated, of a cheap camera."""
 PRISM = {"cx": 0.02, "cy": 0.02, "p1": 0.03, "p2": 0.03, "s1": 0.1, "s2": 0.1, "s3": 0.1, "s4": 0.1}
-"""Standard deviations of what a thin prism trades against, once the images show one: 23 px of a real camera are 0.05.
-A board's intrinsics without prism terms know the principal point to 3 px, with these terms to 39 px."""
+"""Standard deviations of what a thin prism trades against, once the images show one: 23 px of a real camera are 0.05."""
 DECENTRING = 1e-3
-"""Standard deviation of the thin prism coefficients of a camera that nobody calibrated: as large as the tangential
-distortion of factory calibrations."""
+"""Standard deviation of thin prism coefficients that nobody calibrated: tangential distortion at the factory."""
 FIXED: Mapping[str, float] = {}
 """Standard deviations of exact intrinsics: no parameter is free."""
 LEAST = 1e-12

@@ -41,8 +41,7 @@ LAST = 8
 FITS = (1e-4, 1e-3)
 """Largest misfit (m, rad) of a pose that the arm reaches."""
 REFUSED = (0.01, np.radians(1.0))
-"""Misfit, as a share of the reach and in rad, from which poses are not of this arm. Factory calibration and joint
-limits that were widened explain less."""
+"""Misfit, as a share of the reach and in rad, from which poses are not of this arm."""
 TO_REST = 0.5
 """Share of the way to its rest posture that a redundant arm goes in one step."""
 MISFIT_WEIGHT, REST_WEIGHT = 1e10, 0.05
@@ -91,18 +90,6 @@ def inverse_kinematics(
         if tried[-1].fits:
             break
     return min(tried, key=lambda one: float(((one.misfit * (1.0, ARM)) ** 2).sum()))
-
-
-def required_posture(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"]) -> Posture:
-    """Return the result of `inverse_kinematics`; raise InputError with the misfit where the poses do not fit the arm."""
-    posture = inverse_kinematics(arm, base_from_gripper)
-    metres, radians = posture.misfit.max(0)
-    if metres > REFUSED[0] * arm.reach or radians > REFUSED[1]:
-        raise InputError(
-            f"poses do not fit a {arm.name}: {1e3 * metres:.0f} mm, {np.degrees(radians):.1f}° off; name another robot, "
-            "or leave it out"
-        )
-    return posture
 
 
 def reach_toward(
@@ -249,18 +236,22 @@ def posed(arm: Arm, joints: Joints | None, base_from_gripper: Poses) -> tuple[Ar
     """
     if joints is not None:
         return mounted_arm(arm, joints, base_from_gripper), joints
-    posture = required_posture(arm, base_from_gripper)
+    posture = inverse_kinematics(arm, base_from_gripper)
+    metres, radians = posture.misfit.max(0)
+    if metres > REFUSED[0] * arm.reach or radians > REFUSED[1]:
+        raise InputError(
+            f"poses do not fit a {arm.name}: {1e3 * metres:.0f} mm, {np.degrees(radians):.1f}° off; name another robot, "
+            "or leave it out"
+        )
     return with_tool(arm, posture.flange_from_tool), posture.joints
 
 
 NOISE = (1e-3, 1e-3 / ARM)
 """Differences (m, rad) of equal weight."""
 AGREE = (0.015, np.radians(1.5))
-"""Largest rms difference of agreeing angles and poses, as a share of the reach and in rad. Controllers use kinematics
-calibrated at the factory, which are millimetres from the nominal arm."""
+"""Largest rms difference of agreeing angles and poses, as a share of the reach and in rad (factory calibration)."""
 ALIKE, SURE = 0.01, 5.0
-"""Difference of lengths from which reported positions are not of this arm: relative, and in standard deviations. A
-factory's calibration changes lengths by less."""
+"""Difference of lengths beyond a factory's calibration: relative, and in standard deviations."""
 
 
 class LengthError(InputError):

@@ -128,7 +128,7 @@ def error_std(arm: Arm, joint_offset: float, link: float) -> Float[ndarray, " p"
 def error_jacobian(arm: Arm, joints: Joints) -> Float[ndarray, "n 6 p"]:
     """Return the derivative of the gripper's true pose by the arm's errors, at errors zero; p = 5 dof.
 
-    Rows are those of `equation.residuals`, steps of geometry.retract from the reported pose (m, rad; base axes), to
+    Rows are those of `residuals`, steps of geometry.retract from the reported pose (m, rad; base axes), to
     which errors φ add `error_jacobian · φ`. Columns are the offsets of all joints, then the errors of each link.
     """
     frames, gripper = joint_frames(arm, joints)

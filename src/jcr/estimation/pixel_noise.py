@@ -17,16 +17,14 @@ LOSS_SCALE = 2.0
 """Cauchy loss: observations count half at this many sigma."""
 MIN_SIGMA_PX = 0.02
 RATIOS = (0.25, 100.0)
-"""Bounds of the ratio of the variances of other cameras' observations to those of the first camera. A camera whose few
-points only one other camera observes seems as good as its weight makes it."""
+"""Bounds of the ratio of the variances of other groups' observations to those of the first camera."""
 FAR_OFF = 6.0
 """Median residuals; seven sigma."""
 COMMON = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
 """Shares of the variance of the median observation that are tried as what all observations have in common."""
 SCALE_STEPS = 10
 NEAREST = 0.05
-"""Least depth of an observation as a share of the median depth. No camera focuses on nearer points, and a mismatch
-that lies in front of two cameras fixes them the more, the nearer it lies."""
+"""Least depth of an observation as a share of the median depth: no camera focuses on nearer points."""
 LEAST_LEFT = 0.1
 """Least share of an observation's variance after its point took its part; below, the residual shows nothing of it."""
 

@@ -44,8 +44,7 @@ Pixels = Float[ndarray, "*points 2"]
 Distances = Float[ndarray, "*#points"] | float
 Covariances = Float[ndarray, "*points 3 3"]
 ScenePoints = tuple[Float[ndarray, "p 3"], Float[ndarray, "p 3 p 3"], Float[ndarray, "p 3 3"]]
-"""Some reconstructed points in the frame of the first arm's poses (m), their covariance by rigs, cameras and arms, which
-they share, and by the triangulation of each (m²)."""
+"""Some points in the frame of the first arm (m), their shared covariance, and that of each triangulation (m²)."""
 SCENE_POINTS = 300
 """Number of points, drawn at random, that represent a scene."""
 

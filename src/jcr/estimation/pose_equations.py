@@ -57,7 +57,7 @@ class Region:
     fit: Float[ndarray, "u s"]
     """A = (JᵀWJ)⁻¹JᵀW; zero for poses that are not used."""
     unknowns: int = 13
-    """Number of unknowns of the whole problem, which begin as those of equation.py."""
+    """Number of unknowns of the whole problem, which begin with X, log λ and Z."""
 
     @staticmethod
     def of_unknowns(by_unknown: Float[ndarray, "s u"], unknowns: int) -> "Region":
@@ -101,8 +101,7 @@ class Region:
 PRIOR_STD = np.array([1.0] * 3 + [np.pi] * 3 + [5.0])
 """Standard deviations (m, rad, log scale) of a prior that only keeps unobservable directions finite."""
 LARGEST_ROTATION = 0.5
-"""Largest step of a rotation (rad) and of the logarithm of scale: a poor initial estimate of nearly unobservable
-motions must not rotate beyond a half turn."""
+"""Largest step of a rotation (rad) and of the logarithm of scale: below a half turn."""
 ASSUMED_NOISE = (5e-4, np.radians(0.1))
 """Assumed noise (m, rad) of a robot that has not been measured."""
 
@@ -303,7 +302,7 @@ class Fit(NamedTuple):
     gripper_from_camera: Transform
     base_from_recon: Transform
     residual: Float[ndarray, "n 6"]
-    """Steps of `equation.residuals` (m, rad)."""
+    """Steps of `residuals` (m, rad)."""
 
 
 def fit_known_scale(
@@ -316,7 +315,7 @@ def fit_known_scale(
     """Return the weighted least-squares fit from `start` (gripper_from_camera, base_from_recon); `noise` in m, rad.
 
     Directions that the motions do not determine stay as they are in `start`. `exchanged` is that of
-    `equation.residuals`.
+    `residuals`.
     """
     weight, columns = 1 / np.repeat(noise, 3), columns_of_arm(0)
 

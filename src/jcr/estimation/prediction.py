@@ -42,18 +42,15 @@ FEWEST = 3
 COLUMNS = 9
 """Columns of the grid of rays of an image that end in points of the scene."""
 MOST_POINTS = 400
-"""Largest number of points of a scene. With 1000 the predictions differ by 0.1 % (after eleven more poses by 5 %), and
-take twice as long."""
+"""Largest number of points of a scene; with 1000 the predictions differ by 0.1 %."""
 RELIEF = 0.1
 """Relief of the scene to either side of its surface, as a share of the working distance: objects on a table."""
 TYPICAL_INFORMATION, TYPICAL_MODEL_ERROR = 5000.0, 1.2e-4
-"""Information (1/px²) of an image and size of the camera-model error (image widths) before images are matched: about
-the geometric mean over eleven real captures."""
+"""Information (1/px²) of an image and size of the camera-model error (image widths): means of eleven captures."""
 LEAST_MODEL_ERROR = 1e-9
 """Size of the camera-model error of an exact model, image widths."""
 UNCONNECTED = 1e-2
-"""Information (1/m², 1/rad²) added to the pose of each image. Without it, an image that shares hardly a point with
-others loses its information in the rounding of the elimination."""
+"""Information (1/m², 1/rad²) added to the pose of each image, above the rounding of the elimination."""
 SAME_FEATURE = np.radians(40.0), 2.0
 """Largest rotation of the line of sight and largest ratio of distances at which a matcher finds a feature again."""
 USUAL_FOCAL = 0.8

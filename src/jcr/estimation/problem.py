@@ -96,14 +96,12 @@ def sorted_by_point(observations: Observations, points: int) -> Observations:
 
 
 CELLS = 8
-"""Across the width of an image: so near each other features share errors, of a texture, a shadow or what the distortion
-model leaves."""
+"""Cells across the width of an image, within which features share errors."""
 OF_IMAGE, PRISM = 4, 4
 """Number of nuisance parameters of each image, and of those that all images share.
 
-Of an image: the logarithm of its focal length over its camera's; a shear, by which x moves from the top of the image
-to its bottom in focal lengths (rolling shutter); an offset in x and one in y, in widths of the image. All images
-share the coefficients s1 to s4 of OpenCV's thin prism distortion."""
+An image has the logarithm of its focal length over its camera's; a shear from top to bottom in focal lengths (rolling
+shutter); offsets in x and y, in widths. All images share s1 to s4 of OpenCV's thin prism."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

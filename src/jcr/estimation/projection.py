@@ -2,7 +2,7 @@
 
 With the projection π and the principal point c of its camera, an image shows a point at x = c + A (π − c) + offset,
 where A = [[e^l, a], [0, e^l]] holds the image's own logarithm of the focal length l and its shear a (rolling
-shutter). A thin prism and the remaining distortion of the camera's model (model_error.py) are added.
+shutter). A thin prism and the remaining distortion of the camera's model (intrinsics_prior.py) are added.
 """
 
 from dataclasses import dataclass

@@ -6,7 +6,7 @@ Casella and McCulloch, "Variance components", 1992, section 6.6). Few images det
 over them on a grid about the mode (Rue, Martino and Chopin, J. R. Statist. Soc. B 71, 2009, section 3).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -25,8 +25,7 @@ REACH = 0.45
 ALIKE = 1.0
 """Distance (rad, with REACH for lengths) of gripper poses that share e^(−1/2) of their errors."""
 LINK_PER_JOINT = 3e-3 / np.radians(1.0)
-"""Error of a link (m) for each rad of a joint offset: more exact arms are so in both, 0.03° and 0.1 mm, 0.1° and 0.3
-mm, 0.3° and 1 mm."""
+"""Error of a link (m) for each rad of a joint offset: 0.1° and 0.3 mm, 0.3° and 1 mm."""
 
 
 def smooth_errors(base_from_gripper: Poses) -> Float[ndarray, "s s"]:
@@ -61,11 +60,9 @@ NOISE_FLOOR = (2e-5, np.radians(0.002))
 TYPICAL = np.array([3e-4, np.radians(0.04), np.radians(0.1)])
 """Middle of the weak priors of σ_t (m), σ_r (rad) and σ_s (rad) of an arm."""
 FACTOR_STD = np.log([10.0, 10.0, 3.0])
-"""Logarithms of the factors by which arms differ in these. Data sheets of industrial arms state 0.03 to 0.1° of
-systematic error, those of servo arms 1 to 2°."""
+"""Logarithms of the factors by which arms differ in these (data sheets: 0.03 to 0.1°, servo arms 1 to 2°)."""
 TYPICAL_WALKS, WALK_FACTOR_STD = np.array([3e-4, 1e-3, 1e-3]), np.log(30.0)
-"""Growth of the errors of camera poses from one image to the next (m, rad, relative scale), and the factor by which it
-differs between sequences."""
+"""Growth of the errors of camera poses per image (m, rad, relative scale), and the factor by which it varies."""
 GIVEN_SHARE = 0.3
 """Middle of the prior of a robot's noise beside a given one, as a share of the given one."""
 SHOWN = 1.1
@@ -73,14 +70,11 @@ SHOWN = 1.1
 LEAST_BESIDE = 0.01
 """Least errors beside the given noise, as a share of it: the logarithm of no error is not finite."""
 RATIO_STD = np.log(4.0)
-"""Standard deviation of log(σ_t / (REACH · σ_r)) over robots. With log 2 instead, three images of a robot whose
-rotations are six times better than its positions cover 80 to 90 %."""
+"""Standard deviation of log(σ_t / (REACH · σ_r)) over robots; with log 2, three images cover 80 to 90 %."""
 LEVELS = tuple(1.5 * np.arange(-4, 5))
-"""Distances from the mode at which the posterior is evaluated, in standard deviations of the log sizes; for a normal
-posterior the error of this sum is 3e-4."""
+"""Distances from the mode at which the posterior is evaluated, in standard deviations; an error of 3e-4."""
 FARTHEST, LESS_FAR = 21.0, 10.0
-"""Largest squared distance from the mode. Rare errors come from rare sizes: with 7 as the limit, three images covered
-81 % instead of 95 %, and two of 120 images that had not moved were called moved at p < 0.001."""
+"""Largest squared distance from the mode; with 7, three images covered 81 % instead of 95 %."""
 MANY, TOO_MANY = 15, 80
 """Numbers of poses from which the smaller limit is enough, and from which the mode alone is used, of as many poses."""
 AT_ONCE = 4e6
@@ -332,17 +326,6 @@ def log_evidence(equations: Equations, at_mode: LinearSolution, information: Inf
     against_prior = gradient @ np.linalg.lstsq(equations.prior_information, gradient, rcond=None)[0]
     volumes = np.linalg.slogdet(information)[1] / 2 + np.log(equations.prior[1]).sum()
     return float(at_mode.log_posterior - against_prior / 2 - volumes)
-
-
-def growth_scores(
-    equations: Equations, log_sizes: LogSizes, parts: Sequence[Float[ndarray, "s s"]]
-) -> Float[ndarray, " k"]:
-    """Return the score test of further components at size 0, in standard deviations (Rao 1948)."""
-    solution = solve_equations(equations, log_sizes)
-    projection, left = solution.projection, solution.weighed_left
-    by = [projection @ part for part in parts]
-    pull = np.array([left @ part @ left - np.trace(one) for part, one in zip(parts, by, strict=True)])
-    return pull / np.sqrt([2 * (one * one.T).sum() for one in by])
 
 
 def over_sizes(

@@ -26,18 +26,14 @@ Images = Bool[ndarray, " n"]
 SHARE_RIGHT = 0.65
 """Share of images that the trimmed fit relies on; up to the rest may be wrong."""
 MAX_TRIPLES, MOST_TRIPLES = 1500, 30_000
-"""Triples that a closed form is tried for, and triples that these are chosen from: of 57 images all, of more that many
-at random."""
+"""Triples that a closed form is tried for, and triples that these are chosen from (all of 57 images)."""
 CONCENTRATED = 20
-"""Best triples from which the trimmed fit is sought: with 5 its cost was 2 % above the least that was found, with 20
-0.1 % (240 simulated problems of 6 to 15 images, a fifth of them wrong)."""
+"""Best triples from which the trimmed fit is sought: its cost is then 0.1 % above the least found, with 5 it is 2 %."""
 WRONG = 1e-5
-"""Share of gripper poses that are taken for wrong before anything is known. Of simulated low-cost arms' poses, 30 a
-capture, all sound, 5 % were rejected at 0.02, 2 % at 1e-5, and at 1e-7 still as many; there a wrong pose of doosan_bench
-with its board is kept."""
+"""Prior share of wrong gripper poses: of sound ones of low-cost arms 5 % were rejected at 0.02, 2 % at 1e-5; at 1e-7 a
+wrong pose of doosan_bench is kept."""
 LEAST_WRONG, MOST_WRONG = (1e-3, np.radians(0.2)), (1.0, np.pi)
-"""Least errors of wrong poses (m, rad). No image is rejected for less: smaller errors come from vision, and are
-harmless."""
+"""Least and largest errors of wrong poses (m, rad): no image is rejected for less."""
 
 
 def robust_fit(
