@@ -221,8 +221,8 @@ def fed(folder: Path) -> Fed:
         batch, at_once_s = _timed(lambda: calibrate(out / "bare", out / "batch"))
     sigmas = None
     if finished is not None and batch is not None:
-        std = np.sqrt(np.diag(batch.hand_eye.covariance)[:6])
-        away = step_between(finished.hand_eye.gripper_from_camera, batch.hand_eye.gripper_from_camera)
+        std = np.sqrt(np.diag(batch.found.covariance)[:6])
+        away = step_between(finished.found.gripper_from_camera, batch.found.gripper_from_camera)
         sigmas = float(np.abs(away / std).max())
     verdicts = ["none" if one is None else str(one.verdict) for one in (finished, batch)]
     cells = [folder.name, f"{len(capture)}", *verdicts, "" if sigmas is None else f"{sigmas:.2g}"]
