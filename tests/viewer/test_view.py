@@ -180,6 +180,7 @@ def test_command_serves_this_machine_alone_until_it_is_interrupted(done: Path):
         assert served.returncode == 0 and out == "" and err == ""
 
 
+@pytest.mark.long
 def test_in_a_browser(viewer: "Viewer", tmp_path: Path):
     gpu = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
     chromium = Chromium(tmp_path, *gpu)
