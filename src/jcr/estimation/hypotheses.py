@@ -96,7 +96,7 @@ class Test:
         return bool((np.linalg.norm(self.estimate.reshape(2, 3), axis=1) <= limits).all())
 
 
-def rank(equations: Equations, log_sizes: LogSizes, every: Sequence[Float[ndarray, "s d"]]) -> list[float]:
+def rank(equations: Equations, log_sizes: LogSizes, every: Sequence[Float[ndarray, "s _"]]) -> list[float]:
     """Return the gain of the score test for each set of columns A: gᵀS⁻¹g, g = Aᵀ V⁻¹(r + Jθ), S = Aᵀ P A."""
     solution = solve_equations(equations, log_sizes)
     projection, gains = solution.projection, list[float]()

@@ -3,7 +3,7 @@
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,13 +45,13 @@ class PosedImages:
     """Points of the tracks (m)."""
 
 
-def write_ply(path: Path, cloud: PointCloud, notes: Mapping[str, str]) -> None:
+def write_ply(path: Path, cloud: PointCloud, notes: dict[str, str]) -> None:
     """Write the cloud as PLY with its provenance in the header."""
     write_cloud(path, cloud, notes)
 
 
 def write_nerfstudio(
-    folder: Path, views: PosedImages, cloud: PointCloud, notes: Mapping[str, str], options: ExportOptions
+    folder: Path, views: PosedImages, cloud: PointCloud, notes: dict[str, str], options: ExportOptions
 ) -> None:
     """Write transforms.json, images/ and points.ply (initial points of a splat) into a new folder.
 
@@ -95,7 +95,7 @@ def _nerfstudio_camera(intrinsics: Intrinsics) -> dict[str, str | float]:
     }
 
 
-def write_colmap(folder: Path, views: PosedImages, notes: Mapping[str, str], options: ExportOptions) -> None:
+def write_colmap(folder: Path, views: PosedImages, notes: dict[str, str], options: ExportOptions) -> None:
     """Write images/ and sparse/0, as binary and as text, with every track into a new folder."""
     with _new_folder(folder) as made:
         names, intrinsics = _place_images(made / "images", views, options)

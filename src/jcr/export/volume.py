@@ -3,7 +3,6 @@
 The first three query the map itself, so that they answer as `SceneMap.check_spheres` and `SceneMap.query` do.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +28,7 @@ _GRIPPER_AXES_M = 0.05
 _SIGN = "positive outside of what is solid, negative inside, metres (cuRobo wants the negative)"
 
 
-def write_octomap(path: Path, scene: SceneMap, notes: Mapping[str, str], options: ExportOptions) -> None:
+def write_octomap(path: Path, scene: SceneMap, notes: dict[str, str], options: ExportOptions) -> None:
     """Write a binary OctoMap (.bt) with voxels of side `voxel_size` m, by default the map's cell.
 
     A voxel is occupied when the sphere inscribed in it touches a seen surface, free when that sphere touches
@@ -51,7 +50,7 @@ def write_octomap(path: Path, scene: SceneMap, notes: Mapping[str, str], options
     write_bytes(path, first + b"\n" + comments.encode() + rest)
 
 
-def write_esdf(path: Path, scene: SceneMap, notes: Mapping[str, str], options: ExportOptions) -> None:
+def write_esdf(path: Path, scene: SceneMap, notes: dict[str, str], options: ExportOptions) -> None:
     """Write the signed distance at the centres of voxels of side `voxel_size` m, by default the map's cell, as .npz.
 
     Unseen space counts as occupied by default.
@@ -77,7 +76,7 @@ def write_esdf(path: Path, scene: SceneMap, notes: Mapping[str, str], options: E
     )
 
 
-def _write_npz(path: Path, notes: Mapping[str, str], **arrays: object) -> None:
+def _write_npz(path: Path, notes: dict[str, str], **arrays: object) -> None:
     """Write arrays and provenance as .npz, whole or not at all."""
     with written_whole(path) as temporary, open(temporary, "wb") as stream:
         np.savez_compressed(
@@ -85,7 +84,7 @@ def _write_npz(path: Path, notes: Mapping[str, str], **arrays: object) -> None:
         )
 
 
-def write_spheres(path: Path, scene: SceneMap, notes: Mapping[str, str], options: ExportOptions) -> None:
+def write_spheres(path: Path, scene: SceneMap, notes: dict[str, str], options: ExportOptions) -> None:
     """Write spheres that hold solid space and reach at most `excess` m beyond it as .npz: `centers` (n,3), `radii` (n,).
 
     Unseen space counts as free by default. The default excess is two of the map's cells; space is sampled in steps of
@@ -101,7 +100,7 @@ def write_spheres(path: Path, scene: SceneMap, notes: Mapping[str, str], options
     _write_npz(path, notes, centers=points[tuple(index.T)], radii=radii, unknown=unknown)
 
 
-def write_glb(path: Path, scene: SceneMap, notes: Mapping[str, str]) -> None:
+def write_glb(path: Path, scene: SceneMap, notes: dict[str, str]) -> None:
     """Write the seen surface with vertex colours as binary glTF.
 
     Its vertices are those of the robot's frame, z up, as planners load them; glTF's own viewers take y for up and
@@ -139,7 +138,7 @@ def write_rrd(
     views: "PosedImages",
     cloud: PointCloud,
     scene: SceneMap,
-    notes: Mapping[str, str],
+    notes: dict[str, str],
 ) -> None:
     """Write a .rrd; raise InputError without rerun-sdk, which is 500 MB and therefore an extra of its own."""
     rr: Any = extra("rerun", "rerun", "a .rrd file")
