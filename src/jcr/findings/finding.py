@@ -24,6 +24,8 @@ RANK: dict[Severity, int] = {"rejects": 0, "warns": 1, "informs": 2}
 class Finding:
     """Observation that speaks against a calibration, or that is worth stating."""
 
+    # Files also hold text and remedy, which follow from the fields.
+    __pydantic_config__ = {"extra": "ignore"}
     kind: FindingKind
     severity: Severity
     concerns: Concerns = "none"
