@@ -12,7 +12,7 @@ import pytest
 
 from jcr import reconstruct as backends
 from jcr.calibration import stage as calibration_stage
-from jcr.calibration.checks import capture as capture_checks
+from jcr.calibration.checks import convention
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
@@ -39,7 +39,7 @@ GARBAGE = {
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch):
     """The search for other readings of the poses takes seconds and is tested elsewhere, and there are no images."""
-    monkeypatch.setattr(capture_checks, "better_reading", lambda *_: None)
+    monkeypatch.setattr(convention, "better_reading", lambda *_: None)
     monkeypatch.setattr(selection, "view_findings", lambda _: ())
 
 

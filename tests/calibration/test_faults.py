@@ -3,18 +3,23 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import jcr
 from benchmarks.faults import calibrated, outcome
+from jcr.calibration.adjust import adjust_case
+from jcr.calibration.case import Case
+from jcr.calibration.checks import effects
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_poses
 from jcr.calibration.stage import calibrate
 from jcr.camera import project, unproject
 from jcr.cell.carried import eye_to_hand, refined
 from jcr.estimation.arms import RobotName, arm_named
+from jcr.estimation.solve import Solution
 from jcr.findings import FindingKind, kinds_of, sentence
 from jcr.geometry import apply, inverse, step_between
 from jcr.records import Capture, PosePairs, Reconstruction
@@ -209,6 +214,22 @@ def test_an_unmeasured_prism_of_estimated_intrinsics_is_within_sigma():
     pixel = project(found.intrinsics, ahead)
     placed = apply(hand_eye.gripper_from_camera, 0.5 * unproject(camera, pixel))
     assert np.linalg.norm(placed - apply(found.gripper_from_camera, ahead)) < 2e-3
+
+
+def test_many_images_with_an_effect_each_are_adjusted_with_the_points_that_memory_allows(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    counts: list[int] = []
+
+    def counted(case: Case, **free: Any) -> Solution:
+        counts.append(len(case.tracks.image))
+        return adjust_case(case, **free)
+
+    monkeypatch.setattr(effects, "adjust_case", counted)
+    monkeypatch.setattr(effects, "MOST_BYTES", 16 * 12 * 1000)
+    found, hand_eye = calibrated(Faults(focal_scatter=0.02), 3)
+    assert counts and max(counts) <= 1000 < len(found.tracks.image)
+    assert outcome(found, hand_eye).is_within
 
 
 def test_a_focus_that_varies_is_modelled():

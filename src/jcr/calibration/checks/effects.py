@@ -14,11 +14,12 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.calibration.adjust import adjust_case, refined_by
-from jcr.calibration.case import Case
+from jcr.calibration.case import Case, some_points
 from jcr.calibration.checks.camera import (
     LOG_P,
     MATERIAL,
     MIN_IMAGES,
+    MOST_BYTES,
     CameraAdjustment,
     CameraEffect,
     EffectsState,
@@ -275,12 +276,17 @@ def _adopted(case: Case, state: EffectsState, findings: tuple[Finding, ...]) -> 
     """Return the calibration with the effects that its model can carry; one that is rejected stays.
 
     The effects were found with some of the points. Effects on the camera that do not move the calibration by all points
-    are not reported.
+    are not reported; of many images with an effect each, as many points take part as memory allows.
     """
-    adjusted, adopted = with_effects(case, state, findings)
+    free = all_combinations(state.found)
+    most = MOST_BYTES // (16 * (1 if free is None else free.shape[1]))
+    fewer = case
+    if len(case.tracks.image) > most:
+        fewer = replace(case, chosen_tracks=some_points(case.tracks, most), adjusted=None)
+    adjusted, adopted = with_effects(fewer, state, findings)
     if adjusted is None:
         return case.after(findings)
-    before, refined = case.hand_eye, judged(refined_by(case, adjusted))
+    before, refined = case.hand_eye, judged(refined_by(fewer, adjusted))
     if not refined.converged:
         return case.after(findings)
     of_camera = {one.kind for one in findings if one.kind.row.group == "camera"} - {FindingKind.INTRINSICS}
@@ -290,7 +296,7 @@ def _adopted(case: Case, state: EffectsState, findings: tuple[Finding, ...]) -> 
         rest = tuple(one for one in state.found if one.kind not in of_camera)
         kept = tuple(one for one in findings if one.kind not in of_camera)
         return _adopted(case, replace(state, found=rest), kept)
-    return case.after(adopted, refined, adjusted)
+    return fewer.after(adopted, refined, adjusted)
 
 
 def with_effects(
