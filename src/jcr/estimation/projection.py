@@ -154,34 +154,36 @@ def _by_rig(problem: Problem, state: State, view: ProjectedObservations) -> Floa
 
 def _by_cameras(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, "k 2 l"]:
     """Return the derivative of every observation by the intrinsics and the other camera parameters."""
-    out = np.zeros((len(view.in_camera), 2, problem.columns.nuisance.stop))
+    first, last = problem.columns.nuisance.start, problem.columns.nuisance.stop
+    out = np.zeros((len(view.in_camera), 2, last))
+    by_intrinsics, by_nuisance = out[:, :, :first], out[:, :, first:]
     each = list(
         zip(view.cameras, problem.cameras, problem.columns.intrinsics, problem.camera_rows, strict=True)
     )
     for camera, prior, columns, rows in each:
-        out[rows, :, columns] = by_parameters(camera, view.in_camera[rows]) @ prior.directions
+        by_intrinsics[rows, :, columns] = by_parameters(camera, view.in_camera[rows]) @ prior.directions
     if view.own_map is None:
         return out
-    by_centre = np.zeros_like(out)
+    by_centre = np.zeros_like(by_intrinsics)
     for _, prior, columns, rows in each:
         by_centre[rows, :, columns] = prior.directions[CENTRE]
-    out = _mapped(view.own_map, out - by_centre) + by_centre
+    by_intrinsics[:] = _mapped(view.own_map, by_intrinsics - by_centre) + by_centre
     for camera, prior, columns, rows in each:
         # The shear is counted in focal lengths, and grows with it.
         sheared = view.own_map[rows, 1] * view.from_centre_px[rows, 1] / camera.fx
-        out[rows, 0, columns] += sheared[:, None] * prior.directions[0]
+        by_intrinsics[rows, 0, columns] += sheared[:, None] * prior.directions[0]
     assert problem.observations is not None
-    about, directions = view.from_centre_px, problem.nuisance_directions
-    of_images = directions[:-PRISM].reshape(OF_IMAGE, -1, directions.shape[1])
-    focal, sheared, *offset = of_images[:, problem.observations.image]
+    about, directions, image = view.from_centre_px, problem.nuisance_directions, problem.observations.image
+    focal, sheared, *offset = directions[:-PRISM].reshape(OF_IMAGE, -1, directions.shape[1])
     shear_px = _of_camera(problem, [camera.fx / camera.height for camera in view.cameras]) * about[:, 1]
     width = _of_camera(problem, [camera.width for camera in view.cameras])
-    by_nuisance = (view.own_map[:, :1] * about)[..., None] * focal[:, None]
-    by_nuisance[:, 0] += shear_px[:, None] * sheared
-    by_nuisance += width[:, None, None] * np.stack(offset, axis=1)
+    # One block at a time: of hundreds of images each has hundreds of megabytes.
+    np.multiply((view.own_map[:, :1] * about)[..., None], focal[image][:, None], out=by_nuisance)
+    by_nuisance[:, 0] += shear_px[:, None] * sheared[image]
+    for axis, one in enumerate(offset):
+        by_nuisance[:, axis] += width[:, None] * one[image]
     if directions[-PRISM:].any():
         by_nuisance += problem.prism @ directions[-PRISM:]
-    out[:, :, problem.columns.nuisance] = by_nuisance
     return out
 
 
