@@ -12,7 +12,7 @@ from numpy import ndarray
 from scipy.stats import chi2
 
 from benchmarks.page import folders_with_captures, largest_std, mm_deg, of_rows, squared_distance, table
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import parameters, with_parameters
 from jcr.capture.read import read_capture
 from jcr.cell.stage import place_cameras
@@ -162,7 +162,7 @@ def _withheld(folder: Path) -> Iterator[tuple[list[str], tuple[float, float] | N
     hand_eye = reconstruction = None
     try:
         reconstruction = reconstruct(rest, ReconstructOptions(backend="colmap"))
-        hand_eye = calibrate(rest, reconstruction)
+        hand_eye = calibrate_reconstruction(rest, reconstruction)
     except RejectedError:
         pass
     if reconstruction is None or hand_eye is None or not hand_eye.converged:

@@ -21,7 +21,7 @@ import jcr
 from benchmarks.page import mm_deg, squared_distance, table
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.errors import InputError, RejectedError
 from jcr.findings import FindingKind, kinds_of
 from jcr.geometry import step_between
@@ -198,7 +198,7 @@ def calibrated(
 ) -> tuple[FaultyCapture, Calibration]:
     """Draw a capture of observations with these faults and calibrate it."""
     found = faulty_capture(np.random.default_rng([seed, images]), images, faults)
-    return found, calibrate(*reconstructed(found, not given), options)
+    return found, calibrate_reconstruction(*reconstructed(found, not given), options)
 
 
 def outcome(found: FaultyCapture, hand_eye: Calibration) -> Outcome:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from benchmarks.page import folders_with_captures, largest_std, number, table
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
 from jcr.features.matchers import FeatureName, Matcher
@@ -56,7 +56,7 @@ def _row(folder: Path, features: FeatureName, gate: bool, way: str) -> tuple[boo
         with nullcontext() if gate else patch.object(colmap, "match_with_robot", _match_all):
             made = reconstruct_colmap(capture, features)
         count = len(made.image_index)
-        hand_eye = calibrate(capture, made)
+        hand_eye = calibrate_reconstruction(capture, made)
     except RejectedError:
         pass
     seconds, numbers = time.perf_counter() - begun, ["", "", ""]

@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 from benchmarks.page import of_rows, table
 from benchmarks.peers import WEBCAM
 from jcr.calibration.record import Calibration
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import project
 from jcr.capture.read import read_capture
 from jcr.depth.densify import densify
@@ -187,7 +187,9 @@ def calibrated_cloud(truth: Truth) -> PointCloud:
         for row in found.image_index
     ]
     masks = np.stack(labels).astype(int)
-    return point_cloud(capture, found, calibrate(capture, found), masks, label_names=truth.labels)
+    return point_cloud(
+        capture, found, calibrate_reconstruction(capture, found), masks, label_names=truth.labels
+    )
 
 
 def _depths(
@@ -290,7 +292,7 @@ def _depth(folder: Path) -> list[str]:
         begun = time.process_time()
         found = densify(capture, reconstruct(capture, ReconstructOptions(backend=backend)))
         seconds = time.process_time() - begun
-        near, on_table = covered(found, calibrate(capture, found), read_truth(made))
+        near, on_table = covered(found, calibrate_reconstruction(capture, found), read_truth(made))
         of_table, of_objects = 100 * near[on_table].mean(0), 100 * near[~on_table].mean(0)
         parts.append(f"{name} {of_table[1]:.1f} % of the table and {of_objects[1]:.1f} % of the objects")
         shares = 100 * (found.dense.confidence > 0).mean(), *of_table, *of_objects
@@ -359,7 +361,7 @@ def _measured_heights(place: Path, seed: int, images: int) -> list[tuple[TrueObj
         shutil.copytree(place / "truth" / "labels", place / "labels")
     capture, truth = of_rows(read_capture(place), range(images)), read_truth(place)
     reconstruction = densify(capture, reconstruct(capture, ReconstructOptions(backend="colmap")))
-    hand_eye = calibrate(capture, reconstruction)
+    hand_eye = calibrate_reconstruction(capture, reconstruction)
     given = read_labels(capture, reconstruction)
     assert given is not None  # copied above
     masked = point_cloud(capture, reconstruction, hand_eye, given.labels)

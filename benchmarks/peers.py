@@ -15,7 +15,7 @@ from numpy import ndarray
 from benchmarks.page import apart, mm_deg, table
 from jcr.calibration.case import of_images
 from jcr.calibration.hand_eye import solve_hand_eye
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
 from jcr.estimation.wrist import adjust_wrist, recon_frame
@@ -227,7 +227,7 @@ def _methods(made: Path, choice: ReconstructOptions) -> tuple[bool, dict[str, tu
         rescaled = scale_translation(made_of.recon_from_camera, unit / SCALE)
         for name, solver in PAPER_SOLVERS.items():
             found[name] = apart(solver(capture.base_from_gripper[made_of.image_index], rescaled)[0], true)
-        hand_eye = calibrate(capture, made_of)
+        hand_eye = calibrate_reconstruction(capture, made_of)
     except RejectedError:
         return False, found
     return hand_eye.converged, found | {"jcr": apart(hand_eye.gripper_from_camera, true)}

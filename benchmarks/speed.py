@@ -185,20 +185,20 @@ def _growth() -> list[tuple[int, tuple[int, float], Spent]]:
 def reconstruct_first(folder: str, count: int, facts: str) -> None:
     """Reconstruct and calibrate the first images of a capture; write images registered and error in mm to `facts`."""
     from jcr.calibration.difference import read_hand_eye
-    from jcr.calibration.stage import calibrate
+    from jcr.calibration.stage import calibrate_reconstruction
     from jcr.capture.read import read_capture
     from jcr.sfm.colmap import reconstruct_colmap
 
     capture = of_rows(read_capture(Path(folder)), range(count))
     made = reconstruct_colmap(capture)
     reference = read_hand_eye(Path(folder) / "reference.json").gripper_from_camera
-    off_mm, _ = apart(calibrate(capture, made).gripper_from_camera, reference)
+    off_mm, _ = apart(calibrate_reconstruction(capture, made).gripper_from_camera, reference)
     Path(facts).write_text(json.dumps([len(made.image_index), off_mm]))
 
 
 def _calibration(images: int) -> tuple[int, int, str]:
     """Return images, observations, and the median processor seconds of their calibration."""
-    from jcr.calibration.stage import calibrate
+    from jcr.calibration.stage import calibrate_reconstruction
     from simulation.faults import faulty_capture, reconstructed
 
     seconds, count = [], 0
@@ -206,6 +206,6 @@ def _calibration(images: int) -> tuple[int, int, str]:
         made = reconstructed(faulty_capture(np.random.default_rng([seed, images]), images), False)
         count = len(made[1].tracks.image)
         begun = time.process_time()
-        calibrate(*made)
+        calibrate_reconstruction(*made)
         seconds.append(time.process_time() - begun)
     return images, count, f"{np.median(seconds):.2f}"

@@ -21,7 +21,7 @@ from benchmarks.cameras import COUNT, answered, wanted
 from benchmarks.faults import IMAGES, OBSERVED, calibrated
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.read import read_capture
 from jcr.estimation.arms import arm_named
 from jcr.geometry import step_between
@@ -138,7 +138,7 @@ def _record(hand_eye: Calibration) -> Record:
 
 def _stored(capture: Path, run: Path) -> Calibration:
     """Calibrate a capture from a stored reconstruction."""
-    return calibrate(read_capture(capture), read_reconstruction(run / "reconstruction.npz"))
+    return calibrate_reconstruction(read_capture(capture), read_reconstruction(run / "reconstruction.npz"))
 
 
 def _cell(kind: Kind) -> Record:
@@ -154,7 +154,9 @@ def _with_sheet(sheet: Sheet) -> Calibration:
     rng = np.random.default_rng([0, IMAGES])
     bare = faulty_capture(rng, IMAGES)
     capture, reconstruction = reconstructed(bare, False)
-    return calibrate(capture, replace(reconstruction, tracks=with_sheet(bare, rng, sheet).tracks))
+    return calibrate_reconstruction(
+        capture, replace(reconstruction, tracks=with_sheet(bare, rng, sheet).tracks)
+    )
 
 
 def _arm(arm: str, preset: Any, count: int) -> Calibration:

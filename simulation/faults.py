@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from jcr.camera import NO_DISTORTION, parameter_names, parameters, project, unproject, with_parameters, zoomed
 from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, camera_with_prior
-from jcr.estimation.pose_equations import fit_known_scale, predict
+from jcr.estimation.pose_equations import fit_known_scale, predicted_gripper_poses
 from jcr.estimation.wrist import adjust_wrist
 from jcr.geometry import inverse, rotation_exp, transform
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
@@ -256,7 +256,7 @@ def reconstructed(found: FaultyCapture, estimated: bool) -> tuple[Capture, Recon
     sfm = adjust_wrist(cameras, start, cameras, free, found.tracks, noise=LOOSE)
     state = sfm.state
     intrinsics, x = sfm.problem.intrinsics(state)[0], state.x[0]
-    rigs = predict(x, state.scale, state.z[0], state.world_from_rig)
+    rigs = predicted_gripper_poses(x, state.scale, state.z[0], state.world_from_rig)
     capture = Capture(
         folder=Path("."),
         images=tuple(f"{k:02d}.png" for k in range(m)),

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation, Slerp
 
-from jcr.capture.images import read_depth, read_image
+from jcr.capture.images import read_depth_images, read_image
 from jcr.extras import extra
 from jcr.geometry import rotation_between_deg, transform
 from jcr.records import Capture
@@ -139,7 +139,9 @@ def _messages(
             continue
         row = round(float(rows[0]))
         if capture.depths is not None and (name := capture.depths[row]) is not None:
-            depth = (1000 * read_depth(capture.folder / name, capture.image_size)).round().astype("<u2")
+            depth = (
+                (1000 * read_depth_images(capture.folder / name, capture.image_size)).round().astype("<u2")
+            )
             message = image_message(at + DEPTH_LATER_NS, "16UC1", depth)
             yield at, "/camera/aligned_depth_to_color/image_raw", message
         # Blurred by the camera's speed, with one grey level of noise in places: no two frames are alike.

@@ -16,7 +16,7 @@ from PIL import Image
 import capture_writers as writers
 from jcr.calibration.difference import read_hand_eye
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.poses import calibrate_poses
+from jcr.calibration.poses import calibrate_pose_pairs
 from jcr.calibration.record import read_calibration, write_calibration
 from jcr.capture.added import read_added
 from jcr.capture.camera_info import read_camera_info
@@ -330,7 +330,7 @@ def sound_run(out: Path) -> Path:
     )
     seconds = {"reconstruct_s": 1.0, "calibrate_s": 0.5}
     attempt = Attempt(backend="colmap", images_registered=RUN_IMAGES, why_not=None, **seconds)
-    content = replace(calibrate_poses(pairs), attempts=(attempt,)).as_json()
+    content = replace(calibrate_pose_pairs(pairs), attempts=(attempt,)).as_json()
     intrinsics = {"fx": 90.0, "fy": 90.0, "cx": 47.5, "cy": 35.5, "distortion": [0.0] * 5}
     intrinsics |= {"width": 96, "height": 72}
     (out / "calibration.json").write_text(json.dumps(content | {"intrinsics": intrinsics}))

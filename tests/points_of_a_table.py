@@ -12,7 +12,7 @@ from jcr.features.matchers import Matcher
 from jcr.features.stage import Matched, match_with_robot
 from jcr.geometry import Transforms, apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics
-from jcr.sfm.model import camera_of
+from jcr.sfm.model import colmap_camera
 
 INTRINSICS = Intrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
 IMAGES, STEP_M, HEIGHT_M = 30, 0.1, 0.5
@@ -65,7 +65,7 @@ class PointsOfATable:
 
 def matcher_of_points(features: PointsOfATable) -> Matcher:
     """Return the matcher of these features."""
-    return Matcher(features, np.ones(2), camera_of(INTRINSICS, True), True, 0)
+    return Matcher(features, np.ones(2), colmap_camera(INTRINSICS, True), True, 0)
 
 
 def matched_pairs_of(features: PointsOfATable, base_from_gripper: Transforms) -> Matched:

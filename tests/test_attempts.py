@@ -106,7 +106,7 @@ def auto_result(
         return reconstruction(options.backend, answer, observations)
 
     monkeypatch.setattr(selection, "reconstruct", answered)
-    choice = selection.choose(capture_of(problem), RunOptions())
+    choice = selection.select_reconstruction(capture_of(problem), RunOptions())
     assert [attempt.backend for attempt in choice.attempts] == tried
     kept = [attempt for attempt in choice.attempts if attempt.why_not is None]
     assert [attempt.backend for attempt in kept] == [choice.reconstruction.backend]
@@ -176,7 +176,7 @@ def test_of_two_that_are_rejected_the_one_that_shows_the_cause_is_kept(
             uncertain, sheared
         ),
     }
-    monkeypatch.setattr(selection, "calibrate", lambda _, made, __: of_backend[made.backend])
+    monkeypatch.setattr(selection, "calibrate_reconstruction", lambda _, made, __: of_backend[made.backend])
     poses = problem.recon_from_camera
     kept, tried = auto_result(problem, {"mast3r": poses, "colmap": poses}, monkeypatch)
     assert tried == ["colmap", "mast3r"] and kept.backend == "mast3r"
@@ -253,10 +253,10 @@ def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
 
     def slow(*arguments: object) -> Calibration:
         now_s[0] += 3.0
-        return calibration_stage.calibrate(*arguments)
+        return calibration_stage.calibrate_reconstruction(*arguments)
 
     monkeypatch.setattr(selection, "reconstruct", door)
-    monkeypatch.setattr(selection, "calibrate", slow)
+    monkeypatch.setattr(selection, "calibrate_reconstruction", slow)
     result = calibrate(capture, tmp_path)
     content = json.loads((tmp_path / "calibration.json").read_text())
     colmap, direct = content["attempts"]
@@ -344,12 +344,12 @@ def test_a_known_length_ends_on_surfaces_and_nothing_else_needs_depth_before_the
     )
     monkeypatch.setattr(selection, "densify", deeper)
     capture = capture_of(problem)
-    choice = selection.choose(capture, RunOptions())
+    choice = selection.select_reconstruction(capture, RunOptions())
     assert not densified and choice.reconstruction.pointmaps is None
     for length, why in (("nowhere.png", "nowhere"), ("00.png", "no surface was found")):
         lost = CalibrateOptions(known_length=(length, 0.0, 0.0, 9.0, 9.0, 50.0))
         with pytest.raises(InputError, match=why):
-            selection.choose(capture, RunOptions(calibrate=lost))
+            selection.select_reconstruction(capture, RunOptions(calibrate=lost))
     assert densified == ["colmap", "colmap"]
 
 

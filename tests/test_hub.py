@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from jcr.errors import InputError
-from jcr.reconstruct import BACKENDS, ReconstructOptions, weights_of
+from jcr.reconstruct import BACKENDS, ReconstructOptions, network_weights
 
 pytestmark = pytest.mark.slow  # processes
 COMMIT = BACKENDS["da3-small"].revision
@@ -177,4 +177,4 @@ def test_a_run_without_weights_names_the_command_and_asks_no_network(monkeypatch
         (ReconstructOptions(backend="mast3r", weights="owner/name.pth"), "give a file, a folder or a hub id"),
     ):
         with pytest.raises(InputError, match=command):
-            weights_of(options)
+            network_weights(options)

@@ -9,7 +9,7 @@ import pytest
 from numpy import ndarray
 
 import jcr
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.images import read_image
 from jcr.findings import FindingKind
 from jcr.geometry import apply_similarity, fit_similarity, rotation_between_deg, step_between
@@ -33,7 +33,7 @@ def test_within_reach_of_the_marker_reference(
     """And the cameras follow the gripper."""
     capture = jcr.read_capture(real_captures / name)
     found = reconstruct_colmap(capture)
-    solved, reference = calibrate(capture, found), reference_of(capture)
+    solved, reference = calibrate_reconstruction(capture, found), reference_of(capture)
     assert solved.converged and solved.inliers.sum() == len(found.image_index) == count
     assert 1e3 * np.linalg.norm(solved.gripper_from_camera[:3, 3] - reference[:3, 3]) < max_mm
     assert rotation_between_deg(solved.gripper_from_camera[:3, :3], reference[:3, :3]) < max_deg
@@ -51,7 +51,7 @@ def test_within_reach_of_the_marker_reference(
 def test_nominal_intrinsics_are_contradicted_by_their_images(real_captures: Path):
     """The reference of this capture was made with them, and belongs to them."""
     capture = jcr.read_capture(real_captures / "franka_tabletop")
-    solved = calibrate(capture, reconstruct_colmap(capture))
+    solved = calibrate_reconstruction(capture, reconstruct_colmap(capture))
     assert solved.converged and any(one.kind is FindingKind.INTRINSICS for one in solved.findings)
     found, given = solved.intrinsics, solved.with_given_intrinsics
     assert found is not None and found.fx == pytest.approx(found.fy, rel=2e-3)
@@ -85,7 +85,7 @@ def test_images_that_are_added_live_have_the_findings_of_a_batch(real_captures: 
     """Thirteen images: "camera moved on the gripper" was reported live, and gone at the sixteenth."""
     whole = jcr.read_capture(real_captures / "ur_snack_table")
     capture = replace(whole, images=whole.images[:13], base_from_gripper=whole.base_from_gripper[:13])
-    batch = calibrate(capture, reconstruct_colmap(capture))
+    batch = calibrate_reconstruction(capture, reconstruct_colmap(capture))
     live = jcr.LiveCalibration(tmp_path / "live", intrinsics=capture.intrinsics)
     for k, (name, pose) in enumerate(zip(capture.images, capture.base_from_gripper, strict=True)):
         live.live.add(read_image(capture.folder / name), pose)

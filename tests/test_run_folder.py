@@ -161,7 +161,7 @@ def test_a_kill_during_the_calibration_does_not_lose_the_reconstruction_of_a_nam
 
     with monkeypatch.context() as patched:
         patched.setattr(selection, "reconstruct", lambda *_: made)
-        patched.setattr(selection, "calibrate", killed)
+        patched.setattr(selection, "calibrate_reconstruction", killed)
         with pytest.raises(KeyboardInterrupt):
             calibrate(str(small_capture), tmp_path / "out", backend="colmap")
     assert (tmp_path / "out" / "reconstruction.npz").is_file()

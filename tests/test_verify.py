@@ -12,7 +12,7 @@ import pytest
 import jcr
 from jcr.calibration.drift import drift
 from jcr.calibration.record import write_calibration
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.images import read_image
 from jcr.cli import dispatch
 from jcr.estimation.absolute_pose import CameraPose
@@ -184,7 +184,7 @@ def out(tmp_path_factory: pytest.TempPathFactory, capture: Capture, reconstructi
         frame["base_from_gripper"] = pose.tolist()
     old = write_capture(folder / "yesterday", capture, noisy, range(OLD))
     (folder / "out").mkdir()
-    hand_eye = calibrate(old, reconstruction)
+    hand_eye = calibrate_reconstruction(old, reconstruction)
     assert hand_eye.converged
     write_calibration(folder / "out/calibration.json", hand_eye)
     begin = begun(folder / "out", jcr.read_capture(old.folder), RunOptions())

@@ -14,7 +14,7 @@ from jcr import Capture, InputError, Reconstruction
 from jcr.geometry import apply, inverse
 from jcr.pointmaps.grid import image_grid, resize_and_crop
 from jcr.pointmaps.posed import PosedPointmaps
-from jcr.reconstruct import Backend, ReconstructOptions, device_of, weights_of
+from jcr.reconstruct import Backend, ReconstructOptions, device_of, network_weights
 
 LONG_EDGE, PATCH = 518, 14
 
@@ -32,7 +32,7 @@ def reconstruct(capture: Capture, options: ReconstructOptions, progress: Any = N
     from jcr.pointmaps.any_view import reconstruct_any_view  # imports torch
 
     return reconstruct_any_view(
-        capture, load, weights_of(options), device_of(options), "mapanything", progress
+        capture, load, network_weights(options), device_of(options), "mapanything", progress
     )
 
 

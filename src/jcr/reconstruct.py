@@ -52,7 +52,7 @@ def _lazy(function: str, *arguments: str) -> Callable[..., Reconstruction]:
     ) -> Reconstruction:
         if "device" in arguments:
             extra("torch", "networks", f"--backend {options.backend}")
-        chosen = {"weights": weights_of, "device": device_of}
+        chosen = {"weights": network_weights, "device": device_of}
         values = [chosen[a](options) if a in chosen else getattr(options, a) for a in arguments]
         return resolve_name(function)(capture, *values, progress)
 
@@ -409,7 +409,7 @@ def with_cameras_of(capture: Capture, options: ReconstructOptions) -> Reconstruc
     return replace(options, cameras=capture.cameras.resolve()) if free else options
 
 
-def weights_of(options: ReconstructOptions) -> Weights:
+def network_weights(options: ReconstructOptions) -> Weights:
     """Return the weights of the network that `options` names: a path, or the pinned commit in the cache.
 
     Nothing is downloaded. Raises InputError, with the command that gets them, where they are not on this machine.

@@ -8,7 +8,7 @@ import pytest
 
 from jcr.boards import corners
 from jcr.boards.detection import Board, Sighting, boards, is_of_unknown_size, side_of
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import project
 from jcr.findings import FindingKind, sentence
 from jcr.geometry import apply, inverse, rotation_exp, transform
@@ -70,7 +70,7 @@ def test_a_board_that_was_moved_is_used_where_most_images_show_it_and_the_others
     capture, made, _ = with_board(monkeypatch, [0] * 6 + [1] * 3)
     boards = made.tracks.boards
     assert boards is not None and boards.elsewhere == (6, 7, 8)
-    hand_eye = calibrate(capture, made)
+    hand_eye = calibrate_reconstruction(capture, made)
     (named,) = (one for one in hand_eye.findings if one.kind is FindingKind.BOARD_MOVED)
     assert named.images == ("06.png", "07.png", "08.png") and "it was moved, or there are two" in sentence(
         named
@@ -81,15 +81,15 @@ def test_a_board_that_was_moved_is_used_where_most_images_show_it_and_the_others
 
 def test_a_board_that_no_image_shows_is_named_and_features_alone_are_used(monkeypatch: pytest.MonkeyPatch):
     capture, made, found = with_board(monkeypatch, [-1] * 8)
-    hand_eye = calibrate(capture, made)
-    alone = calibrate(*reconstructed(found, estimated=False))
+    hand_eye = calibrate_reconstruction(capture, made)
+    alone = calibrate_reconstruction(*reconstructed(found, estimated=False))
     assert np.array_equal(hand_eye.gripper_from_camera, alone.gripper_from_camera)
     (named,) = (one for one in hand_eye.findings if one.kind is FindingKind.BOARD_NOT_FOUND)
     assert named.severity == "warns" and SPEC in sentence(named)
     boards = made.tracks.boards
     assert boards is not None
     proposed = replace(made.tracks, boards=replace(boards, proposed="aruco:SIDE:X"))
-    warnings = calibrate(capture, replace(made, tracks=proposed)).warnings
+    warnings = calibrate_reconstruction(capture, replace(made, tracks=proposed)).warnings
     assert any("seem to show aruco:SIDE:X" in text for text in warnings)
 
 

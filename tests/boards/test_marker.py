@@ -11,7 +11,7 @@ import pytest
 
 from jcr.boards.detection import boards
 from jcr.boards.marker import reconstruct_marker
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import unproject
 from jcr.capture.read import read_capture
 from jcr.cli import dispatch
@@ -140,7 +140,7 @@ def test_calibrates_from_every_kind_of_board(tmp_path, spec):
     capture, gripper_from_camera = capture_of(tmp_path / "capture", BOARDS[spec])
     reconstruction = reconstruct_marker(capture, spec)
     assert len(reconstruction.image_index) == len(capture)
-    hand_eye = calibrate(capture, reconstruction)
+    hand_eye = calibrate_reconstruction(capture, reconstruction)
     found = hand_eye.gripper_from_camera
     mm = 1e3 * np.linalg.norm(found[:3, 3] - gripper_from_camera[:3, 3])
     deg = rotation_between_deg(found[:3, :3], gripper_from_camera[:3, :3])
@@ -161,7 +161,7 @@ def test_other_readings_of_a_charuco_board_are_tried_and_named(tmp_path, spec, l
     )
     reconstruction = reconstruct_marker(capture, spec)
     assert any(read_as in note for note in reconstruction.notes)
-    found = calibrate(capture, reconstruction).gripper_from_camera
+    found = calibrate_reconstruction(capture, reconstruction).gripper_from_camera
     assert np.linalg.norm(found - gripper_from_camera) < 0.01
 
 
@@ -193,7 +193,7 @@ def test_lines_that_a_detector_drew_over_a_board_are_no_hindrance(tmp_path):
         assert detector.detectMarkers(image)[1] is None or len(detector.detectMarkers(image)[1]) < len(ids)
         cv2.imwrite(str(capture.folder / name), image)
     spec = "charuco:7x6:0.030:0.022:DICT_4X4_50"
-    hand_eye = calibrate(capture, reconstruct_marker(capture, spec))
+    hand_eye = calibrate_reconstruction(capture, reconstruct_marker(capture, spec))
     found = hand_eye.gripper_from_camera
     assert 1e3 * np.linalg.norm(found[:3, 3] - gripper_from_camera[:3, 3]) < 3.0
 
@@ -243,7 +243,7 @@ DATA = SHARED / "data"
 )
 def test_real_boards_reproduce_their_references(name, spec, limit_mm, limit_deg, accepted):
     capture = read_capture(DATA / name)
-    hand_eye = calibrate(capture, reconstruct_marker(capture, spec))
+    hand_eye = calibrate_reconstruction(capture, reconstruct_marker(capture, spec))
     reference = json.loads((DATA / name / "reference.json").read_text())
     true = np.array(reference["gripper_from_camera"])
     found = hand_eye.gripper_from_camera
@@ -256,5 +256,5 @@ def test_an_unknown_intrinsics_comes_from_the_board(tmp_path):
     capture, gripper_from_camera = capture_of(tmp_path / "capture", charuco, known_intrinsics=False)
     reconstruction = reconstruct_marker(capture, "charuco:7x6:0.030:0.022:DICT_4X4_50")
     assert abs(reconstruction.intrinsics.fx / INTRINSICS.fx - 1) < 0.01
-    hand_eye = calibrate(capture, reconstruction)
+    hand_eye = calibrate_reconstruction(capture, reconstruction)
     assert np.linalg.norm(hand_eye.gripper_from_camera - gripper_from_camera) < 0.01

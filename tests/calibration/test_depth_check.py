@@ -13,7 +13,7 @@ from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration, validated
 from jcr.calibration.words import details
 from jcr.camera import rays
-from jcr.capture.images import encode_png, read_depth
+from jcr.capture.images import encode_png, read_depth_images
 from jcr.capture.read import read_capture
 from jcr.depth.measured import with_measured_depth
 from jcr.errors import InputError
@@ -195,7 +195,7 @@ def test_depth_images_of_a_capture_are_found_and_faults_named(tmp_path: Path):
 
     capture = read_capture(written())
     assert capture.depths == ("depth/0.png", "depth/1.png", "depth/2.png", None)
-    assert read_depth(folder / "depth/2.png", (30, 20))[5, 5] == pytest.approx(0.702)
+    assert read_depth_images(folder / "depth/2.png", (30, 20))[5, 5] == pytest.approx(0.702)
     left = read_capture(written(depth=5))
     assert left.images == tuple(f"images/{k}.png" for k in (1, 2, 3))
     assert any("frame 0" in note and "depth: Input should be a valid string" in note for note in left.notes)
@@ -203,9 +203,9 @@ def test_depth_images_of_a_capture_are_found_and_faults_named(tmp_path: Path):
         with pytest.raises(InputError, match=said):
             read_capture(written(depth=wrong))
     with pytest.raises(InputError, match="16 bits"):
-        read_depth(folder / "images/0.png", (30, 20))
+        read_depth_images(folder / "images/0.png", (30, 20))
     with pytest.raises(InputError, match="align depth"):
-        read_depth(folder / "depth/0.png", (60, 40))
+        read_depth_images(folder / "depth/0.png", (60, 40))
     (folder / "capture.json").unlink()
     rows = "\n".join(",".join([f"{k}.png", *map(str, [0.1 * k, 0, 0.3, 0, 0.1 * k, 0])]) for k in range(4))
     (folder / "poses.csv").write_text("image,x,y,z,roll,pitch,yaw\n" + rows + "\n")

@@ -14,8 +14,8 @@ from jcr.calibration.adjust import adjust_case
 from jcr.calibration.case import Case
 from jcr.calibration.checks import effects
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.poses import calibrate_poses
-from jcr.calibration.stage import calibrate
+from jcr.calibration.poses import calibrate_pose_pairs
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import project, unproject
 from jcr.cell.carried import eye_to_hand, refined
 from jcr.estimation.arms import RobotName, arm_named
@@ -169,7 +169,7 @@ def test_an_effect_that_moves_the_calibration_by_all_points_too_little_is_not_re
     A calibration of those points moves by two standard deviations with them, that of all points by 0.1.
     """
     capture = jcr.read_capture(attacks / "scale_32")
-    assert not calibrate(capture, reconstruct_colmap(capture)).warnings
+    assert not calibrate_reconstruction(capture, reconstruct_colmap(capture)).warnings
 
 
 @pytest.mark.parametrize(("arm", "preset"), [("ur5e", "typical"), ("panda", "low-cost")])
@@ -189,7 +189,9 @@ def test_joint_offsets_and_link_errors_are_not_named_as_a_bent_robot(arm: RobotN
         tracks=observed(problem, np.random.default_rng(2), 300, 0.4),
         backend="simulated",
     )
-    assert not kinds_of("strain") & {one.kind for one in calibrate(capture, reconstruction).findings}
+    assert not kinds_of("strain") & {
+        one.kind for one in calibrate_reconstruction(capture, reconstruction).findings
+    }
 
 
 def test_a_thin_prism_becomes_part_of_the_intrinsics():
@@ -247,7 +249,9 @@ def test_the_parts_of_the_uncertainty_of_a_fixed_camera_are_the_whole_with_its_f
     seen, reconstruction = reconstructed(found, estimated=False)
     capture = replace(seen, base_from_gripper=inverse(seen.base_from_gripper), mount="base")
     assert np.allclose(eye_to_hand(capture).base_from_gripper, seen.base_from_gripper)
-    hand_eye = refined(capture, reconstruction, calibrate(eye_to_hand(capture), reconstruction))
+    hand_eye = refined(
+        capture, reconstruction, calibrate_reconstruction(eye_to_hand(capture), reconstruction)
+    )
     assert hand_eye.converged and hand_eye.uncertainty.budget is not None
     parts = np.sum(list(vars(hand_eye.uncertainty.budget).values()), axis=0)
     assert np.allclose(parts, hand_eye.covariance, rtol=0, atol=1e-9)
@@ -270,7 +274,7 @@ def test_a_change_of_the_tool_in_translation_alone_is_named_in_few_images_howeve
         recon_from_camera=problem.recon_from_camera,
         is_metric=False,
     )
-    found = next(one for one in calibrate_poses(pairs).findings if one.kind is FindingKind.SLIP)
+    found = next(one for one in calibrate_pose_pairs(pairs).findings if one.kind is FindingKind.SLIP)
     assert found.images == ("d", "e")
     assert found.value == pytest.approx(1e-3 * mm, abs=1e-3)
 
@@ -278,12 +282,12 @@ def test_a_change_of_the_tool_in_translation_alone_is_named_in_few_images_howeve
 def test_positions_that_are_all_too_long_are_said_to_be_beyond_what_images_show_and_a_known_length_contradicts_them():
     found = faulty_capture(np.random.default_rng(5), 12, Faults(pose_scale=1.05))
     capture, reconstruction = reconstructed(found, False)
-    unknown = calibrate(capture, reconstruction)
+    unknown = calibrate_reconstruction(capture, reconstruction)
     assert unknown.converged and not unknown.warnings
     file = unknown
     (alone,) = (sentence(one) for one in file.findings if one.kind is FindingKind.SCALE_FROM_ROBOT)
     assert alone in file.notes
     # Simulated observations are metric as the scene is; the robot's positions are not.
-    metric = calibrate(capture, replace(reconstruction, is_metric=True, metric_std=0.002))
+    metric = calibrate_reconstruction(capture, replace(reconstruction, is_metric=True, metric_std=0.002))
     assert "4.8 ± 0.15 %" in metric.warnings[0] and "larger than given" in metric.warnings[0]
     assert alone not in metric.notes

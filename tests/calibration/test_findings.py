@@ -9,9 +9,9 @@ import pytest
 
 from jcr.calibration.case import with_findings
 from jcr.calibration.hand_eye import solve_hand_eye
-from jcr.calibration.poses import calibrate_poses
+from jcr.calibration.poses import calibrate_pose_pairs
 from jcr.calibration.record import Calibration, read_calibration
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.calibration.words import summary
 from jcr.errors import InputError
 from jcr.findings import Finding, FindingKind, remedy, sentence, text
@@ -105,7 +105,7 @@ def test_what_a_cause_explains_is_not_another_fault():
         recon_from_camera=problem.recon_from_camera,
         is_metric=False,
     )
-    content = calibrate_poses(pairs)
+    content = calibrate_pose_pairs(pairs)
     assert content.findings[0].kind is FindingKind.POSE_CONVENTION and FindingKind.UNCERTAIN in {
         one.kind for one in content.findings
     }
@@ -144,11 +144,11 @@ def test_motions_are_not_the_cause_where_images_are_missing(tilt_deg: float):
         base_from_gripper=gripper,
         image_size=(640, 480),
     )
-    found = calibrate(capture, made)
+    found = calibrate_reconstruction(capture, made)
     assert [one.kind for one in found.findings[:2]] == [FindingKind.FEW_USED, FindingKind.UNOBSERVABLE]
     assert found.findings[0].concerns == "reconstruction" and found.observability.advice == ("",)
     alone = replace(capture, images=capture.images[:5], base_from_gripper=gripper[:5])
-    found = calibrate(alone, made)
+    found = calibrate_reconstruction(alone, made)
     assert (
         found.findings[0].kind is FindingKind.UNOBSERVABLE
         and "tilt the wrist" in found.observability.advice[0]
@@ -165,7 +165,7 @@ def test_findings_are_in_the_file_and_come_back(tmp_path: Path):
         recon_from_camera=problem.recon_from_camera,
         is_metric=False,
     )
-    hand_eye = calibrate_poses(pairs).with_findings(*(example(kind) for kind in FindingKind))
+    hand_eye = calibrate_pose_pairs(pairs).with_findings(*(example(kind) for kind in FindingKind))
     hand_eye = with_findings(
         hand_eye, (replace(example(FindingKind.SLIP), concerns="mount", shift=(1e-3,) * 7),)
     )

@@ -9,7 +9,7 @@ import pytest
 
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.records import Capture, Intrinsics, Reconstruction
 from simulation.problems import INTRINSICS, HandEyeProblem, error, hand_eye_problem, observed
 
@@ -44,7 +44,7 @@ def calibrated(
     seed: int, images: int, intrinsics: Intrinsics | None, options: CalibrateOptions | None = None, **motion
 ) -> tuple[HandEyeProblem, Calibration]:
     problem, capture, reconstruction = pictured(seed, images, intrinsics, **motion)
-    return problem, calibrate(capture, reconstruction, options)
+    return problem, calibrate_reconstruction(capture, reconstruction, options)
 
 
 def scaled(factor: float) -> Intrinsics:
@@ -88,7 +88,7 @@ def test_more_views_are_not_promised_to_make_up_for_a_wrong_intrinsics() -> None
     offset, promised, reported = [], [], []
     for intrinsics in (INTRINSICS, scaled(1.03), scaled(1.2)):
         _, capture, reconstruction = pictured(0, 5, intrinsics)
-        hand_eye = calibrate(capture, reconstruction, CalibrateOptions(next_poses=2))
+        hand_eye = calibrate_reconstruction(capture, reconstruction, CalibrateOptions(next_poses=2))
         content = hand_eye
         offset.append(hand_eye.gripper_from_camera[:3, 3])
         promised.append(np.linalg.norm(content.next_poses[-1].expected_std[:3]))

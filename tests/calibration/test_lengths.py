@@ -9,7 +9,7 @@ from jcr.calibration import stage
 from jcr.calibration.checks import lengths
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.findings import Finding, FindingKind, sentence
 from jcr.geometry import step_between
 from jcr.records import DepthCheck
@@ -27,7 +27,7 @@ def calibrated(
     bare = faulty_capture(rng, 12, Faults(pose_scale=pose_scale))
     found = bare if sheet is None else with_sheet(bare, rng, sheet)
     capture, reconstruction = reconstructed(bare, estimated=False)
-    hand_eye = calibrate(capture, replace(reconstruction, tracks=found.tracks), options)
+    hand_eye = calibrate_reconstruction(capture, replace(reconstruction, tracks=found.tracks), options)
     return hand_eye, found.gripper_from_camera
 
 

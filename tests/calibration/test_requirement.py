@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jcr.calibration.options import GRASPING, CalibrateOptions
-from jcr.calibration.poses import calibrate_poses
+from jcr.calibration.poses import calibrate_pose_pairs
 from jcr.calibration.record import Calibration, validated, write_calibration
 from jcr.calibration.requirement import advised, assumptions_of_poses
 from jcr.calibration.robot_errors import errors_of
@@ -58,11 +58,11 @@ def test_95_percent_of_errors_are_below_the_length(spread: tuple[float, float, f
 
 def test_what_is_reached_is_of_a_point_seen_or_of_the_camera():
     given, x = pairs(12, 12)
-    at_point = calibrate_poses(given)
+    at_point = calibrate_pose_pairs(given)
     required = at_point.requirement
     assert required is not None and (required.translation_mm, required.rotation_deg) == GRASPING
     assert not required.asked and required.at == "seen" and 300 < required.distance_mm < 1000
-    at_camera = calibrate_poses(given, CalibrateOptions(require_at="camera")).requirement
+    at_camera = calibrate_pose_pairs(given, CalibrateOptions(require_at="camera")).requirement
     assert at_camera is not None and at_camera.at == "camera" and at_camera.distance_mm == 0
     # Draws of transform and scale move the point on the optical axis by as much.
     steps = np.random.default_rng(0).multivariate_normal(np.zeros(7), at_point.covariance, 20_000)
@@ -97,13 +97,13 @@ def test_the_poses_that_are_proposed_reach_what_they_promise():
     for seed in range(12, 17):
         rng = np.random.default_rng(seed)
         problem = hand_eye_problem(rng, 12, robot_noise=NOISE)
-        now = calibrate_poses(with_poses(problem, np.zeros((0, 4, 4)), rng)).requirement
+        now = calibrate_pose_pairs(with_poses(problem, np.zeros((0, 4, 4)), rng)).requirement
         assert now is not None
         asked = CalibrateOptions(require=(0.75 * now.reached_mm, 10.0))
-        hand_eye = calibrate_poses(with_poses(problem, np.zeros((0, 4, 4)), rng), asked)
+        hand_eye = calibrate_pose_pairs(with_poses(problem, np.zeros((0, 4, 4)), rng), asked)
         assert hand_eye.requirement is not None and hand_eye.requirement.more_images
         added = np.stack([pose.base_from_gripper for pose in hand_eye.next_poses])
-        then = calibrate_poses(with_poses(problem, added, rng), asked).requirement
+        then = calibrate_pose_pairs(with_poses(problem, added, rng), asked).requirement
         assert then is not None
         ratios.append(then.reached_mm / then.translation_mm)
     assert np.median(ratios) < 1.15
@@ -111,10 +111,10 @@ def test_the_poses_that_are_proposed_reach_what_they_promise():
 
 def test_the_images_that_are_missing_are_counted_and_proposed():
     given, _ = pairs(12, 12)
-    reached = calibrate_poses(given).requirement
+    reached = calibrate_pose_pairs(given).requirement
     assert reached is not None and reached.met and reached.more_images == 0
     asked = CalibrateOptions(require=(0.75 * reached.reached_mm, 10.0))
-    hand_eye = calibrate_poses(given, asked)
+    hand_eye = calibrate_pose_pairs(given, asked)
     required = hand_eye.requirement
     assert required is not None and not required.met and required.more_images
     assert len(hand_eye.next_poses) == max(2, required.more_images)
@@ -139,7 +139,7 @@ def test_a_scale_that_was_known_is_not_promised_again():
         is_metric=True,
     )
     asked = CalibrateOptions(next_poses=2)
-    known = calibrate_poses(given, asked)
+    known = calibrate_pose_pairs(given, asked)
     gripper = given.base_from_gripper
     assumptions = assumptions_of_poses(known, gripper)
     free = advised(known, gripper, asked, errors_of(gripper), assumptions)
@@ -151,7 +151,7 @@ def test_a_scale_that_was_known_is_not_promised_again():
 def test_the_command_ends_with_3_where_what_was_asked_is_not_reached(capsys: pytest.CaptureFixture[str]):
     given, _ = pairs(12, 12)
     for asked in (None, (0.5, 0.1)):
-        hand_eye = calibrate_poses(given, CalibrateOptions(require=asked))
+        hand_eye = calibrate_pose_pairs(given, CalibrateOptions(require=asked))
         result = RunResult("out", calibration=hand_eye)
         show_calibration(result, VerboseOutput())
         status = show(result, VerboseOutput())
@@ -179,7 +179,7 @@ def test_one_notion_of_accepted_in_python_notebook_and_compare(
     given, _ = pairs(12, 12)
     verdicts = {None: "accepted", (5.0, 1.0): "accepted", (0.5, 0.1): "rejected"}
     for k, (asked, verdict) in enumerate(verdicts.items()):
-        hand_eye = calibrate_poses(given, CalibrateOptions(require=asked))
+        hand_eye = calibrate_pose_pairs(given, CalibrateOptions(require=asked))
         assert hand_eye.verdict == verdict and hand_eye.is_sound
         content = hand_eye
         assert f"gripper_from_camera, {verdict}" in content.as_html()
@@ -187,7 +187,7 @@ def test_one_notion_of_accepted_in_python_notebook_and_compare(
     # By default it is a wish: it warns, in the notebook too.
     gripper, camera = _first(given, 4)
     few = replace(given, images=given.images[:4], base_from_gripper=gripper, recon_from_camera=camera)
-    poor = calibrate_poses(few)
+    poor = calibrate_pose_pairs(few)
     assert poor.verdict == "accepted with warnings"
     table = poor.as_html()
     assert "accepted with warnings: " in table and "not as exact as needed" in table
@@ -221,7 +221,7 @@ def _first(given: PosePairs, count: int) -> tuple[np.ndarray, np.ndarray]:
 def test_options_that_cannot_be_are_refused_before_any_work(
     options: CalibrateOptions, message: str, tabletop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("jcr.pipeline.stages.choose", lambda *_: pytest.fail("images were reconstructed"))
+    monkeypatch.setattr("jcr.pipeline.stages.select_reconstruction", lambda *_: pytest.fail("images were reconstructed"))
     with pytest.raises(InputError, match=message):
         run.calibrate(read_capture(tabletop), tmp_path / "out", RunOptions(calibrate=options))
     assert not (tmp_path / "out").exists()

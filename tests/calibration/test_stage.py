@@ -7,7 +7,7 @@ import numpy as np
 
 from jcr.calibration.checks.capture import REPETITIVE, share_of_twins
 from jcr.calibration.hand_eye import solve_hand_eye
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.images import read_image
 from jcr.geometry import retract, step_between
 from places import ROOT
@@ -22,7 +22,10 @@ def test_the_adjustment_replaces_a_rejected_fit_from_poses():
     errors = rng.normal(size=(12, 6)) * np.repeat([0.04, np.radians(5.0)], 3)
     found = replace(reconstruction, recon_from_camera=retract(reconstruction.recon_from_camera, errors))
     assert not solve_hand_eye(capture.base_from_gripper, found.recon_from_camera).converged
-    calibrated, right = calibrate(capture, found), calibrate(capture, reconstruction)
+    calibrated, right = (
+        calibrate_reconstruction(capture, found),
+        calibrate_reconstruction(capture, reconstruction),
+    )
     assert calibrated.converged and calibrated.inliers.all()
     step = step_between(right.gripper_from_camera, calibrated.gripper_from_camera)
     assert (np.abs(step) < 0.1 * np.sqrt(np.diag(right.covariance)[:6])).all()

@@ -10,7 +10,7 @@ import pytest
 
 import capture_writers as writers
 import jcr
-from jcr.capture.images import encode_png, read_depth, read_image
+from jcr.capture.images import encode_png, read_depth_images, read_image
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import NEVER, pose_track
 from jcr.capture.recording import Recording, best_frames, capture_of_recording
@@ -76,7 +76,7 @@ def test_depth_that_is_aligned_comes_with_the_frames(tmp_path: Path, capture: Ca
     assert got.depths is not None and all(got.depths)
     _, _, view = nearest_view(got.base_from_gripper, few)
     for name, k in zip(got.depths, view, strict=True):
-        depth = read_depth(got.folder / str(name), got.image_size)
+        depth = read_depth_images(got.folder / str(name), got.image_size)
         assert depth[0, -1] == pytest.approx((500 + k) / 1000) and (depth == 0).sum() == 10 * k * height
     assert jcr.read_capture(tmp_path / "frames").depths == got.depths
 

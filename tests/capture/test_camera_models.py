@@ -10,7 +10,7 @@ from pydantic import TypeAdapter
 import jcr
 from jcr.capture import camera_info
 from jcr.capture.formats import colmap
-from jcr.capture.plain_files import validated
+from jcr.capture.plain_files import validated_content
 from jcr.export import ros
 from jcr.records import Intrinsics
 from jcr.records.capture_json import IntrinsicsEntry
@@ -44,10 +44,10 @@ def test_intrinsics_survive_capture_json_camera_info_and_calibration_json(
 def test_intrinsics_survive_colmap(intrinsics: Intrinsics, tmp_path: Path):
     import pycolmap
 
-    from jcr.sfm.model import camera_of
+    from jcr.sfm.model import colmap_camera
 
     model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(camera_of(intrinsics, known=True))
+    model.add_camera_with_trivial_rig(colmap_camera(intrinsics, known=True))
     image = pycolmap.Image(name="0.png", camera_id=1, image_id=1)
     image.frame_id = 1
     model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
@@ -79,7 +79,9 @@ def test_a_capture_names_the_models_that_there_are():
     with pytest.raises(
         jcr.InputError, match="model: Input should be 'pinhole', 'rational', 'thin_prism' or 'fisheye'"
     ):
-        validated(entry, intrinsics | {"model": "omni"}, "capture.json")
-    fisheye = validated(entry, intrinsics | {"model": "fisheye", "distortion": [0.0] * 5}, "capture.json")
+        validated_content(entry, intrinsics | {"model": "omni"}, "capture.json")
+    fisheye = validated_content(
+        entry, intrinsics | {"model": "fisheye", "distortion": [0.0] * 5}, "capture.json"
+    )
     with pytest.raises(jcr.InputError, match="5 numbers, not the 4 of a fisheye model, k1,k2,k3,k4"):
         fisheye.record(SIZE, "capture.json")

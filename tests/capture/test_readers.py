@@ -85,7 +85,7 @@ def test_cameras_that_were_given_read_back_with_their_capture(
     assert format_of(path) == "colmap"
     got = jcr.read_capture(path)
     assert_same(got, capture)
-    _, cameras = colmap.read_cameras(got.cameras)
+    _, cameras = colmap.read_registered_cameras(got.cameras)
     assert np.allclose(cameras, problem.recon_from_camera, atol=1e-9)
     assert_same_calibration(got.base_from_gripper, cameras, problem)
     table = (path / "poses.csv").rename(path / "rows.csv")

@@ -13,9 +13,9 @@ from benchmarks.cameras import answered, cell_of, wanted
 from jcr.calibration.checks.camera import CameraAdjustment
 from jcr.calibration.checks.effects import effects
 from jcr.calibration.record import Calibration
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.formats.capture_json import read, write
-from jcr.cell.added import camera_of, read_added_cameras
+from jcr.cell.added import added_camera, read_added_cameras
 from jcr.cell.carried import eye_to_hand, refined
 from jcr.cell.images import CellImages
 from jcr.cell.placement import CameraPlacement, CellPlacement, read_cameras, write_cameras
@@ -83,7 +83,7 @@ def calibrated(tabletop: Path) -> tuple[Capture, Reconstruction, Calibration]:
         backend="test",
     )
     old = capture.of_rows(range(OLD))
-    return old, reconstruction, calibrate(old, reconstruction)
+    return old, reconstruction, calibrate_reconstruction(old, reconstruction)
 
 
 def placed(calibrated: tuple[Capture, Reconstruction, Calibration], *cameras: CellCamera) -> CellPlacement:
@@ -104,7 +104,7 @@ def fixed(capture: Capture, *images: str, known: bool = True) -> CellCamera:
 @pytest.mark.parametrize("known", [True, False])
 def test_an_image_of_the_scene_places_a_fixed_camera(tabletop: Path, calibrated, known: bool, tmp_path: Path):
     truth, own = read_truth(tabletop), calibrated[0].camera_name
-    added = camera_of("camera", [tabletop / truth.images[10]], None, (own,), tmp_path)
+    added = added_camera("camera", [tabletop / truth.images[10]], None, (own,), tmp_path)
     (camera,) = placed(calibrated, replace(added, intrinsics=truth.intrinsics if known else None)).cameras
     assert camera.converged and camera.parent_from_camera is not None and camera.covariance is not None
     error = step_between(camera.parent_from_camera, truth.base_from_camera[10])
@@ -122,7 +122,7 @@ def test_a_fixed_camera_is_calibrated_by_what_the_gripper_carries(tabletop: Path
     )
     seen = eye_to_hand(carried, tmp_path)
     made = reconstruct_colmap(seen)
-    found = refined(carried, made, calibrate(seen, made))
+    found = refined(carried, made, calibrate_reconstruction(seen, made))
     error = step_between(found.base_from_camera, read_truth(tabletop).gripper_from_camera)
     assert found.converged and len(made.image_index) == len(capture)
     assert error @ np.linalg.solve(found.covariance[:6, :6], error) < 16.8

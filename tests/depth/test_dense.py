@@ -168,7 +168,7 @@ def test_depth_is_found_and_reasons_and_sigmas_are_honest(scene: Scene, dense: P
 
 def test_only_a_confirmed_depth_sees_through_a_point() -> None:
     """A wall at 1 m before four cameras side by side; the last one found 2 m, by chance or because it is so."""
-    from jcr.depth.consistency import agreement, evidence
+    from jcr.depth.consistency import agreement, inverse_depth_evidence
     from jcr.depth.matched import grid, relative
 
     poses = transform(np.eye(3), np.array([[x, 0.0, 0.0] for x in (0.0, 0.02, -0.02, 0.01)]))
@@ -178,7 +178,7 @@ def test_only_a_confirmed_depth_sees_through_a_point() -> None:
     chance = known & (np.arange(4) != 3)[:, None, None]
     view = relative(0, np.arange(1, 4), poses, PINHOLE)
     for confirmed, seeing in ((chance, 0), (known, 1)):
-        compared = evidence(inverse_depth, known, confirmed)
+        compared = inverse_depth_evidence(inverse_depth, known, confirmed)
         mean, count, through, information = agreement(0, compared, *view, grid(PINHOLE), PINHOLE.width, 0.01)
         middle = np.s_[10:-10, 10:-10]
         assert (count[middle] == 2).all() and (through[middle] == seeing).all()

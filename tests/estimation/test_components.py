@@ -8,7 +8,7 @@ from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.estimation.arms import arm_named
 from jcr.estimation.hypotheses import joint_offsets
 from jcr.estimation.inverse_kinematics import posed
-from jcr.estimation.pose_equations import Region, pose_equations, residuals
+from jcr.estimation.pose_equations import Region, pose_equations, pose_residuals
 from jcr.estimation.problem import pose_problem
 from jcr.estimation.robot_noise import Equations, arm_errors, most_likely, smooth_errors
 from jcr.estimation.robust import robust_fit
@@ -74,7 +74,7 @@ def test_constant_errors_of_base_and_gripper_are_part_of_the_answer():
         @ retract(np.eye(4), 1e-5 * rng.normal(size=6))
     )
     constant = step_between(gripper, moved).reshape(-1, 1)
-    _, jacobian = residuals(
+    _, jacobian = pose_residuals(
         problem.gripper_from_camera, 1.0, np.eye(4), gripper, gripper @ problem.gripper_from_camera
     )
     left = Region.of_unknowns(np.delete(jacobian.reshape(-1, 13), 6, axis=1), 13).left(constant @ constant.T)

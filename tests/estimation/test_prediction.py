@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.coverage import FACTOR, predicted
-from jcr.calibration.poses import calibrate_poses
+from jcr.calibration.poses import calibrate_pose_pairs
 from jcr.calibration.record import read_calibration
 from jcr.calibration.requirement import Proposals
 from jcr.calibration.robot_errors import errors_of
@@ -99,7 +99,7 @@ def test_a_robot_that_is_found_worse_than_assumed_is_not_promised_away():
         recon_from_camera=problem.recon_from_camera,
         is_metric=False,
     )
-    found = calibrate_poses(pairs)
+    found = calibrate_pose_pairs(pairs)
     assert not found.converged
     promised = found.next_poses[-1].expected_std
     _, proposed = expected_with(problem, noise, 2)

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 import jcr
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.estimation.closed_form import closed_form
-from jcr.estimation.pose_equations import PRIOR_STD, residuals, residuals_by_camera
+from jcr.estimation.pose_equations import PRIOR_STD, pose_residuals, residuals_by_camera
 from jcr.estimation.robot_noise import Equations, left_out, smooth_errors, solve_equations
 from jcr.findings import FindingKind
 from jcr.geometry import inverse, retract, rotation_exp, scale_translation, transform
@@ -98,7 +98,7 @@ def test_the_95_percent_ellipsoid_covers_95_percent(given):
         for k, part in enumerate((slice(0, 7), slice(0, 6))):
             squared = errors[part] @ np.linalg.solve(solved.covariance[part, part], errors[part])
             inside[k] += squared < chi2.ppf(0.95, part.stop)
-        _, jacobian = residuals(
+        _, jacobian = pose_residuals(
             solved.gripper_from_camera,
             solved.scale,
             solved.base_from_recon.rigid,
@@ -139,12 +139,15 @@ def test_the_equations_jacobians_match_finite_differences():
 
     def by_unknowns(step):
         unknowns = retract(x, step[:6]), scale * np.exp(step[6]), retract(z, step[7:])
-        return residuals(*unknowns, gripper, camera)[0]
+        return pose_residuals(*unknowns, gripper, camera)[0]
 
     def by_cameras(step):
-        return residuals(x, scale, z, gripper, retract(camera, step))[0]
+        return pose_residuals(x, scale, z, gripper, retract(camera, step))[0]
 
-    jacobian, of_camera = residuals(x, scale, z, gripper, camera)[1], residuals_by_camera(x, scale, z, camera)
+    jacobian, of_camera = (
+        pose_residuals(x, scale, z, gripper, camera)[1],
+        residuals_by_camera(x, scale, z, camera),
+    )
     for analytic, function in ((jacobian, by_unknowns), (of_camera, by_cameras)):
         for k, step in enumerate(1e-6 * np.eye(analytic.shape[2])):
             numeric = (function(step) - function(-step)) / 2e-6
@@ -158,7 +161,7 @@ def test_leave_one_out_error_is_that_of_a_fit_without_the_image():
     gripper, camera = problem.base_from_gripper, problem.recon_from_camera
     full = solve_hand_eye(gripper, camera)
     unknowns = full.gripper_from_camera, full.scale, full.base_from_recon.rigid
-    residual, jacobian = (of.reshape(48, -1) for of in residuals(*unknowns, gripper, camera))
+    residual, jacobian = (of.reshape(48, -1) for of in pose_residuals(*unknowns, gripper, camera))
     prior = np.diag(np.r_[PRIOR_STD**-2.0, np.zeros(6)])
     alike, sizes = smooth_errors(gripper), np.log([4e-4, 2e-3, 2e-3])
 

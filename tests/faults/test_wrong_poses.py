@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jcr
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.findings import FindingKind, kinds_of, without_consequences
 from jcr.geometry import inverse, rotation_exp, transform
 from jcr.pipeline.check import check_capture
@@ -81,7 +81,7 @@ def with_poses(capture: Capture, poses: np.ndarray) -> Capture:
 
 def first_kinds(capture: Capture, reconstruction: Reconstruction) -> tuple[list[FindingKind], str]:
     """Return the kinds of what is said of a rejected calibration, and its reason."""
-    found = calibrate(capture, reconstruction)
+    found = calibrate_reconstruction(capture, reconstruction)
     said = [one.kind for one in without_consequences(found.findings) if one.severity != "informs"]
     assert not found.converged and not CONSEQUENCES & {one.kind for one in found.findings}
     assert found.doubt is not None
@@ -143,6 +143,6 @@ def test_a_reconstruction_in_pieces_leads(faultless: tuple[Capture, Reconstructi
     camera = made.recon_from_camera.copy()
     camera[astray] = away @ camera[astray]
     nothing = made.tracks.only(np.zeros(len(made.tracks.image), bool))
-    found = calibrate(capture, replace(made, recon_from_camera=camera, tracks=nothing))
+    found = calibrate_reconstruction(capture, replace(made, recon_from_camera=camera, tracks=nothing))
     assert found.findings[0].kind is FindingKind.PIECES, found.warnings
     assert set(found.findings[0].images) == {capture.images[k] for k in np.flatnonzero(astray)}

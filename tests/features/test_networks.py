@@ -79,14 +79,14 @@ def test_a_rotated_image_is_matched_when_it_is_rotated_back(roll: float, tableto
 
 def test_a_chessboard_before_a_plain_background(real_captures: Path):
     """SIFT registers none of its images; what says which way round the board is, is the robot."""
-    from jcr.calibration.stage import calibrate
+    from jcr.calibration.stage import calibrate_reconstruction
     from jcr.geometry import rotation_between_deg
     from jcr.sfm.colmap import reconstruct_colmap
 
     capture = read_capture(real_captures / "franka_plain_background")
     made = reconstruct_colmap(capture, "xfeat")
     assert len(made.image_index) == 8
-    hand_eye = calibrate(capture, made)
+    hand_eye = calibrate_reconstruction(capture, made)
     reference = np.array(json.loads((capture.folder / "reference.json").read_text())["gripper_from_camera"])
     assert rotation_between_deg(hand_eye.gripper_from_camera[:3, :3], reference[:3, :3]) < 1.0
     # With squares of 26.07 mm, as the sheet's being A4 says, the board has the camera here; the reference was made with

@@ -9,7 +9,7 @@ from jcr.camera import project
 from jcr.features.matchers import matched
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics
-from jcr.sfm.model import camera_of
+from jcr.sfm.model import colmap_camera
 
 INTRINSICS = Intrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
 
@@ -34,7 +34,7 @@ def rows_of(right: int, seed: int) -> Int[ndarray, "400 2"]:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_three_right_matches_of_ten_are_found_and_none_make_no_pair(seed: int):
-    x_px, camera = keypoints(seed), camera_of(INTRINSICS, True)
+    x_px, camera = keypoints(seed), colmap_camera(INTRINSICS, True)
     found = matched(x_px, camera, (0, 1), rows_of(120, seed), 0, True)
     assert found is not None
     inside = np.asarray(found.inlier_matches)[:, 0]

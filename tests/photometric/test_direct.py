@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import rays
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
@@ -44,7 +44,7 @@ def plain(tmp_path_factory):
 def test_a_plain_table_calibrates_the_camera_from_nothing(plain):
     capture, truth = plain
     reconstruction = reconstruct_direct(capture)
-    hand_eye = calibrate(capture, reconstruction)
+    hand_eye = calibrate_reconstruction(capture, reconstruction)
     assert hand_eye.converged and hand_eye.inliers.all()
     errors = hand_eye.gripper_from_camera[:3, 3] - truth.gripper_from_camera[:3, 3]
     assert np.linalg.norm(errors) < 3e-3
@@ -64,7 +64,9 @@ def test_a_image_of_another_pose_is_left_out_and_named(plain):
     reconstruction = reconstruct_direct(replace(capture, base_from_gripper=poses))
     assert reconstruction.image_index.tolist() == [0, 1, 2, 3, 5]
     assert f"fit nowhere near their poses: {capture.images[4]}" in " ".join(reconstruction.notes)
-    x = calibrate(replace(capture, base_from_gripper=poses), reconstruction).gripper_from_camera
+    x = calibrate_reconstruction(
+        replace(capture, base_from_gripper=poses), reconstruction
+    ).gripper_from_camera
     assert np.linalg.norm(x[:3, 3] - truth.gripper_from_camera[:3, 3]) < 5e-3
 
 

@@ -131,7 +131,7 @@ def networks(scene: Scene, given_to_network: dict[str, Any]) -> dict[str, Callab
             ]
 
     return {
-        "da3": lambda views: da3.predict(Da3(), views),
+        "da3": lambda views: da3.predict_views(Da3(), views),
         "mapanything": lambda views: jcr_mapanything.predict(MapAnything(), views),
     }
 
@@ -190,7 +190,7 @@ def test_a_network_of_another_release_is_named() -> None:
 
     scene = Scene(640, 480)
     with pytest.raises(InputError, match="gave no depth of shape"):
-        da3.predict(Other(), Views(scene.colors, None))
+        da3.predict_views(Other(), Views(scene.colors, None))
 
 
 def packaged(images: ndarray) -> Any:
@@ -215,14 +215,14 @@ def test_depth_anything_3_agrees_with_its_package() -> None:
     network = da3.build("da3-small")
     grid = da3.grid_of((410, 300))
     theirs = packaged(images)
-    ours = normalised(np.stack([da3.resized(image, grid, da3.LONG_EDGE) for image in images]), "cpu")
+    ours = normalised(np.stack([da3.resized_for_grid(image, grid, da3.LONG_EDGE) for image in images]), "cpu")
     assert ours.shape == theirs.shape and torch.allclose(ours, theirs, atol=1e-5)
 
     from depth_anything_3.utils.io.output_processor import OutputProcessor  # type: ignore[import-not-found]
 
     with torch.inference_mode():
         answer = OutputProcessor()(network(theirs[None]))
-    found = da3.predict(network, Views(images, None))
+    found = da3.predict_views(network, Views(images, None))
     there = found.confidence > 0
     assert there.mean() > 0.99
     np.testing.assert_allclose(found.x_in_camera[..., 2][there], answer.depth[there], rtol=1e-5)

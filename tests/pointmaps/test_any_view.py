@@ -128,7 +128,7 @@ def found(capture: Capture) -> Reconstruction:
 
 
 def test_matches_by_colour_put_predicted_cameras_right(capture: Capture, found: Reconstruction) -> None:
-    from jcr.calibration.stage import calibrate
+    from jcr.calibration.stage import calibrate_reconstruction
 
     assert found.evidence is None and "refined" in found.notes[-1]
     truth = base_from_camera()
@@ -143,7 +143,7 @@ def test_matches_by_colour_put_predicted_cameras_right(capture: Capture, found: 
     in_base = apply_similarity(base, scale, found.dense.points_in_recon.reshape(-1, 3).astype(float))
     assert np.abs(in_base[:, 2]).max() < 4e-3, "20 mm as predicted"
 
-    hand_eye = calibrate(capture, found)
+    hand_eye = calibrate_reconstruction(capture, found)
     assert hand_eye.converged and hand_eye.uncertainty.joint is not None
     assert np.linalg.norm(hand_eye.gripper_from_camera[:3, 3] - X[:3, 3]) < 2e-3
     assert rotation_between_deg(hand_eye.gripper_from_camera[:3, :3], X[:3, :3]) < 0.1

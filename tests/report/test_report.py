@@ -19,7 +19,7 @@ from chromium import Chromium
 from conftest import shrunk_capture
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import failed_calibration
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.controllers import numbers_from_poses, poses_from_numbers
 from jcr.capture.formats.capture_json import kept, origin
 from jcr.capture.options import ReadOptions
@@ -82,7 +82,7 @@ def run(done: Path, tabletop: Path, tmp_path_factory: pytest.TempPathFactory) ->
         notes=("a <note> & more",),
         warnings=("a <pose> is off",),
     )
-    hand_eye = calibrate(capture, reconstruction, CalibrateOptions(next_poses=2))
+    hand_eye = calibrate_reconstruction(capture, reconstruction, CalibrateOptions(next_poses=2))
     cloud = label_tabletop(point_cloud(capture, reconstruction, hand_eye))
     cloud = replace(cloud, label_names=("none", *(f"<i>{name}" for name in cloud.label_names[1:])))
     return RunResult(
@@ -320,7 +320,7 @@ def test_cameras_alone_are_reported_without_tracks_points_or_map(run: RunResult)
 
 def with_reconstruction(run: RunResult, reconstruction: Reconstruction) -> str:
     """Return the report of the calibration of another reconstruction, without a map."""
-    hand_eye = calibrate(run.capture, reconstruction)
+    hand_eye = calibrate_reconstruction(run.capture, reconstruction)
     found = run.with_parts(cloud=None, scene=None, reconstruction=reconstruction)
     return report_html(found.with_parts(calibration=hand_eye))
 

@@ -19,7 +19,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 import jcr
-from jcr.capture.images import read_depth, read_image
+from jcr.capture.images import read_depth_images, read_image
 from places import ROOT
 from waiting import until
 
@@ -289,7 +289,7 @@ def test_the_node_broadcasts_the_transform_where_it_is_accepted_alone(
     assert np.allclose([place.x, place.y, place.z], position)
     capture = jcr.read_capture(tmp_path / "c")
     assert capture.depths is not None
-    depth_m = read_depth(capture.folder / str(capture.depths[0]), capture.image_size)
+    depth_m = read_depth_images(capture.folder / str(capture.depths[0]), capture.image_size)
     assert np.median(depth_m) == 0.5
     if require_mm < 1:
         assert not answer.success and node.broadcaster.sent == []

@@ -10,7 +10,7 @@ import pytest
 
 from jcr.calibration.record import Calibration
 from jcr.camera import rays, resized, undistort_image
-from jcr.capture.added import read_added, with_images, write_added
+from jcr.capture.added import read_added, with_added_images, write_added
 from jcr.capture.formats import capture_json
 from jcr.capture.images import encode_png, read_image
 from jcr.capture.read import read_capture
@@ -135,7 +135,7 @@ def added_views(
         write_bytes(new / name, encode_png(view.image))
     poses = base_from_camera @ inverse(truth.gripper_from_camera)
     capture_json.write(new, replace(capture, images=names, base_from_gripper=poses, joints=None, depths=None))
-    return with_images(read_added(folder, capture), new)
+    return with_added_images(read_added(folder, capture), new)
 
 
 def extended(before: Reconstruction, hand_eye: Calibration, capture: Capture, new: Capture) -> Reconstruction:
@@ -242,13 +242,13 @@ def test_added_images_are_kept_and_wrong_ones_refused(truth: Truth, capture: Cap
     assert again.images == added.images
     assert np.allclose(again.base_from_gripper, truth.base_from_gripper[:1])
     with pytest.raises(InputError, match="added before"):
-        with_images(again, tmp_path / "new0")
+        with_added_images(again, tmp_path / "new0")
     small = tmp_path / "small"
     write_bytes(small / "0.png", encode_png(np.zeros((30, 40, 3), np.uint8)))
     one = Capture(folder=small, images=("0.png",), base_from_gripper=np.eye(4)[None], image_size=(40, 30))
     capture_json.write(small, one)
     with pytest.raises(InputError, match="40x30"):
-        with_images(again, small)
+        with_added_images(again, small)
     with pytest.raises(InputError, match="another folder"):
         read_added(tmp_path, replace(capture, folder=tmp_path))
     (tmp_path / "added" / again.images[0]).unlink()

@@ -14,10 +14,10 @@ from jcr.sfm import colmap
 from jcr.sfm.missing_images import with_missing_images
 from jcr.sfm.model import (
     adjust_robustly,
-    camera_of,
+    colmap_camera,
     poses_of,
     quiet_colmap,
-    triangulated,
+    triangulated_model,
     write_database,
 )
 from points_of_a_table import IMAGES, INTRINSICS, PointsOfATable, matched_pairs_of, matcher_of_points
@@ -45,10 +45,10 @@ def begun(
     folder: Path, table: PointsOfATable, matched: Matched, missing: tuple[int, ...]
 ) -> tuple[Path, pycolmap.Reconstruction]:
     """Return a database of the matches and a map without some images."""
-    camera = camera_of(INTRINSICS, True)
+    camera = colmap_camera(INTRINSICS, True)
     database = write_database(folder, camera, table.x_px, matched.geometries)
     cameras = {row: pose for row, pose in enumerate(table.base_from_camera) if row not in missing}
-    return database, triangulated(database, camera, cameras)
+    return database, triangulated_model(database, camera, cameras)
 
 
 def off_mm(table: PointsOfATable, model: pycolmap.Reconstruction) -> float:

@@ -19,7 +19,7 @@ from jcr.estimation.hypotheses import focal_lengths
 from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.intrinsics_prior import CameraPrior, decentring
 from jcr.estimation.point_uncertainty import joint_covariance
-from jcr.estimation.pose_equations import paper_residuals, predict
+from jcr.estimation.pose_equations import paper_residuals, predicted_gripper_poses
 from jcr.estimation.problem import LinearPrior, pose_problem, wrist_arm
 from jcr.estimation.projection import view_of
 from jcr.estimation.solve import START_NOISE, Solution, solve
@@ -44,7 +44,7 @@ SETTLED_ENOUGH = 0.5
 are not reported either (checks/effects.py)."""
 
 
-def adjust_images(case: Case) -> Case:
+def with_adjusted_images(case: Case) -> Case:
     """Adjust the images of a case and replace its fit from poses by the calibration that results.
 
     A rejected fit is replaced too: without intrinsics the fit from poses alone is poor, and the adjustment is not. On
@@ -232,7 +232,7 @@ def refined_by(case: Case, found: Solution) -> Calibration:
     # Rejected poses are measured against where their cameras show them.
     predicted = base_from_recon @ scale_translation(camera, scale) @ inverse(x)
     state, rigs = found.state, found.problem.arms[0].rigs
-    predicted[used] = predict(x, state.scale, state.z[0], state.world_from_rig[rigs])
+    predicted[used] = predicted_gripper_poses(x, state.scale, state.z[0], state.world_from_rig[rigs])
     metres, radians = np.linalg.norm(step_between(gripper, predicted).reshape(-1, 2, 3), axis=2).T
     reprojection = np.full(len(gripper), np.nan)
     reprojection[used] = median_reprojection_px(found.problem, found.images.view)
@@ -263,7 +263,7 @@ def _leave_one_out(found: Solution) -> LeaveOneOut | None:
     likely, images = found.most_likely, found.images
     x, z = likely.x[0], likely.z[0]
     own, rigs = found.problem.arms[0].rigs, likely.world_from_rig.copy()
-    gripper = predict(x, likely.scale, z, rigs[own])
+    gripper = predicted_gripper_poses(x, likely.scale, z, rigs[own])
     in_metres = inverse(z) @ retract(gripper, -left_out) @ x
     rigs[own] = scale_translation(in_metres, 1 / likely.scale)
     moved = view_of(found.problem, replace(images.state, world_from_rig=rigs))

@@ -11,7 +11,7 @@ from numpy import ndarray
 from jcr.calibration.hand_eye import judged
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
-from jcr.calibration.robot_errors import RobotErrors, of_poses
+from jcr.calibration.robot_errors import RobotErrorPrior, of_poses
 from jcr.estimation.intrinsics_prior import (
     ESTIMATED,
     MEASURED,
@@ -44,7 +44,7 @@ class Case:
     capture: Capture
     reconstruction: Reconstruction
     options: CalibrateOptions
-    robot: RobotErrors
+    robot: RobotErrorPrior
     """Systematic errors of the registered images' poses."""
     priors: tuple[LinearPrior, ...]
     """Measurements of scale and height beside the robot's poses."""

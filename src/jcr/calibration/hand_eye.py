@@ -15,7 +15,7 @@ from jcr.estimation.hypotheses import drift_covariance
 from jcr.estimation.inverse_kinematics import posed
 from jcr.estimation.kinematics import Arm, Joints
 from jcr.estimation.observability import observability
-from jcr.estimation.pose_equations import paper_residuals, residuals
+from jcr.estimation.pose_equations import paper_residuals, pose_residuals
 from jcr.estimation.problem import LinearPrior, offset_prior, scale_prior
 from jcr.estimation.robot_noise import arm_errors, smooth_errors
 from jcr.estimation.robust import robust_fit
@@ -145,7 +145,7 @@ def _with_residuals(
     x, scale, z = fit.state.x[0], fit.state.scale, fit.state.z[0]
     used = fit.problem.used[distinct]
     seen = observability(gripper[used], x, camera[used], fit.problem.priors)
-    residual, _ = residuals(x, scale, z, gripper, camera)
+    residual, _ = pose_residuals(x, scale, z, gripper, camera)
     metres, radians = np.linalg.norm(residual.reshape(-1, 2, 3), axis=2).T
     reasons = _reasons(used, metres, radians, fit.noise)
     return Calibration(

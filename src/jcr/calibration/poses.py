@@ -13,7 +13,7 @@ from jcr.calibration.hand_eye import SCALE_STD, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.record import Calibration
 from jcr.calibration.requirement import advised, assumptions_of_poses
-from jcr.calibration.robot_errors import RobotErrors, errors_of
+from jcr.calibration.robot_errors import RobotErrorPrior, errors_of
 from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.problem import pose_problem
@@ -24,7 +24,7 @@ METRIC_STD = 0.005
 """Relative standard deviation of the size of a printed marker."""
 
 
-def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -> Calibration:
+def calibrate_pose_pairs(pairs: PosePairs, options: CalibrateOptions | None = None) -> Calibration:
     """Calibrate from given camera poses, without images.
 
     The estimated scale of metric poses tests the given size of the marker; where motions do not determine the scale, it
@@ -50,7 +50,7 @@ def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -
     return advised(hand_eye, gripper, options, robot, assumptions).of_capture(pairs, pairs)
 
 
-def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotErrors) -> Calibration:
+def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotErrorPrior) -> Calibration:
     gripper, camera, noise = pairs.base_from_gripper, pairs.recon_from_camera, options.robot_noise_m_rad
     if options.known_length is not None:
         raise InputError("--known-length: there are no images in which it could be seen; leave it out")

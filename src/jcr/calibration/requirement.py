@@ -11,14 +11,14 @@ from numpy import ndarray
 from jcr.calibration.case import Case
 from jcr.calibration.options import GRASPING, MOST_POSES, CalibrateOptions
 from jcr.calibration.record import Calibration
-from jcr.calibration.robot_errors import RobotErrors, of_poses
+from jcr.calibration.robot_errors import RobotErrorPrior, of_poses
 from jcr.estimation.point_uncertainty import seen_points, within_95
 from jcr.estimation.prediction import (
     Assumptions,
     PredictedCamera,
     assumed_camera,
-    candidates,
-    choose,
+    candidate_poses,
+    choose_poses,
     median_distance,
     nearest,
     predict,
@@ -42,7 +42,7 @@ class Proposals:
 
     assumptions: Assumptions
     base_from_gripper: Float[ndarray, "n 4 4"]
-    robot: RobotErrors
+    robot: RobotErrorPrior
     """Errors of the poses of the capture."""
     names: Sequence[str]
     """Names of the poses of the capture."""
@@ -53,7 +53,7 @@ class Proposals:
         assumptions: Assumptions,
         base_from_gripper: Poses,
         names: Sequence[str],
-        robot: RobotErrors,
+        robot: RobotErrorPrior,
         count: int,
         reach: Float[ndarray, "2 3"] | None = None,
         seed: int = 0,
@@ -70,7 +70,7 @@ class Proposals:
         )
         if count == 0:
             return found
-        possible = candidates(now, x, reach, np.random.default_rng(seed))
+        possible = candidate_poses(now, x, reach, np.random.default_rng(seed))
         if is_likely is not None and (likely := is_likely(possible)).any():
             possible = possible[likely]
         possible = possible[:COMPARED]
@@ -83,7 +83,7 @@ class Proposals:
             covariance = predict_covariance(assumptions, poses[together], errors, averaged=False)
             return total_uncertainty(covariance, assumptions.distance_m * x[:3, 2])
 
-        return replace(found, added=possible[choose(count, len(possible), uncertainty_of)])
+        return replace(found, added=possible[choose_poses(count, len(possible), uncertainty_of)])
 
     def predict(self, count: int) -> Uncertainty:
         """Return the predicted uncertainty with the first `count` of the added poses."""
@@ -149,7 +149,7 @@ def advised(
     hand_eye: Calibration,
     gripper: Float[ndarray, "m 4 4"],
     options: CalibrateOptions,
-    robot: RobotErrors,
+    robot: RobotErrorPrior,
     assumptions: Assumptions,
     scene: SceneUncertainty | None = None,
 ) -> Calibration:
@@ -233,7 +233,7 @@ def _worthwhile(
     used: Float[ndarray, "k 4 4"],
     required: Requirement,
     assumptions: Assumptions,
-    robot: RobotErrors,
+    robot: RobotErrorPrior,
     least: int,
 ) -> tuple[int | None, list[NextPose]]:
     """Return how many poses would reach the requirement, and those poses or `least`, the best first.

@@ -20,7 +20,7 @@ from jcr.records import Capture
 
 
 @dataclass(frozen=True)
-class RobotErrors:
+class RobotErrorPrior:
     """Prior covariance of the systematic errors of gripper poses, and the arm that it follows from."""
 
     systematic: Float[ndarray, "r r"]
@@ -32,7 +32,7 @@ class RobotErrors:
     unused: Finding | None = None
     """Finding that the arm of the capture is not used; None where it is used, or none is named."""
 
-    def of(self, poses: Int[ndarray, " m"]) -> "RobotErrors":
+    def of(self, poses: Int[ndarray, " m"]) -> "RobotErrorPrior":
         """Return the errors of some of the poses."""
         joints = None if self.joints is None else self.joints[poses]
         return replace(self, systematic=of_poses(self.systematic, poses), joints=joints)
@@ -50,7 +50,9 @@ class RobotErrors:
         return arm_errors(self.arm, np.concatenate([self.joints, reach_toward(self.arm, added, start)]))
 
 
-def robot_errors(capture: Capture, options: CalibrateOptions, later: Capture | None = None) -> RobotErrors:
+def robot_errors(
+    capture: Capture, options: CalibrateOptions, later: Capture | None = None
+) -> RobotErrorPrior:
     """Return the errors of the capture's gripper poses and of `later` ones of the same robot.
 
     Raises InputError where the poses are not those of the arm that the user named, or are all too long by one factor for
@@ -71,15 +73,15 @@ def robot_errors(capture: Capture, options: CalibrateOptions, later: Capture | N
         return replace(errors_of(gripper), unused=unused)
 
 
-def errors_of(gripper: Poses, arm: Arm | None = None, joints: Joints | None = None) -> RobotErrors:
+def errors_of(gripper: Poses, arm: Arm | None = None, joints: Joints | None = None) -> RobotErrorPrior:
     """Return the errors of poses of an arm at joint angles (rad), or of any robot; unknown angles follow from the poses.
 
     Raises InputError where poses, joints and arm do not fit.
     """
     if arm is None:
-        return RobotErrors(smooth_errors(gripper))
+        return RobotErrorPrior(smooth_errors(gripper))
     arm, joints = posed(arm, joints, gripper)
-    return RobotErrors(arm_errors(arm, joints), arm, joints)
+    return RobotErrorPrior(arm_errors(arm, joints), arm, joints)
 
 
 def _arm(capture: Capture, options: CalibrateOptions) -> Arm | None:

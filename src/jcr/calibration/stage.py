@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jcr.calibration.adjust import adjust_images
+from jcr.calibration.adjust import with_adjusted_images
 from jcr.calibration.case import Case
 from jcr.calibration.checks.table import CHECKS
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
@@ -12,7 +12,7 @@ from jcr.calibration.hand_eye import SCALE_STD, Offset, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.record import Calibration
 from jcr.calibration.requirement import advised, assumptions_of
-from jcr.calibration.robot_errors import RobotErrors, robot_errors
+from jcr.calibration.robot_errors import RobotErrorPrior, robot_errors
 from jcr.errors import RejectedError
 from jcr.estimation.point_uncertainty import with_given_intrinsics
 from jcr.estimation.problem import offset_prior, scale_prior
@@ -21,7 +21,7 @@ from jcr.records import Capture, Reconstruction
 
 
 @one_blas_thread
-def calibrate(
+def calibrate_reconstruction(
     capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions | None = None
 ) -> Calibration:
     """Calibrate the registered images of a capture.
@@ -43,21 +43,21 @@ def calibrate(
 
 
 def calibrate_case(
-    capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrors
+    capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrorPrior
 ) -> Case:
     """Return the case after fit, adjustment, checks and advice; `robot` is of the registered images."""
-    case = checked(capture, reconstruction, options, robot)
+    case = checked_case(capture, reconstruction, options, robot)
     gripper, assumptions = case.base_from_gripper, assumptions_of(case)
     found = advised(case.hand_eye, gripper, options, robot, assumptions, case.scene_uncertainty)
     return replace(case, hand_eye=found)
 
 
 @one_blas_thread
-def checked(
-    capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrors
+def checked_case(
+    capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrorPrior
 ) -> Case:
     """Return the case after fit, adjustment and checks, without advice; `robot` is of the registered images."""
-    case = adjust_images(fit_poses(capture, reconstruction, options, robot))
+    case = with_adjusted_images(fit_poses(capture, reconstruction, options, robot))
     for check, is_needed in CHECKS:
         if is_needed(case):
             try:
@@ -70,7 +70,7 @@ def checked(
 
 
 def fit_poses(
-    capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrors
+    capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrorPrior
 ) -> Case:
     """Fit the hand-eye transform to camera poses, with the known lengths that replace what the motions do not show.
 
@@ -109,7 +109,7 @@ def _solved(
     capture: Capture,
     reconstruction: Reconstruction,
     options: CalibrateOptions,
-    robot: RobotErrors,
+    robot: RobotErrorPrior,
     scale: tuple[float, float] | None = None,
     offset: Offset | None = None,
 ) -> Calibration:

@@ -37,7 +37,7 @@ def read_added(run_folder: Path, capture: Capture) -> Capture:
     return added
 
 
-def with_images(added: Capture, path: Path, options: ReadOptions | None = None) -> Capture:
+def with_added_images(added: Capture, path: Path, options: ReadOptions | None = None) -> Capture:
     """Return the added images and those of one more capture, which are copied; `write_added` makes them part of the run.
 
     Raises InputError for images of another size than the run's, and for images that were added before.

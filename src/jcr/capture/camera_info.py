@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from jcr.capture.plain_files import read_yaml, validated
+from jcr.capture.plain_files import read_yaml, validated_content
 from jcr.errors import InputError, shown
 from jcr.records import COEFFICIENTS, DistortionModel, Intrinsics
 from jcr.records.capture_json import IntrinsicsEntry
@@ -41,7 +41,7 @@ class _CameraInfo(BaseModel):
 
 def read_camera_info(file: Path, size: tuple[int, int]) -> Intrinsics | None:
     """Read the intrinsics of a camera_info YAML for images of `size`; None of a camera that is not calibrated."""
-    info: _CameraInfo = validated(_CameraInfo, read_yaml(file), str(file))
+    info: _CameraInfo = validated_content(_CameraInfo, read_yaml(file), str(file))
     matrix, coefficients = info.camera_matrix.data, info.distortion_coefficients.data
     calibrated = info.image_width, info.image_height
     return intrinsics_of_ros(matrix, info.distortion_model, coefficients, calibrated, size, str(file))
@@ -94,4 +94,4 @@ def checked_intrinsics(
     entry = dict(zip(("fx", "fy", "cx", "cy"), parameters, strict=True))
     entry |= {"distortion": [*distortion], "model": model}
     entry |= dict(zip(("width", "height"), calibrated_size, strict=True))
-    return validated(IntrinsicsEntry, entry, where[0]).record(size, ": ".join(where))
+    return validated_content(IntrinsicsEntry, entry, where[0]).record(size, ": ".join(where))

@@ -94,7 +94,7 @@ def _eight_bits(path: Path) -> UInt8[ndarray, "h w *rgb"]:
     return np.ascontiguousarray(eight[..., ::-1] if eight.ndim == 3 else eight)
 
 
-def read_depth(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h w"]:
+def read_depth_images(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h w"]:
     """Read the depth along the optical axis (m) at the pixels of images of `size`; 0 where none was measured.
 
     Raises InputError where the file is no 16-bit grey image of that size.

@@ -96,7 +96,7 @@ def first_few(names: Sequence[str]) -> str:
     return ", ".join(name[:LONGEST] for name in names[:NAMED]) + more
 
 
-def validated(schema: type[BaseModel] | TypeAdapter, content: Any, where: str) -> Any:
+def validated_content(schema: type[BaseModel] | TypeAdapter, content: Any, where: str) -> Any:
     """Return the content of a file as its schema has it; raise InputError, begun with `where`, for another one."""
     validate = schema.validate_python if isinstance(schema, TypeAdapter) else schema.model_validate
     try:

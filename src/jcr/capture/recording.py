@@ -13,7 +13,7 @@ from jcr.capture.images import BLURRED, DEPTH, encode_png, sharpness
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.errors import InputError
 from jcr.estimation.pose_equations import ASSUMED_NOISE, expected_covariance
-from jcr.estimation.prediction import choose, pose_information, total_uncertainty
+from jcr.estimation.prediction import choose_poses, pose_information, total_uncertainty
 from jcr.files import write_bytes
 from jcr.geometry import inverse, motion_length
 from jcr.progress import Progress
@@ -167,7 +167,7 @@ def best_frames(
         def uncertainty_of(rows: Rows, gain: ndarray = gain, before: ndarray = before) -> float:
             return total_uncertainty(expected_covariance(before + gain[rows].sum(0)))
 
-        chosen = np.array(choose(count - len(frames), len(gain), uncertainty_of), dtype=int)
+        chosen = np.array(choose_poses(count - len(frames), len(gain), uncertainty_of), dtype=int)
         frames, known = np.append(frames, views[of_kind][chosen]), known + gain.sum(0)
     notes = []
     if len(clear) < len(sharpest):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from jcr.capture.formats.capture_json import camera_entries, with_cameras
 from jcr.capture.images import read_image, size_of_all
-from jcr.capture.plain_files import read_json, validated
+from jcr.capture.plain_files import read_json, validated_content
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.records import Capture, CellCamera
@@ -32,7 +32,7 @@ def read_added_cameras(run_folder: Path, capture: Capture) -> tuple[CellCamera, 
     return tuple(replace(camera, folder=folder) for camera in read.others)
 
 
-def camera_of(
+def added_camera(
     name: str, files: Sequence[Path], intrinsics: Path | None, taken: Sequence[str], folder: Path
 ) -> CellCamera:
     """Return a fixed camera of image files, copied to `folder`; raise InputError where they cannot be of one camera.
@@ -50,7 +50,9 @@ def camera_of(
         content = read_json(intrinsics)
         if isinstance(content, dict) and isinstance(content.get("intrinsics"), dict):
             content = content["intrinsics"]
-        known = validated(IntrinsicsEntry, content, str(intrinsics)).record(size, f"{files[0]}, {intrinsics}")
+        known = validated_content(IntrinsicsEntry, content, str(intrinsics)).record(
+            size, f"{files[0]}, {intrinsics}"
+        )
     images = tuple(f"{name}/{k:03d}{file.suffix.lower()}" for k, file in enumerate(files))
     for image, file in zip(images, files, strict=True):
         write_bytes(folder / image, file.read_bytes())

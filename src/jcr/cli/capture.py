@@ -195,7 +195,7 @@ def _source(
 
 def _intrinsics(file: Path | None) -> "IntrinsicsEntry | None":
     """Return the intrinsics in a JSON file; raise InputError where it has none."""
-    from jcr.capture.plain_files import read_json, validated
+    from jcr.capture.plain_files import read_json, validated_content
     from jcr.records.capture_json import IntrinsicsEntry
 
     if file is None:
@@ -204,4 +204,4 @@ def _intrinsics(file: Path | None) -> "IntrinsicsEntry | None":
     given = content.get("intrinsics") if isinstance(content, dict) else None
     if not isinstance(given, dict):
         raise InputError(f'--intrinsics-from {file}: holds no "intrinsics"; name a capture.json with some')
-    return validated(IntrinsicsEntry, given, f"--intrinsics-from {file}")
+    return validated_content(IntrinsicsEntry, given, f"--intrinsics-from {file}")

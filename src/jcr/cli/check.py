@@ -10,7 +10,7 @@ import tyro
 
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output, VerboseOutput, numbers
-from jcr.cli.run import looked_at, with_images
+from jcr.cli.run import looked_at, require_images
 from jcr.errors import InputError
 from jcr.pipeline.options import VerifyOptions
 from jcr.progress import progress_bars
@@ -266,7 +266,7 @@ class VerifyCommand:
         from jcr.pipeline.verify import verify_run
 
         with progress_bars() as progress, looked_at(self.capture, self.read, progress, at_least=1) as new:
-            capture = with_images(new, self.capture, "which verify needs")
+            capture = require_images(new, self.capture, "which verify needs")
             found = verify_run(self.out, capture, self.verify, progress)
         cameras = (found, *found.others)
         facts = _drift_facts(found) | {"cameras": {one.fixed: _drift_facts(one) for one in found.others}}

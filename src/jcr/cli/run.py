@@ -101,7 +101,7 @@ class RunCommand(CalibrateCommand):
         options = run_options(self, map=None if self.no_map else self.map)
         with progress_bars() as progress:
             found = _source(self, progress)
-            capture = with_images(found, self.capture, "nothing to map; use `jcr calibrate`")
+            capture = require_images(found, self.capture, "nothing to map; use `jcr calibrate`")
             result = _run(self, capture, options, progress)
         lines = [note for note in result.calibration.notes if note.startswith("no map was made")]
         if (self.out / "map.safetensors").is_file():
@@ -236,7 +236,7 @@ def looked_at(
         yield (read or read_source)(path, options, into=scratch, progress=progress, **more)
 
 
-def with_images(found: "Capture | PosePairs", path: Path, needed: str) -> "Capture":
+def require_images(found: "Capture | PosePairs", path: Path, needed: str) -> "Capture":
     """Return the capture; raise InputError, which ends with `needed`, where there are poses alone."""
     from jcr.records import PosePairs
 

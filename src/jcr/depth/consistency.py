@@ -19,7 +19,7 @@ SEEN_THROUGH = 0.01
 table often gets the object's depth; the neighbours that look past the object there show the table's."""
 
 
-def evidence(
+def inverse_depth_evidence(
     inverse_depth: Float[ndarray, "m h w"], known: Bool[ndarray, "m h w"], sees: Bool[ndarray, "m h w"]
 ) -> Float[ndarray, "m h _"]:
     """Return the maps for `agreement`: inverse depths, 0 where not `known`, negative where not `sees`.

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict
 from jcr.depth.densify import pointmaps_of, undistorted
 from jcr.geometry import apply, inverse
 from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction
-from jcr.records.npz import check_arrays, read_npz, write_npz
+from jcr.records.npz import read_npz, require_shapes, write_npz
 
 FILE = "depth.npz"
 FORMAT = "jcr.depth/2"
@@ -67,7 +67,7 @@ def read_depth(path: Path, reconstruction: Reconstruction, capture: Capture | No
         pinhole = DepthHeader.model_validate_json(text, strict=True).intrinsics
         shape = len(reconstruction.image_index), pinhole.height, pinhole.width
         depth, std, confidence = (file[name] for name in ("depth", "relative_std", "confidence"))
-        check_arrays(
+        require_shapes(
             {"depth": (depth, shape), "relative_std": (std, shape), "confidence": (confidence, shape)}
         )
         matched, filled = (

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import rays
-from jcr.depth.consistency import agreement, evidence
+from jcr.depth.consistency import agreement, inverse_depth_evidence
 from jcr.depth.matched import Relative, grid, relative
 from jcr.depth.priors import ON_PLANE, evened, planar_prior, support_plane
 from jcr.geometry import apply
@@ -109,7 +109,7 @@ def _checked(
     tolerance: float,
 ) -> list[ndarray]:
     """Return `agreement` of all images, (m,h,w) each; inverse depths that are not known stay as they are."""
-    compared, k = evidence(depth, known, sees), grid(pinhole)
+    compared, k = inverse_depth_evidence(depth, known, sees), grid(pinhole)
     found = pool.map(
         lambda i: agreement(i, compared, *views[i], k, pinhole.width, tolerance), range(len(views))
     )

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from jcr.camera import project, rays
-from jcr.capture.images import read_depth
+from jcr.capture.images import read_depth_images
 from jcr.geometry import apply, inverse
 from jcr.records import MATCHED, PRIOR, Capture, DepthCheck, Reconstruction
 
@@ -55,7 +55,7 @@ def with_measured_depth(
     for k, row in enumerate(reconstruction.image_index):
         if row >= len(capture.depths) or (name := capture.depths[row]) is None:
             continue
-        depth, inside = _sampled(read_depth(capture.folder / name, capture.image_size), at)
+        depth, inside = _sampled(read_depth_images(capture.folder / name, capture.image_size), at)
         z = depth / (1 + 0.01 * check.off_percent)
         sigma = check.std_m(z)
         recon_from_camera = reconstruction.recon_from_camera[k]

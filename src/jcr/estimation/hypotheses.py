@@ -16,7 +16,7 @@ from numpy import ndarray
 from jcr.camera import parameter_names
 from jcr.distributions import f as f_distribution
 from jcr.estimation.elimination import cholesky, over
-from jcr.estimation.image_equations import ImageEvidence, evidence
+from jcr.estimation.image_equations import ImageEvidence, image_evidence
 from jcr.estimation.intrinsics_prior import CameraPrior
 from jcr.estimation.kinematics import Arm, Joints, error_jacobian
 from jcr.estimation.pose_equations import PoseEquations, pose_by_pose, pose_equations, reported_poses
@@ -380,7 +380,7 @@ def alternatives(
         freedom=max(len(equations.residual) - begin, 1),
         dispersion=max(float((pull**2).sum()), problem.layout.squares_of_cells(pull)) / expected,
         names=parameter_names(start),
-        units=units_of(start)[0],
+        units=parameter_units(start)[0],
         distance=np.where(np.isfinite(distance), distance, np.nanmedian(distance)),
         down_in_camera=-(now.z[0] @ now.world_from_rig[rig] @ now.rig_from_camera[camera])[:, 2, :3],
     )
@@ -401,7 +401,7 @@ def _with_all_free(
     """Return the evidence of the images where every parameter of a camera and of its images is free."""
     problem, state, own = solution.problem, solution.images.state, len(prior.std)
     start = problem.intrinsics(state)[camera]
-    units, weak = units_of(start)
+    units, weak = parameter_units(start)
     wider = replace(
         prior,
         directions=np.column_stack([prior.directions, np.diag(units)]),
@@ -425,7 +425,7 @@ def _with_all_free(
     ]
     sizes = state.model_error_std
     sizes = sizes if model_error_std is None else np.full_like(sizes, model_error_std)
-    return evidence(all_free, replace(state, camera_steps=wider_steps, model_error_std=sizes))
+    return image_evidence(all_free, replace(state, camera_steps=wider_steps, model_error_std=sizes))
 
 
 def with_camera(problem: Problem, prior: CameraPrior, camera: int = 0) -> Problem:
@@ -442,7 +442,7 @@ def beyond_prior(solution: Solution, prior: CameraPrior, camera: int = 0) -> Flo
     return problem.cameras[camera].directions[:, own:] @ steps[own:]
 
 
-def units_of(camera: Intrinsics) -> tuple[Float[ndarray, " q"], Float[ndarray, " q"]]:
+def parameter_units(camera: Intrinsics) -> tuple[Float[ndarray, " q"], Float[ndarray, " q"]]:
     """Return the units of the parameters, focal lengths and widths for the centre, and weak priors' std in these."""
     more = len(parameter_names(camera)) - 4
     units = np.r_[camera.fx, camera.fy, camera.width, camera.width, np.ones(more)]
@@ -477,7 +477,7 @@ def freed(
     own = problem.cameras[camera]
     q = len(parameter_names(own.intrinsics))
     of_camera, of_images = spanned(combinations[:q]), spanned(combinations[q:])
-    units, weak = units_of(own.intrinsics)
+    units, weak = parameter_units(own.intrinsics)
     wider = replace(
         own,
         directions=np.column_stack([own.directions, units[:, None] * of_camera]),

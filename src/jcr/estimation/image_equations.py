@@ -93,7 +93,7 @@ def adjust_images(problem: Problem, state: State) -> ImageEvidence:
         before = state.pixel_noise
         state, view, damping = adjusted_images(problem, state, [world], damping)
         state = with_pixel_noise(problem, state, view)
-        images, change = with_model_error_of(evidence(problem, state))
+        images, change = with_model_error_of(image_evidence(problem, state))
         state = images.state
         assert before is not None and state.pixel_noise is not None
         if max(state.pixel_noise.change(before), change) < SIZES_SETTLED:
@@ -109,7 +109,7 @@ def adjust_images(problem: Problem, state: State) -> ImageEvidence:
         rig_from_camera=scale_translation(state.rig_from_camera, unit),
         points_in_world=apply(start[0] @ back, unit * state.points_in_world),
     )
-    return evidence(problem, state)
+    return image_evidence(problem, state)
 
 
 def with_pixel_noise(problem: Problem, state: State, view: ProjectedObservations) -> State:
@@ -167,7 +167,7 @@ def adjusted_images(
     return *found, START_DAMPING if damping > LARGEST_DAMPING else damping
 
 
-def evidence(problem: Problem, state: State) -> ImageEvidence:
+def image_evidence(problem: Problem, state: State) -> ImageEvidence:
     """Return the evidence of the images and of the priors of their cameras about a state."""
     return linearised(problem, state, view_of(problem, state))[0]
 

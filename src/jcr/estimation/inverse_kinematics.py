@@ -20,7 +20,7 @@ from jcr.estimation.kinematics import (
     kinematic_jacobian,
     with_tool,
 )
-from jcr.estimation.pose_equations import expected_covariance, fit_known_scale, residuals
+from jcr.estimation.pose_equations import expected_covariance, fit_known_scale, pose_residuals
 from jcr.geometry import (
     ARM,
     Poses,
@@ -290,7 +290,7 @@ def _require_length(arm: Arm, base_from_gripper: Poses, nominal: Poses) -> None:
     factor = float(scale)
     if factor <= 0:  # unobservable
         return
-    residual, j = residuals(tool, factor, base, base_from_gripper, nominal)
+    residual, j = pose_residuals(tool, factor, base, base_from_gripper, nominal)
     metres, radians = _apart(residual)
     if metres > AGREE[0] * arm.reach * factor or radians > AGREE[1]:
         return

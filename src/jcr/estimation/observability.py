@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.estimation.pose_equations import residuals
+from jcr.estimation.pose_equations import pose_residuals
 from jcr.estimation.problem import BASE_ROTATION, ROTATION, SCALE, LinearPrior
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import ARM, Poses, Transform, transform
@@ -41,7 +41,7 @@ def excitation(
     base_from_centers = transform(np.eye(3), camera[:, :3, 3].mean(0))
     camera[:, :3, 3] -= base_from_centers[:3, 3]
     spread = max(float(np.sqrt((camera[:, :3, 3] ** 2).sum(1).mean())), MIN_SPREAD)
-    _, j = residuals(x, 1.0, base_from_centers, base_from_gripper, camera)
+    _, j = pose_residuals(x, 1.0, base_from_centers, base_from_gripper, camera)
     unit = np.ones(13)
     unit[ROTATION], unit[SCALE], unit[BASE_ROTATION] = ARM, spread, ARM
     j *= np.repeat([1.0, ARM], 3)[:, None] / unit

@@ -106,7 +106,7 @@ ASSUMED_NOISE = (5e-4, np.radians(0.1))
 """Assumed noise (m, rad) of a robot that has not been measured."""
 
 
-def predict(
+def predicted_gripper_poses(
     x: Transforms,
     scale: Float[ndarray, "*batch"] | np.floating | float,
     z: Transforms,
@@ -117,7 +117,7 @@ def predict(
     return z[..., None, :, :] @ scaled @ inverse(x)[..., None, :, :]
 
 
-def residuals(
+def pose_residuals(
     x: Transform,
     scale: float,
     z: Transform,
@@ -130,7 +130,7 @@ def residuals(
     `exchanged`: the camera is fixed and the gripper carries the scene. X is then base_from_camera, Z
     gripper_from_recon, and they predict gripper_from_base; the residuals are still those of base_from_gripper.
     """
-    predicted = predict(x, scale, z, recon_from_camera)
+    predicted = predicted_gripper_poses(x, scale, z, recon_from_camera)
     rotation = predicted[:, :3, :3]
     arm = scale * recon_from_camera[:, :3, 3] @ z[:3, :3].T
     j = np.zeros((len(predicted), 6, UNKNOWNS))
@@ -156,7 +156,7 @@ def residuals_by_camera(
     j[:, :3, :3] = scale * base_from_recon
     j[:, :3, 3:] = base_from_recon @ skew(lever)
     j[:, 3:, 3:] = base_from_recon
-    return by_inverse(predict(x, scale, z, recon_from_camera)) @ j if exchanged else j
+    return by_inverse(predicted_gripper_poses(x, scale, z, recon_from_camera)) @ j if exchanged else j
 
 
 def pose_by_pose(blocks: Float[ndarray, "n 6 6"], matrix: Float[ndarray, "r c"]) -> Float[ndarray, "r c"]:
@@ -225,7 +225,7 @@ def reported_poses(
     for k, arm in enumerate(problem.arms):
         at, rigs = (state.x[k], state.scale, state.z[k]), state.world_from_rig[arm.rigs]
         exchanged = arm.carries == "scene"
-        residual, by_unknown = residuals(*at, arm.base_from_gripper, rigs, exchanged)
+        residual, by_unknown = pose_residuals(*at, arm.base_from_gripper, rigs, exchanged)
         # X, then the scale that all arms share, then Z.
         jacobian[begin : begin + len(rigs), :, np.insert(columns_of_arm(k), 6, SCALE.start)] = by_unknown
         each.append((residual, residuals_by_camera(*at, rigs, exchanged)))
@@ -320,11 +320,13 @@ def fit_known_scale(
     weight, columns = 1 / np.repeat(noise, 3), columns_of_arm(0)
 
     def linearised(at: tuple[Transform, Transform]) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 12"]]:
-        residual, jacobian = residuals(at[0], 1.0, at[1], base_from_gripper, recon_from_camera, exchanged)
+        residual, jacobian = pose_residuals(
+            at[0], 1.0, at[1], base_from_gripper, recon_from_camera, exchanged
+        )
         return weight * residual, weight[:, None] * jacobian[:, :, columns]
 
     def moved(at: tuple[Transform, Transform], step: Float[ndarray, "12"]) -> tuple[Transform, Transform]:
         return retract(at[0], step[:6]), retract(at[1], step[6:])
 
     x, z = minimise(linearised, start, moved).unknowns
-    return Fit(x, z, residuals(x, 1.0, z, base_from_gripper, recon_from_camera, exchanged)[0])
+    return Fit(x, z, pose_residuals(x, 1.0, z, base_from_gripper, recon_from_camera, exchanged)[0])

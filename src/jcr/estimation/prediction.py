@@ -14,11 +14,11 @@ from numpy import ndarray
 
 from jcr.camera import parameters, project, unproject, with_parameters
 from jcr.estimation.covariance import expected_covariance_at
-from jcr.estimation.image_equations import evidence
+from jcr.estimation.image_equations import image_evidence
 from jcr.estimation.intrinsics_prior import CameraPrior, camera_about
 from jcr.estimation.pixel_noise import PixelNoise
 from jcr.estimation.point_uncertainty import seen_points
-from jcr.estimation.pose_equations import pose_equations, residuals
+from jcr.estimation.pose_equations import pose_equations, pose_residuals
 from jcr.estimation.problem import ROTATION, TRANSLATION, pose_problem, scale_prior, wrist_arm
 from jcr.estimation.robot_noise import GIVEN_SHARE, TYPICAL
 from jcr.estimation.solve import Solution, expected_solution
@@ -211,7 +211,7 @@ def _predicted_solution(
         model_error_std=np.array([max(camera.model_error, LEAST_MODEL_ERROR)]),
         pixel_noise=PixelNoise(np.array([np.sqrt(per_image / camera.information_per_px2)])),
     )
-    images = evidence(problem, state)
+    images = image_evidence(problem, state)
     images.information[np.diag_indices(len(images.information))] += UNCONNECTED
     return expected_solution(problem, state, images, noise)
 
@@ -276,7 +276,9 @@ UNIT = np.array([1e-3] * 3 + [np.radians(0.1)] * 3 + [2e-3])
 """Errors that count alike: 1 mm, 0.1°, 0.2 % of scale."""
 
 
-def choose(count: int, candidates: int, uncertainty_of: Callable[[Int[ndarray, " c"]], float]) -> list[int]:
+def choose_poses(
+    count: int, candidates: int, uncertainty_of: Callable[[Int[ndarray, " c"]], float]
+) -> list[int]:
     """Return the rows of `count` candidates, chosen one by one, best first.
 
     `uncertainty_of` returns the uncertainty that some rows leave, which the next row reduces most. A candidate gains
@@ -313,7 +315,7 @@ def pose_information(
     """Return the Fisher information of each gripper pose about the 13 unknowns, for random errors (m, rad)."""
     # The frame and unit of the reconstruction are arbitrary: those of the base, in metres.
     camera = base_from_gripper @ gripper_from_camera
-    _, j = residuals(gripper_from_camera, 1.0, np.eye(4), base_from_gripper, camera)
+    _, j = pose_residuals(gripper_from_camera, 1.0, np.eye(4), base_from_gripper, camera)
     j /= np.repeat(noise, 3)[:, None]
     return np.swapaxes(j, 1, 2) @ j
 
@@ -323,7 +325,7 @@ def nearest(poses: Float[ndarray, "c 4 4"], existing: Poses) -> Int[ndarray, " c
     return motion_length(inverse(existing) @ poses[:, None]).argmin(1)
 
 
-def candidates(
+def candidate_poses(
     base_from_gripper: Poses, x: Transform, reach: Float[ndarray, "2 3"] | None, rng: np.random.Generator
 ) -> Float[ndarray, "k 4 4"]:
     """Return gripper poses whose cameras look at the scene from about as far as the capture did.

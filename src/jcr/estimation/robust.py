@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.estimation.closed_form import closed_form, initial_estimate, motions, sine_axis
-from jcr.estimation.pose_equations import predict
+from jcr.estimation.pose_equations import predicted_gripper_poses
 from jcr.estimation.problem import SCALE, LinearPrior, pose_problem
 from jcr.estimation.solve import Solution, solve
 from jcr.geometry import ARM, Poses, rotation_angle, transform
@@ -182,7 +182,7 @@ def _squared_error(
     recon_from_camera: Poses,
 ) -> Float[ndarray, "*batch n"]:
     """Return the squared distance (m²) of each reported gripper pose from its prediction, rotation counted by ARM."""
-    gap = predict(x, scale, z, recon_from_camera) - base_from_gripper
+    gap = predicted_gripper_poses(x, scale, z, recon_from_camera) - base_from_gripper
     return (gap[..., :3, 3] ** 2).sum(-1) + ARM**2 * (gap[..., :3, :3] ** 2).sum((-1, -2)) / 2
 
 

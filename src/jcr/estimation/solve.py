@@ -23,7 +23,7 @@ from jcr.estimation.image_equations import (
     RigInformation,
     adjusted_images,
     cost_of_images,
-    evidence,
+    image_evidence,
     information_along,
     linearised,
     with_model_error_of,
@@ -292,10 +292,10 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
         else:
             information = _rig_information(problem, state, root)
             state = adjusted_images(problem, state, [information])[0]
-            state = _most_likely_arms(problem, state, evidence(problem, state), STEP_SETTLED**2)
+            state = _most_likely_arms(problem, state, image_evidence(problem, state), STEP_SETTLED**2)
             ends, steps = [], []
     state = replace(state, robot_log_sizes=log_sizes)
-    return state, evidence(problem, state), False, ROUNDS, last_step
+    return state, image_evidence(problem, state), False, ROUNDS, last_step
 
 
 def _joint_step(

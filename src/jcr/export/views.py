@@ -21,7 +21,7 @@ from jcr.export.options import ExportOptions
 from jcr.geometry import inverse
 from jcr.records import COEFFICIENTS, Intrinsics, PointCloud, Tracks
 from jcr.scene.cloud import write_cloud
-from jcr.sfm.model import camera_of
+from jcr.sfm.model import colmap_camera
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _ORIENTATION = 0x0112
@@ -116,7 +116,7 @@ def _colmap_model(views: PosedImages, names: list[str], intrinsics: Intrinsics) 
     if intrinsics.model == "thin_prism":
         raise InputError("COLMAP has no thin_prism distortion model; export with --undistort")
     model = pycolmap.Reconstruction()
-    camera = camera_of(intrinsics, known=True)
+    camera = colmap_camera(intrinsics, known=True)
     camera.camera_id = 1
     model.add_camera_with_trivial_rig(camera)
     x_px = views.tracks.x_px

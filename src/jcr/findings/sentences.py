@@ -222,7 +222,7 @@ def worst_direction(gripper_from_camera: ndarray, covariance: ndarray) -> str:
     return f"along {name}: ±{size}"
 
 
-def not_exact_enough(finding: "Finding") -> str:
+def unmet_bound(finding: "Finding") -> str:
     """Return the bound of 95 % of the errors that is not within the requirement, in words."""
     return f"{SHORT}: {_reached(finding.details)}"
 

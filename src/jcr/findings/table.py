@@ -109,7 +109,7 @@ class FindingKind(StrEnum):
     LEAVE_ONE_OUT = "leave-one-out error", KindRow("motion",
         "the leave-one-out error ({mm:.1f} mm) is well above the fit's residual ({residual_mm:.1f} mm): "
         "too few images for this motion", "add some", evidence="m")
-    NOT_EXACT_ENOUGH = "requirement not met", KindRow("motion", sentences.not_exact_enough,
+    NOT_EXACT_ENOUGH = "requirement not met", KindRow("motion", sentences.unmet_bound,
         "{concerns:images=add {more_images:.0f} more at the poses of next_poses|robot=most of it comes from systematic "
         "robot errors: name the arm (--robot) or add its joint angles|none=a dozen more images would not be enough; "
         "move closer to the scene, or use a better camera or robot}",

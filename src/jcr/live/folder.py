@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 
 from jcr.calibration.checks.capture import STILL as MOVED
 from jcr.capture.controllers import far_faults
-from jcr.capture.formats.capture_json import FILE, frame_of, read_content, stated_fields
+from jcr.capture.formats.capture_json import FILE, frame_of, read_capture_json, stated_fields
 from jcr.capture.images import encode_png, read_image, size_of_all
-from jcr.capture.plain_files import contained, validated
+from jcr.capture.plain_files import contained, validated_content
 from jcr.errors import InputError
 from jcr.estimation.arms import ROBOT_NAMES
 from jcr.files import remove_unfinished, write_bytes, write_text
@@ -45,7 +45,7 @@ class LiveFolder:
             raise InputError(f"{folder}: is a file; name a folder for the capture")
         self._content = CaptureFile(frames=[], intrinsics=None, source={"program": "jcr capture"})  # pyright: ignore[reportCallIssue]
         if file.exists():
-            self._content = read_content(file)
+            self._content = read_capture_json(file)
         self.images = tuple(frame_of(self._content, row, file) for row in range(len(self._content.frames)))
         given = {"intrinsics": intrinsics, "robot": robot}
         update = {key: value for key, value in given.items() if value is not None}
@@ -112,7 +112,7 @@ class LiveFolder:
             entry = {"image": f"{IMAGES}/{stem}.png", "base_from_gripper": pose, "time_s": time_s}
             entry |= {"joints": None if joints is None else np.asarray(joints, np.float64).tolist()}
             entry |= {"depth": None if depth_mm is None else f"depth/{stem}.png"}
-            new: FrameEntry = validated(FrameEntry, entry, number)
+            new: FrameEntry = validated_content(FrameEntry, entry, number)
             images = (*self.images, new)
             if len({len(one.joints) for one in images if one.joints is not None}) > 1:
                 raise InputError(

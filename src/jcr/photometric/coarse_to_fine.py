@@ -25,7 +25,7 @@ SETTLED = 0.995
 
 
 @dataclass(frozen=True)
-class Stage:
+class PyramidLevel:
     """One level of the pyramid."""
 
     height: int
@@ -43,13 +43,13 @@ def axes_meet(base_from_camera: Float[ndarray, "*batch n 4 4"]) -> Float[ndarray
     return nearest_to_lines(base_from_camera[..., :3, 3], base_from_camera[..., :3, 2])
 
 
-def cost_of(level: Level, cameras: Cameras, stage: Stage) -> float:
+def cost_of(level: Level, cameras: Cameras, stage: PyramidLevel) -> float:
     """Return the cost of the cameras' colour differences, at the best depth of each point."""
     host, x_px = strongest(level, _per_image(level, stage))
     return on_rays(level, cameras, host, x_px, _depths(cameras), stage.sigma, AGREED)[1]
 
 
-def _per_image(level: Level, stage: Stage) -> int:
+def _per_image(level: Level, stage: PyramidLevel) -> int:
     return max(10, stage.per_image * IMAGES_AT_FULL // max(level.count, IMAGES_AT_FULL))
 
 
@@ -79,7 +79,7 @@ def free_directions(cameras: Cameras, intrinsics_known: bool) -> Float[ndarray, 
 
 
 def align_photometrically(
-    level: Level, cameras: Cameras, stage: Stage, directions: Float[ndarray, "p q"]
+    level: Level, cameras: Cameras, stage: PyramidLevel, directions: Float[ndarray, "p q"]
 ) -> tuple[Cameras, Points]:
     """Search along the rays and Gauss-Newton, alternately."""
     host, x_px = strongest(level, _per_image(level, stage))

@@ -21,7 +21,7 @@ from jcr.capture.images import read_image
 from jcr.errors import InputError, RejectedError
 from jcr.geometry import apply, inverse, step_axes
 from jcr.photometric.coarse_to_fine import (
-    Stage,
+    PyramidLevel,
     align_photometrically,
     free_directions,
     tied_directions,
@@ -41,10 +41,10 @@ from jcr.photometric.search import SIZES, search
 from jcr.progress import Progress, silent
 from jcr.records import CameraEvidence, Capture, Intrinsics, Reconstruction, Tracks
 
-FREED = (Stage(60, 300, 3, 0.12), Stage(120, 300, 3, 0.1))
+FREED = (PyramidLevel(60, 300, 3, 0.12), PyramidLevel(120, 300, 3, 0.1))
 """Found without the robot poses."""
-FINEST = Stage(240, 300, 3, 0.1)
-BEFORE_GAINS = Stage(60, 300, 1, 0.2)
+FINEST = PyramidLevel(240, 300, 3, 0.1)
+BEFORE_GAINS = PyramidLevel(60, 300, 1, 0.2)
 """Stage after which brightness is compared."""
 GAIN_ROUNDS = 3
 """Number of estimates of the gains; each time more points agree."""

@@ -9,7 +9,13 @@ from numpy import ndarray
 
 from jcr.errors import RejectedError
 from jcr.geometry import inverse, rotation_between_deg, rotation_exp, transform
-from jcr.photometric.coarse_to_fine import Stage, align_photometrically, axes_meet, cost_of, tied_directions
+from jcr.photometric.coarse_to_fine import (
+    PyramidLevel,
+    align_photometrically,
+    axes_meet,
+    cost_of,
+    tied_directions,
+)
 from jcr.photometric.residuals import Cameras, Level, strongest
 from jcr.progress import Progress
 
@@ -24,9 +30,9 @@ SAME_M, SAME_DEG = 0.03, 5.0
 CLEARLY_BETTER = 0.9
 """Largest cost of a found hand-eye transform, relative to the next different one. Right ones, where there was another
 at all, had 0.60 to 0.81; wrong ones 0.96 to 1.00 (nine captures, eight of them with gripper poses of other images)."""
-COARSEST = Stage(15, 150, 3, 0.2)
-COARSE = Stage(30, 100, 8, 0.15)
-JUDGE = Stage(60, 100, 1, 0.12)
+COARSEST = PyramidLevel(15, 150, 3, 0.2)
+COARSE = PyramidLevel(30, 100, 8, 0.15)
+JUDGE = PyramidLevel(60, 100, 1, 0.12)
 SIZES = (COARSEST.height, COARSE.height, JUDGE.height)
 
 
@@ -47,7 +53,11 @@ def search(
     directions = tied_directions(intrinsics_known)
 
     def refined(
-        found: list[tuple[float, Cameras]], stage: Stage, judge: Stage, begin: float, share: float
+        found: list[tuple[float, Cameras]],
+        stage: PyramidLevel,
+        judge: PyramidLevel,
+        begin: float,
+        share: float,
     ) -> list[tuple[float, Cameras]]:
         """Align cameras at a stage and return them with their costs at the next one."""
         made = []

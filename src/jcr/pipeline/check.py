@@ -14,11 +14,11 @@ from jcr.calibration.checks.capture import as_causes, view_findings
 from jcr.calibration.checks.left_out import left_out_poses
 from jcr.calibration.hand_eye import SCALE_STD, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.poses import calibrate_poses, is_one
+from jcr.calibration.poses import calibrate_pose_pairs, is_one
 from jcr.calibration.record import Calibration
 from jcr.calibration.requirement import Proposals, assumptions_of, assumptions_of_poses
-from jcr.calibration.robot_errors import RobotErrors, errors_of, robot_errors
-from jcr.calibration.stage import checked
+from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
+from jcr.calibration.stage import checked_case
 from jcr.camera import fold_distance_px
 from jcr.capture.formats.table import OpenConventionError, possible_options
 from jcr.capture.images import brightness_and_sharpness, exposure_fault, read_image
@@ -183,7 +183,7 @@ def _look(
 
 def _compare_with_images(
     capture: Capture,
-    robot: RobotErrors,
+    robot: RobotErrorPrior,
     options: CalibrateOptions,
     seed: int,
     progress: Progress | None,
@@ -202,7 +202,7 @@ def _compare_with_images(
 
 def _compare_registered(
     capture: Capture,
-    robot: RobotErrors,
+    robot: RobotErrorPrior,
     options: CalibrateOptions,
     seed: int,
     progress: Progress | None,
@@ -218,7 +218,7 @@ def _compare_registered(
         if not quick:
             board = proposed([read_image(capture.folder / name) for name in capture.images])
         return _Comparison(findings=(*no_reconstruction(error), *(() if board is None else (board,))))
-    case = checked(capture, made, options, robot.of(made.image_index))
+    case = checked_case(capture, made, options, robot.of(made.image_index))
     hand_eye, assumptions = case.hand_eye, None
     if hand_eye.converged:
         assumptions = assumptions_of(case)
@@ -234,7 +234,7 @@ def _compare_registered(
 
 def _compare_pairs(pairs: PosePairs, options: CalibrateOptions) -> _Comparison:
     """Compare gripper poses with camera poses that were given, by the calibration of both."""
-    hand_eye = calibrate_poses(pairs, options)
+    hand_eye = calibrate_pose_pairs(pairs, options)
     used, assumptions = hand_eye.inliers, None
     if hand_eye.converged:
         scale_std = SCALE_STD if pairs.is_metric and is_one(hand_eye) else None

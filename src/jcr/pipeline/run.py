@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 from jcr.calibration.cues import check_known_length
 from jcr.calibration.options import CalibrateOptions, check_options
-from jcr.calibration.poses import calibrate_poses as calibrate_poses_stage
-from jcr.capture.added import with_images
+from jcr.calibration.poses import calibrate_pose_pairs
+from jcr.capture.added import with_added_images
 from jcr.capture.formats.capture_json import kept
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
-from jcr.cell.added import camera_of, keep_camera
+from jcr.cell.added import added_camera, keep_camera
 from jcr.cell.placement import write_cameras
 from jcr.errors import InputError, RejectedError
 from jcr.extras import is_installed
@@ -114,7 +114,7 @@ def calibrate_poses(pairs: PosePairs, out: str | Path, options: CalibrateOptions
     out = Path(out)
     with locked(out):
         start = time.perf_counter()
-        content = calibrate_poses_stage(pairs, options)
+        content = calibrate_pose_pairs(pairs, options)
         content = replace(content, timings_s={"calibrate": round(time.perf_counter() - start, 3)})
         forget_reconstruction(out)
         keep_calibration(out, content)
@@ -151,7 +151,7 @@ def build_map(
     with locked(before.out):
         result = begun(before.out, before.capture, options)
         for path in add:
-            added = with_images(result.added, Path(path), checked_options(read, ReadOptions))
+            added = with_added_images(result.added, Path(path), checked_options(read, ReadOptions))
             result = result.with_parts(added=added)
         stages = stages_of(result)
         return finished(make(result, stages[:2], report), stages[2:], report)
@@ -186,7 +186,7 @@ def add_camera(
         file = None if intrinsics is None else Path(intrinsics)
         taken = [known.capture.camera_name, *(one.name for one in known.others)]
         with TemporaryDirectory() as scratch:
-            camera = camera_of(name, files, file, taken, Path(scratch))
+            camera = added_camera(name, files, file, taken, Path(scratch))
             result = make(known.with_parts(others=(*known.others, camera)), stages_of(known)[:2], report)
             located = place(result, report)
             if (found := located.cameras[-1]).doubt is not None:

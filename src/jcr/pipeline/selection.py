@@ -9,7 +9,7 @@ from jcr.allocator import give_back
 from jcr.calibration.checks.capture import as_causes, view_findings
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.calibration.words import leave_one_out_text
 from jcr.depth.densify import densify
 from jcr.errors import InputError, RejectedError
@@ -123,7 +123,7 @@ def is_textured(trial: Trial, images: int) -> bool:
     return len(trial.reconstruction.tracks.image) >= TEXTURED * images
 
 
-def choose(
+def select_reconstruction(
     capture: Capture,
     options: RunOptions,
     progress: Progress | None = None,
@@ -287,7 +287,7 @@ def _try(
         report("calibrate", 0.0)
         start = time.perf_counter()
         try:
-            hand_eye = calibrate(capture, reconstruction, options.calibrate)
+            hand_eye = calibrate_reconstruction(capture, reconstruction, options.calibrate)
         except RejectedError as error:
             failure = error.with_traceback(None)
         calibrate_s = time.perf_counter() - start

@@ -33,7 +33,7 @@ from jcr.depth.depth_npz import is_made_from, write_depth
 from jcr.errors import InputError
 from jcr.files import read_bytes, write_text
 from jcr.findings import sentence
-from jcr.pipeline.selection import NothingFoundError, again, choose, timings_of
+from jcr.pipeline.selection import NothingFoundError, again, select_reconstruction, timings_of
 from jcr.progress import Progress
 from jcr.reconstruct import candidates, device_of
 from jcr.records import Capture, Reconstruction
@@ -205,7 +205,7 @@ def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
     before = _with_same_reconstruction(result, seen)
     try:
         if before is None:
-            found = choose(seen, options, progress, partial(keep_reconstruction, result))
+            found = select_reconstruction(seen, options, progress, partial(keep_reconstruction, result))
         else:
             found = again(seen, lambda: before.reconstruction, options, progress)
     except NothingFoundError as error:

@@ -12,7 +12,7 @@ from numpy import ndarray
 from jcr.calibration.drift import Cause, Drift, detectable, drift
 from jcr.calibration.options import GRASPING
 from jcr.calibration.robot_errors import of_poses, robot_errors
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.images import read_image
 from jcr.capture.read import read_source
 from jcr.cell.added import read_added_cameras
@@ -246,7 +246,7 @@ def _fixed_cameras(
         known = {"intrinsics": intrinsics, "intrinsics_std": np.zeros(4 + len(intrinsics.distortion))}
         now = replace(camera, name=f"{camera.name[:60]}_now", folder=camera.folder or new.folder, **known)
         both = replace(own, **known), now
-        hand_eye = calibrate(capture, reconstruction, calibrate_options)
+        hand_eye = calibrate_reconstruction(capture, reconstruction, calibrate_options)
         cell = place_cameras(capture, both, reconstruction, hand_eye, calibrate_options, progress)
         for one in cell.cameras:
             if one.parent_from_camera is None:
@@ -268,7 +268,7 @@ def _by_recalibration(
     if calibration.intrinsics is not None:
         new = replace(new, intrinsics=calibration.intrinsics)
     reconstruction = reconstruct(new, then.reconstruct, progress)
-    hand_eye = calibrate(new, reconstruction, then.calibrate)
+    hand_eye = calibrate_reconstruction(new, reconstruction, then.calibrate)
     if not hand_eye.converged:
         raise RejectedError(f"cannot tell: a new calibration from these images failed ({hand_eye.doubt})")
     offset = step_between(calibration.gripper_from_camera, hand_eye.gripper_from_camera)

@@ -62,7 +62,7 @@ def reconstruct_any_view(
     with redirect_stdout(sys.stderr):  # packages print there, and stdout is for the command's result
         maps = load(weights.path, device)(Views(images.colors, images.pinhole))
     report("reconstruct", 1.0)
-    maps = checked(maps, backend)
+    maps = usable_pointmaps(maps, backend)
     colors = np.stack([resize_and_crop(image, maps.grid) for image in images.colors])
     return reconstruct_pointmaps(
         capture,
@@ -73,7 +73,7 @@ def reconstruct_any_view(
     )
 
 
-def checked(maps: PosedPointmaps, model: str) -> PosedPointmaps:
+def usable_pointmaps(maps: PosedPointmaps, model: str) -> PosedPointmaps:
     """Return the pointmaps with confidence 0 wherever they cannot be used; raise InputError where nothing is left."""
     confidence = maps.confidence
     there = np.isfinite(maps.x_in_camera).all(-1) & np.isfinite(confidence) & (confidence > 0)

@@ -60,7 +60,7 @@ def load(weights: Path, device: str) -> Predict:
     except (OSError, ValueError, KeyError, RuntimeError, SafetensorError) as error:
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{weights}: no weights of Depth Anything 3 ({reason})") from None
-    return partial(predict, network.to(device))
+    return partial(predict_views, network.to(device))
 
 
 def build(name: str) -> nn.Module:
@@ -74,10 +74,10 @@ def build(name: str) -> nn.Module:
         return create_object(load_config(MODEL_REGISTRY[name])).eval()
 
 
-def predict(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) -> PosedPointmaps:
+def predict_views(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) -> PosedPointmaps:
     """Predict all views in one pass."""
     grid = grid_of(views.size, long_edge)
-    colors = np.stack([resized(image, grid, long_edge) for image in views.colors])
+    colors = np.stack([resized_for_grid(image, grid, long_edge) for image in views.colors])
     device = next(network.parameters()).device.type
     # Half the time on a GPU, and what the package does there; on a CPU half precision is no faster.
     half = torch.autocast("cuda", torch.bfloat16) if device == "cuda" else nullcontext()
@@ -111,7 +111,9 @@ def grid_of(size: tuple[int, int], long_edge: int = LONG_EDGE) -> ImageGrid:
     return ImageGrid.uncropped(size, (width, height))
 
 
-def resized(image: UInt8[ndarray, "h w 3"], grid: ImageGrid, long_edge: int) -> UInt8[ndarray, "h2 w2 3"]:
+def resized_for_grid(
+    image: UInt8[ndarray, "h w 3"], grid: ImageGrid, long_edge: int
+) -> UInt8[ndarray, "h2 w2 3"]:
     """Resize an image to `long_edge` and then to the grid, with the filters that Depth Anything 3 uses for each."""
     height, width = image.shape[:2]
     scale = long_edge / max(width, height)

@@ -61,7 +61,7 @@ def _filled(value: Any, file: Mapping[str, np.ndarray]) -> Any:
     if value.keys() != {ARRAY}:
         return {name: _filled(one, file) for name, one in value.items()}
     array = file[value[ARRAY]]
-    check_arrays({value[ARRAY]: (array, array.shape)})
+    require_shapes({value[ARRAY]: (array, array.shape)})
     return array
 
 
@@ -106,7 +106,7 @@ def read_npz(path: Path, expected: str) -> Iterator[tuple[str, Mapping[str, np.n
         raise InputError(f"{path}: damaged ({error}); delete it and run again") from None
 
 
-def check_arrays(shapes: Mapping[str, tuple[np.ndarray, tuple[int, ...]]]) -> None:
+def require_shapes(shapes: Mapping[str, tuple[np.ndarray, tuple[int, ...]]]) -> None:
     """Raise ValueError where an array, by name, has another shape than it should, or is not finite."""
     for name, (array, shape) in shapes.items():
         if array.shape != shape:
@@ -143,7 +143,7 @@ def _check(found: Reconstruction) -> None:
             for name, array in vars(maps).items()
             if isinstance(array, np.ndarray)
         }
-    check_arrays(shapes)
+    require_shapes(shapes)
     if min(positive) <= 0:
         raise ValueError("a length or a standard deviation is not positive")
     for name, index, end in (*rows, ("tracks.point", tracks.point, p)):

@@ -34,7 +34,7 @@ from jcr.sfm.missing_images import with_missing_images
 from jcr.sfm.model import (
     ENOUGH,
     adjust_robustly,
-    camera_of,
+    colmap_camera,
     intrinsics_of,
     observations,
     poses_of,
@@ -152,7 +152,7 @@ def map_images(
     )
     matched = replace(found, geometries=_thinned(found.geometries, len(names), matcher.seed))
     if matched.intrinsics != working:
-        cameras = [camera_of(matched.intrinsics, matcher.known), *cameras]
+        cameras = [colmap_camera(matched.intrinsics, matcher.known), *cameras]
     model, matching = begun, len({row for key in matched.geometries for row in key})
     with tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = write_database(Path(folder), cameras[0], matcher.x_px, matched.geometries)

@@ -15,7 +15,7 @@ from jcr.features.pairs import all_pairs
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 from jcr.sfm.colmap import matcher_of
-from jcr.sfm.model import quiet_colmap, tracks_of, triangulated, working_cameras, write_database
+from jcr.sfm.model import quiet_colmap, tracks_of, triangulated_model, working_cameras, write_database
 
 MIN_POINTS = 50
 
@@ -28,7 +28,7 @@ def reconstruct_given(
     Raises InputError when the model knows fewer than three, RejectedError when nothing can be triangulated.
     """
     report = progress or silent
-    names, recon_from_camera = colmap.read_cameras(cameras)
+    names, recon_from_camera = colmap.read_registered_cameras(cameras)
     row_of = _rows(names)
     known = [k for k, name in enumerate(capture.images) if row_of(name) is not None]
     if len(known) < 3:
@@ -94,5 +94,5 @@ def _triangulated(
         pairs = all_pairs(len(images))
         geometries = matcher.geometries(pairs, np.zeros((len(pairs), 2)))
         database = write_database(Path(folder), camera, matcher.x_px, geometries)
-        model = triangulated(database, camera, dict(enumerate(recon_from_camera)))
+        model = triangulated_model(database, camera, dict(enumerate(recon_from_camera)))
         return tracks_of(model, range(1, len(images) + 1), (intrinsics.width, intrinsics.height))

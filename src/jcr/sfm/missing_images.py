@@ -16,7 +16,7 @@ from jcr.camera import HALF_PIXEL
 from jcr.estimation.robust import robust_fit
 from jcr.features.matchers import Matcher
 from jcr.geometry import inverse
-from jcr.sfm.model import adjust_robustly, poses_of, rows_of, triangulated
+from jcr.sfm.model import adjust_robustly, poses_of, rows_of, triangulated_model
 
 PASSES = ((32.0, 1, 4.0), (8.0, 1, 1.0), (4.0, 5, 0.5))
 """Largest reprojection error of a point (px), refinements of each triangulation, and scale (px) of the loss of the
@@ -55,7 +55,7 @@ def with_missing_images(
     predicted[:, :3, 3] /= state.scale
     larger, cameras = model, dict(enumerate(predicted)) | dict(zip(rows, poses, strict=True))
     for largest_px, refinements, scale_px in PASSES:
-        larger = triangulated(database, larger.camera(1), cameras, largest_px, refinements)
+        larger = triangulated_model(database, larger.camera(1), cameras, largest_px, refinements)
         tied = Counter[int]()
         for point in larger.points3D.values():
             seen_by = {element.image_id - 1 for element in point.track.elements}

@@ -27,7 +27,7 @@ ENOUGH = 1e-6
 1e-5 of their distance elsewhere."""
 
 
-def camera_of(intrinsics: Intrinsics, known: bool) -> pycolmap.Camera:
+def colmap_camera(intrinsics: Intrinsics, known: bool) -> pycolmap.Camera:
     """Return COLMAP's camera: the given intrinsics, or a focal length and two radial coefficients to refine."""
     centre = [intrinsics.cx + HALF_PIXEL, intrinsics.cy + HALF_PIXEL]
     both = [intrinsics.fx, intrinsics.fy, *centre]
@@ -52,7 +52,7 @@ def working_cameras(
     width, height = all_intrinsics[0].width, all_intrinsics[0].height
     scale = min(1.0, working_size_px / max(width, height))
     size = round(width * scale), round(height * scale)
-    return [camera_of(resized(intrinsics, *size), known) for intrinsics in all_intrinsics]
+    return [colmap_camera(resized(intrinsics, *size), known) for intrinsics in all_intrinsics]
 
 
 def intrinsics_of(camera: pycolmap.Camera, like: Intrinsics, known: bool) -> Intrinsics:
@@ -139,7 +139,7 @@ def observations(model: pycolmap.Reconstruction, image_ids: Sequence[int]) -> li
     ]
 
 
-def triangulated(
+def triangulated_model(
     database: Path,
     camera: pycolmap.Camera,
     recon_from_camera: Mapping[int, Float[ndarray, "4 4"]],

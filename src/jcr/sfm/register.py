@@ -117,7 +117,9 @@ def shared_points(known: KnownImages, new: ImageFeatures) -> SharedPoints:
     theirs = list(zip(known.features, (rows for _, rows in of_row), strict=True))
     rays = np.concatenate([one.rays[rows] for one, rows in theirs])
     gate = GATE_PX / known.camera.fx
-    points, spread, good = triangulated(feature, row, rays, known.recon_from_camera, gate, len(new.rays))
+    points, spread, good = triangulated_features(
+        feature, row, rays, known.recon_from_camera, gate, len(new.rays)
+    )
     seen = good[feature]
     return SharedPoints(
         known=known,
@@ -166,7 +168,7 @@ def registration(
     )
 
 
-def triangulated(
+def triangulated_features(
     feature: Int[ndarray, " c"],
     row: Int[ndarray, " c"],
     seen: Float[ndarray, "c 2"],

@@ -13,7 +13,7 @@ from PIL import Image
 from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.hub import Weights
-from jcr.reconstruct import BACKENDS, ReconstructOptions, weights_of
+from jcr.reconstruct import BACKENDS, ReconstructOptions, network_weights
 from jcr.records import Capture, Intrinsics
 
 if TYPE_CHECKING:
@@ -267,10 +267,10 @@ def test_a_hub_id_comes_from_the_cache(
     with pytest.raises(
         InputError, match="only revision 000000000000 is on this machine; jcr models get dust3r"
     ):
-        weights_of(ReconstructOptions(backend="dust3r"))
+        network_weights(ReconstructOptions(backend="dust3r"))
     write_folder(repository / "snapshots" / row.revision, linear, LINEAR_CONFIG)
     assert row.has_weights()
-    weights = weights_of(ReconstructOptions(backend="dust3r"))
+    weights = network_weights(ReconstructOptions(backend="dust3r"))
     assert weights.name == row.hub_id and weights.licence.startswith("CC BY-NC-SA 4.0")
     assert weights.path.name == row.revision
     assert_same_output(linear, load_weights(weights).network)

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from jcr.calibration.record import Calibration
-from jcr.calibration.stage import calibrate
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import unproject
 from jcr.estimation.point_uncertainty import point_covariance
 from jcr.findings import FindingKind
@@ -105,7 +105,7 @@ def test_a_wrong_gripper_pose_is_left_out():
     poses = made.capture.base_from_gripper.copy()
     poses[2, :3, 3] += [0.02, 0.0, 0.0]
     wrong = replace(made, capture=replace(made.capture, base_from_gripper=poses))
-    found = calibrate(wrong.capture, wrong.reconstruction())
+    found = calibrate_reconstruction(wrong.capture, wrong.reconstruction())
     assert found.inliers.tolist() == [True, True, False, True, True, True, True]
     assert found.converged
     error = made.error(found)
@@ -141,7 +141,7 @@ def test_a_fault_of_the_poses_is_named_beside_a_wrong_focal_length(spoil: Callab
     made = case(12, 3, (1e-4, 3e-4), PairErrors(focal=0.03))
     poses = spoil(made.capture.base_from_gripper, made.gripper_from_camera)
     wrong = replace(made, capture=replace(made.capture, base_from_gripper=poses))
-    assert calibrate(wrong.capture, wrong.reconstruction()).findings[0].kind is cause
+    assert calibrate_reconstruction(wrong.capture, wrong.reconstruction()).findings[0].kind is cause
 
 
 @pytest.mark.parametrize("given", [True, False])
@@ -154,7 +154,7 @@ def test_the_focal_length_of_a_network_is_a_measurement(off: float, given: bool)
         images = replace(made.images, pinhole=None, intrinsics_of_capture=None)
         made = replace(made, capture=replace(made.capture, intrinsics=None), images=images)
     reconstruction = made.reconstruction()
-    found = calibrate(made.capture, reconstruction)
+    found = calibrate_reconstruction(made.capture, reconstruction)
     assert found.converged
     error = made.error(found)
     assert error @ np.linalg.solve(found.covariance, error) < 18.5
@@ -188,7 +188,7 @@ def test_reported_sigmas_are_those_of_the_errors(noise: tuple[float, float]):
     squared = []
     for seed in range(10):
         made = case(4 + seed % 2, seed, noise)
-        found = calibrate(made.capture, made.reconstruction())
+        found = calibrate_reconstruction(made.capture, made.reconstruction())
         error = made.error(found)
         # The principal point is exact here, and the errors that it may have rotate the camera.
         of_pointmaps = found.covariance - found.uncertainty.budget.intrinsics
@@ -210,7 +210,7 @@ def test_a_metric_network_is_fixed_against_the_robot(factor: float, off_percent:
         is_metric=True,
     )
     reconstruction = replace(made, predictions=network).reconstruction()
-    found = calibrate(made.capture, reconstruction)
+    found = calibrate_reconstruction(made.capture, reconstruction)
     check = found.scale_check
     assert abs(check.off_percent - off_percent) < 4 * check.std_percent * factor
     assert check.std_percent < 0.2 * factor
@@ -222,7 +222,7 @@ def test_a_metric_network_is_fixed_against_the_robot(factor: float, off_percent:
 
 def test_a_network_without_a_metre_shows_nothing_of_the_scale():
     made = case(4, 3, (1e-4, 2e-4))
-    assert calibrate(made.capture, made.reconstruction()).scale_check is None
+    assert calibrate_reconstruction(made.capture, made.reconstruction()).scale_check is None
 
 
 def test_evidence_survives_the_file(tmp_path: Path):

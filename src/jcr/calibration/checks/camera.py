@@ -256,7 +256,7 @@ def of_fewer_points(case: Case) -> Case:
     return replace(fewer, adjusted=adjust_case(fewer, combinations=free))
 
 
-def freed(state: EffectsState, best: CameraEffect) -> EffectsState | None:
+def with_effect_free(state: EffectsState, best: CameraEffect) -> EffectsState | None:
     """Adjust with one more effect free, or with the simpler one that explains nearly the same.
 
     Return None where the first step towards the effect moves the camera too little, or where the images then determine

@@ -12,7 +12,7 @@ from jcr.capture.checks import how_rotated
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image, show_one_view
 from jcr.estimation.closed_form import initial_estimate
 from jcr.estimation.observability import observability
-from jcr.estimation.pose_equations import predict
+from jcr.estimation.pose_equations import predicted_gripper_poses
 from jcr.estimation.robust import least_trimmed
 from jcr.features.sift import FARTHEST, detect, grey_of
 from jcr.findings import Finding, FindingKind
@@ -72,7 +72,9 @@ def check_pieces(case: Case) -> Case:
     agree, _ = least_trimmed(gripper, camera)
     for _ in range(CONCENTRATED):
         x, scale, z = initial_estimate(gripper[agree], camera[agree])
-        off = np.linalg.norm(step_between(gripper, predict(x, scale, z, camera)) / np.repeat(SAME, 3), axis=1)
+        off = np.linalg.norm(
+            step_between(gripper, predicted_gripper_poses(x, scale, z, camera)) / np.repeat(SAME, 3), axis=1
+        )
         agree = off <= np.sort(off)[max(MIN_IMAGES, len(off) // 2) - 1]
     x, scale, z = initial_estimate(gripper[agree], camera[agree])
     each = gripper @ x @ inverse(scale_translation(camera, scale))

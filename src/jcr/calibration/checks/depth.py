@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.calibration.record import Calibration
-from jcr.capture.images import read_depth
+from jcr.capture.images import read_depth_images
 from jcr.geometry import apply, inverse
 from jcr.records import Capture, DepthCheck, Reconstruction
 
@@ -61,7 +61,7 @@ def _pairs(
     for k, row in enumerate(reconstruction.image_index):
         if row >= len(depths) or (name := depths[row]) is None:
             continue
-        depth = read_depth(capture.folder / name, capture.image_size)
+        depth = read_depth_images(capture.folder / name, capture.image_size)
         seen = np.flatnonzero(tracks.image == k)
         u, v = np.rint(tracks.x_px[seen]).astype(int).T
         inside = (u >= 1) & (v >= 1) & (u < depth.shape[1] - 1) & (v < depth.shape[0] - 1)

@@ -27,11 +27,11 @@ from jcr.calibration.checks.camera import (
     best_camera_effect,
     camera_finding,
     contradicted_intrinsics,
-    freed,
     is_material,
     log_p,
     of_case,
     of_fewer_points,
+    with_effect_free,
 )
 from jcr.calibration.hand_eye import judged, poses_agree
 from jcr.calibration.options import GRASPING
@@ -101,7 +101,7 @@ def effects(imaged: CameraAdjustment) -> tuple[EffectsState, tuple[Finding, ...]
                 findings.append(found)
                 state = state.with_free(state.found, (*state.poses, test.row))
         elif of_camera is not None:
-            after = freed(state, of_camera)
+            after = with_effect_free(state, of_camera)
             found = None if after is None else camera_finding(after, state)
             camera_explains = after is None or poses_agree(after.adjusted.noise)
             if after is None or found is None or not camera_explains or not is_material(found, after):
@@ -114,7 +114,7 @@ def effects(imaged: CameraAdjustment) -> tuple[EffectsState, tuple[Finding, ...]
 
 def _explains(state: EffectsState, test: Test, of_camera: CameraEffect, log_chance: float) -> bool:
     """Return whether an effect on the poses rather than one on the camera is the cause where both are significant."""
-    with_camera = freed(state, of_camera)
+    with_camera = with_effect_free(state, of_camera)
     if with_camera is None:
         return True
     left = _best_pose_effect(with_camera, set())

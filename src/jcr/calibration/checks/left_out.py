@@ -9,7 +9,7 @@ from jcr.calibration.checks.capture import SAME
 from jcr.calibration.record import Calibration
 from jcr.capture.images import read_image
 from jcr.estimation.absolute_pose import CameraPose
-from jcr.estimation.pose_equations import predict
+from jcr.estimation.pose_equations import predicted_gripper_poses
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import ARM, step_between
 from jcr.records import Capture, Reconstruction
@@ -76,4 +76,8 @@ def _shown_poses(
         places = zip(unseen, register(made, older, new), strict=True)
         camera |= {row: place.a_from_camera for row, place in places if isinstance(place, CameraPose)}
     x, scale, z = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon.rigid
-    return {row: predict(x, scale, z, one[None])[0] for row, one in camera.items() if row not in used}
+    return {
+        row: predicted_gripper_poses(x, scale, z, one[None])[0]
+        for row, one in camera.items()
+        if row not in used
+    }

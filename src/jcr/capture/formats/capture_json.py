@@ -13,7 +13,7 @@ from jcr.capture.controllers import CONVENTIONS
 from jcr.capture.formats import Format
 from jcr.capture.images import read_image, size_of_all
 from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import contained, read_json, validated
+from jcr.capture.plain_files import contained, read_json, validated_content
 from jcr.errors import InputError, shown
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.files import write_new
@@ -32,26 +32,26 @@ FILE, URDF = "capture.json", "robot.urdf"
 _CAMERAS = TypeAdapter(CameraEntries)
 
 
-def read_content(file: Path) -> CaptureFile:
+def read_capture_json(file: Path) -> CaptureFile:
     """Read a capture.json; raise InputError where the file is none."""
     if not file.is_file():
         raise InputError(f"{file.parent}: holds no capture.json; name a capture folder")
     content = read_json(file)
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
         raise InputError(f'{file}: has no list "frames"; expected {{"frames": [...], "intrinsics": ...}}')
-    return validated(CaptureFile, content, str(file))
+    return validated_content(CaptureFile, content, str(file))
 
 
 def frame_of(content: CaptureFile, row: int, file: Path) -> FrameEntry:
     """Return a frame of a capture.json; raise InputError that names its image where the frame cannot be used."""
     where = f"{file}: frame {row} ({_image_name(content, row, file)})"
-    return validated(FrameEntry, content.frames[row], where)
+    return validated_content(FrameEntry, content.frames[row], where)
 
 
 def read(path: Path, options: ReadOptions | None = None) -> Capture:
     """Read the capture in a folder, or named by its capture.json; no option changes how."""
     folder, file = (path, path / FILE) if path.is_dir() else (path.parent, path)
-    content = read_content(file)
+    content = read_capture_json(file)
     count = len(content.frames)
     require_frames(count, str(file), 0)
     images = [_image_name(content, row, file) for row in range(count)]
@@ -110,7 +110,7 @@ def with_cameras(capture: Capture, cameras: Any, where: str, used: Sequence[bool
 
     `used` tells for each frame of the file whether the capture has it, all by default.
     """
-    entries: dict[str, CameraEntry] = validated(_CAMERAS, cameras, f"{where}: cameras")
+    entries: dict[str, CameraEntry] = validated_content(_CAMERAS, cameras, f"{where}: cameras")
     own = next((name for name, entry in entries.items() if entry.is_own), None)
     if own is not None:
         capture = replace(capture, camera_name=own, mount=entries.pop(own).mount)

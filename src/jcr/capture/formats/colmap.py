@@ -41,7 +41,7 @@ def read(path: Path, options: ReadOptions) -> Capture:
     if folder is None:
         raise InputError(f"{path}: holds no COLMAP model (cameras.bin or .txt, images, points3D)")
     root = next((parent for parent in (path, *folder.parents[:3]) if (parent / "images").is_dir()), path)
-    names, _ = read_cameras(folder)
+    names, _ = read_registered_cameras(folder)
     name_of = dict[str, str]()
     """Names in the model of the images' files."""
     for name in names:
@@ -81,7 +81,7 @@ def read_model(folder: Path) -> "pycolmap.Reconstruction":
         pycolmap.logging.minloglevel = before
 
 
-def read_cameras(folder: Path) -> tuple[list[str], Float[ndarray, "n 4 4"]]:
+def read_registered_cameras(folder: Path) -> tuple[list[str], Float[ndarray, "n 4 4"]]:
     """Read the names of the registered images, in order, and their recon_from_camera (n,4,4)."""
     model = read_model(folder)
     images = sorted((model.image(k) for k in model.reg_image_ids()), key=lambda image: image.name)

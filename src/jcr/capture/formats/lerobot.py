@@ -15,7 +15,7 @@ from jcr.capture.camera_info import read_camera_info
 from jcr.capture.controllers import CONVENTIONS, poses_from_numbers
 from jcr.capture.formats import Format
 from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import contained, read_json, validated
+from jcr.capture.plain_files import contained, read_json, validated_content
 from jcr.capture.pose_track import pose_track, speed
 from jcr.capture.recording import Picture, Recording, capture_of_recording, chosen_name
 from jcr.capture.urdf_chain import read_arm
@@ -80,7 +80,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
 
     Raises InputError that lists the existing cameras, states or episodes where the options name others.
     """
-    info: Info = validated(Info, read_json(path / INFO), str(path / INFO))
+    info: Info = validated_content(Info, read_json(path / INFO), str(path / INFO))
     features = info.features
     cameras = [key for key, feature in features.items() if feature.dtype in ("video", "image")]
     camera = chosen_name(

@@ -29,7 +29,7 @@ Entry = dict[str, Any] | list[Any]
 """Cells of one pose, texts or numbers: by the names of a table's columns, or in order."""
 
 
-def read_content(file: Path) -> Any:
+def read_yaml_or_json(file: Path) -> Any:
     """Read a YAML or JSON file; several YAML documents (as `ros2 topic echo` prints) are a list."""
     return read_json(file) if file.suffix.lower() == ".json" else read_yaml(file)
 

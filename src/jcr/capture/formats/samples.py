@@ -7,7 +7,7 @@ from pathlib import Path
 
 from jcr.capture.checks import require_frames
 from jcr.capture.formats import Format
-from jcr.capture.formats.pose_lists import SUFFIXES, pair_keys, read_content, read_rows
+from jcr.capture.formats.pose_lists import SUFFIXES, pair_keys, read_rows, read_yaml_or_json
 from jcr.capture.formats.table import pose_table
 from jcr.capture.options import ReadOptions
 from jcr.errors import InputError
@@ -20,7 +20,7 @@ def read(path: Path, options: ReadOptions) -> PosePairs:
 
     Raises InputError for eye_on_base, where the camera stands beside the robot and `robot` is inverted.
     """
-    content = read_content(path)
+    content = read_yaml_or_json(path)
     keys = pair_keys(content)
     if keys is None:
         raise InputError(
@@ -57,7 +57,7 @@ FORMAT = Format(
     name="samples",
     about="samples of MoveIt Calibration or easy_handeye2",
     recognises=lambda path: (
-        path.is_file() and path.suffix.lower() in SUFFIXES and pair_keys(read_content(path)) is not None
+        path.is_file() and path.suffix.lower() in SUFFIXES and pair_keys(read_yaml_or_json(path)) is not None
     ),
     read=read,
 )

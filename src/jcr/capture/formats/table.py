@@ -110,7 +110,7 @@ def find_table(path: Path) -> Path | None:
 def read_pose_table(file: Path, options: ReadOptions) -> PoseTable:
     """Read the poses of a file; InputError naming the column at fault, or the option that it needs."""
     if file.suffix in pose_lists.SUFFIXES:
-        header, rows = pose_lists.read_rows(pose_lists.read_content(file), str(file))
+        header, rows = pose_lists.read_rows(pose_lists.read_yaml_or_json(file), str(file))
     else:
         header, rows = _read_rows(file)
     return pose_table(header, rows, options, str(file))

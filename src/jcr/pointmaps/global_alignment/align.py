@@ -15,7 +15,7 @@ from jcr.camera import rays
 from jcr.errors import InputError
 from jcr.pointmaps.global_alignment.gauss_newton import ITERATIONS, AlignmentSolution, solve
 from jcr.pointmaps.global_alignment.observations import AlignmentProblem, observe
-from jcr.pointmaps.global_alignment.residuals import fused_depth
+from jcr.pointmaps.global_alignment.residuals import fitted_depth
 from jcr.pointmaps.pairs import PairPredictions, read_pairs
 from jcr.progress import Progress, silent
 from jcr.records import Intrinsics
@@ -109,7 +109,7 @@ def _dense_alignment(problem: AlignmentProblem, solution: AlignmentSolution, pro
     def settle(k: int) -> None:
         for start in range(0, height * width, DEPTH_CHUNK):
             chunk = slice(start, start + DEPTH_CHUNK)
-            depth[k, chunk], confidence[k, chunk] = fused_depth(
+            depth[k, chunk], confidence[k, chunk] = fitted_depth(
                 observe(problem, k, chunk), state, solution.noise[k]
             )
 

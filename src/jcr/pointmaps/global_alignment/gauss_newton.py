@@ -21,10 +21,10 @@ from jcr.pointmaps.global_alignment.residuals import (
     AlignmentState,
     Residuals,
     ResidualSpread,
-    agreement,
-    fused_depth,
+    depth_residuals,
+    fitted_depth,
+    geman_mcclure_weights,
     measure_noise,
-    residuals,
 )
 
 COARSE_PIXELS = 300
@@ -91,7 +91,7 @@ def solve(problem: AlignmentProblem, pixels: int) -> AlignmentSolution:
     pair_spread = START_SPREAD * np.repeat([np.exp(np.median(np.concatenate(state.log_depth))), 1.0], 3)
     coarse = gauss_newton(images, state, pair_spread, COARSE_TOLERANCE)
     images = problem.observe_all(pixels)
-    depth = [fused_depth(o, coarse.state, noise)[0] for o, noise in zip(images, coarse.noise, strict=True)]
+    depth = [fitted_depth(o, coarse.state, noise)[0] for o, noise in zip(images, coarse.noise, strict=True)]
     state = replace(coarse.state, log_depth=[np.log(z) for z in depth])
     return gauss_newton(images, state, coarse.pair_spread, FINE_TOLERANCE)
 
@@ -109,7 +109,7 @@ def gauss_newton(
     focal = 6 * len(images)
     for iteration in range(1, ITERATIONS + 1):
         misfit = [
-            residuals(o, state, log_depth) for o, log_depth in zip(images, state.log_depth, strict=True)
+            depth_residuals(o, state, log_depth) for o, log_depth in zip(images, state.log_depth, strict=True)
         ]
         noise = measure_noise(images, misfit)
         try:
@@ -207,7 +207,7 @@ def image_equations(
     """
     n, count, maps = o.second_count, 6 * o.second_count, len(o.pair)
     # Of mean 1, so that the hessian is the information in the pointmaps.
-    robust = o.weight / np.maximum(o.weight.mean(), np.float32(1e-12)) * agreement(r, noise)
+    robust = o.weight / np.maximum(o.weight.mean(), np.float32(1e-12)) * geman_mcclure_weights(r, noise)
     w_across = robust / (noise.across**2 * noise.across_inflation)[:, None]
     w_along = robust / (noise.along**2 * noise.along_inflation)[:, None]
     alpha = w_across / r.distance**2

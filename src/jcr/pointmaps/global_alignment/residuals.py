@@ -68,7 +68,9 @@ class Residuals:
     along: Float[ndarray, "k m"]
 
 
-def residuals(o: ImageObservations, state: AlignmentState, log_depth: Float[ndarray, " m"]) -> Residuals:
+def depth_residuals(
+    o: ImageObservations, state: AlignmentState, log_depth: Float[ndarray, " m"]
+) -> Residuals:
     """Model one image's points at `log_depth` and compare them with every pointmap that shows them."""
     camera, observer = state.recon_from_camera[o.image], state.recon_from_camera[o.observer]
     error = state.pair_error[o.pair]
@@ -99,7 +101,7 @@ def residuals(o: ImageObservations, state: AlignmentState, log_depth: Float[ndar
     )
 
 
-def agreement(r: Residuals, noise: ResidualSpread) -> Float[ndarray, "k m"]:
+def geman_mcclure_weights(r: Residuals, noise: ResidualSpread) -> Float[ndarray, "k m"]:
     """Return the Geman-McClure weights of the residuals, in (0, 1]."""
     u = r.across_squared / noise.across[:, None] ** 2 + r.along**2 / noise.along[:, None] ** 2
     return (1.0 + u * np.float32(ROBUST_WIDTH**-2)) ** -2
@@ -125,7 +127,7 @@ def _own_noise(o: ImageObservations, r: Residuals) -> Float[ndarray, "4 k"]:
     """Estimate spreads per pointmap from medians, and inflations from the agreement within cells; fields of Noise."""
     across = np.maximum(np.sqrt(np.median(r.across_squared, axis=1) / 1.386), LEAST_NOISE)
     along = np.maximum(1.4826 * np.median(np.abs(r.along), axis=1), LEAST_NOISE)
-    weight = o.weight * agreement(r, ResidualSpread(across, along, across, along))
+    weight = o.weight * geman_mcclure_weights(r, ResidualSpread(across, along, across, along))
     return np.stack([across, along, _inflation(o, weight, r.across), _inflation(o, weight, r.along[:, None])])
 
 
@@ -156,7 +158,7 @@ def initial_depth(o: ImageObservations, state: AlignmentState) -> Float[ndarray,
     return np.maximum(np.median(depths, axis=0), 1e-6)
 
 
-def fused_depth(
+def fitted_depth(
     o: ImageObservations, state: AlignmentState, noise: ResidualSpread
 ) -> tuple[Float[ndarray, " m"], Float[ndarray, " m"]]:
     """Estimate the depth of the observed pixels by Gauss-Newton from `initial_depth`, and their mean weight.
@@ -165,8 +167,8 @@ def fused_depth(
     """
     log_depth, weight = np.log(initial_depth(o, state)), o.weight
     for _ in range(DEPTH_ITERATIONS):
-        r = residuals(o, state, log_depth)
-        weight = o.weight * agreement(r, noise)
+        r = depth_residuals(o, state, log_depth)
+        weight = o.weight * geman_mcclure_weights(r, noise)
         over_distance = weight / r.distance
         w_across, w_along = (over_distance / of[:, None] ** 2 for of in (noise.across, noise.along))
         along_arm = np.einsum("kcm,cm->km", r.toward, r.depth_arm)
