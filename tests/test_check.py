@@ -19,6 +19,7 @@ from jcr.calibration.checks.left_out import left_out_poses
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.capture.images import BLURRED_EDGE, edge_width, encode_png, read_image
 from jcr.cli import dispatch
+from jcr.cli.check import read_arguments
 from jcr.findings import FindingKind
 from jcr.pipeline.check import read_and_compare, spread_rows
 from jcr.pointmaps.reconstruction import NO_TRACKS
@@ -137,7 +138,8 @@ def test_poses_that_are_as_noisy_as_is_assumed_show_their_convention(
         backend="colmap",
     )
     monkeypatch.setattr("jcr.pipeline.check.reconstruct_colmap", lambda *_: made)
-    found = read_and_compare(tmp_path)
+    found, options = read_and_compare(tmp_path)
+    assert read_arguments(options) == ["--pose-convention", convention]
     assert isinstance(found, Capture) and found.pose_convention == convention
     assert f"read with --pose-convention {convention}" in found.notes[-1]
 

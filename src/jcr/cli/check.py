@@ -1,7 +1,7 @@
 """Commands that test a capture or a calibration: check, verify, compare and touch."""
 
 import shlex
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -69,7 +69,7 @@ class CheckCommand:
         check_options(options)
         with (
             progress_bars() as progress,
-            looked_at(self.capture, self.read, progress, read_and_compare) as capture,
+            looked_at(self.capture, self.read, progress, read_and_compare) as (capture, read),
         ):
             found = check_capture(
                 capture,
@@ -81,11 +81,24 @@ class CheckCommand:
                 progress,
                 self.thorough,
             )
-            self.output.result(_check_lines(self, capture, found), _check_facts(capture, found))
+            self.output.result(_check_lines(self, capture, read, found), _check_facts(capture, found))
         return 3 if found.verdict == "rejected" else 0
 
 
-def _check_lines(command: CheckCommand, capture: "Capture | PosePairs", found: "Examination") -> list[str]:
+def read_arguments(read: ReadOptions) -> list[str]:
+    """Return the arguments that give the options of reading a capture, as far as they are not the default."""
+    given = list[str]()
+    for option in fields(read):
+        value = getattr(read, option.name)
+        if value != option.default:
+            values = value if isinstance(value, tuple) else () if value is True else (value,)
+            given += [f"--{option.name.replace('_', '-')}", *map(str, values)]
+    return given
+
+
+def _check_lines(
+    command: CheckCommand, capture: "Capture | PosePairs", read: ReadOptions, found: "Examination"
+) -> list[str]:
     """Return the verdict with its cause and remedy, or with what a calibration is expected to reach."""
     from jcr.calibration.words import MOST_LINES, actions, labelled, verdict_in_words
     from jcr.findings import sentence
@@ -104,7 +117,8 @@ def _check_lines(command: CheckCommand, capture: "Capture | PosePairs", found: "
         rotation = np.degrees(found.largest_rotation_rad)
         motion = f"up to {1e3 * found.largest_move_m:.0f} mm and {rotation:.0f}° between two poses"
         lines += [*labelled("Motion", motion), *_expected(len(capture), found)]
-        closing = shlex.join(["jcr", "run", str(command.capture), f"out/{command.capture.stem}"])
+        run = ["jcr", "run", str(command.capture), f"out/{command.capture.stem}"]
+        closing = shlex.join([*run, *read_arguments(read)])
     notes = [line for note in found.notes for line in labelled("Note", note)]
     acting = actions(found.findings, MOST_LINES - len(lines) - 1)
     if command.output.verbose:

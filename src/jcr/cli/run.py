@@ -227,7 +227,7 @@ def looked_at(
     progress: "Progress",
     read: Callable[..., Any] | None = None,
     **more: Any,
-) -> "Iterator[Capture | PosePairs]":
+) -> Iterator[Any]:
     """Read what lies at a path with `read`, by default read_source; the frames of a recording vanish afterwards."""
     _announce(path)
     from jcr.capture.read import read_source

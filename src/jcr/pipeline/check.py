@@ -108,7 +108,7 @@ def check_capture(
     where gripper poses and joint angles contradict each other.
     """
     if isinstance(capture, str | Path):
-        capture = read_and_compare(capture, progress=progress)
+        capture = read_and_compare(capture, progress=progress)[0]
     given = capture.base_from_gripper
     (move_m, rotation_rad), notes = largest_motion(given), [*capture.notes, *_remark_on_units(given)]
     options = CalibrateOptions()
@@ -253,16 +253,17 @@ def read_and_compare(
     *,
     into: str | Path | None = None,
     progress: Progress | None = None,
-) -> Capture | PosePairs:
+) -> tuple[Capture | PosePairs, ReadOptions]:
     """Read a capture; where its file leaves the pose convention open, find the one that the images fit.
 
-    Raises InputError where the images do not tell either.
+    Return the capture and the options that read it. Raises InputError where the images do not tell either.
     """
+    options = options or ReadOptions()
     try:
-        return read_source(path, options, into=into, progress=progress)
+        return read_source(path, options, into=into, progress=progress), options
     except OpenConventionError:
         read = list[tuple[Capture, ReadOptions]]()
-        for possible in possible_options(options or ReadOptions()):
+        for possible in possible_options(options):
             for one in possible:
                 with suppress(InputError):
                     read.append((read_capture(path, one), one))
@@ -276,7 +277,9 @@ def read_and_compare(
         return found
 
 
-def _best_fit(read: list[tuple[Capture, ReadOptions]], progress: Progress | None) -> Capture | None:
+def _best_fit(
+    read: list[tuple[Capture, ReadOptions]], progress: Progress | None
+) -> tuple[Capture, ReadOptions] | None:
     """Return the capture whose poses agree with the images far better than those of the others, with a note."""
     if not read:
         return None
@@ -304,7 +307,7 @@ def _best_fit(read: list[tuple[Capture, ReadOptions]], progress: Progress | None
         f"columns rx, ry, rz are read with --pose-convention {options.pose_convention}{units}: these poses agree with "
         f"the images to {off} (median){worse}; give these options to jcr run"
     )
-    return replace(capture, notes=(*capture.notes, note))
+    return replace(capture, notes=(*capture.notes, note)), options
 
 
 def spread_rows(count: int) -> Int[ndarray, " k"]:
