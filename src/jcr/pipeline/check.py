@@ -40,6 +40,7 @@ from jcr.findings import (
 from jcr.geometry import ARM, largest_motion
 from jcr.progress import Progress
 from jcr.records import Capture, NextPose, Observability, PosePairs, Uncertainty
+from jcr.rounding import significant
 from jcr.sfm.colmap import reconstruct_colmap
 
 CLEARER = 3.0
@@ -296,7 +297,7 @@ def _best_fit(
         # The noise of a rejected fit is the assumed one, and says nothing of the poses.
         residuals = [(one.translation_residual_mm, one.rotation_residual_deg) for one in fit.images]
         mm, deg = np.median(np.array(residuals, dtype=float), axis=0)
-        off = f"{mm:.2g} mm and {deg:.2g}°"
+        off = f"{significant(mm)} mm and {significant(deg)}°"
         fits.append((float(1e-3 * mm + ARM * np.radians(deg)), off, capture, options))
     (best, off, capture, options), *others = sorted(fits, key=lambda fit: fit[0])
     if others and others[0][0] < CLEARER * best:
