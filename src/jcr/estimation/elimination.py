@@ -158,11 +158,14 @@ def with_fixed_points(
     s, o = rows.shared.shape[2], rows.own.shape[2]
     size = s + o * len(seen.rows)
     hessian, right = np.zeros((size, size)), np.zeros(size)
+    shared = rows.shared.reshape(2 * len(rows.shared), s)
+    hessian[:s, :s], right[:s] = shared.T @ shared, -(shared.T @ rows.residual.ravel())
     for i, of_image in enumerate(seen.rows):
-        block = np.concatenate([rows.shared[of_image], rows.own[of_image]], axis=2).reshape(-1, s + o)
-        columns = np.r_[0:s, s + o * i : s + o * (i + 1)]
-        hessian[np.ix_(columns, columns)] += block.T @ block
-        right[columns] -= block.T @ rows.residual[of_image].ravel()
+        columns = slice(s + o * i, s + o * (i + 1))
+        own = rows.own[of_image].reshape(-1, o)
+        coupling = rows.shared[of_image].reshape(len(own), s).T @ own
+        hessian[:s, columns], hessian[columns, :s] = coupling, coupling.T
+        hessian[columns, columns], right[columns] = own.T @ own, -(own.T @ rows.residual[of_image].ravel())
     return hessian, right
 
 
