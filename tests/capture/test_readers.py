@@ -17,9 +17,9 @@ import jcr
 from in_process import run_jcr
 from jcr.capture.controllers import CONVENTIONS, poses_from_numbers
 from jcr.capture.formats import colmap
-from jcr.capture.formats.table import PoseTable, read_pose_table
+from jcr.capture.formats.table import read_pose_table
 from jcr.capture.options import ReadOptions
-from jcr.capture.pairing import stamp_ns
+from jcr.capture.pairing import PoseTable, stamp_ns
 from jcr.capture.plain_files import read_yaml
 from jcr.capture.read import FORMATS, format_of, read_source
 from jcr.geometry import scale_translation

@@ -3,12 +3,12 @@
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path, PureWindowsPath
-from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.capture.controllers import tolerated
@@ -17,9 +17,6 @@ from jcr.capture.plain_files import first_few, shown
 from jcr.capture.pose_track import pose_track
 from jcr.errors import InputError
 
-if TYPE_CHECKING:
-    from jcr.capture.formats.table import PoseTable
-
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _LATEST_NS = np.iinfo(np.int64).max
 """The last nanosecond that fits 64 bits, in the year 2262."""
@@ -27,7 +24,21 @@ Paired = tuple[list[str], Float[ndarray, "n 4 4"], Mapping[int, str], tuple[str,
 """Images relative to the folder, their base_from_gripper, messages of the rows without one, and notes."""
 
 
-def pair_with_images(folder: Path, file: Path, table: "PoseTable", options: ReadOptions) -> Paired:
+@dataclass(frozen=True, kw_only=True)
+class PoseTable:
+    """Rows of a file of gripper poses."""
+
+    base_from_gripper: Float[ndarray, "n 4 4"]
+    images: tuple[str, ...] | None
+    """Names as they stand in the file."""
+    stamp_ns: Int[ndarray, " n"] | None
+    convention: str
+    """A name of CONVENTIONS."""
+    faults: Mapping[int, str]
+    """Messages of the rows that hold no pose; their poses are NaN."""
+
+
+def pair_with_images(folder: Path, file: Path, table: PoseTable, options: ReadOptions) -> Paired:
     """Pair the rows of a file of poses with the images of a folder; InputError where they cannot be paired."""
     if table.images is not None:
         return _paired_by_name(folder, file, table)
@@ -88,7 +99,7 @@ def stamp_ns(text: str, where: str) -> int:
     raise InputError(f"{where}: {shown(text)} is not a time stamp; give seconds or nanoseconds")
 
 
-def _paired_by_name(folder: Path, file: Path, table: "PoseTable") -> Paired:
+def _paired_by_name(folder: Path, file: Path, table: PoseTable) -> Paired:
     """Pair rows with the images that they name, of tools that write other folders, slashes and endings."""
     assert table.images is not None
     own: dict[str, list[str]] = {}
@@ -118,7 +129,7 @@ def _paired_by_name(folder: Path, file: Path, table: "PoseTable") -> Paired:
 
 
 def _paired_by_time(
-    folder: Path, file: Path, table: "PoseTable", taken: list[str], options: ReadOptions
+    folder: Path, file: Path, table: PoseTable, taken: list[str], options: ReadOptions
 ) -> Paired | None:
     """Interpolate the poses at images that are named by their time stamps; None where they are not."""
     assert table.stamp_ns is not None

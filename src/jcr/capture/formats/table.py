@@ -3,14 +3,12 @@
 import csv
 import re
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from jaxtyping import Float, Int
-from numpy import ndarray
 
 from jcr.capture.camera_info import FILE, read_camera_info
 from jcr.capture.checks import checked_capture, require_frames
@@ -18,7 +16,7 @@ from jcr.capture.controllers import CONVENTIONS, checked_rows, tolerated
 from jcr.capture.formats import Format, pose_lists
 from jcr.capture.images import DEPTH
 from jcr.capture.options import ConventionName, ReadOptions, UnitsName
-from jcr.capture.pairing import pair_with_images, stamp_ns
+from jcr.capture.pairing import PoseTable, pair_with_images, stamp_ns
 from jcr.capture.plain_files import read_npy, read_text, shown
 from jcr.errors import InputError
 from jcr.records import Capture
@@ -46,20 +44,6 @@ _EXPLICIT: dict[str, ConventionName] = {
 _UR_POSE = re.compile(r"\bp\s*\[([^\]]*)\]")
 _UNIT = re.compile(r"^(.+?)(?:_|_?[\[(])(mm|cm|m|deg|rad|s|ns)[\])]?$")
 _DECIMAL_COMMA = re.compile(r"^([+-]?\d+),(\d+(?:[eE][+-]?\d+)?)$")
-
-
-@dataclass(frozen=True, kw_only=True)
-class PoseTable:
-    """Rows of a file of gripper poses."""
-
-    base_from_gripper: Float[ndarray, "n 4 4"]
-    images: tuple[str, ...] | None
-    """Names as they stand in the file."""
-    stamp_ns: Int[ndarray, " n"] | None
-    convention: str
-    """A name of CONVENTIONS."""
-    faults: Mapping[int, str]
-    """Messages of the rows that hold no pose; their poses are NaN."""
 
 
 class OpenConventionError(InputError):
