@@ -91,6 +91,7 @@ def _quantities(finding: "Finding") -> _Quantities:
         named[f"{name}_percent"] = _Text(significant(100 * detail))
     if (value := finding.value) is not None:
         named |= {"value": value, "mm": 1e3 * value, "percent": 100 * value, "size": abs(value)}
+        named["percent_rounded"] = significant(100 * value)
         named |= {"way": _Number(value), "size_percent": 100 * abs(value), "size_deg": np.degrees(abs(value))}
     if (std := finding.std) is not None:
         for unit, per in (("", 1), ("_percent", 100), ("_mm", 1e3), ("_deg", np.degrees(1))):

@@ -120,7 +120,7 @@ class FindingKind(StrEnum):
         "view to the farthest", "lock the focus, or --focus varies", explains=MISFIT,
         evidence="share, from the nearest view to the farthest; the chance `p`")
     FOCUS_BY_IMAGE = "focal length differs between images", KindRow("camera",
-        "the focal length differs between images by {percent:.1f} % (rms, each ± {std_percent} %)",
+        "the focal length differs between images by {percent_rounded} % (rms, each ± {std_percent} %)",
         "lock the focus and take the images again, or --focus varies", explains=MISFIT, evidence="share, rms")
     ZOOM = "focal length changed once", KindRow("camera",
         "the focal length changes by {percent:+.1f} ± {std_percent} % after {images[0]}: the "
