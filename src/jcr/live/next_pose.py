@@ -78,12 +78,8 @@ def propose(
         is_apart = _least_rotation(added, poses) >= APART
         return is_likely(added) & is_apart if is_limited_by_rotation else is_likely(added)
 
-    if (
-        best is not None
-        and reach.arm is None
-        and reach.box is None
-        and is_wanted(best.base_from_gripper[None])[0]
-    ):
+    is_free = reach.arm is None and reach.box is None
+    if best is not None and is_free and is_wanted(best.base_from_gripper[None])[0]:
         return {"next_pose": best}
 
     def is_wanted_or_likely(added: Poses) -> Bool[ndarray, " k"]:
