@@ -275,12 +275,19 @@ def _run(
 
 
 def show_calibration(result: "RunResult", output: VerboseOutput) -> None:
-    """Print the summary as soon as the calibration stands; with --json all comes at the end."""
-    from jcr.calibration.words import MOST_LINES, summary
+    """Print the summary as soon as the calibration stands, with what was noted when the capture was read.
+
+    With --json all comes at the end.
+    """
+    from jcr.calibration.words import MOST_LINES, labelled, summary
 
     if not output.json:
         others = 0 if result.cameras is None else len(result.cameras.cameras)
-        sys.stdout.write(summary(result.calibration, MOST_LINES - others - 1))  # a line of the caller
+        most = MOST_LINES - others - 1  # a line of the caller
+        lines = summary(result.calibration, most).splitlines()
+        notes = [line for note in result.capture.notes for line in labelled("Note", note)]
+        lines += notes[: max(most - 2 - len(lines), 0)]
+        sys.stdout.write("\n".join(lines) + "\n")
         sys.stdout.flush()
 
 

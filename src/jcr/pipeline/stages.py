@@ -284,7 +284,8 @@ def _calibrate(result: RunResult, progress: Progress) -> RunResult:
     capture, reconstruction, content = result.capture, result.reconstruction, result.found
     if capture.mount == "base":
         content = refined(capture, reconstruction, content, result.state.options.calibrate)
-    content = replace(content, attempts=result.state.attempts, notes=reconstruction.notes)
+    notes = (*capture.notes, *reconstruction.notes)
+    content = replace(content, attempts=result.state.attempts, notes=notes)
     if content.verdict == "rejected" or content.short is not None:
         board = proposed_for(capture, result.state.options.reconstruct.board)
         content = content if board is None else content.with_findings(board)
