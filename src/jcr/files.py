@@ -18,7 +18,7 @@ COPIES = "capture", "added"
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; on success it replaces `path`, on failure it goes."""
+    """Yield a temporary path beside `path`; on success it replaces `path`, on failure it is deleted."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}.part{path.suffix}"
     # The system applies the umask, so a result is as readable as any file that the user makes.

@@ -18,7 +18,15 @@ from jcr.capture.formats.capture_json import read, write
 from jcr.cell.added import added_camera, read_added_cameras
 from jcr.cell.carried import eye_to_hand, refined
 from jcr.cell.images import CellImages
-from jcr.cell.placement import CameraPlacement, CellPlacement, read_cameras, write_cameras
+from jcr.cell.placement import (
+    CameraPlacement,
+    CamerasFile,
+    CellPlacement,
+    ImageUse,
+    TransformUncertainty,
+    read_cameras,
+    write_cameras,
+)
 from jcr.cell.rigs import CameraViews, fit_views
 from jcr.cell.stage import place_cameras
 from jcr.estimation.absolute_pose import CameraPose
@@ -414,3 +422,31 @@ def test_a_damaged_file_of_the_run_is_refused(folder: Path, tmp_path: Path, name
     with pytest.raises(jcr.InputError) as refusal:
         read_it()
     assert "\n" not in str(refusal.value) and "run" in str(refusal.value)
+
+
+def test_images_of_a_capture_that_changed_keep_their_places_by_name():
+    """An image that was put before the others moves none of them to another gripper pose."""
+    poses = {row: transform(np.eye(3), np.array([0.1 * row, 0.0, 0.0])) for row in range(3)}
+    images = [
+        ImageUse(image=name, used=name != "b", points=9, reprojection_px=None, reason=None) for name in "abc"
+    ]
+    found = CameraPlacement(
+        name="wrist2",
+        mount="gripper",
+        arm=None,
+        gripper_from_camera=np.eye(4),
+        uncertainty=TransformUncertainty.of(1e-6 * np.eye(6)),
+        pictures=images,
+        verdict="accepted",
+        converged=True,
+        warnings=[],
+    )
+    camera = CellCamera(
+        name="wrist2",
+        mount="gripper",
+        images=("new", "a", "c"),
+        image_size=(640, 480),
+        frame=np.array([2, 0, 1]),
+    )
+    placed = CamerasFile(cameras=[found], arms=[], version="0").base_from_camera(camera, found, poses)
+    assert [pose[0, 3] for pose in placed] == [0.0, 0.1]

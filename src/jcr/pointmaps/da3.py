@@ -75,7 +75,7 @@ def build(name: str) -> nn.Module:
 
 
 def predict_views(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) -> PosedPointmaps:
-    """Predict all views in one pass."""
+    """Return the pointmaps of all views, predicted in one pass."""
     grid = grid_of(views.size, long_edge)
     colors = np.stack([resized_for_grid(image, grid, long_edge) for image in views.colors])
     device = next(network.parameters()).device.type
