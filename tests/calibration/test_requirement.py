@@ -153,7 +153,7 @@ def test_the_command_ends_with_3_where_what_was_asked_is_not_reached(capsys: pyt
     for asked in (None, (0.5, 0.1)):
         hand_eye = calibrate_pose_pairs(given, CalibrateOptions(require=asked))
         result = RunResult("out", calibration=hand_eye)
-        show_calibration(result, VerboseOutput())
+        show_calibration(result, given, VerboseOutput())
         status = show(result, VerboseOutput())
         said = capsys.readouterr()
         quaternion = Rotation.from_matrix(hand_eye.gripper_from_camera[:3, :3]).as_quat(canonical=True)

@@ -64,7 +64,7 @@ class CalibrateCommand:
             capture = _source(self, progress)
             if isinstance(capture, PosePairs):
                 result, is_marker = calibrate_poses(capture, self.out, self.calibrate), True
-                show_calibration(result, self.output)
+                show_calibration(result, capture, self.output)
             else:
                 result, is_marker = _run(self, capture, run_options(self, map=None), progress), False
         if is_marker and result.converged and is_one(result.found):
@@ -260,7 +260,7 @@ def _run(
 
     def show_early(result: "RunResult") -> None:
         """Print the calibration before depth and map are made."""
-        show_calibration(result, command.output)
+        show_calibration(result, capture, command.output)
         shown.append(result)
 
     try:
@@ -270,11 +270,11 @@ def _run(
     if result.is_unchanged:
         sys.stderr.write(f"unchanged: {out} is the run of this capture with these options\n")
     if not shown:
-        show_calibration(result, command.output)
+        show_calibration(result, capture, command.output)
     return result
 
 
-def show_calibration(result: "RunResult", output: VerboseOutput) -> None:
+def show_calibration(result: "RunResult", capture: "Capture | PosePairs", output: VerboseOutput) -> None:
     """Print the summary as soon as the calibration stands, with what was noted when the capture was read.
 
     With --json all comes at the end.
@@ -285,7 +285,7 @@ def show_calibration(result: "RunResult", output: VerboseOutput) -> None:
         others = 0 if result.cameras is None else len(result.cameras.cameras)
         most = MOST_LINES - others - 1  # a line of the caller
         lines = summary(result.calibration, most).splitlines()
-        notes = [line for note in result.capture.notes for line in labelled("Note", note)]
+        notes = [line for note in capture.notes for line in labelled("Note", note)]
         lines += notes[: max(most - 2 - len(lines), 0)]
         sys.stdout.write("\n".join(lines) + "\n")
         sys.stdout.flush()
