@@ -26,6 +26,7 @@ from jcr.errors import InputError, RejectedError
 from jcr.findings import FindingKind, kinds_of
 from jcr.geometry import step_between
 from simulation import image_faults as make
+from simulation import scene_faults as scenes
 from simulation.faults import Faults, FaultyCapture, faulty_capture, reconstructed
 from simulation.image_faults import IMAGES as FEW_IMAGES
 from simulation.image_faults import ImageFault, rendered
@@ -44,6 +45,8 @@ MOVED = frozenset({FindingKind.SLIP, FindingKind.DRIFT})
 ORDER = frozenset({FindingKind.POSE_CONVENTION, FindingKind.DELAY, FindingKind.POSES_SWAPPED})
 ONE_POSE = frozenset({FindingKind.POSES_SWAPPED, FindingKind.POSE_CONTRADICTS_IMAGE})
 ROBOT = kinds_of("strain") | {FindingKind.JOINT_OFFSETS}
+BOARD = frozenset({FindingKind.BOARD_SIZE, FindingKind.BOARD_MOVED, FindingKind.BOARD_STRETCHED})
+SCENE = frozenset({FindingKind.BASE_MOVED, FindingKind.REPETITIVE})
 SCALE_ALONE = "positions 1 % too long"
 """Fault that no image shows: scale comes from the robot."""
 
@@ -126,7 +129,15 @@ RENDERED = (
     _case("one pose 5 mm 1° off", ONE_POSE, change=make.one_off(5.0, 1.0, 4), wrong=(4,)),
     _case("two poses exchanged", ONE_POSE, change=make.reordered(EXCHANGED), wrong=(3, 6)),
     _case("a frame that is repeated", ONE_POSE, change=make.repeated(4, (5,)), wrong=(5,)),
-    _case("objects pushed by 6 cm midway", pushed=True),
+    _case("objects pushed by 6 cm midway", scene=scenes.pushed),
+    _case("a belt with most objects moves by 5 cm midway", SCENE, scene=scenes.belt),
+    _case("a display scrolls", SCENE, scene=scenes.display),
+    _case("an arm's link moves over the table", SCENE, scene=scenes.moving_link),
+    _case("the table is a regular tiling", SCENE, scene=scenes.tiled),
+    *(
+        _case(f"board: {what}", frozenset() if what == "right" else BOARD, scene=change, board=scenes.BOARD)
+        for what, change in scenes.WRONG_BOARDS.items()
+    ),
     _case("exposure and white balance differ by 30 %", change=make.exposed(0.3)),
     _case("two images blurred by 9 px", change=make.blurred(9, (2, 6))),
 )
@@ -211,7 +222,9 @@ def through_images(seed: int, fault: ImageFault, given: bool) -> Outcome:
     capture = make.draw(rendered(seed % SCENES), seed, fault, given=given)
     with tempfile.TemporaryDirectory() as folder:
         try:
-            result = jcr.calibrate(make.write(capture, Path(folder) / "capture"), Path(folder) / "out")
+            options = {"reconstruct": {"board": fault.board}} if fault.board else None
+            folders = make.write(capture, Path(folder) / "capture"), Path(folder) / "out"
+            result = jcr.calibrate(*folders, options)
         except InputError:
             return Outcome(False, refused=True)
         except RejectedError:

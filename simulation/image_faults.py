@@ -25,7 +25,8 @@ from simulation.faults import Faults, effective_transform, moved_parts, optics_o
 from simulation.motion import motion_over_table
 from simulation.problems import disturbed
 from simulation.render import render
-from simulation.scenes import make_scene, moved
+from simulation.scene_faults import SceneChange
+from simulation.scenes import Scene, make_scene, moved
 
 Poses = Float[ndarray, "n 4 4"]
 Images = list[UInt8[ndarray, "h w 3"]]
@@ -38,8 +39,6 @@ SIZE, WIDE = (640, 480), (960, 720)
 """Sizes (px) of a camera's images and of those rendered, of one focal length."""
 FOCAL_PX = (600.0, 660.0)
 POSES = 14
-PUSHED, BY_M = 3, (0.04, 0.045, 0.0)
-"""Number of objects that are pushed, and their motion."""
 ARMS: tuple[RobotName | None, ...] = (None, "ur5e", None, "panda", None)
 """Arms of the scenes in turn; None is a gripper whose poses have no systematic errors."""
 
@@ -53,8 +52,8 @@ class Rendered:
 
     images: tuple[UInt8[ndarray, "h w 3"], ...]
     """Images (RGB) of size WIDE."""
-    images_pushed: tuple[UInt8[ndarray, "h w 3"], ...]
-    """Images after somebody pushed objects aside."""
+    scene: Scene
+    base_from_camera: Float[ndarray, "n 4 4"]
     camera: Intrinsics
     """Intrinsics of images of size SIZE."""
     base_from_gripper: Float[ndarray, "n 4 4"]
@@ -66,13 +65,25 @@ class Rendered:
     white: tuple[float, float]
     """Standard deviations (m, rad per axis) of random errors of the poses."""
 
-    def seen(self, row: int, believed_from_px: PxFromPx, pushed: bool = False) -> UInt8[ndarray, "h w 3"]:
-        """Return the image that a camera takes at a place."""
-        margin = (np.array(WIDE) - SIZE) / 2
-        px = np.stack(np.meshgrid(*map(np.arange, SIZE)), axis=-1).astype(float)
-        x, y = np.moveaxis(believed_from_px(px) + margin, -1, 0).astype(np.float32)
-        wide = (self.images_pushed if pushed else self.images)[row]
-        return np.asarray(cv2.remap(wide, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), np.uint8)
+    def changed(self, rows: Int[ndarray, " k"], change: SceneChange) -> list[UInt8[ndarray, "h w 3"]]:
+        """Render images of size WIDE from places, each of the scene as it is when that image is taken."""
+        return [
+            next(render(change(self.scene, k, pose), _wide(self.camera), [pose], with_truth=False)).image
+            for k, pose in enumerate(self.base_from_camera[rows])
+        ]
+
+
+def taken(wide: UInt8[ndarray, "h w 3"], believed_from_px: PxFromPx) -> UInt8[ndarray, "h w 3"]:
+    """Return the image of size SIZE that a camera takes, from the rendered one of size WIDE."""
+    margin = (np.array(WIDE) - SIZE) / 2
+    px = np.stack(np.meshgrid(*map(np.arange, SIZE)), axis=-1).astype(float)
+    x, y = np.moveaxis(believed_from_px(px) + margin, -1, 0).astype(np.float32)
+    return np.asarray(cv2.remap(wide, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), np.uint8)
+
+
+def _wide(camera: Intrinsics) -> Intrinsics:
+    """Return the camera of images of size WIDE."""
+    return replace(camera, cx=(WIDE[0] - 1) / 2, cy=(WIDE[1] - 1) / 2, width=WIDE[0], height=WIDE[1])
 
 
 @cache
@@ -85,19 +96,12 @@ def rendered(seed: int) -> Rendered:
     path = motion_over_table(bent, "varied", POSES, scene.table_center_in_base, (motion, elsewhere))
     scene, cameras = moved(scene, path.target_in_base), path.base_from_gripper @ path.physical
     focal_px = float(intrinsics.uniform(*FOCAL_PX))
-    (width, height), (wide, high) = SIZE, WIDE
-    wide_camera = Intrinsics(focal_px, focal_px, (wide - 1) / 2, (high - 1) / 2, wide, high)
-    by = transform(np.eye(3), np.array(BY_M))
-    moved_aside = [replace(one, base_from_object=by @ one.base_from_object) for one in scene.objects[:PUSHED]]
-    pushed = replace(scene, objects=(*moved_aside, *scene.objects[PUSHED:]))
-    first, second = (
-        tuple(view.image for view in render(one, wide_camera, cameras, with_truth=False))
-        for one in (scene, pushed)
-    )
+    camera = Intrinsics(focal_px, focal_px, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2, *SIZE)
     return Rendered(
-        images=first,
-        images_pushed=second,
-        camera=Intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, width, height),
+        images=tuple(view.image for view in render(scene, _wide(camera), cameras, with_truth=False)),
+        scene=scene,
+        base_from_camera=cameras,
+        camera=camera,
         base_from_gripper=path.reported,
         distance=np.linalg.norm(cameras[:, :3, 3] - scene.table_center_in_base, axis=1),
         gripper_from_camera=path.effective,
@@ -129,8 +133,10 @@ class ImageFault:
     faults: Faults = Faults()
     change: Change | None = None
     """Fault of stored images or single poses."""
-    pushed: bool = False
-    """Whether somebody pushed objects aside midway."""
+    scene: SceneChange | None = None
+    """Change of the scene while the images are taken."""
+    board: str | None = None
+    """Board that the user states."""
     wrong: tuple[int, ...] = ()
     """Rows of the images whose poses or content are wrong, so that no result may rest on them."""
 
@@ -145,10 +151,8 @@ def draw(scene: Rendered, seed: int, fault: ImageFault, given: bool = True) -> D
     cameras = scene.base_from_gripper[rows] @ x
     true = inverse(pushes) @ cameras @ inverse(mounts)
     optics = optics_of(faults, scene.camera, cameras, scene.distance[rows], of_faults)
-    images = [
-        _noisy(scene.seen(row, one.believed_from_px, fault.pushed and k >= IMAGES // 2), pixels)
-        for k, (row, one) in enumerate(zip(rows.tolist(), optics, strict=True))
-    ]
+    wide = [scene.images[row] for row in rows] if fault.scene is None else scene.changed(rows, fault.scene)
+    images = [_noisy(taken(one, by.believed_from_px), pixels) for one, by in zip(wide, optics, strict=True)]
     truths = [x] if np.allclose(mounts[0], mounts[-1]) else [mounts[0], mounts[-1]]
     if faults.is_bent:
         truths = [effective_transform(scene.base_from_gripper, x, faults)]

@@ -33,7 +33,7 @@ def _joined(meshes: Sequence[Mesh]) -> Mesh:
     )
 
 
-def _grid(vertices: Float[ndarray, "r c 3"], uv: Float[ndarray, "r c 2"]) -> Mesh:
+def grid(vertices: Float[ndarray, "r c 3"], uv: Float[ndarray, "r c 2"]) -> Mesh:
     """Return a sheet of vertices, rows by columns; outside is where columns × rows points."""
     rows, columns = vertices.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)
@@ -61,7 +61,7 @@ def box(size: Triple, sides: Sequence[str] = tuple(_SIDES)) -> Mesh:
     for side in sides:
         normal, right, up = (np.array(direction) * half for direction in _SIDES[side])
         corners = normal + (2 * square[..., :1] - 1) * right + (2 * square[..., 1:] - 1) * up
-        meshes.append(_grid(corners + [0, 0, half[2]], square))
+        meshes.append(grid(corners + [0, 0, half[2]], square))
     return _joined(meshes)
 
 
@@ -80,7 +80,7 @@ def revolved(*profiles: Sequence[tuple[float, float]], segments: int = 48) -> Me
         vertices[..., 2] = z[:, None]
         along = np.r_[0.0, np.cumsum(np.hypot(np.diff(radius), np.diff(z)))]
         uv = np.stack(np.broadcast_arrays(around, (along / along[-1])[:, None]), -1)
-        meshes.append(_grid(vertices, uv))
+        meshes.append(grid(vertices, uv))
     return _joined(meshes)
 
 
@@ -95,4 +95,4 @@ def tube(path: Float[ndarray, "n 3"], radius: float, segments: int = 12) -> Mesh
     around = np.linspace(0, 1, segments + 1)[None, :, None]
     ring = np.cos(2 * np.pi * around) * side[:, None] + np.sin(2 * np.pi * around) * other[:, None]
     along = np.linspace(0, 1, len(path))[:, None]
-    return _grid(path[:, None] + radius * ring, np.stack(np.broadcast_arrays(around[..., 0], along), -1))
+    return grid(path[:, None] + radius * ring, np.stack(np.broadcast_arrays(around[..., 0], along), -1))

@@ -11,9 +11,11 @@ from jcr.findings import FindingKind
 from jcr.geometry import inverse, step_between
 from jcr.records import Intrinsics
 from simulation import image_faults as make
+from simulation import scene_faults as scenes
 from simulation.faults import Faults, optics_of
 from simulation.image_faults import FOCAL_PX, IMAGES, POSES, SIZE, WIDE, ImageFault, Rendered, draw
 from simulation.poses import gripper_poses, random_hand_eye
+from simulation.scenes import make_scene
 
 
 def scene() -> Rendered:
@@ -27,7 +29,8 @@ def scene() -> Rendered:
     distance = np.linalg.norm((poses @ x)[:, :3, 3] - [0.5, 0.0, 0.0], axis=1)
     return Rendered(
         images=(wide,) * POSES,
-        images_pushed=(255 - wide,) * POSES,
+        scene=make_scene("tabletop", 0),
+        base_from_camera=poses @ x,
         camera=camera,
         base_from_gripper=poses,
         distance=distance,
@@ -69,7 +72,7 @@ def test_images_show_a_point_where_observations_of_the_same_fault_have_it(name: 
 
 def test_poses_are_those_of_a_gripper_whose_camera_took_the_same_images():
     one, clean = scene(), draw(scene(), 1, ImageFault())
-    assert np.array_equal(one.seen(0, lambda px: px), one.images[0][120:600, 160:800])
+    assert np.array_equal(make.taken(one.images[0], lambda px: px), one.images[0][120:600, 160:800])
     cameras, half = clean.base_from_gripper @ clean.gripper_from_camera[0], IMAGES // 2
     slipped = draw(one, 1, ImageFault(faults=Faults(slip=(3e-3, np.radians(1.0)))))
     before, after = slipped.gripper_from_camera
@@ -86,10 +89,15 @@ def test_poses_are_those_of_a_gripper_whose_camera_took_the_same_images():
     text = draw(one, 1, ImageFault(change=make.sorted_as_text))
     assert list(text.names) == sorted(clean.names) != list(clean.names)
     assert np.array_equal(text.base_from_gripper, clean.base_from_gripper)
-    # Objects are pushed midway.
-    pushed = draw(one, 1, ImageFault(pushed=True))
-    change = [np.abs(a.astype(int) - b).mean() for a, b in zip(pushed.images, clean.images, strict=True)]
-    assert max(change[:half]) == 0.0 and min(change[half:]) > 20.0
+
+
+@pytest.mark.gl
+def test_objects_are_pushed_midway():
+    same, pushed = (
+        scene().changed(np.arange(6), change) for change in (lambda scene, row, pose: scene, scenes.pushed)
+    )
+    change = [np.abs(a.astype(int) - b).mean() for a, b in zip(pushed, same, strict=True)]
+    assert max(change[: scenes.MIDWAY]) == 0.0 and min(change[scenes.MIDWAY :]) > 0.5
 
 
 def test_a_row_counts_silent_errors_apart_from_warned_and_stated_ones():
