@@ -20,7 +20,7 @@ from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
 from jcr.estimation.wrist import adjust_wrist, recon_frame
 from jcr.geometry import (
-    apply_similarity,
+    Similarity,
     fit_similarity,
     inverse,
     nearest_rotation,
@@ -272,7 +272,7 @@ def camera_errors(base_from_camera: Poses, recon_from_camera: Poses) -> tuple[fl
     """Return mean distance (mm) and angle (degrees) of the cameras from the truth, after the best similarity."""
     true, found = base_from_camera[:, :3, 3], recon_from_camera[:, :3, 3]
     base_from_recon, scale = fit_similarity(true, found)
-    off = np.linalg.norm(apply_similarity(base_from_recon, scale, found) - true, axis=1)
+    off = np.linalg.norm(Similarity(base_from_recon, scale)(found) - true, axis=1)
     rotations = base_from_recon[:3, :3] @ recon_from_camera[:, :3, :3]
     angle = rotation_between_deg(rotations, base_from_camera[:, :3, :3])
     return 1e3 * float(off.mean()), float(angle.mean())

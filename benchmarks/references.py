@@ -16,7 +16,7 @@ from numpy import ndarray
 from scipy.optimize import least_squares
 
 from jcr.boards.detection import boards, most_seen
-from jcr.camera import NO_DISTORTION, parameters, project, unproject, with_parameters
+from jcr.camera import parameters, project, unproject, with_parameters
 from jcr.capture.images import read_image
 from jcr.errors import RejectedError
 from jcr.geometry import apply, inverse, retract, rotation_exp, transform
@@ -209,7 +209,7 @@ def _begin(
     """Return X, base_from_board and intrinsics by OpenCV's calibration and the hand-eye method of Park and Martin."""
     rows = [corners.image == k for k in np.unique(corners.image)]
     middle = (size[0] - 1) / 2, (size[1] - 1) / 2
-    camera = intrinsics or Intrinsics(1.0 * size[0], 1.0 * size[0], *middle, *size, NO_DISTORTION)
+    camera = intrinsics or Intrinsics(1.0 * size[0], 1.0 * size[0], *middle, *size)
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_PRINCIPAL_POINT
     flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     _, matrix, _, rotations, translations = cv2.calibrateCamera(
@@ -227,5 +227,5 @@ def _begin(
     x = transform(rotation, translation[:, 0])
     places = gripper @ x @ board
     nearest = int(np.linalg.norm(places[:, :3, 3] - np.median(places[:, :3, 3], 0), axis=1).argmin())
-    camera = Intrinsics(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *size, NO_DISTORTION)
+    camera = Intrinsics(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *size)
     return x, places[nearest], camera

@@ -15,7 +15,7 @@ from numpy import ndarray
 from jcr.estimation.arms import arm_named
 from jcr.estimation.problem import Observations, ReportedPoses
 from jcr.estimation.robot_noise import smooth_errors
-from jcr.geometry import apply_similarity, inverse, rotation_exp, scale_translation, transform
+from jcr.geometry import Similarity, inverse, rotation_exp, scale_translation, transform
 from jcr.records import Intrinsics
 from simulation.arms import EFFECTIVE_POSES, PRESETS, PresetName, about_posture, bend, effective_fit
 from simulation.motion import fixed_camera, motion_over_table
@@ -199,7 +199,7 @@ def _seen(
         ),
         world_from_rig=scale_translation(world_from_base @ rigs, 1 / scale),
         rig_from_camera=scale_translation(np.stack(cell.mounts), 1 / scale),
-        points_in_world=apply_similarity(world_from_base, 1.0, x_in_base) / scale,
+        points_in_world=Similarity(world_from_base, 1.0)(x_in_base) / scale,
         cameras=tuple(cell.cameras),
         scale=scale,
         truth=cell.truth,

@@ -12,7 +12,7 @@ from numpy import ndarray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from jcr.camera import NO_DISTORTION, parameter_names, parameters, project, unproject, with_parameters, zoomed
+from jcr.camera import parameter_names, parameters, project, unproject, with_parameters, zoomed
 from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, camera_with_prior
 from jcr.estimation.pose_equations import fit_known_scale, predicted_gripper_poses
 from jcr.estimation.wrist import adjust_wrist
@@ -23,7 +23,7 @@ from simulation.poses import gripper_poses, random_hand_eye
 from simulation.problems import TARGET_IN_BASE, disturbed, shown_points
 
 Poses = Float[ndarray, "n 4 4"]
-INTRINSICS = Intrinsics(620.0, 620.0, 319.5, 239.5, 640, 480, NO_DISTORTION)
+INTRINSICS = Intrinsics(620.0, 620.0, 319.5, 239.5, 640, 480)
 """Believed intrinsics."""
 LOOSE = (3.0, 3.0)
 """m, rad: gripper poses by which structure from motion is hardly held."""

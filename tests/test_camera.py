@@ -20,7 +20,7 @@ from jcr.camera import (
     project,
     rays,
     resized,
-    undistort_image,
+    undistortion,
     unproject,
     with_parameters,
     zoomed,
@@ -132,7 +132,7 @@ def test_resampled_pixels_show_what_their_rays_see(factor: int) -> None:
     u, v = np.meshgrid(np.arange(252), np.arange(192))
     image = np.stack([u, v, 255 - u], axis=-1).astype(np.uint8)  # every pixel says where it is
     pinhole = pinhole_inside(intrinsics, 252 // factor)
-    seen = undistort_image(image, intrinsics, pinhole).astype(float)
+    seen = undistortion(intrinsics, pinhole)(image).astype(float)
     expected = project(intrinsics, rays(pinhole))
     difference = (seen[..., :2] - expected)[2:-2, 2:-2]
     assert np.abs(difference.mean((0, 1))).max() < 0.05

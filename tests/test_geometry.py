@@ -7,9 +7,9 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from jcr.errors import InputError
 from jcr.geometry import (
     ARM,
+    Similarity,
     adjoint,
     apply,
-    apply_similarity,
     fit_similarity,
     inverse,
     motion_length,
@@ -99,7 +99,7 @@ def test_similarity_is_recovered_exactly_and_ignores_points_without_weight():
     rng = np.random.default_rng(1)
     a_from_b, scale = transform(rotation_exp(rng.normal(size=3)), rng.normal(size=3)), 2.7
     x_in_b = rng.normal(size=(20, 3))
-    x_in_a = apply_similarity(a_from_b, scale, x_in_b)
+    x_in_a = Similarity(a_from_b, scale)(x_in_b)
     x_in_a[0] += 5.0
     weights = np.r_[0.0, np.ones(19)]
     found, found_scale = fit_similarity(x_in_a, x_in_b, weights)

@@ -12,7 +12,7 @@ import jcr
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.images import read_image
 from jcr.findings import FindingKind
-from jcr.geometry import apply_similarity, fit_similarity, rotation_between_deg, step_between
+from jcr.geometry import Similarity, fit_similarity, rotation_between_deg, step_between
 from jcr.records import Capture
 from jcr.sfm.colmap import reconstruct_colmap
 
@@ -42,7 +42,7 @@ def test_within_reach_of_the_marker_reference(
     # To within the few millimetres to which the references are good, and the poses of both robots.
     centers = (capture.base_from_gripper[found.image_index] @ reference)[:, :3, 3]
     base_from_recon, scale = fit_similarity(centers, found.recon_from_camera[:, :3, 3])
-    fitted = apply_similarity(base_from_recon, scale, found.recon_from_camera[:, :3, 3])
+    fitted = Similarity(base_from_recon, scale)(found.recon_from_camera[:, :3, 3])
     off_m = np.linalg.norm(fitted - centers, axis=1)
     assert np.median(off_m) < 3e-3 and off_m.max() < 0.01
 

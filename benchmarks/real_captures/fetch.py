@@ -28,7 +28,7 @@ from jcr.errors import InputError
 from jcr.estimation.arms import RobotName, arm_named
 from jcr.estimation.kinematics import forward_kinematics
 from jcr.files import write_bytes
-from jcr.records import Capture, Intrinsics, coefficients_of
+from jcr.records import Capture, Intrinsics
 
 RECIPES = Path(__file__).with_name("recipes.toml")
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
@@ -142,7 +142,7 @@ def build(recipe: Recipe, out: Path, clone: str | None = None) -> Path:
     intrinsics = None
     if recipe.intrinsics:
         fx, fy, cx, cy, *distortion = recipe.intrinsics
-        intrinsics = Intrinsics(fx, fy, cx, cy, *size, coefficients_of(distortion or [0.0] * 5))
+        intrinsics = Intrinsics(fx, fy, cx, cy, *size, tuple(distortion or [0.0] * 5))
     capture = Capture(
         folder=out,
         images=tuple(f"images/{name}" for name in names),

@@ -17,13 +17,12 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from jcr.records import COEFFICIENTS, Intrinsics, coefficients_of
+from jcr.records import COEFFICIENTS, Intrinsics
 
 HALF_PIXEL = 0.5
 """Pixels of COLMAP and nerfstudio are ours plus this: theirs are counted from the corner of the image."""
 WITHIN_FOLD = 0.9
 """Share of the distance at which a distortion folds over, up to which its inverse is used."""
-NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2")
 """The parameters with which every model begins; the other coefficients follow, as records.COEFFICIENTS has them."""
 NORMALIZED = Intrinsics(1.0, 1.0, 0.0, 0.0, 1, 1)
@@ -50,8 +49,8 @@ def parameters(camera: Intrinsics) -> Float[ndarray, " p"]:
 
 def with_parameters(camera: Intrinsics, values: Float[ndarray, " p"]) -> Intrinsics:
     """Return a camera of the same model and image size with the values of a vector of `parameters`."""
-    fx, fy, cx, cy, *distortion = (float(value) for value in values)
-    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=coefficients_of(distortion))
+    fx, fy, cx, cy, *distortion = values.tolist()
+    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion))
 
 
 def is_distorted(camera: Intrinsics) -> bool:
@@ -62,12 +61,12 @@ def is_distorted(camera: Intrinsics) -> bool:
 def with_thin_prism(camera: Intrinsics) -> Intrinsics:
     """Return a pinhole or rational camera as one of the thin prism model that projects alike."""
     padded = [*camera.distortion, *[0.0] * (len(COEFFICIENTS["thin_prism"]) - len(camera.distortion))]
-    return replace(camera, distortion=coefficients_of(padded), model="thin_prism")
+    return replace(camera, distortion=tuple(padded), model="thin_prism")
 
 
 def without_distortion(camera: Intrinsics) -> Intrinsics:
     """Return the pinhole with the same focal lengths and principal point."""
-    return replace(camera, distortion=NO_DISTORTION, model="pinhole")
+    return replace(camera, distortion=(0.0,) * 5, model="pinhole")
 
 
 def project(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Float[ndarray, "*batch 2"]:
@@ -311,17 +310,13 @@ def rays(pinhole: Intrinsics) -> Float[ndarray, "h w 3"]:
     return unproject(pinhole, np.stack([u, v], axis=-1).astype(np.float64))
 
 
-def undistort_image(
-    image: UInt8[ndarray, "h w 3"], camera: Intrinsics, pinhole: Intrinsics
-) -> UInt8[ndarray, "h2 w2 3"]:
-    """Return the image resampled to an undistorted grid; averaged over areas where the grid is coarser."""
-    return undistortion(camera, pinhole)(image)
-
-
 def undistortion(
     camera: Intrinsics, pinhole: Intrinsics
 ) -> Callable[[UInt8[ndarray, "h w 3"]], UInt8[ndarray, "h2 w2 3"]]:
-    """`undistort_image` for many images of one camera: where the pixels come from is computed once."""
+    """Return the resampling of a camera's images to an undistorted grid; averaged over areas where the grid is coarser.
+
+    Where the pixels come from is computed once for all images.
+    """
     factor = max(1, round(camera.fx / pinhole.fx))
     fine = resized(pinhole, factor * pinhole.width, factor * pinhole.height)
     u, v = (

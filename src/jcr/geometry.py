@@ -168,11 +168,6 @@ class Similarity:
         return apply(self.rigid, self.scale * np.asarray(x_in_b, float))
 
 
-def apply_similarity(a_from_b: Transform, scale: float, x_in_b: Vectors) -> Vectors:
-    """x_in_a = R · (scale · x_in_b) + t for points (...,3)."""
-    return apply(a_from_b, scale * x_in_b)
-
-
 def nearest_rotation(matrix: Rotations) -> Rotations:
     """Return the proper rotations (...,3,3) closest to the matrices in Frobenius norm (det = +1)."""
     u, _, vt = np.linalg.svd(matrix)

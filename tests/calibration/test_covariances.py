@@ -14,7 +14,7 @@ ACCEPTED = ROOT / "tests" / "calibrations" / "accepted.json"
 CHANGES: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
     "zeroed": (np.zeros_like, "has no variance"),
     "one error zeroed": (lambda c: c * np.outer(np.arange(7) != 2, np.arange(7) != 2), "has no variance"),
-    "negative": (lambda c: -c, "more than each by itself"),
+    "negative": (lambda c: -c, "a negative variance"),
     # Each pair of errors by itself could be; three that are all opposite to one another cannot.
     "not positive": (lambda c: _std(c) * (np.eye(7) - 0.8 * (1 - np.eye(7))), "negative variance"),
     "one combination without variance": (lambda c: _std(c), "has no variance"),

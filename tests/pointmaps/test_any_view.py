@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from jcr.camera import rays
 from jcr.geometry import (
-    apply_similarity,
+    Similarity,
     fit_similarity,
     inverse,
     retract,
@@ -134,13 +134,13 @@ def test_matches_by_colour_put_predicted_cameras_right(capture: Capture, found: 
     truth = base_from_camera()
     base, scale = fit_similarity(truth[:, :3, 3], found.recon_from_camera[:, :3, 3])
     assert scale == pytest.approx(0.5, rel=0.02), "the model's own unit stays"
-    off = apply_similarity(base, scale, found.recon_from_camera[:, :3, 3]) - truth[:, :3, 3]
+    off = Similarity(base, scale)(found.recon_from_camera[:, :3, 3]) - truth[:, :3, 3]
     assert np.linalg.norm(off, axis=1).max() < 5e-4, "10 mm as predicted"
     rotated = rotation_between_deg(base[:3, :3] @ found.recon_from_camera[:, :3, :3], truth[:, :3, :3])
     assert np.max(rotated) < 0.05, "0.8° as predicted"
 
     # The depth is bent back: the plane is one plane.
-    in_base = apply_similarity(base, scale, found.dense.points_in_recon.reshape(-1, 3).astype(float))
+    in_base = Similarity(base, scale)(found.dense.points_in_recon.reshape(-1, 3).astype(float))
     assert np.abs(in_base[:, 2]).max() < 4e-3, "20 mm as predicted"
 
     hand_eye = calibrate_reconstruction(capture, found)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jcr.calibration.record import Calibration
-from jcr.camera import rays, resized, undistort_image
+from jcr.camera import rays, resized, undistortion
 from jcr.capture.added import read_added, with_added_images, write_added
 from jcr.capture.formats import capture_json
 from jcr.capture.images import encode_png, read_image
@@ -87,7 +87,7 @@ def known_reconstruction(truth: Truth, rendered: list[View]) -> tuple[Reconstruc
         depth = cv2.resize(view.depth, SIZE, interpolation=cv2.INTER_NEAREST) / SCALE
         points.append(apply(recon_from, depth[..., None] * rays(pinhole)))
         confidence.append((depth > 0).astype(float))
-        colors.append(undistort_image(view.image, truth.intrinsics, pinhole))
+        colors.append(undistortion(truth.intrinsics, pinhole)(view.image))
     points_in_recon = np.stack(points)
     some = np.random.default_rng(0).choice(np.flatnonzero(np.ravel(confidence)), 2000, replace=False)
     x = points_in_recon.reshape(-1, 3)[some]

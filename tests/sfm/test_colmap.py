@@ -17,7 +17,7 @@ from jcr.depth.densify import densify, undistorted
 from jcr.depth.options import DepthOptions
 from jcr.errors import RejectedError
 from jcr.features.sift import SiftFeatures
-from jcr.geometry import apply_similarity, fit_similarity, inverse, rotation_between_deg
+from jcr.geometry import Similarity, fit_similarity, inverse, rotation_between_deg
 from jcr.progress import silent
 from jcr.records import Capture, Reconstruction
 from jcr.sfm.colmap import reconstruct_colmap
@@ -57,7 +57,7 @@ def _center_errors(capture: Capture, result: Reconstruction) -> Float[ndarray, "
     """Distances (m) of the camera centres from where gripper pose and reference put them."""
     centers = _true_base_from_camera(capture, result)[:, :3, 3]
     base_from_recon, scale = fit_similarity(centers, result.recon_from_camera[:, :3, 3])
-    fitted = apply_similarity(base_from_recon, scale, result.recon_from_camera[:, :3, 3])
+    fitted = Similarity(base_from_recon, scale)(result.recon_from_camera[:, :3, 3])
     return np.linalg.norm(fitted - centers, axis=1)
 
 
@@ -98,9 +98,7 @@ def test_pointmaps_show_the_table_at_its_height(capture: Capture, found: Reconst
     assert (found.dense.confidence > 0).mean() > 0.5
     centers = _true_base_from_camera(capture, found)[:, :3, 3]
     base_from_recon, scale = fit_similarity(centers, found.recon_from_camera[:, :3, 3])
-    x_in_base = apply_similarity(
-        base_from_recon, scale, found.dense.points_in_recon[found.dense.confidence > 0]
-    )
+    x_in_base = Similarity(base_from_recon, scale)(found.dense.points_in_recon[found.dense.confidence > 0])
     truth = read_truth(capture.folder)
     low, high = truth.workspace_in_base
     inside = ((x_in_base > low) & (x_in_base < high))[:, :2].all(-1)

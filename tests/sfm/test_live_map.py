@@ -10,7 +10,7 @@ import pytest
 import jcr
 from jcr.capture.images import read_image
 from jcr.features import sift
-from jcr.geometry import apply_similarity, fit_similarity
+from jcr.geometry import Similarity, fit_similarity
 from jcr.records import Capture
 from jcr.sfm.live_map import LiveMap
 
@@ -33,7 +33,7 @@ def off_mm(capture: Capture, found: LiveMap) -> float:
     reference = np.array(json.loads((capture.folder / "reference.json").read_text())["gripper_from_camera"])
     centers, own = (capture.base_from_gripper @ reference)[:, :3, 3], made.recon_from_camera[:, :3, 3]
     base_from_recon, scale = fit_similarity(centers, own)
-    away = np.linalg.norm(apply_similarity(base_from_recon, scale, own) - centers, axis=1)
+    away = np.linalg.norm(Similarity(base_from_recon, scale)(own) - centers, axis=1)
     return 1e3 * float(away.max())
 
 

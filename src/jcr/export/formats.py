@@ -16,7 +16,7 @@ from jcr.errors import InputError, RejectedError, did_you_mean
 from jcr.export import ros
 from jcr.export.options import ExportName, ExportOptions, provenance
 from jcr.files import written_whole
-from jcr.geometry import apply_similarity, scale_translation, transform
+from jcr.geometry import scale_translation, transform
 from jcr.options import checked_options
 from jcr.result import CLOUD, RunResult
 from jcr.scene.cloud import read_cloud
@@ -251,16 +251,15 @@ class ExportedRun:
         """
         from jcr.export.views import PosedImages
 
-        scale = self.calibration.scale
-        assert scale is not None  # wherever there is a transform
         calibration, capture, found = self.run.of_wrist_camera()
-        base_from_recon = calibration.base_from_recon.rigid
+        base_from_recon = calibration.base_from_recon
         return PosedImages(
             folder=capture.folder,
             images=tuple(capture.images[row] for row in found.image_index),
-            base_from_camera=base_from_recon @ scale_translation(found.recon_from_camera, scale),
+            base_from_camera=base_from_recon.rigid
+            @ scale_translation(found.recon_from_camera, base_from_recon.scale),
             base_from_gripper=capture.base_from_gripper[found.image_index],
             intrinsics=found.intrinsics,
             tracks=found.tracks,
-            points_in_base=apply_similarity(base_from_recon, scale, found.tracks.points_in_recon),
+            points_in_base=base_from_recon(found.tracks.points_in_recon),
         )

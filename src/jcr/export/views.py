@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from PIL import Image
 
-from jcr.camera import pinhole_inside, project, undistort_image, unproject
+from jcr.camera import pinhole_inside, project, undistortion, unproject
 from jcr.capture.images import encode_png, read_image
 from jcr.errors import InputError
 from jcr.export.options import ExportOptions
@@ -149,9 +149,9 @@ def _place_images(folder: Path, views: PosedImages, options: ExportOptions) -> t
     if options.undistort:
         names = [f"{Path(name).stem}.png" for name in names]
         pinhole = pinhole_inside(views.intrinsics, max(views.intrinsics.width, views.intrinsics.height))
+        undistort = undistortion(views.intrinsics, pinhole)
         for image, name in zip(views.images, names, strict=True):
-            pixels = undistort_image(read_image(views.folder / image), views.intrinsics, pinhole)
-            (folder / name).write_bytes(encode_png(pixels))
+            (folder / name).write_bytes(encode_png(undistort(read_image(views.folder / image))))
         return names, pinhole
     for k, (image, name) in enumerate(zip(views.images, names, strict=True)):
         source = (views.folder / image).resolve()

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from jcr.camera import pinhole_inside, project, undistort_image, unproject, usable_intrinsics, zoomed
+from jcr.camera import pinhole_inside, project, undistortion, unproject, usable_intrinsics, zoomed
 from jcr.capture.images import read_image
 from jcr.errors import InputError, RejectedError
 from jcr.geometry import apply, inverse, step_axes
@@ -160,7 +160,7 @@ def pyramid(images: Sequence[UInt8[ndarray, "h w 3"]], intrinsics: Intrinsics) -
     """Undistorted images by height in pixels."""
     width, height = intrinsics.width, intrinsics.height
     grid = pinhole_inside(intrinsics, round(FINEST.height * max(width, height) / min(width, height)))
-    stack = np.stack([undistort_image(image, intrinsics, grid) for image in images]).astype(np.float32) / 255
+    stack = np.stack(list(map(undistortion(intrinsics, grid), images))).astype(np.float32) / 255
     heights = {*SIZES, *(stage.height for stage in FREED), FINEST.height}
     return {height: make_level(stack, grid, height) for height in heights}
 

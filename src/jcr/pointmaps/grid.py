@@ -17,7 +17,7 @@ from jcr.camera import (
     pinhole_inside,
     project,
     resized,
-    undistort_image,
+    undistortion,
     unproject,
     usable_intrinsics,
     without_distortion,
@@ -153,7 +153,7 @@ def read_colors(
     for row, name in enumerate(capture.images):
         image = read_image(capture.folder / name)
         if intrinsics is not None and pinhole is not None and is_distorted(intrinsics):
-            image = undistort_image(image, intrinsics, pinhole)
+            image = undistortion(intrinsics, pinhole)(image)
         colors[row] = resize_and_crop(image, grid)
     return colors
 

@@ -185,12 +185,8 @@ def _covariance_of(share: Share | None) -> Float[ndarray, "7 7"]:
     return np.zeros((7, 7)) if share is None else share.covariance
 
 
-PartOfBudget = Annotated[
-    Float[ndarray, "7 7"],
-    in_json(
-        Annotated[Share | None, AfterValidator(_covariance_of), PlainSerializer(share_of, return_type=Share)]
-    ),
-]
+_share = Annotated[Share | None, AfterValidator(_covariance_of), PlainSerializer(share_of, return_type=Share)]
+PartOfBudget = Annotated[Float[ndarray, "7 7"], in_json(_share)]
 """Covariance in COVARIANCE_ORDER; in files a Share."""
 
 
@@ -354,20 +350,12 @@ class JointCovariance:
         return self
 
 
-def _checked_order(names: tuple[str, ...]) -> tuple[str, ...]:
-    if names != COVARIANCE_ORDER:
-        raise ValueError(f"not {', '.join(COVARIANCE_ORDER)}")
-    return names
-
-
 @dataclass(frozen=True, kw_only=True)
 class Uncertainty:
     """One-sigma uncertainty of transform, scale and intrinsics; axes of the gripper, of the base for a fixed camera."""
 
     covariance: Covariance7
     """Covariance in COVARIANCE_ORDER."""
-    order: Annotated[tuple[str, ...], AfterValidator(_checked_order)] = COVARIANCE_ORDER
-    """Names of the rows of the covariance, which are COVARIANCE_ORDER."""
     budget: Budget | None = None
     """Parts of the covariance by cause; None where it was not divided."""
     joint: JointCovariance | None = None
@@ -378,6 +366,12 @@ class Uncertainty:
     """Point uncertainty at the working distance; None of a fit outside the stage calibrate."""
     scene: SceneUncertainty | None = None
     """Uncertainty of the whole reconstruction in the base frame; None where no image was adjusted."""
+
+    @computed_field
+    @property
+    def order(self) -> tuple[str, ...]:
+        """Names of the rows of the covariance."""
+        return COVARIANCE_ORDER
 
     @computed_field
     @property

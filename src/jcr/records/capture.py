@@ -1,9 +1,9 @@
 """Input of a calibration: intrinsics, images with gripper poses, or poses alone."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -22,22 +22,9 @@ COEFFICIENTS: dict[DistortionModel, tuple[str, ...]] = {
 }
 """Coefficients of each distortion in OpenCV's order; ROS calls them plumb_bob, rational_polynomial (with 8 or 12) and
 equidistant."""
-Coefficients = (
-    tuple[float, float, float, float]
-    | tuple[float, float, float, float, float]
-    | tuple[float, float, float, float, float, float, float, float]
-    | tuple[float, float, float, float, float, float, float, float, float, float, float, float]
-)
-
-
 LARGEST_PX = 100_000
 """Width of the largest image; no camera's image is wider."""
 Pixels = Annotated[int, Field(ge=1, le=LARGEST_PX)]
-
-
-def coefficients_of(values: Iterable[float]) -> Coefficients:
-    """Return four, five, eight or twelve numbers as a model has them."""
-    return cast(Coefficients, tuple(float(value) for value in values))
 
 
 @dataclass(frozen=True)
@@ -51,7 +38,7 @@ class Intrinsics:
     cy: float
     width: Pixels
     height: Pixels
-    distortion: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """Coefficients, as many as COEFFICIENTS has names for the model."""
     model: DistortionModel = "pinhole"
 

@@ -20,7 +20,8 @@ from pydantic import (
 
 from jcr.errors import InputError
 from jcr.geometry import HUGE, require_rigid
-from jcr.records.capture import COEFFICIENTS, DistortionModel, Intrinsics, Mount, coefficients_of
+from jcr.records.capture import COEFFICIENTS, DistortionModel, Intrinsics, Mount
+from jcr.records.json_fields import Positive
 
 NAME = r"[A-Za-z][A-Za-z0-9_]{0,63}"
 """Pattern of the names of cameras and arms."""
@@ -28,7 +29,6 @@ Name = Annotated[str, StringConstraints(pattern=f"^{NAME}$")]
 MOST_ROTATION = 6 * np.pi + 0.01
 """Largest joint angle, rad: no joint rotates farther to either side."""
 PARAMETERS = ("fx", "fy", "cx", "cy")
-Positive = Annotated[float, Field(gt=0, lt=HUGE)]
 Std = Annotated[float, Field(ge=0, lt=HUGE)] | None
 
 
@@ -116,8 +116,7 @@ class IntrinsicsEntry(Entry):
                 f"{where}: the principal point ({self.cx:.4g}, {self.cy:.4g}) lies outside the {size[0]}x{size[1]} "
                 "images; give the intrinsics of this resolution, or null to estimate them"
             )
-        coefficients = coefficients_of(distortion)
-        return Intrinsics(self.fx, self.fy, self.cx, self.cy, *size, coefficients, self.model)
+        return Intrinsics(self.fx, self.fy, self.cx, self.cy, *size, tuple(distortion), self.model)
 
 
 class StdEntry(Entry, extra="forbid"):
@@ -160,13 +159,6 @@ class FrameEntry(Entry):
     """Time on the camera's clock."""
 
 
-class CameraFrame(Entry):
-    """Image of a camera on another arm, and that arm's gripper pose in its own base."""
-
-    image: str
-    base_from_gripper: RigidMatrix
-
-
 class CameraEntry(Entry, extra="forbid"):
     """Camera in "cameras" of a capture.json."""
 
@@ -175,8 +167,8 @@ class CameraEntry(Entry, extra="forbid"):
     """Subject of the images; unset: the gripper for a fixed camera without images, else the scene."""
     arm: Name | None = None
     """Other arm that carries the camera."""
-    frames: list[CameraFrame] | None = None
-    """Images of a camera on another arm."""
+    frames: list[FrameEntry] | None = None
+    """Images of a camera on another arm, each with that arm's gripper pose in its own base."""
     images: list[str | None] | None = None
     intrinsics: IntrinsicsEntry | None = None
     intrinsics_std: StdEntry | None = None

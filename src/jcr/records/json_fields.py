@@ -1,5 +1,6 @@
 """Fields of the JSON files that jcr writes: arrays as lists, covariances, transforms and numbers in other units."""
 
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -49,37 +50,23 @@ def _rigid(rows: list[list[float]]) -> Float[ndarray, "4 4"]:
 
 LEAST_EIGENVALUE = 1e-14
 """Least eigenvalue of a correlation matrix: below it the errors depend on each other, or digits were lost."""
-NOTHING = 1e-27
-"""Standard deviation below which an error of a part is rounding."""
 LOST_DIGITS = 1e-3
 """By which an eigenvalue of a part may be below 0: of motions that show little, the last digits are not exact."""
+EXACT = 1e-15
+"""Standard deviation below which an error of a part is rounding."""
 
 
-def _part(rows: list[list[float]]) -> Float[ndarray, "n n"]:
+def _covariance(rows: list[list[float]], *, least: float = -LOST_DIGITS) -> Float[ndarray, "n n"]:
+    """Return a covariance; raise ValueError where an eigenvalue of its correlation matrix is below `least`."""
     matrix = np.array(rows)
-    std = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    std[std < NOTHING] = 0.0
-    largest = np.outer(std, std)  # Cauchy-Schwarz
-    if (np.diag(matrix) < 0).any() or not (np.abs(matrix) <= (1 + LOST_DIGITS) * largest + 1e-30).all():
-        raise ValueError("no covariance: two errors vary together more than each by itself")
-    if not (np.abs(matrix - matrix.T) <= LOST_DIGITS * largest + 1e-30).all():
+    std = np.sqrt(np.maximum(np.diag(matrix), EXACT**2))
+    correlation = matrix / np.outer(std, std)
+    if not (eigenvalue := np.linalg.eigvalsh(correlation)[0]) >= least:
+        what = "no variance" if eigenvalue > -LOST_DIGITS else "a negative variance"
+        raise ValueError(f"no covariance: some combination of errors has {what}")
+    if (np.abs(correlation - correlation.T) > LOST_DIGITS).any():
         raise ValueError("no covariance: not symmetric")
-    if _least_eigenvalue(matrix, std) < -LOST_DIGITS:
-        raise ValueError("no covariance: some combination of errors has a negative variance")
     return matrix
-
-
-def _whole(rows: list[list[float]]) -> Float[ndarray, "n n"]:
-    matrix = _part(rows)
-    std = np.sqrt(np.diag(matrix))
-    if not std.all() or _least_eigenvalue(matrix, std) < LEAST_EIGENVALUE:
-        raise ValueError("no covariance: some error, or a combination of errors, has no variance")
-    return matrix
-
-
-def _least_eigenvalue(matrix: Float[ndarray, "n n"], std: Float[ndarray, " n"]) -> float:
-    unit = np.where(std > 0, std, 1.0)
-    return float(np.linalg.eigvalsh(matrix / np.outer(unit, unit))[0])
 
 
 def in_json(kind: Any) -> GetPydanticSchema:
@@ -104,9 +91,11 @@ def in_unit(per_unit: float) -> GetPydanticSchema:
     return in_json(Annotated[float, AfterValidator(from_unit), PlainSerializer(to_unit, return_type=float)])
 
 
-def _arrays(kind: Any, made: Any = np.array, count: int | None = None) -> GetPydanticSchema:
-    """Return the annotation of arrays that JSON has as lists: of `count` times `kind`, made an array by `made`."""
-    lists: Any = Annotated[list[kind], Field(min_length=count, max_length=count)]
+def _arrays(*counts: int | None, made: Any = np.array) -> GetPydanticSchema:
+    """Return the annotation of arrays of this shape that JSON has as lists, made arrays by `made`; None: any length."""
+    lists: Any = float
+    for count in reversed(counts):
+        lists = Annotated[list[lists], Field(min_length=count, max_length=count)]
     return in_json(
         Annotated[lists, AfterValidator(made), BeforeValidator(_listed), PlainSerializer(_listed, lists)]
     )
@@ -118,17 +107,15 @@ Positive = Annotated[float, Field(gt=0, lt=HUGE)]
 Spread = Annotated[float, Field(ge=0)]
 """Standard deviation, or a size."""
 Spread3 = Annotated[list[Spread], Field(min_length=3, max_length=3), BeforeValidator(_listed)]
-Numbers = Annotated[Float[ndarray, " _"], _arrays(float)]
-Numbers3 = Annotated[Float[ndarray, "3"], _arrays(float, count=3)]
-Numbers7 = Annotated[Float[ndarray, "7"], _arrays(float, count=7)]
-Square = Annotated[Float[ndarray, "_ _"], _arrays(list[float])]
-_Row4, _Row6, _Row7 = (
-    Annotated[list[float], Field(min_length=count, max_length=count)] for count in (4, 6, 7)
-)
-Matrix = Annotated[Float[ndarray, "4 4"], _arrays(_Row4, _rigid, 4)]
+Numbers = Annotated[Float[ndarray, " _"], _arrays(None)]
+Numbers3 = Annotated[Float[ndarray, "3"], _arrays(3)]
+Numbers7 = Annotated[Float[ndarray, "7"], _arrays(7)]
+Square = Annotated[Float[ndarray, "_ _"], _arrays(None, None)]
+Matrix = Annotated[Float[ndarray, "4 4"], _arrays(4, 4, made=_rigid)]
 """Rigid transform."""
-Covariance6 = Annotated[Float[ndarray, "6 6"], _arrays(_Row6, _whole, 6)]
-Covariance7 = Annotated[Float[ndarray, "7 7"], _arrays(_Row7, _whole, 7)]
+_whole = partial(_covariance, least=LEAST_EIGENVALUE)
+Covariance6 = Annotated[Float[ndarray, "6 6"], _arrays(6, 6, made=_whole)]
+Covariance7 = Annotated[Float[ndarray, "7 7"], _arrays(7, 7, made=_whole)]
 """Covariance of everything that was estimated: positive definite."""
-PartCovariance7 = Annotated[Float[ndarray, "7 7"], _arrays(_Row7, _part, 7)]
+PartCovariance7 = Annotated[Float[ndarray, "7 7"], _arrays(7, 7, made=_covariance)]
 """Part of a covariance that one cause adds, which may be nothing."""

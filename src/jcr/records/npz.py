@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import jaxtyped
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from jcr.allocator import require_memory
@@ -67,7 +68,7 @@ def _filled(value: Any, file: Mapping[str, np.ndarray]) -> Any:
 
 def read_reconstruction(path: Path) -> Reconstruction:
     """Read a reconstruction.npz; raise InputError where it is damaged or of another format."""
-    with read_npz(path, FORMAT) as (text, file):
+    with read_npz(path, FORMAT) as (text, file), jaxtyped("context"):
         found = ReconstructionContent.model_validate(_filled(json.loads(text), file)).reconstruction
         _check(found)
         return found
@@ -116,37 +117,25 @@ def require_shapes(shapes: Mapping[str, tuple[np.ndarray, tuple[int, ...]]]) -> 
 
 
 def _check(found: Reconstruction) -> None:
-    """Raise ValueError where the arrays do not belong together, or hold what cannot be."""
-    m, tracks, evidence, maps = len(found.image_index), found.tracks, found.evidence, found.pointmaps
-    k, p, boards = len(tracks.image), len(tracks.points_in_recon), tracks.boards
-    shapes = {"cameras": (found.recon_from_camera, (m, 4, 4)), "x_px": (tracks.x_px, (k, 2))}
+    """Raise ValueError where the arrays, whose shapes agree, hold what cannot be."""
+    tracks, boards, maps = found.tracks, found.tracks.boards, found.pointmaps
+    m, p, cameras = len(found.image_index), len(tracks.points_in_recon), [*found.recon_from_camera]
     rows = [("image_index", found.image_index, np.inf), ("tracks.image", tracks.image, m)]
-    shapes["tracks.point"], cameras = (tracks.point, (k,)), [*found.recon_from_camera]
-    positive = [found.metric_std or 1.0]
-    if tracks.std_px is not None:
-        shapes["std_px"] = tracks.std_px, (k,)
-        positive += tracks.std_px.tolist()
+    rows.append(("tracks.point", tracks.point, p))
+    positive = [found.metric_std or 1.0, *(() if tracks.std_px is None else tracks.std_px.tolist())]
     if boards is not None:
         positive += [boards.side, boards.size_std or 1.0]
         rows.append(("boards.elsewhere", np.array(boards.elsewhere, int), m))
-        for body in boards.bodies:
-            shapes[f"body {body.number}"] = body.x_in_body, (len(body.point), 3)
-            rows.append(("board's point", body.point, p))
-    if evidence is not None:
-        shapes["evidence"] = evidence.recon_from_camera, (m, 4, 4)
-        shapes["covariance"] = evidence.covariance, (6 * m, 6 * m)
-        cameras += [*evidence.recon_from_camera]
+        rows += [("board's point", body.point, p) for body in boards.bodies]
+        require_shapes({f"body {one.number}": (one.x_in_body, (len(one.point), 3)) for one in boards.bodies})
+    if found.evidence is not None:
+        cameras += [*found.evidence.recon_from_camera]
     if maps is not None:
         size = m, maps.intrinsics.height, maps.intrinsics.width
-        shapes |= {
-            name: (array, (*size, 3) if name in ("points_in_recon", "colors") else size)
-            for name, array in vars(maps).items()
-            if isinstance(array, np.ndarray)
-        }
-    require_shapes(shapes)
+        require_shapes({"confidence": (maps.confidence, size)})
     if min(positive) <= 0:
         raise ValueError("a length or a standard deviation is not positive")
-    for name, index, end in (*rows, ("tracks.point", tracks.point, p)):
+    for name, index, end in rows:
         if index.dtype.kind not in "iu" or (index < 0).any() or (index >= end).any():
             raise ValueError(f"{name} counts rows that are not there")
     if (np.diff(found.image_index) <= 0).any():

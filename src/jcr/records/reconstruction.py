@@ -15,9 +15,9 @@ class Body:
 
     number: int
     """Number of the tag; 0 for a board."""
-    point: Int[ndarray, " c"]
+    point: Int[ndarray, " _"]
     """Rows of `Tracks.points_in_recon`, its corners."""
-    x_in_body: Float[ndarray, "c 3"]
+    x_in_body: Float[ndarray, "_ 3"]
     """Corners as printed, z = 0; in metres, or in sides where the side is unknown."""
 
 
@@ -78,8 +78,8 @@ class CameraEvidence:
     """The cameras as the images alone determine them, with their covariance; no robot pose is used."""
 
     recon_from_camera: Float[ndarray, "m 4 4"]
-    covariance: Float[ndarray, "r r"]
-    """Covariance of steps of the cameras (geometry.retract, recon axes), camera by camera; r = 6m. The recon frame is
+    covariance: Float[ndarray, "6*m 6*m"]
+    """Covariance of steps of the cameras (geometry.retract, recon axes), camera by camera. The recon frame is
     that of one of the cameras, which is therefore exact."""
 
 

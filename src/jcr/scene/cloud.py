@@ -10,7 +10,7 @@ from numpy import ndarray
 from jcr.calibration.record import Calibration
 from jcr.errors import InputError
 from jcr.files import read_bytes, write_bytes
-from jcr.geometry import apply, apply_similarity, by_similarity, inverse, scale_translation
+from jcr.geometry import apply, by_similarity, inverse, scale_translation
 from jcr.records import MATCHED, PRIOR, Capture, PointCloud, Reconstruction
 from jcr.scene.options import CloudOptions
 
@@ -68,7 +68,7 @@ def point_cloud(
     x_in_recon = dense.points_in_recon.reshape(-1, 3)[pixel].astype(np.float64)
     recon_from_camera = scale_translation(reconstruction.recon_from_camera, hand_eye.scale)
     return PointCloud(
-        points_in_base=apply_similarity(hand_eye.base_from_recon.rigid, hand_eye.scale, x_in_recon),
+        points_in_base=hand_eye.base_from_recon(x_in_recon),
         color=dense.colors.reshape(-1, 3)[pixel],
         confidence=confident,
         margin=position_std(hand_eye, recon_from_camera, image, hand_eye.scale * x_in_recon),

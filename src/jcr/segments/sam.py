@@ -18,7 +18,6 @@ from torch.nn import functional as F
 from jcr.calibration.record import Calibration
 from jcr.errors import InputError
 from jcr.extras import extra
-from jcr.geometry import apply_similarity
 from jcr.hub import cached_files
 from jcr.progress import Progress
 from jcr.records import Reconstruction
@@ -84,9 +83,7 @@ def sam_labels(
         if progress:
             progress("segment anything", k / len(dense.colors))
         masks.append(image_masks(model, image))
-    x_in_base = apply_similarity(
-        hand_eye.base_from_recon.rigid, hand_eye.scale, dense.points_in_recon.astype(np.float64)
-    )
+    x_in_base = hand_eye.base_from_recon(dense.points_in_recon.astype(np.float64))
     return merged(masks, x_in_base, dense.confidence > 0)
 
 

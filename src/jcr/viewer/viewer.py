@@ -22,7 +22,7 @@ from jcr.camera import pinhole_inside, undistortion
 from jcr.capture.images import read_image
 from jcr.capture.urdf_chain import load_urdf
 from jcr.errors import InputError
-from jcr.geometry import apply_similarity, scale_translation
+from jcr.geometry import scale_translation
 from jcr.progress import Progress, silent
 from jcr.records import Capture
 from jcr.report.render import TRACK_COLOR, label_colors, render
@@ -131,7 +131,7 @@ class Viewer:
             self.reconstruction.recon_from_camera, scale
         )
         tracked = self.reconstruction.tracks.points_in_recon
-        self.tracks_in_base = apply_similarity(base_from_recon, scale, tracked)
+        self.tracks_in_base = self.calibration.base_from_recon(tracked)
         server.scene.set_up_direction("+z")
         server.gui.add_markdown(self._verdict(run))
         report("view", 0.1)

@@ -9,7 +9,7 @@ import pytest
 from benchmarks import adam
 from jcr.camera import rays
 from jcr.errors import InputError, RejectedError
-from jcr.geometry import apply_similarity, fit_similarity, retract, rotation_between_deg
+from jcr.geometry import Similarity, fit_similarity, retract, rotation_between_deg
 from jcr.pointmaps.dust3r.pair_graph import complete_pairs, window_pairs
 from jcr.pointmaps.global_alignment.align import Alignment, global_align
 from jcr.pointmaps.global_alignment.gauss_newton import gauss_newton
@@ -26,7 +26,7 @@ def errors(result: Alignment, truth: PairTruth) -> tuple[float, float]:
     """Mean error of the cameras, mm and degrees, after the best similarity."""
     true, found = truth.base_from_camera, result.recon_from_camera
     base_from_recon, scale = fit_similarity(true[:, :3, 3], found[:, :3, 3])
-    centers = apply_similarity(base_from_recon, scale, found[:, :3, 3])
+    centers = Similarity(base_from_recon, scale)(found[:, :3, 3])
     rotation = rotation_between_deg(base_from_recon[:3, :3] @ found[:, :3, :3], true[:, :3, :3])
     return 1e3 * float(np.linalg.norm(centers - true[:, :3, 3], axis=1).mean()), float(rotation.mean())
 

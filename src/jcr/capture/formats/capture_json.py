@@ -21,7 +21,6 @@ from jcr.records import Capture, CellCamera
 from jcr.records.capture_json import (
     CameraEntries,
     CameraEntry,
-    CameraFrame,
     CaptureFile,
     FrameEntry,
     IntrinsicsEntry,
@@ -183,7 +182,7 @@ def camera_entries(capture: Capture) -> dict[str, CameraEntry]:
     for camera in capture.others:
         if camera.base_from_gripper is not None:
             pairs = zip(camera.images, camera.base_from_gripper, strict=True)
-            frames = [CameraFrame(image=image, base_from_gripper=pose) for image, pose in pairs]
+            frames = [FrameEntry(image=image, base_from_gripper=pose) for image, pose in pairs]
             listed: dict[str, Any] = {"arm": camera.arm, "frames": frames}
         elif camera.frame is None:
             listed = {"images": [*camera.images]}
