@@ -19,12 +19,12 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_pose_pairs
 from jcr.calibration.record import read_calibration, write_calibration
 from jcr.capture.added import read_added
-from jcr.capture.camera_info import read_camera_info
 from jcr.capture.formats import capture_json
 from jcr.capture.formats.lerobot import Info, read_episode
 from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_source
+from jcr.capture.ros import read_camera_info
 from jcr.capture.urdf_chain import read_chain
 from jcr.cli.use import read_points
 from jcr.depth.densify import pointmaps_of

@@ -7,9 +7,9 @@ from .calibration.options import CalibrateOptions as CalibrateOptions
 from .calibration.record import Calibration as Calibration
 from .capture.options import ReadOptions as ReadOptions
 from .capture.read import read_capture as read_capture
-from .capture.ros_image import read_ros_camera_info as read_ros_camera_info
-from .capture.ros_image import read_ros_depth as read_ros_depth
-from .capture.ros_image import read_ros_image as read_ros_image
+from .capture.ros import read_ros_camera_info as read_ros_camera_info
+from .capture.ros import read_ros_depth as read_ros_depth
+from .capture.ros import read_ros_image as read_ros_image
 from .cell.placement import CameraPlacement as CameraPlacement
 from .cell.placement import CamerasFile as CamerasFile
 from .cell.placement import ImageUse as ImageUse

@@ -12,9 +12,9 @@ import capture_writers as writers
 import jcr
 from jcr.capture.images import encode_png, read_depth_images, read_image
 from jcr.capture.options import ReadOptions
-from jcr.capture.pose_track import NEVER, pose_track
+from jcr.capture.pose_track import NEVER, PoseTrack
 from jcr.capture.recording import Recording, best_frames, capture_of_recording
-from jcr.capture.ros_image import image_of, read_ros_depth
+from jcr.capture.ros import image_of, read_ros_depth
 from jcr.files import write_bytes
 from jcr.geometry import rotation_exp, transform
 from jcr.progress import silent
@@ -193,7 +193,7 @@ def test_interpolation_is_exact_on_a_screw_and_refuses_what_lies_outside():
     start = 1_700_000_000_000_000_001
     time_s = np.arange(5.0)
     rotation = rotation_exp(np.outer(time_s, [0.1, 0.3, -0.2]))
-    track = pose_track(
+    track = PoseTrack(
         start + (1e9 * time_s).astype(np.int64), transform(rotation, np.outer(time_s, [1.0, 0, 0]))
     )
     at, gap = track.at(start + np.array([1_500_000_000, 3_000_000_000, -1, 4_000_000_001]))

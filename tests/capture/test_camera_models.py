@@ -8,9 +8,9 @@ import yaml
 from pydantic import TypeAdapter
 
 import jcr
-from jcr.capture import camera_info
 from jcr.capture.formats import colmap
 from jcr.capture.plain_files import validated_content
+from jcr.capture.ros import intrinsics_of_ros, read_camera_info
 from jcr.export import ros
 from jcr.records import Intrinsics
 from jcr.records.capture_json import IntrinsicsEntry
@@ -33,7 +33,7 @@ def test_intrinsics_survive_capture_json_camera_info_and_calibration_json(
         parent="tool0", child="optical", parent_from_child=np.eye(4), intrinsics=intrinsics
     )
     (tmp_path / "camera_info.yaml").write_text(ros.camera_info(mount))
-    assert camera_info.read_camera_info(tmp_path / "camera_info.yaml", SIZE) == intrinsics
+    assert read_camera_info(tmp_path / "camera_info.yaml", SIZE) == intrinsics
     printed = yaml.safe_load((tmp_path / "camera_info.yaml").read_text())
     assert printed["distortion_model"] in ("plumb_bob", "rational_polynomial", "equidistant")
     file = TypeAdapter(Intrinsics)
@@ -68,9 +68,10 @@ def test_intrinsics_survive_colmap(intrinsics: Intrinsics, tmp_path: Path):
     ],
 )
 def test_other_camera_models_are_refused_by_name(model: str, count: int, words: str):
-    k = [500.0, 0, 320, 0, 500, 240, 0, 0, 1]
+    k = [500.0, 0.0, 320.0, 0.0, 500.0, 240.0, 0.0, 0.0, 1.0]
+    info = {"width": SIZE[0], "height": SIZE[1], "k": k, "distortion_model": model, "d": [0.1] * count}
     with pytest.raises(jcr.InputError, match=words):
-        camera_info.intrinsics_of_ros(k, model, [0.1] * count, SIZE, SIZE, "camera_info")
+        intrinsics_of_ros(info, SIZE, "camera_info")
 
 
 def test_a_capture_names_the_models_that_there_are():

@@ -21,8 +21,8 @@ NAMED = 10
 """Names that a message lists; of more it gives the number."""
 
 
-def read_text(file: Path) -> str:
-    """Read the text of a file; InputError when it is missing, binary, compressed or not UTF-8."""
+def read_text(file: Path, most: int = MAX_JSON) -> str:
+    """Read the text of a file; InputError when it is missing, too long, binary, compressed or not UTF-8."""
     try:
         data = read_bytes(file)
     except OSError as error:
@@ -35,6 +35,8 @@ def read_text(file: Path) -> str:
         raise InputError(f"{file}: not UTF-8 text (byte {error.start}); save it as UTF-8") from None
     if "\0" in text:
         raise InputError(f"{file}: a binary file, not text; name another, or say what it is with --format")
+    if len(text) > most:
+        raise InputError(f"{file}: {len(text) / 1e6:.0f} MB; {most // 1_000_000} MB at most")
     return text
 
 
@@ -47,7 +49,7 @@ def read_yaml(file: Path) -> Any:
     except ImportError:
         from yaml import SafeLoader
 
-    text = _bounded(file, MAX_YAML)
+    text = read_text(file, MAX_YAML)
     try:
         documents = [one for one in yaml.load_all(text, Loader=SafeLoader) if one is not None]
         return documents[0] if len(documents) == 1 else documents or None
@@ -70,7 +72,7 @@ def read_json(file: Path) -> Any:
         return content
 
     try:
-        return json.loads(_bounded(file, MAX_JSON), object_pairs_hook=unique)
+        return json.loads(read_text(file), object_pairs_hook=unique)
     except json.JSONDecodeError as error:
         raise InputError(
             f"{file}: not JSON at line {error.lineno}, column {error.colno}: {error.msg}; correct it there"
@@ -81,13 +83,6 @@ def read_json(file: Path) -> Any:
         raise InputError(
             f"{file}: a number that is none, or nested too deeply ({error}); correct it"
         ) from None
-
-
-def _bounded(file: Path, most: int) -> str:
-    """Return the text of a file; raise InputError where it is longer than any capture's."""
-    if len(text := read_text(file)) > most:
-        raise InputError(f"{file}: {len(text) / 1e6:.0f} MB; {most // 1_000_000} MB at most")
-    return text
 
 
 def first_few(names: Sequence[str]) -> str:

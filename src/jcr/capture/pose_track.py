@@ -2,7 +2,6 @@
 
 from array import array
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +22,12 @@ SPEED_OVER_NS = 50_000_000
 """Time to either side over which speed is measured, ns: long for an encoder's last digit, short for a stop."""
 
 
-@dataclass(frozen=True)
 class PoseTrack:
-    """Samples of a_from_b in ascending time."""
+    """Samples of a_from_b in ascending time; the first of those with the same stamp stays."""
 
-    stamp_ns: Stamps
-    a_from_b: Float[ndarray, "n 4 4"]
+    def __init__(self, stamp_ns: Stamps, a_from_b: Float[ndarray, "n 4 4"]) -> None:
+        self.stamp_ns, rows = np.unique(stamp_ns, return_index=True)
+        self.a_from_b = a_from_b[rows]
 
     def at(self, stamp_ns: Stamps) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
         """Return poses at stamps (ns), linear in position and by slerp in rotation, and the gaps (ns) around each."""
@@ -40,12 +39,6 @@ class PoseTrack:
         rotation = Slerp(rows, Rotation.from_matrix(self.a_from_b[:, :3, :3]))(before + share).as_matrix()
         low, high = self.a_from_b[before, :3, 3], self.a_from_b[np.minimum(before + 1, rows[-1]), :3, 3]
         return transform(rotation, low + share[:, None] * (high - low)), gap
-
-
-def pose_track(stamp_ns: Stamps, a_from_b: Float[ndarray, "n 4 4"]) -> PoseTrack:
-    """Return samples in order of time; the first of those with the same stamp stays."""
-    stamps, rows = np.unique(stamp_ns, return_index=True)
-    return PoseTrack(stamps, a_from_b[rows])
 
 
 def bracket(
@@ -133,4 +126,4 @@ class TfTree:
             text = "holds a transform that is none; record again"
             raise InputError(f"{source}: tf from {self._parent[child]} to {child}: {text}")
         poses = transform(Rotation.from_quat(numbers[:, 3:]).as_matrix(), numbers[:, :3])
-        return pose_track(stamps, poses), child in self._static
+        return PoseTrack(stamps, poses), child in self._static

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jcr.capture.checks import how_rotated, require_frames, require_motion
-from jcr.capture.formats import Format, bag, capture_json, colmap, lerobot, samples, table
+from jcr.capture.formats import bag, capture_json, colmap, lerobot, samples, table
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.capture.pairing import image_names
 from jcr.errors import InputError
@@ -18,10 +18,17 @@ from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.records import Capture, PosePairs
 
-FORMATS = {
-    module.FORMAT.name: module.FORMAT for module in (capture_json, bag, lerobot, samples, colmap, table)
+FORMATS: dict[str, Any] = {
+    "capture": capture_json,
+    "bag": bag,
+    "lerobot": lerobot,
+    "samples": samples,
+    "colmap": colmap,
+    "table": table,
 }
-"""Formats by name, in the order in which files are tested."""
+"""Modules of the formats by name, in the order in which files are tested."""
+RECORDINGS = ("bag", "lerobot")
+"""Formats whose images are inside a file."""
 
 
 def read_capture(
@@ -63,14 +70,14 @@ def read_source(
         raise InputError(
             f"--frames {options.frames}: at least {MIN_FRAMES} frames are needed, 8 to 15 are good"
         )
-    form = FORMATS[format_of(path, options) if options.format == "auto" else options.format]
-    if form.recording:
+    name = format_of(path, options) if options.format == "auto" else options.format
+    if name in RECORDINGS:
         if into is None:
             raise InputError(
                 f"{path}: its images are inside it; give a folder to extract them to: into=FOLDER"
             )
-        return _extracted(path, options, Path(into), form, progress or silent)
-    found = _inverted(form.read(path, options), options)
+        return _extracted(path, options, Path(into), FORMATS[name], progress or silent)
+    found = _inverted(FORMATS[name].read(path, options), options)
     require_frames(len(found), str(path), at_least)
     require_motion(found.base_from_gripper, str(path))
     if isinstance(found, Capture) and (rotated := how_rotated(found)) is not None:
@@ -81,15 +88,15 @@ def read_source(
 def format_of(path: Path, options: ReadOptions | None = None) -> str:
     """Return the name of the format that the files at a path show; raise InputError when they show none."""
     has_poses = options is not None and options.poses is not None
-    for form in FORMATS.values():
-        if form.recognises(path) or (form.name == "table" and has_poses):
-            return form.name
+    for name, form in FORMATS.items():
+        if form.recognises(path) or (name == "table" and has_poses):
+            return name
     if path.is_file():
         raise InputError(
             f"{path}: not recognised by its name or content; give its format with --format "
             f"({', '.join(FORMATS)}), see jcr docs captures"
         )
-    if any(bag.is_bag(file) for file in path.iterdir()):
+    if any(bag.recognises(file) for file in path.iterdir()):
         raise InputError(f"{path}: holds bags; name one of them")
     if taken := image_names(path):
         raise InputError(
@@ -109,7 +116,7 @@ def _inverted(found: Any, options: ReadOptions) -> Any:
     return replace(found, base_from_gripper=inverse(found.base_from_gripper))
 
 
-def _extracted(path: Path, options: ReadOptions, into: Path, form: Format, progress: Progress) -> Capture:
+def _extracted(path: Path, options: ReadOptions, into: Path, form: Any, progress: Progress) -> Capture:
     """Return the capture of a recording in the folder `into`; read again where its files or the options changed."""
     sources = [path, *filter(None, (options.urdf, options.camera_info))]
     files = [file for one in sources for file in ([one] if one.is_file() else sorted(one.rglob("*")))]

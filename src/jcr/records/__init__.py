@@ -7,5 +7,4 @@ and unit). Pixel (0, 0) is the *centre* of the top-left pixel, as in OpenCV. Met
 from jcr.findings.requirement import *
 from jcr.records.calibration import *
 from jcr.records.capture import *
-from jcr.records.cloud import *
 from jcr.records.reconstruction import *

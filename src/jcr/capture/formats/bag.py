@@ -10,12 +10,10 @@ import numpy as np
 from jaxtyping import Int, UInt16
 from numpy import ndarray
 
-from jcr.capture.camera_info import intrinsics_of_ros, read_camera_info
-from jcr.capture.formats import Format
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import TfTree, speed
 from jcr.capture.recording import Picture, Recording, capture_of_recording, chosen_name
-from jcr.capture.ros_image import image_of, read_ros_depth
+from jcr.capture.ros import image_of, intrinsics_of_ros, read_camera_info, read_ros_depth
 from jcr.capture.urdf_chain import JointSamples, RecordedArm, read_arm
 from jcr.errors import InputError
 from jcr.extras import extra
@@ -32,8 +30,8 @@ SAME_MOMENT_NS = 20_000_000
 """Largest difference between the stamps of the colour and the depth image of one exposure, ns."""
 
 
-def is_bag(path: Path) -> bool:
-    """Return whether a path is a bag: a folder with a metadata.yaml, or a file."""
+def recognises(path: Path) -> bool:
+    """Test whether a path is a bag: a folder with a metadata.yaml, or a file."""
     return (path / "metadata.yaml").is_file() or path.suffix.lower() in SUFFIXES
 
 
@@ -146,11 +144,8 @@ class _Bag:
             return read_camera_info(options.camera_info, size)
         if (info := self.camera_info) is None:
             return None
-        k, d, p = (list(getattr(info, name if hasattr(info, name) else name.upper())) for name in "kdp")
-        calibrated, where = (info.width, info.height), f"{self.path}: camera_info of {self.topic}"
-        if "image_rect" in self.topic:
-            return intrinsics_of_ros([*p[:3], *p[4:7], *p[8:11]], "", (), calibrated, size, where)
-        return intrinsics_of_ros(k, info.distortion_model, d, calibrated, size, where)
+        where = f"{self.path}: camera_info of {self.topic}"
+        return intrinsics_of_ros(info, size, where, is_rectified="image_rect" in self.topic)
 
 
 @contextmanager
@@ -219,6 +214,3 @@ def _stamp(message: Any, log_ns: int) -> int:
     """Return the stamp (ns) of a message; the time of its recording for drivers that leave the stamp empty."""
     stamp = message.header.stamp
     return stamp.sec * 10**9 + stamp.nanosec or log_ns
-
-
-FORMAT = Format(name="bag", about="a ROS 1 or ROS 2 bag", recognises=is_bag, read=read, recording=True)

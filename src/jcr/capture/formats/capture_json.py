@@ -10,7 +10,6 @@ from pydantic import TypeAdapter
 
 from jcr.capture.checks import checked_capture, require_frames
 from jcr.capture.controllers import CONVENTIONS
-from jcr.capture.formats import Format
 from jcr.capture.images import read_image, size_of_all
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_json, validated_content
@@ -29,6 +28,14 @@ from jcr.records.capture_json import (
 
 FILE, URDF = "capture.json", "robot.urdf"
 _CAMERAS = TypeAdapter(CameraEntries)
+
+
+def recognises(path: Path) -> bool:
+    """Test whether a path is a folder with a capture.json, or a JSON file with frames."""
+    if path.name == FILE or path.suffix.lower() != ".json" or not path.is_file():
+        return (path if path.name == FILE else path / FILE).is_file()
+    content = read_json(path)
+    return isinstance(content, dict) and "frames" in content
 
 
 def read_capture_json(file: Path) -> CaptureFile:
@@ -250,14 +257,3 @@ def _image_name(content: CaptureFile, row: int, file: Path) -> str:
     if not isinstance(frame, dict) or not isinstance(frame.get("image"), str):
         raise InputError(f'{file}: frame {row} has no "image"; give the image\'s path as text')
     return frame["image"]
-
-
-def _is_capture(path: Path) -> bool:
-    """Return whether a path is a folder with a capture.json, or a JSON file with frames."""
-    if path.name == FILE or path.suffix.lower() != ".json" or not path.is_file():
-        return (path if path.name == FILE else path / FILE).is_file()
-    content = read_json(path)
-    return isinstance(content, dict) and "frames" in content
-
-
-FORMAT = Format(name="capture", about="a folder with capture.json", recognises=_is_capture, read=read)

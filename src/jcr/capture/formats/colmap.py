@@ -13,13 +13,13 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.camera import HALF_PIXEL
-from jcr.capture.camera_info import checked_intrinsics
-from jcr.capture.formats import Format, table
+from jcr.capture.formats import table
 from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import contained
+from jcr.capture.plain_files import contained, validated_content
 from jcr.errors import InputError
 from jcr.geometry import inverse, transform
 from jcr.records import COEFFICIENTS, Capture, DistortionModel, Intrinsics
+from jcr.records.capture_json import IntrinsicsEntry
 
 if TYPE_CHECKING:
     import pycolmap
@@ -33,6 +33,11 @@ def find_model(path: Path) -> Path | None:
     """Return the folder of a COLMAP model in or at a folder; None where there is none."""
     files = (path / place / f"cameras.{end}" for place in _PLACES for end in ("bin", "txt"))
     return next((file.parent for file in files if file.is_file()), None)
+
+
+def recognises(path: Path) -> bool:
+    """Test whether a path is or holds a COLMAP model."""
+    return find_model(path) is not None
 
 
 def read(path: Path, options: ReadOptions) -> Capture:
@@ -113,19 +118,9 @@ def read_intrinsics(folder: Path, size: tuple[int, int], names: Collection[str] 
             f"{folder}: camera model {name}, which jcr does not know; run colmap image_undistorter"
         )
     value = dict(zip(names_of_params.split(", "), params, strict=True))
+    kind: DistortionModel = "fisheye" if "FISHEYE" in name else "rational" if any(params[9:]) else "pinhole"
     value = {"fx": value.get("f"), "fy": value.get("f"), "k1": value.get("k", 0.0)} | value
-    distortion: DistortionModel = (
-        "fisheye" if "FISHEYE" in name else "rational" if any(params[9:]) else "pinhole"
-    )
-    parameters = (value["fx"], value["fy"], value["cx"] - HALF_PIXEL, value["cy"] - HALF_PIXEL)
-    coefficients = [value.get(key, 0.0) for key in COEFFICIENTS[distortion]]
-    where = str(folder), "cameras"
-    return checked_intrinsics(parameters, coefficients, distortion, (width, height), size, where)
-
-
-FORMAT = Format(
-    name="colmap",
-    about="a COLMAP model and gripper poses",
-    recognises=lambda path: find_model(path) is not None,
-    read=read,
-)
+    entry = {"fx": value["fx"], "fy": value["fy"], "width": width, "height": height, "model": kind}
+    entry |= {key: value[key] - HALF_PIXEL for key in ("cx", "cy")}
+    entry["distortion"] = [value.get(key, 0.0) for key in COEFFICIENTS[kind]]
+    return validated_content(IntrinsicsEntry, entry, str(folder)).record(size, f"{folder}: cameras")

@@ -11,13 +11,12 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 from pydantic import BaseModel, ConfigDict, Field
 
-from jcr.capture.camera_info import read_camera_info
 from jcr.capture.controllers import CONVENTIONS, poses_from_numbers
-from jcr.capture.formats import Format
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_json, validated_content
-from jcr.capture.pose_track import pose_track, speed
+from jcr.capture.pose_track import PoseTrack, speed
 from jcr.capture.recording import Picture, Recording, capture_of_recording, chosen_name
+from jcr.capture.ros import read_camera_info
 from jcr.capture.urdf_chain import read_arm
 from jcr.errors import InputError
 from jcr.extras import extra
@@ -75,6 +74,11 @@ class Episode:
     video_start_s: float
 
 
+def recognises(path: Path) -> bool:
+    """Test whether a folder is a LeRobot data set."""
+    return (path / INFO).is_file()
+
+
 def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
     """Read the best frames of the chosen episodes into the folder `into`.
 
@@ -103,7 +107,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
         options=options,
         names=[f"episode_{e.index:06d}_frame_{k:06d}" for e in episodes for k in range(len(e.time_s))],
         base_from_gripper=poses,
-        speed=np.concatenate([speed(pose_track(at, poses[part]).at, at) for at, part in pieces]),
+        speed=np.concatenate([speed(PoseTrack(at, poses[part]).at, at) for at, part in pieces]),
         gap_ns=np.zeros(len(state), np.int64),  # a row is one instant
         images_of_rows=lambda wanted: _images(episodes, rows, wanted, camera, info.fps),
         intrinsics_of_size=lambda size: (
@@ -250,12 +254,3 @@ def _poses(
         raise InputError(f"{where}: {state.shape[1]} numbers, a pose of this convention has {len(names)}")
     numbers = state[:, [names.index(name) for name in wanted]]
     return poses_from_numbers(numbers, convention, options.pose_units, where), None
-
-
-FORMAT = Format(
-    name="lerobot",
-    about="a LeRobot data set",
-    recognises=lambda path: (path / INFO).is_file(),
-    read=read,
-    recording=True,
-)

@@ -6,13 +6,18 @@ A marker that stands still is a reconstruction's frame: recon_from_camera is the
 from pathlib import Path
 
 from jcr.capture.checks import require_frames
-from jcr.capture.formats import Format
 from jcr.capture.formats.pose_lists import SUFFIXES, pair_keys, read_rows, read_yaml_or_json
 from jcr.capture.formats.table import pose_table
 from jcr.capture.options import ReadOptions
 from jcr.errors import InputError
 from jcr.geometry import inverse
 from jcr.records import PosePairs
+
+
+def recognises(path: Path) -> bool:
+    """Test whether a path is a file with samples of MoveIt Calibration or easy_handeye2."""
+    is_list = path.is_file() and path.suffix.lower() in SUFFIXES
+    return is_list and pair_keys(read_yaml_or_json(path)) is not None
 
 
 def read(path: Path, options: ReadOptions) -> PosePairs:
@@ -51,13 +56,3 @@ def read(path: Path, options: ReadOptions) -> PosePairs:
         is_metric=True,
         notes=(*notes, *(f"left out: {faults[row]}" for row in sorted(faults))),
     )
-
-
-FORMAT = Format(
-    name="samples",
-    about="samples of MoveIt Calibration or easy_handeye2",
-    recognises=lambda path: (
-        path.is_file() and path.suffix.lower() in SUFFIXES and pair_keys(read_yaml_or_json(path)) is not None
-    ),
-    read=read,
-)

@@ -10,14 +10,14 @@ from typing import Any, get_args
 
 import numpy as np
 
-from jcr.capture.camera_info import FILE, read_camera_info
 from jcr.capture.checks import checked_capture, require_frames
 from jcr.capture.controllers import CONVENTIONS, checked_rows, tolerated
-from jcr.capture.formats import Format, pose_lists
+from jcr.capture.formats import pose_lists
 from jcr.capture.images import DEPTH
 from jcr.capture.options import ConventionName, ReadOptions, UnitsName
 from jcr.capture.pairing import PoseTable, pair_with_images, stamp_ns
 from jcr.capture.plain_files import read_npy, read_text, shown
+from jcr.capture.ros import CAMERA_INFO, read_camera_info
 from jcr.errors import InputError
 from jcr.records import Capture
 
@@ -61,6 +61,11 @@ def possible_options(options: ReadOptions) -> list[list[ReadOptions]]:
     ]
 
 
+def recognises(path: Path) -> bool:
+    """Test whether a path is or holds a table or list of gripper poses."""
+    return (file := find_table(path)) is not None and file.suffix.lower() in SUFFIXES
+
+
 def read(path: Path, options: ReadOptions) -> Capture:
     """Read a file of poses, or a folder that holds one; the images are in the same folder or in images/."""
     file = options.poses or find_table(path)
@@ -72,7 +77,7 @@ def read(path: Path, options: ReadOptions) -> Capture:
     capture, _ = checked_capture(folder, images, poses, str(file), faults)
     names = [f"{DEPTH}/{Path(name).stem}.png" for name in capture.images]
     depths = tuple(name if (folder / name).is_file() else None for name in names)
-    info = options.camera_info or folder / FILE
+    info = options.camera_info or folder / CAMERA_INFO
     known = options.camera_info is not None or info.is_file()
     return replace(
         capture,
@@ -285,11 +290,3 @@ def _name_and_unit(cell: str) -> tuple[str, str]:
     name, unit = match.groups() if match else (plain, "")
     matches = ((pattern.fullmatch(name), usual) for pattern, usual in _ALIASES.items())
     return next((match.expand(usual) for match, usual in matches if match), name), unit
-
-
-FORMAT = Format(
-    name="table",
-    about="images and a table or list of gripper poses",
-    recognises=lambda path: (file := find_table(path)) is not None and file.suffix.lower() in SUFFIXES,
-    read=read,
-)

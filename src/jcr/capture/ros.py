@@ -1,15 +1,83 @@
-"""Images, depth and intrinsics of ROS messages, from bags (rosbags) and nodes (rclpy); ROS itself is not imported."""
+"""Intrinsics, images and depth of ROS: messages of bags (rosbags) and nodes (rclpy), and camera_info YAML."""
 
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8, UInt16
 from numpy import ndarray
+from pydantic import AliasChoices, AliasPath, BaseModel, BeforeValidator, ConfigDict, Field
 
-from jcr.capture.camera_info import intrinsics_of_ros
-from jcr.errors import InputError
-from jcr.records import Intrinsics
+from jcr.capture.plain_files import read_yaml, validated_content
+from jcr.errors import InputError, shown
+from jcr.records import COEFFICIENTS, DistortionModel, Intrinsics
+from jcr.records.capture_json import IntrinsicsEntry
+
+CAMERA_INFO = "camera_info.yaml"
+_ROS_MODELS: dict[str, DistortionModel] = {
+    "": "pinhole",
+    "plumb_bob": "pinhole",
+    "rational_polynomial": "rational",
+    "equidistant": "fisheye",
+    "fisheye": "fisheye",
+}
+"""Distortion models by their names in ROS (sensor_msgs/distortion_models.hpp; depthai and others write fisheye)."""
+_Numbers = Annotated[
+    list[float], BeforeValidator(lambda array: list(array) if hasattr(array, "__iter__") else array)
+]
+"""Array of a message."""
+
+
+class CameraInfo(BaseModel):
+    """Content of a CameraInfo message or a camera_info YAML; ROS 1 names the matrices K, D and P."""
+
+    model_config = ConfigDict(strict=True, from_attributes=True)
+    width: int = Field(validation_alias=AliasChoices("image_width", "width"))
+    height: int = Field(validation_alias=AliasChoices("image_height", "height"))
+    k: _Numbers = Field(validation_alias=AliasChoices(AliasPath("camera_matrix", "data"), "k", "K"))
+    distortion_model: str
+    d: _Numbers = Field(validation_alias=AliasChoices(AliasPath("distortion_coefficients", "data"), "d", "D"))
+    p: _Numbers = Field(default=[], validation_alias=AliasChoices("p", "P"))
+
+
+def read_camera_info(file: Path, size: tuple[int, int]) -> Intrinsics | None:
+    """Read the intrinsics of a camera_info YAML for images of `size`; None of a camera that is not calibrated."""
+    return intrinsics_of_ros(read_yaml(file), size, str(file))
+
+
+def intrinsics_of_ros(
+    content: Any, size: tuple[int, int], where: str, is_rectified: bool = False
+) -> Intrinsics | None:
+    """Return the intrinsics of images of `size`; None for the zeros of a camera that was never calibrated.
+
+    `content` is a CameraInfo message or the content of a YAML. Raises InputError, begun with `where`, for a distortion
+    that jcr does not know, or intrinsics of another resolution.
+    """
+    info: CameraInfo = validated_content(CameraInfo, content, where)
+    matrix, model, coefficients = info.k, info.distortion_model, info.d
+    if is_rectified:
+        matrix, model, coefficients = [*info.p[:3], *info.p[4:7], *info.p[8:11]], "", []
+    if len(matrix) != 9:
+        raise InputError(f"{where}: the camera matrix has {len(matrix)} numbers, not nine")
+    if not any(matrix):
+        return None
+    known = _ROS_MODELS.get(model)
+    if known is None and not any(coefficients):
+        known = "pinhole"
+    if known is None or any(coefficients[len(COEFFICIENTS[known]) :]):
+        raise InputError(
+            f"{where}: distortion model {shown(model)} with {len(coefficients)} coefficients; jcr knows plumb_bob (5), "
+            "rational_polynomial (8) and equidistant (4): use rectified images, or calibrate with one of these"
+        )
+    if known == "rational" and not any(coefficients[5:]):
+        known = "pinhole"
+    fx, _, cx, _, fy, cy, *_ = matrix
+    count = len(COEFFICIENTS[known])
+    entry = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": info.width, "height": info.height}
+    entry |= {"model": known, "distortion": [*coefficients[:count], *[0.0] * (count - len(coefficients))]}
+    return validated_content(IntrinsicsEntry, entry, where).record(size, f"{where}: intrinsics")
+
 
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "rgb8": (3, None),
@@ -39,10 +107,7 @@ def read_ros_image(message: Any) -> UInt8[ndarray, "h w 3"]:
 
 def read_ros_camera_info(message: Any) -> Intrinsics | None:
     """Return the intrinsics of a sensor_msgs/CameraInfo; None of a camera that was never calibrated."""
-    size = (message.width, message.height)
-    return intrinsics_of_ros(
-        list(message.k), message.distortion_model, list(message.d), size, size, "camera_info"
-    )
+    return intrinsics_of_ros(message, (message.width, message.height), "camera_info")
 
 
 def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"], str]:
