@@ -81,7 +81,6 @@ CALIBRATIONS: dict[str, Change] = {
     "scale null": lambda c: c.update(scale=None),
     "covariance of six": lambda c: c["uncertainty"]["covariance"].pop(),
     "negative variance": lambda c: c["uncertainty"]["covariance"][0].__setitem__(0, -1.0),
-    "covariance in another order": lambda c: c["uncertainty"]["order"].reverse(),
     "mirrored transform": lambda c: c["gripper_from_camera"][0].__setitem__(0, 3.0),
     "two coefficients": lambda c: c["intrinsics"].update(distortion=[0.1, 0.2]),
     "no reason": lambda c: c.update(converged=False, warnings=[]),
