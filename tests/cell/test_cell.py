@@ -224,7 +224,6 @@ def test_a_zoom_of_a_second_camera_is_named_with_its_size_and_none_where_there_i
         is_given=True,
         prior=images.problem.cameras[1],
         std=np.sqrt(np.diag(answer.transform(place)[1])),
-        answer=lambda adjusted: (place(adjusted.state), adjusted.state.scale),
         camera=1,
         place=place,
     )

@@ -9,7 +9,7 @@ import pytest
 from benchmarks.coverage import FACTOR, predicted
 from jcr.calibration.poses import calibrate_pose_pairs
 from jcr.calibration.record import read_calibration
-from jcr.calibration.requirement import Proposals
+from jcr.calibration.requirement import better_poses, next_poses, predictions
 from jcr.calibration.robot_errors import errors_of
 from jcr.estimation.prediction import assumed, predict, typical_camera
 from jcr.pipeline.check import check_capture
@@ -53,14 +53,14 @@ def test_what_is_not_known_of_the_camera_is_in_the_expectation():
 
 def expected_with(
     problem: HandEyeProblem, noise: tuple[float, float] | None, count: int, reach: np.ndarray | None = None
-) -> tuple[np.ndarray, list[NextPose]]:
+) -> tuple[np.ndarray, tuple[NextPose, ...]]:
     """Standard deviations expected of a problem's poses, and the poses to add to them."""
     gripper, x = problem.base_from_gripper, problem.gripper_from_camera
     assumptions = replace(assumed(gripper, None, noise), gripper_from_camera=x)
-    proposals = Proposals.of(
-        assumptions, gripper, [str(k) for k in range(len(gripper))], errors_of(gripper), count, reach
-    )
-    return proposals.predict(0).std, proposals.next_poses(count)
+    added = better_poses(assumptions, gripper, errors_of(gripper), count, reach)
+    predicted = predictions(assumptions, gripper, errors_of(gripper), added)
+    names = [str(k) for k in range(len(gripper))]
+    return predicted(0).std, next_poses(gripper, names, added, predicted)
 
 
 def test_proposed_poses_keep_their_promise_and_stay_in_reach():

@@ -15,7 +15,6 @@ from jcr.calibration.hand_eye import image_verdicts, judged
 from jcr.calibration.record import Calibration
 from jcr.camera import by_parameters, by_point, parameter_names
 from jcr.estimation.closed_form import initial_estimate
-from jcr.estimation.hypotheses import focal_lengths
 from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.intrinsics_prior import CameraPrior, decentring
 from jcr.estimation.point_uncertainty import joint_covariance
@@ -55,8 +54,7 @@ def with_adjusted_images(case: Case) -> Case:
     if not case.is_adjustable:
         return _considered(case)
     try:
-        varies = case.options.focus == "varies" and case.shows_camera
-        found = adjust_case(case, combinations=focal_of_each(case) if varies else None)
+        found = adjust_case(case, combinations=case.free_focus if case.shows_camera else None)
     except np.linalg.LinAlgError:
         return case
     case = replace(case, adjusted=found)
@@ -112,11 +110,6 @@ def _start_noise(fit: Calibration) -> tuple[float, float]:
     """
     metres, radians = fit.robot_noise.together
     return max(START_NOISE[0], metres), max(START_NOISE[1], radians)
-
-
-def focal_of_each(case: Case) -> Float[ndarray, "e p"]:
-    """Return the combinations that give every used image a focal length of its own."""
-    return focal_lengths(case.reconstruction.intrinsics, len(case.used))
 
 
 def with_decentring(uncertainty: Uncertainty, camera: Intrinsics, x: Float[ndarray, "4 4"]) -> Uncertainty:

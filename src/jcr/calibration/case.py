@@ -12,6 +12,7 @@ from jcr.calibration.hand_eye import judged
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import RobotErrorPrior, of_poses
+from jcr.estimation.hypotheses import focal_lengths
 from jcr.estimation.intrinsics_prior import (
     ESTIMATED,
     MEASURED,
@@ -108,6 +109,13 @@ class Case:
             return self.chosen_tracks
         found = of_images(self.reconstruction.tracks, self.hand_eye.inliers)
         return found if len(found.image) <= MOST_OBSERVATIONS else some_points(found, MOST_OBSERVATIONS)
+
+    @property
+    def free_focus(self) -> Float[ndarray, "e p"] | None:
+        """Combinations that give every used image a focal length of its own; None where the user asked for none."""
+        if self.options.focus == "fixed":
+            return None
+        return focal_lengths(self.reconstruction.intrinsics, len(self.used))
 
     @property
     def scene_distance_m(self) -> float | None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from jcr.calibration.adjust import adjust_case
 from jcr.calibration.case import MIN_OBSERVATIONS, Case, with_findings
-from jcr.calibration.checks.camera import of_case, of_fewer_points
+from jcr.calibration.checks.camera import of_case
 from jcr.calibration.checks.effects import EFFECTS, effects, with_effects
 from jcr.calibration.hand_eye import judged, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
@@ -81,7 +81,7 @@ def _refined(
     if found.source == "poses" or case.tracks.from_pointmaps or len(case.tracks.image) < MIN_OBSERVATIONS:
         return found
     case = replace(case, adjusted=adjust_case(case))
-    state, effects_found = effects(of_case(of_fewer_points(case)))
+    state, effects_found = effects(of_case(case))
     adjusted, effects_found = with_effects(case, state, effects_found)
     answer = adjusted or case.adjusted
     assert answer is not None

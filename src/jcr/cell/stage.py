@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.case import Case
-from jcr.calibration.checks.camera import CameraAdjustment, all_combinations
+from jcr.calibration.checks.camera import CameraAdjustment
 from jcr.calibration.checks.effects import LARGE_MOTION, MATERIAL, as_adopted, effects
 from jcr.calibration.hand_eye import MAX_STD
 from jcr.calibration.options import CalibrateOptions
@@ -172,16 +172,12 @@ def _examined(
                 is_given=views.camera.intrinsics is not None,
                 prior=prior,
                 std=np.sqrt(np.diag(placed.covariance)) * placed.converged,
-                answer=lambda solution, one=one: (
-                    one.parent_from_camera(solution.state),
-                    solution.state.scale,
-                ),
                 camera=one.number,
                 place=one.parent_from_camera,
             )
         )
         if state.found:
-            images = images.with_freed(one.number, prior, all_combinations(state.found))
+            images = images.with_freed(one.number, prior, state.combinations)
             solution = images.adjusted()
             faults = tuple(
                 as_adopted(fault) if fault.kind.row.group == "camera" else fault for fault in faults

@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from jcr.calibration.case import Case
 from jcr.calibration.record import Calibration
-from jcr.calibration.requirement import Proposals, assumptions_of
+from jcr.calibration.requirement import assumptions_of, better_poses, next_poses, predictions
 from jcr.calibration.robot_errors import errors_of
 from jcr.estimation.inverse_kinematics import FITS, inverse_kinematics, reach_toward
 from jcr.estimation.kinematics import Arm, forward_kinematics
@@ -89,16 +89,15 @@ def propose(
 
     count, joints = 1 if reach.arm is None else PROPOSALS, None
     names = [capture.images[row] for row in rows]
-    proposals = Proposals.of(
-        assumptions, poses[rows], names, robot, count, reach.box, is_likely=is_wanted_or_likely
-    )
+    added = better_poses(assumptions, poses[rows], robot, count, reach.box, is_likely=is_wanted_or_likely)
     if reach.arm is not None:
         recorded = None if capture.joints is None else capture.joints[rows]
-        for pose in proposals.added:
+        for pose in added:
             if (joints := joints_at(reach.arm, poses[rows], recorded, pose)) is not None:
-                proposals = replace(proposals, added=pose[None])
+                added = pose[None]
                 break
-    return {"next_pose": proposals.next_poses(1)[0], "next_joints": joints}
+    predicted = predictions(assumptions, poses[rows], robot, added)
+    return {"next_pose": next_poses(poses[rows], names, added[:1], predicted)[0], "next_joints": joints}
 
 
 def _assumed(capture: Capture, poses: Float[ndarray, "m 4 4"], hand_eye: Calibration | None) -> Assumptions:

@@ -16,7 +16,13 @@ from jcr.calibration.hand_eye import SCALE_STD, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_pose_pairs, is_one
 from jcr.calibration.record import Calibration
-from jcr.calibration.requirement import Proposals, assumptions_of, assumptions_of_poses
+from jcr.calibration.requirement import (
+    assumptions_of,
+    assumptions_of_poses,
+    better_poses,
+    next_poses,
+    predictions,
+)
 from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
 from jcr.calibration.stage import checked_case
 from jcr.camera import fold_distance_px
@@ -138,15 +144,17 @@ def check_capture(
     box = None if reach is None else np.asarray(reach, float)
     of_rows = assumptions or assumed(gripper, camera, robot_noise)
     names = [capture.images[row] for row in rows]
-    proposals = Proposals.of(of_rows, gripper, names, robot.of(rows), suggest, box, seed)
+    robot_of_rows = robot.of(rows)
+    added = better_poses(of_rows, gripper, robot_of_rows, suggest, box, seed)
+    predicted = predictions(of_rows, gripper, robot_of_rows, added)
     return Examination(
         sharpness=sharpness,
         largest_move_m=move_m,
         largest_rotation_rad=rotation_rad,
         observability=seen,
-        expected=proposals.predict(0) if len(counted) >= FEWEST else None,
+        expected=predicted(0) if len(counted) >= FEWEST else None,
         counted=counted,
-        suggestions=tuple(proposals.next_poses(suggest)),
+        suggestions=next_poses(gripper, names, added, predicted),
         hand_eye=hand_eye,
         findings=strongest_first({sentence(one): one for one in found}.values()),
         notes=(*notes, *shown.notes),

@@ -22,15 +22,11 @@ from jcr.calibration.checks.camera import (
     MOST_BYTES,
     CameraAdjustment,
     CameraEffect,
-    EffectsState,
-    all_combinations,
     best_camera_effect,
     camera_finding,
-    contradicted_intrinsics,
     is_material,
-    log_p,
     of_case,
-    of_fewer_points,
+    rows_of_arm,
     with_effect_free,
 )
 from jcr.calibration.hand_eye import judged, poses_agree
@@ -40,7 +36,6 @@ from jcr.camera import parameters, with_thin_prism
 from jcr.estimation.hypotheses import (
     PLAUSIBLE,
     STRAINS,
-    Row,
     Test,
     arm_rows,
     best_tests,
@@ -75,28 +70,23 @@ def check_effects(case: Case) -> Case:
     longer = _with_rejected_runs(case)
     if case.adjusted is None or longer.adjusted is None or not case.shows_camera:
         return case.after(_effects_of_poses(longer))
-    state, findings = effects(of_case(of_fewer_points(longer)))
+    state, findings = effects(of_case(longer))
     return case.after(findings) if longer is not case else _adopted(case, state, findings)
 
 
-def effects(imaged: CameraAdjustment) -> tuple[EffectsState, tuple[Finding, ...]]:
+def effects(state: CameraAdjustment) -> tuple[CameraAdjustment, tuple[Finding, ...]]:
     """Return the adjustment with all effects free that one camera's images show, and a finding of each.
 
     An effect beside which the gripper poses still contradict the images is not their cause, and is not reported.
     """
-    state, findings = EffectsState.start(imaged), list[Finding]()
-    dismissed, passed = list[CameraEffect](), set[FindingKind]()
+    findings, dismissed, passed = list[Finding](), list[CameraEffect](), set[FindingKind]()
     camera_explains = True
     while len(findings) < AT_ONCE:
         of_camera, log_chance = best_camera_effect(state, dismissed) if camera_explains else (None, 0.0)
         test = _best_pose_effect(state, passed)
-        if of_camera is None and test is None and camera_explains:
-            of_camera = contradicted_intrinsics(state, dismissed)
-        if of_camera is None and test is None:
-            break
         if test is not None and (of_camera is None or _explains(state, test, of_camera, log_chance)):
             passed.add(test.row.kind)
-            found = pose_finding(test, _poses_of(state), imaged.names, imaged.std)
+            found = pose_finding(test, _tested_poses(state), state.names, state.std)
             if found is not None:
                 findings.append(found)
                 state = state.with_free(state.found, (*state.poses, test.row))
@@ -109,18 +99,19 @@ def effects(imaged: CameraAdjustment) -> tuple[EffectsState, tuple[Finding, ...]
                 continue
             state = after
             findings.append(found)
+        else:
+            break
     return state, tuple(findings)
 
 
-def _explains(state: EffectsState, test: Test, of_camera: CameraEffect, log_chance: float) -> bool:
+def _explains(state: CameraAdjustment, test: Test, of_camera: CameraEffect, log_chance: float) -> bool:
     """Return whether an effect on the poses rather than one on the camera is the cause where both are significant."""
     with_camera = with_effect_free(state, of_camera)
     if with_camera is None:
         return True
     left = _best_pose_effect(with_camera, set())
     poses_remain = left is not None and left.row.kind is test.row.kind
-    with_poses = state.with_free(state.found, (*state.poses, test.row))
-    camera_remains = log_p(of_camera, with_poses, with_poses.equations) <= LOG_P
+    camera_remains = state.with_free(state.found, (*state.poses, test.row)).log_p(of_camera) <= LOG_P
     return test.log_p < log_chance if poses_remain == camera_remains else poses_remain
 
 
@@ -135,118 +126,102 @@ class ArmEquations:
     columns: Int[ndarray, "12"]
     """Columns of the arm's hand-eye transform and of its base_from_recon."""
 
-    def rows_of_effects(self) -> list[Row]:
-        """Return all effects on the poses of the arm, with 0 in the rows of other arms."""
-        n, s = len(self.base_from_gripper), len(self.equations.residual)
-        if n < MIN_IMAGES:
-            return []
-        blocks = self.by_motion()
-        found = [*order_rows(self.base_from_gripper, *blocks), *arm_rows(self.base_from_gripper)]
-        wide = [np.zeros((s, row.columns.shape[1])) for row in found]
-        for columns, row in zip(wide, found, strict=True):
-            columns[self.rows] = row.columns
-        return [replace(row, columns=columns) for row, columns in zip(found, wide, strict=True)]
 
-    def by_motion(self) -> tuple[Float[ndarray, "n 6 6"], Float[ndarray, "n 6 6"]]:
-        """Return the derivatives of the arm's residuals by its X and by its base_from_recon."""
-        own = self.equations.jacobian[self.rows][:, self.columns].reshape(-1, 6, 12)
-        return own[:, :, :6], own[:, :, 6:]
-
-
-def _poses_of(state: EffectsState) -> ArmEquations | None:
+def _tested_poses(state: CameraAdjustment) -> ArmEquations:
     """Return the equations of the arm whose poses are tested with the camera."""
-    adjusted, arm = state.adjusted, state.imaged.arm
-    if arm is None:
-        return None
+    adjusted, arm = state.adjusted, state.arm or 0
     return ArmEquations(
         equations=adjusted.equations,
         log_sizes=adjusted.log_sizes,
         base_from_gripper=adjusted.problem.arms[arm].base_from_gripper,
-        rows=state.imaged.rows_of_arm,
+        rows=rows_of_arm(adjusted.problem, arm),
         columns=columns_of_arm(arm),
     )
 
 
-def _best_pose_effect(state: EffectsState, passed: Collection[FindingKind]) -> Test | None:
+def _best_pose_effect(state: CameraAdjustment, passed: Collection[FindingKind]) -> Test | None:
     """Return the most significant effect on the gripper poses that its cause can produce."""
-    poses = _poses_of(state)
-    return None if poses is None else best_pose_effect(poses, {*passed, *(row.kind for row in state.poses)})
+    if state.arm is None:
+        return None
+    return best_pose_effect(_tested_poses(state), {*passed, *(row.kind for row in state.poses)})
 
 
 def best_pose_effect(poses: ArmEquations, passed: Collection[FindingKind]) -> Test | None:
     """Return the most significant effect on the poses of an arm, none of the kinds `passed`.
 
     Return None where the most significant one is larger than its cause can produce, or leaves poses that contradict the
-    images: the poses then have another fault.
+    images: the poses then have another fault. A motion must show less in nearly all other orders of the images.
     """
-    rows = [row for row in poses.rows_of_effects() if row.kind not in passed]
-    for test in best_tests(poses.equations, poses.log_sizes, rows):
-        kind = test.row.kind
+    equations, own, gripper = poses.equations, poses.rows, poses.base_from_gripper
+    n, s = len(gripper), len(equations.residual)
+    if n < MIN_IMAGES:
+        return None
+    by_motion = equations.jacobian[own][:, poses.columns].reshape(n, 6, 12)
+    by_x, by_z = by_motion[:, :, :6], by_motion[:, :, 6:]
+    rows = [
+        replace(row, columns=np.pad(row.columns, ((own.start, s - own.stop), (0, 0))))
+        for row in (*order_rows(gripper, by_x, by_z), *arm_rows(gripper))
+        if row.kind not in passed
+    ]
+    for test in best_tests(equations, poses.log_sizes, rows):
+        kind, place = test.row.kind, test.row.place
         if test.log_p > LOG_ALPHA.get(kind, LOG_ALPHA_OF_ORDER):
             continue
         if not test.is_within(PLAUSIBLE[kind]) or not poses_agree(test.noise):
             return None
-        if kind in SHARES and not _is_of_the_order(poses, test):
-            continue
+        if kind in SHARES:
+            share = np.linspace(-0.5, 0.5, n) if place == 0 else (np.arange(n) >= place).astype(float)
+            others, by = (
+                (own.start // 6, (s - own.stop) // 6),
+                by_z if kind is FindingKind.BASE_MOVED else by_x,
+            )
+            by, share = np.pad(by, (others, (0, 0), (0, 0))), np.pad(share, others)
+            images = slice(own.start // 6, own.stop // 6)
+            if not explains_by_order(equations, poses.log_sizes, by, share, images):
+                continue
         return test
     return None
 
 
-def _is_of_the_order(poses: ArmEquations, test: Test) -> bool:
-    """Return whether the images in nearly all other orders show the motion less."""
-    n, place = len(poses.base_from_gripper), test.row.place
-    share = np.linspace(-0.5, 0.5, n) if place == 0 else (np.arange(n) >= place).astype(float)
-    blocks = np.zeros((len(poses.equations.residual) // 6, 6, 6))
-    of_images = np.zeros(len(blocks))
-    own = slice(poses.rows.start // 6, poses.rows.stop // 6)
-    blocks[own], of_images[own] = poses.by_motion()[test.row.kind is FindingKind.BASE_MOVED], share
-    return explains_by_order(poses.equations, poses.log_sizes, blocks, of_images, own)
-
-
 def pose_finding(
-    test: Test, poses: ArmEquations | None, names: Sequence[str], std: Float[ndarray, "6"]
+    test: Test, poses: ArmEquations, names: Sequence[str], std: Float[ndarray, "6"]
 ) -> Finding | None:
     """Return a confirmed effect as a finding; None where it moves the camera by less than is material.
 
     `names` are those of the images in their order, `std` is the uncertainty of the camera's place (m, rad).
     """
-    assert poses is not None
-    own = test.shift[poses.columns[:6]]
-    kind, p = test.row.kind, float(np.exp(max(test.log_p, -700)))
+    own, moved = test.shift[poses.columns[:6]], test.estimate
+    kind, place, p = test.row.kind, test.row.place, float(np.exp(max(test.log_p, -700)))
     if kind.row.group == "strain":
         columns = test.row.prior_std * test.row.columns
         straight = straight_shift(poses.equations, poses.log_sizes, columns)[poses.columns[:6]]
         if not (np.abs([own, straight]) > MATERIAL * std).any():
             return None
         return replace(Finding.of(kind, "warns", "robot", p=p), **_size_of_strain(test))
-    moved = own if kind is FindingKind.DELAY else test.estimate
+    if kind is FindingKind.DELAY:
+        moved = own
     if not (np.abs(moved) > MATERIAL * std).any():
         return None
-    return replace(Finding.of(kind, "warns", "mount", p=p), **_size_in_order(test, own, names))
-
-
-def _size_in_order(test: Test, shift: Float[ndarray, "6"], names: Sequence[str]) -> dict[str, Any]:
-    """Return the fields of a finding that state how large an effect of the order is."""
-    kind, place = test.row.kind, test.row.place
+    found = Finding.of(kind, "warns", "mount", p=p)
     if kind is FindingKind.DELAY:
-        std = float(np.sqrt(test.covariance[0, 0]))
-        fields = {"value": float(test.estimate[0]), "std": std, "shift": (*shift.tolist(), 0.0)}
-        return {"concerns": "poses", "details": {"unit": "interval"}, **fields}
-    metres, radians = np.linalg.norm(test.estimate.reshape(2, 3), axis=1).tolist()
+        size, std_of_size = float(test.estimate[0]), float(np.sqrt(test.covariance[0, 0]))
+        found = replace(found, concerns="poses", value=size, std=std_of_size, details={"unit": "interval"})
+        return replace(found, shift=(*own.tolist(), 0.0))
+    metres, radians = np.linalg.norm(moved.reshape(2, 3), axis=1).tolist()
+    found = replace(found, value=metres, details={"rotation": radians})
     if kind is FindingKind.DRIFT:
-        shift = test.estimate / 2
-        return {"value": metres, "shift": (*shift.tolist(), 0.0), "details": {"rotation": radians}}
+        return replace(found, shift=(*(moved / 2).tolist(), 0.0))
     count, longer = max((place, "before"), (len(names) - place, "after"))
     # A base that moves takes no part in the hand-eye transform: its shift is what it does to the fit.
-    moved = test.estimate if kind is FindingKind.SLIP else shift
-    return {
-        "severity": "rejects" if metres > LARGE_MOTION[0] or radians > LARGE_MOTION[1] else "warns",
-        "concerns": "mount" if kind is FindingKind.SLIP else "poses",
-        "images": (names[place - 1], names[place]),
-        "value": metres,
-        "shift": (*moved.tolist(), 0.0),
-        "details": {"rotation": radians, "longer": longer, "count": float(count)},
-    }
+    shift, concerns = (moved, "mount") if kind is FindingKind.SLIP else (own, "poses")
+    return replace(
+        found,
+        severity="rejects" if metres > LARGE_MOTION[0] or radians > LARGE_MOTION[1] else "warns",
+        concerns=concerns,
+        images=(names[place - 1], names[place]),
+        shift=(*shift.tolist(), 0.0),
+        details={"rotation": radians, "longer": longer, "count": float(count)},
+    )
 
 
 def _size_of_strain(test: Test) -> dict[str, Any]:
@@ -272,13 +247,13 @@ def _size_of_strain(test: Test) -> dict[str, Any]:
     }
 
 
-def _adopted(case: Case, state: EffectsState, findings: tuple[Finding, ...]) -> Case:
+def _adopted(case: Case, state: CameraAdjustment, findings: tuple[Finding, ...]) -> Case:
     """Return the calibration with the effects that its model can carry; one that is rejected stays.
 
     The effects were found with some of the points. Effects on the camera that do not move the calibration by all points
     are not reported; of many images with an effect each, as many points take part as memory allows.
     """
-    free = all_combinations(state.found)
+    free = state.combinations
     most = MOST_BYTES // (16 * (1 if free is None else free.shape[1]))
     fewer = case
     if len(case.tracks.image) > most:
@@ -300,7 +275,7 @@ def _adopted(case: Case, state: EffectsState, findings: tuple[Finding, ...]) -> 
 
 
 def with_effects(
-    case: Case, state: EffectsState, findings: tuple[Finding, ...]
+    case: Case, state: CameraAdjustment, findings: tuple[Finding, ...]
 ) -> tuple[Solution | None, tuple[Finding, ...]]:
     """Adjust a case with the effects on camera and arm free, and return the findings with the shifts that remain.
 
@@ -311,16 +286,17 @@ def with_effects(
     strains = [row for row in state.poses if row.kind.row.group == "strain"]
     if not strains and not any(one.kind.row.group == "camera" for one in findings):
         return None, findings
-    found = list(state.found)
-    if any(one.kind is FindingKind.THIN_PRISM for one in found) and state.camera.model != "fisheye":
+    free = state.combinations
+    if any(one.kind is FindingKind.THIN_PRISM for one in state.found) and state.intrinsics.model != "fisheye":
         camera = with_thin_prism(case.reconstruction.intrinsics)
-        reconstruction = replace(case.reconstruction, intrinsics=camera)
-        case = replace(case, reconstruction=reconstruction, adjusted=None)
-        own, own_now = len(parameters(state.camera)), len(parameters(camera))
-        found = [one.with_parameters(own, own_now) for one in found if one.kind is not FindingKind.THIN_PRISM]
+        case = replace(case, reconstruction=replace(case.reconstruction, intrinsics=camera), adjusted=None)
+        found = tuple(one for one in state.found if one.kind is not FindingKind.THIN_PRISM)
+        if (free := replace(state, found=found).combinations) is not None:
+            # The columns of the further parameters follow those of the camera as it was.
+            before, now = len(parameters(state.intrinsics)), len(parameters(camera))
+            free = np.insert(free, [before] * (now - before), 0.0, axis=0)
     bent = np.concatenate([row.prior_std * row.columns for row in strains], axis=1) if strains else None
-    adjusted = adjust_case(case, combinations=all_combinations(found), confirmed_errors=bent)
-    remaining = []
+    adjusted, remaining = adjust_case(case, combinations=free, confirmed_errors=bent), list[Finding]()
     for one in findings:
         if one.kind.row.group == "camera":
             one = as_adopted(one)
@@ -329,7 +305,13 @@ def with_effects(
             straight = np.zeros(7)
             if one.kind is strains[0].kind:
                 straight = straight_shift(adjusted.equations, adjusted.log_sizes, bent)[:7]
-            one = replace(one, shift=tuple(_with_metre(one, straight, adjusted).tolist()))
+            if one.kind is FindingKind.LENGTHS and one.value is not None:
+                # Of three lengths one differs, and no image shows which is a metre.
+                jacobian = adjusted.equations.jacobian[:, :UNKNOWNS]
+                region = Region.of_unknowns(np.delete(jacobian, SCALE, axis=1), UNKNOWNS)
+                metre = abs(one.value) / 3 * np.r_[-(region.fit @ jacobian[:, SCALE])[:6, 0], 1.0]
+                straight = straight + metre * (1 if straight[:6] @ metre[:6] >= 0 else -1)
+            one = replace(one, shift=tuple(straight.tolist()))
         remaining.append(one)
     return adjusted, tuple(remaining)
 
@@ -337,17 +319,6 @@ def with_effects(
 def as_adopted(found: Finding) -> Finding:
     """Return the finding of an effect that is part of the calibration, which no uncertainty remains of."""
     return replace(found, shift=None, intrinsics_shift=None)
-
-
-def _with_metre(found: Finding, shift: Float[ndarray, "7"], adjusted: Solution) -> Float[ndarray, "7"]:
-    """Add to a shift what the scale may be off by: of three lengths one differs, and no image shows which is a metre."""
-    if found.kind is not FindingKind.LENGTHS or found.value is None:
-        return shift
-    equations = adjusted.equations
-    region = Region.of_unknowns(np.delete(equations.jacobian[:, :UNKNOWNS], SCALE, axis=1), UNKNOWNS)
-    metre = np.r_[-(region.fit @ equations.jacobian[:, SCALE])[:6, 0], 1.0]
-    of_metre = abs(found.value) / 3 * metre
-    return shift + of_metre * (1 if shift[:6] @ of_metre[:6] >= 0 else -1)
 
 
 def straight_shift(
