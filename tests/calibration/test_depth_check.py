@@ -107,8 +107,8 @@ def test_the_robot_shows_that_the_depth_is_too_long_and_how_noisy(measured: tupl
     assert noise == pytest.approx(NOISE_PER_M * depth**2, rel=0.35)
     assert (check.std_m(depth) > noise).all()
     content = replace(hand_eye, depth_check=check)
-    said = f"depth camera: its lengths are {check.off_percent:.2g} ± {check.std_percent:.1g} % too long "
-    assert any(line.startswith(said) for line in details(content))
+    said = f"{check.off_percent:+.2f} ± {check.std_percent:.2g} %"
+    assert f"Depth camera: scale error, compared with the robot: {said}" in details(content)
     assert validated(json.loads(json.dumps(content.as_json())), Path("a")) == content
     assert depth_check(replace(capture, depths=None), reconstruction, hand_eye) is None
 

@@ -24,24 +24,23 @@ DETAILS: dict[str, float | str] = {
     **dict(frame="base", x=0.0, y=0.6, z=0.8, motion="planar", rotation=0.01, part="scale", unit="interval"),
     **dict(reading="their inverses", fits="1 mm", given=1e-3, given_rotation=1e-3, residual=0.01),
     **dict(translation_mm=5.0, rotation_deg=1.0, asked=0.0, distance_mm=0.0, reached_mm=9.0, reached_deg=0.1),
-    **dict(
-        longer="after", count=5.0, camera="overhead", joint_2=0.01, joint_2_std=0.001, of=12.0, arm="right"
-    ),
+    **dict(longer="after", count=5.0, camera="overhead", of=12.0, arm="right"),
+    **dict(at="camera", source="images", shown="a focal length of 600 px where 610 is given"),
     **dict(board="chessboard:9x6:SIDE", proposed="aruco:SIDE:DICT_4X4_50", one="board", other="known length"),
     **dict(
-        needed=3.0, mount="base", focal_std=0.1, rotated="rotated by 90°", text="a thing is wrong", remedy=""
+        needed=3.0,
+        mount="base",
+        focal_std=0.1,
+        rotated="rotated by 90°",
+        text="a thing is wrong",
+        remedy="",
+        at="camera",
     ),
 }
 """Details of any kind."""
-INTRINSICS = {
-    f"{name}{of}": 600.0 + k
-    for name in ("fx", "fy", "cx", "cy")
-    for k, of in enumerate(("", "_given", "_std"))
-}
 OWN_DETAILS = {
     FindingKind.FEW_AGREE: {"images": 9.0},
     FindingKind.POSE_CONVENTION: DETAILS | {"given": "90 mm", "remedy": "add --pose-inverted"},
-    FindingKind.INTRINSICS: INTRINSICS,
 }
 """Details of kinds that give a name another meaning."""
 

@@ -206,13 +206,8 @@ def advised(
         return hand_eye
     systematic = uncertainty.budget is not None and uncertainty.budget.mostly_systematic
     concerns: Concerns = "images" if more is not None else "robot" if systematic else "none"
-    numbers = {
-        name: value if isinstance(value, str) else float(value)
-        for name, value in vars(required).items()
-        if value is not None
-    }
     short = Finding.of(FindingKind.NOT_EXACT_ENOUGH, "rejects" if required.asked else "warns", concerns)
-    return hand_eye.with_findings(replace(short, value=1e-3 * required.reached_mm, details=numbers))
+    return hand_eye.with_findings(replace(short, value=1e-3 * required.reached_mm, details=required.details))
 
 
 def _required(uncertainty: Uncertainty, options: CalibrateOptions) -> Requirement:

@@ -2,15 +2,16 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.errors import RejectedError
-from jcr.findings.sentences import filled
-from jcr.findings.table import FindingKind
+from jcr.findings.requirement import Requirement
+from jcr.findings.table import MOTIONS, REACHED, FindingKind
+from jcr.rounding import significant
 
 Severity = Literal["rejects", "warns", "informs"]
 Concerns = Literal["reconstruction", "motion", "images", "intrinsics", "poses", "mount", "robot", "none"]
@@ -79,14 +80,114 @@ class Finding:
         return np.outer(shift, shift)
 
 
+LENGTHS = {
+    "robot": "the robot's positions",
+    "board": "the size of the board",
+    "known length": "the known length",
+    "depth camera": "the depth camera",
+    "network": "the network's metre",
+}
+"""Names of the sources of a scale."""
+
+
+class _Number(float):
+    """Number of a template: {n:~} has two significant digits, {n:!.1f} no sign, and {n:long|short} goes by the sign."""
+
+    def __format__(self, spec: str) -> str:
+        if "|" in spec:
+            return spec.split("|")[self <= 0]
+        if "$" in spec:
+            return spec.replace("$", significant(self))
+        number, spec = abs(self) if spec.startswith("!") else float(self), spec.removeprefix("!")
+        return significant(number) if spec == "~" else format(number, spec)
+
+
+class _Text(str):
+    """Text of a template: {name:a=words of a|b=words of b}, or {name:words around $}, which are empty without it."""
+
+    def __format__(self, spec: str) -> str:
+        if "=" in spec:
+            return dict(part.split("=", 1) for part in spec.split("|") if part).get(self, "")
+        if not self:
+            return spec.split("|")[1] if "|" in spec else ""
+        return spec.replace("$", self) or str(self)
+
+
+class _Images(tuple[str, ...]):
+    """Images of a template: {images} names at most three, {images:is|are} agrees with their number."""
+
+    def __format__(self, spec: str) -> str:
+        if spec:
+            return spec.split("|")[len(self) > 1]
+        return joined([*self[:3], *[f"{len(self) - 3} more"] * (len(self) > 3)])
+
+
+class Quantities(dict[str, Any]):
+    """Quantities that templates name: details and numbers of a finding, these also in mm, degrees and percent.
+
+    A quantity that a finding lacks is an empty text.
+    """
+
+    def __missing__(self, name: str) -> _Text:
+        return _Text("")
+
+    @staticmethod
+    def of(finding: Finding) -> "Quantities":
+        """Return the quantities of a finding."""
+        named = Quantities(images=_Images(finding.images), concerns=_Text(finding.concerns))
+        for name, one in {"value": finding.value, "std": finding.std, **finding.details}.items():
+            if isinstance(one, str):
+                named[name] = _Text(LENGTHS.get(one, one))
+            elif one is not None:
+                of, units = (
+                    "" if name == "value" else f"{name}_",
+                    {"mm": 1e3, "deg": 180 / np.pi, "percent": 100.0},
+                )
+                named |= {name: _Number(one)} | {
+                    f"{of}{unit}": _Number(per * one) for unit, per in units.items()
+                }
+                if name.endswith("_mm"):
+                    named[name.removesuffix("m")] = _Number(1e-3 * one)
+        if "x" in named:
+            at, frame = np.array([named[name] for name in "xyz"], float), finding.details["frame"]
+            k = int(np.abs(at).argmax())
+            along = abs(at[k]) > np.cos(np.radians(10))
+            numbers = ", ".join(f"{x:.2f}" for x in at)
+            named["axis"] = (
+                f"the {frame}'s {'xyz'[k]} axis" if along else f"the axis ({numbers}) of the {frame}"
+            )
+            named["point"] = ", ".join(f"{1e3 * x:.0f}" for x in at)
+        if "motion" in named:
+            direction, move = MOTIONS[named["motion"]]
+            named |= {"direction": direction.format_map(named), "move": move.format_map(named)}
+        return named
+
+
+def joined(words: Iterable[str]) -> str:
+    """Return the words as an enumeration: "a, b and c"."""
+    *first, last = words
+    return f"{', '.join(first)} and {last}" if first else last
+
+
 def text(finding: Finding) -> str:
     """Return the message: what is wrong, in one sentence."""
-    return filled(finding.kind.row.message, finding)
+    return finding.kind.row.message.format_map(Quantities.of(finding))
 
 
 def remedy(finding: Finding) -> str:
     """Return the remedy in one sentence; empty where nothing helps or nothing need be done."""
-    return filled(finding.kind.row.remedy, finding)
+    return finding.kind.row.remedy.format_map(Quantities.of(finding))
+
+
+def unobservable(finding: Finding) -> str:
+    """Return the direction that is unobservable, or nearly so, in words."""
+    return "{nearly:nearly unobservable: |}{direction}".format_map(Quantities.of(finding))
+
+
+def reached_in_words(required: Requirement) -> str:
+    """Return the bound of 95 % of the errors beside the requirement, in words."""
+    short = Finding(kind=FindingKind.NOT_EXACT_ENOUGH, severity="informs", details=required.details)
+    return REACHED.format_map(Quantities.of(short))
 
 
 def sentence(finding: Finding) -> str:

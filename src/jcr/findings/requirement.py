@@ -28,3 +28,9 @@ class Requirement:
     def met(self) -> bool:
         """Whether 95 % of the errors are within what is required."""
         return self.reached_mm <= self.translation_mm and self.reached_deg <= self.rotation_deg
+
+    @property
+    def details(self) -> dict[str, float | str]:
+        """Numbers and names for the details of a finding."""
+        named = {name: value for name, value in vars(self).items() if value is not None}
+        return {name: one if isinstance(one, str) else float(one) for name, one in named.items()}

@@ -1,14 +1,7 @@
 """Table of the findings: a row for each kind, with message, remedy, consequences and documentation."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING
-
-from jcr.findings import sentences
-
-if TYPE_CHECKING:
-    from jcr.findings.finding import Finding
 
 MISFIT = (
     "few images agree",
@@ -30,6 +23,60 @@ ONE_PART = (
     "calibrate the {count:.0f} images {longer:before=up to {images[0]}|after=from {images[1]} on} alone, and those of "
     "the other part only where "
 )
+SHORT = "not as exact as needed"
+REACHED = (
+    "{at:seen=a point seen at {distance_m:~} m is placed within {reached_mm:~} mm and {reached_deg:~}° in the robot's "
+    "base frame (95 % of errors)|camera=95 % of errors of the camera on the gripper are below {reached_mm:~} mm and "
+    "{reached_deg:~}°|scene=95 % of errors of mapped points are below {reached_mm:~} mm and {reached_deg:~}°}; "
+    "{translation_mm:g} mm and {rotation_deg:g}° are {asked:asked for|needed to grasp}"
+)
+"""Bound of 95 % of the errors beside the requirement."""
+NEARER = "take two or more images 20 % nearer to or farther from the point you look at"
+TILT = "tilt the wrist by 20° or more away from {axis} in two images"
+MOTIONS = {
+    "no camera poses": ("everything: no camera poses", "{advice}"),
+    "two images": (
+        "translation along, and rotation about, the one axis that two images share",
+        "add one image or more, rotated by 20° or more about another axis",
+    ),
+    "no rotation": (
+        "translation of the camera in x, y and z: the gripper never rotates (pure translation)",
+        "tilt the wrist by 20° or more, about two different axes, in at least three images",
+    ),
+    "planar": (
+        "translation along {axis}: all rotations are about it (planar or SCARA motion)",
+        f"{TILT}, or give the camera's known height along it",
+    ),
+    "one axis, translation": ("translation along {axis}: all rotations are about it (one fixed axis)", TILT),
+    "one axis, scale": (
+        "scale: the camera moves on circles about one axis only",
+        "move the gripper sideways and in height as well",
+    ),
+    "one axis, rotation": ("rotation of the camera about {axis}", TILT),
+    "weak translation": (
+        "translation of the camera along {axis}",
+        "rotate the wrist more, about perpendicular axes, in three or more images",
+    ),
+    "weak rotation": (
+        "rotation of the camera along {axis}",
+        "rotate the wrist more, about perpendicular axes, in three or more images",
+    ),
+    "one point": ("scale: all views rotate about the one point ({point}) mm in the gripper frame", NEARER),
+    "own centre": (
+        "scale: the camera only rotates about its own centre",
+        "move the camera sideways by 10 cm or more between images",
+    ),
+    "look-at": (
+        "scale and the translation along the optical axis: all views rotate about one point on it "
+        "(look-at orbit at a constant radius)",
+        NEARER,
+    ),
+    "tool point": (
+        "scale: all views rotate about one tool point fixed at ({point}) mm in the gripper frame",
+        "move that point too: take two or more images with it 10 cm away from where it was",
+    ),
+}
+"""Unobservable direction and remedy of each kind of motion."""
 GROUPS = {
     "motion": "Motions, poses and accuracy",
     "camera": "The camera",
@@ -51,10 +98,10 @@ class KindRow:
 
     group: str
     """Key of GROUPS."""
-    message: "str | Callable[[Finding], str]"
-    """Template of the numbers and names of a finding (`sentences.filled`), or the function that makes the sentence."""
-    remedy: "str | Callable[[Finding], str]" = ""
-    """Remedy in one sentence, a template or a function; empty where nothing helps or nothing need be done."""
+    message: str
+    """Template of the numbers and names of a finding (finding.Quantities)."""
+    remedy: str = ""
+    """Template of the remedy in one sentence; empty where nothing helps or nothing need be done."""
     explains: tuple[str, ...] = ()
     """Kinds that follow from this one where it rejects a calibration; empty for a kind that is no cause."""
     means: str = ""
@@ -62,7 +109,7 @@ class KindRow:
     evidence: str = ""
     """Meaning and unit of `value`, for the documentation."""
     help: str = ""
-    """Remedy for the documentation, where `remedy` is a function or empty."""
+    """Remedy for the documentation, where `remedy` does not state it."""
 
 
 class FindingKind(StrEnum):
@@ -90,18 +137,18 @@ class FindingKind(StrEnum):
         "check that images and poses are paired, and how the poses are written (jcr docs captures)",
         evidence="images that agree")
     POSES_CONTRADICT_IMAGES = "gripper poses contradict the images", KindRow("motion",
-        "gripper poses and images disagree by {mm:.0f} mm and {deg:.1f}° per axis",
+        "gripper poses and images disagree by {mm:.0f} mm and {rotation_deg:.1f}° per axis",
         "check the pairing, and how the poses are written (jcr docs captures)", evidence="m per axis")
     POSE_CONVENTION = "pose convention", KindRow("motion",
         "the poses fit when read as {reading}: {fits}, instead of {given}", "{remedy}",
         explains=MISFIT, evidence="m per axis, when read so",
         help="the option in `remedy`, or correct them at their source")
     NOISE_ABOVE_GIVEN = "noise above the given one", KindRow("motion",
-        "gripper poses and images disagree by {mm:.2g} mm and {deg:.2g}° per axis, more than the given "
+        "gripper poses and images disagree by {mm:.2g} mm and {rotation_deg:.2g}° per axis, more than the given "
         "robot noise ({given_mm:.2g} mm, {given_rotation_deg:.2g}°): the larger is used",
         evidence="m per axis")
     UNCERTAIN = "too uncertain", KindRow("motion",
-        "the {part} is known to ±{part:translation={mm:.0f} mm|rotation={size_deg:.1f}°|scale={percent:.0f} %} only",
+        "the {part} is known to ±{part:translation={mm:.0f} mm|rotation={deg:!.1f}°|scale={percent:.0f} %} only",
         "add images, rotated by 20° or more about different axes{noise_unknown:, or give the robot's repeatability "
         "(--robot-noise MM DEG)|}",
         means="translation, rotation or scale (`details.part`) is less certain than 20 mm, 3° or 5 %",
@@ -109,25 +156,25 @@ class FindingKind(StrEnum):
     LEAVE_ONE_OUT = "leave-one-out error", KindRow("motion",
         "the leave-one-out error ({mm:.1f} mm) is well above the fit's residual ({residual_mm:.1f} mm): "
         "too few images for this motion", "add some", evidence="m")
-    NOT_EXACT_ENOUGH = "requirement not met", KindRow("motion", sentences.unmet_bound,
+    NOT_EXACT_ENOUGH = "requirement not met", KindRow("motion", f"{SHORT}: {REACHED}",
         "{concerns:images=add {more_images:.0f} more at the poses of next_poses|robot=most of it comes from systematic "
         "robot errors: name the arm (--robot) or add its joint angles|none=a dozen more images would not be enough; "
         "move closer to the scene, or use a better camera or robot}",
         means="not as exact as `--require` asks, which rejects, or as grasping needs, which warns",
         evidence="m, 95 % of errors are smaller", help="the images in `next_poses`; or the arm's name")
     FOCUS_BY_DISTANCE = "focal length changes with distance", KindRow("camera",
-        "the focal length {way:grows|shrinks} by {size_percent:.1f} ± {std_percent} % from the nearest "
+        "the focal length {value:grows|shrinks} by {percent:!.1f} ± {std_percent:~} % from the nearest "
         "view to the farthest", "lock the focus, or --focus varies", explains=MISFIT,
         evidence="share, from the nearest view to the farthest; the chance `p`")
     FOCUS_BY_IMAGE = "focal length differs between images", KindRow("camera",
-        "the focal length differs between images by {percent_rounded} % (rms, each ± {std_percent} %)",
+        "the focal length differs between images by {percent:~} % (rms, each ± {std_percent:~} %)",
         "lock the focus and take the images again, or --focus varies", explains=MISFIT, evidence="share, rms")
     ZOOM = "focal length changed once", KindRow("camera",
-        "the focal length changes by {percent:+.1f} ± {std_percent} % after {images[0]}: the "
+        "the focal length changes by {percent:+.1f} ± {std_percent:~} % after {images[0]}: the "
         "zoom or focus was moved", "calibrate the images before or after it, or --focus varies",
         explains=MISFIT, evidence="share; the chance `p`")
     ROLLING_SHUTTER = "images sheared alike", KindRow("camera",
-        "the images are sheared by {value:.1f} ± {std} px from top to bottom, as by the rolling "
+        "the images are sheared by {value:.1f} ± {std:~} px from top to bottom, as by the rolling "
         "shutter of a moving camera", "take the images at rest", explains=MISFIT,
         evidence="px from top to bottom; the chance `p`")
     ROLLING_SHUTTER_BY_IMAGE = "images sheared each by itself", KindRow("camera",
@@ -135,17 +182,17 @@ class FindingKind(StrEnum):
         "rolling shutter of a moving camera", "take the images at rest", explains=MISFIT,
         evidence="px from top to bottom, rms")
     THIN_PRISM = "thin prism", KindRow("camera",
-        "the images show a thin-prism distortion of up to {value:.1f} ± {std} px: the sensor is "
+        "the images show a thin-prism distortion of up to {value:.1f} ± {std:~} px: the sensor is "
         "tilted, or the optics are decentred",
         "use the transform with the estimated intrinsics, which have the coefficients s1 to s4",
         explains=MISFIT,
         evidence="px, where it is largest; the chance `p`")
     CENTRE_SAGS = "principal point moves with gravity", KindRow("camera",
-        "the principal point moves with gravity, by {value:.1f} ± {std} px when it lies in the image"
+        "the principal point moves with gravity, by {value:.1f} ± {std:~} px when it lies in the image"
         ": the optics are image-stabilised or loose",
         "switch image stabilisation off, or fix the optics", explains=MISFIT,
         evidence="px, when gravity lies in the image; the chance `p`")
-    INTRINSICS = "intrinsics contradict the images", KindRow("camera", sentences.intrinsics,
+    INTRINSICS = "intrinsics contradict the images", KindRow("camera", "the {source} show {shown}",
         "{estimated:use the transform with the intrinsics of this calibration|calibrate the intrinsics again at this "
         "resolution, or give no intrinsics (null) to have them estimated}",
         explains=MISFIT,
@@ -153,71 +200,72 @@ class FindingKind(StrEnum):
         means="the given intrinsics are not those of the images; parameters in `details`",
         evidence="the chance `p`")
     SLIP = "camera moved on the gripper", KindRow("order",
-        "the camera seems to have moved on the gripper by {mm:.1f} mm and {deg:.2f}° after {images[0]}",
+        "the camera seems to have moved on the gripper by {mm:.1f} mm and {rotation_deg:.2f}° after {images[0]}",
         ONE_PART + "the camera still sits as then", explains=MISFIT, evidence="m; the chance `p`")
     DRIFT = "camera drifts on the gripper", KindRow("order",
-        "the camera seems to drift on the gripper by {mm:.1f} mm and {deg:.2f}° from the first image to "
+        "the camera seems to drift on the gripper by {mm:.1f} mm and {rotation_deg:.2f}° from the first image to "
         "the last", "tighten its mount, let it warm up, and take the images again",
         explains=MISFIT, evidence="m; the chance `p`")
     BASE_MOVED = "robot base moved against the scene", KindRow("order",
-        "the robot's base and the scene moved against each other by {mm:.1f} mm and {deg:.2f}° after "
+        "the robot's base and the scene moved against each other by {mm:.1f} mm and {rotation_deg:.2f}° after "
         "{images[0]}", ONE_PART + "base and scene still stand as then", explains=MISFIT,
         evidence="m; the chance `p`")
     DELAY = "gripper poses early or late", KindRow("order",
-        "the gripper poses look as if read {size:.3f} ± {std} of the time from one image to the next too "
-        "{way:late|early}", "stop the arm at each image, or read pose and image by the same clock",
+        "the gripper poses look as if read {value:!.3f} ± {std:~} of the time from one image to the next too "
+        "{value:late|early}", "stop the arm at each image, or read pose and image by the same clock",
         explains=MISFIT, evidence="intervals between images; the chance `p`")
     WRONG_MOUNT = "wrong mount", KindRow("robot",
         "the images fit a camera that the gripper carries, not a fixed one",
         "write mount gripper for {camera}", explains=MISFIT)
     ROBOT_UNUSED = "robot not used", KindRow("robot", "the capture's robot is not used: {text}",
         help="correct its name, URDF or joint angles")
-    JOINT_OFFSETS = "joint offsets", KindRow("robot", sentences.joints_off,
+    JOINT_OFFSETS = "joint offsets", KindRow("robot", "robot: {shown}",
         means="`joints` are off; each in `details`", evidence="rad, the largest",
         help="master the joints")
     LENGTHS = "robot lengths differ by direction", KindRow("strain",
-        "along {axis} the robot's positions are {size_percent:.1f} ± {std_percent} % too {way:long|short} "
+        "along {axis} the robot's positions are {percent:!.1f} ± {std_percent:~} % too {value:long|short} "
         "beside those across it",
         "check that axis (a lift, a rail, a gantry): its gear ratio, its unit", explains=MISFIT,
         evidence="share, positive: too long; the chance `p`")
     BASE_LEANS = "robot base leans with reach", KindRow("strain",
-        "the robot's base leans {way:towards|away from} the gripper by {size_deg:.1f} ± {std_deg}° per "
+        "the robot's base leans {value:towards|away from} the gripper by {deg:!.1f} ± {std_deg:~}° per "
         "metre of reach, which its poses do not say", "bolt the stand to the floor, or brace it",
         explains=MISFIT,
         evidence="rad per m, positive: towards the gripper; the chance `p`")
     TOOL_SAGS = "tool sags", KindRow("strain",
-        "the gripper rotates by {size_deg:.2f} ± {std_deg}° where it is level, as a tool does that sags "
+        "the gripper rotates by {deg:!.2f} ± {std_deg:~}° where it is level, as a tool does that sags "
         "under its weight",
         "stiffen its mount, and check the zero of the wrist's joints, which looks like it", explains=MISFIT,
         evidence="rad, where it is level; the chance `p`")
     BOARD_SIZE = "board size contradicts the robot", KindRow("lengths",
-        "by the robot's motion the {marker:marker|board} is {size_percent:.1f} ± {std_percent} % {way:larger|smaller} "
+        "by the robot's motion the {marker:marker|board} is {percent:!.1f} ± {std_percent:~} % {value:larger|smaller} "
         "than given",
         "measure its squares, and check that the gripper poses are in metres", explains=MISFIT,
         evidence="share, positive: larger")
     SCALES = "lengths contradict each other", KindRow("lengths",
-        "{one} and {other} contradict each other by {size_percent:.1f} ± {std_percent} %",
+        "{one} and {other} contradict each other by {percent:!.1f} ± {std_percent:~} %",
         "measure both again",
         explains=MISFIT,
         means="two of what the scale is known from (`details.one`, `details.other`: robot, board, known "
         "length, depth camera, network) differ by more than they may",
         evidence="share, positive: the second is longer")
     BOARD_SIDE = "side of a board", KindRow("lengths",
-        "by the robot's positions the sides of {board} are {value_std_mm} mm",
+        "by the robot's positions the sides of {board} are {mm:.2f} ± {std_mm:.2f} mm",
         "measure one, and give it in --board: the scale is then known twice", evidence="m")
     BOARD_MOVED = "board at several places", KindRow("lengths",
         "in {images} {board} is at another place than in the other images: it was moved, or there are two",
         "its corners there count little or not at all; keep one board of a kind, and keep it still")
     BOARD_STRETCHED = "board stretched", KindRow("lengths",
-        "{board} is {size_percent:.1f} % longer along one side than along the other: it was not printed at its size",
+        "{board} is {percent:!.1f} % longer along one side than along the other: it was not printed at its size",
         "print it without scaling (jcr board) and measure both sides; its size is not used for the scale",
         evidence="share")
     BOARD_NOT_FOUND = "board not found", KindRow("lengths",
         "no two images show {board}: features alone are used{proposed:, but they seem to show $}",
         "check its kind and its numbers of squares or corners (jcr docs markers)",
         means="no two images show what `--board` names; `details.proposed` is what they seem to show")
-    NETWORK_SCALE = "a network's metre contradicts the robot", KindRow("lengths", sentences.network_scale_of,
-        "check the unit of the gripper poses", means="by far more than networks err",
+    NETWORK_SCALE = "a network's metre contradicts the robot", KindRow("lengths",
+        "the network's own lengths are {percent:!.3g} ± {std_percent:~} % too {value:long|short} compared with the "
+        "robot's", "check the unit of the gripper poses", means="by far more than networks err",
         evidence="share, positive: too long")
     SCALE_ASSUMED = "scale assumed", KindRow("lengths",
         "the scale is unobservable from these motions: it is taken as 1, from the marker's size",
@@ -258,7 +306,7 @@ class FindingKind(StrEnum):
     SECOND_ON_ARM = "second camera on another arm", KindRow("cell",
         "a second camera on arm {arm}: one each is supported")
     NOT_FIXED = "camera not fixed", KindRow("cell",
-        "{images[0]} and {images[1]} were taken from places {mm:.0f} mm and {deg:.1f}° apart: it is not "
+        "{images[0]} and {images[1]} were taken from places {mm:.0f} mm and {rotation_deg:.1f}° apart: it is not "
         "fixed", "of a camera on the gripper write mount gripper, of several cameras give each its own name",
         evidence="m")
     NOT_RIGID = "camera not rigid on the gripper", KindRow("cell",
@@ -275,8 +323,8 @@ class FindingKind(StrEnum):
         evidence="px, median",
         help="tighten the mount, or leave the image out")
     PLACE_UNCERTAIN = "camera's place too uncertain", KindRow("cell",
-        "its place is known to ±{mm:.0f} mm and {deg:.1f}° only{focal_std_percent:, for its images do not show its "
-        "intrinsics (focal length ± $ %)}",
+        "its place is known to ±{mm:.0f} mm and {rotation_deg:.1f}° only{focal_std_percent:, for its images do not show "
+        "its intrinsics (focal length ± $ %)}",
         "{concerns:intrinsics=give them, or images with more of the scene, at other depths|images=let it see more of "
         "the mapped scene, or add images to the wrist camera's capture}",
         means="a further camera is known worse than to 20 mm and 3°", evidence="m, 1σ of the worst axis",
@@ -288,7 +336,7 @@ class FindingKind(StrEnum):
         "more of the scene in view would help", evidence="share of the image")
     STATIC_IMAGES = "images show no motion", KindRow("images",
         "all images show the same view but for noise, while the gripper moves by {mm:.0f} mm and rotates "
-        "by {deg:.0f}°",
+        "by {rotation_deg:.0f}°",
         "check that the camera is on the gripper and its stream is live, and take each image at its own pose",
         explains=(*MISFIT, *TOO_FEW), evidence="m, the gripper's motion")
     BLURRED = "images blurred", KindRow("images", "{images} {images:is|are} blurred (edges {value:.0f} px wide)",
@@ -313,7 +361,7 @@ class FindingKind(StrEnum):
         "{images} have each other's gripper poses", "correct the pairing of images and poses",
         explains=MISFIT)
     POSE_CONTRADICTS_IMAGE = "gripper pose contradicts its image", KindRow("single",
-        "the gripper pose of {images[0]} is {mm:.0f} mm and {deg:.1f}° from where its image shows the "
+        "the gripper pose of {images[0]} is {mm:.0f} mm and {rotation_deg:.1f}° from where its image shows the "
         "gripper", "correct that pose, or drop the image", evidence="m")
     NOT_REGISTERED = "image not registered", KindRow("single",
         "{images} {images:is|are} not registered: {value:.0f} other images match, too little of each",

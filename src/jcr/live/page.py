@@ -12,8 +12,7 @@ from numpy import ndarray
 
 from jcr.calibration.options import GRASPING
 from jcr.capture.images import read_image
-from jcr.findings import sentence
-from jcr.findings.sentences import reached_in_words
+from jcr.findings import reached_in_words, sentence
 from jcr.live.progress import (
     FIRST_ADVICE,
     Notation,

@@ -11,8 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from pydantic import AfterValidator, Field, PlainSerializer, computed_field, model_validator
 
-from jcr.findings import Finding, remedy
-from jcr.findings.sentences import unobservable
+from jcr.findings import Finding, remedy, unobservable
 from jcr.records.capture import Intrinsics
 from jcr.records.json_fields import (
     Covariance7,

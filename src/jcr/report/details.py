@@ -10,12 +10,11 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.record import AnyCalibration
-from jcr.calibration.words import attempt_in_words, budget_in_words
+from jcr.calibration.words import facts
 from jcr.cell.placement import CamerasFile, TransformUncertainty
 from jcr.extras import is_installed
-from jcr.findings.sentences import LENGTHS
 from jcr.report.render import Section, label_colors
-from jcr.rounding import significant, with_std
+from jcr.rounding import significant
 from jcr.segments.measure import Measurement
 
 StageOptions = Mapping[str, Mapping[str, Any]]
@@ -27,45 +26,7 @@ def details_section(
     calibration: AnyCalibration, options: StageOptions, map_history: Mapping[str, str] | None = None
 ) -> Section:
     """Return blocks of names and values."""
-    times, uncertainty = calibration.timings_s, calibration.uncertainty
-    budget = None if uncertainty is None else uncertainty.budget
-    attempts = (
-        [] if calibration.parent_from_camera is None else calibration.attempts
-    )  # else the failure lists them
-    lengths = {
-        LENGTHS[
-            one.name
-        ]: f"{one.robot_longer_percent:+.2f} ± {significant(one.std_percent)} % longer by the robot's "
-        f"positions, {'part of the scale' if one.used else 'not used'}"
-        for one in calibration.lengths
-    }
-    depth, robot = {}, {}
-    if (check := calibration.depth_check) is not None:
-        depth["scale error, compared with the robot"] = (
-            f"{check.off_percent:+.2f} ± {check.std_percent:.2g} %"
-        )
-        for z in check.distances_m:
-            depth[f"noise at {z:.2f} m, 1 σ"] = f"{significant(1e3 * float(check.std_m(np.array(z))))} mm"
-        depth["looked at"] = f"{check.features} features of {check.images} images"
-    if (errors := calibration.robot_errors) is not None:
-        shared = f"{errors.translation_mm:.2g} mm {errors.rotation_deg:.2g}° per axis"
-        robot["errors shared by neighbouring poses"] = shared
-        for k, joint in enumerate(errors.joints or [], start=1):
-            robot[f"joint {k} off by"] = f"{joint.offset_deg:+.3f} ± {joint.std_deg:.3f}°"
-    blocks: dict[str, Mapping[str, str]] = {
-        "Time": {stage: f"{seconds:.1f} s" for stage, seconds in times.items()}
-        | {"together": f"{sum(times.values()):.1f} s"}
-        | {
-            f"attempt {k}": attempt_in_words(one, len(calibration.images))
-            for k, one in enumerate(attempts, start=1)
-        },
-        "Uncertainty, 1 σ per axis": {} if budget is None else budget_in_words(budget),
-        "Lengths": lengths,
-        "Depth camera": depth,
-        "Robot": robot,
-        "Board": _board(calibration),
-        "Map": map_history or {},
-    }
+    blocks = facts(calibration) | {"Map": map_history or {}}
     for stage, chosen in options.items():
         blocks[f"Options: {stage}"] = {
             name: "unset" if value is None else str(list(value) if isinstance(value, tuple) else value)
@@ -74,23 +35,6 @@ def details_section(
     versions = {"jcr": calibration.version, "python": platform.python_version()}
     blocks["Versions"] = versions | {name: metadata.version(name) for name in PACKAGES if is_installed(name)}
     return Section("details", {"blocks": {title: rows for title, rows in blocks.items() if rows}})
-
-
-def _board(calibration: AnyCalibration) -> dict[str, str]:
-    """Return size, place and flatness of a board that took part beside features."""
-    if (board := calibration.board) is None:
-        return {}
-    stated = f", {board.stated_mm:g} mm stated" if board.stated_mm else ""
-    rows = {
-        board.spec: f"{board.corners} corners in {board.images} images, {board.rms_px:.2f} px rms per axis",
-        "side by the robot's positions": f"{with_std(board.side_mm, board.side_std_mm)} mm{stated}",
-        "lowest to highest corner": f"{significant(board.bend_mm)} mm",
-    }
-    for k, (centre, tilt) in enumerate(zip(board.centres_in_base, board.tilts_deg, strict=True), start=1):
-        name = f"place of tag {k}" if board.bodies > 1 else "place"
-        at = ", ".join(f"{x:.3f}" for x in centre)
-        rows[name] = f"({at}) m in the base, {tilt:.1f}° from horizontal"
-    return rows
 
 
 def objects_section(measured: Measurement, label_names: tuple[str, ...]) -> Section:

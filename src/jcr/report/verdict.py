@@ -3,9 +3,9 @@
 from collections.abc import Iterator
 
 from jcr.calibration.record import AnyCalibration, Calibration
-from jcr.calibration.words import leave_one_out_text
-from jcr.findings import FindingKind, remedy, sentence, text
-from jcr.findings.sentences import SHORT, reached_in_words, worst_direction
+from jcr.calibration.words import leave_one_out_text, worst_direction
+from jcr.findings import FindingKind, reached_in_words, remedy, sentence, text
+from jcr.findings.table import SHORT
 from jcr.report.render import Section
 from jcr.rounding import significant
 

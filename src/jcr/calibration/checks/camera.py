@@ -4,7 +4,7 @@ Each is a hypothesis of estimation/hypotheses.py, tested beside a focal length t
 The images are adjusted with the effect free, which shows its size and the motion of the camera that comes with it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -32,9 +32,10 @@ from jcr.estimation.hypotheses import (
 from jcr.estimation.intrinsics_prior import TYPICAL, CameraPrior
 from jcr.estimation.problem import OF_IMAGE, PRISM, Problem, State
 from jcr.estimation.solve import Solution
-from jcr.findings import Concerns, Finding, FindingKind
+from jcr.findings import Concerns, Finding, FindingKind, joined
 from jcr.geometry import step_between
 from jcr.records import Intrinsics
+from jcr.rounding import significant
 
 LOG_P = float(np.log(1e-6))
 """Logarithm of the probability of a false alarm of one effect, over all places of a change."""
@@ -81,6 +82,15 @@ FOCUS = {FindingKind.FOCUS_BY_DISTANCE, FindingKind.FOCUS_BY_IMAGE, FindingKind.
 NEARLY_ALL = 0.9
 """Share of the squared differences of focal lengths that a simpler effect must explain."""
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+PAIRS = (
+    (("fx", "fy"), "focal lengths of", " px", 1),
+    (("cx", "cy"), "a principal point of", " px", 1),
+    (("k1", "k2"), "a distortion k1, k2 of", "", 3),
+    (("p1", "p2"), "a distortion p1, p2 of", "", 4),
+)
+"""Parameters that are named together: names, words, unit and decimals."""
+NAMED = 4.0
+"""Standard deviations from which a parameter is named by itself (4: p = 6e-5)."""
 Combinations = Float[ndarray, "e p"]
 """Combinations of the columns of hypotheses.Alternatives."""
 
@@ -368,19 +378,9 @@ def _size(after: CameraAdjustment, covariance: Float[ndarray, "p p"]) -> dict[st
     """
     best, std = after.found[-1], np.sqrt(np.maximum(np.diag(covariance), 0.0))
     if best.kind is FindingKind.INTRINSICS:
-        names = parameter_names(after.intrinsics)
-        given, now = (
-            dict(zip(names, parameters(one).tolist(), strict=True))
-            for one in (after.prior.intrinsics, after.intrinsics)
-        )
         units = dict(zip(after.equations.names, after.equations.units, strict=True))
-        found: dict[str, float] = {} if after.is_given else {"estimated": 1.0}
-        for name in filter(now.__contains__, INTRINSICS):
-            found |= {name: now[name], f"{name}_given": given[name]}
-        return {
-            "details": found
-            | {f"{n}_std": float(s * units[n]) for n, s in zip(_freed(after), std, strict=True)}
-        }
+        stds = {name: float(one * units[name]) for name, one in zip(_freed(after), std, strict=True)}
+        return {"details": _intrinsics(after, stds)}
     value = after.estimates(best)
     if best.kind is FindingKind.THIN_PRISM:
         moved = after.adjusted.problem.prism @ value
@@ -393,3 +393,24 @@ def _size(after: CameraAdjustment, covariance: Float[ndarray, "p p"]) -> dict[st
         return {"value": best.unit * float(np.sqrt(value @ value / after.equations.images)), "std": typical}
     size = value[0] if best.kind in FOCUS else np.sqrt(np.mean(value**2))
     return {"value": best.unit * float(size), "std": typical / float(np.sqrt(count))}
+
+
+def _intrinsics(after: CameraAdjustment, std: Mapping[str, float]) -> dict[str, float | str]:
+    """Return the details of wrong intrinsics: each parameter as found and as given, and those that differ surely."""
+    names, shown = parameter_names(after.intrinsics), list[str]()
+    given, now = (
+        dict(zip(names, parameters(one).tolist(), strict=True))
+        for one in (after.prior.intrinsics, after.intrinsics)
+    )
+    for pair, what, unit, digits in PAIRS:
+        surest = max((std[name] for name in pair if name in std), default=0.0)
+        if any(abs(now[name] - given[name]) > NAMED * std[name] for name in pair if name in std):
+            found, was = (", ".join(f"{of[name]:.{digits}f}" for name in pair) for of in (now, given))
+            before = "is given" if after.is_given else "was estimated first"
+            shown.append(f"{what} ({found}) ± {significant(surest)}{unit} where ({was}) {before}")
+    unsure = "other intrinsics than those used, no one of them surely by itself"
+    details: dict[str, float | str] = {"source": "images", "shown": joined(shown or [unsure])}
+    details |= {} if after.is_given else {"estimated": 1.0}
+    for name in filter(now.__contains__, INTRINSICS):
+        details |= {name: now[name], f"{name}_given": given[name]}
+    return details | {f"{name}_std": one for name, one in std.items()}

@@ -8,7 +8,7 @@ from jcr.calibration.case import Case
 from jcr.estimation.hypotheses import joint_offsets
 from jcr.estimation.pose_equations import pose_equations
 from jcr.estimation.problem import pose_problem
-from jcr.findings import Finding, FindingKind
+from jcr.findings import Finding, FindingKind, joined
 
 MIN_EXAMINED = 4
 """Fewest images from which joint offsets are estimated."""
@@ -37,8 +37,17 @@ def check_robot(case: Case) -> Case:
     off = np.flatnonzero(np.abs(found.offset) > SURE * found.std).tolist()
     if not off or any(one.kind.row.group == "camera" for one in hand_eye.findings):
         return replace(case, hand_eye=hand_eye)
-    sizes = {f"joint_{k + 1}": float(found.offset[k]) for k in off}
-    stds = {f"joint_{k + 1}_std": float(found.std[k]) for k in off}
-    value = float(np.abs(found.offset[off]).max())
-    finding = Finding.of(FindingKind.JOINT_OFFSETS, "informs", "robot", value=value, **sizes, **stds)
-    return case.after((replace(finding, joints=tuple(k + 1 for k in off)),), hand_eye)
+    degrees = np.degrees([found.offset, found.std]).T
+    sizes = joined(f"{degrees[k, 0]:+.2f} ± {degrees[k, 1]:.2f}°" for k in off)
+    details = {"shown": f"joint{'s' * (len(off) > 1)} {joined(str(k + 1) for k in off)} seem off by {sizes}"}
+    for k in off:
+        details |= {f"joint_{k + 1}": float(found.offset[k]), f"joint_{k + 1}_std": float(found.std[k])}
+    finding = Finding(
+        kind=FindingKind.JOINT_OFFSETS,
+        severity="informs",
+        concerns="robot",
+        joints=tuple(k + 1 for k in off),
+        value=float(np.abs(found.offset[off]).max()),
+        details=details,
+    )
+    return case.after((finding,), hand_eye)
