@@ -16,8 +16,8 @@ from PIL import Image
 import capture_writers as writers
 from jcr.calibration.difference import read_hand_eye
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.poses import calibrate_pose_pairs
 from jcr.calibration.record import read_calibration, write_calibration
+from jcr.calibration.stage import calibrate_pose_pairs
 from jcr.capture.added import read_added
 from jcr.capture.formats import capture_json
 from jcr.capture.formats.lerobot import Info, read_episode

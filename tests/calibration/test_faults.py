@@ -14,8 +14,7 @@ from jcr.calibration.adjust import adjust_case
 from jcr.calibration.case import Case
 from jcr.calibration.checks import effects
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.poses import calibrate_pose_pairs
-from jcr.calibration.stage import calibrate_reconstruction
+from jcr.calibration.stage import calibrate_pose_pairs, calibrate_reconstruction
 from jcr.camera import project, unproject
 from jcr.cell.carried import eye_to_hand, refined
 from jcr.estimation.arms import RobotName, arm_named

@@ -9,9 +9,8 @@ import pytest
 
 from jcr.calibration.case import with_findings
 from jcr.calibration.hand_eye import solve_hand_eye
-from jcr.calibration.poses import calibrate_pose_pairs
 from jcr.calibration.record import Calibration, read_calibration
-from jcr.calibration.stage import calibrate_reconstruction
+from jcr.calibration.stage import calibrate_pose_pairs, calibrate_reconstruction
 from jcr.calibration.words import summary
 from jcr.errors import InputError
 from jcr.findings import Finding, FindingKind, remedy, sentence, text

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jcr.calibration.options import GRASPING, CalibrateOptions
-from jcr.calibration.poses import calibrate_pose_pairs
 from jcr.calibration.record import Calibration, validated, write_calibration
 from jcr.calibration.requirement import advised, assumptions_of_poses
 from jcr.calibration.robot_errors import errors_of
+from jcr.calibration.stage import calibrate_pose_pairs
 from jcr.calibration.words import summary
 from jcr.capture.read import read_capture
 from jcr.cli import dispatch

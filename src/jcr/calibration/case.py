@@ -24,7 +24,7 @@ from jcr.estimation.intrinsics_prior import (
 from jcr.estimation.point_uncertainty import scene_points, scene_uncertainty
 from jcr.estimation.problem import LinearPrior
 from jcr.estimation.solve import Solution
-from jcr.findings import Finding, verdict_of
+from jcr.findings import Finding, is_explained, verdict_of
 from jcr.records import Capture, Reconstruction, SceneUncertainty, Tracks
 
 MIN_OBSERVATIONS = 200
@@ -155,6 +155,11 @@ class Case:
             self.is_adjustable and not self.tracks.from_pointmaps and self.hand_eye.observability.observable
         )
 
+    @property
+    def is_open(self) -> bool:
+        """Whether the motions are observable and no cause rejects the calibration yet."""
+        return self.hand_eye.observability.observable and not is_explained(self.hand_eye.findings)
+
     def after(
         self,
         findings: tuple[Finding, ...],
@@ -205,9 +210,4 @@ def some_points(tracks: Tracks, most: int, most_points: int | None = None) -> Tr
         order = order[count[order] >= 2][:most_points]
     chosen = tracks.on_board
     chosen[order[np.cumsum(count[order]) <= most]] = True
-    return of_points(tracks, chosen)
-
-
-def of_points(tracks: Tracks, chosen: Bool[ndarray, " p"]) -> Tracks:
-    """Return the observations of some of the points, which keep their rows."""
     return tracks.only(chosen[tracks.point])

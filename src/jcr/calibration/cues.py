@@ -5,10 +5,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.options import LengthInImage
-from jcr.calibration.record import Calibration
 from jcr.camera import project, unproject
 from jcr.errors import InputError
-from jcr.findings import Finding, FindingKind
 from jcr.geometry import Poses, rotation_angle
 from jcr.records import Capture, Reconstruction
 
@@ -58,18 +56,18 @@ def check_known_length(capture: Capture, known_length: LengthInImage | None) -> 
 
 
 def length_cue(
-    capture: Capture,
-    reconstruction: Reconstruction,
-    image: str,
-    ends_px: Float[ndarray, "2 2"],
-    length: float,
+    capture: Capture, reconstruction: Reconstruction, known_length: LengthInImage
 ) -> tuple[float, float]:
-    """Return the metres per recon unit from the length (m) between two pixels of one image, and its relative error.
+    """Return the metres per recon unit from the length between two pixels of one image, and its relative error.
 
     Raises InputError when the image or a surface at either pixel is not there.
     """
-    first, second = (surface_at(capture, reconstruction, image, end, "--known-length") for end in ends_px)
-    return length / float(np.linalg.norm(second - first)), LENGTH_STD
+    image, *ends, length_mm = known_length
+    first, second = (
+        surface_at(capture, reconstruction, image, end, "--known-length")
+        for end in np.array(ends).reshape(2, 2)
+    )
+    return 1e-3 * length_mm / float(np.linalg.norm(second - first)), LENGTH_STD
 
 
 def surface_at(
@@ -93,17 +91,3 @@ def surface_at(
     if not inside or not dense.confidence[rows[0], row, column] > 0:
         raise InputError(f"{asked_by}: no surface was found at that pixel of {image}; choose textured places")
     return dense.points_in_recon[rows[0], row, column].astype(np.float64)
-
-
-def scale_contradiction(free: Calibration, metric_std: float) -> Finding | None:
-    """Return the finding that the robot's motion excludes that the reconstruction is in metres; None where it does not.
-
-    `free` is a calibration without that scale; `metric_std` is the relative standard deviation of the metre.
-    """
-    if not free.converged:
-        return None
-    off, std = float(np.log(free.scale)), float(np.sqrt(free.covariance[6, 6]))
-    sigmas, share = CONTRADICTED
-    if abs(off) < max(share, sigmas * float(np.hypot(std, metric_std))):
-        return None
-    return Finding.of(FindingKind.BOARD_SIZE, "rejects", "poses", value=float(np.expm1(off)), std=std)

@@ -1,23 +1,52 @@
-"""Calibration of a capture: fit to camera poses, bundle adjustment, checks, verdict, requirement."""
+"""Calibration of a capture, or of given camera poses: fit, bundle adjustment, checks, verdict, requirement."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from jcr.calibration.adjust import with_adjusted_images
-from jcr.calibration.case import Case
-from jcr.calibration.checks.table import CHECKS
-from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
-from jcr.calibration.hand_eye import SCALE_STD, Offset, solve_hand_eye
+from jcr.calibration.case import Case, with_findings
+from jcr.calibration.checks.boards import check_boards
+from jcr.calibration.checks.capture import check_pieces, check_registered, check_remarks
+from jcr.calibration.checks.convention import better_reading, check_convention, convention_finding
+from jcr.calibration.checks.effects import check_effects, effects_of_fit, with_rejected_runs
+from jcr.calibration.checks.left_out import check_pairing
+from jcr.calibration.checks.lengths import check_lengths, check_predicted_focal
+from jcr.calibration.checks.robot import check_robot
+from jcr.calibration.cues import CONTRADICTED, height_cue, length_cue
+from jcr.calibration.hand_eye import SCALE_STD, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.record import Calibration
-from jcr.calibration.requirement import advised, assumptions_of
-from jcr.calibration.robot_errors import RobotErrorPrior, robot_errors
-from jcr.errors import RejectedError
+from jcr.calibration.requirement import advised, assumptions_of, assumptions_of_poses
+from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
+from jcr.errors import InputError, RejectedError
+from jcr.estimation.arms import arm_named
 from jcr.estimation.point_uncertainty import with_given_intrinsics
-from jcr.estimation.problem import offset_prior, scale_prior
+from jcr.estimation.problem import offset_prior, pose_problem, scale_prior
+from jcr.findings import Finding, FindingKind, is_explained
 from jcr.least_squares import one_blas_thread
-from jcr.records import Capture, Reconstruction
+from jcr.records import Capture, PosePairs, Reconstruction
+
+CHECKS = (
+    check_registered,
+    check_convention,
+    check_pairing,
+    check_effects,
+    check_pieces,
+    check_predicted_focal,
+    check_boards,
+    check_lengths,
+    check_robot,
+    check_remarks,
+)
+"""Checks in their order, causes before consequences.
+
+Poses of another convention fit nothing, so the convention is tested first where the fit was rejected. Effects on camera
+and robot compete in one test, of rejected calibrations as well, since they explain the rejection.
+"""
+METRIC_STD = 0.005
+"""Relative standard deviation of the size of a printed marker."""
 
 
 @one_blas_thread
@@ -58,14 +87,13 @@ def checked_case(
 ) -> Case:
     """Return the case after fit, adjustment and checks, without advice; `robot` is of the registered images."""
     case = with_adjusted_images(fit_poses(capture, reconstruction, options, robot))
-    for check, is_needed in CHECKS:
-        if is_needed(case):
-            try:
-                case = check(case)
-            except np.linalg.LinAlgError:
-                # A rejected fit may be so wrong, points behind the cameras, that there is nothing to compute.
-                if case.hand_eye.converged:
-                    raise
+    for check in CHECKS:
+        try:
+            case = check(case)
+        except np.linalg.LinAlgError:
+            # A rejected fit may be so wrong, points behind the cameras, that there is nothing to compute.
+            if case.hand_eye.converged:
+                raise
     return case
 
 
@@ -76,68 +104,106 @@ def fit_poses(
 
     `robot` is of the registered images' poses. Raises RejectedError with fewer than two registered images.
     """
-    registered = len(reconstruction.image_index)
-    if registered < 2:
+    evidence, rows = reconstruction.evidence, reconstruction.image_index
+    if len(rows) < 2:
         raise RejectedError(
-            f"{registered} of {len(capture)} images registered",
+            f"{len(rows)} of {len(capture)} images registered",
             "overlap the views more",
             also=(*reconstruction.warnings, *reconstruction.notes),
         )
-    (scale, offset), contradiction = _measured(capture, reconstruction, options), None
-    if scale is not None and offset is None:
-        # Where the motions determine the scale, it is compared with the length beside others (checks/lengths.py).
-        scale = None if _solved(capture, reconstruction, options, robot).converged else scale
-    if scale is offset is None and (metric_std := reconstruction.metric_std) is not None:
-        free = _solved(capture, reconstruction, options, robot)
-        contradiction = scale_contradiction(free, metric_std)
-        scale = 1.0, metric_std
-    hand_eye = _solved(capture, reconstruction, options, robot, scale, offset)
-    priors = () if scale is None else (scale_prior(*scale),)
-    priors += () if offset is None else (offset_prior(*offset),)
-    hand_eye = replace(hand_eye, intrinsics=reconstruction.intrinsics.with_std(None))
-    return Case(
-        capture=capture,
-        reconstruction=reconstruction,
-        options=options,
-        robot=robot,
-        priors=priors,
-        hand_eye=hand_eye if contradiction is None else hand_eye.with_findings(contradiction),
-    )
-
-
-def _solved(
-    capture: Capture,
-    reconstruction: Reconstruction,
-    options: CalibrateOptions,
-    robot: RobotErrorPrior,
-    scale: tuple[float, float] | None = None,
-    offset: Offset | None = None,
-) -> Calibration:
-    evidence, rows = reconstruction.evidence, reconstruction.image_index
-    return solve_hand_eye(
-        capture.base_from_gripper[rows],
+    gripper, metric_std = capture.base_from_gripper[rows], reconstruction.metric_std
+    height, scale, found = options.known_height, None, list[Finding]()
+    offset = None if height is None else height_cue(gripper, height / 1e3)
+    solve = partial(
+        solve_hand_eye,
+        gripper,
         reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera,
         robot_noise=options.robot_noise_m_rad,
-        scale=None if scale is None else scale[0],
-        scale_std=SCALE_STD if scale is None else scale[1],
-        offset=offset,
         camera_covariance=None if evidence is None else evidence.covariance,
         systematic=robot.systematic,
         in_sequence=False,
         names=[capture.images[row] for row in rows],
     )
-
-
-def _measured(
-    capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions
-) -> tuple[tuple[float, float] | None, Offset | None]:
-    """Return the scale and the height that the user measured, each with its standard deviation."""
-    gripper = capture.base_from_gripper[reconstruction.image_index]
-    scale = offset = None
-    if options.known_height is not None:
-        offset = height_cue(gripper, options.known_height / 1e3)
     if options.known_length is not None:
-        image, *ends, length_mm = options.known_length
-        ends_px = np.array(ends).reshape(2, 2)
-        scale = length_cue(capture, reconstruction, image, ends_px, length_mm / 1e3)
-    return scale, offset
+        scale = length_cue(capture, reconstruction, options.known_length)
+        # Where the motions determine the scale, it is compared with the length beside others (checks/lengths.py).
+        scale = None if offset is None and solve().converged else scale
+    if scale is offset is None and metric_std is not None:
+        free, scale = solve(), (1.0, metric_std)
+        off, std = float(np.log(free.scale)), float(np.sqrt(free.covariance[6, 6]))
+        sigmas, share = CONTRADICTED
+        if free.converged and abs(off) >= max(share, sigmas * float(np.hypot(std, metric_std))):
+            size = {"value": float(np.expm1(off)), "std": std}
+            found.append(Finding.of(FindingKind.BOARD_SIZE, "rejects", "poses", **size))
+    known, known_std = scale or (None, SCALE_STD)
+    hand_eye = solve(scale=known, scale_std=known_std, offset=offset).with_findings(*found)
+    priors = () if known is None else (scale_prior(known, known_std),)
+    return Case(
+        capture=capture,
+        reconstruction=reconstruction,
+        options=options,
+        robot=robot,
+        priors=priors if offset is None else (*priors, offset_prior(*offset)),
+        hand_eye=replace(hand_eye, intrinsics=reconstruction.intrinsics.with_std(None)),
+    )
+
+
+def calibrate_pose_pairs(pairs: PosePairs, options: CalibrateOptions | None = None) -> Calibration:
+    """Calibrate from given camera poses, without images.
+
+    The estimated scale of metric poses tests the given size of the marker; where motions do not determine the scale, it
+    is taken as 1.
+    """
+    check_options(options := options or CalibrateOptions())
+    gripper, noise = pairs.base_from_gripper, options.robot_noise_m_rad
+    robot = errors_of(gripper, None if options.robot is None else arm_named(options.robot))
+    hand_eye = _calibrated_poses(pairs, options, robot)
+    if hand_eye.observability.observable and not is_explained(hand_eye.findings):
+        start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon.rigid
+        poses = {"error_covariance": robot.systematic, "noise_floor": noise}
+        problem, state = pose_problem(gripper, pairs.recon_from_camera, start, **poses)
+        problem = replace(problem, used=with_rejected_runs(hand_eye.inliers))
+        hand_eye = with_findings(hand_eye, effects_of_fit(problem, state, hand_eye, pairs.images))
+    is_known = options.scale is not None or (pairs.is_metric and is_one(hand_eye))
+    assumptions = assumptions_of_poses(hand_eye, gripper[hand_eye.inliers], SCALE_STD if is_known else None)
+    return advised(hand_eye, gripper, options, robot, assumptions).of_capture(pairs, pairs)
+
+
+def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotErrorPrior) -> Calibration:
+    """Return the fit to given camera poses, with the findings of its scale and of the pose convention."""
+    if options.known_length is not None:
+        raise InputError("--known-length: there are no images in which it could be seen; leave it out")
+    gripper, camera, height = pairs.base_from_gripper, pairs.recon_from_camera, options.known_height
+    solve = partial(
+        solve_hand_eye,
+        gripper,
+        camera,
+        robot_noise=options.robot_noise_m_rad,
+        offset=None if height is None else height_cue(gripper, height / 1e3),
+        systematic=robot.systematic,
+        in_sequence=not pairs.is_metric,  # poses of a marker of known size are found each by itself
+        names=pairs.images,
+    )
+    hand_eye = free = solve()
+    scale = 1.0 if options.scale is None and pairs.is_metric else options.scale
+    # A known size makes few samples worth more; where the robot's motion excludes it, the motion decides.
+    if scale is not None and (options.scale is not None or not free.converged or is_one(free)):
+        hand_eye = solve(scale=scale)
+        if not free.observability.observable and scale == 1.0:
+            return hand_eye.with_findings(Finding.of(FindingKind.SCALE_ASSUMED, "warns", "motion"))
+    if not hand_eye.converged:
+        found = better_reading(gripper, camera)
+        # Of degenerate motions another convention may fit by chance: what is missing comes first.
+        severity = "rejects" if hand_eye.observability.observable else "warns"
+        return hand_eye.with_findings(*(() if found is None else (convention_finding(found, severity),)))
+    if pairs.is_metric and not is_one(hand_eye):
+        std = hand_eye.scale * float(np.sqrt(hand_eye.covariance[6, 6]))
+        size = {"value": hand_eye.scale - 1, "std": std, "marker": 1.0}
+        return hand_eye.with_findings(Finding.of(FindingKind.BOARD_SIZE, "warns", "intrinsics", **size))
+    return hand_eye
+
+
+def is_one(hand_eye: Calibration) -> bool:
+    """Return whether the scale is 1 within its uncertainty."""
+    off = abs(float(np.log(hand_eye.scale)))
+    return off < max(3 * float(np.sqrt(hand_eye.covariance[6, 6])), METRIC_STD)

@@ -55,7 +55,7 @@ class CalibrateCommand:
 
     def main(self) -> int:
         """Calibrate and print the result."""
-        from jcr.calibration.poses import is_one
+        from jcr.calibration.stage import is_one
         from jcr.calibration.words import labelled
         from jcr.pipeline.run import calibrate_poses
         from jcr.records import PosePairs

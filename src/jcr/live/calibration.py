@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8, UInt16
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from jcr.calibration.case import Case, of_points
+from jcr.calibration.case import Case
 from jcr.calibration.checks.capture import SAME
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.robot_errors import robot_errors
@@ -254,7 +254,7 @@ def _longest(tracks: Tracks, most: int) -> Tracks:
     order = np.lexsort([fraction, -count])
     chosen = tracks.on_board
     chosen[order[np.cumsum(count[order]) <= most]] = True
-    return of_points(tracks, chosen)
+    return tracks.only(chosen[tracks.point])
 
 
 def _too_few(images: int) -> Finding:

@@ -14,7 +14,6 @@ from jcr.calibration.checks.capture import as_causes, view_findings
 from jcr.calibration.checks.left_out import left_out_poses
 from jcr.calibration.hand_eye import SCALE_STD, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.poses import calibrate_pose_pairs, is_one
 from jcr.calibration.record import Calibration
 from jcr.calibration.requirement import (
     assumptions_of,
@@ -24,7 +23,7 @@ from jcr.calibration.requirement import (
     predictions,
 )
 from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
-from jcr.calibration.stage import checked_case
+from jcr.calibration.stage import calibrate_pose_pairs, checked_case, is_one
 from jcr.camera import fold_distance_px
 from jcr.capture.formats.table import OpenConventionError, possible_options
 from jcr.capture.images import brightness_and_sharpness, exposure_fault, read_image

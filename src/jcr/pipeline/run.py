@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from jcr.calibration.cues import check_known_length
 from jcr.calibration.options import CalibrateOptions, check_options
-from jcr.calibration.poses import calibrate_pose_pairs
+from jcr.calibration.stage import calibrate_pose_pairs
 from jcr.capture.added import with_added_images
 from jcr.capture.formats.capture_json import kept
 from jcr.capture.options import ReadOptions

@@ -67,7 +67,7 @@ def check_pieces(case: Case) -> Case:
     of a reconstruction has one of its own.
     """
     gripper, camera = case.base_from_gripper, case.recon_from_camera
-    if case.hand_eye.converged or len(gripper) < LEAST_OF_PIECE + MIN_IMAGES:
+    if case.hand_eye.converged or not case.is_open or len(gripper) < LEAST_OF_PIECE + MIN_IMAGES:
         return case
     agree, _ = least_trimmed(gripper, camera)
     for _ in range(CONCENTRATED):

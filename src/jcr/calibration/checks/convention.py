@@ -104,10 +104,13 @@ _Candidate = tuple[str, Float[ndarray, "k 4 4"], Int[ndarray, " k"]]
 
 
 def check_convention(case: Case) -> Case:
-    """Report the convention by which the gripper poses fit, where there is one.
+    """Report the convention by which the gripper poses fit, where these are rejected with and without the images.
 
-    Degenerate motions fit another convention by chance, and are reported first.
+    Degenerate motions fit another convention by chance, and are reported first. A board may be the cause instead.
     """
+    by_board = any(one.kind is FindingKind.BOARD_SIZE for one in case.hand_eye.findings)
+    if case.hand_eye.converged or case.pose_fit.converged or by_board:
+        return case
     rows, capture = case.reconstruction.image_index, case.capture
     by_name = paired_by_name(capture.images, capture.base_from_gripper)
     by_name = {by_number: poses[rows] for by_number, poses in by_name.items()}

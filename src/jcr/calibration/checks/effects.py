@@ -67,6 +67,8 @@ requirement decides."""
 
 def check_effects(case: Case) -> Case:
     """Return what the used images and gripper poses show against one camera on one straight arm, in any order."""
+    if not case.is_open:
+        return case
     longer = _with_rejected_runs(case)
     if case.adjusted is None or longer.adjusted is None or not case.shows_camera:
         return case.after(_effects_of_poses(longer))

@@ -24,6 +24,10 @@ def check_pairing(case: Case) -> Case:
 
     Such poses are left out one by one, so that a calibration of the others may be accepted.
     """
+    kinds = {one.kind for one in case.hand_eye.findings}
+    disagree = kinds & {FindingKind.FEW_AGREE, FindingKind.POSES_CONTRADICT_IMAGES, FindingKind.UNOBSERVABLE}
+    if disagree or len(case.capture) - len(case.used) < 2:
+        return case
     # An adjustment bends the cameras towards wrong poses that it uses; the fit to the cameras of the images does not.
     fit = case.pose_fit
     found = left_out_poses(case.capture, case.reconstruction, fit)

@@ -1,4 +1,4 @@
-"""Comparison of known lengths with the robot: boards, a known length, a depth camera, a network's metre.
+"""Comparison of known lengths with the robot (board, known length, depth camera, network), and of a network's focal length.
 
 Lengths that agree with the robot become priors of the mixed model. Where two lengths contradict each other, the scale
 stays the robot's, and a finding names both. The scale of depth cameras is off by a few percent, and their noise grows
@@ -20,14 +20,12 @@ from jcr.calibration.checks.depth import depth_check
 from jcr.calibration.cues import CONTRADICTED, length_cue
 from jcr.calibration.hand_eye import judged
 from jcr.calibration.record import Calibration
+from jcr.estimation.intrinsics_prior import MEASURED, camera_with_prior
 from jcr.estimation.problem import SCALE, LinearPrior
 from jcr.estimation.solve import Solution, size_of_boards, with_priors
 from jcr.findings import Finding, FindingKind
-from jcr.records import (
-    LengthCheck,
-    LengthName,
-    ScaleCheck,
-)
+from jcr.records import LengthCheck, LengthName, ScaleCheck
+from jcr.rounding import significant
 
 DEPTH_STD, NETWORK_STD = 0.02, 0.05
 """Relative standard deviations of the metre of depth cameras, off by a few percent, and of networks, by up to ten."""
@@ -45,6 +43,9 @@ EXACT = 0.015
 """Relative standard deviation up to which a length can reject a calibration."""
 WORTH = 10.0
 """Standard deviations of the robot's scale: a length less exact than that hardly moves it, and is compared alone."""
+
+OF_NETWORK = 1.64
+"""Standard deviations between a network's focal length and the given one; a tenth of the networks is farther off."""
 
 
 @dataclass(frozen=True)
@@ -111,9 +112,7 @@ def _measured(case: Case) -> tuple[Calibration, list[Length]]:
         of_images = max(together - float(adjusted.covariance[SCALE, SCALE].item()), 0.0)
         found.append(Length("board", off, float(np.hypot(np.sqrt(of_images), boards.size_std))))
     if case.options.known_length is not None and not case.priors:
-        image, *ends, length_mm = case.options.known_length
-        ends_px = np.array(ends).reshape(2, 2)
-        scale, std = length_cue(case.capture, case.reconstruction, image, ends_px, length_mm / 1e3)
+        scale, std = length_cue(case.capture, case.reconstruction, case.options.known_length)
         found.append(Length("known length", float(np.log(hand_eye.scale / scale)), std))
     if hand_eye.converged and (depth := depth_check(case.capture, case.reconstruction, hand_eye)) is not None:
         of_depth = max((depth.std_percent / 100) ** 2 - hand_eye.covariance[6, 6], 0.0)
@@ -208,3 +207,25 @@ def _fused(
         depth = replace(depth, off_percent=percent)
     measured = {name: getattr(hand_eye, name) for name in ("findings", "scale_check", "lengths", "board")}
     return judged(replace(refined, depth_check=depth, **measured)), adjusted
+
+
+def check_predicted_focal(case: Case) -> Case:
+    """Report that a network's focal length contradicts the one that was given; their difference is uncertainty."""
+    given, predicted = case.capture.intrinsics, case.reconstruction.predicted_focal
+    if given is None or predicted is None:
+        return case
+    focal, relative_std = predicted
+    off = focal / given.fx - 1
+    if abs(off) < OF_NETWORK * np.hypot(relative_std, MEASURED["f"]):
+        return case
+    sizes = f"{focal:.0f} ± {significant(focal * relative_std)} px where {given.fx:.0f} is given"
+    details = {
+        "source": "pointmaps",
+        "shown": f"a focal length of {sizes}",
+        "fx": focal,
+        "fx_given": given.fx,
+    }
+    by_focal = camera_with_prior(case.reconstruction.intrinsics, {"f": abs(off)})
+    moved = tuple((by_focal.directions @ by_focal.std).tolist())
+    found = Finding.of(FindingKind.INTRINSICS, "warns", "intrinsics", **details)
+    return case.after((replace(found, shift=(0.0,) * 7, intrinsics_shift=moved),))

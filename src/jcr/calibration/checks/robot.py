@@ -22,7 +22,7 @@ def check_robot(case: Case) -> Case:
     A camera that is not as its model has it changes the cameras' poses: then no joint is named.
     """
     used, arm, joints, hand_eye = case.used, case.robot.arm, case.robot.joints, case.hand_eye
-    if len(used) < MIN_EXAMINED or arm is None or joints is None:
+    if not case.is_open or len(used) < MIN_EXAMINED or arm is None or joints is None:
         return case
     fit = case.pose_fit
     problem, state = pose_problem(
