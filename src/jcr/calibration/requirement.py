@@ -188,7 +188,7 @@ def advised(
 
     def is_met(count: int) -> bool:
         share = np.divide(reached(predicted(count), required.at), reached(predicted(0), required.at))
-        mm, deg = share * (required.reached_mm, required.reached_deg)
+        mm, deg = (share * (required.reached_mm, required.reached_deg)).tolist()
         return replace(required, reached_mm=mm, reached_deg=deg).met
 
     more = None if not hand_eye.converged or is_open else 0

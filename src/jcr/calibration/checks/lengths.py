@@ -1,4 +1,4 @@
-"""Comparison of known lengths with the robot (board, known length, depth camera, network), and of a network's focal length.
+"""Known lengths (board, known length, depth camera, network) and a network's focal length, compared with the robot.
 
 Lengths that agree with the robot become priors of the mixed model. Where two lengths contradict each other, the scale
 stays the robot's, and a finding names both. The scale of depth cameras is off by a few percent, and their noise grows
