@@ -40,8 +40,6 @@ from jcr.records import (
     Intrinsics,
     PointCloud,
     Pointmaps,
-    PosePairs,
-    Reconstruction,
     Tracks,
 )
 from jcr.records.npz import read_reconstruction, write_reconstruction
@@ -50,6 +48,7 @@ from jcr.scene.cloud import read_cloud, write_cloud
 from jcr.scene.map_file import load_map
 from jcr.scene.options import MapOptions
 from jcr.segments.segments import _read_names
+from scenes import pairs_of, reconstruction_of
 from simulation.problems import hand_eye_problem
 from simulation.ros_bag import write_bag
 
@@ -212,9 +211,8 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
     folder.mkdir()
     draw, shape = np.random.default_rng(3), (COUNT, SIZE[1], SIZE[0])
     assert capture.intrinsics is not None
-    reconstruction = Reconstruction(
-        image_index=np.arange(COUNT),
-        recon_from_camera=cameras,
+    reconstruction = reconstruction_of(
+        cameras,
         intrinsics=capture.intrinsics,
         pointmaps=Pointmaps(
             intrinsics=capture.intrinsics,
@@ -228,7 +226,6 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
             point=np.arange(2),
             points_in_recon=draw.random((2, 3)),
         ),
-        backend="colmap",
     )
     write_reconstruction(folder / "reconstruction.npz", reconstruction)
     layers = [np.full(shape, 0.01, np.float16), np.ones(shape, np.float16), np.ones(shape, np.uint8)]
@@ -321,13 +318,7 @@ def sound_run(out: Path) -> Path:
     """Write a run folder with calibration.json and run.json, of poses without noise; its capture lies in it."""
     capture = small_capture(out / "capture", (96, 72), RUN_IMAGES, "")
     problem = hand_eye_problem(np.random.default_rng(0), RUN_IMAGES)
-    pairs = PosePairs(
-        source=out,
-        images=capture.images,
-        base_from_gripper=problem.base_from_gripper,
-        recon_from_camera=problem.recon_from_camera,
-        is_metric=False,
-    )
+    pairs = pairs_of(problem.base_from_gripper, problem.recon_from_camera, images=capture.images)
     seconds = {"reconstruct_s": 1.0, "calibrate_s": 0.5}
     attempt = Attempt(backend="colmap", images_registered=RUN_IMAGES, why_not=None, **seconds)
     content = replace(calibrate_pose_pairs(pairs), attempts=(attempt,)).as_json()

@@ -24,6 +24,7 @@ from jcr.pipeline import selection
 from jcr.reconstruct import Backend, ReconstructOptions
 from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
 from jcr.result import RunOptions, RunResult
+from scenes import capture_of, reconstruction_of
 from simulation.problems import HandEyeProblem, hand_eye_problem
 
 GARBAGE = {
@@ -54,18 +55,11 @@ def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
 
 
 def reconstruction(backend: str, poses: np.ndarray, observations: int = 0) -> Reconstruction:
-    intrinsics = Intrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
     n = observations
     tracks = Tracks(
         image=np.zeros(n, int), x_px=np.zeros((n, 2)), point=np.arange(n), points_in_recon=np.zeros((n, 3))
     )
-    return Reconstruction(
-        image_index=np.arange(len(poses)),
-        recon_from_camera=poses,
-        intrinsics=intrinsics,
-        tracks=tracks,
-        backend=backend,
-    )
+    return reconstruction_of(poses, tracks=tracks, backend=backend)
 
 
 def without_surface(capture: Capture, made: Reconstruction, *_: object, **__: object) -> Reconstruction:
@@ -80,13 +74,6 @@ def without_surface(capture: Capture, made: Reconstruction, *_: object, **__: ob
         depth_std=nothing,
     )
     return replace(made, pointmaps=pointmaps)
-
-
-def capture_of(problem: HandEyeProblem) -> Capture:
-    names = tuple(f"{k:02d}.png" for k in range(len(problem.base_from_gripper)))
-    return Capture(
-        folder=Path(), images=names, base_from_gripper=problem.base_from_gripper, image_size=(640, 480)
-    )
 
 
 def auto_result(
@@ -106,7 +93,7 @@ def auto_result(
         return reconstruction(options.backend, answer, observations)
 
     monkeypatch.setattr(selection, "reconstruct", answered)
-    choice = selection.select_reconstruction(capture_of(problem), RunOptions())
+    choice = selection.select_reconstruction(capture_of(problem.base_from_gripper), RunOptions())
     assert [attempt.backend for attempt in choice.attempts] == tried
     kept = [attempt for attempt in choice.attempts if attempt.why_not is None]
     assert [attempt.backend for attempt in kept] == [choice.reconstruction.backend]
@@ -141,16 +128,6 @@ def test_a_second_one_runs_only_when_the_first_is_rejected(
     assert kept.backend == "colmap" and "direct failed (0 of 8" in kept.notes[0]
     with pytest.raises(RejectedError, match="0 of 8.*mast3r failed"):
         auto_result(problem, {"colmap": nothing, "mast3r": damaged, "direct": nothing}, monkeypatch)
-
-
-BLUR = Finding(
-    kind=FindingKind.BLURRED,
-    severity="warns",
-    concerns="images",
-    images=tuple(f"{k:02d}.png" for k in range(6)),
-    value=14.0,
-    details={"of": 8.0},
-)
 
 
 def test_of_two_that_are_rejected_the_one_that_shows_the_cause_is_kept(
@@ -343,10 +320,10 @@ def test_a_known_length_ends_on_surfaces_and_nothing_else_needs_depth_before_the
         lambda _, options, __: reconstruction(options.backend, answers[options.backend]),
     )
     monkeypatch.setattr(selection, "densify", deeper)
-    capture = capture_of(problem)
+    capture = capture_of(problem.base_from_gripper)
     choice = selection.select_reconstruction(capture, RunOptions())
     assert not densified and choice.reconstruction.pointmaps is None
-    for length, why in (("nowhere.png", "nowhere"), ("00.png", "no surface was found")):
+    for length, why in (("nowhere.png", "nowhere"), ("0.png", "no surface was found")):
         lost = CalibrateOptions(known_length=(length, 0.0, 0.0, 9.0, 9.0, 50.0))
         with pytest.raises(InputError, match=why):
             selection.select_reconstruction(capture, RunOptions(calibrate=lost))

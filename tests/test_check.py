@@ -22,9 +22,9 @@ from jcr.cli import dispatch
 from jcr.cli.check import read_arguments
 from jcr.findings import FindingKind
 from jcr.pipeline.check import read_and_compare, spread_rows
-from jcr.pointmaps.reconstruction import NO_TRACKS
-from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
-from simulation.problems import INTRINSICS, hand_eye_problem
+from jcr.records import Capture, Intrinsics
+from scenes import capture_of, reconstruction_of
+from simulation.problems import hand_eye_problem
 
 RNG = np.random.default_rng(0)
 
@@ -85,15 +85,9 @@ def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():
     gripper = right.copy()
     gripper[[3, 8]] = gripper[[8, 3]]
     gripper[5, :3, 3] += 0.08
-    names = tuple(f"{k}.png" for k in range(12))
-    capture = Capture(folder=Path(), images=names, base_from_gripper=gripper, image_size=(640, 480))
-    none = np.zeros(0, int)
-    made = Reconstruction(
-        image_index=np.arange(12),
-        recon_from_camera=problem.recon_from_camera,
-        intrinsics=Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480),
-        tracks=Tracks(image=none, x_px=np.zeros((0, 2)), point=none, points_in_recon=np.zeros((0, 3))),
-        backend="given",
+    capture = capture_of(gripper)
+    made = reconstruction_of(
+        problem.recon_from_camera, intrinsics=Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480)
     )
     hand_eye = solve_hand_eye(gripper, problem.recon_from_camera)
     assert hand_eye.converged and not hand_eye.inliers[[3, 5, 8]].any()
@@ -130,13 +124,7 @@ def test_poses_that_are_as_noisy_as_is_assumed_show_their_convention(
     problem = hand_eye_problem(np.random.default_rng(0), 12, robot_noise=(3e-4, 7e-4))
     capture = replace(jcr.read_capture(tabletop), base_from_gripper=problem.base_from_gripper)
     writers.write_table(tmp_path, capture, convention, "image,x,y,z,rx,ry,rz")
-    made = Reconstruction(
-        image_index=np.arange(8),
-        recon_from_camera=problem.recon_from_camera[spread_rows(12)],
-        intrinsics=INTRINSICS,
-        tracks=NO_TRACKS,
-        backend="colmap",
-    )
+    made = reconstruction_of(problem.recon_from_camera[spread_rows(12)])
     monkeypatch.setattr("jcr.pipeline.check.reconstruct_colmap", lambda *_: made)
     found, options = read_and_compare(tmp_path)
     assert read_arguments(options) == ["--pose-convention", convention]

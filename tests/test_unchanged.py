@@ -17,10 +17,10 @@ from conftest import shrunk_capture
 from jcr.capture.images import read_image
 from jcr.cli import dispatch
 from jcr.pipeline import selection
-from jcr.pointmaps.reconstruction import NO_TRACKS
 from jcr.reconstruct import ReconstructOptions
 from jcr.records import Capture, Reconstruction
-from simulation.problems import INTRINSICS, hand_eye_problem
+from scenes import reconstruction_of
+from simulation.problems import hand_eye_problem
 from simulation.ros_bag import write_bag
 
 pytestmark = pytest.mark.slow
@@ -48,13 +48,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     def reconstruct(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
         made.append(options.backend)
-        return Reconstruction(
-            image_index=np.arange(len(capture)),
-            recon_from_camera=PROBLEM.recon_from_camera[: len(capture)],
-            intrinsics=INTRINSICS,
-            tracks=NO_TRACKS,
-            backend=options.backend,
-        )
+        return reconstruction_of(PROBLEM.recon_from_camera[: len(capture)], backend=options.backend)
 
     monkeypatch.setattr(selection, "reconstruct", reconstruct)
     monkeypatch.setattr(selection, "view_findings", lambda _: ())

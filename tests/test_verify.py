@@ -26,9 +26,10 @@ from jcr.geometry import inverse, rotation_exp, scale_translation, transform
 from jcr.pipeline.options import VerifyOptions
 from jcr.pipeline.stages import begun, keep_reconstruction
 from jcr.pipeline.verify import _judged, _of_two
-from jcr.records import Capture, Reconstruction, Tracks
+from jcr.records import Capture, Reconstruction
 from jcr.result import RunOptions
 from jcr.sfm.register import register
+from scenes import reconstruction_of
 from simulation.capture import with_robot_noise
 from simulation.problems import bent_problem
 
@@ -63,18 +64,7 @@ def reconstruction(capture: Capture, x: np.ndarray) -> Reconstruction:
     """Of the old images, as a structure from motion without error would give."""
     intrinsics = capture.intrinsics
     assert intrinsics is not None
-    return Reconstruction(
-        image_index=np.arange(OLD),
-        recon_from_camera=cameras(capture, x)[:OLD],
-        intrinsics=intrinsics,
-        tracks=Tracks(
-            image=np.zeros(0, int),
-            x_px=np.zeros((0, 2)),
-            point=np.zeros(0, int),
-            points_in_recon=np.zeros((0, 3)),
-        ),
-        backend="colmap",
-    )
+    return reconstruction_of(cameras(capture, x)[:OLD], intrinsics=intrinsics)
 
 
 @pytest.fixture(scope="module")

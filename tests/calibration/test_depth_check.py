@@ -20,6 +20,7 @@ from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import MATCHED, PRIOR, Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
+from scenes import reconstruction_of
 
 INTRINSICS = Intrinsics(FOCAL_PX, FOCAL_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
 OFF, NOISE_PER_M, SCALE = 1.03, 0.004, 0.1
@@ -87,13 +88,8 @@ def _reconstruction(cameras: np.ndarray, true: np.ndarray, draw: np.random.Gener
         reason=nothing.astype(np.uint8),
         depth_std=nothing,
     )
-    return Reconstruction(
-        image_index=np.arange(len(true)),
-        recon_from_camera=cameras,
-        intrinsics=INTRINSICS,
-        tracks=tracks,
-        backend="cast",
-        pointmaps=pointmaps,
+    return reconstruction_of(
+        cameras, intrinsics=INTRINSICS, tracks=tracks, backend="cast", pointmaps=pointmaps
     )
 
 

@@ -21,8 +21,8 @@ from jcr.estimation.arms import RobotName, arm_named
 from jcr.estimation.solve import Solution
 from jcr.findings import FindingKind, kinds_of, sentence
 from jcr.geometry import apply, inverse, step_between
-from jcr.records import Capture, PosePairs, Reconstruction
 from jcr.sfm.colmap import reconstruct_colmap
+from scenes import capture_of, pairs_of, reconstruction_of
 from simulation.arms import PresetName
 from simulation.faults import INTRINSICS, Faults, faulty_capture, reconstructed
 from simulation.problems import INTRINSICS as OBSERVED_BY
@@ -174,19 +174,9 @@ def test_an_effect_that_moves_the_calibration_by_all_points_too_little_is_not_re
 @pytest.mark.parametrize(("arm", "preset"), [("ur5e", "typical"), ("panda", "low-cost")])
 def test_joint_offsets_and_link_errors_are_not_named_as_a_bent_robot(arm: RobotName, preset: PresetName):
     problem = bent_problem(arm_named(arm), preset, 12, 2)
-    capture = Capture(
-        folder=Path("."),
-        images=tuple(f"{k}.png" for k in range(12)),
-        base_from_gripper=problem.base_from_gripper,
-        image_size=(640, 480),
-        intrinsics=OBSERVED_BY,
-    )
-    reconstruction = Reconstruction(
-        image_index=np.arange(12),
-        recon_from_camera=problem.recon_from_camera,
-        intrinsics=OBSERVED_BY,
-        tracks=observed(problem, np.random.default_rng(2), 300, 0.4),
-        backend="simulated",
+    capture = capture_of(problem.base_from_gripper, intrinsics=OBSERVED_BY)
+    reconstruction = reconstruction_of(
+        problem.recon_from_camera, tracks=observed(problem, np.random.default_rng(2), 300, 0.4)
     )
     assert not kinds_of("strain") & {
         one.kind for one in calibrate_reconstruction(capture, reconstruction).findings
@@ -266,13 +256,7 @@ def test_a_change_of_the_tool_in_translation_alone_is_named_in_few_images_howeve
     problem = hand_eye_problem(np.random.default_rng(0), 8, robot_noise=(3e-4, 1e-3))
     gripper = problem.base_from_gripper.copy()
     gripper[4:, :3, 3] += 1e-3 * mm * gripper[4:, :3, 0]
-    pairs = PosePairs(
-        source=Path("samples.yaml"),
-        images=tuple("abcdefgh"),
-        base_from_gripper=gripper,
-        recon_from_camera=problem.recon_from_camera,
-        is_metric=False,
-    )
+    pairs = pairs_of(gripper, problem.recon_from_camera, images=tuple("abcdefgh"))
     found = next(one for one in calibrate_pose_pairs(pairs).findings if one.kind is FindingKind.SLIP)
     assert found.images == ("d", "e")
     assert found.value == pytest.approx(1e-3 * mm, abs=1e-3)

@@ -16,7 +16,8 @@ from jcr.errors import InputError
 from jcr.findings import Finding, FindingKind, remedy, sentence, text
 from jcr.findings.table import GROUPS
 from jcr.geometry import rotation_exp, transform
-from jcr.records import Capture, Intrinsics, PosePairs, Reconstruction, Tracks
+from jcr.records import Intrinsics
+from scenes import capture_of, pairs_of, reconstruction_of
 from simulation.problems import hand_eye_problem
 
 DETAILS: dict[str, float | str] = {
@@ -95,14 +96,7 @@ def test_a_fault_that_is_too_much_rejects_and_comes_before_its_consequences(solv
 @pytest.mark.slow
 def test_what_a_cause_explains_is_not_another_fault():
     problem = hand_eye_problem(np.random.default_rng(0), 12, robot_noise=(5e-4, 1e-3))
-    names = tuple(f"{k}.png" for k in range(12))
-    pairs = PosePairs(
-        source=Path("a"),
-        images=names,
-        base_from_gripper=problem.base_from_gripper[::-1],
-        recon_from_camera=problem.recon_from_camera,
-        is_metric=False,
-    )
+    pairs = pairs_of(problem.base_from_gripper[::-1], problem.recon_from_camera)
     content = calibrate_pose_pairs(pairs)
     assert content.findings[0].kind is FindingKind.POSE_CONVENTION and FindingKind.UNCERTAIN in {
         one.kind for one in content.findings
@@ -124,24 +118,8 @@ def test_motions_are_not_the_cause_where_images_are_missing(tilt_deg: float):
     yaw = rotation_exp(np.radians(tilt_deg) * rng.normal(size=(5, 3))) @ yaw
     gripper[:5] = transform(yaw @ first[:3, :3], first[:3, 3] + 0.2 * rng.normal(size=(5, 3)))
     camera = gripper[:5] @ problem.gripper_from_camera
-    made = Reconstruction(
-        image_index=np.arange(5),
-        recon_from_camera=camera,
-        intrinsics=Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480),
-        tracks=Tracks(
-            image=np.zeros(0, int),
-            x_px=np.zeros((0, 2)),
-            point=np.zeros(0, int),
-            points_in_recon=np.zeros((0, 3)),
-        ),
-        backend="colmap",
-    )
-    capture = Capture(
-        folder=Path(),
-        images=tuple(f"{k}.png" for k in range(12)),
-        base_from_gripper=gripper,
-        image_size=(640, 480),
-    )
+    made = reconstruction_of(camera, intrinsics=Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480))
+    capture = capture_of(gripper)
     found = calibrate_reconstruction(capture, made)
     assert [one.kind for one in found.findings[:2]] == [FindingKind.FEW_USED, FindingKind.UNOBSERVABLE]
     assert found.findings[0].concerns == "reconstruction" and found.observability.advice == ("",)
@@ -155,14 +133,7 @@ def test_motions_are_not_the_cause_where_images_are_missing(tilt_deg: float):
 
 def test_findings_are_in_the_file_and_come_back(tmp_path: Path):
     problem = hand_eye_problem(np.random.default_rng(0), 12, robot_noise=(5e-4, 1e-3))
-    names = tuple(f"{k}.png" for k in range(12))
-    pairs = PosePairs(
-        source=Path("a"),
-        images=names,
-        base_from_gripper=problem.base_from_gripper,
-        recon_from_camera=problem.recon_from_camera,
-        is_metric=False,
-    )
+    pairs = pairs_of(problem.base_from_gripper, problem.recon_from_camera)
     hand_eye = calibrate_pose_pairs(pairs).with_findings(*(example(kind) for kind in FindingKind))
     hand_eye = with_findings(
         hand_eye, (replace(example(FindingKind.SLIP), concerns="mount", shift=(1e-3,) * 7),)

@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.records import Capture, Intrinsics, Reconstruction
+from scenes import capture_of, reconstruction_of
 from simulation.problems import INTRINSICS, HandEyeProblem, error, hand_eye_problem, observed
 
 
@@ -23,19 +23,9 @@ def pictured(
         rng, images, robot_noise=(5e-4, np.radians(0.1)), camera_noise=(1e-3, np.radians(0.1)), **motion
     )
     tracks = observed(problem, rng, 250, 0.5)
-    capture = Capture(
-        folder=Path("."),
-        images=tuple(f"{k}.png" for k in range(images)),
-        base_from_gripper=problem.base_from_gripper,
-        image_size=(640, 480),
-        intrinsics=intrinsics,
-    )
-    reconstruction = Reconstruction(
-        image_index=np.arange(images),
-        recon_from_camera=problem.recon_from_camera,
-        intrinsics=intrinsics or INTRINSICS,
-        tracks=tracks,
-        backend="test",
+    capture = capture_of(problem.base_from_gripper, intrinsics=intrinsics)
+    reconstruction = reconstruction_of(
+        problem.recon_from_camera, intrinsics=intrinsics or INTRINSICS, tracks=tracks
     )
     return problem, capture, reconstruction
 

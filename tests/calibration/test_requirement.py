@@ -24,6 +24,7 @@ from jcr.pipeline import run
 from jcr.records import PosePairs
 from jcr.report.html import poses_report_html
 from jcr.result import RunOptions, RunResult
+from scenes import pairs_of
 from simulation.problems import HandEyeProblem, disturbed, hand_eye_problem
 
 DISAGREE = Finding(
@@ -34,14 +35,7 @@ NOISE = (5e-4, np.radians(0.1))
 
 def pairs(seed: int, count: int) -> tuple[PosePairs, np.ndarray]:
     problem = hand_eye_problem(np.random.default_rng(seed), count, robot_noise=NOISE)
-    names = tuple(f"sample {k}" for k in range(count))
-    found = PosePairs(
-        source=Path("a.yaml"),
-        images=names,
-        base_from_gripper=problem.base_from_gripper,
-        recon_from_camera=problem.recon_from_camera,
-        is_metric=False,
-    )
+    found = pairs_of(problem.base_from_gripper, problem.recon_from_camera)
     return found, problem.gripper_from_camera
 
 
@@ -81,14 +75,7 @@ def with_poses(problem: HandEyeProblem, poses: np.ndarray, rng: np.random.Genera
     recon_from_base = cameras[0] @ inverse(problem.base_from_camera[0])
     more = scale_translation(recon_from_base @ poses @ problem.gripper_from_camera, 1 / problem.scale)
     gripper = np.concatenate([problem.base_from_gripper, disturbed(poses, NOISE, rng)])
-    names = tuple(f"sample {k}" for k in range(len(gripper)))
-    return PosePairs(
-        source=Path("a.yaml"),
-        images=names,
-        base_from_gripper=gripper,
-        recon_from_camera=np.concatenate([problem.recon_from_camera, more]),
-        is_metric=False,
-    )
+    return pairs_of(gripper, np.concatenate([problem.recon_from_camera, more]))
 
 
 @pytest.mark.slow
@@ -131,13 +118,7 @@ def test_a_scale_that_was_known_is_not_promised_again():
     problem = hand_eye_problem(np.random.default_rng(5), 8, robot_noise=NOISE)
     cameras = problem.recon_from_camera.copy()
     cameras[:, :3, 3] *= problem.scale
-    given = PosePairs(
-        source=Path("a.yaml"),
-        images=tuple("abcdefgh"),
-        base_from_gripper=problem.base_from_gripper,
-        recon_from_camera=cameras,
-        is_metric=True,
-    )
+    given = pairs_of(problem.base_from_gripper, cameras, images=tuple("abcdefgh"), is_metric=True)
     asked = CalibrateOptions(next_poses=2)
     known = calibrate_pose_pairs(given, asked)
     gripper = given.base_from_gripper

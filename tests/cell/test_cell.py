@@ -33,9 +33,10 @@ from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.intrinsics_prior import camera_with_prior
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import inverse, rotation_exp, scale_translation, step_between, transform
-from jcr.records import Capture, CellCamera, Reconstruction, Tracks
+from jcr.records import Capture, CellCamera, Reconstruction
 from jcr.sfm.colmap import reconstruct_colmap
 from jcr.sfm.register import Registration
+from scenes import reconstruction_of
 from simulation.cells import FIXED_CAMERA, Kind, cell_problem
 from simulation.faults import Faults, moved_parts, reported_poses
 from simulation.motion import fixed_camera
@@ -82,14 +83,7 @@ def calibrated(tabletop: Path) -> tuple[Capture, Reconstruction, Calibration]:
     capture, x = jcr.read_capture(tabletop), read_truth(tabletop).gripper_from_camera
     recon_from_base = transform(rotation_exp(np.array([0.3, -0.8, 0.5])), np.array([0.2, 0.1, -0.4]))
     poses = scale_translation(recon_from_base @ capture.base_from_gripper[:OLD] @ x, 1 / SCALE)
-    none = np.zeros(0, int)
-    reconstruction = Reconstruction(
-        image_index=np.arange(OLD),
-        recon_from_camera=poses,
-        intrinsics=read_truth(tabletop).intrinsics,
-        tracks=Tracks(image=none, x_px=np.zeros((0, 2)), point=none, points_in_recon=np.zeros((0, 3))),
-        backend="test",
-    )
+    reconstruction = reconstruction_of(poses, intrinsics=read_truth(tabletop).intrinsics)
     old = capture.of_rows(range(OLD))
     return old, reconstruction, calibrate_reconstruction(old, reconstruction)
 

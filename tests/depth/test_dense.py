@@ -23,9 +23,9 @@ from jcr.records import (
     Capture,
     Intrinsics,
     Pointmaps,
-    Reconstruction,
     Tracks,
 )
+from scenes import reconstruction_of
 
 pytestmark = pytest.mark.slow
 
@@ -242,12 +242,10 @@ def test_the_stage_estimates_depth_whatever_the_order_of_the_frames(
         image_size=(PINHOLE.width, PINHOLE.height),
     )
     by_name = np.argsort(order)
-    sparse = Reconstruction(
-        image_index=np.arange(7),
-        recon_from_camera=scene.recon_from_camera[order],
+    sparse = reconstruction_of(
+        scene.recon_from_camera[order],
         intrinsics=PINHOLE,
         tracks=replace(scene.tracks, image=by_name[scene.tracks.image]),
-        backend="colmap",
     )
     made = densify(capture, sparse, DepthOptions(pointmap_size_px=PINHOLE.width))
     assert made.dense.intrinsics == PINHOLE and not made.dense.is_predicted

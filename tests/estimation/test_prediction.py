@@ -13,7 +13,8 @@ from jcr.calibration.robot_errors import errors_of
 from jcr.calibration.stage import calibrate_pose_pairs
 from jcr.estimation.prediction import assumed, predict, typical_camera
 from jcr.pipeline.check import check_capture
-from jcr.records import Intrinsics, NextPose, PosePairs
+from jcr.records import Intrinsics, NextPose
+from scenes import pairs_of
 from simulation.problems import HandEyeProblem, hand_eye_problem
 
 WITHIN = np.log(FACTOR)
@@ -91,14 +92,7 @@ def test_a_planar_capture_is_asked_to_tilt():
 def test_a_robot_that_is_found_worse_than_assumed_is_not_promised_away():
     noise = (0.03, np.radians(4.0))
     problem = hand_eye_problem(np.random.default_rng(4), 12, robot_noise=noise)
-    names = tuple(f"{k}.png" for k in range(12))
-    pairs = PosePairs(
-        source=Path("."),
-        images=names,
-        base_from_gripper=problem.base_from_gripper,
-        recon_from_camera=problem.recon_from_camera,
-        is_metric=False,
-    )
+    pairs = pairs_of(problem.base_from_gripper, problem.recon_from_camera)
     found = calibrate_pose_pairs(pairs)
     assert not found.converged
     promised = found.next_poses[-1].expected_std

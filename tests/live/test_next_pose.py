@@ -1,7 +1,6 @@
 """The proposed pose shows the scene, and none is proposed twice at which no image could be kept."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from jcr.calibration.record import Calibration
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.live.next_pose import AIMED, ELSEWHERE_M, Reach, propose
 from jcr.records import Capture, Uncertainty
+from scenes import capture_of
 from simulation.poses import looking_at
 
 SCENE = np.array([0.5, 0.0, 0.1])
@@ -27,12 +27,7 @@ def seen() -> tuple[Capture, Calibration]:
     cameras = np.array([one @ transform(np.eye(3), -SCENE) @ facing for one in about])
     cameras[2, :3, 3] += 0.03
     poses = cameras @ inverse(TILTED)
-    capture = Capture(
-        folder=Path(),
-        images=tuple(f"{k}.png" for k in range(4)),
-        base_from_gripper=poses,
-        image_size=(640, 480),
-    )
+    capture = capture_of(poses)
     return capture, solve_hand_eye(poses, cameras)
 
 

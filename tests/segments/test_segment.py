@@ -23,13 +23,13 @@ from jcr.records import (
     Pointmaps,
     Reconstruction,
     RobotNoise,
-    Tracks,
     Uncertainty,
 )
 from jcr.segments.measure import measure_objects
 from jcr.segments.options import SegmentOptions
 from jcr.segments.segments import image_labels, label_cloud, read_labels
 from jcr.segments.tabletop import fit_support, label_tabletop
+from scenes import reconstruction_of
 
 NOISE = 5e-4
 UPRIGHT = np.eye(4)
@@ -240,17 +240,10 @@ def labelled_capture(folder: Path, rows: tuple[int, ...] = (0, 1)) -> tuple[Capt
     m = len(rows)
     grid = np.stack(np.meshgrid(np.linspace(-0.2, 0.2, 40), np.linspace(-0.15, 0.15, 30)), -1)
     points = np.concatenate([grid, np.full((30, 40, 1), 0.5)], -1)
-    reconstruction = Reconstruction(
-        image_index=np.array(rows),
-        recon_from_camera=np.stack([np.eye(4)] * m),
+    reconstruction = reconstruction_of(
+        np.stack([np.eye(4)] * m),
         intrinsics=INTRINSICS,
-        tracks=Tracks(
-            image=np.zeros(0, int),
-            x_px=np.zeros((0, 2)),
-            point=np.zeros(0, int),
-            points_in_recon=np.zeros((0, 3)),
-        ),
-        backend="colmap",
+        image_index=np.array(rows),
         pointmaps=Pointmaps(
             intrinsics=PINHOLE,
             points_in_recon=np.stack([points] * m),
