@@ -1,15 +1,19 @@
 """Records of problems with a known answer: captures without images, samples, and reconstructions without a back end."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+from scipy.spatial.transform import Rotation
 
+from jcr.geometry import inverse, transform
 from jcr.records import Capture, PosePairs, Reconstruction, Tracks
 from simulation.problems import INTRINSICS
 
+Change = Callable[[ndarray], ndarray]
 NOTHING = np.zeros(0, int)
 NO_TRACKS = Tracks(image=NOTHING, x_px=np.zeros((0, 2)), point=NOTHING, points_in_recon=np.zeros((0, 3)))
 
@@ -39,3 +43,45 @@ def reconstruction_of(recon_from_camera: Float[ndarray, "n 4 4"], **facts: Any) 
     """Return a reconstruction with these cameras and no tracks, of every image of a capture."""
     usual = {"image_index": np.arange(len(recon_from_camera)), "intrinsics": INTRINSICS, "tracks": NO_TRACKS}
     return Reconstruction(recon_from_camera=recon_from_camera, **(usual | {"backend": "colmap"} | facts))
+
+
+def rotated(change: Callable[[Rotation], Rotation]) -> Change:
+    """Return a change of the rotations of poses."""
+
+    def changed(poses: ndarray) -> ndarray:
+        rotation = change(Rotation.from_matrix(poses[:, :3, :3]))
+        return transform(rotation.as_matrix(), poses[:, :3, 3])
+
+    return changed
+
+
+def mirrored(poses: ndarray) -> ndarray:
+    return np.diag([1, 1, -1, 1.0]) @ poses @ np.diag([1, 1, -1, 1.0])
+
+
+MISTAKES: dict[str, tuple[Change, str]] = {
+    "inverses": (inverse, "inverse"),
+    "reversed": (lambda g: g[::-1].copy(), "reverse order"),
+    "late by one": (lambda g: np.roll(g, 1, 0), "1 ahead of the images"),
+    "early by two": (lambda g: np.roll(g, -2, 0), "2 behind the images"),
+    "left-handed base": (mirrored, "mirrored ones"),
+    "transposed": (rotated(lambda r: r.inv()), "transposed rotations"),
+    "w first": (
+        rotated(lambda r: Rotation.from_quat(r.as_quat()[:, [3, 0, 1, 2]])),
+        "quaternions w, x, y, z",
+    ),
+    "w last": (rotated(lambda r: Rotation.from_quat(r.as_quat()[:, [1, 2, 3, 0]])), "quaternions x, y, z, w"),
+    "Euler order": (
+        rotated(lambda r: Rotation.from_euler("xyz", r.as_euler("ZYX"))),
+        "Euler angles ZYX that were taken as xyz",
+    ),
+    "vectors, radians for degrees": (
+        rotated(lambda r: Rotation.from_rotvec(np.radians(r.as_rotvec()))),
+        "rotation vectors in radians that were taken as degrees",
+    ),
+    "angles, radians for degrees": (
+        rotated(lambda r: Rotation.from_euler("xyz", np.radians(r.as_euler("xyz")))),
+        r"Euler angles \(xyz\) in radians that were taken as degrees",
+    ),
+}
+"""Mistakes in writing gripper poses that another reading explains, and how that is named."""

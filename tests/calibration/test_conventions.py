@@ -5,48 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from jcr.calibration.checks.convention import BY_NUMBER, BY_TEXT, MIRRORED, better_reading, convention_finding
 from jcr.capture.pairing import paired_by_name
 from jcr.findings import sentence
-from jcr.geometry import inverse, transform
+from scenes import MISTAKES
 from simulation.problems import hand_eye_problem
-
-
-def with_rotation(poses: np.ndarray, rotation: Rotation) -> np.ndarray:
-    return transform(rotation.as_matrix(), poses[:, :3, 3])
-
-
-def rotations(poses: np.ndarray) -> Rotation:
-    return Rotation.from_matrix(poses[:, :3, :3])
-
-
-def reordered_quaternion(poses: np.ndarray, order: list[int]) -> np.ndarray:
-    return with_rotation(poses, Rotation.from_quat(rotations(poses).as_quat()[:, order]))
-
-
-MISTAKES = {
-    "inverses": (inverse, "inverse"),
-    "reversed": (lambda g: g[::-1].copy(), "reverse order"),
-    "late by one": (lambda g: np.roll(g, 1, 0), "1 ahead of the images"),
-    "early by one": (lambda g: np.roll(g, -1, 0), "1 behind the images"),
-    "left-handed base": (lambda g: np.diag([1, 1, -1, 1.0]) @ g @ np.diag([1, 1, -1, 1.0]), "mirrored ones"),
-    "w first": (lambda g: reordered_quaternion(g, [3, 0, 1, 2]), "quaternions w, x, y, z"),
-    "w last": (lambda g: reordered_quaternion(g, [1, 2, 3, 0]), "quaternions x, y, z, w"),
-    "Euler order": (
-        lambda g: with_rotation(g, Rotation.from_euler("xyz", rotations(g).as_euler("ZYX"))),
-        "Euler angles ZYX that were taken as xyz",
-    ),
-    "vectors, radians for degrees": (
-        lambda g: with_rotation(g, Rotation.from_rotvec(np.radians(rotations(g).as_rotvec()))),
-        "rotation vectors in radians that were taken as degrees",
-    ),
-    "angles, radians for degrees": (
-        lambda g: with_rotation(g, Rotation.from_euler("xyz", np.radians(rotations(g).as_euler("xyz")))),
-        r"Euler angles \(xyz\) in radians that were taken as degrees",
-    ),
-}
 
 
 @pytest.mark.slow
@@ -93,6 +57,5 @@ def test_rows_in_another_order_of_the_images_names_are_named():
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [(0.0, 0.0), (5e-4, np.radians(0.1)), (5e-3, np.radians(1.0))])
 def test_sound_poses_are_left_alone(noise):
-    for seed in range(2):
-        problem = hand_eye_problem(np.random.default_rng(seed), 10, robot_noise=noise)
-        assert better_reading(problem.base_from_gripper, problem.recon_from_camera) is None
+    problem = hand_eye_problem(np.random.default_rng(0), 10, robot_noise=noise)
+    assert better_reading(problem.base_from_gripper, problem.recon_from_camera) is None

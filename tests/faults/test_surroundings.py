@@ -14,10 +14,12 @@ import numpy as np
 import pytest
 
 from capture_writers import write_easy_handeye2
+from in_process import run_jcr
 from jcr.calibration.record import read_calibration
 from jcr.errors import InputError
 from jcr.geometry import scale_translation
 from jcr.records.npz import read_reconstruction
+from jcr.result import RunResult
 from simulation.problems import hand_eye_problem
 from waiting import until
 
@@ -87,31 +89,61 @@ def test_a_command_ends_as_it_should_wherever_it_is_started(name: str, tmp_path:
     assert case.check(out) and not list(out.glob("*.part*"))
 
 
+MOMENTS: dict[str, Callable[[int, Path], bool]] = {
+    "while libraries load": lambda process, _: "pycolmap" in Path(f"/proc/{process}/maps").read_text(),
+    "while COLMAP works": lambda _, temporary: any(temporary.glob("jcr-colmap-*/*")),
+}
+"""Whether it has come: of the process's number and the folder of its temporary files. Both are after the lock."""
+
+
+@pytest.mark.parametrize(
+    ("moment", "number"), [*((moment, signal.SIGINT) for moment in MOMENTS), ([*MOMENTS][1], signal.SIGTERM)]
+)
 def test_a_run_that_is_asked_to_end_leaves_nothing_half_written_and_goes_on(
-    small_capture: Path, tmp_path: Path
+    moment: str, number: signal.Signals, small_capture: Path, tmp_path: Path
 ):
-    out = tmp_path / "out"
-    command = [
-        sys.executable,
-        "-m",
-        "jcr",
-        "calibrate",
-        str(small_capture),
-        str(out),
-        "--no-dense",
-        "--quiet",
-    ]
-    environment = os.environ | {"TMPDIR": str(tmp_path)}
-    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as run:
-        until(lambda: run.poll() is not None or any(tmp_path.glob("jcr-colmap-*/*")))
-        run.send_signal(signal.SIGTERM)
-        assert "Traceback" not in run.communicate(timeout=60)[1]
-        assert run.returncode in (-signal.SIGTERM, 143, 130, 0)
-    for name in RESULTS:
-        if name.endswith(".json") and (out / name).exists():
-            json.loads((out / name).read_text())
-    assert subprocess.run(command, check=False, timeout=200).returncode == 0
-    assert read_calibration(out).converged and not list(out.glob(".*.part*"))
+    out, temporary = tmp_path / "out", tmp_path / "temporary"
+    temporary.mkdir()
+    words = ["calibrate", str(small_capture), str(out), "--no-dense", "--quiet", "--json"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "jcr", *words],
+        env=os.environ | {"TMPDIR": str(temporary)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as running:
+        until(lambda: running.poll() is not None or MOMENTS[moment](running.pid, temporary))
+        running.send_signal(number)
+        _, printed = running.communicate(timeout=60)
+    # Python itself ends by the signal, which shells show as 130, where it was interrupted in what it compiled from
+    # a string, as dataclasses are.
+    assert running.returncode in (-number, 128 + number, 130) and "Traceback" not in printed
+    if number is signal.SIGINT:
+        assert printed.startswith("error: interrupted") and printed.count("\n") == 1
+        assert not out.exists() and not list(temporary.iterdir()), "nothing came of it"
+    if moment == "while COLMAP works":
+        finished = run_jcr(*words)
+        assert finished.returncode == 0 and len(json.loads(finished.stdout)["images"]) == 5, finished.stderr
+        assert not list(out.glob(".*.part*"))
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be bound to cores here")
+def test_two_threads_on_one_core_find_what_one_thread_finds_on_all_of_them(
+    small_capture: Path, small_done: Path, tmp_path: Path
+):
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    core = {min(os.sched_getaffinity(0))}
+    subprocess.run(
+        [sys.executable, "-m", "jcr", "calibrate", str(small_capture), str(tmp_path), "--quiet"],
+        env=os.environ | dict.fromkeys(names, "2"),
+        preexec_fn=lambda: os.sched_setaffinity(0, core),
+        timeout=300,
+    )
+    one, two = (RunResult(out).calibration for out in (small_done, tmp_path))
+    assert [image.used for image in one.images] == [image.used for image in two.images]
+    for name in ("gripper_from_camera", "scale"):
+        assert np.allclose(getattr(one, name), getattr(two, name), rtol=0, atol=1e-6), name
+    assert np.allclose(one.covariance, two.covariance, rtol=1e-6, atol=1e-12)
 
 
 def test_too_little_address_space_is_one_line(tmp_path: Path):

@@ -1,20 +1,26 @@
-"""Hostile bytes and hostile numbers: a right reading, an InputError or an honest doubt, and nothing else.
+"""Hostile bytes, values and numbers: a right reading, an InputError or an honest doubt, soon, and nothing else.
 
-JCR_TEST_FUZZ=20 looks twenty times as long.
+JCR_TEST_FUZZ=20 looks twenty times as long, and exchanges every value of the structured files.
 """
 
+import json
 import os
+import time
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import get_args
+from pathlib import Path
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 import jcr
-from corpus import Target, corpus
-from jcr.errors import InputError
+from corpus import SIZE, STRUCTURES, Target, corpus
+from jcr.capture.read import read_source
+from jcr.errors import InputError, RejectedError
 from jcr.geometry import rotation_exp, transform
 from simulation.poses import Pattern
 from simulation.problems import HandEyeProblem, error, hand_eye_problem
@@ -22,6 +28,8 @@ from simulation.problems import HandEyeProblem, error, hand_eye_problem
 pytestmark = pytest.mark.slow
 
 LONGER = int(os.environ.get("JCR_TEST_FUZZ", "1"))
+EVERY = 25 if LONGER == 1 else 1
+"""One of so many exchanges of a value is tried."""
 TOKENS = [
     b"NaN", b"-Infinity", b"1e999", b"1e-999", b"sNaN", b"1e99999999", b"9" * 5000, b"0x10", b"null", b"true", b"{}",
     b"[]", b"[[", b"}", b'"', b"'", b",", b":", b"\n", b"\t", b"- ", b"&a [*a]", b"*a", b"2001-99-99",
@@ -63,34 +71,19 @@ def changed(data: bytes, edits: list[tuple[float, str, int, bytes]]) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
+def targets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
     return corpus(tmp_path_factory.mktemp("fuzz") / "targets")
 
 
-NAMES = [
-    "about.json", "added/capture.json", "arm.urdf", "calibration.json", "camera_info.yaml", "cameras.bin",
-    "capture.json", "cloud.ply", "compared calibration.json", "depth.npz", "episode.parquet",
-    "info.json v2.1", "info.json v3.0", "map.safetensors", "metadata.yaml", "names.json", "pairs.npz", "picture.bmp",
-    "picture.gif", "picture.jpg", "picture.png", "picture.tif", "picture.webp", "points.csv", "points.npy",
-    "points.ply", "poses.csv", "poses.json", "poses.npy", "poses.tsv", "poses.txt", "reconstruction.npz",
-    "reference.json", "resumed capture.json", "run.json", "sample.json", "samples.yaml", "scan.bag", "scan.mcap",
-    "weights.pth", "wrist.samples",
-]  # fmt: skip
-
-
-def test_every_target_reads_as_it_is(readers: dict[str, Target]):
-    assert sorted(readers) == sorted(NAMES)
-    for name, target in readers.items():
+def test_every_target_reads_as_it_is(targets: dict[str, Target]):
+    for name, target in targets.items():
         try:
             target.read(target.file)
         except InputError:
             assert name == "weights.pth"  # of no network
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", NAMES)
-def test_changed_bytes_are_read_or_refused(name: str, readers: dict[str, Target]):
-    target = readers[name]
+def feed_changes(name: str, target: Target) -> None:
     valid = target.file.read_bytes()
 
     @bounded
@@ -99,12 +92,18 @@ def test_changed_bytes_are_read_or_refused(name: str, readers: dict[str, Target]
         try:
             target.feed(changed(valid, edits))
         except InputError as error:
-            assert "\0" not in str(error)
+            assert "\0" not in str(error), name
 
     try:
         feed()
     finally:
         target.file.write_bytes(valid)
+
+
+@pytest.mark.long
+def test_changed_bytes_are_read_or_refused(targets: dict[str, Target]):
+    for name, target in targets.items():
+        feed_changes(name, target)
 
 
 @st.composite
@@ -142,3 +141,139 @@ def test_no_poses_make_the_solver_fail_or_trust_what_is_wrong(given_poses: tuple
         assert (np.abs(off) <= 5 * std + 1e-7)[known].all(), off / std
     else:
         assert solved.warnings
+
+
+TOO_LONG_S = 5.0
+VALUES = {
+    "null": None,
+    "-1": -1,
+    "0": 0,
+    "1e309": float("inf"),
+    "empty text": "",
+    "list": [],
+    "object": {},
+    "text of 10⁶": "x" * 1_000_000,
+}
+"""What takes a value's place; infinity is written as 1e309, which JSON has no other word for."""
+Place = tuple[str | int, ...]
+
+
+def places(content: object, place: Place = ()) -> Iterator[Place]:
+    """Yield every place of a value, of each list the first and the last."""
+    if place:
+        yield place
+    if isinstance(content, dict):
+        for key, value in content.items():
+            yield from places(value, (*place, key))
+    if isinstance(content, list) and content:
+        for k in sorted({0, len(content) - 1}):
+            yield from places(content[k], (*place, k))
+
+
+def exchanged(content: Any, place: Place, value: object) -> Any:
+    """Return a copy of the content with another value at a place."""
+    if not place:
+        return value
+    copy = dict(content) if isinstance(content, dict) else list(content)
+    copy[place[0]] = exchanged(content[place[0]], place[1:], value)
+    return copy
+
+
+def content_of(target: Target) -> Any:
+    return STRUCTURES[target.file.suffix][0](target.file.read_text())
+
+
+def tried(target: Target, place: Place, value: object) -> tuple[str, float]:
+    """Return how reading ends: `read`, `refused`, or the exception that would be status 1; and the seconds."""
+    valid, write = target.file.read_bytes(), STRUCTURES[target.file.suffix][1]
+    data = write(exchanged(content_of(target), place, value)).encode()
+    start = time.process_time()  # of a busy machine the clock tells nothing
+    try:
+        target.feed(data)
+        ended = "read"
+    except (InputError, RejectedError) as error:
+        ended = "refused" if "\0" not in str(error) else "unreadable message"
+    except Exception as error:  # what a user would see as a traceback
+        ended = f"status 1: {type(error).__name__}: {str(error)[:200]}"
+    finally:
+        target.file.write_bytes(valid)
+    return ended, time.process_time() - start
+
+
+@pytest.mark.long
+def test_no_value_of_another_kind_makes_a_traceback_or_takes_long(targets: dict[str, Target]):
+    cases = [
+        (name, place, value)
+        for name, target in targets.items()
+        if target.file.suffix in STRUCTURES
+        for place in places(content_of(target))
+        for value in VALUES
+    ]
+    shuffled = np.random.default_rng(0).permutation(len(cases))[::EVERY]
+    bad, ended = [], []
+    for name, place, value in (cases[k] for k in shuffled):
+        how, seconds = tried(targets[name], place, VALUES[value])
+        ended.append(how)
+        if how not in ("read", "refused") or seconds > TOO_LONG_S:
+            bad.append(f"{name} {place} = {value}: {how} ({seconds:.1f} s)")
+    assert not bad
+    # Most values have a kind, and some may be anything: a fuzzer that is always refused tests nothing.
+    assert 0.1 < ended.count("read") / len(ended) < 0.4
+
+
+FRAME = {"image": "0.png", "base_from_gripper": np.eye(4).tolist()}
+MANY = {
+    "missing images": (
+        "capture.json",
+        {"frames": [FRAME | {"image": f"images/{k}.png"} for k in range(30_000)]},
+        "30000 frames; choose 1000 at most",
+    ),
+    "this many images": (
+        "capture.json",
+        {"frames": [FRAME | {"image": f"l{k}.png"} for k in range(1001)]},
+        "1001 frames; choose 1000 at most",
+    ),
+    "samples": (
+        "samples.yaml",
+        [dict.fromkeys(("effector_wrt_world", "object_wrt_sensor"), np.eye(4).ravel().tolist())] * 1001,
+        "1001 frames; choose 1000 at most",
+    ),
+    "rows": (
+        "poses.csv",
+        "image,x,y,z,qx,qy,qz,qw\n" + "".join(f"{k}.png,0.5,0.1,0.4,0,0,0,1\n" for k in range(100_000)),
+        "100000 frames; choose 1000 at most",
+    ),
+    "columns": (
+        "poses.csv",
+        ",".join(f"c{k}" for k in range(30_000)) + "\n" + ",".join("0" * 30_000),
+        "contain no pose",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", MANY)
+def test_many_entries_of_any_kind_are_refused_at_once(tmp_path: Path, what: str):
+    name, content, words = MANY[what]
+    Image.new("RGB", SIZE).save(tmp_path / "0.png")
+    for k in range(1001):
+        os.link(tmp_path / "0.png", tmp_path / f"l{k}.png")
+    (tmp_path / name).write_text(content if isinstance(content, str) else json.dumps(content))
+    start = time.process_time()
+    with pytest.raises(InputError, match=words):
+        read_source(tmp_path / name if what == "samples" else tmp_path)
+    assert time.process_time() - start < TOO_LONG_S
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "value"),
+    [
+        ("resumed capture.json", ("frames", 3, "joints", 0), [[]]),
+        ("resumed capture.json", ("frames", 3, "joints"), {"a": [{}]}),
+        ("camera_info.yaml", ("distortion_model",), "plumb\0bob"),
+        ("added/capture.json", ("added_to",), "a\0b"),
+    ],
+)
+def test_what_further_values_found_stays_closed(
+    targets: dict[str, Target], name: str, place: Place, value: object
+):
+    assert tried(targets[name], place, value)[0] == "refused"
