@@ -25,7 +25,10 @@ def reference_of(capture: Capture) -> ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "max_mm", "max_deg", "count"),
-    [("franka_wood_table", 4.0, 0.5, 12), ("doosan_bench", 5.0, 0.7, 15)],
+    [
+        pytest.param("franka_wood_table", 4.0, 0.5, 12, marks=pytest.mark.long),
+        ("doosan_bench", 5.0, 0.7, 15),
+    ],
 )
 def test_within_reach_of_the_marker_reference(
     real_captures: Path, name: str, max_mm: float, max_deg: float, count: int
@@ -70,7 +73,9 @@ def test_a_plain_background_is_rejected(real_captures: Path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "least"), [("elephant_floor", 15), ("ur_black_cloth", 18)])
+@pytest.mark.parametrize(
+    ("name", "least"), [("elephant_floor", 15), pytest.param("ur_black_cloth", 18, marks=pytest.mark.long)]
+)
 def test_another_first_pair_is_tried_where_the_first_bends_unknown_intrinsics(
     real_captures: Path, name: str, least: int
 ):
@@ -80,7 +85,7 @@ def test_another_first_pair_is_tried_where_the_first_bends_unknown_intrinsics(
     assert len(reconstruct_colmap(capture).image_index) >= least
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_images_that_are_added_live_have_the_findings_of_a_batch(real_captures: Path, tmp_path: Path):
     """Thirteen images: "camera moved on the gripper" was reported live, and gone at the sixteenth."""
     whole = jcr.read_capture(real_captures / "ur_snack_table")

@@ -8,14 +8,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 import jcr
+from conftest import shrunk_capture
 from jcr.calibration.drift import drift
 from jcr.calibration.record import write_calibration
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.images import read_image
 from jcr.cli import dispatch
-from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.arms import arm_named
 from jcr.estimation.closed_form import initial_estimate
 from jcr.estimation.inverse_kinematics import posed
@@ -44,8 +45,9 @@ NUDGE = transform(rotation_exp(np.array([0.0, 0.0, 0.02])), np.array([0.02, -0.0
 
 
 @pytest.fixture(scope="module")
-def capture(tabletop: Path) -> Capture:
-    return jcr.read_capture(tabletop)
+def capture(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    folder = tmp_path_factory.mktemp("small") / "capture"
+    return jcr.read_capture(shrunk_capture(tabletop, folder, 12, 320))
 
 
 @pytest.fixture(scope="module")
@@ -65,14 +67,6 @@ def reconstruction(capture: Capture, x: np.ndarray) -> Reconstruction:
     intrinsics = capture.intrinsics
     assert intrinsics is not None
     return reconstruction_of(cameras(capture, x)[:OLD], intrinsics=intrinsics)
-
-
-@pytest.fixture(scope="module")
-def located(capture: Capture, reconstruction: Reconstruction) -> list[CameraPose]:
-    images = [read_image(capture.folder / name) for name in capture.images]
-    found = register(reconstruction, images[:OLD], images[OLD:])
-    assert all(isinstance(place, CameraPose) for place in found)
-    return found  # type: ignore[return-value]
 
 
 def test_a_image_of_something_else_is_not_located(reconstruction: Reconstruction, capture: Capture):
@@ -115,7 +109,7 @@ def drifts(
 def test_joint_angles_show_a_drift_that_poses_of_a_bent_arm_hide():
     arm, of_old = arm_named("ur5e"), slice(0, OLD)
     shown = []
-    for seed in range(4):
+    for seed in range(2):
         made = bent_problem(arm, "poor", OLD + 3, seed)
         gripper, camera = made.base_from_gripper, made.recon_from_camera
         covariances = arm_errors(*posed(arm, made.joints, gripper)), smooth_errors(gripper)
@@ -129,7 +123,7 @@ def test_joint_angles_show_a_drift_that_poses_of_a_bent_arm_hide():
             for cameras in (camera, bumped):
                 new = gripper[OLD:], cameras[OLD:], np.broadcast_to(1e-10 * np.eye(6), (3, 6, 6))
                 shown.append(drift(fit, (gripper[of_old], camera[of_old]), new, systematic, 1e-3).p_value)
-    known_still, known_bumped, poses_still, poses_bumped = np.array(shown).reshape(4, 4).T
+    known_still, known_bumped, poses_still, poses_bumped = np.array(shown).reshape(-1, 4).T
     assert min(known_still.min(), poses_still.min()) > 1e-3
     assert known_bumped.max() < 1e-3 < np.median(poses_bumped)
 
@@ -137,10 +131,10 @@ def test_joint_angles_show_a_drift_that_poses_of_a_bent_arm_hide():
 def test_false_alarms_come_at_their_rate(capture: Capture, x: np.ndarray):
     # Of the seeds from 0 on two in 120 are below 1e-3 also by the noise that they were drawn with (9e-5 and 5e-4).
     p = np.array([[drifts(capture, x, 7 * seed + k, rows).p_value for k, rows in enumerate(([9], [9, 10, 11]))]
-                  for seed in range(200, 240)])  # fmt: skip
-    # Binomial: 5 % of 80 is 4 ± 1.9, 50 % is 40 ± 4.5.
-    assert (p < 0.05).sum() <= 10
-    assert 24 <= (p < 0.5).sum() <= 52
+                  for seed in range(200, 220)])  # fmt: skip
+    # Binomial: 5 % of 40 is 2 ± 1.4, 50 % is 20 ± 3.2.
+    assert (p < 0.05).sum() <= 6
+    assert 11 <= (p < 0.5).sum() <= 29
     assert (p < 1e-3).sum() <= 1
 
 
@@ -197,11 +191,8 @@ def write_capture(folder: Path, capture: Capture, poses: np.ndarray, rows) -> Ca
     )
 
 
-@pytest.mark.parametrize("seed", [2, 3])
-def test_the_command_is_content_with_what_has_not_moved(
-    out: Path, capture: Capture, tmp_path: Path, capsys, seed: int
-):
-    poses = with_robot_noise(capture.base_from_gripper, 0.2, 0.03, np.random.default_rng(seed))
+def test_the_command_is_content_with_what_has_not_moved(out: Path, capture: Capture, tmp_path: Path, capsys):
+    poses = with_robot_noise(capture.base_from_gripper, 0.2, 0.03, np.random.default_rng(2))
     write_capture(tmp_path / "today", capture, poses, [10, 11])
     assert dispatch(["verify", str(out), str(tmp_path / "today"), "--quiet"]) == 0
     assert capsys.readouterr().out.startswith("ACCEPTED: nothing has moved")
@@ -241,9 +232,7 @@ def test_the_command_finds_a_bump_from_one_image_and_shows_what_to_do(
 
 def test_another_scene_with_few_images_cannot_tell(out: Path, capture: Capture, tmp_path: Path, capsys):
     today = write_capture(tmp_path / "today", capture, capture.base_from_gripper, [10])
-    from PIL import Image
-
-    Image.new("RGB", (640, 480), (90, 90, 90)).save(today.folder / today.images[0], format="PNG")
+    Image.new("RGB", capture.image_size, (90, 90, 90)).save(today.folder / today.images[0], format="PNG")
     assert dispatch(["verify", str(out), str(tmp_path / "today"), "--quiet"]) == 3
     assert "cannot tell" in capsys.readouterr().err
     assert dispatch(["verify", str(out), str(tmp_path / "nothing"), "--quiet"]) == 2

@@ -17,13 +17,12 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate_pose_pairs, calibrate_reconstruction
 from jcr.camera import project, unproject
 from jcr.cell.carried import eye_to_hand, refined
-from jcr.estimation.arms import RobotName, arm_named
+from jcr.estimation.arms import arm_named
 from jcr.estimation.solve import Solution
 from jcr.findings import FindingKind, kinds_of, sentence
 from jcr.geometry import apply, inverse, step_between
 from jcr.sfm.colmap import reconstruct_colmap
 from scenes import capture_of, pairs_of, reconstruction_of
-from simulation.arms import PresetName
 from simulation.faults import INTRINSICS, Faults, faulty_capture, reconstructed
 from simulation.problems import INTRINSICS as OBSERVED_BY
 from simulation.problems import bent_problem, hand_eye_problem, observed
@@ -121,15 +120,7 @@ NAMED: dict[str, tuple[Faults, str, list[float], float]] = {
 }
 
 
-OF_CAMERA = (
-    "focus follows distance",
-    "focus scatters",
-    "zoom",
-    "principal point",
-    "rolling shutter",
-    "thin prism",
-    "image-stabilised optics",
-)
+OF_CAMERA = [*NAMED][:7]
 
 
 @pytest.mark.parametrize("name", NAMED)
@@ -145,21 +136,25 @@ def test_a_silent_fault_is_named_with_its_size_and_counts_as_uncertainty(name: s
     assert np.allclose(parts, hand_eye.covariance, rtol=0, atol=1e-9)
     # An effect on the camera is part of the calibration, and its uncertainty is not that of a fault.
     assert (np.trace(hand_eye.uncertainty.budget.faults) > 0) == (name not in OF_CAMERA)
+    if (
+        name == "thin prism"
+    ):  # without it in the model, the rotation is 2.3° off: it looks like a rotated camera
+        camera = hand_eye.intrinsics
+        assert camera is not None and camera.model == "thin_prism" and camera.std is not None
+        off = np.array(camera.distortion[-4:]) - NAMED[name][0].prism
+        assert (np.abs(off) < 3 * np.array(camera.std[-4:])).all()
     # No one result is right on both sides of a motion beyond the requirement, and a delay of that size leaves ± 10 mm.
     assert hand_eye.converged is (name not in ("slip", "tool changed", "base pushed", "delay"))
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_what_given_intrinsics_may_be_off_is_within_sigma_unsaid(seed: int):
-    found, hand_eye = calibrated(Faults(intrinsics=(("k1", -0.03),)), seed)
+def test_what_given_intrinsics_may_be_off_is_within_sigma_unsaid():
+    found, hand_eye = calibrated(Faults(intrinsics=(("k1", -0.03),)), 0)
     assert hand_eye.converged and outcome(found, hand_eye).is_sound
 
 
-@pytest.mark.parametrize("estimated", [False, True])
-def test_nothing_is_named_where_nothing_is_wrong(estimated: bool):
-    for seed in range(3):
-        _, hand_eye = calibrated(Faults(), seed, (8, 12, 16)[seed], not estimated)
-        assert hand_eye.warnings == ()
+@pytest.mark.parametrize(("images", "given"), [(8, True), (16, False)])
+def test_nothing_is_named_where_nothing_is_wrong(images: int, given: bool):
+    assert calibrated(Faults(), 0, images, given)[1].warnings == ()
 
 
 def test_an_effect_that_moves_the_calibration_by_all_points_too_little_is_not_reported(attacks: Path):
@@ -171,9 +166,8 @@ def test_an_effect_that_moves_the_calibration_by_all_points_too_little_is_not_re
     assert not calibrate_reconstruction(capture, reconstruct_colmap(capture)).warnings
 
 
-@pytest.mark.parametrize(("arm", "preset"), [("ur5e", "typical"), ("panda", "low-cost")])
-def test_joint_offsets_and_link_errors_are_not_named_as_a_bent_robot(arm: RobotName, preset: PresetName):
-    problem = bent_problem(arm_named(arm), preset, 12, 2)
+def test_joint_offsets_and_link_errors_are_not_named_as_a_bent_robot():
+    problem = bent_problem(arm_named("panda"), "low-cost", 12, 2)
     capture = capture_of(problem.base_from_gripper, intrinsics=OBSERVED_BY)
     reconstruction = reconstruction_of(
         problem.recon_from_camera, tracks=observed(problem, np.random.default_rng(2), 300, 0.4)
@@ -181,16 +175,6 @@ def test_joint_offsets_and_link_errors_are_not_named_as_a_bent_robot(arm: RobotN
     assert not kinds_of("strain") & {
         one.kind for one in calibrate_reconstruction(capture, reconstruction).findings
     }
-
-
-def test_a_thin_prism_becomes_part_of_the_intrinsics():
-    """Without it in the model, the rotation is 2.3° off: a prism and a rotated camera look alike."""
-    found, hand_eye = calibrated(NAMED["thin prism"][0], 3)
-    camera = hand_eye.intrinsics
-    assert camera is not None and camera.model == "thin_prism" and camera.std is not None
-    std = np.array(camera.std[-4:])
-    assert (np.abs(np.array(camera.distortion[-4:]) - [0.02, 0.0, 0.01, 0.0]) < 3 * std).all()
-    assert outcome(found, hand_eye).is_sound
 
 
 def test_an_unmeasured_prism_of_estimated_intrinsics_is_within_sigma():
@@ -267,9 +251,8 @@ def test_positions_that_are_all_too_long_are_said_to_be_beyond_what_images_show_
     capture, reconstruction = reconstructed(found, False)
     unknown = calibrate_reconstruction(capture, reconstruction)
     assert unknown.converged and not unknown.warnings
-    file = unknown
-    (alone,) = (sentence(one) for one in file.findings if one.kind is FindingKind.SCALE_FROM_ROBOT)
-    assert alone in file.notes
+    (alone,) = (sentence(one) for one in unknown.findings if one.kind is FindingKind.SCALE_FROM_ROBOT)
+    assert alone in unknown.notes
     # Simulated observations are metric as the scene is; the robot's positions are not.
     metric = calibrate_reconstruction(capture, replace(reconstruction, is_metric=True, metric_std=0.002))
     assert "4.8 ± 0.15 %" in metric.warnings[0] and "larger than given" in metric.warnings[0]
