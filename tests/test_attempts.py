@@ -6,7 +6,6 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -16,25 +15,14 @@ from jcr.calibration.checks import convention
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
-from jcr.cli import dispatch
 from jcr.errors import InputError, RejectedError
 from jcr.findings import Finding, FindingKind
-from jcr.geometry import rotation_exp, transform
 from jcr.pipeline import selection
 from jcr.reconstruct import Backend, ReconstructOptions
 from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
 from jcr.result import RunOptions, RunResult
 from scenes import capture_of, reconstruction_of
 from simulation.problems import HandEyeProblem, hand_eye_problem
-
-GARBAGE = {
-    "enc_embed_dim": 32,
-    "enc_depth": 1,
-    "enc_num_heads": 2,
-    "dec_embed_dim": 32,
-    "dec_depth": 1,
-    "dec_num_heads": 2,
-}
 
 
 @pytest.fixture(autouse=True)
@@ -281,27 +269,6 @@ def test_where_nothing_is_found_each_attempt_reports_why(
         assert re.search(rf"<b>{backend}</b>, [\d.]+ s: {backend} saw nothing</li>", report)
 
 
-def test_input_that_calibration_cannot_use_is_no_reason_for_another_back_end(
-    present: set[str], tmp_path: Path, tabletop: Path, monkeypatch: pytest.MonkeyPatch
-):
-    from jcr.capture.read import read_capture
-    from jcr.pipeline.run import calibrate
-
-    problem = hand_eye_problem(np.random.default_rng(3), 12)
-    capture, made = read_capture(tabletop), []
-
-    def door(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
-        made.append(options.backend)
-        return reconstruction(options.backend, problem.recon_from_camera)
-
-    monkeypatch.setattr(selection, "reconstruct", door)
-    monkeypatch.setattr(selection, "densify", without_surface)
-    lost = CalibrateOptions(known_length=(capture.images[0], 0.0, 0.0, 9.0, 9.0, 50.0))
-    with pytest.raises(InputError, match="no surface was found"):
-        calibrate(capture, tmp_path / "auto", RunOptions(calibrate=lost))
-    assert made == ["colmap"]
-
-
 def test_a_known_length_ends_on_surfaces_and_nothing_else_needs_depth_before_the_calibration(
     present: set[str], monkeypatch: pytest.MonkeyPatch
 ):
@@ -328,52 +295,3 @@ def test_a_known_length_ends_on_surfaces_and_nothing_else_needs_depth_before_the
         with pytest.raises(InputError, match=why):
             selection.select_reconstruction(capture, RunOptions(calibrate=lost))
     assert densified == ["colmap", "colmap"]
-
-
-@pytest.fixture
-def garbage_weights(tmp_path: Path) -> Path:
-    """A folder of weights that no training touched."""
-    import torch
-    from safetensors.torch import save_file
-
-    from jcr.pointmaps.dust3r.network import Dust3r
-
-    torch.manual_seed(0)
-    network = Dust3r(**GARBAGE)
-    folder = tmp_path / "weights"
-    folder.mkdir()
-    save_file(
-        {k: v.contiguous().clone() for k, v in network.state_dict().items()}, folder / "model.safetensors"
-    )
-    (folder / "config.json").write_text(json.dumps(GARBAGE))
-    return folder
-
-
-def test_where_no_back_end_finds_a_pose_the_run_folder_keeps_the_licence_of_the_weights(
-    tmp_path: Path, garbage_weights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    from safetensors.torch import load_file, save_file
-
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    weights = load_file(garbage_weights / "model.safetensors")
-    flat = {key: 0 * tensor if "downstream" in key else tensor for key, tensor in weights.items()}
-    save_file(flat, garbage_weights / "model.safetensors")
-    frames = []
-    for k in range(3):
-        grey = np.full((48, 64, 3), 90 + 5 * k, np.uint8)
-        grey[20 + k, 30] = 255
-        cv2.imwrite(str(tmp_path / f"{k}.png"), grey)
-        pose = transform(rotation_exp(np.array([0.3 * k, 0.2, 0.1 * k * k])), np.array([0.1 * k, 0.0, 0.3]))
-        frames.append({"image": f"{k}.png", "base_from_gripper": pose.tolist()})
-    intrinsics = {"fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5, "distortion": [0] * 5}
-    (tmp_path / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": intrinsics}))
-    for backend in ("auto", "dust3r"):
-        out = tmp_path / backend
-        command = ["run", str(tmp_path), str(out), "--weights", str(garbage_weights), "--backend", backend]
-        assert dispatch(command) == 3
-        licence = f"weights {garbage_weights}: licence unknown, ask who made the file"
-        written = json.loads((out / "calibration.json").read_text())
-        assert licence in " ".join([*written["warnings"], *written["notes"]])
-        assert licence in (out / "log.txt").read_text() and licence in (out / "report.html").read_text()
-        printed = capsys.readouterr().out
-        assert printed.startswith("REJECTED") and not {"  0.", "Accuracy"} & set(printed.split())

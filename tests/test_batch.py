@@ -3,8 +3,6 @@
 import csv
 import json
 import shutil
-import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -151,36 +149,3 @@ def test_a_capture_that_falls_short_of_what_is_required_is_rejected(tmp_path: Pa
     out, read = tmp_path / "b", ReadOptions()
     row = run_one(Task(capture=captures[1], out=out, run=options, calibrate_only=True, read=read))
     assert row.status == "rejected" and row.reason, row
-
-
-def test_a_node_of_a_ray_cluster_that_dies_loses_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    pytest.importorskip("ray", reason="the extra jcr-handeye[cluster] is not installed")
-    from ray.cluster_utils import Cluster
-
-    first, removed = tmp_path / "0", tmp_path / "removed"
-
-    def unfinished(task: Task) -> BatchRow:
-        """The first ends at once, the others when the node is gone on which some of them run."""
-        deadline = time.monotonic() + 60
-        while task.capture != first and not removed.exists() and time.monotonic() < deadline:
-            time.sleep(0.01)
-        return BatchRow(capture=str(task.capture), out=str(task.out), status="accepted", offset_std_mm=1.0)
-
-    monkeypatch.setattr(module, "run_one", unfinished)
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 2})
-    try:
-        nodes = [cluster.add_node(num_cpus=2)]
-
-        def kill(stage: str, fraction: float) -> None:
-            if fraction > 0 and nodes:
-                cluster.remove_node(nodes.pop(), allow_graceful=False)
-                removed.touch()
-
-        options = replace(COMPLETE, ray=cluster.address)
-        with pytest.raises(module.InputError, match="no node has the 64 cores"):
-            batch([first], tmp_path / "none", RunOptions(), replace(options, cpus_per_task=64))
-        rows = batch([tmp_path / f"{k}" for k in range(6)], tmp_path / "out", RunOptions(), options, kill)
-    finally:
-        cluster.shutdown()
-    assert not nodes
-    assert sorted(Path(row.capture).name for row in rows if row.status == "accepted") == list("012345")

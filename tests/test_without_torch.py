@@ -96,24 +96,6 @@ def test_what_needs_torch_shows_what_to_install_before_any_work(
         assert ("`jcr run` and `jcr calibrate`" in line) == (name == "map")
 
 
-def test_a_map_is_made_later_where_torch_is(calibrated: Path, tmp_path: Path):
-    pytest.importorskip("torch", reason="the map needs torch")
-    from jcr.cli import dispatch
-
-    out = tmp_path / "out"
-    shutil.copytree(calibrated, out)
-    capture = json.loads((out / "run.json").read_text())["capture"]
-    assert dispatch(["run", capture, str(out), "--no-dense", "--quiet"]) == 2 and not list(out.glob("map.*"))
-    assert dispatch(["map", str(out), "--max-seconds", "1", "--quiet"]) == 0
-    assert (out / "map.safetensors").is_file() and (out / "cloud.ply").is_file()
-    one, other = (json.loads((folder / "calibration.json").read_text()) for folder in (calibrated, out))
-    assert one["gripper_from_camera"] == other["gripper_from_camera"]
-    names = ("reconstruction.npz", "depth.npz")
-    made = [(out / name).stat().st_mtime_ns for name in names]
-    assert dispatch(["run", capture, str(out), "--no-map", "--quiet"]) == 0
-    assert [(out / name).stat().st_mtime_ns for name in names] == made
-
-
 def test_only_the_modules_that_work_with_tensors_need_torch():
     source = ROOT / "src" / "jcr"
     names = [str(file.relative_to(source).with_suffix("")) for file in sorted(source.rglob("*.py"))]

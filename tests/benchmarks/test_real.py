@@ -5,10 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks import real
-from benchmarks.real import WristCamera, measure, pixels_of, predicted
+from benchmarks.real import WristCamera, measure, pixels_of
 from benchmarks.references import Corners, reference
-from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.camera import parameters
 from jcr.geometry import step_between
 from jcr.records import Intrinsics
@@ -62,21 +60,3 @@ def test_references_state_their_own_error():
         assert found.noise[0] == pytest.approx(4e-4, rel=0.5) and found.rms_px < 2 * NOISE_PX
     # The mean square of 30 parameters is 1 ± 0.26.
     assert 0.22 < np.mean(squared) < 1.78
-
-
-@pytest.mark.slow
-def test_the_scatter_is_predicted_from_what_a_calibration_states(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(real, "DRAWS", 40)
-    ratios = []
-    for seed in range(3):
-        problem = hand_eye_problem(np.random.default_rng(seed), 12, robot_noise=(4e-4, 1e-3))
-        hand_eye = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
-        camera, corners = seen(problem)
-        found = replace(
-            camera,
-            gripper_from_camera=hand_eye.gripper_from_camera,
-            base_from_gripper=problem.base_from_gripper,
-        )
-        draws = predicted(found, hand_eye, corners, NOISE_PX)
-        ratios.append(measure(found, corners).scatter / np.sqrt((np.array(draws) ** 2).mean()))
-    assert 0.7 < np.median(ratios) < 1.4

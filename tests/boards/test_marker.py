@@ -14,7 +14,6 @@ from jcr.boards.marker import reconstruct_marker
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import unproject
 from jcr.capture.read import read_capture
-from jcr.cli import dispatch
 from jcr.depth.densify import densify
 from jcr.errors import InputError
 from jcr.geometry import rotation_between_deg
@@ -163,39 +162,6 @@ def test_other_readings_of_a_charuco_board_are_tried_and_named(tmp_path, spec, l
     assert any(read_as in note for note in reconstruction.notes)
     found = calibrate_reconstruction(capture, reconstruction).gripper_from_camera
     assert np.linalg.norm(found - gripper_from_camera) < 0.01
-
-
-def test_a_board_named_in_the_wrong_size_is_rejected(tmp_path, capsys):
-    capture_of(tmp_path / "capture", chessboard)
-    command = [
-        "calibrate",
-        str(tmp_path / "capture"),
-        str(tmp_path / "out"),
-        "--backend",
-        "marker",
-        "--board",
-        "chessboard:8x5:0.028",
-    ]
-    assert dispatch(command) == 3
-    words = " ".join(capsys.readouterr().out.split())
-    assert "smaller than given" in words and "easure its squares" in words
-    found = json.loads((tmp_path / "out" / "calibration.json").read_text())
-    assert not found["converged"] and found["backend"] == "marker"
-
-
-def test_lines_that_a_detector_drew_over_a_board_are_no_hindrance(tmp_path):
-    capture, gripper_from_camera = capture_of(tmp_path / "capture", charuco)
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
-    for name in capture.images:
-        image = cv2.imread(str(capture.folder / name))
-        corners, ids, _ = detector.detectMarkers(image)
-        cv2.aruco.drawDetectedMarkers(image, corners, ids)
-        assert detector.detectMarkers(image)[1] is None or len(detector.detectMarkers(image)[1]) < len(ids)
-        cv2.imwrite(str(capture.folder / name), image)
-    spec = "charuco:7x6:0.030:0.022:DICT_4X4_50"
-    hand_eye = calibrate_reconstruction(capture, reconstruct_marker(capture, spec))
-    found = hand_eye.gripper_from_camera
-    assert 1e3 * np.linalg.norm(found[:3, 3] - gripper_from_camera[:3, 3]) < 3.0
 
 
 def test_the_metre_of_a_board_is_kept_on_disk_and_its_pointmaps_are_in_metres(tmp_path):

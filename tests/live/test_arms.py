@@ -4,8 +4,6 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -17,9 +15,7 @@ import pytest
 import jcr
 from fake_arms import fake_xarm
 from jcr.camera import project
-from jcr.estimation.arms import arm_named
-from jcr.estimation.kinematics import forward_kinematics
-from jcr.geometry import inverse, rotation_exp, transform
+from jcr.geometry import rotation_exp, transform
 from jcr.live.cameras import CameraOptions, apply_options
 from jcr.records import Intrinsics
 from places import ROOT
@@ -65,49 +61,6 @@ def test_an_arm_gives_pose_and_joints_through_its_makers_package():
     # An xArm tells float32, and its package keeps six digits.
     assert np.allclose(pose, POSE, atol=1e-6) and np.allclose(joints, JOINTS, atol=1e-6)
     assert "xarm:127.0.0.8" in refused and "check the address" in refused
-
-
-@contextmanager
-def simulated_franka(host: str) -> Iterator[None]:
-    """franky-sim in a process of its own: an FR3 in MuJoCo behind the Franka Control Interface."""
-    command = [sys.executable, "-u", "-m", "franky_sim.run_server", "-s", "mujoco", "--hostname", host]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            assert any("Press Ctrl+C" in line for line in process.stdout)
-            yield
-        finally:
-            process.terminate()
-
-
-MOVED_FRANKA = """
-    import json, sys, franky
-    import numpy as np
-    from jcr.live.robot import states_of
-    from jcr.live.robot import MOVED_ON, next_rest
-    states = states_of("franka:" + sys.argv[1])
-    first = next_rest(states, None, MOVED_ON)
-    robot = franky.Robot(sys.argv[1], realtime_config=franky.RealtimeConfig.Ignore)
-    robot.relative_dynamics_factor = 0.3
-    goal = np.array(robot.state.q) + np.array([0.3, 0, 0, 0, 0, 0.2, 0])
-    robot.move(franky.JointMotion(goal))
-    del robot
-    second = next_rest(states, first.base_from_gripper, MOVED_ON)
-    print(json.dumps([[a.base_from_gripper.tolist() for a in (first, second)],
-                      [a.joints.tolist() for a in (first, second)], goal.tolist()]))
-"""
-
-
-@pytest.mark.slow
-def test_a_simulated_franka_gives_pose_and_joints():
-    needs("franky", "franky_sim")
-    with simulated_franka("127.0.0.9"):
-        poses, joints, goal = map(np.array, named_by(MOVED_FRANKA, "127.0.0.9"))
-    assert np.allclose(joints[1], goal, atol=0.05)
-    # The end effector is the hand, constant in the flange.
-    tools = inverse(forward_kinematics(arm_named("fr3"), joints)) @ poses
-    assert np.allclose(tools[0], tools[1], atol=2e-4)
-    assert np.allclose(tools[0][:3, 3], [0, 0, 0.1034], atol=1e-3)
 
 
 FILMED = """

@@ -4,7 +4,6 @@ import json
 import shutil
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -254,13 +253,3 @@ def test_grey_and_bgr_images_are_converted_and_lists_are_poses(tmp_path: Path, t
         live.add(grey, poses[1].tolist())
         kept = [read_image(live.live.folder / name) for name in live.live.names]
     assert np.array_equal(kept[0], image) and np.array_equal(kept[1], np.dstack([grey] * 3))
-
-
-def test_two_threads_may_add_images(tmp_path: Path, tabletop: Path):
-    poses = jcr.read_capture(tabletop).base_from_gripper
-    with closing(LiveCalibration(tmp_path / "capture")) as live:
-        with ThreadPoolExecutor(3) as threads:
-            states = [*threads.map(lambda k: live.add(still(tabletop, k), poses[k]), range(3))]
-        # Each state is that after one more image, and all are kept.
-        assert sorted(len(state.images) for state in states) == [1, 2, 3]
-        assert live.progress.images == tuple(live.live.names) == tuple(f"images/00{k}.png" for k in range(3))

@@ -27,13 +27,12 @@ from jcr.cell.placement import ArmPlacement, CameraPlacement, CellPlacement, Tra
 from jcr.errors import RejectedError
 from jcr.estimation.observability import excitation
 from jcr.findings import no_reconstruction
-from jcr.geometry import inverse, rotation_exp, transform
+from jcr.geometry import inverse, transform
 from jcr.records import COVARIANCE_ORDER, BoardFound, Capture, CellCamera, Reconstruction, Tracks
 from jcr.report.details import details_section
 from jcr.report.html import failed_report_html, report_html
 from jcr.report.images import MAGNIFIED
 from jcr.report.motion import excitation_bars
-from jcr.report.transform import sketch
 from jcr.result import RunResult
 from jcr.rounding import decimals_of, significant
 from jcr.scene.cloud import point_cloud
@@ -166,46 +165,6 @@ def test_numbers_are_those_of_the_calibration_file(run: RunResult, page: str):
     for image in written["images"]:
         if image["used"]:
             assert f"{significant(image['reprojection_px'])} px" in elements.text
-
-
-def test_headline_tiles_and_head_have_the_numbers_of_the_calibration(run: RunResult, page: str):
-    tiles = re.findall(r'class="name">([^<]*)</div><div class="number">([^<]*)<', page)
-    assert [name for name, _ in tiles] == [
-        "Point at the image centre",
-        "Point in the image corner",
-        "Images used",
-        "Scale",
-    ]
-    required, uncertainty = run.calibration.requirement, run.calibration.uncertainty
-    assert required is not None and uncertainty is not None and uncertainty.seen is not None
-    assert tiles[0][1] == f"{significant(required.reached_mm)} mm"
-    assert tiles[1][1] == f"{significant(uncertainty.seen.corners.within_95_mm)} mm"
-    assert tiles[2][1] == "10 of 12"
-    text, found = Elements(page).text, run.intrinsics
-    assert f"within {tiles[0][1]}" in text and f"fx {found.fx:.2f}, fy {found.fy:.2f}" in text
-    assert f"{run.found.gripper_from_camera[0, 3]:.6f}" in text
-    collapsed = re.findall(r'<details class="section" id="(\w+)"', page)
-    assert collapsed == ["residuals", "uncertainty", "notes", "details"]
-
-
-def test_a_sketch_shows_camera_and_flange_to_scale(run: RunResult):
-    x = transform(rotation_exp(np.array([0.0, 0.0, np.pi])), np.array([0.06, 0.0, 0.08]))
-    figure = sketch(x, run.intrinsics, "gripper")
-    ends = {
-        shape.attributes["class"]: np.array(
-            [pair.split(",") for pair in str(shape.attributes["points"]).split()], float
-        )
-        for shape in figure.shapes
-        if shape.tag == "polyline"
-    }
-    assert {"flange", "offset", "axis-x", "axis-y", "axis-z"} == set(ends)
-    origin, camera = ends["offset"]
-    # The flange looks downwards, so that a camera before it is drawn below; one unit is the same for both.
-    assert camera[1] > origin[1] + 20
-    assert "100 mm" in [shape.text for shape in figure.shapes]
-    assert (np.abs(np.concatenate([*ends.values()]) - [220, 160]) < [220, 160]).all()
-    fixed = sketch(x, None, "base")
-    assert "flange" not in [shape.attributes["class"] for shape in fixed.shapes]
 
 
 def test_rejected_images_are_reported_with_why(run: RunResult, page: str):

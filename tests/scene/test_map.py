@@ -211,15 +211,6 @@ def test_the_same_seed_gives_the_same_map_and_torchs_own_state_stays():
     assert not np.array_equal(untrained[0].query(x).color, untrained[1].query(x).color)
 
 
-def test_a_map_moved_to_another_device_is_a_copy(scene: "SceneMap"):
-    moved = scene.to("cpu")
-    assert moved.fields is not scene.fields
-    for one, two in zip(moved.fields.parameters(), scene.fields.parameters(), strict=True):
-        assert one.data_ptr() != two.data_ptr()
-    x = uniform(1000)
-    np.testing.assert_array_equal(moved.query(x).occupancy, scene.query(x).occupancy)
-
-
 def test_a_wrong_colour_that_nobody_trusts_does_not_stain_the_map(cloud: PointCloud):
     from jcr.scene.build import build_scene
 

@@ -1,12 +1,10 @@
 """Global alignment against the truth of synthetic pairs: accuracy, gauge, wrong pairs, graphs, bad input."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from benchmarks import adam
 from jcr.camera import rays
 from jcr.errors import InputError, RejectedError
 from jcr.geometry import Similarity, fit_similarity, retract, rotation_between_deg
@@ -16,7 +14,7 @@ from jcr.pointmaps.global_alignment.gauss_newton import gauss_newton
 from jcr.pointmaps.global_alignment.observations import AlignmentProblem
 from jcr.pointmaps.global_alignment.residuals import AlignmentState
 from jcr.records import Intrinsics
-from simulation.pairs import PairErrors, PairTruth, synthetic_pairs, write_pairs
+from simulation.pairs import PairErrors, PairTruth, synthetic_pairs
 
 SMALL = (48, 36)
 NO_ERRORS = PairErrors(pixel=0.0, warp=0.0, outliers=0.0)
@@ -48,19 +46,6 @@ def test_exact_predictions_give_the_exact_scene():
     np.testing.assert_array_equal(result.recon_from_camera[0], np.eye(4))
     assert result.pair_residual.max() < 2e-4
     assert result.notes == ()
-
-
-@pytest.mark.slow
-def test_fast_beats_adam_and_both_are_near_the_truth():
-    predictions, truth = synthetic_pairs(complete_pairs(4), (32, 24), seed=1)
-    fast = errors(global_align(predictions), truth)
-    from benchmarks.adam import align_adam
-
-    adam = errors(align_adam(predictions), truth)
-    assert adam[0] < 4
-    assert adam[1] < 0.4
-    assert fast[0] < adam[0] / 2
-    assert fast[1] < adam[1]
 
 
 def test_one_step_from_near_the_truth_is_almost_all_the_way():
@@ -168,12 +153,6 @@ def test_pixels_without_confidence_do_not_count(network):
     assert result.confidence[:, :, 28:].mean() > nothing + 0.1
 
 
-def test_senseless_options_are_refused():
-    predictions, _ = synthetic_pairs(complete_pairs(2), SMALL)
-    with pytest.raises(InputError, match="alignment needs 50"):
-        global_align(predictions, pixels=1)
-
-
 def test_predictions_that_are_noise_are_called_useless():
     predictions, _ = synthetic_pairs(complete_pairs(3), SMALL, PairErrors(noise_pairs=6))
     try:
@@ -181,23 +160,6 @@ def test_predictions_that_are_noise_are_called_useless():
     except RejectedError as refusal:
         said = (str(refusal),)
     assert any("nothing can be built on them" in note or "too little in common" in note for note in said)
-
-
-def command(*arguments: str) -> int:
-    """Return the exit status of `python -m benchmarks align`."""
-    return adam.main(arguments)
-
-
-def test_command_reads_aligns_and_writes(tmp_path, capsys):
-    predictions, truth = synthetic_pairs(complete_pairs(3), SMALL)
-    write_pairs(tmp_path / "pairs.npz", predictions)
-    result = tmp_path / "new" / "aligned.npz"
-    assert command(str(tmp_path / "pairs.npz"), str(result)) == 0
-    assert json.loads(capsys.readouterr().out)["seconds"] > 0
-    with np.load(result) as file:
-        assert file["poses"].shape == (3, 4, 4)
-        assert file["depth"].shape == (3, 36, 48)
-        np.testing.assert_allclose(file["focals"], truth.intrinsics.fx, rtol=2e-3)
 
 
 def test_pairs_whose_errors_cannot_be_solved_for_are_rejected(monkeypatch: pytest.MonkeyPatch):
