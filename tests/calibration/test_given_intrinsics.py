@@ -47,15 +47,16 @@ def said(hand_eye: Calibration) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("images", [3, 5, 10])
-@pytest.mark.parametrize("motion", [{}, {"pattern": "translation", "deviation": np.radians(6.0)}])
+@pytest.mark.parametrize(
+    ("images", "motion"),
+    [(3, {}), (10, {}), (5, {"pattern": "translation", "deviation": np.radians(6.0)})],
+)
 def test_a_true_intrinsics_is_never_named(images: int, motion: dict) -> None:
-    for seed in range(2):
-        assert said(calibrated(seed, images, INTRINSICS, **motion)[1]) == ""
+    assert said(calibrated(0, images, INTRINSICS, **motion)[1]) == ""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("factor", "images"), [(0.8, 5), (0.95, 10), (1.05, 10), (1.2, 5)])
+@pytest.mark.parametrize(("factor", "images"), [(0.8, 5), (1.05, 10)])
 def test_a_wrong_focal_length_is_named_with_the_right_one(factor: float, images: int) -> None:
     problem, hand_eye = calibrated(0, images, scaled(factor))
     found = re.match(
@@ -79,9 +80,8 @@ def test_more_views_are_not_promised_to_make_up_for_a_wrong_intrinsics() -> None
     for intrinsics in (INTRINSICS, scaled(1.03), scaled(1.2)):
         _, capture, reconstruction = pictured(0, 5, intrinsics)
         hand_eye = calibrate_reconstruction(capture, reconstruction, CalibrateOptions(next_poses=2))
-        content = hand_eye
         offset.append(hand_eye.gripper_from_camera[:3, 3])
-        promised.append(np.linalg.norm(content.next_poses[-1].expected_std[:3]))
+        promised.append(np.linalg.norm(hand_eye.next_poses[-1].expected_std[:3]))
         reported.append(np.sqrt(np.trace(hand_eye.covariance[:3, :3])))
     assert promised[0] < 0.7 * reported[0]
     for k in (1, 2):

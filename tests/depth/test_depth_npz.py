@@ -4,7 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from jcr.camera import pinhole_inside
 from jcr.capture.read import read_capture
@@ -56,12 +55,3 @@ def test_what_is_read_is_what_was_written(tabletop: Path, tmp_path: Path):
         np.testing.assert_array_equal(getattr(found, name), getattr(dense, name))
     grey = read_depth(file, reconstruction, None)
     assert (grey.colors == 128).all() and (grey.points_in_recon == dense.points_in_recon).all()
-
-
-@pytest.mark.slow
-def test_thirty_images_take_at_most_30_mb(tabletop: Path, tmp_path: Path):
-    reconstruction = made(tabletop, 6)
-    write_depth(tmp_path / "depth.npz", reconstruction, "a")
-    pixels = reconstruction.dense.confidence[0].size
-    assert pixels >= 400 * 299
-    assert (tmp_path / "depth.npz").stat().st_size * 30 / 6 <= 30e6

@@ -6,7 +6,6 @@ from functools import cache
 import numpy as np
 import pytest
 
-from benchmarks.coverage import BENT, WAYS, measure_seen
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration
 from jcr.camera import parameters, unproject, with_parameters
@@ -141,12 +140,3 @@ def test_points_of_the_scene_are_where_they_are_said_to_be():
         sizes.append(np.trace(scene.covariance_at(in_base), axis1=1, axis2=2).mean())
         assert sizes[-1] == pytest.approx(np.trace(together[n, :, n], axis1=1, axis2=2).mean(), rel=0.1)
     assert np.concatenate(inside).mean() > 0.8
-
-
-@pytest.mark.slow
-def test_seen_points_err_as_is_said_whatever_is_known_of_the_camera():
-    rows = measure_seen(("white",), (12,), WAYS, draws=8)
-    assert {row.known for row in rows} == {way.name for way in WAYS} and BENT in {way.camera for way in WAYS}
-    for row in rows:
-        assert row.within_95 > 0.85 and row.within_3 > 0.95, row
-        assert row.seen_mm < row.stated_mm < 5 * row.seen_mm, row

@@ -214,17 +214,3 @@ def test_joint_angles_contradict_positions_that_are_all_too_long(name):
             poses[:, :3, 3] *= factor
             with pytest.raises(LengthError, match=f"{words}for a {name}"):
                 mounted_arm(arm, joints, poses)
-
-
-def test_urdf_that_is_no_arm_is_refused(tmp_path):
-    form = urdf_form("ur5e")
-    file = tmp_path / "arm.urdf"
-    file.write_text(urdf_text(form, arm_named("ur5e").limits))
-    with pytest.raises(InputError, match="no chain with 7 joints"):
-        read_chain(file, 7)
-    file.write_text(file.read_text().replace('"j2" type="revolute"', '"j2" type="prismatic"'))
-    with pytest.raises(InputError, match="joint j2 is prismatic"):
-        read_chain(file, 6)
-    file.write_text("no xml")
-    with pytest.raises(InputError, match="not a readable URDF"):
-        read_chain(file, 6)

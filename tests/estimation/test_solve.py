@@ -233,7 +233,7 @@ def test_motions_that_show_too_little_are_named(pattern, deviation_deg, noise):
 
 @pytest.mark.slow
 def test_general_motion_is_never_called_degenerate():
-    for seed in range(60):
+    for seed in range(20):
         rng = np.random.default_rng(seed)
         problem = hand_eye_problem(rng, int(rng.integers(5, 16)), robot_noise=NOISE)
         solved = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)

@@ -157,7 +157,7 @@ def test_the_error_that_the_model_leaves_is_not_taken_for_pixel_noise():
     assert noise is not None and noise.sigma_px[0] == pytest.approx(0.1, rel=0.15) and noise.inflation < 1.5
 
 
-SEEDS = range(6)
+SEEDS = range(2)
 
 
 @cache

@@ -316,7 +316,7 @@ def test_reprojections_and_poses_to_add_are_those_of_the_run(run: RunResult, pag
 
 @pytest.mark.parametrize(
     ("convention", "robot", "as_written"),
-    [("kuka", None, "kuka"), (None, "ur5e", "ur"), (None, "panda", "franka"), (None, None, "quat-xyzw")],
+    [("kuka", None, "kuka"), (None, "panda", "franka"), (None, None, "quat-xyzw")],
 )
 def test_poses_to_add_are_in_the_notation_of_the_robot(
     run: RunResult, convention: str | None, robot: str | None, as_written: str

@@ -11,7 +11,7 @@ import pytest
 from scipy.special import expit
 
 import analytic_scene
-from analytic_scene import BALL_CENTER, BALL_RADIUS, BOX_CENTER, BOX_HALF, WORKSPACE, signed_distance
+from analytic_scene import BALL_CENTER, BALL_RADIUS, BOX_CENTER, BOX_HALF, WORKSPACE, signed_distance, warmth
 from jcr.errors import InputError
 from jcr.records import PointCloud
 from jcr.scene.map_file import load_map
@@ -27,24 +27,6 @@ INSIDE_BOX = BOX_CENTER - [0, 0, 0.01]
 UNDER_TABLE = np.array([0.0, 0.0, -0.08])
 FREE_SPOT = np.array([0.0, 0.2, 0.15])
 OUTSIDE = np.array([2.0, 0.0, 0.1])
-
-
-@pytest.fixture(scope="module")
-def cloud() -> PointCloud:
-    return analytic_scene.cloud()
-
-
-def warmth(cloud: PointCloud) -> np.ndarray:
-    """A property of two numbers, for the door that any continuous property takes."""
-    x = cloud.points_in_base
-    return np.stack([20 + 30 * x[:, 0], x[:, 2] > 0.02], -1)
-
-
-@pytest.fixture(scope="module")
-def scene(cloud: PointCloud) -> "SceneMap":
-    from jcr.scene.build import build_scene
-
-    return build_scene(cloud, OPTIONS, values={"warmth": warmth(cloud)})
 
 
 def uniform(count: int, seed: int = 0) -> np.ndarray:

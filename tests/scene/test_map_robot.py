@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 import analytic_scene
-from analytic_scene import BALL_CENTER, WORKSPACE
+from analytic_scene import BALL_CENTER
 from jcr.errors import InputError
 from jcr.geometry import apply, transform
 from jcr.scene.cloud import write_cloud
-from jcr.scene.options import MapOptions
 from places import ROOT
 
 if TYPE_CHECKING:
@@ -57,13 +56,6 @@ def urdf(tmp_path_factory: pytest.TempPathFactory) -> Path:
     wedge.export(folder / "wedge.stl")
     (folder / "arm.urdf").write_text(URDF)
     return folder / "arm.urdf"
-
-
-@pytest.fixture(scope="module")
-def scene() -> "SceneMap":
-    from jcr.scene.build import build_scene
-
-    return build_scene(analytic_scene.cloud(), MapOptions(workspace=WORKSPACE))
 
 
 def shape_named(name: str) -> "trimesh.Trimesh":

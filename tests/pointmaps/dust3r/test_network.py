@@ -151,22 +151,3 @@ def test_bfloat16_stays_near_float32_and_returns_float32() -> None:
     error = (view.points - truth["pts3d"]).norm(dim=-1) / truth["pts3d"].norm(dim=-1)
     # Eight bits through 15 blocks leave a few percent where no training has taught the weights to be smooth.
     assert 0 < error.median() < 0.05
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [("head_type", "catmlp"), ("pos_embed", "cosine"), ("depth_mode", ["linear"]), ("patch_size", 14)],
-)
-def test_a_configuration_of_another_network_is_refused(field: str, value: object) -> None:
-    from jcr.pointmaps.dust3r.network import Dust3r
-
-    with pytest.raises(ValueError, match=field):
-        Dust3r(**{field: value})
-
-
-def test_an_image_that_is_no_whole_number_of_patches_is_refused() -> None:
-    import torch
-
-    _, network = fixture("tiny_linear_48x64_b1")
-    with pytest.raises(ValueError, match="multiples of 16"):
-        network.encode(torch.zeros(1, 3, 50, 64))

@@ -6,15 +6,12 @@ import pickle
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.hub import Weights
 from jcr.reconstruct import BACKENDS, ReconstructOptions, network_weights
-from jcr.records import Capture, Intrinsics
 
 if TYPE_CHECKING:
     import torch
@@ -274,33 +271,3 @@ def test_a_hub_id_comes_from_the_cache(
     assert weights.name == row.hub_id and weights.licence.startswith("CC BY-NC-SA 4.0")
     assert weights.path.name == row.revision
     assert_same_output(linear, load_weights(weights).network)
-
-
-def test_pairs_are_predicted_from_a_checkpoint_and_a_damaged_one_is_named(
-    tmp_path: Path, linear: "Dust3r"
-) -> None:
-    from jcr.pointmaps.dust3r.dust3r import predict_pairs, reconstruct_dust3r
-    from jcr.pointmaps.dust3r.pair_graph import complete_pairs
-    from jcr.pointmaps.grid import prepare_images
-
-    rng = np.random.default_rng(0)
-    names = tuple(f"{k}.png" for k in range(3))
-    for name in names:
-        Image.fromarray(rng.integers(0, 256, (60, 80, 3), dtype=np.uint8)).save(tmp_path / name)
-    capture = Capture(
-        folder=tmp_path,
-        images=names,
-        base_from_gripper=np.tile(np.eye(4), (3, 1, 1)),
-        image_size=(80, 60),
-        intrinsics=Intrinsics(70.0, 70.0, 39.5, 29.5, 80, 60),
-    )
-    weights = write_pth(tmp_path / "weights.pth", linear, LINEAR_MODEL)
-    images = prepare_images(capture)
-    pairs, notes = predict_pairs(load(weights), images, names, complete_pairs(3))
-    assert pairs.images == names and pairs.conf.shape == (6, 384, 512)
-    assert pairs.intrinsics is not None and pairs.intrinsics.cx == pytest.approx(255.5)
-    assert pairs.intrinsics.fx == pytest.approx(70 * 512 / 80)
-    assert notes == ()
-    weights.write_bytes(b"no weights")
-    with pytest.raises(InputError, match=str(weights)):
-        reconstruct_dust3r(capture, Weights(weights, str(weights), "unknown"), "cpu", "auto", "dust3r")
