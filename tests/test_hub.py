@@ -13,8 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from jcr.errors import InputError
-from jcr.reconstruct import BACKENDS, ReconstructOptions, network_weights
+from jcr.reconstruct import BACKENDS
 
 pytestmark = pytest.mark.slow  # processes
 COMMIT = BACKENDS["da3-small"].revision
@@ -159,22 +158,3 @@ def test_a_non_commercial_licence_is_accepted_first_and_once(hub: Hub, tmp_path:
     accepted = get(hub, tmp_path, "mast3r", "--accept-licence")
     assert accepted.returncode == 0, accepted.stderr
     assert get(hub, tmp_path, "mast3r").returncode == 0
-
-
-def test_a_run_without_weights_names_the_command_and_asks_no_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    import huggingface_hub
-
-    def fetch(*names: object, **options: object) -> None:
-        raise AssertionError("nothing is downloaded during a run")
-
-    for name in ("snapshot_download", "hf_hub_download"):
-        monkeypatch.setattr(huggingface_hub, name, fetch)
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", "/nowhere")
-    for options, command in (
-        (ReconstructOptions(backend="dust3r"), "jcr models get dust3r downloads"),
-        (ReconstructOptions(backend="da3"), "jcr models get da3 downloads"),
-        (ReconstructOptions(backend="mast3r", weights="owner/name"), "jcr models get owner/name downloads"),
-        (ReconstructOptions(backend="mast3r", weights="owner/name.pth"), "give a file, a folder or a hub id"),
-    ):
-        with pytest.raises(InputError, match=command):
-            network_weights(options)

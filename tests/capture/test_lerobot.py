@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import capture_writers as writers
 import jcr
 from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
-from jcr.records import Capture, Intrinsics
+from jcr.records import Capture
 from simulation.problems import HandEyeProblem, hand_eye_problem
 
 pytestmark = [
@@ -163,31 +162,6 @@ def test_what_is_not_in_the_set_is_listed(tmp_path: Path, small: Path, options: 
     with pytest.raises(jcr.InputError, match=words):
         jcr.read_capture(small, ReadOptions(**options), into=tmp_path / "frames")
     assert not (tmp_path / "frames").exists()
-
-
-def test_an_edited_set_or_camera_info_is_read_again(tmp_path: Path, small: Path, tabletop: Path):
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    path, into = shutil.copytree(small, tmp_path / "set"), tmp_path / "frames"
-    bundled = jcr.read_capture(tabletop)
-    intrinsics = Intrinsics(150.0, 150.0, 80.0, 60.0, 160, 120)
-    writers.write_camera_info(replace(bundled, intrinsics=intrinsics), tmp_path)
-    options = ReadOptions(frames=4, camera_info=tmp_path / "camera_info.yaml")
-    first = jcr.read_capture(path, options, into=into)
-    stamp = (into / first.images[0]).stat().st_mtime_ns
-    jcr.read_capture(path, options, into=into)
-    assert (into / first.images[0]).stat().st_mtime_ns == stamp
-    file = next(path.rglob("data/**/*.parquet"))
-    table = pq.read_table(file)
-    states = [[state[0] + 0.25, *state[1:]] for state in table[DROID].to_pylist()]
-    pq.write_table(table.set_column(table.column_names.index(DROID), DROID, pa.array(states)), file)
-    edited = jcr.read_capture(path, options, into=into)
-    moved = edited.base_from_gripper[:, :3, 3] - first.base_from_gripper[:, :3, 3]
-    np.testing.assert_allclose(moved, np.tile([0.25, 0, 0], (4, 1)), atol=1e-9)
-    writers.write_camera_info(replace(bundled, intrinsics=replace(intrinsics, fx=170.0)), tmp_path)
-    again = jcr.read_capture(path, options, into=into)
-    assert again.intrinsics is not None and again.intrinsics.fx == 170.0
 
 
 def test_damaged_sets_are_one_line(tmp_path: Path, small: Path, tabletop: Path):

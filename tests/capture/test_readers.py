@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 import capture_writers as writers
 import jcr
-from in_process import run_jcr
 from jcr.capture.controllers import CONVENTIONS, poses_from_numbers
 from jcr.capture.formats import colmap
 from jcr.capture.formats.table import read_pose_table
@@ -479,23 +478,6 @@ def test_what_is_no_capture_is_named_what_would_be_one(tmp_path: Path):
     with pytest.raises(jcr.InputError, match="give its format with --format") as caught:
         jcr.read_capture(tmp_path / "notes.md")
     assert all(name in str(caught.value) for name in FORMATS)
-
-
-@pytest.mark.slow
-def test_the_command_line_calibrates_samples(tmp_path: Path, problem: HandEyeProblem):
-    cameras = scale_translation(problem.recon_from_camera, problem.scale)
-    path = writers.write_easy_handeye2(tmp_path, problem.base_from_gripper, cameras)
-    done = run_jcr("calibrate", path, tmp_path / "out")
-    assert done.returncode == 0, done.stderr
-    assert "\nScale       1, as the marker's size says\n" in done.stdout
-    content = json.loads((tmp_path / "out" / "calibration.json").read_text())
-    assert np.abs(content["gripper_from_camera"] - problem.gripper_from_camera).max() < 1e-6
-    checked = run_jcr("check", path, "--json")
-    assert checked.returncode == 0 and json.loads(checked.stdout)["observability"]["observable"]
-    refused = run_jcr("run", path, tmp_path / "map")
-    assert (
-        refused.returncode == 2 and refused.stderr.startswith("error: ") and "jcr calibrate" in refused.stderr
-    )
 
 
 @pytest.mark.parametrize("text", ["9700000000000000000", "1e30", "0.58E58800781040842", "nan", "now"])

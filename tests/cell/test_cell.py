@@ -15,7 +15,7 @@ from jcr.calibration.checks.effects import effects
 from jcr.calibration.record import Calibration
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.formats.capture_json import read, write
-from jcr.cell.added import added_camera, read_added_cameras
+from jcr.cell.added import added_camera
 from jcr.cell.carried import eye_to_hand, refined
 from jcr.cell.images import CellImages
 from jcr.cell.placement import (
@@ -359,23 +359,6 @@ def test_cameras_that_cannot_be_are_refused_in_one_line(
     with pytest.raises(jcr.InputError, match=message) as refusal:
         read(folder)
     assert "\n" not in str(refusal.value)
-
-
-@pytest.mark.parametrize("name", ["cameras/cameras.json", "cameras.json"])
-@pytest.mark.parametrize("text", ["{", "7"])
-def test_a_damaged_file_of_the_run_is_refused(folder: Path, tmp_path: Path, name: str, text: str):
-    (folder / "capture.json").write_text(json.dumps(content()))
-    capture, run = read(folder), tmp_path / "run"
-
-    def read_it() -> object:
-        return read_cameras(run) if name == "cameras.json" else read_added_cameras(run, capture)
-
-    assert not read_it()
-    (run / name).parent.mkdir(parents=True)
-    (run / name).write_text(text)
-    with pytest.raises(jcr.InputError) as refusal:
-        read_it()
-    assert "\n" not in str(refusal.value) and "run" in str(refusal.value)
 
 
 def test_images_of_a_capture_that_changed_keep_their_places_by_name():

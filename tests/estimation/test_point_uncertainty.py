@@ -15,7 +15,6 @@ from jcr.estimation.point_uncertainty import (
     point_in_base,
     scene_points,
     scene_uncertainty,
-    seen_points,
     with_given_intrinsics,
     within_95,
 )
@@ -72,19 +71,6 @@ def test_covariance_of_a_seen_point_is_that_of_draws_of_all_that_places_it():
     in_camera = drawn @ x[:3, :3]
     for k, covariance in enumerate(point_covariance(x, uncertainty, camera, X_PX, DISTANCE_M)):
         assert np.cov(in_camera[:, k].T) == pytest.approx(covariance, abs=0.06 * np.trace(covariance))
-
-
-def test_intrinsics_and_transform_together_place_a_point_better_than_each_is_known():
-    x, uncertainty, camera, _ = estimated()
-    together = point_covariance(x, uncertainty, camera, X_PX[0], DISTANCE_M)
-    assert uncertainty.joint is not None
-    of_both = uncertainty.joint.covariance.copy()
-    of_both[:7, 7:] = of_both[7:, :7] = 0.0
-    apart = replace(uncertainty, joint=replace(uncertainty.joint, covariance=of_both))
-    assert np.trace(together) < 0.7 * np.trace(point_covariance(x, apart, camera, X_PX[0], DISTANCE_M))
-    found = seen_points(x, uncertainty, camera, DISTANCE_M)
-    assert found.within_95_mm == pytest.approx(1e3 * within_95(together))
-    assert found.lateral_95_mm < found.within_95_mm < found.corners.within_95_mm
 
 
 def test_errors_of_the_gripper_pose_stand_beside_those_of_the_calibration():

@@ -1,7 +1,5 @@
 """The calibration from poses: known answers, invariances, outliers, coverage, degenerate motions."""
 
-import time
-
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -257,14 +255,6 @@ def test_a_known_offset_cures_planar_motion_and_a_known_scale_cures_an_orbit():
         assert np.linalg.norm(error(problem, solved.gripper_from_camera, solved.scale)[:3]) < 5e-3
 
 
-def test_poses_that_belong_to_other_images_are_rejected():
-    rng = np.random.default_rng(12)
-    problem = hand_eye_problem(rng, 10)
-    solved = solve_hand_eye(problem.base_from_gripper[rng.permutation(10)], problem.recon_from_camera)
-    assert not solved.converged
-    assert "how the poses are written" in " ".join(solved.warnings)
-
-
 @pytest.mark.parametrize(
     ("gripper", "camera", "words"),
     [
@@ -279,15 +269,6 @@ def test_poses_that_belong_to_other_images_are_rejected():
 def test_what_cannot_be_poses_is_an_input_error(gripper, camera, words):
     with pytest.raises(jcr.InputError, match=words):
         solve_hand_eye(gripper, camera)
-
-
-def test_two_hundred_poses_take_seconds():
-    problem = hand_eye_problem(np.random.default_rng(3), 200, robot_noise=(5e-4, 1e-3))
-    start = time.process_time()
-    solved = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
-    assert time.process_time() - start < 5
-    off = error(problem, solved.gripper_from_camera, solved.scale)
-    assert (np.abs(off) < 4 * np.sqrt(np.diag(solved.covariance))).all()
 
 
 GROWTH = (3e-3, 3e-3)
@@ -319,13 +300,3 @@ def test_growing_errors_are_weighed_and_in_the_uncertainty():
         squared.append(float(off @ np.linalg.solve(solved.covariance[:6, :6], off)))
     assert np.median(metres[True]) < 0.5 * np.median(metres[False])
     assert np.median(squared) < 12.6 and max(squared) < 25
-
-
-def test_independent_errors_do_not_grow():
-    for seed in range(4):
-        problem = hand_eye_problem(
-            np.random.default_rng(seed), 24, robot_noise=(3e-4, 1e-3), camera_noise=(5e-4, 1e-3)
-        )
-        poses = problem.base_from_gripper, problem.recon_from_camera
-        plain, either = (solve_hand_eye(*poses, in_sequence=flag) for flag in (False, True))
-        assert np.array_equal(plain.covariance, either.covariance)

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 import analytic_scene
 import jcr
-from jcr.camera import project, unproject
+from jcr.camera import unproject
 from jcr.capture.images import read_image
 from jcr.cli import dispatch
 from jcr.errors import InputError, RejectedError
@@ -131,29 +131,6 @@ def test_ros_files_hold_the_transform_and_name_frames_and_units(name: str, doubt
     first = path.read_text()[:300]
     assert "optical in tool0" in first and "metres, radians" in first
     assert ("REJECTED: scale: every view" in first) == (doubt is not None)
-
-
-def test_camera_info_is_what_image_proc_reads():
-    intrinsics = Intrinsics(601.5, 602.5, 318.0, 244.0, 640, 480, (-0.2, 0.05, 1e-3, -2e-3, 0.01))
-    content = yaml.safe_load(ros.camera_info(replace(mount(), intrinsics=intrinsics)))
-    assert (content["image_width"], content["image_height"]) == (640, 480)
-    assert content["distortion_model"] == "plumb_bob"
-
-    def matrix(name: str) -> np.ndarray:
-        part = content[name]
-        return np.reshape(part["data"], (part["rows"], part["cols"]))
-
-    np.testing.assert_array_equal(matrix("camera_matrix"), intrinsics.matrix)
-    np.testing.assert_array_equal(
-        matrix("projection_matrix"), np.column_stack([intrinsics.matrix, np.zeros(3)])
-    )
-    np.testing.assert_array_equal(matrix("rectification_matrix"), np.eye(3))
-    # OpenCV, whose order of coefficients plumb_bob takes, projects where our camera model does.
-    x = np.array([[0.2, -0.15, 1.0]])
-    seen, _ = cv2.projectPoints(
-        x, np.zeros(3), np.zeros(3), matrix("camera_matrix"), matrix("distortion_coefficients")
-    )
-    np.testing.assert_allclose(seen[0, 0], project(intrinsics, x[0]), atol=1e-9)
 
 
 def test_files_name_the_intrinsics_that_their_transform_belongs_to(done: Path, tmp_path: Path):

@@ -155,18 +155,6 @@ def test_pointmaps_in_one_frame_keep_their_poses(
     assert result.intrinsics.cx == pytest.approx(2.5 * WIDTH + 2, abs=0.05)
 
 
-def test_a_distorted_intrinsics_is_used_with_intrinsics_and_given_up_without(
-    capture: Capture, truth: dict[str, Any]
-) -> None:
-    intrinsics = Intrinsics(600.0, 600.0, 320.0, 240.0, 640, 480, (-0.1, 0.02, 0.0, 0.0, 0.0))
-    distorted = replace(capture, intrinsics=intrinsics)
-    seen = np.array([truth["gt_focal"], truth["gt_focal"], WIDTH / 2, HEIGHT / 2])
-    arrays = pointmap_arrays(truth)
-    assert reconstructed(distorted, arrays | {"intrinsics": seen}).intrinsics == intrinsics
-    result = reconstructed(distorted, arrays)
-    assert result.intrinsics.distortion == (0.0,) * 5 and "distorted images" in result.warnings[0]
-
-
 def test_faults_in_a_file_are_named(capture: Capture, truth: dict[str, Any]) -> None:
     pairs, pointmaps = pair_arrays(truth), pointmap_arrays(truth)
     flipped = pointmaps["recon_from_camera"].copy()

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from scipy.spatial.transform import Rotation
 
 import jcr
@@ -28,8 +27,7 @@ from jcr.errors import RejectedError
 from jcr.estimation.observability import excitation
 from jcr.findings import no_reconstruction
 from jcr.geometry import inverse, transform
-from jcr.records import COVARIANCE_ORDER, BoardFound, Capture, CellCamera, Reconstruction, Tracks
-from jcr.report.details import details_section
+from jcr.records import COVARIANCE_ORDER, Capture, CellCamera, Reconstruction, Tracks
 from jcr.report.html import failed_report_html, report_html
 from jcr.report.images import MAGNIFIED
 from jcr.report.motion import excitation_bars
@@ -372,32 +370,6 @@ def test_numbers_have_two_digits_and_none_below_a_tenth_of_sigma():
         "0", "0", "0.012", "-0.50", "1.0", "12", "1234", "unknown",
     ]  # fmt: skip
     assert [decimals_of(std) for std in (2.8e-5, 0.021, 0.1, 3.0, 40.0, np.inf)] == [5, 2, 2, 0, 0, 0]
-
-
-def test_details_describe_the_board(run: RunResult, page: str):
-    info = yaml.safe_load(Elements(page).copied("camera_info"))
-    assert info["camera_matrix"]["data"][0] == pytest.approx(run.intrinsics.fx)
-    assert "13 unknowns were fitted" in page
-    board = BoardFound(
-        spec="chessboard:9x6:0.025",
-        bodies=1,
-        images=7,
-        corners=54,
-        side_mm=25.12,
-        side_std_mm=0.03,
-        stated_mm=25.0,
-        rms_px=0.1,
-        bend_mm=1.25,
-        centres_in_base=((0.5, 0.1, 0.0),),
-        tilts_deg=(0.4,),
-    )
-    details = details_section(replace(run.found, board=board), {}).content["blocks"]
-    assert details["Board"] == {
-        "chessboard:9x6:0.025": "54 corners in 7 images, 0.10 px rms per axis",
-        "side by the robot's positions": "25.12 ± 0.03 mm, 25 mm stated",
-        "lowest to highest corner": "1.2 mm",
-        "place": "(0.500, 0.100, 0.000) m in the base, 0.4° from horizontal",
-    }
 
 
 @pytest.fixture(scope="module")

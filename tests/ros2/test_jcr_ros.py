@@ -10,6 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -165,6 +166,15 @@ class Message(SimpleNamespace):
         return part
 
 
+class Module(ModuleType):
+    """Any module of ROS, in which every name is that of a message."""
+
+    def __getattr__(self, name: str) -> type[Message]:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return Message
+
+
 class FakeNode:
     """rclpy.node.Node, as far as the node uses it."""
 
@@ -173,13 +183,12 @@ class FakeNode:
     def __init__(self, name: str) -> None:
         self.subscriptions_made: dict[str, Callable[[Any], None]] = {}
         self.services: dict[str, Callable[[Any, Any], Any]] = {}
+        self.get_logger = self.get_clock = MagicMock()
 
     def declare_parameter(self, name: str, default: Any) -> Any:
         return SimpleNamespace(value=self.parameters.get(name, default))
 
-    def create_subscription(
-        self, kind: Any, topic: str, heard: Callable[[Any], None], qos: Any, **_: Any
-    ) -> str:
+    def create_subscription(self, kind: Any, topic: str, heard: Any, qos: Any, **_: Any) -> str:
         self.subscriptions_made[topic] = heard
         return topic
 
@@ -193,43 +202,33 @@ class FakeNode:
     def create_service(self, kind: Any, name: str, answer: Callable[[Any, Any], Any], **_: Any) -> None:
         self.services[name] = answer
 
-    def get_logger(self) -> Any:
-        return SimpleNamespace(info=lambda text: None, error=lambda text, **_: None)
 
-    def get_clock(self) -> Any:
-        return Message(now=lambda: Message(to_msg=Message))
-
-
-NAMES = {
-    "rclpy": (),
-    "rclpy.callback_groups": ("ReentrantCallbackGroup",),
-    "rclpy.executors": ("ExternalShutdownException", "MultiThreadedExecutor"),
-    "rclpy.node": (),
-    "rclpy.qos": ("qos_profile_sensor_data",),
-    "rclpy.time": ("Time",),
-    "tf2_ros": (),
-    "geometry_msgs.msg": ("PoseStamped", "TransformStamped"),
-    "sensor_msgs.msg": ("CameraInfo", "CompressedImage", "Image"),
-    "std_msgs.msg": ("String",),
-    "std_srvs.srv": ("Trigger",),
-}
-"""Modules of ROS that the node imports, and names in them for which any message will do."""
+MODULES = (
+    *(
+        "rclpy",
+        "rclpy.callback_groups",
+        "rclpy.executors",
+        "rclpy.node",
+        "rclpy.qos",
+        "rclpy.time",
+        "tf2_ros",
+    ),
+    *("geometry_msgs.msg", "sensor_msgs.msg", "std_msgs.msg", "std_srvs.srv"),
+)
+"""Modules of ROS that the node imports."""
 
 
 @pytest.fixture
 def node_module(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    for name in {*NAMES, *(name.partition(".")[0] for name in NAMES)}:
-        module = ModuleType(name)
-        vars(module).update(dict.fromkeys(NAMES.get(name, ()), Message))
-        monkeypatch.setitem(sys.modules, name, module)
+    for name in {*MODULES, *(name.partition(".")[0] for name in MODULES)}:
+        monkeypatch.setitem(sys.modules, name, Module(name))
     monkeypatch.delitem(sys.modules, "jcr_ros.node", raising=False)
     sent: list[Any] = []
-    vars(sys.modules["rclpy.node"]).update(Node=FakeNode)
+    sys.modules["rclpy.node"].Node = FakeNode  # type: ignore[attr-defined]
     vars(sys.modules["tf2_ros"]).update(
         Buffer=lambda: SimpleNamespace(lookup_transform=None),
         StaticTransformBroadcaster=lambda node: SimpleNamespace(sendTransform=sent.append, sent=sent),
         TransformException=KeyError,
-        TransformListener=lambda buffer, node: None,
     )
     return import_module("jcr_ros.node")
 

@@ -86,15 +86,6 @@ def test_distances_and_gradients_are_those_of_the_box_and_the_ball(scene: "Scene
     assert np.percentile(np.linalg.norm(sample.gradient, axis=1), 90) < 1.1
 
 
-def test_unknown_as_occupied_is_no_farther_than_unknown_as_free(scene: "SceneMap"):
-    x = uniform(50_000)
-    careful, bold = (scene.query(x, unknown=choice).distance for choice in ("occupied", "free"))
-    outside = bold > 0
-    assert (careful <= bold + scene.cell / 2)[outside].all()
-    assert (careful <= bold + 1e-6)[outside].mean() > 0.99
-    assert (careful[scene.query(x).unknown] < scene.cell).mean() > 0.99
-
-
 def test_spheres_touch_what_they_reach_and_nothing_else(scene: "SceneMap"):
     centers = uniform(100_000)
     radii = np.random.default_rng(1).uniform(0.005, 0.05, len(centers))
@@ -105,15 +96,6 @@ def test_spheres_touch_what_they_reach_and_nothing_else(scene: "SceneMap"):
     assert answer[seen & (true > radii + 0.006)].mean() < 0.001
     # To be careful frees nothing, but for the half cell that two distance grids may differ by.
     assert scene.check_spheres(centers, radii + scene.cell / 2)[answer].all()
-
-
-def test_spheres_come_in_any_batch(scene: "SceneMap"):
-    centers = uniform(24).reshape(2, 3, 4, 3)
-    flat = scene.check_spheres(centers.reshape(-1, 3), 0.03)
-    assert (scene.check_spheres(centers, 0.03) == flat.reshape(2, 3, 4)).all()
-    assert (scene.check_spheres(centers, np.full((3, 1), 0.03)) == flat.reshape(2, 3, 4)).all()
-    assert scene.check_spheres(centers[0, 0, 0], 0.03).shape == ()
-    assert scene.check_spheres(np.zeros((0, 3)), 0.03).shape == (0,)
 
 
 def test_a_segment_touches_where_its_middle_does(scene: "SceneMap"):

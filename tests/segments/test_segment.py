@@ -1,7 +1,6 @@
 """Segments and sizes: known tables with noise, and what users and networks may get wrong."""
 
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -438,18 +437,3 @@ def test_segment_anything_gives_distinct_masks_of_the_image(
     )
     assert labels.labels.max() == len(labels.names) - 1 > 0
     np.testing.assert_array_equal(labels.labels[0], labels.labels[1])
-
-
-@pytest.mark.slow
-def test_segment_anything_that_is_not_there_shows_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from jcr.segments.sam import load_sam
-
-    pytest.importorskip("transformers", reason="the extra `sam` is not installed")
-    with pytest.raises(InputError, match="config.json and model.safetensors"):
-        load_sam(str(tmp_path))
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(InputError, match="not on this machine; jcr models get owner/sam downloads them"):
-        load_sam("owner/sam")
-    monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(InputError, match=r"pip install 'jcr-handeye\[sam\]'"):
-        load_sam("facebook/sam2.1-hiera-tiny")
