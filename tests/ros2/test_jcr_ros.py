@@ -158,6 +158,9 @@ def test_an_image_gets_the_depth_of_its_own_stamp():
 class Message(SimpleNamespace):
     """Any message: parts are made when they are asked for."""
 
+    def __init__(self, *_: Any, **fields: Any) -> None:
+        super().__init__(**fields)
+
     def __getattr__(self, name: str) -> "Message":
         if name.startswith("__"):
             raise AttributeError(name)
