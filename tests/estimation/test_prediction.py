@@ -10,7 +10,6 @@ from benchmarks.coverage import FACTOR, predicted
 from jcr.calibration.record import read_calibration
 from jcr.calibration.requirement import better_poses, next_poses, predictions
 from jcr.calibration.robot_errors import errors_of
-from jcr.calibration.stage import calibrate_pose_pairs
 from jcr.estimation.prediction import assumed, predict, typical_camera
 from jcr.pipeline.check import check_capture
 from jcr.records import Intrinsics, NextPose
