@@ -131,8 +131,8 @@ RENDERED = (
     _case("a frame that is repeated", ONE_POSE, change=make.repeated(4, (5,)), wrong=(5,)),
     _case("objects pushed by 6 cm midway", scene=scenes.pushed),
     _case("a belt with most objects moves by 5 cm midway", SCENE, scene=scenes.belt),
-    _case("a display scrolls", SCENE, scene=scenes.display),
-    _case("an arm's link moves over the table", SCENE, scene=scenes.moving_link),
+    _case("a display scrolls", scene=scenes.display),
+    _case("an arm's link moves over the table", scene=scenes.moving_link),
     _case("the table is a regular tiling", SCENE, scene=scenes.tiled),
     *(
         _case(f"board: {what}", frozenset() if what == "right" else BOARD, scene=change, board=scenes.BOARD)

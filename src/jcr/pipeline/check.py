@@ -24,7 +24,6 @@ from jcr.calibration.requirement import (
 )
 from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
 from jcr.calibration.stage import calibrate_pose_pairs, checked_case, is_one
-from jcr.camera import fold_distance_px
 from jcr.capture.formats.table import OpenConventionError, possible_options
 from jcr.capture.images import brightness_and_sharpness, exposure_fault, read_image
 from jcr.capture.options import ReadOptions
@@ -174,7 +173,7 @@ def _remark_on_units(base_from_gripper: Float[ndarray, "n 4 4"]) -> list[str]:
 def _look(
     capture: Capture, views: tuple[Finding, ...]
 ) -> tuple[Int[ndarray, " c"], Float[ndarray, " n"], list[str]]:
-    """Return the rows of clear images, the relative sharpness of every image, and remarks on exposure and intrinsics."""
+    """Return the rows of clear images, the relative sharpness of every image, and remarks on exposure."""
     looks = [brightness_and_sharpness(read_image(capture.folder / name)) for name in capture.images]
     brightness, sharpness = np.array(looks).T
     blurred = {name for one in views if one.kind is FindingKind.BLURRED for name in one.images}
@@ -182,10 +181,6 @@ def _look(
     pairs = list(zip(capture.images, faults, strict=True))
     clear = np.flatnonzero([fault is None and name not in blurred for name, fault in pairs])
     remarks = [f"{name} is {fault}; expose it again" for name, fault in pairs if fault is not None]
-    if capture.intrinsics is not None and (fold := fold_distance_px(capture.intrinsics)) is not None:
-        remarks.append(
-            f"the stored distortion folds over at {fold:.0f} px from the centre; it will not be used"
-        )
     return clear, sharpness / max(float(np.median(sharpness)), 1e-9), remarks
 
 
