@@ -2,8 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from functools import cache
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import TypeVar, get_args, get_type_hints
 
 from jcr.errors import InputError, did_you_mean
 
@@ -20,39 +19,22 @@ def checked_options(options: object, kind: type[Options]) -> Options:
     if not isinstance(options, kind | Mapping):
         raise InputError(f"{options!r:.80}: give jcr.{kind.__name__}(...), not {type(options).__name__}")
     known = {field.name for field in fields(kind)}  # pyright: ignore[reportArgumentType]
-    given = dict(options) if isinstance(options, Mapping) else vars(options)
-    for name in given:
+    content, hints = dict(options if isinstance(options, Mapping) else vars(options)), get_type_hints(kind)
+    for name, value in content.items():
         if name not in known:
             raise InputError(
                 f"{kind.__name__}: no option {name!r}{did_you_mean(str(name), known)}; it has {', '.join(sorted(known))}"
             )
-    kinds = _kinds_of_records(kind)
-    content = {
-        name: checked_options(value, kinds[name]) if name in kinds and value is not None else value
-        for name, value in given.items()
-    }
-    from pydantic import ValidationError  # half a second, which the command line's help need not wait for
+        record = next(filter(is_dataclass, (hints[name], *get_args(hints[name]))), None)
+        if isinstance(record, type) and value is not None:
+            content[name] = checked_options(value, record)
+    from pydantic import TypeAdapter, ValidationError  # half a second, which the help need not wait for
 
     try:
-        return _adapter(kind).validate_python(content)
+        return TypeAdapter(kind).validate_python(content)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))
         allowed = str(first.get("ctx", {}).get("expected", "")).replace("'", "").replace(" or ", ", ")
         like = did_you_mean(str(first["input"]), allowed.split(", ")) if allowed else ""
         raise InputError(f"{kind.__name__}: {place}: {first['input']!r:.80}: {first['msg']}{like}") from None
-
-
-@cache
-def _kinds_of_records(kind: type) -> dict[str, type]:
-    """Return the fields that are records of options themselves, with their kinds."""
-    hints = get_type_hints(kind)
-    found = {name: next(filter(is_dataclass, (hint, *get_args(hint))), None) for name, hint in hints.items()}
-    return {name: record for name, record in found.items() if isinstance(record, type)}
-
-
-@cache
-def _adapter(kind: type) -> Any:
-    from pydantic import TypeAdapter
-
-    return TypeAdapter(kind)

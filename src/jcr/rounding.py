@@ -1,4 +1,4 @@
-"""Rounding of numbers for people."""
+"""Numbers and labelled lines for people."""
 
 import numpy as np
 
@@ -26,3 +26,8 @@ def significant(value: float, digits: int = 2) -> str:
         return "0"
     decimals = digits - 1 - int(np.floor(np.log10(abs(value))))
     return f"{value:.{min(max(decimals, 0), 6)}f}"
+
+
+def labelled(label: str, *lines: str) -> list[str]:
+    """Return lines behind a label in a column of 12 characters."""
+    return [f"{label if k == 0 else '':<12}{line}" for k, line in enumerate(lines)]

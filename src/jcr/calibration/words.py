@@ -20,7 +20,7 @@ from jcr.findings import (
     without_consequences,
 )
 from jcr.records import BoardFound, Budget, LeaveOneOut, SeenAndCorners, WithGivenIntrinsics, share_of
-from jcr.rounding import significant, with_std
+from jcr.rounding import labelled, significant, with_std
 
 NEGLIGIBLE = 0.02
 """Share of the largest part of a budget below which a part is left out: its square is 0.04 % of the whole."""
@@ -37,11 +37,6 @@ PARTS = {
     "faults found": "faults",
 }
 """Parts of a budget by their names for people."""
-
-
-def labelled(label: str, *lines: str) -> list[str]:
-    """Return lines behind a label in a column of 12 characters."""
-    return [f"{label if k == 0 else '':<12}{line}" for k, line in enumerate(lines)]
 
 
 def verdict_in_words(findings: Iterable[Finding]) -> str:

@@ -34,14 +34,14 @@ class Convention:
     """Names of its numbers, in order: position first, unless it is a whole matrix."""
     rotation: str
     """Notation after the position: one of QUATERNIONS, `rotvec`, or SciPy's order of Euler angles, lower case about
-    fixed axes, upper case about moving ones; `rows` or `columns` of a whole matrix."""
+    fixed axes, upper case about moving ones; `matrix` of a whole matrix."""
     length: str = "m"
     angle: str = "rad"
 
     @property
     def has_angles(self) -> bool:
         """Presence of angles, which have a unit."""
-        return self.rotation not in (*QUATERNIONS, "rows", "columns")
+        return self.rotation not in (*QUATERNIONS, "matrix")
 
     def units(self, asked: UnitsName = "auto") -> tuple[str, str]:
         """Return the names of the units of positions and angles, the convention's own or the given: ("mm", "deg")."""
@@ -58,17 +58,16 @@ _XYZ = ("x", "y", "z")
 _XYZW, _WXYZ = ("qx", "qy", "qz", "qw"), ("qw", "qx", "qy", "qz")
 _VECTOR, _RPY = ("rx", "ry", "rz"), ("roll", "pitch", "yaw")
 _ROWS = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
-_COLUMNS = tuple(f"m{row}{column}" for column in range(4) for row in range(4))
 
 # "xyz" about fixed axes is Rz(yaw)·Ry(pitch)·Rx(roll); "ZYX" about moving ones is Rz(A)·Ry(B)·Rx(C).
 CONVENTIONS = {
-    "matrix": Convention(_ROWS, "rows"),
+    "matrix": Convention(_ROWS, "matrix"),
     "quat-xyzw": Convention(_XYZ + _XYZW, "xyzw"),
     "quat-wxyz": Convention(_XYZ + _WXYZ, "wxyz"),
     "rotation-vector": Convention(_XYZ + _VECTOR, "rotvec"),
     "rpy": Convention(_XYZ + _RPY, "xyz"),
     "ur": Convention(_XYZ + _VECTOR, "rotvec"),
-    "franka": Convention(_COLUMNS, "columns"),
+    "franka": Convention(tuple(f"m{row}{column}" for column in range(4) for row in range(4)), "matrix"),
     "xarm": Convention(_XYZ + _RPY, "xyz", "mm", "deg"),
     "xarm-axis-angle": Convention(_XYZ + _VECTOR, "rotvec", "mm", "deg"),
     "kuka": Convention((*_XYZ, "a", "b", "c"), "ZYX", "mm", "deg"),
@@ -101,9 +100,9 @@ def numbers_from_poses(
     form = CONVENTIONS[convention]
     position_unit, angle_unit = form.scales(units)
     position = base_from_gripper[:, :3, 3] / position_unit
-    if form.rotation in ("rows", "columns"):
-        matrices = transform(base_from_gripper[:, :3, :3], position)
-        return (np.swapaxes(matrices, 1, 2) if form.rotation == "columns" else matrices).reshape(-1, 16)
+    if form.rotation == "matrix":
+        cells = transform(base_from_gripper[:, :3, :3], position).reshape(-1, 16)
+        return cells[:, [_ROWS.index(name) for name in form.columns]]
     rotation = Rotation.from_matrix(base_from_gripper[:, :3, :3])
     if form.rotation in QUATERNIONS:
         order = np.argsort(QUATERNIONS[form.rotation])
@@ -137,9 +136,11 @@ def checked_rows(
     unusable = np.asarray(~(np.abs(numbers) < HUGE).all(axis=1))
     faults = {k: f"{names[k]} {text}" for k in np.flatnonzero(unusable).tolist()}
     numbers = np.where(unusable[:, None], 0.0, numbers)
-    is_matrix, rest = form.rotation in ("rows", "columns"), numbers[:, 3:].copy()
-    poses = numbers.reshape(-1, 4, 4) if is_matrix else transform(np.eye(3), numbers[:, :3])
-    poses = np.swapaxes(poses, 1, 2).copy() if form.rotation == "columns" else poses
+    is_matrix, rest = form.rotation == "matrix", numbers[:, 3:].copy()
+    if is_matrix:
+        poses = numbers[:, [form.columns.index(name) for name in _ROWS]].reshape(-1, 4, 4)
+    else:
+        poses = transform(np.eye(3), numbers[:, :3])
     poses[:, :3, 3] *= per_m
     faults |= far_faults(poses[:, :3, 3], where, names)
     _require_units(poses[:, :3, 3], rest, form, units, where)

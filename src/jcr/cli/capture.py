@@ -4,6 +4,7 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,19 +12,29 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from jcr.capture.options import ConventionName, UnitsName
+from jcr.capture.plain_files import read_json, validated_content
 from jcr.cli.output import Output
 from jcr.errors import InputError
 from jcr.estimation.arms import CHOICES, ROBOT_NAMES, RobotName, arm_named
-from jcr.live.cameras import CameraOptions
-from jcr.live.session import LEAST_IMAGES, SessionOptions
+from jcr.files import locked
+from jcr.live.cameras import CameraOptions, open_camera
+from jcr.live.progress import Notation
+from jcr.live.robot import (
+    HELP,
+    KINDS,
+    RobotState,
+    States,
+    address_of,
+    states_of,
+    typed_poses,
+    without_commands,
+)
+from jcr.live.session import LEAST_IMAGES, Answer, LiveSession, SessionOptions
+from jcr.records.capture_json import IntrinsicsEntry
+from jcr.rounding import labelled
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from jcr.live.robot import States
     from jcr.live.server import LiveServer
-    from jcr.live.session import Answer, LiveSession
-    from jcr.records.capture_json import IntrinsicsEntry
     from jcr.result import RunResult
 
 
@@ -92,14 +103,9 @@ class CaptureCommand:
 
 def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
     """Take images until there are enough, or the calibration is as accurate as required; calibrate all of them."""
-    from jcr.files import locked
     from jcr.live.calibration import LiveCalibration
-    from jcr.live.cameras import open_camera
     from jcr.live.folder import LiveFolder
-    from jcr.live.progress import Notation
-    from jcr.live.robot import KINDS, address_of, states_of
     from jcr.live.server import Listen, LiveServer
-    from jcr.live.session import LiveSession
 
     options, token = arguments.session, arguments.token or os.environ.get("JCR_TOKEN") or None
     if options.until_accurate and options.require is None:
@@ -112,7 +118,7 @@ def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
         raise InputError(f"--poses {arguments.poses}: give ur:HOST, franka:HOST, xarm:HOST, typed or http")
     answers: list[Answer] = []
 
-    def tell(answer: "Answer", lines: list[str]) -> None:
+    def tell(answer: Answer, lines: list[str]) -> None:
         """Print lines, and keep the answer for --json."""
         answers.append(answer)
         _print("\n".join(lines))
@@ -141,7 +147,7 @@ def _conclude(
     arguments: CaptureCommand, facts: dict[str, Any], result: "RunResult | None", requirement_met: bool
 ) -> int:
     """Print the result and the next command; return 3 where it is rejected or not what `--until-accurate` requires."""
-    from jcr.calibration.words import labelled, summary
+    from jcr.calibration.words import summary
 
     out, images, lines = facts["capture"], len(facts["images"]), list[str]()
     is_accepted, is_met = False, False
@@ -168,11 +174,9 @@ def _print(text: str) -> None:
 
 
 def _source(
-    arguments: CaptureCommand, session: "LiveSession", states: "States | None", server: "LiveServer"
-) -> "Callable[[], None]":
+    arguments: CaptureCommand, session: LiveSession, states: States | None, server: "LiveServer"
+) -> Callable[[], None]:
     """Return the function that requests images where `--poses` says; read typed commands."""
-    from jcr.live.robot import HELP, RobotState, typed_poses, without_commands
-
     lines = without_commands(sys.stdin, session.press)
     if sys.stdin.isatty():
         _print(HELP)
@@ -193,11 +197,8 @@ def _source(
     return lambda: server.await_samples(arguments.timeout)
 
 
-def _intrinsics(file: Path | None) -> "IntrinsicsEntry | None":
+def _intrinsics(file: Path | None) -> IntrinsicsEntry | None:
     """Return the intrinsics in a JSON file; raise InputError where it has none."""
-    from jcr.capture.plain_files import read_json, validated_content
-    from jcr.records.capture_json import IntrinsicsEntry
-
     if file is None:
         return None
     content = read_json(file)

@@ -12,13 +12,15 @@ from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output, VerboseOutput, numbers
 from jcr.cli.run import looked_at, require_images
 from jcr.errors import InputError
+from jcr.findings import sentence, warnings_of
 from jcr.pipeline.options import VerifyOptions
 from jcr.progress import progress_bars
+from jcr.records import Capture, PosePairs
+from jcr.rounding import labelled, significant
 
 if TYPE_CHECKING:
     from jcr.pipeline.check import Examination
     from jcr.pipeline.verify import Verification
-    from jcr.records import Capture, PosePairs
 
 UNLIKELY = 1e-3
 """Largest p-value of a difference that the reported errors do not explain."""
@@ -97,13 +99,10 @@ def read_arguments(read: ReadOptions) -> list[str]:
 
 
 def _check_lines(
-    command: CheckCommand, capture: "Capture | PosePairs", read: ReadOptions, found: "Examination"
+    command: CheckCommand, capture: Capture | PosePairs, read: ReadOptions, found: "Examination"
 ) -> list[str]:
     """Return the verdict with its cause and remedy, or with what a calibration is expected to reach."""
-    from jcr.calibration.words import MOST_LINES, actions, labelled, verdict_in_words
-    from jcr.findings import sentence
-    from jcr.records import PosePairs
-    from jcr.rounding import significant
+    from jcr.calibration.words import MOST_LINES, actions, verdict_in_words
 
     about = f"{len(capture)} samples with the poses of gripper and camera, no images"
     if not isinstance(capture, PosePairs):
@@ -136,9 +135,7 @@ def _check_lines(
 
 def _expected(images: int, found: "Examination") -> list[str]:
     """Return the accuracy that the calibration is expected to report, and how well poses and images agree."""
-    from jcr.calibration.words import labelled
     from jcr.pipeline.check import QUICK
-    from jcr.rounding import significant
 
     lines, fitted = list[str](), found.hand_eye
     if found.expected is not None and (seen := found.expected.seen) is not None:
@@ -161,10 +158,9 @@ def _expected(images: int, found: "Examination") -> list[str]:
     return lines
 
 
-def _check_facts(capture: "Capture | PosePairs", found: "Examination") -> dict[str, Any]:
+def _check_facts(capture: Capture | PosePairs, found: "Examination") -> dict[str, Any]:
     """Return the result of the check for JSON."""
     from jcr.calibration.record import as_json, mm_and_deg
-    from jcr.findings import warnings_of
 
     noise = None if found.hand_eye is None else found.hand_eye.robot_noise
     seen = None if found.expected is None else found.expected.seen
@@ -214,7 +210,6 @@ class CompareCommand:
     def main(self) -> int:
         """Print the difference, whether the reported errors explain it, and the causes that would."""
         from jcr.calibration.difference import difference, read_hand_eye
-        from jcr.calibration.words import labelled
 
         known = {path: read_hand_eye(path) for path in (self.out, self.reference)}
         found = difference(known[self.out], known[self.reference])
@@ -292,8 +287,6 @@ class VerifyCommand:
 
 def _drift_lines(found: "Verification", verbose: bool) -> list[str]:
     """Return the verdict on one camera, the remedy, the drift with its standard deviation, and warnings."""
-    from jcr.calibration.words import labelled
-
     drift = f"{1e3 * found.drift_m:.2f} mm, {np.degrees(found.drift_rad):.3f}° from the calibration"
     mm, mm_std = (numbers(1e3 * part[:3], 2) for part in (found.offset, found.std))
     deg, deg_std = (numbers(np.degrees(part[3:]), 3) for part in (found.offset, found.std))
@@ -348,7 +341,6 @@ class TouchCommand:
 
     def main(self) -> int:
         """Print the verdict, then each error beside what was expected."""
-        from jcr.calibration.words import labelled
         from jcr.pipeline.touch import touch
 
         found = touch(self.out, self.points)

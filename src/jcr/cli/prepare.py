@@ -156,11 +156,9 @@ class ModelsCommand:
                 f"{'':<12} scale: {scale}; here: {present}",
                 *([f"{'':<12} accuracy: {row.accuracy}"] if row.accuracy else []),
             ]
+            own = {name: getattr(row, name) for name in ("licence", "commercial", "accuracy", "download_gb")}
             fact = {"backend": row.name, "weights": row.hub_id, "scale": scale, "present": present}
-            fact |= {
-                name: getattr(row, name) for name in ("licence", "commercial", "accuracy", "download_gb")
-            }
-            facts.append(fact | {"parameters_m": row.parameters})
+            facts.append(fact | own | {"parameters_m": row.parameters})
         self.output.result(lines, {"models": facts})
         return 0
 

@@ -18,16 +18,16 @@ from jcr.cli.output import Output, VerboseOutput
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError, RejectedError
 from jcr.pipeline.options import BatchOptions
-from jcr.progress import progress_bars
+from jcr.progress import Progress, progress_bars
 from jcr.reconstruct import ReconstructOptions
+from jcr.records import Capture, PosePairs
+from jcr.rounding import labelled, significant
 from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
 if TYPE_CHECKING:
     from jcr.cell.placement import CameraPlacement
     from jcr.pipeline.batch import BatchRow
-    from jcr.progress import Progress
-    from jcr.records import Capture, PosePairs
     from jcr.result import RunOptions, RunResult
 
 
@@ -56,9 +56,7 @@ class CalibrateCommand:
     def main(self) -> int:
         """Calibrate and print the result."""
         from jcr.calibration.stage import is_one
-        from jcr.calibration.words import labelled
         from jcr.pipeline.run import calibrate_poses
-        from jcr.records import PosePairs
 
         with progress_bars() as progress:
             capture = _source(self, progress)
@@ -96,8 +94,6 @@ class RunCommand(CalibrateCommand):
 
     def main(self) -> int:
         """Run every stage and print the result."""
-        from jcr.calibration.words import labelled
-
         options = run_options(self, map=None if self.no_map else self.map)
         with progress_bars() as progress:
             found = _source(self, progress)
@@ -202,16 +198,8 @@ def run_options(arguments: Any, **chosen: Any) -> "RunOptions":
     return RunOptions(**given | chosen)
 
 
-def _announce(path: Path) -> None:
-    """Report that the command has started, before the packages that read images are imported."""
-    if sys.stderr.isatty() and path.exists():
-        sys.stderr.write(f"reading {path}\n")
-        sys.stderr.flush()
-
-
-def _source(command: CalibrateCommand, progress: "Progress") -> "Capture | PosePairs":
+def _source(command: CalibrateCommand, progress: Progress) -> Capture | PosePairs:
     """Read the capture of a command; the frames of a recording are put in the run folder."""
-    _announce(command.capture)
     from jcr.capture.read import read_source
     from jcr.files import locked
     from jcr.result import CAPTURE
@@ -224,29 +212,26 @@ def _source(command: CalibrateCommand, progress: "Progress") -> "Capture | PoseP
 def looked_at(
     path: Path,
     options: ReadOptions,
-    progress: "Progress",
+    progress: Progress,
     read: Callable[..., Any] | None = None,
     **more: Any,
 ) -> Iterator[Any]:
     """Read what lies at a path with `read`, by default read_source; the frames of a recording vanish afterwards."""
-    _announce(path)
     from jcr.capture.read import read_source
 
     with tempfile.TemporaryDirectory(prefix="jcr-capture-") as scratch:
         yield (read or read_source)(path, options, into=scratch, progress=progress, **more)
 
 
-def require_images(found: "Capture | PosePairs", path: Path, needed: str) -> "Capture":
+def require_images(found: Capture | PosePairs, path: Path, needed: str) -> Capture:
     """Return the capture; raise InputError, which ends with `needed`, where there are poses alone."""
-    from jcr.records import PosePairs
-
     if isinstance(found, PosePairs):
         raise InputError(f"{path}: gives poses and no images, {needed}")
     return found
 
 
 def _run(
-    command: CalibrateCommand, capture: "Capture", options: "RunOptions", progress: "Progress"
+    command: CalibrateCommand, capture: Capture, options: "RunOptions", progress: Progress
 ) -> "RunResult":
     """Run a capture, and print the calibration as soon as it stands.
 
@@ -274,12 +259,12 @@ def _run(
     return result
 
 
-def show_calibration(result: "RunResult", capture: "Capture | PosePairs", output: VerboseOutput) -> None:
+def show_calibration(result: "RunResult", capture: Capture | PosePairs, output: VerboseOutput) -> None:
     """Print the summary as soon as the calibration stands, with what was noted when the capture was read.
 
     With --json all comes at the end.
     """
-    from jcr.calibration.words import MOST_LINES, labelled, summary
+    from jcr.calibration.words import MOST_LINES, summary
 
     if not output.json:
         others = 0 if result.cameras is None else len(result.cameras.cameras)
@@ -297,7 +282,7 @@ def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
     These are further cameras, `more` lines, the report and the next command; with --verbose the details; with --json
     everything at once.
     """
-    from jcr.calibration.words import details, labelled
+    from jcr.calibration.words import details
 
     content, cameras, out = result.calibration, result.cameras, result.out
     placed = [] if cameras is None else cameras.cameras
@@ -317,8 +302,6 @@ def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
 
 def _camera_in_words(camera: "CameraPlacement") -> str:
     """Return the verdict on a further camera, with its uncertainty or the reason, in one line."""
-    from jcr.rounding import significant
-
     if camera.doubt is not None or camera.uncertainty is None:
         return f"{camera.name}: REJECTED: {camera.doubt}"
     stds = camera.uncertainty.translation_std_mm, camera.uncertainty.rotation_std_deg

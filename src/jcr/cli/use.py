@@ -16,6 +16,7 @@ from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output, warn
 from jcr.errors import InputError, RejectedError
 from jcr.export.options import ExportName, ExportOptions
+from jcr.extras import extra
 from jcr.files import write_bytes, write_text
 from jcr.progress import progress_bars
 from jcr.scene.options import CloudOptions, MapOptions
@@ -299,7 +300,6 @@ class ViewCommand:
 
     def main(self) -> int:
         """Serve the page until Ctrl-C."""
-        from jcr.extras import extra
         from jcr.result import load_run
 
         run = load_run(self.out)  # raises at once where there is none
