@@ -42,26 +42,13 @@ def parsed(record: Any, program: str, arguments: Sequence[str]) -> Any:
         return tyro.cli(record, prog=program, args=list(arguments), config=CONFIGURATION)
 
 
-class _Help(io.StringIO):
-    """Text that is printed later; it counts as a terminal where the output is one, for its colours."""
-
-    def __init__(self, output: Any) -> None:
-        super().__init__()
-        self.output = output
-
-    def __getattribute__(self, name: str) -> Any:
-        """Return an attribute; the encoding, by which tyro draws boxes, is that of the output."""
-        return self.output.encoding if name == "encoding" else super().__getattribute__(name)
-
-    def isatty(self) -> bool:
-        """Test whether the output is a terminal."""
-        return self.output.isatty()
-
-
 @contextmanager
 def _wrapped_paragraphs() -> Iterator[None]:
     """Wrap the paragraphs of the help at words; tyro 1.0 prints each as one line."""
-    width, printed = min(shutil.get_terminal_size().columns, WIDEST), _Help(sys.stdout)
+    width, output = min(shutil.get_terminal_size().columns, WIDEST), sys.stdout
+    # By these two tyro chooses the characters of its boxes, and colours.
+    like_output = {"encoding": output.encoding, "isatty": output.isatty}
+    printed = type("Help", (io.StringIO,), like_output)()
     try:
         with redirect_stdout(printed):
             yield
@@ -69,7 +56,7 @@ def _wrapped_paragraphs() -> Iterator[None]:
         lines = printed.getvalue().split("\n")
         wrapped = (textwrap.fill(line, width) if line[:1].isalpha() else line for line in lines)
         if printed.getvalue():  # an output without room fails even for nothing
-            sys.stdout.write("\n".join(wrapped))
+            output.write("\n".join(wrapped))
 
 
 def write_completion(records: Mapping[str, type], arguments: Sequence[str]) -> None:

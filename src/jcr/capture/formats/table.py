@@ -243,14 +243,9 @@ def _read_rows(file: Path) -> tuple[Sequence[str] | None, Sequence[Sequence[Any]
     lines = [line for line in lines if not line.startswith("#")]
     if any(map(_UR_POSE.search, lines)):
         return _rows_of_ur(file, lines)
-    separator = next((mark for mark in "\t;," if lines and mark in lines[0]), None)
+    separator = next((mark for mark in "\t;," if lines and mark in lines[0]), " ")
     try:
-        rows = [
-            line.split()
-            if separator is None
-            else next(csv.reader([line], delimiter=separator, skipinitialspace=True))
-            for line in lines
-        ]
+        rows = [next(csv.reader([line], delimiter=separator, skipinitialspace=True)) for line in lines]
     except csv.Error as error:
         raise InputError(f"{file}: not a table ({error}); save it as CSV") from None
     rows = [[cell.strip().strip('"') for cell in row] for row in rows]
