@@ -14,7 +14,7 @@ from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import TfTree, speed
 from jcr.capture.recording import Picture, Recording, capture_of_recording, chosen_name
 from jcr.capture.ros import image_of, intrinsics_of_ros, read_camera_info, read_ros_depth
-from jcr.capture.urdf_chain import JointSamples, RecordedArm, read_arm
+from jcr.capture.urdf_chain import read_arm
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.progress import Progress
@@ -50,7 +50,9 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
             poses_at = bag.tree.poses_at(options.base_frame, options.gripper_frame, path)
         else:
             arm = read_arm(options)
-            samples = _samples(arm, bag.joint_states, path)
+            arm.columns(list(bag.joints), str(path))
+            ordered = [dict(sorted(bag.joints[name].items())) for name in arm.joints]
+            samples = [(np.array([*one]), np.array([*one.values()])) for one in ordered]
             poses_at = partial(arm.poses_at, samples)
             joints = arm.angles(arm.interpolated(samples, stamps)[0])
         poses, gap_ns = poses_at(stamps)
@@ -77,8 +79,8 @@ class _Bag:
         self.reader, self.path, self.tree = reader, path, TfTree()
         self.stamp_ns, self.log_ns = list[int](), list[int]()
         """Stamps of the images, and the times at which they were recorded."""
-        self.joint_states = list[tuple[int, list[str], Any]]()
-        """Stamp (ns), names and positions of each message."""
+        self.joints = dict[str, dict[int, float]]()
+        """Positions of each joint by their stamps (ns)."""
         self.camera_info: Any = None
         self.topic = topic = _camera_topic(reader, options, path)
         self.images = [c for c in reader.connections if c.topic == topic]
@@ -94,7 +96,8 @@ class _Bag:
                 if kind in TF:
                     self.tree.add(message.transforms, static=connection.topic.endswith("tf_static"))
                 elif kind == JOINTS:
-                    self.joint_states.append((_stamp(message, at), message.name, message.position))
+                    for name, value in zip(message.name, message.position, strict=False):
+                        self.joints.setdefault(name, {}).setdefault(_stamp(message, at), float(value))
                 elif kind == INFO:
                     self.camera_info = self.camera_info or message
                 else:
@@ -194,20 +197,6 @@ def _pose_connections(reader: Any, options: ReadOptions, path: Path) -> list[Any
     topics = sorted({c.topic for c in reader.connections if c.msgtype == JOINTS})
     topic = chosen_name(topics, options.joint_topic, topics, f"{path}: the joint states", "--joint-topic")
     return [c for c in reader.connections if c.topic == topic]
-
-
-def _samples(arm: RecordedArm, joint_states: list[tuple[int, list[str], Any]], path: Path) -> JointSamples:
-    """Return the stamps and positions of each joint of the arm, in order of time."""
-    found: dict[str, dict[int, float]] = {}
-    for stamp, names, values in joint_states:
-        for name, value in zip(names, values, strict=False):
-            found.setdefault(name, {}).setdefault(stamp, float(value))
-    arm.columns(list(found), str(path))
-    ordered = [sorted(found[joint].items()) for joint in arm.joints]
-    return [
-        (np.array([stamp for stamp, _ in of_joint]), np.array([value for _, value in of_joint]))
-        for of_joint in ordered
-    ]
 
 
 def _stamp(message: Any, log_ns: int) -> int:
