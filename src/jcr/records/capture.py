@@ -11,7 +11,6 @@ from numpy import ndarray
 from pydantic import ConfigDict, Field, model_validator
 
 from jcr.records.json_fields import Positive, Spread
-from jcr.records.notebook import table
 
 DistortionModel = Literal["pinhole", "rational", "thin_prism", "fisheye"]
 COEFFICIENTS: dict[DistortionModel, tuple[str, ...]] = {
@@ -154,23 +153,6 @@ class Capture:
             depths=None if self.depths is None else tuple(self.depths[row] for row in chosen),
             others=(),
         )
-
-    def _repr_html_(self) -> str:
-        """Return a table for notebooks."""
-        width, height = self.image_size
-        centres = self.base_from_gripper[:, :3, 3]
-        camera = "to be estimated"
-        if (given := self.intrinsics) is not None:
-            camera = f"{given.model}, fx {given.fx:.1f}, fy {given.fy:.1f}, cx {given.cx:.1f}, cy {given.cy:.1f} px"
-        rows = [
-            ("images", f"{len(self)} of {width} x {height} px"),
-            ("intrinsics", camera),
-            ("gripper positions", " x ".join(f"{side:.3f}" for side in np.ptp(centres, axis=0)) + " m"),
-            ("robot", self.robot or str(self.urdf or "not named")),
-            ("joint angles", "none" if self.joints is None else f"{self.joints.shape[1]} a pose"),
-            ("further cameras", ", ".join(camera.name for camera in self.others) or "none"),
-        ]
-        return table(f"capture {self.source or self.folder}", rows, "; ".join(self.notes))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,6 @@ from torch import Tensor
 from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.geometry import apply, require_rigid
-from jcr.records.notebook import table
 from jcr.scene.distance import DistanceGrid, distance_grid
 from jcr.scene.fields import Field, Fields, FieldShape, Lattice, in_chunks
 from jcr.scene.robot import JointValues, RobotSpheres, load_robot
@@ -154,18 +153,6 @@ class SceneMap:
         self.fields.expand("occupancy")
         self._distance: dict[str, DistanceGrid] = {}
         self._lock = threading.Lock()
-
-    def _repr_html_(self) -> str:
-        """Return a table for notebooks."""
-        lower, upper = self.box.round(3).tolist()
-        rows = [
-            ("workspace", f"{lower} to {upper} m, base frame"),
-            ("cell", f"{1e3 * self.cell:.1f} mm"),
-            ("properties", ", ".join(self.properties)),
-            ("labels", ", ".join(self.label_names)),
-            *self.history.items(),
-        ]
-        return table("map", rows)
 
     @property
     def box(self) -> Float[ndarray, "2 3"]:
