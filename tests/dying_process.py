@@ -3,22 +3,25 @@
 import json
 import os
 import shutil
+from pathlib import Path
 
-from jcr.pipeline.batch import BatchRow, Task
+from jcr.capture.options import ReadOptions
+from jcr.pipeline.batch import BatchRow
+from jcr.result import RunOptions
 
 
-def dies_on_bad(task: Task) -> BatchRow:
+def dies_on_bad(capture: Path, out: Path, options: RunOptions, read: ReadOptions) -> BatchRow:
     """End this process as the system ends one that is short of memory."""
-    if task.capture.name == "bad":
+    if capture.name == "bad":
         os._exit(9)
-    return BatchRow(capture=str(task.capture), out=str(task.out), status="accepted", offset_std_mm=1.0)
+    return BatchRow(capture=str(capture), out=str(out), status="accepted", offset_std_mm=1.0)
 
 
-def copies_a_run(task: Task) -> BatchRow:
+def copies_a_run(capture: Path, out: Path, options: RunOptions, read: ReadOptions) -> BatchRow:
     """Copy the run folder that the capture names; in the last of three episodes the camera is moved by 20 mm."""
-    shutil.copytree(task.capture, task.out)
-    file = task.out / "calibration.json"
+    shutil.copytree(capture, out)
+    file = out / "calibration.json"
     content = json.loads(file.read_text())
-    content["gripper_from_camera"][0][3] += 0.02 * (task.read.episode == (2,))
+    content["gripper_from_camera"][0][3] += 0.02 * (read.episode == (2,))
     file.write_text(json.dumps(content))
-    return BatchRow(capture=str(task.capture), out=str(task.out), status="accepted")
+    return BatchRow(capture=str(capture), out=str(out), status="accepted")

@@ -81,11 +81,11 @@ def auto_result(
         return reconstruction(options.backend, answer, observations)
 
     monkeypatch.setattr(selection, "reconstruct", answered)
-    choice = selection.select_reconstruction(capture_of(problem.base_from_gripper), RunOptions())
-    assert [attempt.backend for attempt in choice.attempts] == tried
-    kept = [attempt for attempt in choice.attempts if attempt.why_not is None]
-    assert [attempt.backend for attempt in kept] == [choice.reconstruction.backend]
-    return choice.reconstruction, tried
+    made, found = selection.select_reconstruction(capture_of(problem.base_from_gripper), RunOptions())
+    assert [attempt.backend for attempt in found.attempts] == tried
+    kept = [attempt for attempt in found.attempts if attempt.why_not is None]
+    assert [attempt.backend for attempt in kept] == [made.backend]
+    return made, tried
 
 
 @pytest.mark.slow
@@ -288,8 +288,8 @@ def test_a_known_length_ends_on_surfaces_and_nothing_else_needs_depth_before_the
     )
     monkeypatch.setattr(selection, "densify", deeper)
     capture = capture_of(problem.base_from_gripper)
-    choice = selection.select_reconstruction(capture, RunOptions())
-    assert not densified and choice.reconstruction.pointmaps is None
+    made, _ = selection.select_reconstruction(capture, RunOptions())
+    assert not densified and made.pointmaps is None
     for length, why in (("nowhere.png", "nowhere"), ("0.png", "no surface was found")):
         lost = CalibrateOptions(known_length=(length, 0.0, 0.0, 9.0, 9.0, 50.0))
         with pytest.raises(InputError, match=why):

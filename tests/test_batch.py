@@ -15,7 +15,7 @@ from jcr.capture.images import encode_png
 from jcr.capture.options import ReadOptions
 from jcr.cli import dispatch
 from jcr.pipeline import batch as module
-from jcr.pipeline.batch import BatchRow, Task, batch, run_one
+from jcr.pipeline.batch import BatchRow, batch, run_one
 from jcr.pipeline.options import BatchOptions
 from jcr.result import RunOptions
 
@@ -78,12 +78,11 @@ def test_deleted_results_and_changed_facts_of_a_capture_are_made_again(
 
         with monkeypatch.context() as patched:
             patched.setattr("jcr.pipeline.run.make", noted)
-            run_one(task)
+            run_one(*task)
         return bool(called)
 
-    read = ReadOptions()
-    task = Task(capture=capture, out=report.parent, run=RunOptions(), calibrate_only=True, read=read)
-    assert run_one(task).status != "failed" and not is_made()
+    task = capture, report.parent, RunOptions(map=None), ReadOptions()
+    assert run_one(*task).status != "failed" and not is_made()
     for changed in (
         {"frames": frames[:4]},
         {"robot": "ur5e"},
@@ -113,10 +112,8 @@ def test_cores_are_counted_where_processes_cannot_be_bound_to_them(
 def test_a_recording_is_not_extracted_into_a_folder_where_another_process_writes(
     tmp_path: Path, captures: list[Path]
 ):
-    read = ReadOptions()
     with module.locked(tmp_path):
-        task = Task(capture=captures[0], out=tmp_path, run=RunOptions(), calibrate_only=True, read=read)
-        row = run_one(task)
+        row = run_one(captures[0], tmp_path, RunOptions(map=None), ReadOptions())
     assert row.status == "failed" and "another jcr is writing there" in row.reason
     assert not (tmp_path / "capture").exists()
 
@@ -145,7 +142,6 @@ def test_the_episode_whose_camera_moved_is_named(
 
 
 def test_a_capture_that_falls_short_of_what_is_required_is_rejected(tmp_path: Path, captures: list[Path]):
-    options = RunOptions(calibrate=CalibrateOptions(require=(0.001, 0.001)))
-    out, read = tmp_path / "b", ReadOptions()
-    row = run_one(Task(capture=captures[1], out=out, run=options, calibrate_only=True, read=read))
+    options = RunOptions(calibrate=CalibrateOptions(require=(0.001, 0.001)), map=None)
+    row = run_one(captures[1], tmp_path / "b", options, ReadOptions())
     assert row.status == "rejected" and row.reason, row

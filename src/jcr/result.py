@@ -78,7 +78,7 @@ class RunState(BaseModel):
     attempts: tuple[Attempt, ...] = ()
     """Attempts from which the reconstruction was selected."""
     made: dict[str, str] = {}
-    """Fingerprint of what each stage that has finished made its files from, by the stage's name."""
+    """Fingerprints of the inputs: `reconstruct`, of the reconstruction, and of a finished run `run`, of all of them."""
     files: dict[str, str] = {}
     """Identity of each file of a run whose stages have all finished; empty of another."""
 

@@ -20,7 +20,7 @@ from jcr.findings import sentence
 from jcr.geometry import step_between
 from jcr.pipeline import run
 from jcr.records import PosePairs
-from jcr.report.html import poses_report_html
+from jcr.report.html import report_html
 from jcr.result import RunOptions, RunResult
 from scenes import pairs_of
 from simulation.problems import hand_eye_problem
@@ -35,7 +35,7 @@ def pairs(seed: int, count: int) -> tuple[PosePairs, np.ndarray]:
 
 
 def page(of: PosePairs, hand_eye: Calibration) -> str:
-    return poses_report_html(RunResult("out", capture=of, calibration=hand_eye, reconstruction=of))
+    return report_html(RunResult("out", capture=of, calibration=hand_eye, reconstruction=of))
 
 
 @pytest.mark.parametrize("spread", [(1, 1, 1), (3, 1, 0.1), (1, 0, 0), (10, 1, 1)])

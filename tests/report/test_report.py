@@ -28,7 +28,7 @@ from jcr.estimation.observability import excitation
 from jcr.findings import no_reconstruction
 from jcr.geometry import inverse, transform
 from jcr.records import COVARIANCE_ORDER, Capture, CellCamera, Reconstruction, Tracks
-from jcr.report.html import failed_report_html, report_html
+from jcr.report.html import report_html
 from jcr.report.images import MAGNIFIED
 from jcr.report.motion import excitation_bars
 from jcr.result import RunResult
@@ -345,7 +345,7 @@ def test_a_capture_that_was_copied_keeps_its_name_and_path(tmp_path: Path, table
     failed = failed_calibration(
         copied, "colmap", no_reconstruction(RejectedError("nothing matched")), {"reconstruct": 1.0}
     )
-    elements = Elements(failed_report_html(copied, failed))
+    elements = Elements(report_html(RunResult("out", capture=copied, calibration=failed)))
     assert "bin_picking" in elements.text
     assert str(scan / "poses.csv") in elements.text and re.search(
         r"20\d\d-\d\d-\d\d \d\d:\d\d UTC", elements.text
@@ -358,7 +358,7 @@ def test_a_run_without_camera_poses_reports_why_with_its_images(run: RunResult):
     fault, remedy = "only 2 of 12 images share features", "lay <textured> things on the table"
     error = RejectedError(fault, remedy)
     failed = failed_calibration(capture, "colmap", no_reconstruction(error), {"reconstruct": 2.0})
-    elements = Elements(failed_report_html(capture, failed))
+    elements = Elements(report_html(RunResult("out", capture=capture, calibration=failed)))
     assert f"No calibration: {fault}." in elements.text and f"{remedy.capitalize()}." in elements.text
     names = [a.get("alt") for tag, a in elements.found if tag == "img"]
     assert names == list(capture.images)

@@ -134,7 +134,7 @@ class BatchCommand:
 
     def main(self) -> int:
         """Run all and print the table."""
-        from jcr.pipeline.batch import batch, is_accepted
+        from jcr.pipeline.batch import batch
 
         if len(self.paths) < 2:
             raise InputError("batch: name one capture or more, then the folder for the results")
@@ -143,7 +143,7 @@ class BatchCommand:
             rows = batch(captures, out, run_options(self), self.batch, progress, self.read)
         summary, lines = out / "summary.html", [_line(rank, row) for rank, row in enumerate(rows, start=1)]
         self.output.result([*lines, f"table: {summary}"], {"captures": [asdict(row) for row in rows]})
-        if doubtful := sum(not is_accepted(row) for row in rows):
+        if doubtful := sum(not row.is_accepted for row in rows):
             raise RejectedError(f"{doubtful} of {len(rows)} captures failed or are rejected; see {summary}")
         return 0
 

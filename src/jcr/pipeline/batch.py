@@ -10,8 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -36,6 +35,11 @@ MIN_EPISODES = 3
 """Smallest number of accepted episodes of which most can agree."""
 MOVED_P = 1e-3
 """Chance of a difference between two episodes below which the camera moved; the false-alarm rate of `jcr verify`."""
+THREADS = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
+"""Variables from which numerical libraries read their number of threads when a process starts."""
+
+Task = tuple[Path, Path, RunOptions, ReadOptions]
+"""Capture, run folder and options: the arguments of `run_one`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,16 +65,10 @@ class BatchRow:
     reason: str = ""
     """Why it failed or is rejected, a camera that moved between episodes, or its first warning."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class Task:
-    """Capture to run, with its options."""
-
-    capture: Path
-    out: Path
-    run: RunOptions
-    calibrate_only: bool
-    read: ReadOptions
+    @property
+    def is_accepted(self) -> bool:
+        """Whether the calibration is accepted, with warnings or without."""
+        return self.status in ("accepted", "accepted with warnings")
 
 
 def batch(
@@ -89,19 +87,16 @@ def batch(
     """
     if options.processes is not None and options.processes < 1:
         raise InputError(f"--processes {options.processes}: give 1 or more")
-    report = progress or silent
-    read = read or ReadOptions()
-    parts = [(path, episode) for path in captures for episode in read.episode]
-    tasks = [
-        Task(
-            capture=path.resolve(),
-            out=out.resolve() / (name if len(read.episode) == 1 else f"{name}-episode-{episode}"),
-            run=run_options,
-            calibrate_only=options.calibrate_only,
-            read=replace(read, episode=(episode,)),
-        )
-        for (path, episode), name in zip(parts, np.repeat(_names(captures), len(read.episode)), strict=True)
-    ]
+    report, read = progress or silent, read or ReadOptions()
+    run_options = replace(run_options, map=None) if options.calibrate_only else run_options
+    tasks, names = list[Task](), set[str]()
+    for path in captures:
+        own = (path.parent if path.is_file() else path).resolve().name or "capture"
+        numbered = (own if k == 1 else f"{own}-{k}" for k in range(1, len(captures) + 1))
+        names.add(name := next(name for name in numbered if name not in names))
+        for episode in read.episode:
+            folder = out.resolve() / (name if len(read.episode) == 1 else f"{name}-episode-{episode}")
+            tasks.append((path.resolve(), folder, run_options, replace(read, episode=(episode,))))
     out.mkdir(parents=True, exist_ok=True)
     report("captures", 0.0)
     rows: list[BatchRow] = []
@@ -115,26 +110,25 @@ def batch(
     return rows
 
 
-def run_one(task: Task) -> BatchRow:
+def run_one(capture: Path, out: Path, options: RunOptions, read: ReadOptions) -> BatchRow:
     """Run one capture, unless it is finished, and return its row; an error is in the row."""
     start, reason = time.perf_counter(), ""
+    row = BatchRow(capture=str(capture), out=str(out), status="failed")
     try:
-        with locked(task.out):
-            capture = read_capture(task.capture, task.read, into=task.out / CAPTURE)
-        options = replace(task.run, map=None) if task.calibrate_only else task.run
+        with locked(out):
+            found = read_capture(capture, read, into=out / CAPTURE)
         try:
-            content = run(capture, task.out, options).calibration
+            content = run(found, out, options).calibration
         except RejectedError as error:
-            content, reason = load_run(task.out).calibration, str(error)
+            content, reason = load_run(out).calibration, str(error)
     except InputError as error:
-        return _failed(task, str(error))
+        return replace(row, reason=str(error))
     except Exception as error:  # a bug shows in its row, and does not take the other captures with it
-        return _failed(task, f"{type(error).__name__}: {error}")
+        return replace(row, reason=f"{type(error).__name__}: {error}")
     uncertainty, held_out = content.uncertainty, content.held_out
     named = next((sentence(one) for one in content.findings if one.severity != "informs"), "")
-    return BatchRow(
-        capture=str(task.capture),
-        out=str(task.out),
+    return replace(
+        row,
         status=verdict_of(content.findings),
         backend=content.backend,
         images=len(content.images),
@@ -154,77 +148,61 @@ def _with_moved_cameras(rows: Sequence[BatchRow]) -> list[BatchRow]:
 
     The common camera is that of the episode with the smallest median χ² to the others of its data set.
     """
-    of_set: dict[str, list[int]] = {}
-    for k, row in enumerate(rows):
-        if is_accepted(row):
-            of_set.setdefault(row.capture, []).append(k)
     found = list(rows)
-    for members in of_set.values():
+    for capture in {row.capture for row in rows}:
+        members = [k for k, row in enumerate(rows) if row.capture == capture and row.is_accepted]
         if len(members) < MIN_EPISODES:
             continue
         results = [load_run(Path(rows[k].out)).calibration for k in members]
         squared = [np.median([compare(one, other).chi2 or 0.0 for other in results]) for one in results]
-        common = results[int(np.argmin(squared))]
         for k, result in zip(members, results, strict=True):
-            apart = compare(common, result)
-            mm, deg = (
-                1e3 * np.linalg.norm(apart.translation_m),
-                np.degrees(np.linalg.norm(apart.rotation_vector)),
-            )
-            reason = rows[k].reason
+            apart, reason = compare(results[int(np.argmin(squared))], result), rows[k].reason
+            mm = float(1e3 * np.linalg.norm(apart.translation_m))
+            deg = float(np.degrees(np.linalg.norm(apart.rotation_vector)))
             if apart.p_value is not None and apart.p_value < MOVED_P:
                 reason = f"the camera differs by {mm:.1f} mm and {deg:.2f}° from that of most episodes"
-            found[k] = replace(rows[k], moved_mm=float(mm), moved_deg=float(deg), reason=reason)
+            found[k] = replace(rows[k], moved_mm=mm, moved_deg=deg, reason=reason)
     return found
 
 
 def _failed(task: Task, reason: str) -> BatchRow:
     """Return the row of a capture that failed."""
-    return BatchRow(capture=str(task.capture), out=str(task.out), status="failed", reason=reason)
-
-
-def is_accepted(row: BatchRow) -> bool:
-    """Test whether the calibration is accepted, with warnings or without."""
-    return row.status in ("accepted", "accepted with warnings")
+    return BatchRow(capture=str(task[0]), out=str(task[1]), status="failed", reason=reason)
 
 
 def _rank(row: BatchRow) -> tuple[int, float, str]:
+    """Return the key by which rows are ranked: status, uncertainty of the translation, name."""
     order = (*get_args(Verdict), "failed").index(row.status)
     return order, float("inf") if row.offset_std_mm is None else row.offset_std_mm, row.capture
 
 
-def _names(captures: Sequence[Path]) -> list[str]:
-    """Return a folder name for each capture: its own, with a number where two have the same."""
-    names: list[str] = []
-    for path in captures:
-        own = (path.parent if path.is_file() else path).resolve().name or "capture"
-        name, number = own, 2
-        while name in names:
-            name, number = f"{own}-{number}", number + 1
-        names.append(name)
-    return names
-
-
 def _on_this_machine(tasks: list[Task], options: BatchOptions) -> Iterator[BatchRow]:
+    """Yield the row of each task as its process ends; the processes share the cores."""
     # macOS cannot bind a process to cores.
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     processes = min(options.processes or max(1, cores // 2), len(tasks))
-    with _threads_per_process(max(1, cores // processes)):
+    before = dict(os.environ)
+    os.environ.update(dict.fromkeys(THREADS, str(max(1, cores // processes))))
+    try:
         left = yield from _over_pool(tasks, processes)
         # A process that was killed takes its pool along; alone, only the capture that did it fails.
         for task in left:
             if (yield from _over_pool([task], 1)):
                 yield _failed(task, "its process died: out of memory, or a crash in a library")
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
 
 
 def _over_pool(tasks: list[Task], processes: int):
     """Yield rows as they come; return the tasks that a broken pool left undone."""
     left: list[Task] = []
-    # Spawned, not forked: libraries with threads of their own do not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(processes, context, initializer=_dies_on_interrupt)
+    # Spawned, not forked: libraries with threads of their own do not survive a fork. Ctrl-C, which reaches every process
+    # of the terminal, ends each without a report.
+    context, on_interrupt = multiprocessing.get_context("spawn"), (signal.SIGINT, signal.SIG_DFL)
+    pool = ProcessPoolExecutor(processes, context, initializer=signal.signal, initargs=on_interrupt)
     try:
-        task_of = {pool.submit(run_one, task): task for task in tasks}
+        task_of = {pool.submit(run_one, *task): task for task in tasks}
         for future in as_completed(task_of):
             try:
                 yield future.result()
@@ -239,28 +217,8 @@ def _over_pool(tasks: list[Task], processes: int):
         raise
 
 
-def _dies_on_interrupt() -> None:
-    """End at Ctrl-C, which reaches every process of the terminal, without a report."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-@contextmanager
-def _threads_per_process(threads: int) -> Iterator[None]:
-    """Set the number of threads that numerical libraries read when a process starts."""
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, str(threads)))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
 def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[BatchRow]:
+    """Yield the row of each task as it ends on the cluster; raise InputError where no node can run one."""
     extra("ray", "cluster", "--ray")
     import ray  # pyright: ignore[reportMissingImports]
     from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
@@ -281,45 +239,27 @@ def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[BatchRow]:
                 "lower --cpus-per-task or --gpus-per-task, or add the node first"
             )
         remote = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=RETRIES)(run_one)
-        task_of = {remote.remote(task): task for task in tasks}
+        task_of = {remote.remote(*task): task for task in tasks}
         waiting = list(task_of)
         while waiting:
             (done,), waiting = ray.wait(waiting, num_returns=1)
             try:
                 yield ray.get(done)
             except RayError as error:
-                task, reason = task_of[done], " ".join(str(error).split())[:200]
-                yield _failed(task, reason)
+                yield _failed(task_of[done], " ".join(str(error).split())[:200])
     finally:
         if own:
             ray.shutdown()
 
 
-def _write_summary(out: Path, rows: list[BatchRow]) -> None:
+def _write_summary(out: Path, rows: Sequence[BatchRow]) -> None:
     """Write the table as CSV and as a page."""
-    text = io.StringIO()
-    table = csv.DictWriter(text, [field.name for field in fields(BatchRow)], lineterminator="\n")
+    text, content = io.StringIO(), [asdict(row) for row in rows]
+    table = csv.DictWriter(text, list(content[0]), lineterminator="\n")
     table.writeheader()
-    table.writerows(asdict(row) for row in rows)
+    table.writerows(content)
     write_text(out / "summary.csv", text.getvalue())
-    numbers = (
-        "offset_std_mm",
-        "turn_std_deg",
-        "scale_std_percent",
-        "held_out_mm",
-        "held_out_deg",
-        "moved_mm",
-        "moved_deg",
-        "seconds",
-    )
-    shown = [
-        {
-            "row": row,
-            "name": Path(row.out).name,
-            "has_report": (Path(row.out) / "report.html").is_file(),
-            "is_accepted": is_accepted(row),
-            "numbers": [getattr(row, name) for name in numbers],
-        }
-        for row in rows
-    ]
-    write_text(out / "summary.html", render("batch.html", {"table": shown}))
+    folders = [Path(row.out) for row in rows]
+    reports = {folder.name for folder in folders if (folder / "report.html").is_file()}
+    lines = list(zip([folder.name for folder in folders], rows, strict=True))
+    write_text(out / "summary.html", render("batch.html", {"table": lines, "reports": reports}))

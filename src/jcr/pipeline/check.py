@@ -115,11 +115,13 @@ def check_capture(
     if isinstance(capture, str | Path):
         capture = read_and_compare(capture, progress=progress)[0]
     given = capture.base_from_gripper
-    (move_m, rotation_rad), notes = largest_motion(given), [*capture.notes, *_remark_on_units(given)]
-    options = CalibrateOptions()
-    if robot_noise is not None:
-        options = CalibrateOptions(robot_noise=(1e3 * robot_noise[0], float(np.degrees(robot_noise[1]))))
-    views, camera, sharpness, shown = (), None, np.zeros(0), _Comparison()
+    (move_m, rotation_rad), notes = largest_motion(given), [*capture.notes]
+    if move_m < 5e-3 and rotation_rad > np.radians(5):
+        moved = f"by at most {1e3 * move_m:.2g} mm while it rotates by {np.degrees(rotation_rad):.0f}°"
+        notes.append(f"the gripper moves {moved}: the positions may have been divided by 1000")
+    mm_deg = robot_noise and (1e3 * robot_noise[0], float(np.degrees(robot_noise[1])))
+    options, camera, sharpness = CalibrateOptions(robot_noise=mm_deg), None, np.zeros(0)
+    views, shown = (), _Comparison()
     if isinstance(capture, PosePairs):
         robot, clear, shown = errors_of(given), np.arange(len(capture)), _compare_pairs(capture, options)
     else:
@@ -132,19 +134,16 @@ def check_capture(
     counted = clear if shown.registered is None else shown.registered
     rows = counted if len(counted) >= FEWEST else np.arange(len(capture))
     gripper, hand_eye, assumptions = given[rows], shown.hand_eye, shown.assumptions
+    seen = observability(gripper, assumptions and assumptions.gripper_from_camera)
     if hand_eye is not None and shown.registered is not None:
         seen = hand_eye.observability
-    else:
-        seen = observability(gripper, None if assumptions is None else assumptions.gripper_from_camera)
-    found = [*shown.findings, *(() if hand_eye is not None else seen.findings)]
-    found += [] if robot.unused is None else [robot.unused]
+    of_motion = () if hand_eye is not None else seen.findings
+    found = [*shown.findings, *of_motion, *filter(None, [robot.unused])]
     found += as_causes(views) if verdict_of(found) == "rejected" else views
-    box = None if reach is None else np.asarray(reach, float)
-    of_rows = assumptions or assumed(gripper, camera, robot_noise)
-    names = [capture.images[row] for row in rows]
-    robot_of_rows = robot.of(rows)
-    added = better_poses(of_rows, gripper, robot_of_rows, suggest, box, seed)
-    predicted = predictions(of_rows, gripper, robot_of_rows, added)
+    of_rows, names = assumptions or assumed(gripper, camera, robot_noise), [capture.images[k] for k in rows]
+    known = of_rows, gripper, robot.of(rows)
+    added = better_poses(*known, suggest, None if reach is None else np.asarray(reach, float), seed)
+    predicted = predictions(*known, added)
     return Examination(
         sharpness=sharpness,
         largest_move_m=move_m,
@@ -157,17 +156,6 @@ def check_capture(
         findings=strongest_first({sentence(one): one for one in found}.values()),
         notes=(*notes, *shown.notes),
     )
-
-
-def _remark_on_units(base_from_gripper: Float[ndarray, "n 4 4"]) -> list[str]:
-    """Return a remark where the gripper rotates far and moves so little that another unit is likely."""
-    move_m, rotation_rad = largest_motion(base_from_gripper)
-    if move_m >= 5e-3 or rotation_rad <= np.radians(5):
-        return []
-    return [
-        f"the gripper moves by at most {1e3 * move_m:.2g} mm while it rotates by {np.degrees(rotation_rad):.0f}°: "
-        "the positions may have been divided by 1000"
-    ]
 
 
 def _look(
@@ -192,45 +180,34 @@ def _compare_with_images(
     progress: Progress | None,
     thorough: bool,
 ) -> _Comparison:
-    """Compare the gripper poses with few small images and, where that is not enough, with all of them."""
-    if not thorough and len(capture) > QUICK:
-        rows = spread_rows(len(capture))
-        few = replace(capture.of_rows(rows), depths=None)
-        shown = _compare_registered(few, robot.of(rows), options, seed, progress, quick=True)
-        is_sound = verdict_of(shown.findings) != "rejected"
-        if is_sound and shown.registered is not None and len(shown.registered) == QUICK:
-            return replace(shown, registered=None)
-    return _compare_registered(capture, robot, options, seed, progress, quick=False)
+    """Compare the gripper poses with cameras from features, by a calibration and the poses that it left out.
 
-
-def _compare_registered(
-    capture: Capture,
-    robot: RobotErrorPrior,
-    options: CalibrateOptions,
-    seed: int,
-    progress: Progress | None,
-    *,
-    quick: bool,
-) -> _Comparison:
-    """Compare the gripper poses with cameras from features, by a calibration and the poses that it left out."""
+    Few small images are compared first and, where these are not enough, all of them.
+    """
+    is_quick = not thorough and len(capture) > QUICK
+    tried, of_tried, size_px = capture, robot, WORKING_SIZE_PX
+    if is_quick:
+        rows, size_px = spread_rows(len(capture)), QUICK_SIZE_PX
+        tried, of_tried = replace(capture.of_rows(rows), depths=None), robot.of(rows)
     try:
-        size_px = QUICK_SIZE_PX if quick else WORKING_SIZE_PX
-        made = reconstruct_colmap(capture, "sift", seed, progress, size_px)
+        made = reconstruct_colmap(tried, "sift", seed, progress, size_px)
     except RejectedError as error:
-        board = None
-        if not quick:
-            board = proposed([read_image(capture.folder / name) for name in capture.images])
+        if is_quick:
+            return _compare_with_images(capture, robot, options, seed, progress, thorough=True)
+        board = proposed([read_image(capture.folder / name) for name in capture.images])
         return _Comparison(findings=(*no_reconstruction(error), *(() if board is None else (board,))))
-    case = checked_case(capture, made, options, robot.of(made.image_index))
-    hand_eye, assumptions = case.hand_eye, None
+    case = checked_case(tried, made, options, of_tried.of(made.image_index))
+    hand_eye, assumptions, registered = case.hand_eye, None, made.image_index[case.hand_eye.inliers]
     if hand_eye.converged:
         assumptions = assumptions_of(case)
-        hand_eye = hand_eye.with_findings(*left_out_poses(capture, made, hand_eye))
+        hand_eye = hand_eye.with_findings(*left_out_poses(tried, made, hand_eye))
+    if is_quick and (verdict_of(hand_eye.findings) == "rejected" or len(registered) < QUICK):
+        return _compare_with_images(capture, robot, options, seed, progress, thorough=True)
     return _Comparison(
         hand_eye=hand_eye,
         findings=hand_eye.findings,
         notes=made.notes,
-        registered=made.image_index[case.hand_eye.inliers],
+        registered=None if is_quick else registered,
         assumptions=assumptions,
     )
 
@@ -259,39 +236,46 @@ def read_and_compare(
 ) -> tuple[Capture | PosePairs, ReadOptions]:
     """Read a capture; where its file leaves the pose convention open, find the one that the images fit.
 
-    Return the capture and the options that read it. Raises InputError where the images do not tell either.
+    Return the capture, with a note on the convention, and the options that read it. Raises InputError where the poses of
+    no convention agree with the images far better than those of the others.
     """
     options = options or ReadOptions()
-    try:
+    with suppress(OpenConventionError):
         return read_source(path, options, into=into, progress=progress), options
-    except OpenConventionError:
-        read = list[tuple[Capture, ReadOptions]]()
-        for possible in possible_options(options):
-            for one in possible:
-                with suppress(InputError):
-                    read.append((read_capture(path, one), one))
-                    break
-        found = _best_fit(read, progress)
-        if found is None:
-            raise InputError(
-                f"{path}: columns rx, ry, rz may be a rotation vector or angles, and the images do not tell which; add "
-                "--pose-convention ur or --pose-convention yaskawa"
-            ) from None
-        return found
+    read = list[tuple[Capture, ReadOptions]]()
+    for possible in possible_options(options):
+        for one in possible:
+            with suppress(InputError):
+                read.append((read_capture(path, one), one))
+                break
+    fits = _fits(read, progress) if read else []
+    if not fits or (len(fits) > 1 and fits[1][0] < CLEARER * fits[0][0]):
+        raise InputError(
+            f"{path}: columns rx, ry, rz may be a rotation vector or angles, and the images do not tell which; add "
+            "--pose-convention ur or --pose-convention yaskawa"
+        )
+    (_, off, capture, options), *others = fits
+    units = "" if options.pose_units == "auto" else f" --pose-units {options.pose_units}"
+    worse = "".join(f", those of {one.pose_convention} only to {text}" for _, text, _, one in others)
+    note = (
+        f"columns rx, ry, rz are read with --pose-convention {options.pose_convention}{units}: these poses agree with "
+        f"the images to {off} (median){worse}; give these options to jcr run"
+    )
+    return replace(capture, notes=(*capture.notes, note)), options
 
 
-def _best_fit(
+def _fits(
     read: list[tuple[Capture, ReadOptions]], progress: Progress | None
-) -> tuple[Capture, ReadOptions] | None:
-    """Return the capture whose poses agree with the images far better than those of the others, with a note."""
-    if not read:
-        return None
+) -> list[tuple[float, str, Capture, ReadOptions]]:
+    """Return the difference (m, and in words) of each capture's poses from the images, best first.
+
+    The list is empty where few small images give no cameras.
+    """
     rows = spread_rows(len(read[0][0]))
-    few = read[0][0].of_rows(rows)
     try:
-        found = reconstruct_colmap(few, "sift", 0, progress, QUICK_SIZE_PX)
+        found = reconstruct_colmap(read[0][0].of_rows(rows), "sift", 0, progress, QUICK_SIZE_PX)
     except RejectedError:
-        return None
+        return []
     fits = []
     for capture, options in read:
         gripper = capture.base_from_gripper[rows][found.image_index]
@@ -301,16 +285,7 @@ def _best_fit(
         mm, deg = np.median(np.array(residuals, dtype=float), axis=0)
         off = f"{significant(mm)} mm and {significant(deg)}°"
         fits.append((float(1e-3 * mm + ARM * np.radians(deg)), off, capture, options))
-    (best, off, capture, options), *others = sorted(fits, key=lambda fit: fit[0])
-    if others and others[0][0] < CLEARER * best:
-        return None
-    units = "" if options.pose_units == "auto" else f" --pose-units {options.pose_units}"
-    worse = "".join(f", those of {one.pose_convention} only to {text}" for _, text, _, one in others)
-    note = (
-        f"columns rx, ry, rz are read with --pose-convention {options.pose_convention}{units}: these poses agree with "
-        f"the images to {off} (median){worse}; give these options to jcr run"
-    )
-    return replace(capture, notes=(*capture.notes, note)), options
+    return sorted(fits, key=lambda fit: fit[0])
 
 
 def spread_rows(count: int) -> Int[ndarray, " k"]:

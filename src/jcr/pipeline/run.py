@@ -25,7 +25,6 @@ from jcr.options import checked_options
 from jcr.pipeline.selection import NothingFoundError
 from jcr.pipeline.stages import (
     begun,
-    complete,
     finished,
     forget_reconstruction,
     is_unchanged,
@@ -33,7 +32,6 @@ from jcr.pipeline.stages import (
     make,
     noted,
     place,
-    rewrite_calibration,
     stages_of,
 )
 from jcr.progress import Progress, silent
@@ -109,7 +107,7 @@ def calibrate(
 
 def calibrate_poses(pairs: PosePairs, out: str | Path, options: CalibrateOptions | None = None) -> RunResult:
     """Write calibration.json and report to the folder `out`, from camera poses that were given, without images."""
-    from jcr.report.html import poses_report_html
+    from jcr.report.html import report_html
 
     out = Path(out)
     with locked(out):
@@ -119,7 +117,7 @@ def calibrate_poses(pairs: PosePairs, out: str | Path, options: CalibrateOptions
         forget_reconstruction(out)
         keep_calibration(out, content)
         result = RunResult(out, capture=pairs, calibration=content, reconstruction=pairs)
-        page = poses_report_html(result, {"calibrate": asdict(options or CalibrateOptions())})
+        page = report_html(result, {"calibrate": asdict(options or CalibrateOptions())})
         write_text(out / REPORT, page)
         return result
 
@@ -194,10 +192,7 @@ def add_camera(
             keep_camera(before.out, known.capture, camera)
         write_cameras(before.out, located)
         others = RunResult(before.out, capture=known.capture).others
-        result = result.with_parts(others=others, cameras=located)
-        result = make(result, stages_of(result)[3:], report)  # the report alone
-        rewrite_calibration(before.out, result.calibration)
-        return complete(result)
+        return finished(result.with_parts(others=others, cameras=located), ["report"], report)
 
 
 def measure(out: str | Path) -> "Measurement":
@@ -230,10 +225,9 @@ def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, str | 
         return replace(options, map=None), None
     if not options.depth.dense:
         raise InputError("--no-dense: the map needs dense depth; leave it out, or add --no-map")
-    if all(map(is_installed, PACKAGES)):
-        return options, None
     try:
-        require_packages("the map", ", then `jcr map`")
+        if not all(map(is_installed, PACKAGES)):
+            require_packages("the map", ", then `jcr map`")
     except InputError as error:
         return replace(options, map=None), f"no map was made: {error}"
     return options, None

@@ -1,15 +1,12 @@
-"""Table of the stages of a run: each makes its files in the run folder from the records of the stages before it.
-
-capture -> reconstruct -> calibrate -> cameras -> densify -> map -> report
-"""
+"""Table of the stages of a run: each makes its files in the run folder from the records of the stages before it."""
 
 import hashlib
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,8 +30,8 @@ from jcr.depth.depth_npz import is_made_from, write_depth
 from jcr.errors import InputError
 from jcr.files import read_bytes, write_text
 from jcr.findings import sentence
-from jcr.pipeline.selection import NothingFoundError, again, select_reconstruction, timings_of
-from jcr.progress import Progress
+from jcr.pipeline.selection import NothingFoundError, select_reconstruction, timings_of
+from jcr.progress import Progress, silent
 from jcr.reconstruct import candidates, device_of
 from jcr.records import Capture, Reconstruction
 from jcr.records.npz import FORMAT, write_reconstruction
@@ -61,26 +58,6 @@ LARGE = 50_000_000
 """Bytes. Size and date identify larger files, which are weights of networks; the content identifies others."""
 
 
-@dataclass(frozen=True)
-class Stage:
-    """Row of the table of stages."""
-
-    name: str
-    files: tuple[str, ...]
-    """Names of the files that the stage writes into the run folder."""
-    inputs: Callable[[RunResult], Any]
-    """Function of the result so far; returns values, arrays and paths of files that the stage reads."""
-    options: tuple[str, ...]
-    """Fields of RunOptions that the stage uses."""
-    make: Callable[[RunResult, Progress], RunResult]
-    """Function of the result so far; writes the files and returns the result with the records of the stage."""
-
-    def made_from(self, result: RunResult) -> str:
-        """Return the fingerprint of inputs, options and version."""
-        options = [getattr(result.state.options, name) for name in self.options]
-        return fingerprint(self.name, self.inputs(result), options, __version__)
-
-
 def begun(out: Path, capture: Capture, options: RunOptions) -> RunResult:
     """Return the result of a run before its first stage; raise InputError for a name that is not UTF-8."""
     folder = str(capture.folder.resolve())
@@ -90,9 +67,13 @@ def begun(out: Path, capture: Capture, options: RunOptions) -> RunResult:
         raise InputError(f"{capture.folder}: a folder whose name is not UTF-8; rename it") from None
     own = options.reconstruct
     paths = {name: path.resolve() for name, path in vars(own).items() if isinstance(path, Path)}
-    options = replace(options, reconstruct=replace(own, **paths))
-    result = RunResult(out, capture=capture, state=RunState(capture=folder, options=options))
-    return with_state(result, made={"reconstruct": STAGES[0].made_from(result)})
+    own = replace(own, **paths)
+    weights = Path(own.weights) if own.weights and Path(own.weights).exists() else None
+    images = [(name, capture.folder / name) for name in capture.images]
+    facts = images, capture.base_from_gripper, capture.intrinsics, candidates(own), weights, FORMAT
+    made = {"reconstruct": fingerprint(facts, own, __version__)}
+    state = RunState(capture=folder, options=replace(options, reconstruct=own), made=made)
+    return RunResult(out, capture=capture, state=state)
 
 
 def with_state(result: RunResult, **fields: Any) -> RunResult:
@@ -100,17 +81,12 @@ def with_state(result: RunResult, **fields: Any) -> RunResult:
     return result.with_parts(state=result.state.model_copy(update=fields))
 
 
-def stages_of(result: RunResult) -> tuple[Stage, ...]:
-    """Return the stages of a run with these options."""
+def stages_of(result: RunResult) -> list[str]:
+    """Return the names of the stages of a run with these options."""
     left_out = set() if result.others else {"cameras"}
     if result.state.options.map is None:
         left_out |= {"densify", "map"}
-    return tuple(stage for stage in STAGES if stage.name not in left_out)
-
-
-def made_of(result: RunResult) -> dict[str, str]:
-    """Return the fingerprint of what each stage of a run is made from."""
-    return {stage.name: stage.made_from(result) for stage in stages_of(result)[1:]} | result.state.made
+    return [name for name in STAGES if name not in left_out]
 
 
 def is_unchanged(result: RunResult) -> bool:
@@ -121,25 +97,25 @@ def is_unchanged(result: RunResult) -> bool:
     return False
 
 
-def make(result: RunResult, stages: Sequence[Stage], progress: Progress) -> RunResult:
+def make(result: RunResult, stages: Sequence[str], progress: Progress) -> RunResult:
     """Run stages in order, each timed; return the result with their records."""
-    for stage in stages:
+    for name in stages:
         start = time.perf_counter()
-        result = stage.make(result, progress)
+        result = STAGES[name][1](result, progress)
         give_back()
-        if stage.name not in ("reconstruct", "calibrate"):  # they have the seconds of all back ends
-            timings = result.calibration.timings_s | {stage.name: round(time.perf_counter() - start, 3)}
+        if name not in ("reconstruct", "calibrate"):  # they have the seconds of all back ends
+            timings = result.calibration.timings_s | {name: round(time.perf_counter() - start, 3)}
             result = result.with_parts(calibration=replace(result.calibration, timings_s=timings))
     return result
 
 
-def finished(result: RunResult, stages: Sequence[Stage], progress: Progress) -> RunResult:
+def finished(result: RunResult, stages: Sequence[str], progress: Progress) -> RunResult:
     """Run the stages after the calibration, and note in run.json that all files of the run are there."""
-    if "cameras" not in [stage.name for stage in stages]:
+    if not result.others:
         (result.out / CAMERAS).unlink(missing_ok=True)
         result = result.with_parts(cameras=None)
     result = make(result, stages, progress)
-    rewrite_calibration(result.out, result.calibration)
+    write_calibration_and_log(result.out, result.calibration)
     return complete(result)
 
 
@@ -150,12 +126,24 @@ def complete(result: RunResult) -> RunResult:
     return result
 
 
+def made_of(result: RunResult) -> dict[str, str]:
+    """Return the fingerprints of the inputs of a run: those of its reconstruction, and all with the options."""
+    capture, folder = result.capture, result.capture.folder
+    depths = [folder / name for name in capture.depths or () if name is not None]
+    others = [
+        vars(one) | {"folder": [(one.folder or folder) / name for name in one.images]}
+        for one in result.others
+    ]
+    facts = vars(capture) | {"folder": depths, "source": str(capture.source), "others": others}
+    return result.state.made | {"run": fingerprint(facts, result.state.options, __version__)}
+
+
 def files_of(out: Path) -> dict[str, str]:
     """Return the files of the stages that a run folder has, and images added to it, each with its identity.
 
     The content identifies calibration.json and added images; others count where they exist.
     """
-    names = [*(name for stage in STAGES for name in stage.files), ADDED]
+    names = [*(name for files, _ in STAGES.values() for name in files), ADDED]
     return {
         name: fingerprint(out / name) if name in (CALIBRATION, ADDED) else ""
         for name in names
@@ -183,18 +171,11 @@ def _identity(value: Any) -> Any:
     return hashlib.sha256(read_bytes(value)).hexdigest()
 
 
-def _images(result: RunResult) -> Any:
-    """Return images, gripper poses and intrinsics, and the back ends and weights that the options mean here."""
-    capture, options = result.capture, result.state.options.reconstruct
-    weights = Path(options.weights) if options.weights and Path(options.weights).exists() else None
-    images = [(name, capture.folder / name) for name in capture.images]
-    return images, capture.base_from_gripper, capture.intrinsics, candidates(options), weights, FORMAT
-
-
 def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
     """Select a reconstruction among the back ends, with its calibration; or read the one of the same inputs.
 
-    Where the camera watches the gripper, the carried object is the scene.
+    It may be in the folder, or in that of `jcr capture`. Where the camera watches the gripper, the carried object is the
+    scene.
     """
     capture, out, options = result.capture, result.out, result.state.options
     seen = capture
@@ -202,45 +183,34 @@ def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
         # The arm's kinematics are those of the reported poses, and not of their inverses.
         seen, own = eye_to_hand(capture, out / MOVING), replace(options.calibrate, robot=None)
         options = replace(options, calibrate=own)
-    before = _with_same_reconstruction(result, seen)
+
+    def is_same(folder: Path) -> bool:
+        """Test whether a folder has a reconstruction of the same inputs; a state that cannot be read proves nothing."""
+        with suppress(InputError):
+            made = RunResult(folder).state.made.get("reconstruct")
+            return made == result.state.made["reconstruct"] and (folder / RECONSTRUCTION).is_file()
+        return False
+
+    if is_same(out) and not is_made_from(out / DEPTH, _depth_made_from(result)):
+        (out / DEPTH).unlink(missing_ok=True)
+    same = next(filter(is_same, (out, capture.folder / LIVE)), None)
+    before = None if same is None else RunResult(same, capture=seen)
+    read = None if before is None else lambda: before.reconstruction
     try:
-        if before is None:
-            found = select_reconstruction(seen, options, progress, partial(keep_reconstruction, result))
-        else:
-            found = again(seen, lambda: before.reconstruction, options, progress)
+        keep = partial(keep_reconstruction, result)
+        made, found = select_reconstruction(seen, options, progress, keep, read)
     except NothingFoundError as error:
-        if _with_same_reconstruction(result, seen) is None:
+        if not is_same(out):
             forget_reconstruction(out)
         raise _failed(result, error) from None
     attempts = found.attempts if before is None else before.state.attempts or found.attempts
-    result = with_state(result, attempts=attempts).with_parts(
-        reconstruction=found.reconstruction,
-        calibration=replace(found.hand_eye, timings_s=timings_of(found.attempts)),
-    )
-    there = _with_same_reconstruction(result, seen)
-    if there is None or there.out != out:
-        keep_reconstruction(result, found.reconstruction)
-    else:
+    result = with_state(result, attempts=attempts).with_parts(reconstruction=made, calibration=found)
+    if is_same(out):
         write_state(result)
+    else:
+        keep_reconstruction(result, made)
     _keep_depth(result)
     return result
-
-
-def _with_same_reconstruction(result: RunResult, seen: Capture) -> RunResult | None:
-    """Return the earlier run of the folder, or of `jcr capture`, whose reconstruction was made from the same inputs.
-
-    A state that cannot be read proves nothing: to make every stage again is always right.
-    """
-    out, made = result.out, result.state.made
-    for folder in (out, result.capture.folder / LIVE):
-        before, is_same = RunResult(folder, capture=seen), False
-        with suppress(InputError):
-            is_same = before.state.made.get("reconstruct") == made["reconstruct"]
-        if is_same and (folder / RECONSTRUCTION).is_file():
-            if folder == out and not is_made_from(out / DEPTH, _depth_made_from(result)):
-                (out / DEPTH).unlink(missing_ok=True)
-            return before
-    return None
 
 
 def keep_reconstruction(result: RunResult, reconstruction: Reconstruction) -> None:
@@ -260,23 +230,13 @@ def forget_reconstruction(out: Path) -> None:
 
 def _failed(result: RunResult, error: NothingFoundError) -> NothingFoundError:
     """Return the error, with the --board that the images show, after its reason is written to the folder."""
-    from jcr.report.html import failed_report_html
-
     capture, tried = result.capture, error.attempts
     board = proposed_for(capture, result.state.options.reconstruct.board)
     content = failed_calibration(capture, tried[-1].backend, error.findings, timings_of(tried), tried)
     content = content if board is None else content.with_findings(board).with_notes()
     keep_calibration(result.out, content)
-    write_text(result.out / REPORT, failed_report_html(capture, content, for_report(result.state.options)))
-    complete(result)
+    complete(_report(result.with_parts(calibration=content)))
     return error if board is None else NothingFoundError(error.with_more(sentence(board)), tried)
-
-
-def _poses_and_robot(result: RunResult) -> Any:
-    """Return all facts of the capture, with the depth images that the calibration compares."""
-    capture = result.capture
-    depths = [capture.folder / name for name in capture.depths or () if name is not None]
-    return vars(capture) | {"folder": depths, "source": str(capture.source), "others": None}
 
 
 def _calibrate(result: RunResult, progress: Progress) -> RunResult:
@@ -303,10 +263,10 @@ def keep_calibration(out: Path, content: AnyCalibration) -> None:
         same = same and np.array_equal(before.parent_from_camera, content.parent_from_camera)  # pyright: ignore[reportArgumentType]
     for name in () if same else (CLOUD, MAP, REPORT, CAMERAS):
         (out / name).unlink(missing_ok=True)
-    rewrite_calibration(out, content)
+    write_calibration_and_log(out, content)
 
 
-def rewrite_calibration(out: Path, content: AnyCalibration) -> None:
+def write_calibration_and_log(out: Path, content: AnyCalibration) -> None:
     """Write calibration.json and log.txt."""
     write_calibration(out / CALIBRATION, content)
     write_text(out / LOG, log(content))
@@ -316,15 +276,6 @@ def write_state(result: RunResult) -> None:
     """Write run.json."""
     content = result.state.model_dump(mode="json", warnings=False)
     write_text(result.out / STATE, json.dumps(content, indent=2) + "\n")
-
-
-def _other_cameras(result: RunResult) -> Any:
-    """Return the other cameras of the cell with their images."""
-    folder = result.capture.folder
-    return [
-        vars(one) | {"folder": [(one.folder or folder) / name for name in one.images]}
-        for one in result.others
-    ]
 
 
 def place(result: RunResult, progress: Progress) -> CamerasFile:
@@ -412,20 +363,18 @@ def _map(result: RunResult, progress: Progress) -> RunResult:
     return noted(result.with_parts(cloud=cloud, scene=scene, measured=measured), *notes)
 
 
-def _report(result: RunResult, progress: Progress) -> RunResult:
+def _report(result: RunResult, progress: Progress = silent) -> RunResult:
     """Write the report."""
     from jcr.report.html import report_html
 
     progress("report", 0.0)
-    write_text(result.out / REPORT, report_html(result, for_report(result.state.options)))
+    options = result.state.options
+    # The map has its own history.
+    stages = {"reconstruct": options.reconstruct, "calibrate": options.calibrate, "densify": options.depth}
+    about = {stage: asdict(own) for stage, own in stages.items()}
+    write_text(result.out / REPORT, report_html(result, about))
     progress("report", 1.0)
     return result
-
-
-def for_report(options: RunOptions) -> dict[str, Mapping[str, Any]]:
-    """Return the options of the stages up to the map, which has its own history."""
-    stages = {"reconstruct": options.reconstruct, "calibrate": options.calibrate, "densify": options.depth}
-    return {stage: asdict(own) for stage, own in stages.items()}
 
 
 def noted(result: RunResult, *notes: str | None) -> RunResult:
@@ -434,11 +383,12 @@ def noted(result: RunResult, *notes: str | None) -> RunResult:
     return result.with_parts(calibration=replace(result.calibration, notes=tuple(every)))
 
 
-STAGES = (
-    Stage("reconstruct", (RECONSTRUCTION,), _images, ("reconstruct",), _reconstruct),
-    Stage("calibrate", (CALIBRATION,), _poses_and_robot, ("calibrate",), _calibrate),
-    Stage("cameras", (CAMERAS,), _other_cameras, (), _cameras),
-    Stage("densify", (DEPTH,), _depth_made_from, (), _densify),
-    Stage("map", (CLOUD, MAP), lambda result: (), ("cloud", "map", "segment"), _map),
-    Stage("report", (REPORT,), lambda result: (), (), _report),
-)
+STAGES: dict[str, tuple[tuple[str, ...], Callable[[RunResult, Progress], RunResult]]] = {
+    "reconstruct": ((RECONSTRUCTION,), _reconstruct),
+    "calibrate": ((CALIBRATION,), _calibrate),
+    "cameras": ((CAMERAS,), _cameras),
+    "densify": ((DEPTH,), _densify),
+    "map": ((CLOUD, MAP), _map),
+    "report": ((REPORT,), _report),
+}
+"""Files of each stage in the run folder, and the function that writes them and adds its records to the result."""

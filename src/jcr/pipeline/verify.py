@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from jcr.calibration.drift import Cause, Drift, detectable, drift
+from jcr.calibration.drift import Drift, detectable, drift
 from jcr.calibration.options import GRASPING
 from jcr.calibration.robot_errors import of_poses, robot_errors
 from jcr.calibration.stage import calibrate_reconstruction
@@ -38,18 +38,10 @@ MIN_TO_RECALIBRATE = 5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verification:
+class Verification(Drift):
     """Verdict on a calibration, with the measured drift."""
 
     moved: bool
-    cause: Cause
-    """Body that has moved, where one has."""
-    offset: Float[ndarray, "6"]
-    """Drift: translation (m) and rotation vector (rad) of the camera in gripper axes."""
-    std: Float[ndarray, "6"]
-    p_value: float
-    detectable: tuple[float, float]
-    """m, rad: a drift of this size in the worst direction would be found nine times in ten."""
     images: tuple[str, ...]
     """Names of the images that were used."""
     notes: tuple[str, ...]
@@ -58,6 +50,11 @@ class Verification:
     """Name of the camera, where it is a fixed one; the drift is then along axes of the base."""
     others: tuple["Verification", ...] = ()
     """Fixed cameras of the run that the new capture has images of."""
+
+    @property
+    def std(self) -> Float[ndarray, "6"]:
+        """Standard deviations of the drift (m, rad)."""
+        return np.sqrt(np.diag(self.covariance))
 
     @property
     def drift_m(self) -> float:
@@ -127,12 +124,12 @@ def verify_run(
     report("find the old scene", 0.0)
     found = register(reconstruction, [taken_then[row] for row in reconstruction.image_index], list(taken_now))
     report("find the old scene", 1.0)
-    located = [(k, place) for k, place in enumerate(found) if isinstance(place, CameraPose)]
-    lost = [
-        f"{name} shares {place} points with the calibrated scene"
-        for name, place in zip(new.images, found, strict=True)
-        if not isinstance(place, CameraPose)
-    ]
+    located, lost = dict[int, CameraPose](), list[str]()
+    for row, place in enumerate(found):
+        if isinstance(place, CameraPose):
+            located[row] = place
+        else:
+            lost.append(f"{new.images[row]} shares {place} points with the calibrated scene")
     if located:
         wrist = _in_old_scene(run, new, located, lost, options)
         return replace(wrist, others=tuple(_fixed_cameras(run, new, options, progress)))
@@ -173,19 +170,19 @@ def _new_images(
 def _in_old_scene(
     run: RunResult,
     new: Capture,
-    located: Sequence[tuple[int, CameraPose]],
+    located: Mapping[int, CameraPose],
     notes: list[str],
     options: VerifyOptions,
 ) -> Verification:
-    """Test by the images that are located in the calibrated scene, row and camera pose of each.
+    """Test by the images that are located in the calibrated scene, camera pose by row.
 
     The calibration's poses are fitted again, without bundle adjustment, for the joint covariance that its file does not
     keep: new images are located in the same cameras' frame.
     """
     calibration, capture, reconstruction = run.of_wrist_camera()
-    calibrate_options = run.state.options.calibrate
+    calibrate_options, rows = run.state.options.calibrate, list(located)
     is_used = np.array([calibration.images[row].used for row in reconstruction.image_index])
-    used, rows = reconstruction.image_index[is_used], [row for row, _ in located]
+    used = reconstruction.image_index[is_used]
     robot = robot_errors(capture, calibrate_options, new)
     old = capture.base_from_gripper[used], reconstruction.recon_from_camera[is_used]
     similarity = calibration.base_from_recon
@@ -195,14 +192,11 @@ def _in_old_scene(
         error_covariance=of_poses(robot.systematic, used),
         noise_floor=calibrate_options.robot_noise_m_rad,
     )
+    cameras = np.stack([one.a_from_camera for one in located.values()])
     found = drift(
         solve(problem, state, averaged=False),
         old,
-        (
-            new.base_from_gripper[rows],
-            np.stack([place.a_from_camera for _, place in located]),
-            np.stack([place.covariance for _, place in located]),
-        ),
+        (new.base_from_gripper[rows], cameras, np.stack([one.covariance for one in located.values()])),
         of_poses(robot.systematic, np.r_[used, len(capture) + np.array(rows)]),
         options.alpha,
     )
@@ -279,44 +273,30 @@ def _by_recalibration(
 
 def _of_two(offset: Float[ndarray, "6"], covariance: Float[ndarray, "6 6"], options: VerifyOptions) -> Drift:
     """Return the drift of a camera between two places whose difference has this covariance."""
-    return Drift(
-        offset=offset,
-        covariance=covariance,
-        p_value=float(chi2.sf(offset @ np.linalg.solve(covariance, offset), 6)),
-        cause="camera",
-        detectable=detectable(covariance, options.alpha),
-        is_noisier=False,
-    )
+    p_value = float(chi2.sf(offset @ np.linalg.solve(covariance, offset), 6))
+    noticed = detectable(covariance, options.alpha)
+    found = {"offset": offset, "covariance": covariance, "p_value": p_value, "detectable": noticed}
+    return Drift(**found, cause="camera", is_noisier=False)
 
 
 def _judged(
     found: Drift, options: VerifyOptions, images: Sequence[str], notes: Sequence[str], how: str
 ) -> Verification:
     """Return the verdict on a drift: it is significant, and larger than the tolerance."""
+    notes = list(notes)
     if found.is_noisier:
-        noisier = (
+        notes.append(
             "the images disagree with one another; something else than the camera moved too, or the robot is less exact "
             "than when it was calibrated"
         )
-        notes = [*notes, noisier]
     unnoticed_mm, unnoticed_deg = 1e3 * found.detectable[0], float(np.degrees(found.detectable[1]))
     if unnoticed_mm > GRASPING[0] or unnoticed_deg > GRASPING[1]:
-        notes = [
-            *notes,
+        notes.append(
             f"drifts of less than {unnoticed_mm:.0f} mm or {unnoticed_deg:.1f}° would not be noticed; take more images, "
-            "with the wrist rotated and at other distances",
-        ]
+            "with the wrist rotated and at other distances"
+        )
     millimetres = 1e3 * float(np.linalg.norm(found.offset[:3]))
     degrees = float(np.degrees(np.linalg.norm(found.offset[3:])))
     matters = millimetres > options.tolerance[0] or degrees > options.tolerance[1]
-    return Verification(
-        moved=found.p_value < options.alpha and matters,
-        cause=found.cause,
-        offset=found.offset,
-        std=np.sqrt(np.diag(found.covariance)),
-        p_value=found.p_value,
-        detectable=found.detectable,
-        images=tuple(images),
-        notes=tuple(notes),
-        how=how,
-    )
+    moved = found.p_value < options.alpha and matters
+    return Verification(**vars(found), moved=moved, images=tuple(images), notes=tuple(notes), how=how)

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 
-from jcr.calibration.record import AnyCalibration
+from jcr.calibration.record import AnyCalibration, FailedCalibration
 from jcr.capture.formats.capture_json import origin
 from jcr.capture.formats.table import TABLES
 from jcr.errors import printable
@@ -42,51 +42,38 @@ OPEN = {"verdict", "failure", "tiles", "warnings", "transform", "view", "images"
 def report_html(result: RunResult, options: StageOptions | None = None) -> str:
     """Return the report of a run, made with these options, as one HTML page that loads nothing else.
 
-    Sections whose record a run does not have are left out. Raises InputError when an image of the capture has
+    Sections whose record a run does not have are left out: of one from given camera poses the images, of one that found
+    no camera poses all but the reason, the remedy and the images. Raises InputError when an image of the capture has
     become unreadable.
     """
-    calibration, capture, scene = result.calibration, result.capture, result.scene
-    options, fixed = options or {}, capture.mount == "base"
-    objects = None if scene is None or result.measured is None else (result.measured, scene.label_names)
+    calibration, capture, options = result.calibration, result.capture, options or {}
+    if not isinstance(capture, Capture):
+        about, source = "poses given, no images", capture.source or result.out
+    else:
+        about, source = _about_capture(capture, options), origin(capture.folder)
+    if isinstance(calibration, FailedCalibration):
+        sections = [
+            failure_section(calibration),
+            images_section(capture),
+            details_section(calibration, options),
+        ]
+        return _page(about, source, calibration, sections)
+    has_images = isinstance(capture, Capture)
+    is_wrist, scene = has_images and capture.mount != "base", result.scene if has_images else None
+    measured = None if scene is None else result.measured
     sections = [
         *head(calibration),
         transform_section(result.found),
-        None if fixed else scene_section(result),
-        images_section(capture, result),
-        None if result.cameras is None else cameras_section(result.cameras),
+        scene_section(result) if is_wrist else None,
+        images_section(capture, result) if has_images else None,
+        cameras_section(result.cameras) if has_images and result.cameras is not None else None,
         residuals_section(result),
-        None if fixed else motion_section(result),
-        None if objects is None else objects_section(*objects),
+        motion_section(result) if is_wrist or not has_images else None,
+        None if scene is None or measured is None else objects_section(measured, scene.label_names),
         *notes_section(calibration),
         details_section(calibration, options, None if scene is None else scene.history),
     ]
-    return _page(_about_capture(capture, options), origin(capture.folder), calibration, sections)
-
-
-def poses_report_html(result: RunResult, options: StageOptions | None = None) -> str:
-    """Return the report of a calibration from given camera poses, without images."""
-    calibration = result.calibration
-    sections = [
-        *head(calibration),
-        transform_section(result.found),
-        residuals_section(result),
-        motion_section(result),
-        *notes_section(calibration),
-        details_section(calibration, options or {}),
-    ]
-    return _page("poses given, no images", result.capture.source or result.out, calibration, sections)
-
-
-def failed_report_html(
-    capture: Capture, calibration: AnyCalibration, options: StageOptions | None = None
-) -> str:
-    """Return the report of a run that found no camera poses: reason, remedy and images."""
-    sections = [
-        failure_section(calibration),
-        images_section(capture),
-        details_section(calibration, options or {}),
-    ]
-    return _page(_about_capture(capture, options or {}), origin(capture.folder), calibration, sections)
+    return _page(about, source, calibration, sections)
 
 
 def _about_capture(capture: Capture, options: StageOptions) -> str:

@@ -30,41 +30,31 @@ Bar = tuple[str, float, float, str]
 
 def motion_section(result: RunResult) -> Section:
     """Return excitation of the seven directions, standard deviations of their parts, and the poses to add."""
-    observed, uncertainty = result.calibration.observability, result.calibration.uncertainty
-    found = _excitation(result)
+    calibration, spreads, seen = result.calibration, list[list[Bar]](), list[str]()
+    observed, uncertainty = calibration.observability, calibration.uncertainty
+    if uncertainty is not None:
+        spreads.append(list(_spreads("translation along", uncertainty.translation_std_mm, " mm")))
+        spreads.append(list(_spreads("rotation about", uncertainty.rotation_std_deg, "°")))
+        if (at := uncertainty.seen) is not None:
+            distance = significant(1e-3 * at.distance_mm)
+            seen.append(f"At {distance} m: {seen_in_words(at)} (95 % of the errors).")
+            if (kept := calibration.with_given_intrinsics) is not None:
+                seen.append(f"{given_in_words(kept).capitalize()}.")
+    gripper = result.capture.base_from_gripper[[image.used for image in calibration.images]]
+    bars = []
+    if len(gripper) > 1:
+        bars = list(excitation_bars(excitation(gripper, result.found.gripper_from_camera)))
     content = {
         "unobservable": list(zip(observed.unobservable, observed.advice, strict=False)),
         "is_observable": observed.observable,
         "tick": f"{100 * WEAK / GENERAL:.1f}",
-        "excitation": [] if found is None else list(excitation_bars(found)),
-        "seen": _seen(result),
-        "spreads": []
-        if uncertainty is None
-        else [
-            list(_spreads("translation along", uncertainty.translation_std_mm, " mm")),
-            list(_spreads("rotation about", uncertainty.rotation_std_deg, "°")),
-        ],
+        "excitation": bars,
+        "seen": seen,
+        "spreads": spreads,
         "scale_percent": "" if uncertainty is None else significant(uncertainty.scale_std_percent),
         "next_poses": _next_poses(result),
     }
     return Section("uncertainty", content)
-
-
-def _excitation(result: RunResult) -> Excitation | None:
-    """Return the excitation by the gripper poses of the used images; None of one image."""
-    used = [image.used for image in result.calibration.images]
-    gripper = result.capture.base_from_gripper[used]
-    return excitation(gripper, result.found.gripper_from_camera) if len(gripper) > 1 else None
-
-
-def _seen(result: RunResult) -> list[str]:
-    """Return sentences on the point uncertainty; none without intrinsics."""
-    calibration = result.calibration
-    if calibration.uncertainty is None or (seen := calibration.uncertainty.seen) is None:
-        return []
-    kept = calibration.with_given_intrinsics
-    sentences = [f"At {significant(1e-3 * seen.distance_mm)} m: {seen_in_words(seen)} (95 % of the errors)."]
-    return sentences + ([] if kept is None else [f"{given_in_words(kept).capitalize()}."])
 
 
 def excitation_bars(found: Excitation) -> Iterator[tuple[str, str, float, str]]:
@@ -84,24 +74,18 @@ def _spreads(name: str, std: Sequence[float], unit: str) -> Iterator[Bar]:
 
 
 def _next_poses(result: RunResult) -> dict[str, Any] | None:
-    """Return the proposed gripper poses with their expected uncertainty, ready to copy; None without any."""
+    """Return the proposed gripper poses in the convention of the capture's robot, ready to copy; None without any."""
     if not (poses := result.calibration.next_poses):
         return None
-    convention = _convention(result)
+    capture, convention = result.capture, ANY_CONVENTION
+    if isinstance(capture, Capture):
+        convention = capture.pose_convention or OF_ARM.get(capture.robot or "") or ANY_CONVENTION
     written = MATRICES.get(convention) or ", ".join(CONVENTIONS[convention].columns)
     return {
-        "in_the_3d_view": isinstance(result.capture, Capture),
+        "in_the_3d_view": isinstance(capture, Capture),
         "notation": f"{written} ({units_of(convention)}), as {convention} writes poses",
         "rows": [_next_pose(pose, convention) for pose in poses],
     }
-
-
-def _convention(result: RunResult) -> str:
-    """Return the pose convention of the capture's robot; a quaternion where it is unknown."""
-    if not isinstance(result.capture, Capture):
-        return ANY_CONVENTION
-    capture = result.capture
-    return capture.pose_convention or OF_ARM.get(capture.robot or "") or ANY_CONVENTION
 
 
 def _next_pose(pose: NextPose, convention: str) -> dict[str, Any]:

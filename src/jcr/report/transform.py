@@ -1,7 +1,8 @@
 """Section of the hand-eye transform: notations of robot software, ready to copy, and a sketch to scale."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -21,13 +22,12 @@ from jcr.export.ros import (
 )
 from jcr.geometry import apply, roll_pitch_yaw
 from jcr.records import COVARIANCE_ORDER, Intrinsics, Mount
-from jcr.report.figures import WIDTH, Figure, Shape, caption, line
 from jcr.report.render import Section
 from jcr.rounding import significant
 
 FIXED_AXES = "fixed axes x, y, z: R = Rz(yaw)·Ry(pitch)·Rx(roll)"
-HEIGHT, MARGIN = 320.0, 34.0
-"""Height of the sketch and its margin (px)."""
+WIDTH, HEIGHT, MARGIN = 440, 320, 34
+"""Size of the sketch, small enough that its text can be read on a phone, and its margin (px)."""
 EYE_DEG = (-55.0, 22.0)
 """Azimuth of the eye about the parent's z axis, and elevation above its plane."""
 FLANGE_M = 0.0315
@@ -82,8 +82,13 @@ def transform_section(hand_eye: Calibration) -> Section:
     return Section("transform", content)
 
 
-def sketch(parent_from_camera: Float[ndarray, "4 4"], intrinsics: Intrinsics | None, mount: Mount) -> Figure:
-    """Return the camera's pyramid and axes in the frame of the flange (z drawn downwards) or of the base."""
+def sketch(
+    parent_from_camera: Float[ndarray, "4 4"], intrinsics: Intrinsics | None, mount: Mount
+) -> dict[str, Any]:
+    """Return the camera's pyramid and axes in the frame of the flange (z drawn downwards) or of the base.
+
+    "shapes" are the tag, attributes and text of SVG elements, "label" is what a screen reader reads instead.
+    """
     down = mount == "gripper"
     away = float(np.linalg.norm(parent_from_camera[:3, 3]))
     size = max(away, 2 * FLANGE_M)
@@ -97,23 +102,33 @@ def sketch(parent_from_camera: Float[ndarray, "4 4"], intrinsics: Intrinsics | N
     flange = FLANGE_M * down * np.column_stack([np.cos(turn), np.sin(turn), np.zeros(49)])
     place = _projection(np.vstack([pyramid, tips, axes, flange]), down)
     origin, centre = place(np.zeros((1, 3)))[0], place(pyramid[:1])[0]
-    shapes = [line(place(flange), "flange")] * down
-    shapes += [line([origin, centre], "offset")]
+    shapes = list[tuple[str, dict[str, str], str]]()
+
+    def draw(tag: str, ends: Sequence[ndarray] | ndarray, kind: str) -> None:
+        """Draw a polyline or polygon through points."""
+        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in ends)
+        shapes.append((tag, {"class": kind, "points": points}, ""))
+
+    def write(x: float, y: float, words: str, kind: str) -> None:
+        """Write a text whose baseline begins at x, y, or with the class "middle" is centred there."""
+        shapes.append(("text", {"x": f"{x:.1f}", "y": f"{y:.1f}", "class": kind}, words))
+
+    if down:
+        draw("polyline", place(flange), "flange")
+    draw("polyline", [origin, centre], "offset")
     tip, *rim = place(pyramid)
-    shapes += [
-        Shape("polygon", {"class": "cone", "points": " ".join(f"{x:.1f},{y:.1f}" for x, y in face)})
-        for face in [*([tip, rim[k - 1], rim[k]] for k in range(4)), rim]
-    ]
+    for face in [*([tip, rim[k - 1], rim[k]] for k in range(4)), rim]:
+        draw("polygon", face, "cone")
     for begin, ends in ((origin, place(axes)), (centre, place(tips))):
         for name, end in zip("xyz", ends, strict=True):
             x, y = end + 10 * (end - begin) / max(float(np.linalg.norm(end - begin)), 1.0)
-            shapes += [line([begin, end], f"axis-{name}"), caption(x, y + 4, name, "small middle")]
+            draw("polyline", [begin, end], f"axis-{name}")
+            write(x, y + 4, name, "small middle")
     parent, (x, y) = "gripper" if down else "base", (origin + centre) / 2
-    shapes.append(caption(x + 12, y - 6, f"{1e3 * away:.0f} mm", "small"))
-    shapes.append(caption(12.0, 18.0, f"{parent.capitalize()} and camera, to scale", "title"))
-    return Figure(
-        f"The camera in the frame of the {parent}, {1e3 * away:.0f} mm from its origin", shapes, HEIGHT
-    )
+    write(x + 12, y - 6, f"{1e3 * away:.0f} mm", "small")
+    write(12.0, 18.0, f"{parent.capitalize()} and camera, to scale", "title")
+    label = f"The camera in the frame of the {parent}, {1e3 * away:.0f} mm from its origin"
+    return {"label": label, "width": WIDTH, "height": HEIGHT, "shapes": shapes}
 
 
 def _projection(
