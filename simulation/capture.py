@@ -1,4 +1,4 @@
-"""Simulated captures: images of a wrist camera on its way over a scene, and the ground truth."""
+"""Simulated captures: images of a wrist camera on its way over a scene, of fixed cameras, and the ground truth."""
 
 import json
 from collections.abc import Sequence
@@ -19,16 +19,16 @@ from jcr.estimation.arms import CHOICES, RobotName, arm_named
 from jcr.files import write_bytes, write_text
 from jcr.geometry import retract
 from jcr.progress import Progress, silent, steps
-from jcr.records import Capture, Intrinsics
+from jcr.records import Capture, CellCamera, Intrinsics
 from simulation.arms import EFFECTIVE_POSES, ErrorSizes, bend
-from simulation.motion import motion_over_table
+from simulation.motion import fixed_camera, motion_over_table
 from simulation.poses import Pattern
 from simulation.render import render
 from simulation.scenes import SceneName, make_scene, moved
 from simulation.truth import Truth, write_pixels, write_truth
 
 _WIDTH, _HEIGHT = 640, 480
-_RANGES = {"images": (1, 1000), "vignetting": (0, 1)} | dict.fromkeys(
+_RANGES = {"images": (1, 1000), "vignetting": (0, 1), "fixed_cameras": (0, 20)} | dict.fromkeys(
     ("joint_offsets", "link_errors", "gear_errors", "sag", "seed", "noise", "blur", "intrinsics_error"),
     (0, np.inf),
 )
@@ -80,6 +80,8 @@ class SimulateOptions:
     """Share of light lost in the corners, 0 to 1."""
     jpeg_quality: int | Literal["lossless"] = 90
     """1 to 100, or lossless: PNG."""
+    fixed_cameras: int = 0
+    """Number of cameras that stand beside the table and see the scene, an image each."""
     truth: Literal["full", "scene"] = "full"
     """Write truth/ with depth and labels of every image, or with scene.json alone."""
 
@@ -94,8 +96,8 @@ def simulate(out: Path, options: SimulateOptions | None = None, progress: Progre
     _check(out, options := options or SimulateOptions())
     scene = make_scene(options.scene, options.seed)
     # One stream of random numbers a matter: a change in one must not disturb the others.
-    errors, path, elsewhere, camera, noise, intrinsics = (
-        np.random.default_rng([options.seed, stream]) for stream in (8, 4, 9, 5, 6, 10)
+    errors, path, elsewhere, camera, noise, intrinsics, further = (
+        np.random.default_rng([options.seed, stream]) for stream in (8, 4, 9, 5, 6, 10, 14)
     )
     bent = None
     if options.robot is not None:
@@ -142,6 +144,23 @@ def simulate(out: Path, options: SimulateOptions | None = None, progress: Progre
             "physical_gripper_from_camera": motion.physical.tolist(),
             "errors": bent.named_errors(),
         }
+    others = []
+    for k in range(options.fixed_cameras):
+        name, place, own = (
+            f"fixed{k}",
+            fixed_camera(scene.table_center_in_base, 0.55, further),
+            pinhole(further),
+        )
+        image = f"{name}/00.{suffix}"
+        (view,) = render(scene, own, place[None], options.texture, with_truth=False)
+        _write_image(out / image, view.image, options, [15, 0, *name.encode()])
+        size, stated = (own.width, own.height), _stated_intrinsics(own, options, further)
+        others.append(
+            CellCamera(name=name, mount="base", images=(image,), image_size=size, intrinsics=stated)
+        )
+        true = {name: {"base_from_camera": (motion.base_from_true_base @ place).tolist()}}
+        reference = {"cameras": {}, "arms": {}} | reference
+        reference["cameras"] |= true  # type: ignore[operator]
     write_text(out / "reference.json", json.dumps(reference, indent=1) + "\n")
     capture = Capture(
         folder=out,
@@ -151,6 +170,7 @@ def simulate(out: Path, options: SimulateOptions | None = None, progress: Progre
         intrinsics=_stated_intrinsics(truth.intrinsics, options, intrinsics),
         joints=motion.joints,
         robot=options.robot,
+        others=tuple(others),
     )
     # Last: a folder with a capture.json is a complete capture.
     capture_json.write(out, capture, source={"program": "python -m simulation", "options": asdict(options)})

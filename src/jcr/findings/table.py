@@ -368,9 +368,6 @@ class FindingKind(StrEnum):
         "take such a view again, nearer to a pose that registered, with textured things in view",
         means="while a capture is taken (`jcr capture`): its camera is not in the reconstruction",
         evidence="other images that match it")
-    CLOCK_JUMPS = "clock jumps back", KindRow("single",
-        "the time of {images[0]} is {value:.3g} s before that of the image before it",
-        "check that images and poses are stamped by one clock", evidence="s")
     # fmt: on
 
 

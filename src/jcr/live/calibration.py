@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, UInt8, UInt16
+from jaxtyping import Float, UInt16
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from jcr.calibration.case import Case
 from jcr.calibration.checks.capture import SAME
 from jcr.calibration.options import CalibrateOptions, check_options
+from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate_case
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
@@ -84,12 +85,12 @@ class LiveCalibration:
         """Arm that the user or the capture named, and the box of the gripper positions."""
         self._map: LiveMap | None = None
         self._mapped: tuple[str, ...] = ()
-        self._of_image: dict[str, list[Finding]] = {}
+        self._blurred: dict[str, Finding] = {}
         self._history: tuple[Accuracy, ...] = ()
         self._refused: list[Float[ndarray, "4 4"]] = []
         self._propose: Callable[[], dict[str, Any]] = dict
         """Function that returns the next pose, by the last calibration and the gripper poses refused since."""
-        self.progress = Progress(images=tuple(folder.names), history=self._history)
+        self.progress = Progress(images=tuple(folder.names))
 
     def add(
         self,
@@ -146,16 +147,18 @@ class LiveCalibration:
         with self._lock:
             capture, before = self.live.capture(), self._mapped
             self._mapped = () if capture is None else capture.images
-            new = [name for name in self._mapped if name not in before]
-            images = {name: read_image(self.live.folder / name) for name in new}
-            known = {name: self._of_image[name] for name in self._mapped if name in self._of_image}
-            self._of_image = known | {name: self._about(name, image) for name, image in images.items()}
+            new = {name: read_image(self.live.folder / name) for name in self._mapped if name not in before}
+            for name, image in new.items():
+                if (width := edge_width(image)) > BLURRED_EDGE:
+                    edge_px = max(*image.shape[:2], EDGES_AT) * width
+                    found = Finding.of(FindingKind.BLURRED, "warns", "images", name, value=edge_px)
+                    self._blurred[name] = found
             if capture is None:
                 self._map = None
             else:
                 self._map = self._map or LiveMap(capture)
-                self._map.update(capture, images)
-            added = new[-1] if new and len(before) <= len(self._mapped) else None
+                self._map.update(capture, new)
+            added = list(new)[-1] if new and len(before) <= len(self._mapped) else None
             self._refused.clear()
             self.progress = self._calibrated(capture, added)
             return self.progress
@@ -174,16 +177,6 @@ class LiveCalibration:
             self.live.close()
             self._opened.close()
 
-    def _about(self, name: str, image: UInt8[ndarray, "h w 3"]) -> list[Finding]:
-        """Return the findings about an image by itself and its time."""
-        found = []
-        if (width := edge_width(image)) > BLURRED_EDGE:
-            edge_px = max(*image.shape[:2], EDGES_AT) * width
-            found.append(Finding.of(FindingKind.BLURRED, "warns", "images", name, value=edge_px))
-        if (back := self.live.seconds_back(name)) is not None:
-            found.append(Finding.of(FindingKind.CLOCK_JUMPS, "warns", "poses", name, value=back))
-        return found
-
     def _calibrated(self, capture: Capture | None, added: str | None) -> Progress:
         """Return the state of the mapped images, calibrated where enough of them registered."""
         names, self._propose = self._mapped, dict
@@ -192,8 +185,12 @@ class LiveCalibration:
             return state
         made = self._map.reconstruction()
         rows = np.zeros(0, int) if made is None else made.image_index
-        robot, findings = robot_errors(capture, self._options), self._image_findings()
-        case = None
+        robot, case = robot_errors(capture, self._options), None
+        findings = [self._blurred[name] for name in names if name in self._blurred]
+        for row in sorted(set(range(len(names))) - set(self._map.registered)) if len(names) >= FEWEST else ():
+            matches = float(self._map.matched_with(row))
+            kind = FindingKind.NOT_REGISTERED
+            findings.append(Finding.of(kind, "warns", "images", names[row], value=matches))
         if made is not None and len(rows) >= FEWEST:
             most = min(OBSERVATIONS[0] * len(rows), OBSERVATIONS[1])
             some = replace(made, tracks=_longest(made.tracks, most))
@@ -210,10 +207,14 @@ class LiveCalibration:
         self._propose = propose_next
         state = replace(state, registered=tuple(names[row] for row in rows), **self._propose())
         if case is None:
-            unused = () if robot.unused is None else (robot.unused,)
-            return replace(state, findings=strongest_first([*findings, *unused, _too_few(len(names))]))
-        hand_eye = case.hand_eye
-        required = hand_eye.requirement
+            findings += [] if robot.unused is None else [robot.unused]
+            few = Finding.of(FindingKind.FEW_IMAGES, "informs", "images", value=float(len(names)))
+            if len(names) >= FEW:
+                why, then = "fewer than three images are registered", "let the views overlap more"
+                kind = FindingKind.NO_RECONSTRUCTION
+                few = Finding.of(kind, "rejects", "reconstruction", text=why, remedy=then)
+            return replace(state, findings=strongest_first([*findings, few]))
+        hand_eye, required = case.hand_eye, case.hand_eye.requirement
         assert required is not None
         reached = Accuracy(
             images=len(names),
@@ -226,20 +227,10 @@ class LiveCalibration:
         return replace(
             state,
             hand_eye=hand_eye,
-            findings=strongest_first([*findings, *_contradicting(case), *hand_eye.findings]),
+            findings=strongest_first([*findings, *_contradicting(hand_eye), *hand_eye.findings]),
             history=self._history,
             points_in_base=_points(case),
         )
-
-    def _image_findings(self) -> list[Finding]:
-        """Return the findings about single images, and those that the map does not have."""
-        assert self._map is not None
-        names, found = self._mapped, [one for name in self._mapped for one in self._of_image[name]]
-        outside = set(range(len(names))) - set(self._map.registered) if len(names) >= FEWEST else ()
-        for row in sorted(outside):
-            matches = float(self._map.matched_with(row))
-            found.append(Finding.of(FindingKind.NOT_REGISTERED, "warns", "images", names[row], value=matches))
-        return found
 
 
 def _longest(tracks: Tracks, most: int) -> Tracks:
@@ -257,30 +248,16 @@ def _longest(tracks: Tracks, most: int) -> Tracks:
     return tracks.only(chosen[tracks.point])
 
 
-def _too_few(images: int) -> Finding:
-    """Return the reason why there is no calibration."""
-    if images < FEW:
-        return Finding.of(FindingKind.FEW_IMAGES, "informs", "images", value=float(images))
-    text, remedy = "fewer than three images are registered", "let the views overlap more"
-    return Finding.of(FindingKind.NO_RECONSTRUCTION, "rejects", "reconstruction", text=text, remedy=remedy)
-
-
-def _contradicting(case: Case) -> list[Finding]:
+def _contradicting(hand_eye: Calibration) -> list[Finding]:
     """Return a finding for each image whose gripper pose a sound calibration rejects."""
-    hand_eye = case.hand_eye
-    if not hand_eye.is_sound:
-        return []
-    off = {
-        one.image: (1e-3 * (one.translation_residual_mm or 0.0), np.radians(one.rotation_residual_deg or 0.0))
-        for one in hand_eye.images
-        if not one.used
-    }
-    kind = FindingKind.POSE_CONTRADICTS_IMAGE
-    return [
-        Finding.of(kind, "warns", "poses", image, value=metres, rotation=float(radians))
-        for image, (metres, radians) in off.items()
-        if metres > SAME[0] or radians > SAME[1]
-    ]
+    found = list[Finding]()
+    for one in hand_eye.images if hand_eye.is_sound else ():
+        metres = 1e-3 * (one.translation_residual_mm or 0.0)
+        radians = float(np.radians(one.rotation_residual_deg or 0.0))
+        if not one.used and (metres > SAME[0] or radians > SAME[1]):
+            kind = FindingKind.POSE_CONTRADICTS_IMAGE
+            found.append(Finding.of(kind, "warns", "poses", one.image, value=metres, rotation=radians))
+    return found
 
 
 def _points(case: Case) -> Float[ndarray, "p 3"]:

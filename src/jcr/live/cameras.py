@@ -74,9 +74,8 @@ class Frames:
 
     def __init__(self, read: Callable[[], Frame | None], name: str | None) -> None:
         """Read by `read`, which waits for the next frame and returns None at the end; `name`: None for a recording."""
-        self._read, self._name = read, name
-        self._arrived, self._stop = threading.Condition(), threading.Event()
-        self._frame: Frame | None = None
+        self._read, self._name, self._is_open = read, name, True
+        self._arrived, self._frame = threading.Condition(), None
         self._thread = threading.Thread(target=self._watch, daemon=True)
         if name is not None:
             self._thread.start()
@@ -94,36 +93,33 @@ class Frames:
             return
         while True:
             asked = time.monotonic()
-
-            def is_fresh(asked: float = asked) -> bool:
-                return self._frame is not None and self._frame.time_s >= asked
-
+            end = asked + TIMEOUT_S
             with self._arrived:
-                self._arrived.wait_for(lambda: is_fresh() or not self._thread.is_alive(), TIMEOUT_S)
+                while self._frame is None or self._frame.time_s < asked:
+                    left_s = end - time.monotonic()
+                    if left_s <= 0 or not self._thread.is_alive():
+                        raise InputError(
+                            f"--camera {self._name}: gives no more images; check its cable and start again: the same "
+                            "command resumes"
+                        )
+                    self._arrived.wait(left_s)
                 frame = self._frame
-                if frame is None or not is_fresh():
-                    raise InputError(
-                        f"--camera {self._name}: gives no more images; check its cable and start again: the same "
-                        "command resumes"
-                    )
             yield frame
 
     def close(self) -> None:
         """Stop reading."""
-        self._stop.set()
+        self._is_open = False
         if self._name is not None:
             self._thread.join(TIMEOUT_S)
 
     def _watch(self) -> None:
         """Read frames until the source ends."""
-        while not self._stop.is_set():
-            frame = self._read()
+        while self._is_open and (frame := self._read()) is not None:
             with self._arrived:
-                if frame is not None:
-                    self._frame = frame
+                self._frame = frame
                 self._arrived.notify_all()
-            if frame is None:
-                return
+        with self._arrived:
+            self._arrived.notify_all()
 
 
 @contextmanager
@@ -238,21 +234,22 @@ def _open_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
             f"--camera {name}: {' '.join(str(error).split())}; see what rs-enumerate-devices lists, and whether another "
             "program holds the camera"
         ) from None
-    frames = None
-    try:
+    with ExitStack() as stack:
+
+        @stack.callback
+        def stop() -> None:
+            """Stop the pipeline, unless it stopped at the end of its recording."""
+            with suppress(RuntimeError):
+                pipeline.stop()
+
         if is_file:
             profile.get_device().as_playback().set_real_time(False)
         else:
             _apply_realsense_options(rs, profile, options)
         stored = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
-        read = _realsense_reader(rs, pipeline, profile, is_file)
-        frames = Frames(read, None if is_file else name)
+        frames = Frames(_realsense_reader(rs, pipeline, profile, is_file), None if is_file else name)
+        stack.callback(frames.close)
         yield Camera(frames, frames.latest, _realsense_intrinsics(rs, stored))
-    finally:
-        if frames is not None:
-            frames.close()
-        with suppress(RuntimeError):
-            pipeline.stop()
 
 
 def _realsense_reader(

@@ -1,7 +1,6 @@
 """Capture folder that grows image by image and is complete after every change, so that stopping loses nothing."""
 
 import re
-import threading
 from pathlib import Path
 from typing import Literal
 
@@ -31,8 +30,8 @@ Channels = Literal["rgb", "bgr"]
 class LiveFolder:
     """Capture folder whose images are added and removed; images that it holds already are kept.
 
-    Methods that change it hold `lock`; others may read at any time. The files of removed images stay until `close`, so
-    that a change can be undone.
+    Its owner changes it in one thread at a time; others may read at any time. The files of removed images stay until
+    `close`, so that a change can be undone.
     """
 
     def __init__(
@@ -40,16 +39,15 @@ class LiveFolder:
     ) -> None:
         """Open or begin a capture; raise InputError where the folder or its capture.json cannot be used."""
         self.folder, file = folder, folder / FILE
-        self.lock = threading.RLock()
         if folder.exists() and not folder.is_dir():
             raise InputError(f"{folder}: is a file; name a folder for the capture")
-        self._content = CaptureFile(frames=[], intrinsics=None, source={"program": "jcr capture"})  # pyright: ignore[reportCallIssue]
+        content = CaptureFile(frames=[], intrinsics=None, source={"program": "jcr capture"})  # pyright: ignore[reportCallIssue]
         if file.exists():
-            self._content = read_capture_json(file)
-        self.images = tuple(frame_of(self._content, row, file) for row in range(len(self._content.frames)))
+            content = read_capture_json(file)
+        self.images = tuple(frame_of(content, row, file) for row in range(len(content.frames)))
         given = {"intrinsics": intrinsics, "robot": robot}
         update = {key: value for key, value in given.items() if value is not None}
-        self._content = self._content.model_copy(update=update)
+        self._content = content.model_copy(update=update)
         files = {name: contained(folder, name, str(file)) for name in self.names}
         sizes = {name: read_image(path).shape[1::-1] for name, path in files.items()}
         self.size = size_of_all(sizes, str(file)) if sizes else None
@@ -57,7 +55,6 @@ class LiveFolder:
         self._earlier: list[tuple[FrameEntry, ...]] = []
         """Images before each change since the folder was opened."""
         self._summaries: dict[str, ImageSummary] = {}
-        self._opened_with = frozenset(self.names)
         self._ever = {one.image: one for one in self.images}
         # Above the numbers of all image files, files that no capture.json names included.
         files = [*self.names, *(f"{IMAGES}/{file.name}" for file in (folder / IMAGES).glob("*.png"))]
@@ -100,70 +97,52 @@ class LiveFolder:
         InputError where the frame cannot be part of this capture, and OSError where a file cannot be written; the
         capture is then unchanged.
         """
-        with self.lock:
-            number, stem = f"image {len(self.images) + 1}", f"{self._next_number:03d}"
-            pixels = checked_image(image, color, number)
-            pose = checked_pose(base_from_gripper, f"{number}: base_from_gripper")
-            size, summary = (pixels.shape[1], pixels.shape[0]), ImageSummary.of(pixels)
-            if self.size not in (None, size):
-                remedy = "set its old resolution or name a new folder"
-                raise other_size("the camera's image", size, self.size, f"those in {self.folder}", remedy)
-            self._refuse_repeated(summary, pose, number)
-            entry = {"image": f"{IMAGES}/{stem}.png", "base_from_gripper": pose, "time_s": time_s}
-            entry |= {"joints": None if joints is None else np.asarray(joints, np.float64).tolist()}
-            entry |= {"depth": None if depth_mm is None else f"depth/{stem}.png"}
-            new: FrameEntry = validated_content(FrameEntry, entry, number)
-            images = (*self.images, new)
-            if len({len(one.joints) for one in images if one.joints is not None}) > 1:
-                raise InputError(
-                    f"joints of {new.image}: not as many angles as the other images have; give all"
-                )
-            self._capture_of(images, size)
-            try:
-                write_bytes(self.folder / new.image, encode_png(pixels))
-                if new.depth is not None and depth_mm is not None:
-                    write_bytes(self.folder / new.depth, encode_png(depth_mm))
-                self._change(images)
-            except OSError:
-                self._delete(new)
-                raise
-            self.size = size
-            self._summaries[new.image], self._ever[new.image] = summary, new
-            self._next_number += 1
-            return new.image
+        number, stem = f"image {len(self.images) + 1}", f"{self._next_number:03d}"
+        pixels = checked_image(image, color, number)
+        pose = checked_pose(base_from_gripper, f"{number}: base_from_gripper")
+        size, summary = (pixels.shape[1], pixels.shape[0]), ImageSummary.of(pixels)
+        if self.size not in (None, size):
+            remedy = "set its old resolution or name a new folder"
+            raise other_size("the camera's image", size, self.size, f"those in {self.folder}", remedy)
+        self._refuse_repeated(summary, pose, number)
+        entry = {"image": f"{IMAGES}/{stem}.png", "base_from_gripper": pose, "time_s": time_s}
+        entry |= {"joints": None if joints is None else np.asarray(joints, np.float64).tolist()}
+        entry |= {"depth": None if depth_mm is None else f"depth/{stem}.png"}
+        new: FrameEntry = validated_content(FrameEntry, entry, number)
+        images = (*self.images, new)
+        if len({len(one.joints) for one in images if one.joints is not None}) > 1:
+            raise InputError(f"joints of {new.image}: not as many angles as the other images have; give all")
+        self._capture_of(images, size)
+        try:
+            write_bytes(self.folder / new.image, encode_png(pixels))
+            if new.depth is not None and depth_mm is not None:
+                write_bytes(self.folder / new.depth, encode_png(depth_mm))
+            self._change(images)
+        except OSError:
+            self._delete(new)
+            raise
+        self.size = size
+        self._summaries[new.image], self._ever[new.image] = summary, new
+        self._next_number += 1
+        return new.image
 
     def remove(self, name: str) -> None:
         """Remove an image from the capture."""
-        with self.lock:
-            self._change(tuple(one for one in self.images if one.image != name))
+        self._change(tuple(one for one in self.images if one.image != name))
 
     def undo(self) -> bool:
         """Take back the last change since the folder was opened; return whether there was one."""
-        with self.lock:
-            if not self._earlier:
-                return False
-            self._write(self._earlier[-1])
-            self.images = self._earlier.pop()
-            return True
+        if not self._earlier:
+            return False
+        self._write(self._earlier[-1])
+        self.images = self._earlier.pop()
+        return True
 
     def close(self) -> None:
         """Delete the files of images that were removed; no change can be undone after that."""
         for name in self._ever.keys() - set(self.names):
             self._delete(self._ever.pop(name))
         self._earlier.clear()
-
-    def seconds_back(self, name: str) -> float | None:
-        """Return the time by which an image was stamped before its predecessor; None where it was not, or is unknown.
-
-        Images that the folder was opened with may have had another clock.
-        """
-        images, row = self.images, self.names.index(name)
-        before, now = images[row - 1], images[row]
-        if row == 0 or now.time_s is None or before.time_s is None:
-            return None
-        if (before.image in self._opened_with) != (name in self._opened_with):
-            return None
-        return before.time_s - now.time_s if now.time_s <= before.time_s else None
 
     def capture(self) -> Capture | None:
         """Return the images kept so far as a capture; None before the first image."""

@@ -1,6 +1,7 @@
 """Gripper pose that improves the calibration most, within reach and with an image that is likely to register."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -69,27 +70,24 @@ def propose(
     else:
         assumptions, robot = _assumed(capture, poses[rows], hand_eye), errors_of(poses[rows])
 
-    def is_likely(added: Poses) -> Bool[ndarray, " k"]:
-        """Test at which poses an image is likely to register."""
-        return _is_likely(added, assumptions.gripper_from_camera, poses, has_camera, reach.refused)
+    def wanted(added: Poses, *, or_likely: bool = False) -> Bool[ndarray, " k"]:
+        """Test which poses are likely to register and, where that limits the accuracy, rotated enough.
 
-    def is_wanted(added: Poses) -> Bool[ndarray, " k"]:
-        """Test which poses are likely to register and, where that limits the accuracy, rotated enough."""
-        is_apart = _least_rotation(added, poses) >= APART
-        return is_likely(added) & is_apart if is_limited_by_rotation else is_likely(added)
+        `or_likely`: where there are none, return which are likely to register.
+        """
+        likely = _is_likely(added, assumptions.gripper_from_camera, poses, has_camera, reach.refused)
+        found = likely
+        if is_limited_by_rotation:
+            found = likely & (_least_rotation(added, poses) >= APART)
+        return found if found.any() or not or_likely else likely
 
     is_free = reach.arm is None and reach.box is None
-    if best is not None and is_free and is_wanted(best.base_from_gripper[None])[0]:
+    if best is not None and is_free and wanted(best.base_from_gripper[None])[0]:
         return {"next_pose": best}
-
-    def is_wanted_or_likely(added: Poses) -> Bool[ndarray, " k"]:
-        """Test which poses are wanted, and where none is, which are likely to register."""
-        wanted = is_wanted(added)
-        return wanted if wanted.any() else is_likely(added)
-
     count, joints = 1 if reach.arm is None else PROPOSALS, None
     names = [capture.images[row] for row in rows]
-    added = better_poses(assumptions, poses[rows], robot, count, reach.box, is_likely=is_wanted_or_likely)
+    is_likely = partial(wanted, or_likely=True)
+    added = better_poses(assumptions, poses[rows], robot, count, reach.box, is_likely=is_likely)
     if reach.arm is not None:
         recorded = None if capture.joints is None else capture.joints[rows]
         for pose in added:

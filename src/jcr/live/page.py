@@ -11,12 +11,12 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from jcr.calibration.options import GRASPING
+from jcr.calibration.words import leave_one_out_text
 from jcr.capture.images import read_image
 from jcr.findings import reached_in_words, sentence
 from jcr.live.progress import (
     FIRST_ADVICE,
     Notation,
-    Progress,
     accuracy_line,
     faults,
     finding_lines,
@@ -25,14 +25,13 @@ from jcr.live.progress import (
 )
 from jcr.live.session import LiveSession, SessionState
 from jcr.records import Intrinsics
-from jcr.report.figures import Figure, course_figure
 from jcr.report.render import Section, render
 from jcr.report.scene3d import scene_data, scene_view, track_layer
 from jcr.report.verdict import Tile
 from jcr.rounding import significant
 
 PACKAGE = "jcr.live"
-PARTS = ("head", "next", "course", "images")
+PARTS = ("head", "next", "images")
 """Templates of the parts that change, each in an element of this name."""
 LAYERS = {
     "cameras": "cameras",
@@ -44,8 +43,6 @@ LAYERS = {
 """Parts of the 3D view and their labels."""
 ANY_CAMERA = Intrinsics(600.0, 600.0, 320.0, 240.0, 640, 480)
 """Camera that is drawn where no intrinsics are known."""
-BOUNDS = ("Point uncertainty", " mm"), ("Direction", "°")
-"""Names and units of the two bounds of the errors."""
 NOW_PX, CARD_PX = 640, 330
 """Width of the camera's image and of the images in the list."""
 FEW_FEATURES = 150
@@ -83,9 +80,8 @@ def page_content(
     "kind" is the colour of the headline ("good", "fair", "bad" or empty), "images" the cards of the list, the newest
     first.
     """
-    progress = state.progress
+    progress, has_next = state.progress, _is_proposed(state)
     kind, *lines = _verdict(state)
-    has_next = _is_proposed(state)
     headline, *below = (line[:1].upper() + line[1:] for line in lines)
     return {
         "kind": kind,
@@ -96,9 +92,7 @@ def page_content(
         "can_undo": state.can_undo,
         "tiles": _tiles(state, required),
         "next_pose": next_sentence(progress) if has_next else "",
-        # The lines of a program would repeat the pose.
-        "next_lines": next_lines(progress, notation, for_program=False) if has_next else [],
-        "courses": _courses(progress, required),
+        "next_lines": next_lines(progress, notation) if has_next else [],
         "images": _cards(state)[::-1],
     }
 
@@ -161,26 +155,14 @@ def _tiles(state: SessionState, required: tuple[float, float]) -> list[Tile]:
     reached = () if now is None else (now.translation_mm, now.rotation_deg)
     if state.result is not None and (found := state.result.calibration.requirement) is not None:
         reached = found.reached_mm, found.reached_deg
-    for (name, unit), value, limit in zip(BOUNDS, reached, required, strict=False):
+    names = ("Point uncertainty", " mm"), ("Direction", "°")
+    for (name, unit), value, limit in zip(names, reached, required, strict=False):
         tiles.append((f"{name}, 95 %", f"± {significant(value)}{unit}", f"required {limit:g}{unit}", True))
     count = f"{len(state.progress.registered)} of {len(state.images)}"
     tiles.append(("Images registered", count, "", False))
     if (error := state.progress.leave_one_out) is not None:
-        off = f"{significant(error.translation_mm)} mm · {significant(error.rotation_deg)}°"
-        tiles.append(("Leave-one-out error", off, "", False))
+        tiles.append(("Leave-one-out error", leave_one_out_text(error), "", False))
     return tiles
-
-
-def _courses(progress: Progress, required: tuple[float, float]) -> list[Figure]:
-    """Return figures of the accuracy after each image."""
-    if len(history := progress.history) < 2:
-        return []
-    count = [one.images for one in history]
-    values = [one.translation_mm for one in history], [one.rotation_deg for one in history]
-    return [
-        course_figure(f"{name} ({unit.strip()})", count, value, limit, unit)
-        for (name, unit), value, limit in zip(BOUNDS, values, required, strict=True)
-    ]
 
 
 def _scene(state: SessionState) -> dict[str, Any]:
@@ -208,12 +190,12 @@ def _scene(state: SessionState) -> dict[str, Any]:
 @lru_cache(maxsize=128)
 def image_card(file: Path) -> bytes:
     """Return a small copy of an image, JPEG."""
-    return _jpeg(_resized(read_image(file), CARD_PX))
+    return _jpeg(_small(read_image(file), CARD_PX))
 
 
 def camera_image(image: UInt8[ndarray, "h w 3"]) -> tuple[bytes, str]:
     """Return the image NOW_PX wide with a ring at each SIFT feature, JPEG, and a sentence on their number."""
-    small = _resized(np.ascontiguousarray(image), NOW_PX)
+    small = _small(image, NOW_PX)
     found = cv2.SIFT.create(2000).detect(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), None)
     for feature in found:
         center = round(feature.pt[0]), round(feature.pt[1])
@@ -222,10 +204,10 @@ def camera_image(image: UInt8[ndarray, "h w 3"]) -> tuple[bytes, str]:
     return _jpeg(small), f"{len(found)} features.{few}"
 
 
-def _resized(image: UInt8[ndarray, "h w 3"], width: int) -> UInt8[ndarray, "h2 w2 3"]:
-    """Return an image of another width."""
-    height = max(1, round(width * image.shape[0] / image.shape[1]))
-    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+def _small(image: UInt8[ndarray, "h w 3"], width: int) -> UInt8[ndarray, "h2 w2 3"]:
+    """Return a copy of an image of another width."""
+    size = width, max(1, round(width * image.shape[0] / image.shape[1]))
+    return np.asarray(cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _jpeg(image: UInt8[ndarray, "h w 3"]) -> bytes:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.record import Calibration
+from jcr.calibration.words import leave_one_out_text
 from jcr.capture.controllers import CONVENTIONS, numbers_from_poses
 from jcr.capture.options import ConventionName, UnitsName
 from jcr.estimation.kinematics import Arm
@@ -95,13 +96,11 @@ class Progress:
 
     def __str__(self) -> str:
         """Return two lines: the accuracy beside what is required, and what to do next."""
-        wrong = faults(self)
-        if wrong:
+        advice = FIRST_ADVICE if self.next_pose is None else f"next pose: {next_sentence(self)}"
+        if wrong := faults(self):
             advice = sentence(wrong[0])
         elif self.requirement_met:
             advice = REQUIREMENT_MET
-        else:
-            advice = FIRST_ADVICE if self.next_pose is None else f"next pose: {next_sentence(self)}"
         return f"{accuracy_line(self)}\n{advice}"
 
     def as_json(self) -> dict[str, Any]:
@@ -129,22 +128,19 @@ class Progress:
 
 def faults(state: Progress) -> list[Finding]:
     """Return the findings that reject or warn, those of the last image first, but not that more images are needed."""
-    found = [
-        one
-        for one in without_consequences(state.findings)
-        if one.severity != "informs"
-        and one.kind not in (FindingKind.NOT_EXACT_ENOUGH, FindingKind.FEW_IMAGES)
-    ]
+    more_images = FindingKind.NOT_EXACT_ENOUGH, FindingKind.FEW_IMAGES
+    acting = (one for one in without_consequences(state.findings) if one.severity != "informs")
+    found = [one for one in acting if one.kind not in more_images]
     return sorted(found, key=lambda one: one.images != (state.added,))
 
 
 def finding_lines(state: Progress) -> list[str]:
     """Return each fault in a sentence, with the commands for its image; these count images from 1."""
-    lines, numbers = [], {name: number for number, name in enumerate(state.images, start=1)}
-    for one in faults(state):
-        number = numbers.get(one.images[0]) if len(one.images) == 1 else None
-        lines.append(sentence(one) + (f" (retake {number}, or remove {number})" if number else ""))
-    return lines
+    retake = {name: f" (retake {k}, or remove {k})" for k, name in enumerate(state.images, start=1)}
+    return [
+        sentence(one) + (retake.get(one.images[0], "") if len(one.images) == 1 else "")
+        for one in faults(state)
+    ]
 
 
 def progress_lines(state: Progress, notation: Notation) -> list[str]:
@@ -153,8 +149,7 @@ def progress_lines(state: Progress, notation: Notation) -> list[str]:
         return [FIRST_ADVICE]
     below = finding_lines(state)
     if (error := state.leave_one_out) is not None:
-        mm, deg = significant(error.translation_mm), significant(error.rotation_deg)
-        below.insert(0, f"leave-one-out error {mm} mm and {deg}°")
+        below.insert(0, f"leave-one-out error {leave_one_out_text(error)}")
     lines = [accuracy_line(state), *(f"  {line}" for line in below)]
     if state.requirement_met:
         return [*lines, REQUIREMENT_MET]
@@ -172,10 +167,10 @@ def next_sentence(state: Progress) -> str:
     return f"{moved:.0f} mm and {rotated:.0f}° from {pose.like}; {then}"
 
 
-def next_lines(state: Progress, notation: Notation, for_program: bool = True) -> list[str]:
+def next_lines(state: Progress, notation: Notation) -> list[str]:
     """Return the next pose and its joint angles in the notation of the arm, as `pose_lines`."""
     assert state.next_pose is not None
-    lines = pose_lines(state.next_pose.base_from_gripper, notation, state.next_joints, for_program)
+    lines = pose_lines(state.next_pose.base_from_gripper, notation, state.next_joints)
     is_used = all(one.kind is not FindingKind.ROBOT_UNUSED for one in state.findings)
     if notation.arm is not None and state.next_joints is None and is_used:
         lines.append(f"a {notation.arm.name} cannot reach this pose within its joint limits: go near it")
@@ -187,57 +182,45 @@ def accuracy_line(state: Progress) -> str:
     images = f"{len(state.registered)} of {len(state.images)} images registered"
     if state.now is None or state.hand_eye is None:
         return f"{images}: no calibration yet"
-    verdict = "" if state.hand_eye.is_sound else ", rejected"
-    required, limits = state.hand_eye.requirement, ""
-    if required is not None:
-        reached = "reached, but exceeded by the leave-one-out error"
-        if state.leave_one_out is None:
-            reached = f"reached, to be confirmed with {CONFIRMING_IMAGES} images"
-        met = "met" if state.requirement_met else reached if required.met else "not met"
-        limits = f"; required {required.translation_mm:g} mm and {required.rotation_deg:g}°: {met}"
     mm, deg = significant(state.now.translation_mm), significant(state.now.rotation_deg)
-    return (
-        f"{images}: ± {mm} mm and {deg}° (95 % of errors of a point at the working distance){verdict}{limits}"
-    )
+    line = f"{images}: ± {mm} mm and {deg}° (95 % of errors of a point at the working distance)"
+    line += "" if state.hand_eye.is_sound else ", rejected"
+    if (required := state.hand_eye.requirement) is not None:
+        met = "met" if state.requirement_met else "not met"
+        if required.met and not state.requirement_met:
+            met = "reached, but exceeded by the leave-one-out error"
+            if state.leave_one_out is None:
+                met = f"reached, to be confirmed with {CONFIRMING_IMAGES} images"
+        line += f"; required {required.translation_mm:g} mm and {required.rotation_deg:g}°: {met}"
+    return line
 
 
 def pose_lines(
-    pose: Float[ndarray, "4 4"],
-    notation: Notation,
-    joints: Float[ndarray, " dof"] | None = None,
-    for_program: bool = True,
+    pose: Float[ndarray, "4 4"], notation: Notation, joints: Float[ndarray, " dof"] | None = None
 ) -> list[str]:
-    """Return the pose as the arm's pendant writes it, and its joint angles (rad) where they are known.
+    """Return the pose as the arm's pendant writes it, of a UR also as URScript, and its joint angles where known."""
 
-    `for_program`: a UR's pose also as URScript, and joint angles also in radians.
-    """
+    def joined(numbers: Float[ndarray, " k"], digits: int) -> str:
+        """Return numbers with so many decimals, separated by commas."""
+        return ", ".join(f"{value:.{digits}f}" for value in numbers)
+
     convention = "quat-xyzw" if notation.convention == "auto" else notation.convention
     units: UnitsName = "mm-rad" if convention == "ur" else notation.units
     row = numbers_from_poses(pose[None], convention, units)[0]
     if convention in ("franka", "matrix"):
         order = "O_T_EE, by columns" if convention == "franka" else "base_from_gripper, by rows"
-        lines = [f"{order}: [{_joined(row, 5)}]"]
+        lines = [f"{order}: [{joined(row, 5)}]"]
     else:
         form = CONVENTIONS[convention]
         length, angle = form.units(units)
-        digits = 5 if not form.has_angles else 2 if angle == "deg" else 4
-        named = [
-            f"{name} {value:.{(1 if length == 'mm' else 4) if k < 3 else digits}f}"
-            for k, (name, value) in enumerate(zip(form.columns, row, strict=True))
-        ]
+        digits = 3 * [1 if length == "mm" else 4]
+        digits += (len(row) - 3) * [5 if not form.has_angles else 2 if angle == "deg" else 4]
+        named = [f"{name} {value:.{n}f}" for name, value, n in zip(form.columns, row, digits, strict=True)]
         unit = f" {angle.replace('deg', '°')}" if form.has_angles else ""
         lines = [f"{' '.join(named[:3])} {length}, {' '.join(named[3:])}{unit}"]
     if convention == "ur":
-        lines = [f"pendant: {lines[0]}"]
-        if for_program:
-            metres = _joined(numbers_from_poses(pose[None], "ur")[0], 5)
-            lines.append(f"URScript: movel(p[{metres}], a=0.3, v=0.1)")
+        metres = joined(numbers_from_poses(pose[None], "ur")[0], 5)
+        lines = [f"pendant: {lines[0]}", f"URScript: movel(p[{metres}], a=0.3, v=0.1)"]
     if joints is not None:
-        lines.append(f"joints, °: {_joined(np.degrees(joints), 2)}")
-        lines += [f"joints, rad: {_joined(joints, 4)}"] if for_program else []
+        lines += [f"joints, °: {joined(np.degrees(joints), 2)}", f"joints, rad: {joined(joints, 4)}"]
     return lines
-
-
-def _joined(numbers: Float[ndarray, " k"], digits: int) -> str:
-    """Return numbers with so many decimals, separated by commas."""
-    return ", ".join(f"{value:.{digits}f}" for value in numbers)

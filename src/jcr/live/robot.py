@@ -141,34 +141,29 @@ def ur_states(host: str, port: int) -> Iterator[RobotState]:
     try:
         with socket.create_connection((host, port), UR_TIMEOUT_S) as connection:
             stream = connection.makefile("rb")
-            while True:
-                yield _ur_state(stream.read(4), stream.read, where)
+            while head := stream.read(4):
+                length = int.from_bytes(head) if len(head) == 4 else 0
+                if length not in UR_BEFORE_3_0 and length not in UR_SINCE_3_0:
+                    raise InputError(
+                        f"{where}: a packet of {length} bytes does not come from a UR real-time port; use 30003 or "
+                        "30013"
+                    )
+                if len(packet := head + stream.read(length - 4)) < length:
+                    break
+                (time_s,) = struct.unpack_from("!d", packet, 4)
+                offset = UR_TOOL_BEFORE if length in UR_BEFORE_3_0 else UR_TOOL_SINCE_3_0
+                tool = struct.unpack_from("!6d", packet, offset)
+                joints = np.array(struct.unpack_from("!6d", packet, UR_JOINTS))
+                # A last joint without limits may have turned more often than a capture.json allows.
+                plausible = joints if (np.abs(joints) < MOST_ROTATION).all() else None
+                yield RobotState(time_s, pose_of_numbers(list(tool), where), plausible)
     except TimeoutError:
         raise InputError(
             f"{where}: silent for {UR_TIMEOUT_S:.0f} s; is the robot on, and the address right?"
         ) from None
     except OSError as error:
         raise InputError(f"{where}: {error}; check the address, and that the robot is on") from None
-
-
-def _ur_state(head: bytes, read: Callable[[int], bytes], where: str) -> RobotState:
-    """Return the state in one packet, whose first four bytes are `head`."""
-    length = struct.unpack("!i", head)[0] if len(head) == 4 else 0
-    if length not in UR_BEFORE_3_0 and length not in UR_SINCE_3_0:
-        raise InputError(
-            f"{where}: a packet of {length} bytes does not come from a UR real-time port; use 30003 or 30013"
-            if head
-            else f"{where}: the robot closed the connection; is another program using the port?"
-        )
-    packet = head + read(length - 4)
-    if len(packet) < length:
-        raise InputError(f"{where}: the connection broke; the same command resumes")
-    offset = UR_TOOL_BEFORE if length in UR_BEFORE_3_0 else UR_TOOL_SINCE_3_0
-    tool = struct.unpack_from("!6d", packet, offset)
-    joints = np.array(struct.unpack_from("!6d", packet, UR_JOINTS))
-    # A last joint without limits may have turned more often than a capture.json allows.
-    plausible = joints if (np.abs(joints) < MOST_ROTATION).all() else None
-    return RobotState(struct.unpack_from("!d", packet, 4)[0], pose_of_numbers(list(tool), where), plausible)
+    raise InputError(f"{where}: the robot closed the connection; is another program using the port?")
 
 
 def franka_states(host: str) -> Iterator[RobotState]:

@@ -182,20 +182,15 @@ class LiveSession:
         with self._lock:
             if self.state.is_over:
                 return {"accepted": False, "reason": "the capture has ended", "done": True}
-            name, why = "", None
             try:
                 frame = self._frame(state, current)
                 name = self.folder.add(
                     frame.image, state.base_from_gripper, state.joints, frame.time_s, frame.depth_mm
                 )
-            except StopIteration:
-                self.end()
-                why = "the video has ended"
-            except InputError as error:
+            except (InputError, OSError) as error:
                 why = str(error)
-            except OSError as error:
-                why = f"the image cannot be written ({error.strerror}); free the disk and take it again"
-            if why is not None:
+                if isinstance(error, OSError):
+                    why = f"the image cannot be written ({error.strerror}); free the disk and take it again"
                 answer = {"accepted": False, "reason": why, "done": self.state.is_over}
                 self._say(f"refused: {why}", answer)
                 self._follow(state.base_from_gripper)
@@ -213,25 +208,27 @@ class LiveSession:
     def press(self, action: Action, number: int | None = None) -> None:
         """Obey a command; `number` counts images from 1, None: the last one."""
         with self._lock:
-            if self.state.is_over:
-                return
             names = self.folder.names
             number = len(names) if number is None else number
+            if self.state.is_over:
+                return
             if action == "finish":
                 self._show(is_over=True)
             elif action == "undo" and not self.folder.undo():
                 self._refuse("refused: nothing to undo")
-            elif action == "undo":
-                self._say(f"undone: {len(self.folder.names)} images", {"images": self.folder.names})
-                self._follow()
-            elif action != "take" and not 1 <= number <= len(names):
+            elif action in ("retake", "remove") and not 1 <= number <= len(names):
                 self._refuse(f"refused: there is no image {number}")
-            elif action != "take":
-                self.folder.remove(names[number - 1])
-                self._say(f"removed {names[number - 1]}", {"images": self.folder.names})
-                self._follow()
-            if action == "take" or (action == "retake" and 1 <= number <= len(names)):
-                self._take_now()
+            else:
+                if action in ("retake", "remove"):
+                    self.folder.remove(names[number - 1])
+                if (left := self.folder.names) != names:
+                    event = (
+                        f"undone: {len(left)} images" if action == "undo" else f"removed {names[number - 1]}"
+                    )
+                    self._say(event, {"images": left})
+                    self._follow()
+                if action in ("take", "retake"):
+                    self._take_now()
 
     def finish(self) -> "RunResult | None":
         """Return the calibration of all images; None, with a line that says why, where there is none."""
@@ -245,7 +242,7 @@ class LiveSession:
         return self.state.result
 
     def _frame(self, state: RobotState, current: Callable[[], RobotState] | None) -> Frame:
-        """Return a frame at rest; raise InputError with the reason why none is kept, StopIteration at a video's end."""
+        """Return a frame at rest; raise InputError with the reason why none is kept."""
         images, pose = self.folder.images, state.base_from_gripper
         for one in images:
             if not is_farther(one.base_from_gripper, pose, SAME_PLACE):
@@ -253,6 +250,9 @@ class LiveSession:
         kept = [self.folder.summary(one.image) for one in images]
         try:
             found = frame_at_rest(self._frames, kept, self.options.patience)
+        except StopIteration:
+            self.end()
+            raise InputError("the video has ended") from None
         except InputError as error:
             self.end(error)
             raise
@@ -277,9 +277,9 @@ class LiveSession:
         except InputError as error:
             self._refuse(f"refused: {error}")
 
-    def _refuse(self, why: str) -> None:
+    def _refuse(self, event: str) -> None:
         """Show and tell why something was not done."""
-        self._say(why, {"accepted": False, "reason": why.removeprefix("refused: ")})
+        self._say(event, {"accepted": False, "reason": event.removeprefix("refused: ")})
 
     def _follow(self, refused: Float[ndarray, "4 4"] | None = None) -> None:
         """Let the worker calibrate the images where they changed, and propose a pose away from a refused one."""

@@ -3,7 +3,6 @@
 Positions are metres of the base frame; each encoding scales them by itself.
 """
 
-import itertools
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -102,58 +101,6 @@ class Interpolate(torch.autograd.Function):
         return of_table, None, of_weight
 
 
-class SinusoidalEncoding(nn.Module):
-    """sin and cos of 2^k·π·x for k < frequencies, as NeRF (Mildenhall 2020, eq. 4); the box is [-1, 1]."""
-
-    frequency: Tensor
-    center: Tensor
-
-    def __init__(self, frequencies: int, box: Float[Tensor, "2 3"]) -> None:
-        super().__init__()
-        # One scale for all axes: the longest side of the box spans [-1, 1].
-        scale = 2.0 / (box[1] - box[0]).max()
-        frequency = scale * math.pi * 2.0 ** torch.arange(frequencies, device=box.device)
-        self.register_buffer("frequency", frequency, persistent=False)
-        self.register_buffer("center", box.mean(0), persistent=False)
-        self.features = 6 * frequencies
-
-    def forward(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "f n"]:
-        """Return the features (f,n) of points (n,3)."""
-        angle = (self.frequency[:, None, None] * (x_in_base - self.center).T).flatten(0, 1)
-        return torch.cat([angle.sin(), angle.cos()])
-
-
-class GridEncoding(nn.Module):
-    """Features interpolated trilinearly between the nodes of lattices."""
-
-    def __init__(self, lattices: Sequence[Lattice], features: Sequence[int]) -> None:
-        super().__init__()
-        self.lattices = list(lattices)
-        self.tables = nn.ParameterList(
-            torch.zeros(len(lattice.nodes) + 1, n, device=lattice.lower.device)
-            for lattice, n in zip(lattices, features, strict=True)
-        )
-        self.features = sum(features)
-        self._dense: list[Tensor] | None = None
-
-    def forward(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "f n"]:
-        """Return the features (f,n) of points (n,3)."""
-        if self._dense is not None:
-            parts = zip(self._dense, self.lattices, strict=True)
-            return torch.cat(
-                [interpolate_grid(t, lattice.lower, lattice.cell, x_in_base) for t, lattice in parts]
-            )
-        parts = zip(self.tables, self.lattices, strict=True)
-        return torch.cat([Interpolate.apply(t, *lattice.corners(x_in_base)) for t, lattice in parts])
-
-    def expand(self) -> None:
-        """Keep the trained features at every node: more memory, and answers three times as fast."""
-        self._dense = [
-            table.detach()[lattice.row.long()].T.unflatten(1, lattice.shape)
-            for table, lattice in zip(self.tables, self.lattices, strict=True)
-        ]
-
-
 def interpolate_grid(
     table: Float[Tensor, "k nz ny nx"],
     lower: Float[Tensor, "3"],
@@ -177,6 +124,9 @@ def linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.L
 class Field(nn.Module):
     """Properties as functions of position: logits of occupancy and labels, plain values of other properties."""
 
+    frequency: Tensor
+    center: Tensor
+
     def __init__(
         self,
         shape: FieldShape,
@@ -187,12 +137,20 @@ class Field(nn.Module):
         """Initialise the layers from `generator`."""
         super().__init__()
         self.shape = shape
-        self.encoding = (
-            SinusoidalEncoding(shape.frequencies, box)
-            if shape.frequencies
-            else GridEncoding([lattices[k] for k, _ in shape.grids], [n for _, n in shape.grids])
+        # One scale for all axes: the longest side of the box spans [-1, 1].
+        scale = 2.0 / (box[1] - box[0]).max()
+        frequency = scale * math.pi * 2.0 ** torch.arange(shape.frequencies, device=box.device)
+        self.register_buffer("frequency", frequency, persistent=False)
+        self.register_buffer("center", box.mean(0), persistent=False)
+        self._lattices = [lattices[k] for k, _ in shape.grids]
+        features = [n for _, n in shape.grids]
+        tables = (
+            torch.zeros(len(lattice.nodes) + 1, n, device=lattice.lower.device)
+            for lattice, n in zip(self._lattices, features, strict=True)
         )
-        self.hidden = linear(self.encoding.features, shape.hidden, generator)
+        self.encoding = nn.ModuleDict({"tables": nn.ParameterList(tables)})
+        self._dense: list[Tensor] | None = None
+        self.hidden = linear(sum(features, 6 * shape.frequencies), shape.hidden, generator)
         self.heads = nn.ModuleDict(
             {name: linear(shape.hidden, n, generator) for name, n in shape.heads.items()}
         )
@@ -212,10 +170,33 @@ class Field(nn.Module):
             target = targets[name]
             standard.copy_(torch.stack([target.mean(0), target.std(0).clamp(min=1e-6)]))
 
+    def expand(self) -> None:
+        """Keep the trained features at every node: more memory, and answers three times as fast."""
+        self._dense = [
+            table.detach()[lattice.row.long()].T.unflatten(1, lattice.shape)
+            for table, lattice in zip(self.tables, self._lattices, strict=True)
+        ]
+
+    @property
+    def tables(self) -> nn.ParameterList:
+        """Features at the nodes of each lattice."""
+        return cast(nn.ParameterList, self.encoding["tables"])
+
+    def encode(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "f n"]:
+        """Return the features (f,n) of points: of lattices, or sin and cos of 2^k·π·x (Mildenhall 2020, eq. 4)."""
+        if self.shape.frequencies:
+            angle = (self.frequency[:, None, None] * (x_in_base - self.center).T).flatten(0, 1)
+            return torch.cat([angle.sin(), angle.cos()])
+        if self._dense is None:
+            parts = zip(self.tables, self._lattices, strict=True)
+            return torch.cat([Interpolate.apply(t, *lattice.corners(x_in_base)) for t, lattice in parts])
+        parts = zip(self._dense, self._lattices, strict=True)
+        return torch.cat([interpolate_grid(t, one.lower, one.cell, x_in_base) for t, one in parts])
+
     def forward(self, x_in_base: Float[Tensor, "n 3"]) -> dict[str, Tensor]:
         """Return the outputs (n, outputs) of every head at points (n,3)."""
         # Features first: with so few of them, this product and its gradients take half the time.
-        hidden = F.relu(torch.addmm(self.hidden.bias[:, None], self.hidden.weight, self.encoding(x_in_base)))
+        hidden = F.relu(torch.addmm(self.hidden.bias[:, None], self.hidden.weight, self.encode(x_in_base)))
         outputs = {}
         for name, head in self.heads.items():
             outputs[name] = torch.addmm(head.bias[:, None], head.weight, hidden).T  # pyright: ignore[reportArgumentType, reportIndexIssue]
@@ -246,12 +227,6 @@ class Fields(nn.Module):
                 out |= field(x_in_base)
         return {name: out[name] for name in names}
 
-    def expand(self, name: str) -> None:
-        """Keep the features of the field with this output at every node: queries are faster and take more memory."""
-        for shape, field in zip(self.shapes, self.of, strict=True):
-            if name in shape.heads and isinstance(field.encoding, GridEncoding):
-                field.encoding.expand()
-
 
 CHUNK = {"cpu": 1 << 15, "cuda": 1 << 22}
 
@@ -275,4 +250,4 @@ def in_chunks(ask: Callable[..., tuple[Tensor, ...]], *columns: Tensor) -> tuple
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:
             answers = list(pool.map(answer, pieces))
     with torch.inference_mode(not wanted):
-        return tuple(torch.cat(column) for column in itertools.zip_longest(*answers))
+        return tuple(torch.cat(column) for column in zip(*answers, strict=True))

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from functools import cached_property
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 import torch
@@ -65,7 +65,7 @@ class Sample:
     @cached_property
     def color(self) -> Any:
         """RGB (n,3) in [0, 1] of the colour field, trained on surfaces; NaN outside of the workspace."""
-        return self._continuous("color", 0.0, 1.0)
+        return self._answers(lambda x: (self._continuous("color", x).clamp(0.0, 1.0),))[0]
 
     @cached_property
     def label(self) -> Any:
@@ -83,7 +83,8 @@ class Sample:
     def values(self) -> dict[str, Any]:
         """Further continuous properties (n,d) that the map was trained with; NaN outside of the workspace."""
         further = [name for name in self._map.properties if name not in ("occupancy", "color", "label")]
-        return {name: self._continuous(name, -np.inf, np.inf) for name in further}
+        answers = self._answers(lambda x: tuple(self._continuous(name, x) for name in further))
+        return dict(zip(further, answers, strict=True))
 
     @cached_property
     def _occupancy_unknown(self) -> tuple[Any, ...]:
@@ -117,14 +118,9 @@ class Sample:
 
         return self._answers(distance_gradient)
 
-    def _continuous(self, name: str, low: float, high: float) -> Any:
-        """Return a property between two bounds; NaN outside of the workspace."""
-
-        def continuous(x: Tensor) -> tuple[Tensor]:
-            value = self._map.fields(x, (name,))[name].clamp(low, high)
-            return (torch.where(self._map.seen.index(x)[1][:, None], value, torch.nan),)
-
-        return self._answers(continuous)[0]
+    def _continuous(self, name: str, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n d"]:
+        """Return a property at points; NaN outside of the workspace."""
+        return torch.where(self._map.seen.index(x)[1][:, None], self._map.fields(x, (name,))[name], torch.nan)
 
     def _answers(self, ask: Callable[[Tensor], tuple[Tensor, ...]]) -> tuple[Any, ...]:
         """Return the answers at all points as tensors or arrays, as the points were."""
@@ -150,7 +146,9 @@ class SceneMap:
         """Preset, steps and seconds of the training."""
         self.properties = tuple(name for shape in fields.shapes for name in shape.heads)
         """Properties of the fields: occupancy, color, and label or further values where they were given."""
-        self.fields.expand("occupancy")
+        for shape, field in zip(fields.shapes, fields.of, strict=True):
+            if "occupancy" in shape.heads and shape.grids:
+                cast(Field, field).expand()
         self._distance: dict[str, DistanceGrid] = {}
         self._lock = threading.Lock()
 
@@ -168,17 +166,6 @@ class SceneMap:
         """Return a copy of the map on another device, e.g. "cuda"."""
         seen = SeenGrid(self.seen.lower.to(device), self.seen.cell, self.seen.state.to(device))
         return SceneMap(copy.deepcopy(self.fields).to(device), seen, self.label_names, self.history)
-
-    def field(self, x_in_base: Float[ndarray, "n 3"] | Float[Tensor, "n 3"]) -> dict[str, Any]:
-        """Return the raw answers of the networks at points (n,3) m: (n,outputs) for each of `properties`.
-
-        Occupancy and labels are logits, other properties plain values; unseen space is not considered.
-        """
-        x = self._points(x_in_base, "points")
-        answers = in_chunks(lambda x: tuple(self.fields(x, self.properties).values()), x)
-        if not isinstance(x_in_base, Tensor):
-            answers = tuple(answer.cpu().numpy() for answer in answers)
-        return dict(zip(self.properties, answers, strict=True))
 
     def query(self, x_in_base: ArrayLike | Float[Tensor, "n 3"], unknown: Unknown = "report") -> Sample:
         """Query the map at points (n,3) m; tensors are answered with (differentiable) tensors.

@@ -215,26 +215,24 @@ class Viewer:
             control.on_update(lambda _: self.show_points())
 
     def _add_map(self, scene: SceneMap) -> None:
-        """Add the border of unknown space and the level slice, with their controls."""
+        """Add the border of unknown space, which viser's list shows, and the level slice with its controls."""
         gui, (low, high) = self.server.gui, scene.box
         with gui.add_folder("Map", expand_by_default=False):
-            self.show_unknown = gui.add_checkbox("unknown", False, hint="border of the seen space")
             self.unknown = gui.add_dropdown("unknown is", ("occupied", "free"), initial_value="occupied")
             self.slice_of = gui.add_dropdown("slice", ("none", *get_args(SliceOf)), initial_value="none")
             bottom, top = float(low[2].round(3)), float(high[2].round(3))
             self.slice_at = gui.add_slider("height (m)", bottom, top, 0.005, round(self._support() + 0.02, 3))
             self._slice_legend = gui.add_markdown("")
         vertices, faces = unknown_border(scene)
-        self._unknown = None
         if len(faces):
-            self._unknown = self.server.scene.add_mesh_simple(
+            self.server.scene.add_mesh_simple(
                 "/unknown", vertices, faces, color=GREY, opacity=0.25, side="double", visible=False
             )
         size = (high - low)[:2]
         self._slice = self.server.scene.add_image(
             "/slice", np.zeros((2, 2, 4), np.uint8), *size.tolist(), wxyz=(0.0, 1.0, 0.0, 0.0), visible=False
         )
-        for control in (self.slice_of, self.slice_at, self.show_unknown, self.unknown):
+        for control in (self.slice_of, self.slice_at, self.unknown):
             control.on_update(lambda _: self.show_slice())
 
     def _add_sphere(self) -> None:
@@ -317,11 +315,9 @@ class Viewer:
         )
 
     def show_slice(self) -> None:
-        """Draw the chosen slice, and the border of unknown space."""
+        """Draw the chosen slice."""
         assert self.scene is not None  # or there would be no such control
         with self._lock:
-            if self._unknown is not None:
-                self._unknown.visible = self.show_unknown.value
             of, height = self.slice_of.value, self.slice_at.value
             self._slice.visible = of != "none"
             self._slice_legend.content = SLICE_LEGENDS.get(of, "")
