@@ -9,13 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from jcr.boards.detection import boards
 from jcr.boards.marker import reconstruct_marker
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import unproject
 from jcr.capture.read import read_capture
 from jcr.depth.densify import densify
-from jcr.errors import InputError
 from jcr.geometry import rotation_between_deg
 from jcr.records import Intrinsics
 from jcr.records.npz import read_reconstruction, write_reconstruction
@@ -175,22 +173,6 @@ def test_the_metre_of_a_board_is_kept_on_disk_and_its_pointmaps_are_in_metres(tm
     height = dense.points_in_recon[dense.confidence > 0][:, 2]
     assert len(height) > 1000
     assert np.median(np.abs(height)) < 0.002
-
-
-@pytest.mark.parametrize(
-    ("spec", "message"),
-    [
-        ("chessboard:8x5:25", "30 mm is 0.030"),
-        ("chessboard:8x6:0.025", "a rotation by 180°"),
-        ("chessboard:8by5:0.025", "no size such as 7x5"),
-        ("charuco:7x6:0.030:0.032:DICT_4X4_50", "does not fit"),
-        ("charuco:7x6:0.030:0.022:DICT_9X9", "DICT_4X4_50"),
-        ("qr:0.05", "chessboard:9x6:0.025"),
-    ],
-)
-def test_a_board_that_is_none_is_refused_with_the_remedy(spec, message):
-    with pytest.raises(InputError, match=message):
-        boards(spec)
 
 
 DATA = SHARED / "data"

@@ -51,14 +51,6 @@ def test_half_of_the_points_may_be_wrong():
     assert 0.35 < found.std_px < 0.65
 
 
-def test_random_pixels_have_no_pose():
-    rng = np.random.default_rng(2)
-    points = points_in_view(rng, 40, (0.4, 1.0))
-    found = absolute_pose(rng.uniform([0, 0], [640, 480], (40, 2)), points, CAMERA)
-    assert found is None or found.inlier.sum() < 12
-    assert absolute_pose(pixels(points[:5]), points[:5], CAMERA) is None
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("point_std", "noise_px"), [(0.0, 0.5), (2e-4, 0.3)])
 def test_the_covariance_holds_with_that_of_the_points(point_std: float, noise_px: float):

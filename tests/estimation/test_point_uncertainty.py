@@ -1,6 +1,5 @@
 """Uncertainty of points that the camera sees, against draws and against simulated truth."""
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -15,7 +14,6 @@ from jcr.estimation.point_uncertainty import (
     point_in_base,
     scene_points,
     scene_uncertainty,
-    with_given_intrinsics,
     within_95,
 )
 from jcr.estimation.solve import Solution
@@ -89,23 +87,6 @@ def test_errors_of_the_gripper_pose_stand_beside_those_of_the_calibration():
     to_base = pose[:3, :3] @ x[:3, :3]
     expected = to_base @ here[1] @ to_base.T + np.cov(drawn.T)
     assert found[1] == pytest.approx(expected, abs=0.06 * np.trace(found[1]))
-
-
-def test_each_intrinsics_have_a_transform_of_their_own():
-    x, uncertainty, camera, _ = estimated()
-    off = parameters(camera)
-    off[:4] += [3.0, 3.0, 3.0, -3.0]
-    given = with_parameters(camera, off)
-    pair = with_given_intrinsics(x, uncertainty, camera, given, DISTANCE_M)
-    assert pair is not None and pair.intrinsics == given
-    here = placed(x, camera)[0]
-    with_its_own, mixed = (
-        1e3 * np.linalg.norm(placed(x, given)[0] - here) for x in (pair.gripper_from_camera, x)
-    )
-    assert with_its_own < 0.5 * mixed and mixed > 2
-    assert pair.differs_mm == pytest.approx(with_its_own, abs=0.1)
-    assert pair.seen.within_95_mm > pair.differs_mm
-    assert with_given_intrinsics(x, replace(uncertainty, joint=None), camera, given, DISTANCE_M) is None
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ from scipy.stats import chi2
 
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.camera import parameters, with_parameters
-from jcr.estimation import solve
 from jcr.estimation.image_equations import adjust_images, median_reprojection_px
 from jcr.estimation.intrinsics_prior import (
     ESTIMATED,
@@ -23,7 +22,6 @@ from jcr.estimation.pixel_noise import PixelNoise
 from jcr.estimation.problem import Observations, image_problem
 from jcr.estimation.solve import Solution
 from jcr.estimation.wrist import adjust_wrist, recon_frame
-from jcr.geometry import step_between
 from jcr.records import Intrinsics, Tracks
 from simulation.problems import INTRINSICS, HandEyeProblem, error, hand_eye_problem, observed
 
@@ -108,25 +106,6 @@ def test_intrinsics_go_as_far_from_what_was_given_as_their_standard_deviation_le
     ]
     assert sigmas[1] < 3 < sigmas[0]
     assert usual.budget.intrinsics[2, 2] > 0 and not exact.budget.intrinsics.any()
-
-
-def test_an_adjustment_that_begins_near_ends_where_one_from_poses_does(monkeypatch):
-    rng = np.random.default_rng(7)
-    problem = hand_eye_problem(rng, 10, robot_noise=(3e-4, np.radians(0.05)))
-    tracks = observed(problem, rng, 300, 0.4)
-    off = with_parameters(INTRINSICS, parameters(INTRINSICS) + np.r_[2.0, 2.0, 2.0, -2.0, np.zeros(5)])
-    near = solved(problem, tracks, camera_with_prior(off, MEASURED))
-    calls, linearised = [], solve.linearised
-    monkeypatch.setattr(solve, "linearised", lambda *given: (calls.append(1), linearised(*given))[1])
-    from_poses = solved(problem, tracks, camera_with_prior(off, ESTIMATED))
-    of_poses = len(calls)
-    again = solved(problem, tracks, camera_with_prior(off, ESTIMATED), near=near)
-    assert len(calls) - of_poses < of_poses
-    apart = step_between(from_poses.state.x[0], again.state.x[0])
-    assert (np.abs(apart) < 0.05 * np.sqrt(np.diag(from_poses.covariance)[:6])).all()
-    std = np.sqrt(np.diag(from_poses.intrinsics_covariance(0)))[:4]
-    cameras = [parameters(one.problem.intrinsics(one.state)[0])[:4] for one in (from_poses, again)]
-    assert (np.abs(cameras[0] - cameras[1]) < 0.1 * std).all()
 
 
 @cache

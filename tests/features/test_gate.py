@@ -7,7 +7,7 @@ from jcr.estimation.closed_form import motions
 from jcr.features.gate import Pair, judge, rolls, rotation_of_x
 from jcr.features.pairs import translation_of_x
 from jcr.features.stage import hidden, still_cells
-from jcr.features.two_view import TwoViewMotion, _by_step, _retracted, readings, sampson_px
+from jcr.features.two_view import TwoViewMotion, readings
 from jcr.geometry import rotation_angle, rotation_exp, transform
 from simulation.problems import HandEyeProblem, hand_eye_problem
 
@@ -135,19 +135,6 @@ def test_what_keeps_its_pixel_while_the_gripper_moves_is_hidden():
     moving = [rng.uniform(0, [640, 480], (300, 2)) for _ in range(6)]
     few = {key: rows[:300] for key, rows in raw.items()}
     assert not still_cells(moving, few, (640, 480), few).any()
-
-
-def test_the_derivatives_are_those_of_the_distances():
-    rng = np.random.default_rng(0)
-    rotation, direction = rotation_exp(0.3 * rng.normal(size=3)), rng.normal(size=3)
-    direction /= np.linalg.norm(direction)
-    ray_i, ray_j = 0.5 * rng.normal(size=(2, 40, 2))
-    for column, unit in zip(_by_step(rotation, direction, ray_i, ray_j, 600.0).T, np.eye(5), strict=True):
-        ahead, behind = (
-            sampson_px(*_retracted(rotation, direction, sign * unit), ray_i, ray_j, 600.0)
-            for sign in (1e-6, -1e-6)
-        )
-        assert (ahead - behind) / 2e-6 == pytest.approx(column, rel=1e-4, abs=1e-2)
 
 
 def rotations(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

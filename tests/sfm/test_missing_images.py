@@ -10,7 +10,6 @@ import pytest
 
 from jcr.features.stage import Matched
 from jcr.geometry import nearest_rotation, rotation_between_deg
-from jcr.sfm import colmap
 from jcr.sfm.missing_images import with_missing_images
 from jcr.sfm.model import (
     adjust_robustly,
@@ -63,22 +62,6 @@ def off_mm(table: PointsOfATable, model: pycolmap.Reconstruction) -> float:
     own, centres = own - own.mean(0), centres - centres.mean(0)
     scale = (own * centres).sum() / (own**2).sum()
     return 1e3 * float(np.sqrt(((scale * own - centres) ** 2).sum(1).mean()))
-
-
-def test_of_many_matches_whole_features_are_kept(
-    table: PointsOfATable, matched: Matched, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(colmap, "_MOST_MATCHED", 5000)
-    thinned = colmap._thinned(matched.geometries, IMAGES, 0)
-    before, after = (
-        {(i, a, j, b) for (i, j), one in which.items() for a, b in one.inlier_matches.tolist()}
-        for which in (matched.geometries, thinned)
-    )
-    keypoints = {(i, a) for i, a, _, _ in after} | {(j, b) for _, _, j, b in after}
-    assert after == {(i, a, j, b) for i, a, j, b in before if (i, a) in keypoints}
-    assert 4800 < len(keypoints) <= 5000
-    monkeypatch.setattr(colmap, "_MOST_MATCHED", 20_000)
-    assert colmap._thinned(matched.geometries, IMAGES, 0) is matched.geometries
 
 
 def test_missing_images_are_added_from_the_map_s_own_x(

@@ -135,19 +135,3 @@ def test_state_dict_has_the_published_keys_and_shapes(keys: Path) -> None:
         state = Dust3r(**config).state_dict()
     published = dict(line.split("\t")[:2] for line in keys.read_text().splitlines())
     assert {key: str(list(tensor.shape)) for key, tensor in state.items()} == published
-
-
-@pytest.mark.usefixtures("inference_mode")
-def test_bfloat16_stays_near_float32_and_returns_float32() -> None:
-    import torch
-
-    truth, network = fixture("tiny_dpt12_48x64_b1")
-    network.mixed_precision = True
-    try:
-        view, _ = network(truth["img1"], truth["img2"])
-    finally:
-        network.mixed_precision = None
-    assert view.points.dtype == torch.float32
-    error = (view.points - truth["pts3d"]).norm(dim=-1) / truth["pts3d"].norm(dim=-1)
-    # Eight bits through 15 blocks leave a few percent where no training has taught the weights to be smooth.
-    assert 0 < error.median() < 0.05

@@ -7,12 +7,9 @@ import pytest
 
 from jcr.camera import rays
 from jcr.errors import InputError, RejectedError
-from jcr.geometry import Similarity, fit_similarity, retract, rotation_between_deg
+from jcr.geometry import Similarity, fit_similarity, rotation_between_deg
 from jcr.pointmaps.dust3r.pair_graph import complete_pairs, window_pairs
 from jcr.pointmaps.global_alignment.align import Alignment, global_align
-from jcr.pointmaps.global_alignment.gauss_newton import gauss_newton
-from jcr.pointmaps.global_alignment.observations import AlignmentProblem
-from jcr.pointmaps.global_alignment.residuals import AlignmentState
 from jcr.records import Intrinsics
 from simulation.pairs import PairErrors, PairTruth, synthetic_pairs
 
@@ -46,43 +43,6 @@ def test_exact_predictions_give_the_exact_scene():
     np.testing.assert_array_equal(result.recon_from_camera[0], np.eye(4))
     assert result.pair_residual.max() < 2e-4
     assert result.notes == ()
-
-
-def test_one_step_from_near_the_truth_is_almost_all_the_way():
-    # A wrong block of the normal equations leaves the fixed point and spoils the step towards it.
-    predictions, truth = synthetic_pairs(complete_pairs(4), SMALL, NO_ERRORS)
-    problem = AlignmentProblem.of(predictions)
-    images = problem.observe_all(300)
-    log_depth = [np.log(_depth_at(truth, o)) for o in images]
-    rng = np.random.default_rng(0)
-    nudge = 2e-3 * rng.normal(size=(4, 6))
-    nudge[0] = 0
-    log_unit = -np.log(truth.pair_unit)
-    scale_nudge = 2e-3 * rng.normal(size=len(log_unit))
-    start = AlignmentState(
-        recon_from_camera=retract(truth.base_from_camera, nudge),
-        log_focal=float(np.log(truth.intrinsics.fx)) + 2e-3,
-        log_pair_scale=log_unit + scale_nudge - scale_nudge.mean(),
-        pair_error=np.zeros((12, 6)),
-        log_depth=[exact + 2e-3 * rng.normal(size=exact.shape) for exact in log_depth],
-    )
-    one_step = gauss_newton(images, start, np.full(6, 1e-5), np.inf).state
-    for name, exact in (
-        ("recon_from_camera", truth.base_from_camera),
-        ("log_focal", np.log(truth.intrinsics.fx)),
-        ("log_pair_scale", log_unit),
-        ("log_depth", log_depth),
-    ):
-        before, after = (
-            np.abs(np.subtract(getattr(state, name), exact)).max() for state in (start, one_step)
-        )
-        assert after < before / 30, name
-
-
-def _depth_at(truth, observations):
-    x = observations.pixel_offset[0] + truth.intrinsics.cx
-    y = observations.pixel_offset[1] + truth.intrinsics.cy
-    return truth.depth[observations.image, y.round().astype(int), x.round().astype(int)]
 
 
 @pytest.mark.parametrize("spoil", [{"wrong_pairs": 5}, {"noise_pairs": 5}])
