@@ -21,6 +21,7 @@ from jcr.reconstruct import (
 )
 from jcr.records import Capture
 from jcr.result import RunOptions
+from scenes import capture_of
 
 
 @pytest.fixture
@@ -49,9 +50,7 @@ def test_colmap_comes_first_then_networks_whose_weights_are_here_then_direct_ali
 def test_without_weights_the_command_that_gets_them_is_said_in_a_line(
     present: set[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    capture = Capture(
-        folder=Path(), images=("a.png",), base_from_gripper=np.eye(4)[None], image_size=(64, 48)
-    )
+    capture = capture_of(np.eye(4)[None])
     for installed, words in (
         (
             False,
@@ -106,9 +105,7 @@ def test_what_a_back_end_does_not_use_is_refused_in_a_line(
     ("name", "flag"), [("marker", "--board"), ("predictions", "--predictions"), ("given", "--cameras")]
 )
 def test_a_back_end_without_its_input_shows_which_option_names_it(name: str, flag: str) -> None:
-    capture = Capture(
-        folder=Path(), images=("a.png",), base_from_gripper=np.eye(4)[None], image_size=(64, 48)
-    )
+    capture = capture_of(np.eye(4)[None])
     with pytest.raises(InputError, match=f"--backend {name}: name the .* with {flag}[ ,]"):
         backends.reconstruct(capture, ReconstructOptions(backend=name))
 

@@ -24,6 +24,7 @@ from jcr.pipeline.stages import begun, complete, is_unchanged
 from jcr.reconstruct import ReconstructOptions
 from jcr.records import Capture, CellCamera
 from jcr.result import RunOptions, RunResult
+from scenes import capture_of
 
 
 @pytest.fixture(scope="module")
@@ -125,9 +126,7 @@ def test_an_edited_or_cut_file_is_refused_in_one_line(
 
 
 def test_a_capture_in_a_folder_whose_name_is_not_utf8_is_refused_before_any_work():
-    capture = Capture(
-        folder=Path("caf\udce9"), images=("a.png",), base_from_gripper=np.eye(4)[None], image_size=(640, 480)
-    )
+    capture = capture_of(np.eye(4)[None], folder=Path("caf\udce9"), images=("a.png",))
     with pytest.raises(InputError, match="not UTF-8; rename it"):
         begun(Path("out"), capture, RunOptions())
 

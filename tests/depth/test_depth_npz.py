@@ -10,7 +10,8 @@ from jcr.capture.read import read_capture
 from jcr.depth.densify import pointmaps_of, undistorted
 from jcr.depth.depth_npz import is_made_from, read_depth, write_depth
 from jcr.geometry import rotation_exp, transform
-from jcr.records import Reconstruction, Tracks
+from jcr.records import Reconstruction
+from scenes import reconstruction_of
 
 
 def made(tabletop: Path, rows: int) -> Reconstruction:
@@ -32,16 +33,7 @@ def made(tabletop: Path, rows: int) -> Reconstruction:
         cameras,
         pinhole,
     )
-    nothing = np.zeros(0, int)
-    tracks = Tracks(image=nothing, x_px=np.zeros((0, 2)), point=nothing, points_in_recon=np.zeros((0, 3)))
-    return Reconstruction(
-        image_index=index,
-        recon_from_camera=cameras,
-        intrinsics=capture.intrinsics,
-        tracks=tracks,
-        backend="colmap",
-        pointmaps=dense,
-    )
+    return reconstruction_of(cameras, image_index=index, intrinsics=capture.intrinsics, pointmaps=dense)
 
 
 def test_what_is_read_is_what_was_written(tabletop: Path, tmp_path: Path):

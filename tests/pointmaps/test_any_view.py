@@ -21,6 +21,7 @@ from jcr.geometry import (
 )
 from jcr.hub import Weights
 from jcr.records import Capture, Intrinsics, Reconstruction
+from scenes import capture_of
 
 pytestmark = pytest.mark.slow  # draws, and torch
 COUNT, INTRINSICS = 6, Intrinsics(420.0, 420.0, 199.5, 149.5, 400, 300)
@@ -74,13 +75,7 @@ def capture(folder: Path) -> Capture:
     rng = np.random.default_rng(5)
     noise = rng.normal(0, 1, (COUNT, 6)) * ([2e-4] * 3 + [4e-4] * 3)
     gripper = retract(base_from_camera() @ inverse(X), noise)
-    return Capture(
-        folder=folder,
-        images=tuple(f"{k}.png" for k in range(COUNT)),
-        base_from_gripper=gripper,
-        image_size=(400, 300),
-        intrinsics=INTRINSICS,
-    )
+    return capture_of(gripper, folder=folder, image_size=(400, 300), intrinsics=INTRINSICS)
 
 
 class Fake:

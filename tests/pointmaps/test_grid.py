@@ -9,8 +9,9 @@ from PIL import Image
 
 from jcr.capture.images import read_image
 from jcr.pointmaps.grid import image_grid, prepare_images, resize_and_crop
-from jcr.records import Capture, Intrinsics
+from jcr.records import Intrinsics
 from places import SHARED
+from scenes import capture_of
 
 FIXTURES = SHARED / "dust3r" / "fixtures"
 SIZES = ("vga", "hd", "portrait", "square", "small", "odd", "k4", "wide")
@@ -51,13 +52,7 @@ def test_a_distorted_capture_is_undistorted_and_pixels_find_their_way_back(tmp_p
     v, u = np.mgrid[:480, :640]
     image = sum(np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * 5.0**2)) for x, y in spots)
     Image.fromarray(np.repeat((255 * image).astype(np.uint8)[..., None], 3, 2)).save(tmp_path / "0.png")
-    capture = Capture(
-        folder=tmp_path,
-        images=("0.png",),
-        base_from_gripper=np.eye(4)[None],
-        image_size=(640, 480),
-        intrinsics=intrinsics,
-    )
+    capture = capture_of(np.eye(4)[None], folder=tmp_path, images=("0.png",), intrinsics=intrinsics)
 
     prepared = prepare_images(capture)
     assert prepared.intrinsics is not None
