@@ -18,6 +18,7 @@ import shape_checks
 from chromium import Chromium
 from in_process import run_jcr
 from jcr.geometry import apply, transform
+from jcr.reconstruct import Backend
 from places import ROOT, SHARED
 from sift_once import find_sift_once
 from simulation.scenes import make_scene
@@ -54,7 +55,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-SLOW_FIXTURES = {"done", "small_done", "opengl", "real_captures", "attacks", "tiny_sam", "garbage_weights"}
+SLOW_FIXTURES = {"done", "small_done", "opengl", "real_captures", "attacks", "tiny_sam"}
 """Fixtures that run the command line, draw, reconstruct from images, or load a network."""
 
 
@@ -111,6 +112,16 @@ def pytest_runtest_setup() -> Iterator[None]:
 def pytest_runtest_call() -> Iterator[None]:
     shape_checks.begin()
     return (yield)
+
+
+@pytest.fixture
+def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
+    """Names of the back ends whose weights are to count as present; none at first."""
+    names: set[str] = set()
+    monkeypatch.setattr(Backend, "has_weights", lambda self: not self.hub_id or self.name in names)
+    monkeypatch.setattr(Backend, "is_installed", lambda self: True)
+    monkeypatch.setattr("jcr.reconstruct.xfeat_is_installed", lambda: "xfeat" in names)
+    return names
 
 
 @pytest.fixture(scope="session")

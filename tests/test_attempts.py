@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jcr import reconstruct as backends
 from jcr.calibration import stage as calibration_stage
 from jcr.calibration.checks import convention
 from jcr.calibration.hand_eye import solve_hand_eye
@@ -18,7 +17,7 @@ from jcr.calibration.record import Calibration
 from jcr.errors import InputError, RejectedError
 from jcr.findings import Finding, FindingKind
 from jcr.pipeline import selection
-from jcr.reconstruct import Backend, ReconstructOptions
+from jcr.reconstruct import ReconstructOptions
 from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
 from jcr.result import RunOptions, RunResult
 from scenes import capture_of, reconstruction_of
@@ -30,16 +29,6 @@ def quick(monkeypatch: pytest.MonkeyPatch):
     """The search for other readings of the poses takes seconds and is tested elsewhere, and there are no images."""
     monkeypatch.setattr(convention, "better_reading", lambda *_: None)
     monkeypatch.setattr(selection, "view_findings", lambda _: ())
-
-
-@pytest.fixture
-def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
-    """Names of the back ends whose weights are to count as present; none at first."""
-    names: set[str] = set()
-    monkeypatch.setattr(Backend, "has_weights", lambda self: not self.hub_id or self.name in names)
-    monkeypatch.setattr(Backend, "is_installed", lambda self: True)
-    monkeypatch.setattr(backends, "xfeat_is_installed", lambda: "xfeat" in names)
-    return names
 
 
 def reconstruction(backend: str, poses: np.ndarray, observations: int = 0) -> Reconstruction:

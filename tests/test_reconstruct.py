@@ -24,15 +24,6 @@ from jcr.result import RunOptions
 from scenes import capture_of
 
 
-@pytest.fixture
-def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
-    """Names of the back ends whose weights are to count as present; none at first."""
-    names: set[str] = set()
-    monkeypatch.setattr(Backend, "has_weights", lambda self: not self.hub_id or self.name in names)
-    monkeypatch.setattr(Backend, "is_installed", lambda self: True)
-    return names
-
-
 def test_colmap_comes_first_then_networks_whose_weights_are_here_then_direct_alignment(
     present: set[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

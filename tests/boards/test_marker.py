@@ -13,10 +13,8 @@ from jcr.boards.marker import reconstruct_marker
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import unproject
 from jcr.capture.read import read_capture
-from jcr.depth.densify import densify
 from jcr.geometry import rotation_between_deg
 from jcr.records import Intrinsics
-from jcr.records.npz import read_reconstruction, write_reconstruction
 from places import SHARED
 from simulation.problems import TARGET_IN_BASE, HandEyeProblem, hand_eye_problem
 
@@ -37,14 +35,6 @@ def charuco(legacy: bool = False) -> np.ndarray:
 
 def legacy_charuco() -> np.ndarray:
     return charuco(legacy=True)
-
-
-def charuco_among_texture() -> np.ndarray:
-    border = np.random.default_rng(0).integers(0, 255, (70, 90), dtype=np.uint8)
-    sheet = cv2.resize(border, (900, 700), interpolation=cv2.INTER_CUBIC)
-    sheet[140:560, 180:720] = 255
-    sheet[170:530, 240:660] = charuco()
-    return sheet
 
 
 def chessboard() -> np.ndarray:
@@ -160,19 +150,6 @@ def test_other_readings_of_a_charuco_board_are_tried_and_named(tmp_path, spec, l
     assert any(read_as in note for note in reconstruction.notes)
     found = calibrate_reconstruction(capture, reconstruction).gripper_from_camera
     assert np.linalg.norm(found - gripper_from_camera) < 0.01
-
-
-def test_the_metre_of_a_board_is_kept_on_disk_and_its_pointmaps_are_in_metres(tmp_path):
-    pytest.importorskip("torch", reason="dense depth needs torch")
-    capture, _ = capture_of(tmp_path / "capture", charuco_among_texture, count=5)
-    reconstruction = reconstruct_marker(capture, "charuco:7x6:0.030:0.022:DICT_4X4_50")
-    write_reconstruction(tmp_path / "reconstruction.npz", reconstruction)
-    read = read_reconstruction(tmp_path / "reconstruction.npz")
-    assert read.metric_std == reconstruction.metric_std and read.tracks.from_board
-    dense = densify(capture, read).dense
-    height = dense.points_in_recon[dense.confidence > 0][:, 2]
-    assert len(height) > 1000
-    assert np.median(np.abs(height)) < 0.002
 
 
 DATA = SHARED / "data"
