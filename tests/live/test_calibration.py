@@ -11,7 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from numpy import ndarray
 
 import jcr
 from jcr.capture.images import read_image
@@ -21,12 +20,7 @@ from jcr.live.calibration import LiveCalibration
 from jcr.live.page import page_content
 from jcr.live.progress import Notation, Progress, next_lines
 from jcr.live.session import SessionState
-
-REQUIRED = (2.0, 0.3)
-
-
-def still(tabletop: Path, k: int) -> ndarray:
-    return read_image(tabletop / "images" / f"{k:02d}.jpg")
+from scripted_capture import REQUIRED, still
 
 
 @pytest.fixture(scope="module")
