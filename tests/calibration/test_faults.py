@@ -157,6 +157,7 @@ def test_nothing_is_named_where_nothing_is_wrong(images: int, given: bool):
     assert calibrated(Faults(), 0, images, given)[1].warnings == ()
 
 
+@pytest.mark.long
 def test_an_effect_that_moves_the_calibration_by_all_points_too_little_is_not_reported(attacks: Path):
     """Twice the same 16 views share errors of pixels: 800 of their points show focal lengths that differ by 0.05 %.
 
@@ -234,7 +235,7 @@ def test_the_parts_of_the_uncertainty_of_a_fixed_camera_are_the_whole_with_its_f
     assert error @ np.linalg.solve(hand_eye.covariance[:6, :6], error) < 16.8  # 99 % of chi2 of 6
 
 
-@pytest.mark.parametrize("mm", [3.0, 30.0, 100.0])
+@pytest.mark.parametrize("mm", [3.0, 100.0])
 def test_a_change_of_the_tool_in_translation_alone_is_named_in_few_images_however_large(mm: float):
     """The fit takes it for noise of all translations, beside which it was lost the more the larger it was."""
     problem = hand_eye_problem(np.random.default_rng(0), 8, robot_noise=(3e-4, 1e-3))
