@@ -1,9 +1,11 @@
-"""Test back ends of other packages: the example, installed into an environment of its own, and one that is broken."""
+"""Back ends of other packages: the example beside the installed packages, and one that is broken."""
 
 import json
+import os
+import shutil
 import subprocess
 import sys
-import sysconfig
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +13,15 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from jcr.capture.formats import capture_json
 from jcr.geometry import inverse, transform
+from jcr.records import Intrinsics
 from places import ROOT
+from scenes import capture_of
 
 pytestmark = pytest.mark.slow
 COUNT, WIDTH, HEIGHT = 6, 320, 240
+MODULE = "jcr_mapanything"
 
 MODELS = '''
 import numpy as np
@@ -49,40 +55,30 @@ class MapAnything:
 
 
 @pytest.fixture(scope="module")
-def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Interpreter of a new environment with jcr and the example installed, and its dependencies from this one."""
-    folder = tmp_path_factory.mktemp("environment")
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
-    made = folder / "bin" / "python"
-    packages = Path(
-        subprocess.run(
-            [made, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"],
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout.strip()
-    )
-    here = [ROOT / "src", sysconfig.get_path("purelib"), sysconfig.get_path("platlib")]
-    (packages / "dependencies.pth").write_text("".join(f"{path}\n" for path in here))
-    install = [sys.executable, "-m", "pip", "--python", made, "install", "--quiet", "--no-deps"]
-    install += ["--no-build-isolation", "--disable-pip-version-check"]
-    source = folder / "source"  # the build writes beside its files
-    source.mkdir()
-    for path in (ROOT / "examples" / "backend_mapanything").glob("*.*"):
-        (source / path.name).write_text(path.read_text())
-    done = subprocess.run([*install, source], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    broken = packages / "broken-0.1.dist-info"
-    broken.mkdir()
-    (broken / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 0.1\n")
-    (broken / "entry_points.txt").write_text("[jcr.backends]\nbroken = jcr_mapanything:NO_ROW\n")
-    return made
+def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of installed packages: the example with the entry points that it declares, and one that is broken."""
+    folder, example = tmp_path_factory.mktemp("packages"), ROOT / "examples" / "backend_mapanything"
+    project = tomllib.loads((example / "pyproject.toml").read_text())["project"]
+    declared = {
+        project["name"]: project["entry-points"]["jcr.backends"],
+        "broken": {"broken": f"{MODULE}:NO_ROW"},
+    }
+    for name, points in declared.items():
+        about = folder / f"{name.replace('-', '_')}-0.1.dist-info"
+        about.mkdir()
+        (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.1\n")
+        rows = [f"{row} = {place}" for row, place in points.items()]
+        (about / "entry_points.txt").write_text("\n".join(["[jcr.backends]", *rows, ""]))
+    shutil.copy(example / f"{MODULE}.py", folder)
+    return folder
 
 
-def run(python: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
-    code = "from jcr.cli import main; main()"
-    command = [python, "-c", code, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=240)
+def run(*arguments: object, packages: list[Path]) -> subprocess.CompletedProcess[str]:
+    """Run jcr with packages beside the installed ones."""
+    path = os.pathsep.join([*map(str, packages), os.environ.get("PYTHONPATH", "")])
+    command = [sys.executable, "-m", "jcr", *map(str, arguments)]
+    environment = os.environ | {"PYTHONPATH": path}
+    return subprocess.run(command, capture_output=True, text=True, timeout=240, env=environment)
 
 
 @pytest.fixture(scope="module")
@@ -98,35 +94,35 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     gripper_from_camera = transform(
         Rotation.from_rotvec([0.1, 0.2, 0.5]).as_matrix(), np.array([0.03, 0.05, 0.1])
     )
-    frames = []
-    for k, pose in enumerate(cameras @ inverse(gripper_from_camera)):
+    poses = cameras @ inverse(gripper_from_camera)
+    for k in range(COUNT):
         Image.new("RGB", (WIDTH, HEIGHT), (90 + k, 90, 90)).save(folder / f"{k}.png")
-        frames.append({"image": f"{k}.png", "base_from_gripper": pose.tolist()})
-    intrinsics = {"fx": 300.0, "fy": 300.0, "cx": 159.5, "cy": 119.5, "distortion": [0.0] * 5}
-    (folder / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": intrinsics}))
+    camera = Intrinsics(300.0, 300.0, 159.5, 119.5, WIDTH, HEIGHT)
+    capture_json.write(
+        folder, capture_of(poses, folder=folder, image_size=(WIDTH, HEIGHT), intrinsics=camera)
+    )
     np.save(folder / "gripper_from_camera.npy", gripper_from_camera)
     return folder
 
 
-def test_the_example_is_listed_and_names_what_it_lacks(python: Path, capture: Path, tmp_path: Path) -> None:
-    listed = run(python, "models", "--json")
+def test_the_example_is_listed_and_names_what_it_lacks(packages: Path, capture: Path, tmp_path: Path) -> None:
+    listed = run("models", "--json", packages=[packages])
     rows = {row["backend"]: row for row in json.loads(listed.stdout)["models"]}
     assert rows["mapanything"]["licence"] == "Apache-2.0"
     names = list(rows)
     assert names.index("da3-small") < names.index("mapanything") < names.index("direct")
     assert "broken" not in names
     assert "back end broken (jcr_mapanything:NO_ROW) cannot be loaded" in listed.stderr
-    done = run(python, "calibrate", capture, tmp_path / "out", "--backend", "mapanything")
+    done = run("calibrate", capture, tmp_path / "out", "--backend", "mapanything", packages=[packages])
     assert done.returncode == 2
     assert "needs mapanything, which is not installed: pip install git" in done.stderr
 
 
-def test_the_example_calibrates(python: Path, capture: Path, tmp_path: Path) -> None:
+def test_the_example_calibrates(packages: Path, capture: Path, tmp_path: Path) -> None:
     package = tmp_path / "mapanything"
     package.mkdir()
     (package / "__init__.py").touch()
     (package / "models.py").write_text(MODELS)
-    code = f"import sys; sys.path.append({str(tmp_path)!r}); from jcr.cli import main; main()"
     words = [
         "calibrate",
         capture,
@@ -137,7 +133,7 @@ def test_the_example_calibrates(python: Path, capture: Path, tmp_path: Path) -> 
         capture,
         "--json",
     ]
-    done = subprocess.run([python, "-c", code, *map(str, words)], capture_output=True, text=True, timeout=240)
+    done = run(*words, packages=[packages, tmp_path])
     found = json.loads((tmp_path / "out" / "calibration.json").read_text())
     assert found["backend"] == "mapanything", done.stderr
     true = np.load(capture / "gripper_from_camera.npy")
