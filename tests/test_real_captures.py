@@ -1,7 +1,6 @@
 """Real captures with a reference that someone else measured; skipped where they are not at hand."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -89,7 +88,7 @@ def test_another_first_pair_is_tried_where_the_first_bends_unknown_intrinsics(
 def test_images_that_are_added_live_have_the_findings_of_a_batch(real_captures: Path, tmp_path: Path):
     """Thirteen images: "camera moved on the gripper" was reported live, and gone at the sixteenth."""
     whole = jcr.read_capture(real_captures / "ur_snack_table")
-    capture = replace(whole, images=whole.images[:13], base_from_gripper=whole.base_from_gripper[:13])
+    capture = whole.of_rows(range(13))
     batch = calibrate_reconstruction(capture, reconstruct_colmap(capture))
     live = jcr.LiveCalibration(tmp_path / "live", intrinsics=capture.intrinsics)
     for k, (name, pose) in enumerate(zip(capture.images, capture.base_from_gripper, strict=True)):

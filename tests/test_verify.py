@@ -15,6 +15,7 @@ from conftest import shrunk_capture
 from jcr.calibration.drift import drift
 from jcr.calibration.record import write_calibration
 from jcr.calibration.stage import calibrate_reconstruction
+from jcr.capture.formats import capture_json
 from jcr.capture.images import read_image
 from jcr.cli import dispatch
 from jcr.estimation.arms import arm_named
@@ -23,6 +24,7 @@ from jcr.estimation.inverse_kinematics import posed
 from jcr.estimation.problem import pose_problem
 from jcr.estimation.robot_noise import arm_errors, smooth_errors
 from jcr.estimation.solve import solve
+from jcr.files import write_bytes
 from jcr.geometry import inverse, rotation_exp, scale_translation, transform
 from jcr.pipeline.options import VerifyOptions
 from jcr.pipeline.stages import begun, keep_reconstruction
@@ -177,18 +179,11 @@ def out(tmp_path_factory: pytest.TempPathFactory, capture: Capture, reconstructi
 
 
 def write_capture(folder: Path, capture: Capture, poses: np.ndarray, rows) -> Capture:
-    (folder / "images").mkdir(parents=True)
-    frames = []
-    for k in rows:
-        (folder / capture.images[k]).write_bytes((capture.folder / capture.images[k]).read_bytes())
-        frames.append({"image": capture.images[k], "base_from_gripper": poses[k].tolist()})
-    (folder / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": None}))
-    return replace(
-        capture,
-        folder=folder,
-        images=tuple(frame["image"] for frame in frames),
-        base_from_gripper=poses[list(rows)],
-    )
+    few = replace(capture, folder=folder, base_from_gripper=poses).of_rows(rows)
+    for name in few.images:
+        write_bytes(folder / name, (capture.folder / name).read_bytes())
+    capture_json.write(folder, replace(few, intrinsics=None))
+    return few
 
 
 def test_the_command_is_content_with_what_has_not_moved(out: Path, capture: Capture, tmp_path: Path, capsys):

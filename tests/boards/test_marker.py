@@ -9,13 +9,17 @@ import cv2
 import numpy as np
 import pytest
 
+import scenes
 from jcr.boards.marker import reconstruct_marker
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import unproject
+from jcr.capture.images import encode_png
 from jcr.capture.read import read_capture
+from jcr.files import write_bytes
 from jcr.geometry import rotation_between_deg
 from jcr.records import Intrinsics
 from places import SHARED
+from scenes import png_names
 from simulation.problems import TARGET_IN_BASE, HandEyeProblem, hand_eye_problem
 
 pytestmark = pytest.mark.slow
@@ -99,19 +103,11 @@ def photographs(sheet: Callable[[], np.ndarray]) -> tuple[HandEyeProblem, list[n
 def capture_of(folder: Path, sheet: Callable[[], np.ndarray], count: int = 8, known_intrinsics: bool = True):
     """A capture of the sheet's first views, and the true gripper_from_camera."""
     problem, images = photographs(sheet)
-    (folder / "images").mkdir(parents=True)
-    frames = []
-    for k in range(count):
-        cv2.imwrite(str(folder / f"images/{k}.png"), images[k])
-        frames.append(
-            {"image": f"images/{k}.png", "base_from_gripper": problem.base_from_gripper[k].tolist()}
-        )
-    intrinsics = {key: getattr(INTRINSICS, key) for key in ("fx", "fy", "cx", "cy")} | {
-        "distortion": INTRINSICS.distortion
-    }
-    content = {"frames": frames, "intrinsics": intrinsics if known_intrinsics else None}
-    (folder / "capture.json").write_text(json.dumps(content))
-    return read_capture(folder), problem.gripper_from_camera
+    for name, image in zip(png_names(count), images[:count], strict=True):
+        write_bytes(folder / name, encode_png(image))
+    camera = INTRINSICS if known_intrinsics else None
+    capture = scenes.capture_of(problem.base_from_gripper[:count], folder=folder, intrinsics=camera)
+    return capture, problem.gripper_from_camera
 
 
 BOARDS = {

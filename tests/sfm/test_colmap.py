@@ -32,19 +32,13 @@ def capture(tabletop: Path) -> Capture:
 
 @pytest.fixture(scope="module")
 def found(capture: Capture) -> Reconstruction:
-    first = _first(capture, 7)
+    first = capture.of_rows(range(7))
     return densify(first, reconstruct_colmap(first), DepthOptions(pointmap_size_px=240))
 
 
 @pytest.fixture(scope="module")
 def four(capture: Capture) -> Reconstruction:
-    return reconstruct_colmap(_first(capture, 4))
-
-
-def _first(capture: Capture, count: int) -> Capture:
-    return replace(
-        capture, images=capture.images[:count], base_from_gripper=capture.base_from_gripper[:count]
-    )
+    return reconstruct_colmap(capture.of_rows(range(4)))
 
 
 def _true_base_from_camera(capture: Capture, result: Reconstruction) -> Float[ndarray, "m 4 4"]:
@@ -109,7 +103,7 @@ def test_pointmaps_show_the_table_at_its_height(capture: Capture, found: Reconst
 
 def test_same_pixels_same_result(capture: Capture, four: Reconstruction, tmp_path: Path) -> None:
     """Bit for bit, also when the images lie on their side with an EXIF tag that says so."""
-    rotated = _first(capture, 4)
+    rotated = capture.of_rows(range(4))
     names = []
     for name in rotated.images:
         exif = Image.Exif()
@@ -135,7 +129,7 @@ def test_same_pixels_same_result(capture: Capture, four: Reconstruction, tmp_pat
 def test_distortion_that_folds_over_is_not_used(capture: Capture, four: Reconstruction) -> None:
     assert capture.intrinsics is not None
     folding = replace(capture.intrinsics, distortion=(0.01, 0.7, 0.0, 0.0, -9.0))
-    result = reconstruct_colmap(replace(_first(capture, 4), intrinsics=folding))
+    result = reconstruct_colmap(replace(capture.of_rows(range(4)), intrinsics=folding))
     (warning,) = result.warnings
     assert "folds over at" in warning and "not used" in warning and not result.notes
     assert result.intrinsics == capture.intrinsics
@@ -144,7 +138,7 @@ def test_distortion_that_folds_over_is_not_used(capture: Capture, four: Reconstr
 
 def test_unknown_intrinsics_is_found(capture: Capture) -> None:
     assert capture.intrinsics is not None
-    result = reconstruct_colmap(replace(_first(capture, 5), intrinsics=None))
+    result = reconstruct_colmap(replace(capture.of_rows(range(5)), intrinsics=None))
     assert result.intrinsics.fx == pytest.approx(capture.intrinsics.fx, rel=0.01)
     corner = np.array([[0.4, 0.3, 1.0]])
     np.testing.assert_allclose(
@@ -154,7 +148,7 @@ def test_unknown_intrinsics_is_found(capture: Capture) -> None:
 
 
 def test_image_that_shows_something_else_is_named(capture: Capture, tmp_path: Path) -> None:
-    three = _first(capture, 4)
+    three = capture.of_rows(range(4))
     for name in three.images[:3]:
         shutil.copy(capture.folder / name, tmp_path / Path(name).name)
     noise = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)

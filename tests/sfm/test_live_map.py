@@ -1,7 +1,6 @@
 """Map of a capture that is being taken: images that come, leave and come back are matched once."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +14,6 @@ from jcr.records import Capture
 from jcr.sfm.live_map import LiveMap
 
 pytestmark = pytest.mark.slow
-
-
-def some_of(capture: Capture, rows: list[int]) -> Capture:
-    """Return a capture of some images."""
-    return replace(
-        capture,
-        images=tuple(capture.images[row] for row in rows),
-        base_from_gripper=capture.base_from_gripper[rows],
-    )
 
 
 def off_mm(capture: Capture, found: LiveMap) -> float:
@@ -47,7 +37,7 @@ def test_images_that_come_leave_and_come_back_are_matched_once(
 
     def update(rows: list[int], new: list[int]) -> Capture:
         """Map the images of these rows, of which some are new, and return their capture."""
-        capture, before = some_of(whole, rows), len(matched)
+        capture, before = whole.of_rows(rows), len(matched)
         live.update(capture, {whole.images[row]: read_image(tabletop / whole.images[row]) for row in new})
         others = len(rows) - len(new)
         assert len(matched) - before == others * len(new) + len(new) * (len(new) - 1) // 2
