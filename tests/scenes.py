@@ -1,5 +1,6 @@
 """Records of problems with a known answer: captures without images, samples, and reconstructions without a back end."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from jcr.geometry import inverse, transform
+from jcr.geometry import apply, fit_similarity, inverse, transform
 from jcr.records import Capture, PosePairs, Reconstruction, Tracks
 from simulation.problems import INTRINSICS
 
@@ -43,6 +44,23 @@ def reconstruction_of(recon_from_camera: Float[ndarray, "n 4 4"], **facts: Any) 
     """Return a reconstruction with these cameras and no tracks, of every image of a capture."""
     usual = {"image_index": np.arange(len(recon_from_camera)), "intrinsics": INTRINSICS, "tracks": NO_TRACKS}
     return Reconstruction(recon_from_camera=recon_from_camera, **(usual | {"backend": "colmap"} | facts))
+
+
+def reference_of(folder: Path) -> Float[ndarray, "4 4"]:
+    """Return gripper_from_camera of a capture's reference.json."""
+    return np.array(json.loads((folder / "reference.json").read_text())["gripper_from_camera"])
+
+
+def true_cameras(capture: Capture, made: Reconstruction) -> Float[ndarray, "m 4 4"]:
+    """Return base_from_camera of the registered images by their gripper poses and the reference."""
+    return capture.base_from_gripper[made.image_index] @ reference_of(capture.folder)
+
+
+def center_errors(capture: Capture, made: Reconstruction) -> Float[ndarray, " m"]:
+    """Return the distances (m) of camera centres from the true ones after the best similarity."""
+    true, found = true_cameras(capture, made)[:, :3, 3], made.recon_from_camera[:, :3, 3]
+    base_from_recon, scale = fit_similarity(true, found)
+    return np.linalg.norm(apply(base_from_recon, scale * found) - true, axis=1)
 
 
 def rotated(change: Callable[[Rotation], Rotation]) -> Change:

@@ -21,6 +21,8 @@ from places import ROOT
 if TYPE_CHECKING:
     import trimesh
 
+from scenes import reference_of
+
 pytestmark = pytest.mark.slow
 
 EXAMPLES = ROOT / "examples"
@@ -105,16 +107,11 @@ def test_quick_start_prints_the_true_camera_and_the_things_on_the_table(done: Pa
     rows = re.search(r"\(m\):\n(.*?)\none sigma", text, re.DOTALL)
     assert rows is not None and "verdict: accepted" in text
     found = np.array(re.findall(r"-?\d+\.\d*", rows[1]), float).reshape(4, 4)
-    truth = true_hand_eye()
+    truth = reference_of(EXAMPLES / "tabletop")
     assert np.linalg.norm(found[:3, 3] - truth[:3, 3]) < 5e-4
     assert rotation_between_deg(found[:3, :3], truth[:3, :3]) < 0.05
     assert len(re.findall(r"± \d+ mm high", text)) >= 3
     assert "touches above it: False, at its middle: True" in text
-
-
-def true_hand_eye() -> np.ndarray:
-    """Of the bundled capture."""
-    return np.array(json.loads((EXAMPLES / "tabletop/reference.json").read_text())["gripper_from_camera"])
 
 
 def test_own_camera_poses_are_solved_and_what_sliding_hides_is_named(tmp_path: Path):
@@ -142,7 +139,7 @@ def test_the_splat_s_cameras_are_where_the_robot_fixed_them(done: Path, tmp_path
     shutil.copytree(done, tmp_path / "run")
     text = printed("06_splat_export", tmp_path, "run")
     table = jcr.read_capture(EXAMPLES / "tabletop")
-    heights = (table.base_from_gripper @ true_hand_eye())[:, 2, 3]
+    heights = (table.base_from_gripper @ reference_of(EXAMPLES / "tabletop"))[:, 2, 3]
     assert "12 cameras of 640 x 480 px" in text
     lowest_and_highest = numbers(r"hang (.+) to (.+) m above", text)
     np.testing.assert_allclose(lowest_and_highest, [heights.min(), heights.max()], atol=2e-3)
@@ -157,7 +154,7 @@ def test_a_result_places_a_point_compares_exports_and_answers(done: Path, tmp_pa
     point, off = (re.findall(rf"^{what}: (.*)$", text, re.M)[0] for what in ("point", "other transform"))
     x, y, z, *sigmas_mm = map(float, re.findall(r"-?\d+\.\d*", point))
     ray = unproject(capture.intrinsics, np.array([320.0, 240.0]))
-    true = apply(capture.base_from_gripper[0] @ true_hand_eye(), 0.45 * ray)
+    true = apply(capture.base_from_gripper[0] @ reference_of(EXAMPLES / "tabletop"), 0.45 * ray)
     assert np.linalg.norm(np.array([x, y, z]) - true) < 1e-3 and 0 < max(sigmas_mm) < 1
     assert np.linalg.norm([*map(float, re.findall(r"-?\d+\.\d*", off))]) < 0.5
     assert (out / "export" / "hand_eye.urdf").is_file() and "map at the point: occupancy" in text
@@ -183,7 +180,7 @@ def test_the_api_is_called_as_it_is_shown(done: Path, tmp_path: Path):
     )
     assert solve.observability.observable and not solve.observability.unobservable
     assert solve.covariance.shape == (7, 7) and solve.images_used == len(solve.images)
-    np.testing.assert_allclose(solve.gripper_from_camera, true_hand_eye(), atol=2e-3)
+    np.testing.assert_allclose(solve.gripper_from_camera, reference_of(EXAMPLES / "tabletop"), atol=2e-3)
 
 
 def test_the_notebook_runs_and_shows_the_result(done: Path, tmp_path: Path):

@@ -1,24 +1,17 @@
 """Real captures with a reference that someone else measured; skipped where they are not at hand."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy import ndarray
 
 import jcr
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.images import read_image
 from jcr.findings import FindingKind
-from jcr.geometry import Similarity, fit_similarity, rotation_between_deg, step_between
-from jcr.records import Capture
+from jcr.geometry import rotation_between_deg, step_between
 from jcr.sfm.colmap import reconstruct_colmap
-
-
-def reference_of(capture: Capture) -> ndarray:
-    """Return gripper_from_camera as someone else measured it."""
-    return np.array(json.loads((capture.folder / "reference.json").read_text())["gripper_from_camera"])
+from scenes import center_errors, reference_of
 
 
 @pytest.mark.slow
@@ -35,17 +28,14 @@ def test_within_reach_of_the_marker_reference(
     """And the cameras follow the gripper."""
     capture = jcr.read_capture(real_captures / name)
     found = reconstruct_colmap(capture)
-    solved, reference = calibrate_reconstruction(capture, found), reference_of(capture)
+    solved, reference = calibrate_reconstruction(capture, found), reference_of(capture.folder)
     assert solved.converged and solved.inliers.sum() == len(found.image_index) == count
     assert 1e3 * np.linalg.norm(solved.gripper_from_camera[:3, 3] - reference[:3, 3]) < max_mm
     assert rotation_between_deg(solved.gripper_from_camera[:3, :3], reference[:3, :3]) < max_deg
     assert solved.held_out is not None and solved.held_out.translation_mm < 6.0
     assert any("folds over" in text for text in found.warnings) == (name == "doosan_bench")
     # To within the few millimetres to which the references are good, and the poses of both robots.
-    centers = (capture.base_from_gripper[found.image_index] @ reference)[:, :3, 3]
-    base_from_recon, scale = fit_similarity(centers, found.recon_from_camera[:, :3, 3])
-    fitted = Similarity(base_from_recon, scale)(found.recon_from_camera[:, :3, 3])
-    off_m = np.linalg.norm(fitted - centers, axis=1)
+    off_m = center_errors(capture, found)
     assert np.median(off_m) < 3e-3 and off_m.max() < 0.01
 
 
@@ -60,7 +50,7 @@ def test_nominal_intrinsics_are_contradicted_by_their_images(real_captures: Path
     assert capture.intrinsics is not None and capture.intrinsics.fx > 1.005 * capture.intrinsics.fy
     assert solved.held_out is not None and solved.held_out.translation_mm < 2.0
     assert given is not None
-    reference, both = reference_of(capture), (given.gripper_from_camera, solved.gripper_from_camera)
+    reference, both = reference_of(capture.folder), (given.gripper_from_camera, solved.gripper_from_camera)
     off_mm = [1e3 * np.linalg.norm(x[:3, 3] - reference[:3, 3]) for x in both]
     assert off_mm[0] < 10 < off_mm[1]
 

@@ -10,6 +10,7 @@ from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.pipeline.touch import touch
 from jcr.result import RunResult
+from scenes import reference_of
 
 pytestmark = pytest.mark.slow
 
@@ -22,7 +23,7 @@ def touched(done: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     calibration, capture, reconstruction = RunResult(done).of_wrist_camera()
     rng = np.random.default_rng(0)
-    true = np.array(json.loads((capture.folder / "reference.json").read_text())["gripper_from_camera"])
+    true = reference_of(capture.folder)
     lines = ["image, x_px, y_px, x_m, y_m, z_m"]
     for k in (0, 2, 4):
         name = capture.images[reconstruction.image_index[k]]

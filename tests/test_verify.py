@@ -32,7 +32,7 @@ from jcr.pipeline.verify import _judged, _of_two
 from jcr.records import Capture, Reconstruction
 from jcr.result import RunOptions
 from jcr.sfm.register import register
-from scenes import reconstruction_of
+from scenes import reconstruction_of, reference_of
 from simulation.capture import with_robot_noise
 from simulation.problems import bent_problem
 
@@ -54,7 +54,7 @@ def capture(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> Capture
 
 @pytest.fixture(scope="module")
 def x(tabletop: Path) -> np.ndarray:
-    return np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
+    return reference_of(tabletop)
 
 
 def cameras(capture: Capture, x: np.ndarray) -> np.ndarray:

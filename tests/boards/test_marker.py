@@ -1,6 +1,5 @@
 """The marker back end on images of boards drawn where the truth is known."""
 
-import json
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -19,7 +18,7 @@ from jcr.files import write_bytes
 from jcr.geometry import rotation_between_deg
 from jcr.records import Intrinsics
 from places import SHARED
-from scenes import png_names
+from scenes import png_names, reference_of
 from simulation.problems import TARGET_IN_BASE, HandEyeProblem, hand_eye_problem
 
 pytestmark = pytest.mark.slow
@@ -165,8 +164,7 @@ DATA = SHARED / "data"
 def test_real_boards_reproduce_their_references(name, spec, limit_mm, limit_deg, accepted):
     capture = read_capture(DATA / name)
     hand_eye = calibrate_reconstruction(capture, reconstruct_marker(capture, spec))
-    reference = json.loads((DATA / name / "reference.json").read_text())
-    true = np.array(reference["gripper_from_camera"])
+    true = reference_of(DATA / name)
     found = hand_eye.gripper_from_camera
     assert 1e3 * np.linalg.norm(found[:3, 3] - true[:3, 3]) < limit_mm
     assert rotation_between_deg(found[:3, :3], true[:3, :3]) < limit_deg

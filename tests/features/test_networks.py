@@ -1,6 +1,5 @@
 """XFeat and LightGlue: parity, checked weights, and images that SIFT does not register."""
 
-import json
 import math
 from importlib.machinery import ModuleSpec
 from pathlib import Path
@@ -11,6 +10,7 @@ import pytest
 from jcr.capture.read import read_capture
 from jcr.errors import InputError
 from jcr.extras import xfeat_is_installed
+from scenes import reference_of
 
 pytestmark = [
     pytest.mark.slow,
@@ -87,7 +87,7 @@ def test_a_chessboard_before_a_plain_background(real_captures: Path):
     made = reconstruct_colmap(capture, "xfeat")
     assert len(made.image_index) == 8
     hand_eye = calibrate_reconstruction(capture, made)
-    reference = np.array(json.loads((capture.folder / "reference.json").read_text())["gripper_from_camera"])
+    reference = reference_of(capture.folder)
     assert rotation_between_deg(hand_eye.gripper_from_camera[:3, :3], reference[:3, :3]) < 1.0
     # With squares of 26.07 mm, as the sheet's being A4 says, the board has the camera here; the reference was made with
     # 23.6 mm, which the robot's motion excludes.

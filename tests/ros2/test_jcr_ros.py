@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 import jcr
 from jcr.capture.images import read_depth_images, read_image
 from places import ROOT
+from scenes import reference_of
 from waiting import until
 
 PACKAGE = ROOT / "ros2" / "jcr_ros"
@@ -299,7 +300,7 @@ def test_the_node_broadcasts_the_transform_where_it_is_accepted_alone(
     assert answer.success, answer.message
     (sent,) = node.broadcaster.sent
     assert (sent.header.frame_id, sent.child_frame_id) == ("tool0", "camera_color_optical_frame")
-    truth = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
+    truth = reference_of(tabletop)
     place = sent.transform.translation
     assert np.linalg.norm(np.array([place.x, place.y, place.z]) - truth[:3, 3]) < 5e-3
 

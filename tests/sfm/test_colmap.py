@@ -1,6 +1,5 @@
 """The COLMAP back end on the bundled capture, against its truth, and on captures it must refuse or fix."""
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +19,7 @@ from jcr.geometry import Similarity, fit_similarity, inverse, rotation_between_d
 from jcr.progress import silent
 from jcr.records import Capture, Reconstruction
 from jcr.sfm.colmap import reconstruct_colmap
+from scenes import center_errors, true_cameras
 from simulation.truth import read_truth
 
 pytestmark = pytest.mark.slow
@@ -41,19 +41,6 @@ def four(capture: Capture) -> Reconstruction:
     return reconstruct_colmap(capture.of_rows(range(4)))
 
 
-def _true_base_from_camera(capture: Capture, result: Reconstruction) -> Float[ndarray, "m 4 4"]:
-    reference = json.loads((capture.folder / "reference.json").read_text())
-    return capture.base_from_gripper[result.image_index] @ np.array(reference["gripper_from_camera"])
-
-
-def _center_errors(capture: Capture, result: Reconstruction) -> Float[ndarray, " m"]:
-    """Distances (m) of the camera centres from where gripper pose and reference put them."""
-    centers = _true_base_from_camera(capture, result)[:, :3, 3]
-    base_from_recon, scale = fit_similarity(centers, result.recon_from_camera[:, :3, 3])
-    fitted = Similarity(base_from_recon, scale)(result.recon_from_camera[:, :3, 3])
-    return np.linalg.norm(fitted - centers, axis=1)
-
-
 def _reprojection_errors(result: Reconstruction) -> Float[ndarray, "k 2"]:
     tracks = result.tracks
     camera_from_recon = inverse(result.recon_from_camera)[tracks.image]
@@ -66,8 +53,8 @@ def test_cameras_are_where_they_were(capture: Capture, found: Reconstruction) ->
     assert found.image_index.tolist() == list(range(7))
     assert found.intrinsics == capture.intrinsics
     assert found.notes == found.warnings == ()
-    assert np.sqrt((_center_errors(capture, found) ** 2).mean()) < 2e-4
-    true = _true_base_from_camera(capture, found)[:, :3, :3]
+    assert np.sqrt((center_errors(capture, found) ** 2).mean()) < 2e-4
+    true = true_cameras(capture, found)[:, :3, :3]
     relative = np.swapaxes(true[:1], -1, -2) @ true
     measured = np.swapaxes(found.recon_from_camera[:1, :3, :3], -1, -2) @ found.recon_from_camera[:, :3, :3]
     assert rotation_between_deg(relative, measured).max() < 0.1
@@ -89,7 +76,7 @@ def test_observations_agree_within_a_tenth_of_a_pixel(found: Reconstruction) -> 
 def test_pointmaps_show_the_table_at_its_height(capture: Capture, found: Reconstruction) -> None:
     assert np.isfinite(found.dense.points_in_recon).all()
     assert (found.dense.confidence > 0).mean() > 0.5
-    centers = _true_base_from_camera(capture, found)[:, :3, 3]
+    centers = true_cameras(capture, found)[:, :3, 3]
     base_from_recon, scale = fit_similarity(centers, found.recon_from_camera[:, :3, 3])
     x_in_base = Similarity(base_from_recon, scale)(found.dense.points_in_recon[found.dense.confidence > 0])
     truth = read_truth(capture.folder)
@@ -144,7 +131,7 @@ def test_unknown_intrinsics_is_found(capture: Capture) -> None:
     np.testing.assert_allclose(
         project(result.intrinsics, corner), project(capture.intrinsics, corner), atol=3
     )
-    assert _center_errors(capture, result).max() < 1e-3
+    assert center_errors(capture, result).max() < 1e-3
 
 
 def test_image_that_shows_something_else_is_named(capture: Capture, tmp_path: Path) -> None:

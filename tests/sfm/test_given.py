@@ -1,6 +1,5 @@
 """Given cameras without points: features are triangulated, the same bit for bit each time."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from jcr.camera import project
 from jcr.capture.read import read_capture
 from jcr.geometry import apply, inverse
 from jcr.sfm.given import reconstruct_given
+from scenes import reference_of
 
 pytestmark = pytest.mark.slow
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 def test_the_same_cameras_give_the_same_points(tabletop: Path, tmp_path: Path):
     capture = read_capture(tabletop)
     capture = capture.of_rows(range(4))
-    x = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
+    x = reference_of(tabletop)
     cameras = capture.base_from_gripper @ x
     model = write_colmap(tmp_path, capture, cameras) / "sparse" / "0"
     first, second = (reconstruct_given(capture, model) for _ in range(2))

@@ -1,17 +1,15 @@
 """Map of a capture that is being taken: images that come, leave and come back are matched once."""
 
-import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import jcr
 from jcr.capture.images import read_image
 from jcr.features import sift
-from jcr.geometry import Similarity, fit_similarity
 from jcr.records import Capture
 from jcr.sfm.live_map import LiveMap
+from scenes import center_errors
 
 pytestmark = pytest.mark.slow
 
@@ -20,11 +18,7 @@ def off_mm(capture: Capture, found: LiveMap) -> float:
     """Return the largest distance of a camera from where the reference and its gripper put it, of all images."""
     made = found.reconstruction()
     assert made is not None and made.image_index.tolist() == list(range(len(capture)))
-    reference = np.array(json.loads((capture.folder / "reference.json").read_text())["gripper_from_camera"])
-    centers, own = (capture.base_from_gripper @ reference)[:, :3, 3], made.recon_from_camera[:, :3, 3]
-    base_from_recon, scale = fit_similarity(centers, own)
-    away = np.linalg.norm(Similarity(base_from_recon, scale)(own) - centers, axis=1)
-    return 1e3 * float(away.max())
+    return 1e3 * float(center_errors(capture, made).max())
 
 
 def test_images_that_come_leave_and_come_back_are_matched_once(
