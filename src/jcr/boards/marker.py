@@ -12,12 +12,14 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.boards.detection import PRINTED, Board, Sighting, boards, is_of_unknown_size, most_seen
-from jcr.camera import WITHIN_FOLD, by_point, fold_distance_px, project
+from jcr.camera import WITHIN_FOLD, fold_distance_px, project
 from jcr.capture.images import read_image
 from jcr.errors import RejectedError
 from jcr.estimation.absolute_pose import absolute_pose
-from jcr.geometry import apply, inverse, retract, skew
-from jcr.least_squares import minimise
+from jcr.estimation.image_equations import adjust_images
+from jcr.estimation.intrinsics_prior import FIXED, camera_with_prior
+from jcr.estimation.problem import Observations, image_problem
+from jcr.geometry import apply, inverse
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
@@ -69,10 +71,12 @@ def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | Non
     if missing := [name for row, name in enumerate(capture.images) if row not in recon_from_camera]:
         notes.append(f"the board is not seen, or not sharply, in {', '.join(missing)}")
     sightings = [[s for s in seen[row] if s.body in recon_from_body and s.body in poses[row]] for row in rows]
-    cameras = np.stack([recon_from_camera[row] for row in rows])
+    cameras, tracks = np.stack([recon_from_camera[row] for row in rows]), _tracks(sightings, recon_from_body)
     if len(recon_from_body) > 1:
-        cameras, recon_from_body = adjust_bodies(cameras, recon_from_body, sightings, intrinsics)
-    tracks = _tracks(sightings, recon_from_body)
+        observations = Observations.of_one_camera(tracks, len(rows))
+        camera = camera_with_prior(intrinsics, FIXED)
+        problem = image_problem(cameras, camera, observations, tracks.points_in_recon)
+        cameras = adjust_images(*problem).state.world_from_rig
     return Reconstruction(
         image_index=rows,
         recon_from_camera=cameras,
@@ -147,41 +151,6 @@ def locate_cameras_and_bodies(
                 row = min(seers, key=lambda r: poses[r][body][0])
                 placed[body] = cameras[row] @ poses[row][body][1]
     return cameras, placed
-
-
-def adjust_bodies(
-    cameras: Float[ndarray, "m 4 4"],
-    bodies: dict[int, Float[ndarray, "4 4"]],
-    sightings: Sequence[Sequence[Sighting]],
-    intrinsics: Intrinsics,
-) -> tuple[Float[ndarray, "m 4 4"], dict[int, Float[ndarray, "4 4"]]]:
-    """Adjust all cameras and bodies to all points; the first body stays."""
-    numbers = list(bodies)
-    count, of_body = len(cameras), {body: k for k, body in enumerate(numbers)}
-    start = np.concatenate([cameras, np.stack([bodies[body] for body in numbers])])
-    seen = [(row, count + of_body[s.body], s) for row, shown in enumerate(sightings) for s in shown]
-
-    def linearised(poses: Float[ndarray, "p 4 4"]) -> tuple[Float[ndarray, "k 1"], Float[ndarray, "k 1 u"]]:
-        residuals, jacobians = [], []
-        for row, place, s in seen:
-            arm = s.x_in_body @ poses[place, :3, :3].T
-            in_recon = arm + poses[place, :3, 3]
-            from_camera = in_recon - poses[row, :3, 3]
-            x_in_camera = from_camera @ poses[row, :3, :3]
-            in_image = by_point(intrinsics, x_in_camera) @ poses[row, :3, :3].T
-            jacobian = np.zeros((len(arm), 2, len(poses), 6))
-            jacobian[:, :, row] = np.concatenate([-in_image, in_image @ skew(from_camera)], axis=2)
-            jacobian[:, :, place] = np.concatenate([in_image, -in_image @ skew(arm)], axis=2)
-            residuals.append((project(intrinsics, x_in_camera) - s.x_px).reshape(-1, 1))
-            jacobians.append(jacobian.reshape(-1, 1, 6 * len(poses)))
-        first_body = slice(6 * count, 6 * count + 6)
-        return np.concatenate(residuals), np.delete(np.concatenate(jacobians), first_body, axis=2)
-
-    def retracted(poses: Float[ndarray, "p 4 4"], step: Float[ndarray, " u"]) -> Float[ndarray, "p 4 4"]:
-        return retract(poses, np.insert(step, 6 * count, np.zeros(6)).reshape(-1, 6))
-
-    poses = minimise(linearised, start, retracted, "soft_l1").unknowns
-    return poses[:count], dict(zip(numbers, poses[count:], strict=True))
 
 
 def _tracks(sightings: Sequence[Sequence[Sighting]], bodies: dict[int, Float[ndarray, "4 4"]]) -> Tracks:
