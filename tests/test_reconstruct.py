@@ -65,7 +65,6 @@ def test_an_option_of_one_back_end_selects_it(present: set[str]) -> None:
         ReconstructOptions(backend="marker", board="chessboard:9x6:0.025"): ("marker",),
         ReconstructOptions(board="chessboard:9x6:0.025", cameras=Path("sparse")): ("given", "marker"),
         ReconstructOptions(weights="folder"): ("dust3r", "colmap"),
-        ReconstructOptions(weights="folder", pair_graph="window"): ("dust3r", "colmap"),
         ReconstructOptions(backend="mast3r", weights="folder"): ("mast3r",),
     }.items():
         assert candidates(options) == names
@@ -77,11 +76,8 @@ def test_an_option_of_one_back_end_selects_it(present: set[str]) -> None:
         (ReconstructOptions(backend="colmap", predictions=Path("p.npz")), "--predictions p.npz: .*predictions"),
         (ReconstructOptions(backend="predictions", weights="p.npz"), "--weights p.npz: .*mast3r or dust3r or da3"),
         (ReconstructOptions(backend="direct", board="b"), "--board b: .*colmap or marker or given"),
-        (ReconstructOptions(backend="da3", pair_graph="window"), "--pair-graph window: .*mast3r or dust3r"),
-        (ReconstructOptions(pair_graph="robot"), r"--pair-graph robot: .*\(colmap, direct\) does not use it"),
         (ReconstructOptions(board="b", predictions=Path("c")), r"--board b: .*\(predictions\) does not use it"),
         (ReconstructOptions(weights="w", predictions=Path("p")), "--weights and --predictions select"),
-        (ReconstructOptions(predictions=Path("p"), pair_graph="robot"), "--pair-graph robot: "),
     ],
 )  # fmt: skip
 def test_what_a_back_end_does_not_use_is_refused_in_a_line(

@@ -21,6 +21,8 @@ from jcr.records import COEFFICIENTS, Intrinsics
 
 HALF_PIXEL = 0.5
 """Pixels of COLMAP and nerfstudio are ours plus this: theirs are counted from the corner of the image."""
+USUAL_FOCAL = 0.8
+"""Focal length of an unknown camera in long sides of its image, 64° wide; wrist cameras have 0.5 to 1.2."""
 WITHIN_FOLD = 0.9
 """Share of the distance at which a distortion folds over, up to which its inverse is used."""
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2")
@@ -256,6 +258,12 @@ def usable_intrinsics(camera: Intrinsics | None) -> tuple[Intrinsics | None, tup
         "calibrate the intrinsics again with points out to the corners, or give zero distortion"
     )
     return without_distortion(camera), (warning,)
+
+
+def guessed_intrinsics(size: tuple[int, int], focal: float = USUAL_FOCAL) -> Intrinsics:
+    """Return a pinhole of square pixels for images of `size` (width, height); `focal` is in long sides."""
+    (width, height), focal_px = size, focal * max(size)
+    return Intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, width, height)
 
 
 def resized(camera: Intrinsics, width: int, height: int) -> Intrinsics:

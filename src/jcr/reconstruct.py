@@ -118,13 +118,11 @@ class Backend:
 
 _DUST3R = Backend(
     name="dust3r",
-    reconstruct=_lazy(
-        "jcr.pointmaps.dust3r.dust3r:reconstruct_dust3r", "weights", "device", "pair_graph", "backend"
-    ),
+    reconstruct=_lazy("jcr.pointmaps.dust3r.dust3r:reconstruct_dust3r", "weights", "device", "backend"),
     licence=CC_BY_NC_SA,
     auto=True,
     tests_camera=False,
-    options=("weights", "pair_graph"),
+    options=("weights",),
     selected_by="weights",
     hub_id="naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt",
     revision="61c57447d7b0adc8a1a30b2b0adec7a8935aa2a3",
@@ -263,9 +261,6 @@ class ReconstructOptions:
     """A network's output as an npz file (jcr docs predictions); selects the back end predictions."""
     cameras: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
     """Camera poses from another tool, a COLMAP model; selects the back end given."""
-    pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
-    """Pairs of images that dust3r and mast3r process: all, near in order, or near by the gripper poses; auto: all of
-    up to 12 images, else robot."""
 
 
 def check_board(options: ReconstructOptions) -> None:

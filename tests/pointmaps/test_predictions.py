@@ -207,12 +207,12 @@ def test_a_network_gives_the_same_record(
     monkeypatch.setattr(dust3r, "load_weights", lambda weights, device: None)
     monkeypatch.setattr(dust3r, "prepare_images", prepare)
     monkeypatch.setattr(dust3r, "predict_pairs", lambda *arguments: (made, ("a note",)))
-    result = dust3r.reconstruct_dust3r(capture, weights, "cpu", "auto", "dust3r")
+    result = dust3r.reconstruct_dust3r(capture, weights, "cpu", "dust3r")
     assert "a note" in result.notes
     assert result.backend == "dust3r" and "weights X: licence Y" in result.notes
     assert_poses(result, truth["gt_poses"], millimetres=3, degrees=0.3)
     unknown = replace(capture, intrinsics=None)
-    found = dust3r.reconstruct_dust3r(unknown, weights, "cpu", "auto", "dust3r").intrinsics
+    found = dust3r.reconstruct_dust3r(unknown, weights, "cpu", "dust3r").intrinsics
     # The principal point stays where the network has it; the focal length is aligned.
     assert found.fx == pytest.approx(5 * truth["gt_focal"], rel=0.01)
     assert (found.cx, found.cy) == pytest.approx((2.5 * WIDTH - 0.5, 2.5 * HEIGHT - 0.5))

@@ -16,7 +16,7 @@ from jcr.calibration.case import Case
 from jcr.calibration.checks.effects import MIN_IMAGES, effects_of_fit, with_rejected_runs
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration
-from jcr.camera import usable_intrinsics
+from jcr.camera import guessed_intrinsics, usable_intrinsics
 from jcr.capture.images import read_image
 from jcr.cell.placement import CameraPlacement
 from jcr.distributions import chi2
@@ -28,8 +28,6 @@ from jcr.geometry import Transform, inverse, motion_length, scale_translation, s
 from jcr.records import CellCamera, Intrinsics
 from jcr.sfm.register import GATE_PX, KnownImages, Registration, features, registration, shared_points
 
-FOCAL_OF_WIDTH = 0.9
-"""Initial focal length of a camera without given intrinsics, in widths of the image."""
 CLEARLY_MORE = 1.1
 """Factor of the points that agree with given intrinsics, from which RANSAC alone does not explain more."""
 SAME_PLACE = (0.02, np.radians(2.0))
@@ -55,9 +53,7 @@ def localise(
     leave the points that agree with a wrong pose.
     """
     given, _ = usable_intrinsics(camera.intrinsics)
-    width, height = camera.image_size
-    focal = FOCAL_OF_WIDTH * max(width, height)
-    start = given or Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
+    start = given or guessed_intrinsics(camera.image_size)
     gate_px = 2 * GATE_PX * max(1.0, start.width / 1600)
     shared = shared_points(known, features(image, start))
     found = registration(shared, start, "free", gate_px)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from jcr.camera import parameters, project, unproject, with_parameters
+from jcr.camera import guessed_intrinsics, parameters, project, unproject, with_parameters
 from jcr.estimation.covariance import expected_covariance_at
 from jcr.estimation.image_equations import image_evidence
 from jcr.estimation.intrinsics_prior import CameraPrior, camera_about
@@ -53,8 +53,6 @@ UNCONNECTED = 1e-2
 """Information (1/m², 1/rad²) added to the pose of each image, above the rounding of the elimination."""
 SAME_FEATURE = np.radians(40.0), 2.0
 """Largest rotation of the line of sight and largest ratio of distances at which a matcher finds a feature again."""
-USUAL_FOCAL = 0.8
-"""Focal length of an unknown camera in image widths: a horizontal field of view of 64°."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -132,9 +130,7 @@ def typical_camera(
 
     `size` is width and height (px), `std` the standard deviations that `camera_about` takes.
     """
-    width, height = size
-    focal, centre = USUAL_FOCAL * width, ((width - 1) / 2, (height - 1) / 2)
-    camera = intrinsics or Intrinsics(focal, focal, *centre, width, height)
+    camera = intrinsics or guessed_intrinsics(size)
     return PredictedCamera(camera=camera_about(camera, intrinsics is not None, std))
 
 

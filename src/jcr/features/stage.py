@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.ndimage import binary_dilation, find_objects, label
 
-from jcr.camera import unproject
+from jcr.camera import guessed_intrinsics, unproject
 from jcr.estimation.closed_form import motions
 from jcr.features.gate import (
     SYSTEMATIC,
@@ -197,7 +197,7 @@ class _Search:
 
         The angles between cameras become those between grippers.
         """
-        width, height = self.view.intrinsics.width, self.view.intrinsics.height
+        size = self.view.intrinsics.width, self.view.intrinsics.height
         angle = np.asarray(rotation_angle(self.motion[..., :3, :3]))
         known = [
             (
@@ -209,9 +209,8 @@ class _Search:
             if angle[key] > math.radians(8)
         ]
         best, support = None, LEAST_SUPPORT
-        for focal in (FOCALS * max(width, height)).tolist():
-            intrinsics = Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
-            agreeing = 0.0
+        for focal in FOCALS.tolist():
+            intrinsics, agreeing = guessed_intrinsics(size, focal), 0.0
             for of_gripper, geometry, x_px in known:
                 essential, homography = matrices(geometry, intrinsics)
                 ray_i, ray_j = (unproject(intrinsics, x)[:, :2] for x in x_px)

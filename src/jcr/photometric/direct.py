@@ -16,7 +16,15 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from jcr.camera import pinhole_inside, project, undistortion, unproject, usable_intrinsics, zoomed
+from jcr.camera import (
+    guessed_intrinsics,
+    pinhole_inside,
+    project,
+    undistortion,
+    unproject,
+    usable_intrinsics,
+    zoomed,
+)
 from jcr.capture.images import read_image
 from jcr.errors import InputError, RejectedError
 from jcr.geometry import apply, inverse, step_axes
@@ -50,8 +58,6 @@ GAIN_ROUNDS = 3
 """Number of estimates of the gains; each time more points agree."""
 LEAST_GAIN = 0.05
 """Difference of log brightness below which it is left alone: shading and gloss look like as much."""
-GUESSED_FOCAL = 0.8
-"""Focal length in long sides of the image, where nothing is known of the intrinsics."""
 LEAST_AGREED = 0.25
 """Share of the points that the views must agree on in the end."""
 LEAST_POINTS = 100
@@ -76,9 +82,7 @@ def reconstruct_direct(capture: Capture, progress: Progress | None = None) -> Re
     images = [read_image(capture.folder / name) for name in capture.images]
     given, warnings = usable_intrinsics(capture.intrinsics)
     notes = ()
-    width, height = capture.image_size
-    focal = GUESSED_FOCAL * max(width, height)
-    intrinsics = given or Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
+    intrinsics = given or guessed_intrinsics(capture.image_size)
     levels = pyramid(images, intrinsics)
     known = given is not None
     found = search(levels, capture.base_from_gripper, known, report)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.camera import rays
+from jcr.camera import guessed_intrinsics, rays
 from jcr.pointmaps.grid import ImageGrid
 from jcr.records import Intrinsics
 
@@ -59,8 +59,7 @@ def fit_pinhole(maps: PosedPointmaps) -> tuple[Intrinsics, float]:
     pixel = np.broadcast_to(np.stack([u, v], -1), (*prior.shape, 2))
     ahead = (prior > 0) & (points[..., 2] > 0)
     if ahead.sum() < max(100, 0.5 * (prior > 0).sum()):
-        guess = Intrinsics(float(width), float(width), (width - 1) / 2, (height - 1) / 2, width, height)
-        return guess, float("inf")
+        return guessed_intrinsics((width, height)), float("inf")
     ray, pixel, prior = points[ahead, :2] / points[ahead, 2:], pixel[ahead], prior[ahead]
     focal, center = np.empty(2), np.empty(2)
     misfit = np.zeros_like(ray)

@@ -21,7 +21,14 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from jcr.allocator import give_back
-from jcr.camera import HALF_PIXEL, fold_distance_px, resized, usable_intrinsics
+from jcr.camera import (
+    HALF_PIXEL,
+    USUAL_FOCAL,
+    fold_distance_px,
+    guessed_intrinsics,
+    resized,
+    usable_intrinsics,
+)
 from jcr.capture.images import read_image
 from jcr.errors import RejectedError
 from jcr.extras import extra
@@ -48,7 +55,7 @@ from jcr.sfm.model import (
 
 _FILM_DIAGONAL_MM = 43.27
 """Diagonal of the 36 x 24 mm frame that EXIF's equivalent focal length refers to."""
-_START_FOCALS = (0.8, 0.5, 1.2)
+_START_FOCALS = (USUAL_FOCAL, 0.5, 1.2)
 """Initial focal lengths in long sides, without known intrinsics. COLMAP's 1.2 alone fails on two of three real wrist
 cameras (true values 0.5 to 0.7); from 0.8 all three converge."""
 _MIN_REGISTERED = 3
@@ -120,10 +127,9 @@ def starting_intrinsics(capture: Capture) -> tuple[list[Intrinsics], bool, tuple
     with Image.open(capture.folder / capture.images[0]) as opened:
         exif = opened.getexif().get_ifd(ExifTags.IFD.Exif)
     focal_35mm = exif.get(ExifTags.Base.FocalLengthIn35mmFilm)
-    focals = [focal_35mm / _FILM_DIAGONAL_MM * math.hypot(width, height)] if focal_35mm else []
-    focals += [factor * max(width, height) for factor in _START_FOCALS]
-    guesses = [Intrinsics(f, f, (width - 1) / 2, (height - 1) / 2, width, height) for f in focals]
-    return guesses, False, warnings
+    diagonal = math.hypot(width, height) / max(width, height)
+    focals = [focal_35mm / _FILM_DIAGONAL_MM * diagonal] if focal_35mm else []
+    return [guessed_intrinsics((width, height), f) for f in (*focals, *_START_FOCALS)], False, warnings
 
 
 def map_images(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jcr.errors import InputError
-from jcr.pointmaps.dust3r.pair_graph import complete_pairs, pairs_of_graph, window_pairs
+from jcr.pointmaps.dust3r.pair_graph import complete_pairs, pairs_to_predict, window_pairs
 from jcr.pointmaps.grid import PreparedImages, image_grid
 from jcr.pointmaps.pairs import PairPredictions, read_pairs
 from jcr.records import Intrinsics
@@ -146,11 +146,11 @@ def test_the_robot_graph_has_near_pairs_and_joins_far_groups() -> None:
     # Two groups of images, 2 m apart, that share no view.
     base_from_gripper = np.tile(np.eye(4), (24, 1, 1))
     base_from_gripper[:, 0, 3] = 0.05 * np.arange(24) + 2.0 * (np.arange(24) >= 12)
-    edges = pairs_of_graph("auto", base_from_gripper)
+    edges = pairs_to_predict(base_from_gripper)
     pairs = {tuple(edge) for edge in edges.tolist()}
     assert pairs == {(second, first) for first, second in pairs}
     across = {(first, second) for first, second in pairs if (first < 12) != (second < 12)}
     assert across == {(11, 12), (12, 11)}
     assert all((first, first + 1) in pairs for first in range(23)) and len(pairs) < 24 * 23 / 2
-    assert len(pairs_of_graph("auto", base_from_gripper[:12])) == 12 * 11
+    assert len(pairs_to_predict(base_from_gripper[:12])) == 12 * 11
     assert len(pairs_of_graph("window", base_from_gripper)) == len(window_pairs(24, 3))

@@ -12,7 +12,7 @@ from jcr.allocator import give_back
 from jcr.errors import InputError, RejectedError
 from jcr.hub import Weights
 from jcr.pointmaps.dust3r.network import EncodedImages
-from jcr.pointmaps.dust3r.pair_graph import PairGraph, pairs_of_graph
+from jcr.pointmaps.dust3r.pair_graph import pairs_to_predict
 from jcr.pointmaps.dust3r.weights import LoadedNetwork, load_weights
 from jcr.pointmaps.grid import PreparedImages, prepare_images
 from jcr.pointmaps.pairs import PairPredictions
@@ -28,7 +28,6 @@ def reconstruct_dust3r(
     capture: Capture,
     weights: Weights,
     device: str,
-    pair_graph: PairGraph,
     backend: str,
     progress: Progress | None = None,
 ) -> Reconstruction:
@@ -38,7 +37,7 @@ def reconstruct_dust3r(
     """
     loaded = load_weights(weights, device)
     images = prepare_images(capture)
-    edges = pairs_of_graph(pair_graph, capture.base_from_gripper)
+    edges = pairs_to_predict(capture.base_from_gripper)
     predictions, notes = predict_pairs(loaded, images, capture.images, edges, progress)
     del loaded
     give_back()  # the network's memory

@@ -1,6 +1,4 @@
-"""Graph of the pairs of images that a network sees."""
-
-from typing import Literal
+"""Pairs of images that a network sees."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -9,26 +7,20 @@ from numpy import ndarray
 from jcr.estimation.closed_form import motions
 from jcr.features.pairs import NEIGHBOURS, near_pairs
 
-PairGraph = Literal["auto", "complete", "window", "robot"]
-"""complete: all pairs; window: images near each other in the capture's order; robot: the nearest neighbours of every
-image by the gripper poses, and successive images, which join neighbourhoods that share no pair; auto: complete up to
-FEW_IMAGES images, robot beyond."""
 FEW_IMAGES = 12
 """Number of images up to which every pair is predicted (132)."""
-WINDOW = 3
-"""Distance in the capture's order up to which two images make a pair of the window graph."""
 
 
-def pairs_of_graph(graph: PairGraph, base_from_gripper: Float[ndarray, "n 4 4"]) -> Int[ndarray, "e 2"]:
-    """Return the pairs of a graph in both orders."""
+def pairs_to_predict(base_from_gripper: Float[ndarray, "n 4 4"]) -> Int[ndarray, "e 2"]:
+    """Return every pair of few images, in both orders; of more the pairs of near viewpoints and of successive images.
+
+    Successive images join neighbourhoods that share no pair.
+    """
     count = len(base_from_gripper)
-    if graph == "complete" or (graph == "auto" and count <= FEW_IMAGES):
+    if count <= FEW_IMAGES:
         return complete_pairs(count)
-    if graph == "window":
-        return window_pairs(count, WINDOW)
     near = np.reshape(near_pairs(motions(base_from_gripper), NEIGHBOURS), (-1, 2))[:, ::-1]
-    successive = window_pairs(count, 1)[: count - 1]
-    edges = np.unique(np.concatenate([near, successive]), axis=0)
+    edges = np.unique(np.concatenate([near, window_pairs(count, 1)[: count - 1]]), axis=0)
     return np.concatenate([edges, edges[:, ::-1]])
 
 
