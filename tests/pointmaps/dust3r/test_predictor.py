@@ -153,4 +153,3 @@ def test_the_robot_graph_has_near_pairs_and_joins_far_groups() -> None:
     assert across == {(11, 12), (12, 11)}
     assert all((first, first + 1) in pairs for first in range(23)) and len(pairs) < 24 * 23 / 2
     assert len(pairs_to_predict(base_from_gripper[:12])) == 12 * 11
-    assert len(pairs_of_graph("window", base_from_gripper)) == len(window_pairs(24, 3))
