@@ -156,7 +156,7 @@ def test_an_unknown_focal_length_is_adjusted(capture: Capture) -> None:
     guess = replace(INTRINSICS, fx=INTRINSICS.fx * 1.03, fy=INTRINSICS.fy * 1.03)
     refined = refine(unknown, images, predicted.on_rays(predicted.grid.grid_intrinsics(guess)), guess)
     assert refined is not None
-    assert refined.pinhole.fx == pytest.approx(INTRINSICS.fx, rel=0.01)
+    assert refined[0].intrinsics.fx == pytest.approx(INTRINSICS.fx, rel=0.01)
 
 
 def test_without_matches_the_cameras_have_the_published_errors(capture: Capture, tmp_path: Path) -> None:

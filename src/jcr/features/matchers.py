@@ -8,7 +8,7 @@ from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray
 
 from jcr.camera import HALF_PIXEL, unproject
@@ -23,7 +23,7 @@ Geometries = dict[Key, pycolmap.TwoViewGeometry]
 MIN_INLIERS = 25
 """Least number of inliers; with COLMAP's 15 a view of a board was registered 30 cm off, by the wrong squares."""
 STATIONARY_PX = 4.0
-"""Matches that keep their pixel while the gripper moves: fingers, or text drawn into the images."""
+"""Largest way of a match that keeps its pixel while the gripper moves: of its fingers, or text drawn into the images."""
 
 
 @runtime_checkable
@@ -93,21 +93,34 @@ class Matcher:
         return [(x + 0.5) * self._scale - 0.5 for x in self.features.x_px]
 
     def geometries(
-        self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], coarse: bool = False
+        self,
+        pairs: Sequence[Key],
+        rolls: Float[ndarray, "p 2"],
+        repeats: Bool[ndarray, "n n"],
+        coarse: bool = False,
     ) -> Geometries:
-        """Return verified two-view geometries of pairs, their images rotated (rad) before; `coarse` as in Features."""
+        """Return verified two-view geometries of pairs, their images rotated (rad) before; `coarse` as in Features.
+
+        `repeats` are the pairs between whose images the gripper did not move.
+        """
         new = [k for k, key in enumerate(pairs) if self.features.minds_roll or key not in self.raw]
         some = [pairs[k] for k in new]
         self.raw |= dict(zip(some, self.features.matches(some, rolls[new], coarse), strict=True))
         x_px = self.x_px
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            found = pool.map(lambda key: self.verified(key, self.raw[key], x_px), pairs)
+            found = pool.map(lambda key: self.verified(key, self.raw[key], x_px, not repeats[key]), pairs)
             return {key: geometry for key, geometry in zip(pairs, found, strict=True) if geometry is not None}
 
     def verified(
-        self, key: Key, rows: Int[ndarray, "m 2"], x_px: Sequence[Float[ndarray, "_ 2"]]
+        self, key: Key, rows: Int[ndarray, "m 2"], x_px: Sequence[Float[ndarray, "_ 2"]], moved: bool
     ) -> pycolmap.TwoViewGeometry | None:
-        """Return the geometry of some of a pair's matches, kept in memory; None where too few agree on one."""
+        """Return the geometry of some of a pair's matches, kept in memory; None where too few agree on one.
+
+        Matches that keep their pixel are left out where the gripper `moved`.
+        """
+        if moved:
+            way = np.linalg.norm(x_px[key[0]][rows[:, 0]] - x_px[key[1]][rows[:, 1]], axis=1)
+            rows = rows[way > STATIONARY_PX]
         depends = key, np.ascontiguousarray(rows).tobytes()
         if depends not in self._verified:
             self._verified[depends] = matched(x_px, self._camera, key, rows, self.seed, self.known)
@@ -146,9 +159,6 @@ def matched(
     known: bool,
 ) -> pycolmap.TwoViewGeometry | None:
     """Return the geometry on which most matches agree; None where too few do. `known`: the intrinsics are no guess."""
-    i, j = key
-    way = np.linalg.norm(x_px[i][rows[:, 0]] - x_px[j][rows[:, 1]], axis=1)
-    rows = rows[way > STATIONARY_PX]
     if len(rows) < MIN_INLIERS:
         return None
     options = pycolmap.TwoViewGeometryOptions()
@@ -158,12 +168,9 @@ def matched(
     options.ransac.dyn_num_trials_multiplier = 1.0
     options.ransac.confidence, options.ransac.max_num_trials = 0.99, 2000
     options.min_num_inliers = MIN_INLIERS
-    # The gripper's fingers, or text drawn into the images, keep their pixels while the scene moves.
-    options.filter_stationary_matches = True
-    options.stationary_matches_max_error = STATIONARY_PX
     if known:  # a fundamental matrix bends itself to wrong matches, which an essential matrix cannot explain
         options.min_E_F_inlier_ratio = 0.0
-    x_i, x_j = x_px[i] + HALF_PIXEL, x_px[j] + HALF_PIXEL
+    x_i, x_j = (x_px[row] + HALF_PIXEL for row in key)
     found = pycolmap.estimate_two_view_geometry(camera, x_i, camera, x_j, rows.astype(np.uint32), options)
     return found if len(found.inlier_matches) >= MIN_INLIERS else None
 

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.camera import project
@@ -43,12 +43,16 @@ def near_pairs(motion: Float[ndarray, "n n 4 4"], neighbours: int) -> list[Key]:
     return _best(-np.asarray(motion_length(motion)), neighbours, viewpoints(motion))
 
 
-def viewpoints(motion: Float[ndarray, "n n 4 4"]) -> Int[ndarray, " n"]:
-    """Return the row of the first image of each image's viewpoint."""
+def repeats(motion: Float[ndarray, "n n 4 4"]) -> Bool[ndarray, "n n"]:
+    """Test which images repeat each other's viewpoint."""
     metres, radians = SAME_VIEWPOINT
     way = np.linalg.norm(motion[..., :3, 3], axis=-1)
-    same = (way < metres) & (np.asarray(rotation_angle(motion[..., :3, :3])) < radians)
-    first = np.arange(len(motion))
+    return (way < metres) & (np.asarray(rotation_angle(motion[..., :3, :3])) < radians)
+
+
+def viewpoints(motion: Float[ndarray, "n n 4 4"]) -> Int[ndarray, " n"]:
+    """Return the row of the first image of each image's viewpoint."""
+    same, first = repeats(motion), np.arange(len(motion))
     for row in range(len(motion)):
         if first[row] == row:
             first[(first > row) & same[row]] = row

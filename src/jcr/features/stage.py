@@ -27,7 +27,15 @@ from jcr.features.gate import (
     rolls,
 )
 from jcr.features.matchers import Geometries, ImageGeometry, Matcher, matrices
-from jcr.features.pairs import FEW, FIRST_NEIGHBOURS, NEIGHBOURS, all_pairs, near_pairs, seen_in_common
+from jcr.features.pairs import (
+    FEW,
+    FIRST_NEIGHBOURS,
+    NEIGHBOURS,
+    all_pairs,
+    near_pairs,
+    repeats,
+    seen_in_common,
+)
 from jcr.features.two_view import starting_motions
 from jcr.geometry import rotation_angle
 from jcr.records import Intrinsics
@@ -36,8 +44,6 @@ WORTH_SAYING = 0.1
 """Share of the matched pairs: a few wrong ones are left out of every set."""
 AS_TAKEN = math.radians(50)
 """Networks match images that are rotated against each other by up to this; no rotation is larger than its angle."""
-STILL = (5e-3, math.radians(1))
-"""m, rad: a gripper that moved by this moves the whole image."""
 GUESSED_AT_ONCE = 6
 """Pairs whose rotations by 90° are guessed before the robot is asked again."""
 GUESSED_AT_MOST = 30
@@ -78,6 +84,8 @@ class _Search:
     matcher: Matcher
     motion: Float[ndarray, "n n 4 4"]
     view: ImageGeometry
+    repeats: Bool[ndarray, "n n"]
+    """Pairs between whose images the gripper did not move."""
     pairs: dict[Key, tuple[Pair, pycolmap.TwoViewGeometry]] = field(default_factory=dict)
     still: Bool[ndarray, "r c"] | None = None
     """Parts of the image that do not move."""
@@ -106,7 +114,7 @@ class _Search:
                 todo[key] = both
         if not todo:
             return
-        found = self.matcher.geometries(list(todo), np.array(list(todo.values())), coarse)
+        found = self.matcher.geometries(list(todo), np.array(list(todo.values())), self.repeats, coarse)
         if self.matcher.features.minds_roll:  # an image that is rotated brings keypoints of its own
             self.view = ImageGeometry.of(self.matcher.x_px, self.view.intrinsics)
         for key, geometry in found.items():
@@ -142,9 +150,7 @@ class _Search:
 
     def hide_still_parts(self) -> None:
         """Take out what does not move in the image while the gripper does; pairs are verified again without it."""
-        angle = np.asarray(rotation_angle(self.motion[..., :3, :3]))
-        way = np.linalg.norm(self.motion[..., :3, 3], axis=-1)
-        moving = [key for key in self.matcher.raw if angle[key] > STILL[1] or way[key] > STILL[0]]
+        moving = [key for key in self.matcher.raw if not self.repeats[key]]
         size = self.view.intrinsics.width, self.view.intrinsics.height
         still = still_cells(self.view.x_px, self.matcher.raw, size, moving)
         if not still.any():
@@ -171,7 +177,7 @@ class _Search:
         if moves(np.asarray(geometry.inlier_matches, dtype=int).reshape(-1, 2)).all():
             return geometry
         raw = self.matcher.raw[key]
-        return self.matcher.verified(key, raw[moves(raw)], self.view.x_px)
+        return self.matcher.verified(key, raw[moves(raw)], self.view.x_px, not self.repeats[key])
 
     def _is_better(self, new: Pair) -> bool:
         """Test whether a pair's new geometry is confirmed where the old one is not, or has more matches."""
@@ -242,7 +248,8 @@ def match_with_robot(
     n, features = len(base_from_gripper), matcher.features
     motion = motions(base_from_gripper)
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
-    search = _Search(matcher=matcher, motion=motion, view=ImageGeometry.of(matcher.x_px, intrinsics))
+    view = ImageGeometry.of(matcher.x_px, intrinsics)
+    search = _Search(matcher=matcher, motion=motion, view=view, repeats=repeats(motion))
     everything = all_pairs(n) if n <= features.every_pair else near_pairs(motion, NEIGHBOURS)
     at_once = n <= FEW and not features.minds_roll
     first = everything if at_once else near_pairs(motion, FIRST_NEIGHBOURS)

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Int
 from numpy import ndarray
 
+from jcr.camera import without_distortion
 from jcr.errors import InputError
 from jcr.geometry import apply
 from jcr.pointmaps.global_alignment.align import PIXELS, global_align
@@ -69,21 +70,20 @@ def reconstruct_pointmaps(
     if (pinhole := images.pinhole or predicted) is None:
         raise InputError(f"--backend {backend}: its points lie on no pinhole's rays; give the intrinsics")
     maps = maps.on_rays(maps.grid.grid_intrinsics(pinhole))
-    report("refine cameras", 0.0)
-    refined = refine(part, images, maps, pinhole)
-    report("refine cameras", 1.0)
+    refined = refine(part, images, maps, pinhole, report)
     if refined is None:
+        intrinsics = images.intrinsics_of_capture or pinhole
         covariance = published_covariance(maps) if maps.covariance is None else maps.covariance
         tracks, evidence = NO_TRACKS, CameraEvidence(maps.recon_from_camera, covariance)
         note = "too few matches between the images: the cameras are as predicted"
         if images.pinhole is None:
             maps = replace(maps, warnings=(*maps.warnings, UNCONFIRMED))
     else:
-        pinhole, tracks, evidence = refined.pinhole, refined.tracks, None
-        depth = maps.x_in_camera * refined.depth_factor[..., None]
-        maps = replace(maps, recon_from_camera=refined.recon_from_camera, x_in_camera=depth)
+        (made, maps), evidence = refined, None
+        tracks, intrinsics = made.tracks, made.intrinsics
+        pinhole = images.pinhole or without_distortion(intrinsics)
         maps = maps.on_rays(maps.grid.grid_intrinsics(pinhole))
-        note = f"cameras refined by {len(tracks.image)} matches, {refined.error_px:.2f} px"
+        note = f"cameras refined by {len(tracks.image)} matches"
     points = np.stack([apply(*each) for each in zip(maps.recon_from_camera, maps.x_in_camera, strict=True)])
     pointmaps = Pointmaps(
         intrinsics=maps.grid.grid_intrinsics(pinhole),
@@ -94,7 +94,7 @@ def reconstruct_pointmaps(
     return Reconstruction(
         image_index=rows,
         recon_from_camera=maps.recon_from_camera,
-        intrinsics=images.intrinsics_of_capture or pinhole,
+        intrinsics=intrinsics,
         pointmaps=pointmaps,
         tracks=tracks,
         backend=backend,

@@ -37,7 +37,7 @@ from jcr.features.sift import WORKING_SIZE_PX, SiftFeatures, grey_of
 from jcr.features.stage import Matched, match_with_robot
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction
-from jcr.sfm.missing_images import with_missing_images
+from jcr.sfm.missing_images import model_near_cameras, with_missing_images
 from jcr.sfm.model import (
     ENOUGH,
     adjust_robustly,
@@ -95,22 +95,62 @@ def reconstruct_colmap(
         matched, model = map_images(matcher, capture.base_from_gripper, like, cameras, capture.images, report)
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise _not_registered(matcher, matched, model).with_more(*warnings)
-        _thin(model, seed)
-        adjust_robustly(model, known, _ROUGHLY)
-        std_px = _align_observations(model, images, intrinsics_of(model.camera(1), like, known))
-        adjust_robustly(model, known)
-        intrinsics, notes = intrinsics_of(model.camera(1), like, known), matched.notes
-        if not known and fold_distance_px(intrinsics) is not None:
-            notes += ("the views do not determine the distortion: it is taken as zero",)
-            model.camera(1).params = [*model.camera(1).params[:3], 0.0, 0.0]
-            adjust_robustly(model, fix_intrinsics=True)
-            intrinsics = intrinsics_of(model.camera(1), intrinsics, known)
+        made = _adjusted(model, images, like, known, seed)
     report("mapping", 1.0)
-    made = reconstruction_of(model, rows_of(model), intrinsics)
+    notes = matched.notes + made.notes
     if missing := [name for row, name in enumerate(capture.images) if row not in made.image_index]:
         notes += (f"{len(made.image_index)} of {len(capture)} images registered; not {', '.join(missing)}",)
-    tracks = replace(made.tracks, std_px=std_px)
-    return replace(made, tracks=tracks, notes=notes, warnings=(*warnings, *matched.warnings))
+    return replace(made, notes=notes, warnings=(*warnings, *matched.warnings))
+
+
+def reconstruct_near_cameras(
+    capture: Capture,
+    recon_from_camera: Float[ndarray, "n 4 4"],
+    intrinsics: Intrinsics,
+    known: bool,
+    features: FeatureName,
+    report: Progress = silent,
+) -> Reconstruction | None:
+    """Return cameras and tracks near predicted cameras of all images; None where an image matches too little.
+
+    `intrinsics` are held if `known`, else they are the initial ones.
+    """
+    images = [read_image(capture.folder / name) for name in capture.images]
+    with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
+        (camera,) = working_cameras([intrinsics], known)
+        matcher = matcher_of(images, camera, known, features, 0, report)
+        working, size = (
+            resized(intrinsics, camera.width, camera.height),
+            (intrinsics.width, intrinsics.height),
+        )
+        matched = match_with_robot(matcher, capture.base_from_gripper, working, capture.images, size)
+        database = write_database(Path(folder), camera, matcher.x_px, matched.geometries)
+        model = model_near_cameras(database, camera, dict(enumerate(recon_from_camera)), known)
+        if model.num_reg_images() < len(images):
+            return None
+        return _adjusted(model, images, intrinsics, known, 0)
+
+
+def _adjusted(
+    model: pycolmap.Reconstruction,
+    images: Sequence[UInt8[ndarray, "h w 3"]],
+    like: Intrinsics,
+    known: bool,
+    seed: int,
+) -> Reconstruction:
+    """Return cameras and tracks of a model after alignment of its observations and the last adjustment."""
+    _thin(model, seed)
+    adjust_robustly(model, known, _ROUGHLY)
+    std_px = _align_observations(model, images, intrinsics_of(model.camera(1), like, known))
+    adjust_robustly(model, known)
+    intrinsics, notes = intrinsics_of(model.camera(1), like, known), ()
+    if not known and fold_distance_px(intrinsics) is not None:
+        notes = ("the views do not determine the distortion: it is taken as zero",)
+        model.camera(1).params = [*model.camera(1).params[:3], 0.0, 0.0]
+        adjust_robustly(model, fix_intrinsics=True)
+        intrinsics = intrinsics_of(model.camera(1), intrinsics, known)
+    made = reconstruction_of(model, rows_of(model), intrinsics)
+    return replace(made, tracks=replace(made.tracks, std_px=std_px), notes=notes)
 
 
 def starting_intrinsics(capture: Capture) -> tuple[list[Intrinsics], bool, tuple[str, ...]]:

@@ -1,9 +1,11 @@
-"""Registration of images that the mapper left out, by the cameras that gripper poses and the map's own X predict.
+"""Models near predicted cameras, for images that the mapper left out and for the cameras of a network.
 
-Points are triangulated and adjusted in turn, and more points of the map are searched near their projections.
+Points are triangulated and adjusted in turn. The mapper's images are predicted by gripper poses and the map's own X, and
+more points of the map are searched near their projections.
 """
 
 from collections import Counter
+from collections.abc import Container, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -53,22 +55,11 @@ def with_missing_images(
         return model
     predicted = inverse(state.z[0]) @ base_from_gripper @ state.x[0]
     predicted[:, :3, 3] /= state.scale
-    larger, cameras = model, dict(enumerate(predicted)) | dict(zip(rows, poses, strict=True))
-    for largest_px, refinements, scale_px in PASSES:
-        larger = triangulated_model(database, larger.camera(1), cameras, largest_px, refinements)
-        tied = Counter[int]()
-        for point in larger.points3D.values():
-            seen_by = {element.image_id - 1 for element in point.track.elements}
-            if not seen_by.isdisjoint(rows):
-                tied.update(seen_by)
-        for row in cameras:
-            if tied[row] < LEAST_POINTS:
-                larger.deregister_frame(larger.image(row + 1).frame_id)
-        if larger.num_reg_images() <= len(rows):
-            return model
-        adjust_robustly(larger, matcher.known, ROUGHLY, scale_px)
-        cameras = dict(zip(rows_of(larger), poses_of(larger, rows_of(larger)), strict=True))
-    images = {row + 1 for row in cameras if row not in rows}
+    cameras = dict(enumerate(predicted)) | dict(zip(rows, poses, strict=True))
+    larger = model_near_cameras(database, model.camera(1), cameras, matcher.known, rows)
+    if larger.num_reg_images() <= len(rows):
+        return model
+    images = {row + 1 for row in rows_of(larger) if row not in rows}
     filters = pycolmap.ObservationManager(larger)
     for radius_px in RADII_PX:
         for image_id in sorted(images):
@@ -77,6 +68,38 @@ def with_missing_images(
         adjust_robustly(larger, matcher.known, ROUGHLY, PASSES[-1][2])
         filters.filter_points3D_in_images(LARGEST_PX, 0.0, images)
     return larger
+
+
+def model_near_cameras(
+    database: Path,
+    camera: pycolmap.Camera,
+    recon_from_camera: Mapping[int, Float[ndarray, "4 4"]],
+    known: bool,
+    mapped: Container[int] | None = None,
+) -> pycolmap.Reconstruction:
+    """Return a model of predicted cameras, by row, adjusted to all verified matches; intrinsics that are `known` stay.
+
+    It lacks images with few points; those count that an image of `mapped` (None: any) sees, too.
+    """
+    model, cameras = pycolmap.Reconstruction(), dict(recon_from_camera)
+    for largest_px, refinements, scale_px in PASSES:
+        model = triangulated_model(database, camera, cameras, largest_px, refinements)
+        tied = Counter[int]()
+        for point in model.points3D.values():
+            seen_by = {element.image_id - 1 for element in point.track.elements}
+            if mapped is None or any(row in mapped for row in seen_by):
+                tied.update(seen_by)
+        for row in cameras:
+            if tied[row] < LEAST_POINTS:
+                model.deregister_frame(model.image(row + 1).frame_id)
+        if not model.num_reg_images():
+            break
+        adjust_robustly(model, known, ROUGHLY, scale_px)
+        camera, cameras = (
+            model.camera(1),
+            dict(zip(rows_of(model), poses_of(model, rows_of(model)), strict=True)),
+        )
+    return model
 
 
 def _complete(model: pycolmap.Reconstruction, image_id: int, matcher: Matcher, radius_px: float) -> None:
