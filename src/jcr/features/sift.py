@@ -71,7 +71,6 @@ class SiftFeatures:
 
     minds_roll = False
     every_pair = 24
-    farthest = FARTHEST
 
     def __init__(
         self,
