@@ -6,8 +6,8 @@ Method: Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016.
 import math
 import os
 import tempfile
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -115,19 +115,36 @@ def reconstruct_near_cameras(
     `intrinsics` are held if `known`, else they are the initial ones.
     """
     images = [read_image(capture.folder / name) for name in capture.images]
-    with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
-        (camera,) = working_cameras([intrinsics], known)
-        matcher = matcher_of(images, camera, known, features, 0, report)
-        working, size = (
-            resized(intrinsics, camera.width, camera.height),
-            (intrinsics.width, intrinsics.height),
-        )
-        matched = match_with_robot(matcher, capture.base_from_gripper, working, capture.images, size)
-        database = write_database(Path(folder), camera, matcher.x_px, matched.geometries)
+    with matched_database(capture, images, intrinsics, known, features, 0, report) as (database, camera):
         model = model_near_cameras(database, camera, dict(enumerate(recon_from_camera)), known)
         if model.num_reg_images() < len(images):
             return None
         return _adjusted(model, images, intrinsics, known, 0)
+
+
+@contextmanager
+def matched_database(
+    capture: Capture,
+    images: Sequence[UInt8[ndarray, "h w 3"]],
+    intrinsics: Intrinsics,
+    known: bool,
+    features: FeatureName,
+    seed: int,
+    report: Progress,
+) -> Iterator[tuple[Path, pycolmap.Camera]]:
+    """Yield a database of the matches of a capture's images, and its camera; COLMAP's log is silent meanwhile."""
+    with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
+        (camera,) = working_cameras([intrinsics], known)
+        matcher = matcher_of(images, camera, known, features, seed, report)
+        matched = match_with_robot(
+            matcher,
+            capture.base_from_gripper,
+            resized(intrinsics, camera.width, camera.height),
+            capture.images,
+            (intrinsics.width, intrinsics.height),
+            lambda fraction: report("matching", fraction),
+        )
+        yield write_database(Path(folder), camera, matcher.x_px, matched.geometries), camera
 
 
 def _adjusted(

@@ -1,21 +1,17 @@
 """The back end `given`: camera poses of a COLMAP model, with its points or with triangulated features."""
 
-import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
-from numpy import ndarray
 
 from jcr.capture.formats import colmap
 from jcr.capture.images import read_image
 from jcr.errors import InputError, RejectedError
-from jcr.features.pairs import all_pairs
 from jcr.progress import Progress, silent
-from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
-from jcr.sfm.colmap import matcher_of
-from jcr.sfm.model import quiet_colmap, tracks_of, triangulated_model, working_cameras, write_database
+from jcr.records import Capture, Reconstruction, Tracks
+from jcr.sfm.colmap import matched_database
+from jcr.sfm.model import tracks_of, triangulated_model
 
 MIN_POINTS = 50
 
@@ -40,8 +36,11 @@ def reconstruct_given(
     intrinsics = capture.intrinsics or colmap.read_intrinsics(cameras, capture.image_size)
     tracks = _own_tracks(cameras, [names[row] for row in rows], capture.image_size)
     if len(tracks.points_in_recon) < MIN_POINTS:
-        images = [read_image(capture.folder / capture.images[k]) for k in known]
-        tracks = _triangulated(images, intrinsics, recon_from_camera, seed, report)
+        some = capture.of_rows(np.array(known))
+        images = [read_image(some.folder / name) for name in some.images]
+        with matched_database(some, images, intrinsics, True, "sift", seed, report) as (database, camera):
+            model = triangulated_model(database, camera, dict(enumerate(recon_from_camera)))
+            tracks = tracks_of(model, range(1, len(images) + 1), capture.image_size)
     if len(tracks.points_in_recon) < MIN_POINTS:
         raise RejectedError(
             f"{cameras}: with its camera poses only {len(tracks.points_in_recon)} points can be triangulated",
@@ -77,22 +76,3 @@ def _own_tracks(cameras: Path, names: Sequence[str], size: tuple[int, int]) -> T
     model = colmap.read_model(cameras)
     id_of = {model.image(image_id).name: image_id for image_id in model.reg_image_ids()}
     return tracks_of(model, [id_of[name] for name in names], size)
-
-
-def _triangulated(
-    images: Sequence[UInt8[ndarray, "h w 3"]],
-    intrinsics: Intrinsics,
-    recon_from_camera: Float[ndarray, "m 4 4"],
-    seed: int,
-    report: Progress,
-) -> Tracks:
-    """Triangulate points of matched features, with intrinsics and cameras fixed."""
-    with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
-        (camera,) = working_cameras([intrinsics], True)
-        matcher = matcher_of(images, camera, True, "sift", seed, report)
-        report("matching", 0.0)
-        pairs, none = all_pairs(len(images)), np.zeros((len(images), len(images)), bool)
-        geometries = matcher.geometries(pairs, np.zeros((len(pairs), 2)), repeats=none)
-        database = write_database(Path(folder), camera, matcher.x_px, geometries)
-        model = triangulated_model(database, camera, dict(enumerate(recon_from_camera)))
-        return tracks_of(model, range(1, len(images) + 1), (intrinsics.width, intrinsics.height))
