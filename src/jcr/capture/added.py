@@ -9,7 +9,7 @@ import numpy as np
 from jcr.capture.formats import capture_json
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import read_json, shown
-from jcr.capture.read import read_source
+from jcr.capture.read import read_capture
 from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.records import Capture
@@ -43,9 +43,7 @@ def with_added_images(added: Capture, path: Path, options: ReadOptions | None = 
     Raises InputError for images of another size than the run's, and for images that were added before.
     """
     with tempfile.TemporaryDirectory(prefix="jcr-added-") as scratch:
-        new = read_source(path, options, into=scratch, at_least=1)
-        if not isinstance(new, Capture):
-            raise InputError(f"{path}: has poses without images; give images with their gripper poses")
+        new = read_capture(path, options, into=scratch, at_least=1)
         if new.image_size != added.image_size:
             raise other_size(f"{path}: images", new.image_size, added.image_size, "the run has images")
         names = list(added.images)

@@ -37,14 +37,15 @@ def read_capture(
     *,
     into: str | Path | None = None,
     progress: Progress | None = None,
+    at_least: int = MIN_FRAMES,
 ) -> Capture:
     """Read the capture at a path, in any format of the page `captures`.
 
     The images of a recording (bag, LeRobot) are extracted to the new folder `into`, itself a capture folder. A few
     frames that cannot be used are left out, each with a note. Raises InputError with the file, the fault and its
-    remedy for any other fault, and where fewer than three frames remain.
+    remedy for any other fault, and where fewer than `at_least` frames remain.
     """
-    found = read_source(path, options, into=into, progress=progress)
+    found = read_source(path, options, into=into, progress=progress, at_least=at_least)
     if isinstance(found, PosePairs):
         raise InputError(
             f"{path}: has camera poses but no images; use `jcr calibrate`, or solve_hand_eye in Python"

@@ -10,7 +10,7 @@ import tyro
 
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output, VerboseOutput, numbers
-from jcr.cli.run import looked_at, require_images
+from jcr.cli.run import looked_at
 from jcr.errors import InputError
 from jcr.findings import sentence, warnings_of
 from jcr.pipeline.options import VerifyOptions
@@ -71,7 +71,7 @@ class CheckCommand:
         check_options(options)
         with (
             progress_bars() as progress,
-            looked_at(self.capture, self.read, progress, read_and_compare) as (capture, read),
+            looked_at(self.capture, self.read, read_and_compare, progress) as (capture, read),
         ):
             found = check_capture(
                 capture,
@@ -272,10 +272,13 @@ class VerifyCommand:
 
     def main(self) -> int:
         """Verify and print what to do."""
+        from jcr.capture.read import read_capture
         from jcr.pipeline.verify import verify_run
 
-        with progress_bars() as progress, looked_at(self.capture, self.read, progress, at_least=1) as new:
-            capture = require_images(new, self.capture, "which verify needs")
+        with (
+            progress_bars() as progress,
+            looked_at(self.capture, self.read, read_capture, progress, at_least=1) as capture,
+        ):
             found = verify_run(self.out, capture, self.verify, progress)
         cameras = (found, *found.others)
         facts = _drift_facts(found) | {"cameras": {one.fixed: _drift_facts(one) for one in found.others}}

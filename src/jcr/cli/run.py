@@ -56,10 +56,11 @@ class CalibrateCommand:
     def main(self) -> int:
         """Calibrate and print the result."""
         from jcr.calibration.stage import is_one
+        from jcr.capture.read import read_source
         from jcr.pipeline.run import calibrate_poses
 
         with progress_bars() as progress:
-            capture = _source(self, progress)
+            capture = _source(self, read_source, progress)
             if isinstance(capture, PosePairs):
                 result, is_marker = calibrate_poses(capture, self.out, self.calibrate), True
                 show_calibration(result, capture, self.output)
@@ -94,10 +95,11 @@ class RunCommand(CalibrateCommand):
 
     def main(self) -> int:
         """Run every stage and print the result."""
+        from jcr.capture.read import read_capture
+
         options = run_options(self, map=None if self.no_map else self.map)
         with progress_bars() as progress:
-            found = _source(self, progress)
-            capture = require_images(found, self.capture, "nothing to map; use `jcr calibrate`")
+            capture = _source(self, read_capture, progress)
             result = _run(self, capture, options, progress)
         lines = [note for note in result.calibration.notes if note.startswith("no map was made")]
         if (self.out / "map.safetensors").is_file():
@@ -198,36 +200,22 @@ def run_options(arguments: Any, **chosen: Any) -> "RunOptions":
     return RunOptions(**given | chosen)
 
 
-def _source(command: CalibrateCommand, progress: Progress) -> Capture | PosePairs:
-    """Read the capture of a command; the frames of a recording are put in the run folder."""
-    from jcr.capture.read import read_source
+def _source(command: CalibrateCommand, read: Callable[..., Any], progress: Progress) -> Any:
+    """Return what `read` reads of the capture of a command; the frames of a recording are put in the run folder."""
     from jcr.files import locked
     from jcr.result import CAPTURE
 
     with locked(command.out):
-        return read_source(command.capture, command.read, into=command.out / CAPTURE, progress=progress)
+        return read(command.capture, command.read, into=command.out / CAPTURE, progress=progress)
 
 
 @contextmanager
 def looked_at(
-    path: Path,
-    options: ReadOptions,
-    progress: Progress,
-    read: Callable[..., Any] | None = None,
-    **more: Any,
+    path: Path, options: ReadOptions, read: Callable[..., Any], progress: Progress, **more: Any
 ) -> Iterator[Any]:
-    """Read what lies at a path with `read`, by default read_source; the frames of a recording vanish afterwards."""
-    from jcr.capture.read import read_source
-
+    """Yield what `read` reads of the capture at a path; the frames of a recording vanish afterwards."""
     with tempfile.TemporaryDirectory(prefix="jcr-capture-") as scratch:
-        yield (read or read_source)(path, options, into=scratch, progress=progress, **more)
-
-
-def require_images(found: Capture | PosePairs, path: Path, needed: str) -> Capture:
-    """Return the capture; raise InputError, which ends with `needed`, where there are poses alone."""
-    if isinstance(found, PosePairs):
-        raise InputError(f"{path}: gives poses and no images, {needed}")
-    return found
+        yield read(path, options, into=scratch, progress=progress, **more)
 
 
 def _run(

@@ -14,7 +14,7 @@ from jcr.calibration.options import GRASPING
 from jcr.calibration.robot_errors import of_poses, robot_errors
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.images import read_image
-from jcr.capture.read import read_source
+from jcr.capture.read import read_capture
 from jcr.cell.added import read_added_cameras
 from jcr.distributions import chi2
 from jcr.errors import InputError, RejectedError
@@ -111,9 +111,7 @@ def verify_run(
     if not 0 < options.alpha < 0.5:
         raise InputError(f"--alpha {options.alpha}: give a false-alarm rate between 0 and 0.5")
     if not isinstance(new, Capture):
-        path, new = new, read_source(new, at_least=1)  # pyright: ignore[reportAssignmentType]
-        if not isinstance(new, Capture):
-            raise InputError(f"{path}: gives poses and no images, which verify needs")
+        new = read_capture(new, at_least=1)
     run = RunResult(out)
     calibration, capture, reconstruction = run.of_wrist_camera()
     if not calibration.converged:
