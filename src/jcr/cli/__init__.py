@@ -12,7 +12,7 @@ import errno
 import io
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Any, NoReturn
 
@@ -93,32 +93,20 @@ LONGEST_LINE = 2000
 """Characters of a message."""
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one command and exit with its status."""
-    wait_asleep()
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run one command and exit with its status, without the second in which Python takes its modules apart."""
+    # Threads that wait by spinning gain nothing on small matrices; with torch's they cost a run two of fifteen seconds.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     _open_closed_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # of an ASCII terminal, which has no ±
-    _end(dispatch(sys.argv[1:] if arguments is None else arguments))
-
-
-def _end(status: int) -> NoReturn:
-    """End the process after its output is written, without the second in which the interpreter takes modules apart."""
+    status = dispatch(sys.argv[1:] if arguments is None else arguments)
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError):
             stream.flush()
     os._exit(status)
-
-
-def wait_asleep() -> None:
-    """Keep threads from waiting by spinning, before NumPy and torch are imported and unless the environment says more.
-
-    Those of BLAS gain nothing on small matrices; with torch's they cost a run a tenth of its processor time, and two
-    seconds of its fifteen.
-    """
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def _open_closed_streams() -> None:
@@ -132,11 +120,6 @@ def _open_closed_streams() -> None:
         sys.stdout = os.fdopen(os.dup(1), "w")
     if sys.stderr is None:
         sys.stderr = os.fdopen(os.dup(2), "w")
-
-
-def dispatch(arguments: Sequence[str]) -> int:
-    """Run one command line and return its exit status; print an error as one line on stderr."""
-    return _guarded(lambda: _dispatched(arguments))
 
 
 def _dispatched(arguments: Sequence[str]) -> int:
@@ -182,9 +165,10 @@ def command(name: str) -> Any:
     return getattr(import_module(f"jcr.cli.{MODULES[name]}"), kind)
 
 
-def _guarded(action: Callable[[], int]) -> int:
+def dispatch(arguments: Sequence[str]) -> int:
+    """Run one command line and return its exit status; print an error as one line on stderr."""
     try:
-        status = action()
+        status = _dispatched(arguments)
         sys.stdout.flush()
         return status
     except InputError as error:
