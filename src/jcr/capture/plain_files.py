@@ -1,6 +1,8 @@
 """Reading of text, YAML, JSON and arrays from untrusted files: plain data inside the folder, or an InputError."""
 
+import csv
 import json
+import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +21,7 @@ MAX_YAML, MAX_JSON = 4_000_000, 32_000_000
 """Characters of the longest files: a longer one takes long to read, and is no capture."""
 NAMED = 10
 """Names that a message lists; of more it gives the number."""
+_DECIMAL_COMMA = re.compile(r"^([+-]?\d+),(\d+(?:[eE][+-]?\d+)?)$")
 
 
 def read_text(file: Path, most: int = MAX_JSON) -> str:
@@ -38,6 +41,36 @@ def read_text(file: Path, most: int = MAX_JSON) -> str:
     if len(text) > most:
         raise InputError(f"{file}: {len(text) / 1e6:.0f} MB; {most // 1_000_000} MB at most")
     return text
+
+
+def read_lines(file: Path) -> tuple[list[str], list[str]]:
+    """Read the lines of a text, and its comments without their marks; blank lines are left out."""
+    lines = [line.strip() for line in read_text(file).splitlines() if line.strip()]
+    comments = [line.lstrip("# ") for line in lines if line.startswith("#")]
+    return [line for line in lines if not line.startswith("#")], comments
+
+
+def split_cells(lines: Sequence[str], file: Path) -> tuple[list[str] | None, list[list[str]]]:
+    """Return the header of a table, None where no line is one, and the cells of its rows."""
+    separator = next((mark for mark in "\t;," if lines and mark in lines[0]), " ")
+    try:
+        rows = [next(csv.reader([line], delimiter=separator, skipinitialspace=True)) for line in lines]
+    except csv.Error as error:
+        raise InputError(f"{file}: not a table ({error}); save it as CSV") from None
+    rows = [[cell.strip().strip('"') for cell in row] for row in rows]
+    if separator != ",":  # as spreadsheets write numbers where the comma is the decimal mark
+        rows = [[_DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in row] for row in rows]
+    if rows and all(number_of(cell) is None for cell in rows[0]):
+        return rows[0], rows[1:]
+    return None, rows
+
+
+def number_of(cell: Any) -> float | None:
+    """Return a cell as a number, as Python's own floats are written; None where it is none."""
+    try:
+        return float(cell)
+    except (TypeError, ValueError, OverflowError):
+        return None
 
 
 def read_yaml(file: Path) -> Any:

@@ -178,7 +178,7 @@ def _write(path: Path, rows: "np.recarray[Any, Any]") -> None:
 
 def read_points(path: Path) -> Float[ndarray, "n 3"]:
     """Points (n,3) in metres from .csv, .npy or .ply; raises InputError where the file is none of these."""
-    from jcr.capture.plain_files import read_npy
+    from jcr.capture.plain_files import read_lines, read_npy, split_cells
 
     if not path.is_file():
         raise InputError(f"{path}: no such file of points (.csv, .npy or .ply)")
@@ -192,7 +192,8 @@ def read_points(path: Path) -> Float[ndarray, "n 3"]:
 
             points = np.asarray(trimesh.load(path).vertices)  # pyright: ignore[reportAttributeAccessIssue]
         else:
-            points = _read_csv(path)
+            _, rows = split_cells(read_lines(path)[0], path)
+            points = np.array(rows, float).reshape(len(rows), -1 if rows else 3)
     except InputError:
         raise
     except Exception as error:
@@ -205,17 +206,6 @@ def read_points(path: Path) -> Float[ndarray, "n 3"]:
     if not (finite := np.isfinite(points).all(1)).all():
         raise InputError(f"{path}: point {finite.argmin() + 1} is not finite; remove it")
     return points
-
-
-def _read_csv(path: Path) -> ndarray:
-    """Read rows of numbers, without a header line and comments."""
-    lines = [line.split("#")[0].split(",") for line in path.read_text("utf-8").splitlines()]
-    rows = [words for words in lines if any(word.strip() for word in words)]
-    try:
-        float(rows[0][0] if rows else 0)
-    except ValueError:
-        rows = rows[1:]
-    return np.array([[float(word) for word in words] for words in rows]).reshape(len(rows), -1 if rows else 3)
 
 
 def _finite(column: ndarray) -> list:

@@ -1,6 +1,5 @@
 """Touch test: error in task space between points that the robot's tip touched and the map."""
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.cues import surface_at
+from jcr.capture.plain_files import read_lines, split_cells
 from jcr.distributions import chi2
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, skew
@@ -81,24 +81,19 @@ def _read(path: Path) -> tuple[list[str], list[Float[ndarray, "5"]]]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a CSV with the columns {', '.join(COLUMNS)}")
     images, numbers = list[str](), list[ndarray]()
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
-            if missing:
-                raise InputError(f"{path}: has no column {', '.join(missing)}; give {', '.join(COLUMNS)}")
-            for line, row in enumerate(reader, start=2):
-                try:
-                    own = np.array([float(row[name]) for name in COLUMNS[1:]])
-                except (TypeError, ValueError):
-                    numeric = ", ".join(COLUMNS[1:])
-                    raise InputError(f"{path}: line {line}: {numeric} must be numbers") from None
-                if not np.isfinite(own).all() or np.abs(own[2:]).max() > 100:
-                    raise InputError(f"{path}: line {line}: positions are finite and in metres")
-                images.append(row["image"].strip())
-                numbers.append(own)
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: is no CSV ({error})") from None
+    header, rows = split_cells(read_lines(path)[0], path)
+    if missing := [name for name in COLUMNS if name not in (header or ())]:
+        raise InputError(f"{path}: has no column {', '.join(missing)}; give {', '.join(COLUMNS)}")
+    for line, row in enumerate(rows, start=2):
+        named = dict(zip(header or (), row, strict=False))
+        try:
+            own = np.array([float(named[name]) for name in COLUMNS[1:]])
+        except (KeyError, ValueError):
+            raise InputError(f"{path}: line {line}: {', '.join(COLUMNS[1:])} must be numbers") from None
+        if not np.isfinite(own).all() or np.abs(own[2:]).max() > 100:
+            raise InputError(f"{path}: line {line}: positions are finite and in metres")
+        images.append(named.get("image", ""))
+        numbers.append(own)
     if len(images) < LEAST:
         raise InputError(f"{path}: {len(images)} points; touch {LEAST} or more, spread over the scene")
     return images, numbers

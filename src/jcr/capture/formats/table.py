@@ -1,6 +1,5 @@
 """Images and a file of gripper poses: CSV and other tables, NumPy arrays, UR's p[…], YAML and JSON lists."""
 
-import csv
 import re
 from collections import Counter
 from collections.abc import Collection, Sequence
@@ -16,7 +15,7 @@ from jcr.capture.formats import pose_lists
 from jcr.capture.images import DEPTH
 from jcr.capture.options import ConventionName, ReadOptions, UnitsName
 from jcr.capture.pairing import PoseTable, pair_with_images, stamp_ns
-from jcr.capture.plain_files import read_npy, read_text, shown
+from jcr.capture.plain_files import number_of, read_lines, read_npy, shown, split_cells
 from jcr.capture.ros import CAMERA_INFO, read_camera_info
 from jcr.errors import InputError
 from jcr.records import Capture
@@ -43,7 +42,6 @@ _EXPLICIT: dict[str, ConventionName] = {
 """Conventions of columns whose names alone tell what rx, ry, rz are; `ur_` is what UR's p[…] is read into."""
 _UR_POSE = re.compile(r"\bp\s*\[([^\]]*)\]")
 _UNIT = re.compile(r"^(.+?)(?:_|_?[\[(])(mm|cm|m|deg|rad|s|ns)[\])]?$")
-_DECIMAL_COMMA = re.compile(r"^([+-]?\d+),(\d+(?:[eE][+-]?\d+)?)$")
 
 
 class OpenConventionError(InputError):
@@ -138,7 +136,7 @@ def pose_table(
     numbers, texts = np.full((len(rows), len(wanted)), np.nan), dict[int, str]()
     for k, name in enumerate(wanted):
         for row, cell in enumerate(cells[name]):
-            if (number := _number(cell)) is not None:
+            if (number := number_of(cell)) is not None:
                 numbers[row, k] = number
             else:
                 text = f"{shown(cell)} is not a number; correct or drop the row"
@@ -182,14 +180,6 @@ def _units_of(named: Collection[str], convention: str, options: ReadOptions) -> 
     return next(units for units in get_args(UnitsName) if units == f"{length}-{angle}")
 
 
-def _number(cell: Any) -> float | None:
-    """Return a cell as a number, as Python's own floats are written; None where it is none."""
-    try:
-        return float(cell)
-    except (TypeError, ValueError, OverflowError):
-        return None
-
-
 def _named_columns(
     header: Sequence[str] | None, rows: Sequence[Sequence[Any]], options: ReadOptions, where: str
 ) -> tuple[dict[str, tuple[Any, ...]], set[str], ConventionName]:
@@ -206,7 +196,7 @@ def _named_columns(
             convention = _EXPLICIT.get(cell, convention)
         return dict(zip(names, columns, strict=True)), {*units} - {"", "s", "ns"}, convention
     named = dict[str, tuple[Any, ...]]()
-    if _number(columns[0][0]) is None:
+    if number_of(columns[0][0]) is None:
         named["image"] = columns.pop(0)
     known = convention
     if known == "auto":
@@ -238,21 +228,12 @@ def _read_rows(file: Path) -> tuple[Sequence[str] | None, Sequence[Sequence[Any]
             text = "no table of numbers; save (n,4,4) matrices or (n,k) rows with numpy.save"
             raise InputError(f"{file}: {text}")
         return None, array.reshape(len(array), -1).tolist()
-    lines = [line.strip() for line in read_text(file).splitlines() if line.strip()]
-    comments = [line.lstrip("# ") for line in lines if line.startswith("#")]
-    lines = [line for line in lines if not line.startswith("#")]
+    lines, comments = read_lines(file)
     if any(map(_UR_POSE.search, lines)):
         return _rows_of_ur(file, lines)
-    separator = next((mark for mark in "\t;," if lines and mark in lines[0]), " ")
-    try:
-        rows = [next(csv.reader([line], delimiter=separator, skipinitialspace=True)) for line in lines]
-    except csv.Error as error:
-        raise InputError(f"{file}: not a table ({error}); save it as CSV") from None
-    rows = [[cell.strip().strip('"') for cell in row] for row in rows]
-    if separator != ",":  # as spreadsheets write numbers where the comma is the decimal mark
-        rows = [[_DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in row] for row in rows]
-    if rows and all(_number(cell) is None for cell in rows[0]):
-        return rows[0], rows[1:]
+    header, rows = split_cells(lines, file)
+    if header is not None:
+        return header, rows
     # TUM and ethz-asl write the names of their columns as a comment.
     for comment in reversed(comments):
         cells = [cell for cell in re.split(r"[,;\s]+", comment) if cell]
@@ -274,7 +255,7 @@ def _rows_of_ur(file: Path, lines: list[str]) -> tuple[Sequence[str], list[list[
             raise InputError(
                 f"{file}: line {number} holds no p[x, y, z, rx, ry, rz] as the others: {shown(line)}; correct or drop it"
             )
-    first = () if len(rows[0]) == 6 else ("image",) if _number(rows[0][0]) is None else ("timestamp",)
+    first = () if len(rows[0]) == 6 else ("image",) if number_of(rows[0][0]) is None else ("timestamp",)
     return (*first, "x", "y", "z", "ur_x", "ur_y", "ur_z"), rows
 
 
