@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from jcr.capture.formats.capture_json import camera_entries, with_cameras
+from jcr.capture.formats.capture_json import camera_entries, read_intrinsics, with_cameras
 from jcr.capture.images import read_image, size_of_all
-from jcr.capture.plain_files import read_json, validated_content
+from jcr.capture.plain_files import read_json
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.records import Capture, CellCamera
-from jcr.records.capture_json import NAME, IntrinsicsEntry
+from jcr.records.capture_json import NAME
 
 FOLDER, FILE = "cameras", "cameras.json"
 
@@ -47,12 +47,7 @@ def added_camera(
     size = size_of_all({str(file): read_image(file).shape[1::-1] for file in files}, f"--name {name}")
     known = None
     if intrinsics is not None:
-        content = read_json(intrinsics)
-        if isinstance(content, dict) and isinstance(content.get("intrinsics"), dict):
-            content = content["intrinsics"]
-        known = validated_content(IntrinsicsEntry, content, str(intrinsics)).record(
-            size, f"{files[0]}, {intrinsics}"
-        )
+        known = read_intrinsics(intrinsics).record(size, f"{files[0]}, {intrinsics}")
     images = tuple(f"{name}/{k:03d}{file.suffix.lower()}" for k, file in enumerate(files))
     for image, file in zip(images, files, strict=True):
         write_bytes(folder / image, file.read_bytes())

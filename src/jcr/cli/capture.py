@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from jcr.capture.formats.capture_json import read_intrinsics
 from jcr.capture.options import ConventionName, UnitsName
-from jcr.capture.plain_files import read_json, validated_content
 from jcr.cli.output import Output
 from jcr.errors import InputError
 from jcr.estimation.arms import CHOICES, ROBOT_NAMES, RobotName, arm_named
@@ -30,7 +30,6 @@ from jcr.live.robot import (
     without_commands,
 )
 from jcr.live.session import LEAST_IMAGES, Answer, LiveSession, SessionOptions
-from jcr.records.capture_json import IntrinsicsEntry
 from jcr.rounding import labelled
 
 if TYPE_CHECKING:
@@ -113,7 +112,8 @@ def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
     states, listen = states_of(arguments.poses), Listen(port=arguments.page_port, token=token)
     if arguments.listen is not None:
         listen = Listen(*address_of(arguments.listen, 7464, "--listen "), token, "--listen")
-    given = _intrinsics(arguments.intrinsics_from)
+    source = arguments.intrinsics_from
+    given = None if source is None else read_intrinsics(source)
     if states is None and arguments.poses not in ("typed", "http"):
         raise InputError(f"--poses {arguments.poses}: give ur:HOST, franka:HOST, xarm:HOST, typed or http")
     answers: list[Answer] = []
@@ -195,14 +195,3 @@ def _source(
         return lambda: session.watch(states)
     _print(f"waiting for POST http://{server.hosts[0]}/sample with the key {server.key}")
     return lambda: server.await_samples(arguments.timeout)
-
-
-def _intrinsics(file: Path | None) -> IntrinsicsEntry | None:
-    """Return the intrinsics in a JSON file; raise InputError where it has none."""
-    if file is None:
-        return None
-    content = read_json(file)
-    given = content.get("intrinsics") if isinstance(content, dict) else None
-    if not isinstance(given, dict):
-        raise InputError(f'--intrinsics-from {file}: holds no "intrinsics"; name a capture.json with some')
-    return validated_content(IntrinsicsEntry, given, f"--intrinsics-from {file}")

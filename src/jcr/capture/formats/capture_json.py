@@ -48,6 +48,16 @@ def read_capture_json(file: Path) -> CaptureFile:
     return validated_content(CaptureFile, content, str(file))
 
 
+def read_intrinsics(file: Path) -> IntrinsicsEntry:
+    """Read intrinsics from a JSON file that is their entry, or that holds one as "intrinsics"."""
+    content = read_json(file)
+    if isinstance(content, dict):
+        content = content.get("intrinsics", content)
+    if not isinstance(content, dict):
+        raise InputError(f'{file}: holds no "intrinsics"; name a capture.json with some')
+    return validated_content(IntrinsicsEntry, content, str(file))
+
+
 def frame_of(content: CaptureFile, row: int, file: Path) -> FrameEntry:
     """Return a frame of a capture.json; raise InputError that names its image where the frame cannot be used."""
     where = f"{file}: frame {row} ({_image_name(content, row, file)})"
