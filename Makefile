@@ -28,7 +28,7 @@ test: .venv/ready
 test-fast: .venv/ready
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(TWO_WORKERS) -m "not slow"
 
-# Fuzzing, kills and repeats of more than ten seconds each.
+# Fuzzing, kills, browsers and repeats of more than ten seconds each.
 test-long: .venv/ready
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(TWO_WORKERS) -m long
 

@@ -60,11 +60,11 @@ SLOW_FIXTURES = {"done", "small_done", "opengl", "real_captures", "attacks", "ti
 
 
 FIRST = (
-    "faults/test_faults.py", "calibration/test_faults.py",
-    "live/test_calibration.py", "test_verify.py", "test_real_captures.py", "cell/test_cell.py", "test_batch.py",
-    "boards/test_marker.py", "test_examples.py", "scene/test_map.py", "cli/test_cli.py",
-    "calibration/test_conventions.py", "calibration/test_given_intrinsics.py", "scene/test_map_update.py",
-    "report/test_report.py",
+    "live/test_calibration.py", "calibration/test_faults.py",
+    "ros2/test_jcr_ros.py", "test_verify.py", "cell/test_cell.py", "faults/test_surroundings.py",
+    "faults/test_wrong_poses.py", "test_real_captures.py", "boards/test_marker.py", "test_batch.py",
+    "test_examples.py", "scene/test_map.py", "scene/test_map_update.py", "cli/test_cli.py",
+    "calibration/test_conventions.py", "report/test_report.py", "faults/test_faults.py",
 )  # fmt: skip
 """Files by their processor seconds, longest first, after the two that the workers begin with: one makes the run of
 `done`, the other does without it."""

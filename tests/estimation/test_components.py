@@ -64,7 +64,7 @@ def test_the_sizes_are_found_from_many_poses():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("joints_known", [False, True])
+@pytest.mark.parametrize("joints_known", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_answers_of_a_bent_arm_are_within_their_sigma(joints_known: bool):
     """More images of an arm with joint offsets made answers of white noise alone worse: 12 of 24 beyond 3 sigma."""
     arm, worst = arm_named("ur5e"), []

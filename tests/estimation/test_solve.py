@@ -83,7 +83,7 @@ def test_wrong_poses_are_named_and_no_others(count, wrong, kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("given", [False, True])
+@pytest.mark.parametrize("given", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_the_95_percent_ellipsoid_covers_95_percent(given):
     inside, larger = np.zeros(2), []
     runs = 100

@@ -69,7 +69,7 @@ def test_noise_of_the_images_is_found_from_short_tracks_too(views: int):
     assert solved(problem, tracks).images.state.pixel_noise.sigma_px[0] == pytest.approx(0.3, rel=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_robot_noise_is_found_and_the_ellipsoid_covers():
     noise = (5e-4, np.radians(0.1))
     runs, inside, estimates = 30, 0, []

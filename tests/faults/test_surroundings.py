@@ -127,6 +127,7 @@ def test_a_run_that_is_asked_to_end_leaves_nothing_half_written_and_goes_on(
         assert not list(out.glob(".*.part*"))
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be bound to cores here")
 def test_two_threads_on_one_core_find_what_one_thread_finds_on_all_of_them(
     small_capture: Path, small_done: Path, tmp_path: Path

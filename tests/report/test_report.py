@@ -447,6 +447,7 @@ def test_in_a_browser(chromium: Chromium, file: Path):
     _assert_quiet(chromium)
 
 
+@pytest.mark.long
 def test_on_a_phone_and_in_the_dark(chromium: Chromium, file: Path):
     chromium.open(file.as_uri(), 400, phone=True)
     assert chromium.js("document.documentElement.scrollWidth") <= 400

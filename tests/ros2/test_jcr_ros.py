@@ -247,7 +247,7 @@ def stamped(pose: ndarray, time_s: float) -> Any:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("require_mm", [5.0, 1e-3])
+@pytest.mark.parametrize("require_mm", [5.0, pytest.param(1e-3, marks=pytest.mark.long)])
 def test_the_node_broadcasts_the_transform_where_it_is_accepted_alone(
     tmp_path: Path,
     tabletop: Path,

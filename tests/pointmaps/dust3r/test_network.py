@@ -104,8 +104,8 @@ def pointmaps(network: "Dust3r", truth: "dict[str, torch.Tensor]") -> "tuple[Poi
     "name",
     [
         *sorted(path.stem for path in FIXTURES.glob("tiny_*.npz")),
-        pytest.param("vitl512dpt_48x64", marks=pytest.mark.slow),
-        pytest.param("vitl512dpt_160x224", marks=pytest.mark.slow),
+        pytest.param("vitl512dpt_48x64", marks=pytest.mark.long),
+        pytest.param("vitl512dpt_160x224", marks=pytest.mark.long),
     ],
 )
 @pytest.mark.usefixtures("inference_mode")

@@ -181,7 +181,7 @@ def test_the_focal_length_of_a_network_is_a_measurement(off: float, given: bool)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("noise", [(0.0, 0.0), NOISE])
+@pytest.mark.parametrize("noise", [pytest.param((0.0, 0.0), marks=pytest.mark.long), NOISE])
 def test_reported_sigmas_are_those_of_the_errors(noise: tuple[float, float]):
     # With an exact robot the network's errors are all there is; the robot's own noise is not known beforehand.
     squared = []
