@@ -195,54 +195,49 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         """Obey a command of the page, or take a sample."""
         if self.path == "/sample":
-            answer, status = self._sampled()
-            if isinstance(answer, str):
-                answer = {"accepted": False, "reason": answer}
-            self._send_json(answer, status)
-            return
-        if (path := self._path()) is None:
-            return
-        is_json = self.headers.get("Content-Type", "") == "application/json"
-        if not self._is_own_origin(self.headers.get("Origin")) or not is_json:
-            self._send(status=403)
-            return
-        command = None
-        with suppress(ValidationError):
-            command = _Command.model_validate_json(self._body(MAX_COMMAND) or b"")
-        if path != "press" or command is None:
-            self._send(status=400)
-        else:
-            self.server.session.press(command.action, command.number)
-            self._send(status=204)
+            self._send_json(*self._sampled())
+        elif (path := self._path()) is not None:
+            is_json = self.headers.get("Content-Type", "") == "application/json"
+            is_own, command = is_json and self._is_own_origin(), None
+            with suppress(ValidationError):
+                command = _Command.model_validate_json(self._body(MAX_COMMAND) or b"")
+            if is_own and path == "press" and command is not None:
+                self.server.session.press(command.action, command.number)
+                self._send(status=204)
+            else:
+                self._send(status=400 if is_own else 403)
 
-    def _sampled(self) -> tuple[dict[str, Any] | str, int]:
-        """Take an image at the pose in the body; return the answer, or the reason of a refusal, and the status."""
-        server, origin = self.server, self.headers.get("Origin")
+    def _sampled(self) -> tuple[dict[str, Any], int]:
+        """Take an image at the pose in the body; return the answer and the status."""
+        server, why, status = self.server, None, 400
         key = self.headers.get("Authorization", "").removeprefix("Bearer ").strip()
         if self.headers.get("Host") not in server.hosts or not self._is_key(key):
-            return "no or a wrong key; send the header Authorization: Bearer KEY", 403
-        if origin is not None and not self._is_own_origin(origin):
-            return "a sample from another web site", 403
-        if not server.takes_samples:
-            return "the poses of this capture come from elsewhere (--poses)", 409
-        if (body := self._body(MAX_SAMPLE)) is None:
-            return f"no Content-Length, or more than {MAX_SAMPLE} bytes", 400
-        try:
-            pose = sample_pose(body)
-        except InputError as error:
-            return str(error), 400
-        if pose is None:
-            server.session.end()
-            return {"accepted": True, "done": True}, 200
-        server.sampled_s = np.inf
-        answer = server.session.take(RobotState(time.monotonic(), pose), waits=True)
-        server.sampled_s = time.monotonic()
-        # The status tells whether the image is kept, for programs that read a line only.
-        return answer, 200 if answer["accepted"] else 422
+            why, status = "no or a wrong key; send the header Authorization: Bearer KEY", 403
+        elif "Origin" in self.headers and not self._is_own_origin():
+            why, status = "a sample from another web site", 403
+        elif not server.takes_samples:
+            why, status = "the poses of this capture come from elsewhere (--poses)", 409
+        elif (body := self._body(MAX_SAMPLE)) is None:
+            why = f"no Content-Length, or more than {MAX_SAMPLE} bytes"
+        else:
+            try:
+                pose = sample_pose(body)
+            except InputError as error:
+                why = str(error)
+            else:
+                if pose is None:
+                    server.session.end()
+                    return {"accepted": True, "done": True}, 200
+                server.sampled_s = np.inf
+                answer = server.session.take(RobotState(time.monotonic(), pose), waits=True)
+                server.sampled_s = time.monotonic()
+                # The status tells whether the image is kept, for programs that read a line only.
+                return answer, 200 if answer["accepted"] else 422
+        return {"accepted": False, "reason": why}, status
 
-    def _is_own_origin(self, origin: str | None) -> bool:
+    def _is_own_origin(self) -> bool:
         """Test whether a browser's request comes from the page."""
-        return origin in [f"http://{host}" for host in self.server.hosts]
+        return self.headers.get("Origin") in [f"http://{host}" for host in self.server.hosts]
 
     def _path(self) -> str | None:
         """Return the path behind the key; None, after an answer, where host or key are wrong."""

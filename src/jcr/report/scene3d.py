@@ -40,13 +40,12 @@ def scene_section(result: RunResult) -> Section:
     )
     layers, labels = [], []
     if result.scene is not None:
-        surface, names = sample_surface(result.scene, POINTS), result.scene.label_names
-        at = surface.points_in_base
-        layers.append(("map, predicted colour", at, surface.color, surface.point_size))
+        (at, color, label), names = sample_surface(result.scene, POINTS), result.scene.label_names
+        layers.append(("map, predicted colour", at, color, size := point_size(at)))
         if len(names) > 1:
             palette = label_colors(len(names))
             labels = list(zip(names, palette.tolist(), strict=True))
-            layers.append(("map, predicted label", at, palette[surface.label], surface.point_size))
+            layers.append(("map, predicted label", at, palette[label], size))
     if (cloud := result.cloud) is not None:
         some = np.random.default_rng(0).permutation(len(cloud.points_in_base))[:POINTS]
         at = cloud.points_in_base[some]

@@ -35,19 +35,15 @@ def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, no mapping
-    except SafetensorError as error:
-        raise InputError(f"{path}: the map file is damaged ({error}); {again}") from None
-    if metadata.get("format") != FORMAT:
-        found = metadata.get("format", "no map of jcr")
-        raise InputError(f"{path}: holds {found} where this jcr reads {FORMAT}; update jcr, or {again}")
-    if metadata.get("digest") != digest(tensors):
-        raise InputError(
-            f"{path}: the map file is damaged (its numbers changed since it was written); {again}"
-        )
-    try:
+        if (found := metadata.get("format", "no map of jcr")) != FORMAT:
+            raise InputError(f"{path}: holds {found} where this jcr reads {FORMAT}; update jcr, or {again}")
+        if metadata.get("digest") != digest(tensors):
+            raise ValueError("its numbers changed since it was written")
         return map_from_tensors(tensors, json.loads(metadata["about"])).to(device)
-    except (KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:
-        raise InputError(f"{path}: the map file is damaged ({error!r}); {again}") from None
+    except InputError:
+        raise
+    except (SafetensorError, KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:
+        raise InputError(f"{path}: the map file is damaged ({error}); {again}") from None
 
 
 def require_packages(what: str, otherwise: str = "") -> None:

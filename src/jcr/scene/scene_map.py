@@ -360,7 +360,7 @@ def map_from_tensors(tensors: dict[str, Tensor], about: dict[str, Any]) -> Scene
 
 def _worst(states: Bool[ndarray, "*batch k"] | UInt8[ndarray, "*batch k"], unknown: str) -> ndarray:
     """Return the answer for each body from the k answers of its spheres."""
-    if unknown == "report":
-        surface, unseen = (states == OCCUPIED).any(-1), (states == UNKNOWN).any(-1)
-        return np.where(surface, OCCUPIED, np.where(unseen, UNKNOWN, FREE)).astype(np.uint8)
-    return np.asarray(states.any(-1))
+    if unknown != "report":
+        return np.asarray(states.any(-1))
+    rank = np.array([0, 2, 1], np.uint8)  # of FREE, OCCUPIED, UNKNOWN; its own inverse
+    return rank[rank[states].max(-1, initial=0)]

@@ -1,41 +1,16 @@
-"""Surface of a trained map as triangles and points, and level slices; torch is imported when a map is there."""
+"""Surface of a trained map as triangles and points; torch is imported when a map is there."""
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Integer, UInt8
+from jaxtyping import Float, Int, Integer, UInt8
 from numpy import ndarray
 from scipy.spatial import KDTree
 
 from jcr.errors import InputError
 
 if TYPE_CHECKING:
-    from jcr.scene.scene_map import SceneMap, Unknown
-
-SLICE_PIXELS = 240
-"""Pixels along the longer side of a slice."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SurfacePoints:
-    """Points on the surface where the predicted occupancy is one half, on the sides that some camera has seen."""
-
-    points_in_base: Float[ndarray, "n 3"]
-    color: UInt8[ndarray, "n 3"]
-    label: Int[ndarray, " n"]
-    point_size: float
-    """Side (m) of the squares that are drawn in place of the points."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Slice:
-    """Map at one height: columns along the base's x axis, rows along its y axis, downwards in y."""
-
-    occupancy: Float[ndarray, "h w"]
-    distance: Float[ndarray, "h w"]
-    """Signed distance (m); NaN outside of the workspace."""
-    unknown: Bool[ndarray, "h w"]
+    from jcr.scene.scene_map import SceneMap
 
 
 def surface_mesh(
@@ -74,8 +49,13 @@ def surface_mesh(
     return vertices[used], faces.reshape(-1, 3), np.rint(255 * color).astype(np.uint8)
 
 
-def sample_surface(scene: "SceneMap", count: int) -> SurfacePoints:
-    """Return at most `count` points, drawn evenly over the seen surface of the map; none where it has no surface."""
+def sample_surface(
+    scene: "SceneMap", count: int
+) -> tuple[Float[ndarray, "n 3"], UInt8[ndarray, "n 3"], Int[ndarray, " n"]]:
+    """Return at most `count` points of the seen surface, where the occupancy is one half, drawn evenly over its area.
+
+    They are positions (m, base frame), RGB and label; none where the map has no surface.
+    """
     try:
         vertices, faces, color = surface_mesh(scene)
     except InputError:
@@ -86,27 +66,7 @@ def sample_surface(scene: "SceneMap", count: int) -> SurfacePoints:
     drawn = draw.choice(len(faces), count, p=area / area.sum()) if len(faces) else np.zeros(0, int)
     share = draw.dirichlet(np.ones(3), len(drawn))[..., None]
     x = (share * corners[drawn]).sum(1)
-    return SurfacePoints(
-        points_in_base=x,
-        color=(share * color[faces[drawn]]).sum(1).round().astype(np.uint8),
-        label=scene.query(x).label,
-        point_size=point_size(x),
-    )
-
-
-def level_slice(scene: "SceneMap", height: float, unknown: "Unknown") -> Slice:
-    """Return the map at z = height (m), with unknown space counted as given."""
-    low, high = scene.box
-    pitch = float((high - low)[:2].max() / SLICE_PIXELS)
-    a, b = (np.arange(low[k] + pitch / 2, high[k], pitch) for k in (0, 1))
-    x = np.full((len(b), len(a), 3), height)
-    x[..., 0], x[..., 1] = np.meshgrid(a, b[::-1])
-    answer, shape = scene.query(x.reshape(-1, 3), unknown), x.shape[:2]
-    return Slice(
-        occupancy=answer.occupancy.reshape(shape),
-        distance=answer.distance.reshape(shape),
-        unknown=answer.unknown.reshape(shape),
-    )
+    return x, (share * color[faces[drawn]]).sum(1).round().astype(np.uint8), scene.query(x).label
 
 
 def point_size(points: Float[ndarray, "n 3"]) -> float:

@@ -29,7 +29,7 @@ from jcr.report.render import TRACK_COLOR, label_colors, render
 from jcr.report.verdict import head
 from jcr.result import RunResult
 from jcr.scene.scene_map import SceneMap, Unknown
-from jcr.scene.surface import Slice, level_slice, sample_surface
+from jcr.scene.surface import sample_surface
 
 if TYPE_CHECKING:
     import yourdfpy
@@ -47,8 +47,8 @@ FRUSTUM_M, POINT_M = 0.05, 0.005
 """Distance from a camera to its drawn image plane, and size of a point (m)."""
 CLICK_RAD = 0.006
 """Angle about a click's ray within which points are found."""
-FAR_M = 0.2
-"""Distance at which the colours of a slice end."""
+FAR_M, SLICE_PIXELS = 0.2, 240
+"""Distance at which the colours of a slice end, and pixels along its longer side."""
 HOST = "127.0.0.1"
 """Other machines must not reach viser, which has no password and no encryption."""
 Value = Float[ndarray, "3"]
@@ -295,9 +295,9 @@ class Viewer:
             if self.shown.value == CLOUD and self.cloud is not None:
                 x, color = self.cloud.points_in_base, self.cloud.color
             elif self.shown.value == MAP and self.scene is not None:
-                x, color = self._surface.points_in_base, self._surface.color
+                x, color, label = self._surface
                 if self.by_label.value:
-                    color = self._palette[self._surface.label]
+                    color = self._palette[label]
                     labels = list(zip(self.scene.label_names, self._palette.tolist(), strict=True))
                     legend = render("labels.html", {"labels": labels}, "jcr.viewer")
             self.points, self._legend.content = x, legend
@@ -322,7 +322,7 @@ class Viewer:
             self._slice.visible = of != "none"
             self._slice_legend.content = SLICE_LEGENDS.get(of, "")
             if of != "none":
-                self._slice.image = slice_colors(level_slice(self.scene, height, self.unknown.value), of)
+                self._slice.image = slice_image(self.scene, height, self.unknown.value, of)
                 self._slice.position = np.array([*self.scene.box[:, :2].mean(0), height])
 
     def move_sphere(self) -> None:
@@ -385,7 +385,7 @@ class Viewer:
         """Return points of the map's surface, of the cloud, or of the tracks."""
         points = self.tracks_in_base if self.cloud is None else self.cloud.points_in_base
         if self.scene is not None:
-            points = self._surface.points_in_base
+            points = self._surface[0]
         return points if len(points) else np.zeros((1, 3))
 
     def _support(self) -> float:
@@ -417,19 +417,23 @@ def unknown_border(scene: SceneMap) -> tuple[Float[ndarray, "v 3"], Integer[ndar
     return low + pitch * (vertices + 0.5), faces
 
 
-def slice_colors(cut: Slice, of: SliceOf) -> UInt8[ndarray, "h w 4"]:
-    """Return RGBA of a slice in the colours of SLICE_LEGENDS."""
-    rgba = np.zeros((*cut.occupancy.shape, 4), np.uint8)
+def slice_image(scene: SceneMap, height: float, unknown: Unknown, of: SliceOf) -> UInt8[ndarray, "h w 4"]:
+    """Return the map at z = height (m) as RGBA in the colours of SLICE_LEGENDS: columns along x, rows downwards in y."""
+    low, high = scene.box
+    pitch = float((high - low)[:2].max() / SLICE_PIXELS)
+    a, b = (np.arange(low[k] + pitch / 2, high[k], pitch) for k in (0, 1))
+    x = np.stack([*np.meshgrid(a, b[::-1]), np.full((len(b), len(a)), height)], -1)
+    at, rgba = scene.query(x.reshape(-1, 3), unknown), np.zeros((x[..., 0].size, 4), np.uint8)
     if of == "occupancy":
-        rgba[..., :3], rgba[..., 3] = OCCUPIED, 255 * (0.1 + 0.9 * cut.occupancy.clip(0, 1))
-        rgba[cut.unknown] = (*GREY, 160)
-        return rgba
-    known = np.isfinite(cut.distance)
-    share = (255 * (1 - (cut.distance[known] / FAR_M).clip(0, 1))).astype(np.uint8)
-    rgba[known, :3] = cv2.applyColorMap(share[:, None], cv2.COLORMAP_PLASMA)[:, 0, ::-1]
-    rgba[known, 3] = 217
-    rgba[known & (cut.distance <= 0)] = (200, 30, 30, 230)
-    return rgba
+        rgba[:, :3], rgba[:, 3] = OCCUPIED, 255 * (0.1 + 0.9 * at.occupancy.clip(0, 1))
+        rgba[at.unknown] = (*GREY, 160)
+    else:
+        known = np.isfinite(at.distance)
+        share = (255 * (1 - (at.distance[known] / FAR_M).clip(0, 1))).astype(np.uint8)
+        rgba[known, :3] = cv2.applyColorMap(share[:, None], cv2.COLORMAP_PLASMA)[:, 0, ::-1]
+        rgba[known, 3] = 217
+        rgba[known & (at.distance <= 0)] = (200, 30, 30, 230)
+    return rgba.reshape(len(b), len(a), 4)
 
 
 SLICE_LEGENDS: dict[str, str] = {
