@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, UInt8, UInt16
+from jaxtyping import UInt8, UInt16
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
@@ -99,7 +99,12 @@ class LiveFolder:
         """
         number, stem = f"image {len(self.images) + 1}", f"{self._next_number:03d}"
         pixels = checked_image(image, color, number)
-        pose = checked_pose(base_from_gripper, f"{number}: base_from_gripper")
+        where = f"{number}: base_from_gripper"
+        if np.shape(base_from_gripper) == (3, 3):
+            lacks = "a rotation (3x3) has no translation; give 4x4 with the position in metres"
+            raise InputError(f"{where}: {lacks}")
+        pose = read_rigid(base_from_gripper, where)
+        far_faults(pose[None, :3, 3], where, [where])
         size, summary = (pixels.shape[1], pixels.shape[0]), ImageSummary.of(pixels)
         if self.size not in (None, size):
             remedy = "set its old resolution or name a new folder"
@@ -211,14 +216,3 @@ def checked_image(image: ArrayLike | Path, color: str, number: str) -> UInt8[nda
     if pixels.ndim != 3 or pixels.shape[2] != 3:
         raise InputError(f"{number}: shape {pixels.shape}; give (height, width, 3), of RGBA image[..., :3]")
     return np.ascontiguousarray(pixels[..., ::-1] if color == "bgr" else pixels)
-
-
-def checked_pose(base_from_gripper: ArrayLike, where: str) -> Float[ndarray, "4 4"]:
-    """Return a rigid transform (4,4) in metres; raise InputError, begun with `where`, for anything else."""
-    if np.shape(base_from_gripper) == (3, 3):
-        raise InputError(
-            f"{where}: a rotation (3x3) has no translation; give 4x4 with the position in metres"
-        )
-    pose = read_rigid(base_from_gripper, where)
-    far_faults(pose[None, :3, 3], where, [where])
-    return pose

@@ -227,8 +227,13 @@ class LiveSession:
                     )
                     self._say(event, {"images": left})
                     self._follow()
-                if action in ("take", "retake"):
-                    self._take_now()
+                if action in ("take", "retake") and self._gripper is None:
+                    self._refuse("refused: give the pose at which the gripper rests; the image is taken then")
+                elif action in ("take", "retake") and self._gripper is not None:
+                    try:
+                        self.take(self._gripper(), current=self._gripper)
+                    except InputError as error:
+                        self._refuse(f"refused: {error}")
 
     def finish(self) -> "RunResult | None":
         """Return the calibration of all images; None, with a line that says why, where there is none."""
@@ -267,15 +272,6 @@ class LiveSession:
         if is_farther(pose, now, REST):
             raise InputError("the arm moved while the image was taken; let it rest")
         return found
-
-    def _take_now(self) -> None:
-        """Take an image where the gripper is now."""
-        try:
-            if self._gripper is None:
-                raise InputError("give the pose at which the gripper rests; the image is taken then")
-            self.take(self._gripper(), current=self._gripper)
-        except InputError as error:
-            self._refuse(f"refused: {error}")
 
     def _refuse(self, event: str) -> None:
         """Show and tell why something was not done."""

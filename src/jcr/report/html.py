@@ -50,7 +50,11 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
     if not isinstance(capture, Capture):
         about, source = "poses given, no images", capture.source or result.out
     else:
-        about, source = _about_capture(capture, options), origin(capture.folder)
+        (width, height), source = capture.image_size, origin(capture.folder)
+        robot = options.get("calibrate", {}).get("robot") or capture.robot
+        arm = f"arm {robot}" if robot else "arm of a URDF" if capture.urdf else "arm not named"
+        given = "given" if capture.intrinsics is not None else "estimated"
+        about = f"{arm} · {capture.camera_name} camera, {width} × {height} px, intrinsics {given}"
     if isinstance(calibration, FailedCalibration):
         sections = [
             failure_section(calibration),
@@ -76,36 +80,22 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
     return _page(about, source, calibration, sections)
 
 
-def _about_capture(capture: Capture, options: StageOptions) -> str:
-    """Return arm and camera of a capture as text."""
-    width, height = capture.image_size
-    given = "given" if capture.intrinsics is not None else "estimated"
-    robot = options.get("calibrate", {}).get("robot") or capture.robot
-    arm = f"arm {robot}" if robot else "arm of a URDF" if capture.urdf else "arm not named"
-    return f"{arm} · {capture.camera_name} camera, {width} × {height} px, intrinsics {given}"
-
-
-def _about_intrinsics(calibration: AnyCalibration) -> list[str]:
-    """Return a line with the intrinsics that belong to the transform; none where they are unknown."""
-    if (found := calibration.intrinsics) is None:
-        return []
-    focal, centre = (f" ± {significant(max(found.std[k : k + 2]))}" if found.std else "" for k in (0, 2))
-    return [
-        f"fx {found.fx:.2f}, fy {found.fy:.2f}{focal} · cx {found.cx:.2f}, cy {found.cy:.2f}{centre} px · {found.model} "
-        f"distortion {', '.join(f'{value:.4g}' for value in found.distortion)}"
-    ]
-
-
 def _page(about: str, source: Path, calibration: AnyCalibration, sections: Iterable[Section | None]) -> str:
     """Return the whole page; `source` is the capture as the user named it."""
     # The table or the bag's metadata are called alike in every capture: their folder has the name.
     named = source.parent if source.stem in UNNAMED else source
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     run = f"{len(calibration.images)} images · back end {calibration.backend} · {made} · jcr {calibration.version}"
-    shown = [section for section in sections if section is not None]
+    shown, lines = [section for section in sections if section is not None], [about]
+    if (found := calibration.intrinsics) is not None:
+        focal, centre = (f" ± {significant(max(found.std[k : k + 2]))}" if found.std else "" for k in (0, 2))
+        lines.append(
+            f"fx {found.fx:.2f}, fy {found.fy:.2f}{focal} · cx {found.cx:.2f}, cy {found.cy:.2f}{centre} px · "
+            f"{found.model} distortion {', '.join(f'{value:.4g}' for value in found.distortion)}"
+        )
     content = {
         "name": printable(named.resolve().name),
-        "about": [about, *_about_intrinsics(calibration), run, printable(str(source))],
+        "about": [*lines, run, printable(str(source))],
         "sections": shown,
         "open": OPEN,
         "links": {one.name: LINKS[one.name] for one in shown if one.name in LINKS},

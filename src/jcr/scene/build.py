@@ -19,7 +19,7 @@ from jcr.scene.options import MapOptions
 from jcr.scene.paper import train_paper
 from jcr.scene.scene_map import SceneMap
 from jcr.scene.seen import HIT, SeenGrid, carve, dilate, halve, without_doubts
-from jcr.scene.train import NEAR, Rays, rows_inside, train, workspace_box, workspace_rays
+from jcr.scene.train import NEAR, rows_inside, train, workspace_box, workspace_rays
 
 HIDDEN = 32
 """Hidden units of a network."""
@@ -65,7 +65,15 @@ def build_scene(
             fields = Fields(list(learnt.values())).to(device)
         else:
             rays = workspace_rays(cloud, values or {}, box, cell, device)
-            fields = _grid_fields(rays, seen, len(cloud.label_names), options.map_seed).to(device)
+            heads = {name: target.shape[-1] for name, target in rays.targets.items() if name != "label"}
+            heads |= {"label": len(cloud.label_names)} if "label" in rays.targets else {}
+            shapes = (
+                FieldShape({"occupancy": 1}, HIDDEN, grids=OCCUPANCY_GRIDS),
+                FieldShape(heads, HIDDEN, grids=SURFACE_GRIDS),
+            )
+            lattices, generator = feature_lattices(seen), torch.Generator().manual_seed(options.map_seed)
+            untrained = [Field(shape, seen.box, lattices, generator) for shape in shapes]
+            fields = Fields(untrained, lattices).to(device)
 
             def fit(field: Field) -> int:
                 """Train a field and return the number of steps."""
@@ -75,19 +83,6 @@ def build_scene(
             history["steps"] = " + ".join(map(str, pool.map(fit, fields.of)))
         history["training_s"] = f"{time.perf_counter() - carved:.3f}"
     return SceneMap(fields, without_doubts(seen), cloud.label_names, history)
-
-
-def _grid_fields(rays: Rays, seen: SeenGrid, labels: int, seed: int) -> Fields:
-    """Return untrained feature grids with two networks: occupancy, and all properties of surfaces."""
-    lattices = feature_lattices(seen)
-    heads = {name: target.shape[-1] for name, target in rays.targets.items() if name != "label"}
-    heads |= {"label": labels} if "label" in rays.targets else {}
-    shapes = (
-        FieldShape({"occupancy": 1}, HIDDEN, grids=OCCUPANCY_GRIDS),
-        FieldShape(heads, HIDDEN, grids=SURFACE_GRIDS),
-    )
-    generator = torch.Generator().manual_seed(seed)
-    return Fields([Field(shape, seen.box, lattices, generator) for shape in shapes], lattices)
 
 
 def feature_lattices(seen: SeenGrid) -> list[Lattice]:
