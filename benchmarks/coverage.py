@@ -28,7 +28,7 @@ from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.estimation.intrinsics_prior import ESTIMATED, camera_with_prior
 from jcr.estimation.point_uncertainty import point_covariance, within_95
 from jcr.estimation.prediction import predict
-from jcr.estimation.wrist import adjust_wrist, recon_frame, uncertainty_of
+from jcr.estimation.solve import adjust_wrist, recon_frame, uncertainty_of
 from jcr.geometry import step_between
 from jcr.pipeline.check import spread_rows
 from jcr.records import Capture, Intrinsics, Reconstruction

@@ -18,7 +18,7 @@ from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
-from jcr.estimation.wrist import adjust_wrist, recon_frame
+from jcr.estimation.solve import adjust_wrist, recon_frame
 from jcr.geometry import (
     Similarity,
     fit_similarity,

@@ -50,8 +50,6 @@ IN_VIEW, LOWEST_VIEW = np.radians(12.0), np.radians(25.0)
 ASIDE, START_SPREAD, LOOKING_STEPS = 0.35, 0.7, 15
 """Arms with fewer than six joints: rad by which the aim moves about the base, rad about the rest posture at which the
 search for a view begins, and its steps."""
-REACHING_STEPS = 16
-"""Steps that other arms take towards a wished view; where they end is their view."""
 STRIDE = 0.4
 """rad by which joints move about a posture while what the gripper carries is watched."""
 NEAREST, FARTHEST = 0.6, 1.5
@@ -204,7 +202,7 @@ def views(
             start += START_SPREAD * rng.uniform(-1, 1, start.shape)
             joints = _looking(arm, wished, aim, gripper_from_camera, start)
         else:
-            joints = reach_toward(arm, wished @ inverse(gripper_from_camera), start, REACHING_STEPS)
+            joints = reach_toward(arm, wished @ inverse(gripper_from_camera), start)
         camera = forward_kinematics(arm, joints) @ gripper_from_camera
         to_aim = aim - camera[:, :3, 3]
         distance = np.linalg.norm(to_aim, axis=1)

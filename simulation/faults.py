@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from jcr.camera import parameter_names, parameters, project, unproject, with_parameters, zoomed
 from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, camera_with_prior
 from jcr.estimation.pose_equations import fit_known_scale, predicted_gripper_poses
-from jcr.estimation.wrist import adjust_wrist
+from jcr.estimation.solve import adjust_wrist
 from jcr.geometry import inverse, rotation_exp, transform
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 from simulation.arms import EFFECTIVE_NOISE, EFFECTIVE_POSES

@@ -1,11 +1,12 @@
 """Damped Gauss-Newton (Levenberg-Marquardt) on any manifold, dense or with unknowns that a caller eliminates.
 
-Unknowns are any object (a pose, a tuple); they move by steps in a tangent space, as geometry.retract moves poses.
+Unknowns are any object (a pose, a tuple); they move by steps in a tangent space, as geometry.retract moves poses. Where
+the cost is an array, its elements are those of independent problems, and the unknowns have them along the first axis.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -34,9 +35,9 @@ class Minimum(Generic[Unknowns]):
     """The minimum of a sum of losses."""
 
     unknowns: Unknowns
-    cost: float
+    cost: Any
     """Half the sum of the losses."""
-    normal: Float[ndarray, "p p"]
+    normal: Float[ndarray, "*b p p"]
     """Jᵀ W J there, W the weights of the loss: the inverse covariance where residuals are whitened."""
     settled: bool
     """Whether the last step gained less than the tolerance."""
@@ -44,18 +45,18 @@ class Minimum(Generic[Unknowns]):
 
 def damped_gauss_newton(
     linearise: Callable[[Unknowns], System],
-    step: Callable[[Unknowns, System, float], Unknowns],
-    cost: Callable[[Unknowns], float],
+    step: Callable[[Unknowns, System, Any], Unknowns],
+    cost: Callable[[Unknowns], Any],
     start: Unknowns,
     *,
-    enough: Callable[[float], float],
-    damping: float = START_DAMPING,
+    enough: Callable[[Any], Any],
+    damping: Any = START_DAMPING,
     iterations: int = 100,
-) -> tuple[Unknowns, float, float, bool]:
+) -> tuple[Unknowns, Any, Any, bool]:
     """Minimise a cost from `start`; return the unknowns, their cost, the damping, and whether the steps settled.
 
     `step` takes the unknowns, their linearisation and the relative damping of its diagonal. The iteration ends where a
-    step changes the cost by less than `enough` of it.
+    step changes the cost by less than `enough` of it. Of independent problems each has its own damping.
     """
     unknowns, least, settled = start, cost(start), False
     system: System | None = None
@@ -64,21 +65,29 @@ def damped_gauss_newton(
         tried = step(unknowns, system, damping)
         tried_cost = cost(tried)
         gained = least - tried_cost
-        if gained >= 0:
-            unknowns, least, system = tried, tried_cost, None
-            damping = max(damping / 10, LEAST_DAMPING)
-        else:
-            damping *= 10
-        settled = bool(abs(gained) < enough(least))
-        if settled or damping > MOST_DAMPING:
+        better, settled = gained >= 0, bool(np.all(np.abs(gained) < enough(least)))
+        if np.any(better):
+            unknowns, system = _where(better, tried, unknowns), None
+        least = np.where(better, tried_cost, least)[()]
+        damping = np.where(better, np.maximum(damping / 10, LEAST_DAMPING), damping * 10)[()]
+        if settled or np.all(damping > MOST_DAMPING):
             break
     return unknowns, least, damping, settled
 
 
+def _where(better: Any, tried: Any, before: Any) -> Any:
+    """Return the unknowns after the step where that is better; of independent problems, arrays or tuples of these."""
+    if np.all(better):
+        return tried
+    if isinstance(tried, tuple):
+        return tuple(_where(better, *pair) for pair in zip(tried, before, strict=True))
+    return np.where(better.reshape(-1, *[1] * (tried.ndim - 1)), tried, before)
+
+
 def minimise(
-    linearised: Callable[[Unknowns], tuple[Float[ndarray, "k m"], Float[ndarray, "k m p"]]],
+    linearised: Callable[[Unknowns], tuple[Float[ndarray, "*b k m"], Float[ndarray, "*b k m p"]]],
     start: Unknowns,
-    moved: Callable[[Unknowns, Float[ndarray, " p"]], Unknowns],
+    moved: Callable[[Unknowns, Float[ndarray, "*b p"]], Unknowns],
     loss: Loss = "linear",
     tolerance: float = 1e-12,
     iterations: int = 100,
@@ -90,22 +99,26 @@ def minimise(
     """
 
     def step(
-        now: tuple[Unknowns, ndarray, ndarray], normal: tuple[ndarray, ndarray], damping: float
+        now: tuple[Unknowns, ndarray, ndarray], normal: tuple[ndarray, ndarray], damping: Any
     ) -> tuple[Unknowns, ndarray, ndarray]:
         hessian, gradient = normal
-        diagonal = hessian.diagonal()
-        damped = hessian + np.diag(damping * diagonal + UNSEEN * diagonal.max(initial=1e-300))
-        tried = moved(now[0], -np.linalg.solve(damped, gradient))
+        diagonal = np.diagonal(hessian, axis1=-2, axis2=-1)
+        added = np.expand_dims(damping, -1) * diagonal + UNSEEN * diagonal.max(
+            -1, initial=1e-300, keepdims=True
+        )
+        damped = hessian + added[..., None] * np.eye(diagonal.shape[-1])
+        tried = moved(now[0], -np.linalg.solve(damped, gradient[..., None])[..., 0])
         return (tried, *linearised(tried))
 
     begin = (start, *linearised(start))
-    exact = EXACT * _cost(loss, begin[1])
+    exact, damping = EXACT * _cost(loss, begin[1]), np.full(begin[1].shape[:-2], START_DAMPING)[()]
     found, cost, _, settled = damped_gauss_newton(
         lambda now: _equations(loss, *now[1:]),
         step,
         lambda now: _cost(loss, now[1]),
         begin,
         enough=lambda cost: tolerance * cost + exact + TINY,
+        damping=damping,
         iterations=iterations,
     )
     return Minimum(found[0], cost, _equations(loss, *found[1:])[0], settled)
@@ -118,18 +131,20 @@ def loss_weight(loss: Loss, squared: Float[ndarray, "*batch"]) -> Float[ndarray,
     return 1 / np.sqrt(1 + squared) if loss == "soft_l1" else 1 / (1 + squared)
 
 
-def _cost(loss: Loss, residual: Float[ndarray, "k m"]) -> float:
-    squared = (residual**2).sum(1)
+def _cost(loss: Loss, residual: Float[ndarray, "*b k m"]) -> Any:
+    squared = (residual**2).sum(-1)
     if loss == "soft_l1":
         squared = 2 * (np.sqrt(1 + squared) - 1)
     elif loss == "cauchy":
         squared = np.log1p(squared)
-    return 0.5 * float(squared.sum())
+    return 0.5 * squared.sum(-1)
 
 
 def _equations(
-    loss: Loss, residual: Float[ndarray, "k m"], jacobian: Float[ndarray, "k m p"]
-) -> tuple[Float[ndarray, "p p"], Float[ndarray, " p"]]:
-    root = np.sqrt(loss_weight(loss, (residual**2).sum(1)))[:, None]
-    flat = (root[:, :, None] * jacobian).reshape(-1, jacobian.shape[2])
-    return flat.T @ flat, flat.T @ (root * residual).ravel()
+    loss: Loss, residual: Float[ndarray, "*b k m"], jacobian: Float[ndarray, "*b k m p"]
+) -> tuple[Float[ndarray, "*b p p"], Float[ndarray, "*b p"]]:
+    root = np.sqrt(loss_weight(loss, (residual**2).sum(-1)))[..., None]
+    flat = (root[..., None] * jacobian).reshape(*residual.shape[:-2], -1, jacobian.shape[-1])
+    transposed = np.swapaxes(flat, -1, -2)
+    left = (root * residual).reshape(*residual.shape[:-2], -1, 1)
+    return transposed @ flat, (transposed @ left)[..., 0]

@@ -193,10 +193,10 @@ def test_a_zoom_of_a_second_camera_is_named_with_its_size_and_none_where_there_i
     own, other = (camera_with_prior(one) for one in problem.cameras)
     cell, state = cell_of(problem, [own, replace(other, mount_free=True)])
     images = CellImages(problem=cell, state=state, observations=replace(seen, x_px=x_px))
-    answer, place = images.adjusted(), wanted(problem)["gripper_from_second"]
+    answer, place = images.solved(), wanted(problem)["gripper_from_second"]
     second = CameraAdjustment(
         adjusted=answer,
-        adjust=lambda prior, free, bent: images.adjusted(1, prior, free),
+        adjust=lambda _, free, bent: images.with_freed(1, free, None, bent).solved(),
         arm=None,
         names=[f"{k}.png" for k in range(COUNT)],
         is_given=True,

@@ -16,8 +16,7 @@ from jcr.estimation.point_uncertainty import (
     scene_uncertainty,
     within_95,
 )
-from jcr.estimation.solve import Solution
-from jcr.estimation.wrist import adjust_wrist, uncertainty_of
+from jcr.estimation.solve import Solution, adjust_wrist, uncertainty_of
 from jcr.geometry import apply, inverse, retract
 from jcr.records import Intrinsics, RobotNoise, Tracks, Uncertainty
 from simulation.problems import INTRINSICS, HandEyeProblem, hand_eye_problem, observed

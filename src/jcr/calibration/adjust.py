@@ -16,13 +16,11 @@ from jcr.calibration.record import Calibration
 from jcr.camera import by_parameters, by_point, parameter_names
 from jcr.estimation.closed_form import initial_estimate
 from jcr.estimation.image_equations import median_reprojection_px
-from jcr.estimation.intrinsics_prior import CameraPrior, decentring
-from jcr.estimation.point_uncertainty import joint_covariance
+from jcr.estimation.intrinsics_prior import CameraPrior, decentring, joint_covariance
 from jcr.estimation.pose_equations import paper_residuals, predicted_gripper_poses
 from jcr.estimation.problem import LinearPrior, pose_problem, wrist_arm
 from jcr.estimation.projection import view_of
-from jcr.estimation.solve import START_NOISE, Solution, solve
-from jcr.estimation.wrist import adjust_wrist, recon_frame, uncertainty_of
+from jcr.estimation.solve import START_NOISE, Solution, adjust_wrist, recon_frame, solve, uncertainty_of
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import (
     apply,

@@ -18,7 +18,7 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors
 from jcr.cell.background import write_moving_parts
-from jcr.estimation.wrist import recon_frame, uncertainty_of
+from jcr.estimation.solve import recon_frame, uncertainty_of
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import inverse
 from jcr.records import Capture, Reconstruction

@@ -7,11 +7,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.case import MIN_OBSERVATIONS, Case
+from jcr.calibration.case import MIN_OBSERVATIONS
 from jcr.cell.rigs import CameraViews, Rigs
-from jcr.estimation.hypotheses import freed, with_camera
-from jcr.estimation.intrinsics_prior import CameraPrior, camera_about
-from jcr.estimation.problem import Observations, Problem, RigGaussian, State, with_observations
+from jcr.estimation.intrinsics_prior import camera_about
+from jcr.estimation.problem import Observations, Problem, RigGaussian, State, freed, with_observations
 from jcr.estimation.solve import Solution, solve
 from jcr.findings import FindingKind
 from jcr.sfm.track_refinement import KEYPOINT_STD_PX
@@ -29,32 +28,22 @@ class CellImages:
     state: State
     observations: Observations
 
-    def adjusted(
-        self,
-        camera: int = 0,
-        prior: CameraPrior | None = None,
-        combinations: Float[ndarray, "e p"] | None = None,
-        arm: int | None = None,
-        errors: Float[ndarray, "s b"] | None = None,
-    ) -> Solution:
-        """Adjust images and arms together; the arguments are those of `with_freed`."""
-        cell = self if prior is None else self.with_freed(camera, prior, combinations, arm, errors)
-        return solve(*with_observations(cell.problem, cell.state, cell.observations))
+    def solved(self) -> Solution:
+        """Adjust images and arms together."""
+        return solve(*with_observations(self.problem, self.state, self.observations))
 
     def with_freed(
         self,
         camera: int,
-        prior: CameraPrior,
         combinations: Float[ndarray, "e p"] | None,
         arm: int | None = None,
         errors: Float[ndarray, "s b"] | None = None,
     ) -> "CellImages":
-        """Return the cell with another prior of a camera's intrinsics.
+        """Return the cell with combinations of the columns of a camera's hypotheses.Alternatives free, too.
 
-        `combinations` of the columns of its score_test.Alternatives are free too, and the poses of an arm have confirmed
-        `errors` of one standard deviation each.
+        The poses of an arm have confirmed `errors` of one standard deviation each.
         """
-        problem = with_camera(self.problem, prior, camera)
+        problem = self.problem
         if combinations is not None:
             mine = np.flatnonzero(self.observations.camera == camera)
             problem = freed(problem, combinations, mine, len(self.observations.rig), camera)
@@ -66,7 +55,10 @@ class CellImages:
 
 
 def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
-    """Return all images; those of the further cameras follow the own camera's, camera by camera, as they are used."""
+    """Return all images; those of the further cameras follow the own camera's, camera by camera, as they are used.
+
+    Given intrinsics that the own camera's images contradict count as estimated.
+    """
     case, hand_eye = rigs.case, rigs.case.hand_eye
     tracks, prior = case.tracks, None
     # Where bundle adjustment did not decide the calibration, the images' own geometry is not used here either.
@@ -88,13 +80,22 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
             count += n
             rig.append(at)
             camera.append(c)
-    mounts = [np.eye(4) if one.rig_from_camera is None else one.rig_from_camera for one in members]
+    contradicted = (one.kind is FindingKind.INTRINSICS and one.shift is None for one in hand_eye.findings)
+    given = case.capture.intrinsics is not None and not any(contradicted)
+    cameras = [camera_about(case.reconstruction.intrinsics, given, case.capture.intrinsics_std)]
+    mounts = [np.eye(4)]
+    for member in members:
+        own = member.camera
+        prior_of_it = camera_about(member.intrinsics, own.intrinsics is not None, own.intrinsics_std)
+        # A mount is free only beside another camera on its rig.
+        cameras.append(replace(prior_of_it, mount_free=member.rig_from_camera is not None))
+        mounts.append(np.eye(4) if member.rig_from_camera is None else member.rig_from_camera)
     arms, starts = rigs.arm_poses()
     return CellImages(
         problem=Problem(
             arms=tuple(arms),
             n_rigs=len(rigs.poses),
-            cameras=_cameras(case, members),
+            cameras=tuple(cameras),
             known_rigs=prior,
             robot_noise_floor=case.options.robot_noise_m_rad,
         ),
@@ -103,7 +104,7 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
             scale=1.0,
             z=np.stack([z for _, z in starts]),
             world_from_rig=np.stack(rigs.poses),
-            rig_from_camera=np.stack([np.eye(4), *mounts]),
+            rig_from_camera=np.stack(mounts),
             points_in_world=np.concatenate(points),
         ),
         observations=Observations(
@@ -115,22 +116,6 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
             std_px=np.concatenate(std_px),
         ),
     )
-
-
-def _cameras(case: Case, members: Sequence[CameraViews]) -> tuple[CameraPrior, ...]:
-    """Return the cameras with the prior of their intrinsics; a mount is free only beside another camera on its rig.
-
-    Given intrinsics that the own camera's images contradict count as estimated.
-    """
-    capture, found = case.capture, case.hand_eye.findings
-    contradicted = any(one.kind is FindingKind.INTRINSICS and one.shift is None for one in found)
-    given = capture.intrinsics is not None and not contradicted
-    cameras = [camera_about(case.reconstruction.intrinsics, given, capture.intrinsics_std)]
-    for member in members:
-        known = member.camera.intrinsics is not None
-        camera = camera_about(member.intrinsics, known, member.camera.intrinsics_std)
-        cameras.append(replace(camera, mount_free=member.rig_from_camera is not None))
-    return tuple(cameras)
 
 
 def _given_poses(rigs: Rigs) -> RigGaussian:

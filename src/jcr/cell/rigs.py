@@ -21,7 +21,7 @@ from jcr.capture.images import read_image
 from jcr.cell.placement import CameraPlacement
 from jcr.distributions import chi2
 from jcr.estimation.hypotheses import arm_rows
-from jcr.estimation.problem import ReportedPoses, pose_problem, scale_prior
+from jcr.estimation.problem import ReportedPoses, State, pose_problem, scale_prior
 from jcr.estimation.robot_noise import smooth_errors
 from jcr.findings import Concerns, Finding, FindingKind
 from jcr.geometry import Transform, inverse, motion_length, scale_translation, step_between
@@ -82,23 +82,11 @@ class CameraViews:
     """Rig of each used image, once the camera is mounted."""
     rig_from_camera: Float[ndarray, "4 4"] | None = None
     """Pose on the rig; None for the rig's first camera."""
+    number: int = 1
+    """Number among the adjusted cameras; the capture's own is 0."""
     arm: int | None = None
     """Number of its arm; None for a fixed camera."""
     findings: tuple[Finding, ...] = ()
-
-    @classmethod
-    def of(cls, camera: CellCamera, found: Sequence[tuple[Registration | None, int]]) -> "CameraViews":
-        """Return the images of a camera as they were localised."""
-        return cls(
-            camera=camera,
-            points=[count for _, count in found],
-            used={k: one for k, (one, _) in enumerate(found) if one is not None},
-            reasons={
-                k: f"shares {count} points with the mapped scene"
-                for k, (one, count) in enumerate(found)
-                if one is None
-            },
-        )
 
     @property
     def rows(self) -> Int[ndarray, " k"]:
@@ -140,6 +128,12 @@ class CameraViews:
     ) -> CameraPlacement:
         """Return the camera rejected for a finding, as Finding.of makes it."""
         return self.refused(Finding.of(kind, "rejects", concerns, *images, **numbers))
+
+    def parent_from_camera(self, state: State) -> Float[ndarray, "4 4"]:
+        """Return base_from_camera of a fixed camera, else gripper_from_camera."""
+        if self.arm is None:
+            return state.z[0] @ scale_translation(state.world_from_rig[self.rig[0]], state.scale)
+        return state.x[self.arm] @ scale_translation(state.rig_from_camera[self.number], state.scale)
 
 
 def known_images(case: Case) -> KnownImages:

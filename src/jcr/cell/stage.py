@@ -6,7 +6,7 @@ others rests on the same images.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -24,11 +24,11 @@ from jcr.capture.images import read_image
 from jcr.cell.images import CellImages, cell_images
 from jcr.cell.placement import ArmPlacement, CameraPlacement, CellPlacement, TransformUncertainty
 from jcr.cell.rigs import APART, CameraViews, Rigs, known_images, localise
+from jcr.estimation.covariance import positive_part
 from jcr.estimation.image_equations import median_reprojection_px
-from jcr.estimation.problem import State
 from jcr.estimation.solve import Solution
 from jcr.findings import Finding, FindingKind
-from jcr.geometry import apply, inverse, scale_translation, step_between
+from jcr.geometry import apply, inverse, step_between
 from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress, silent, steps
 from jcr.records import Capture, CellCamera, Reconstruction
@@ -42,21 +42,6 @@ LEAST_SPREAD = 0.05
 """Smallest share of the image's area that the points should span; crowded points determine a pose badly."""
 FAR_FROM_GRIPPER = 0.5
 """Distance (m) from the gripper's frame beyond which a camera is likely to be mounted elsewhere."""
-
-
-@dataclass(frozen=True)
-class MountedCamera:
-    """Further camera that takes part in the adjustment."""
-
-    number: int
-    """Number among the adjusted cameras; the capture's own is 0."""
-    views: CameraViews
-
-    def parent_from_camera(self, state: State) -> Float[ndarray, "4 4"]:
-        """Return base_from_camera of a fixed camera, else gripper_from_camera."""
-        if self.views.arm is None:
-            return state.z[0] @ scale_translation(state.world_from_rig[self.views.rig[0]], state.scale)
-        return state.x[self.views.arm] @ scale_translation(state.rig_from_camera[self.number], state.scale)
 
 
 @one_blas_thread
@@ -93,27 +78,33 @@ def place_cameras(
     for camera, image in steps(progress or silent, "other cameras", todo):
         pixels = read_image((camera.folder or capture.folder) / image)
         found[camera.name].append(localise(rigs.known, pixels, camera))
-    cameras, mounted = dict[str, CameraPlacement](), list[MountedCamera]()
+    cameras, mounted = dict[str, CameraPlacement](), list[CameraViews]()
     for camera in others:
-        views = CameraViews.of(camera, found[camera.name])
+        shared = list(enumerate(found[camera.name]))
+        views = CameraViews(
+            camera=camera,
+            points=[count for _, (_, count) in shared],
+            used={k: one for k, (one, _) in shared if one is not None},
+            reasons={k: f"shares {n} points with the mapped scene" for k, (one, n) in shared if one is None},
+        )
         moved = _moved(rigs, views) if camera.mount == "base" and len(views.used) > 1 else ()
         refused = any(one.severity == "rejects" for one in moved)
         views = views.refused(*moved) if refused else rigs.add(replace(views, findings=moved))
         if isinstance(views, CameraPlacement):
             cameras[camera.name] = views
         else:
-            mounted.append(MountedCamera(len(mounted) + 1, views))
+            mounted.append(replace(views, number=len(mounted) + 1))
     if not mounted:
         return CellPlacement(tuple(cameras.values()))
-    solution, faults = _examined(cell_images(rigs, [one.views for one in mounted]), mounted, hand_eye)
+    solution, faults = _examined(cell_images(rigs, mounted), mounted, hand_eye)
     for one, shown in zip(mounted, faults, strict=True):
-        cameras[one.views.camera.name] = _placement(one, solution, hand_eye, shown)
+        cameras[one.camera.name] = _placement(one, solution, hand_eye, shown)
     arms = []
     for k, arm in enumerate(rigs.arms, start=1):
         transform, covariance = solution.transform(lambda p, k=k: p.z[0] @ inverse(p.z[k]))
         uncertainty = TransformUncertainty.of(covariance)
         arms.append(ArmPlacement(name=arm, base_from_other_base=transform.tolist(), uncertainty=uncertainty))
-    poses = {one.views.camera.name: one.parent_from_camera for one in mounted}
+    poses = {one.camera.name: one.parent_from_camera for one in mounted}
     return CellPlacement(tuple(cameras[camera.name] for camera in others), tuple(arms), solution, poses)
 
 
@@ -126,8 +117,8 @@ def _moved(rigs: Rigs, views: CameraViews) -> tuple[Finding, ...]:
     alone = Rigs(rigs.case, rigs.known)
     alone.poses += list(views.places)
     own = len(rigs.known.recon_from_camera)
-    solution = cell_images(alone, [replace(views, rig=own + np.arange(len(views.used)))]).adjusted()
-    cameras = [MountedCamera(1, replace(views, rig=np.array([own + k]))) for k in range(len(views.used))]
+    solution = cell_images(alone, [replace(views, rig=own + np.arange(len(views.used)))]).solved()
+    cameras = [replace(views, rig=np.array([own + k])) for k in range(len(views.used))]
     places = [one.parent_from_camera(solution.state) for one in cameras]
     derivatives = [solution.derivative(one.parent_from_camera) for one in cameras]
     std, farthest, found = np.sqrt(np.diag(solution.transform(cameras[0].parent_from_camera)[1])), APART, ()
@@ -144,7 +135,7 @@ def _moved(rigs: Rigs, views: CameraViews) -> tuple[Finding, ...]:
 
 
 def _examined(
-    images: CellImages, mounted: Sequence[MountedCamera], hand_eye: Calibration
+    images: CellImages, mounted: Sequence[CameraViews], hand_eye: Calibration
 ) -> tuple[Solution, list[tuple[Finding, ...]]]:
     """Adjust all images, and test those of each camera (calibration/checks/effects.py).
 
@@ -152,11 +143,11 @@ def _examined(
     what it shows. The poses of the capture's own arm were tested with its own camera, those of another arm are with its
     camera.
     """
-    solution, found = images.adjusted(), list[tuple[Finding, ...]]()
+    solution, found = images.solved(), list[tuple[Finding, ...]]()
     for one in mounted:
-        prior, views = images.problem.cameras[one.number], one.views
+        prior = images.problem.cameras[one.number]
         # Exact, as of a camera that is compared with itself, or known to have moved.
-        if not len(prior.std) or any(fault.shift is not None for fault in views.findings):
+        if not len(prior.std) or any(fault.shift is not None for fault in one.findings):
             found.append(())
             continue
         placed = _placement(one, solution, hand_eye)
@@ -164,12 +155,12 @@ def _examined(
         state, faults = effects(
             CameraAdjustment(
                 adjusted=solution,
-                adjust=lambda prior, combinations, errors, images=images, one=one: images.adjusted(
-                    one.number, prior, combinations, one.views.arm, errors
-                ),
-                arm=views.arm or None,
-                names=views.names,
-                is_given=views.camera.intrinsics is not None,
+                adjust=lambda _, combinations, errors, images=images, one=one: images.with_freed(
+                    one.number, combinations, one.arm, errors
+                ).solved(),
+                arm=one.arm or None,
+                names=one.names,
+                is_given=one.camera.intrinsics is not None,
                 prior=prior,
                 std=np.sqrt(np.diag(placed.covariance)) * placed.converged,
                 camera=one.number,
@@ -177,8 +168,8 @@ def _examined(
             )
         )
         if state.found:
-            images = images.with_freed(one.number, prior, state.combinations)
-            solution = images.adjusted()
+            images = images.with_freed(one.number, state.combinations)
+            solution = images.solved()
             faults = tuple(
                 as_adopted(fault) if fault.kind.row.group == "camera" else fault for fault in faults
             )
@@ -187,13 +178,19 @@ def _examined(
 
 
 def _placement(
-    mounted: MountedCamera, solution: Solution, hand_eye: Calibration, faults: Sequence[Finding] = ()
+    views: CameraViews, solution: Solution, hand_eye: Calibration, faults: Sequence[Finding] = ()
 ) -> CameraPlacement:
     """Return the placement of a camera with its findings; the shifts of `faults` add to its covariance."""
-    views, c, problem = mounted.views, mounted.number, solution.problem
+    c, problem = views.number, solution.problem
     assert problem.observations is not None
-    transform, covariance = solution.transform(mounted.parent_from_camera)
-    covariance = covariance + _by_faults(solution, mounted, hand_eye)
+    transform, covariance = solution.transform(views.parent_from_camera)
+    # Faults of the own calibration, such as a slip, are the part of its covariance beside images and robot, and move
+    # everything that varies with it.
+    own = solution.covariance[:7, :7]
+    follows = solution.derivative(views.parent_from_camera) @ np.linalg.solve(own, solution.covariance[:7]).T
+    covariance = (
+        covariance + follows @ positive_part(hand_eye.covariance - own, hand_eye.covariance) @ follows.T
+    )
     covariance = covariance + sum(fault.covariance[:6, :6] for fault in views.findings)
     of_all = median_reprojection_px(problem, solution.images.view)
     px = dict(zip(views.used, of_all[problem.observations.camera == c].tolist(), strict=True))
@@ -212,7 +209,10 @@ def _placement(
     else:
         findings += _uncertain(views.camera, covariance, float(std[0]) / intrinsics.fx)
     used = list(views.used.values())
-    if (widest := max(map(_spread, used))) < LEAST_SPREAD:
+    # Share of the image's area that the standard deviations of the points span.
+    sides = [4 * np.sqrt(np.linalg.eigvalsh(np.cov(one.x_px.T))) for one in used]
+    widest = max(float(side.prod()) for side in sides) / float(np.prod(views.camera.image_size))
+    if widest < LEAST_SPREAD:
         findings.append(Finding.of(FindingKind.POINTS_CROWDED, "warns", "images", value=widest))
     away = float(np.linalg.norm(transform[:3, 3]))
     if views.camera.mount == "gripper" and away > FAR_FROM_GRIPPER:
@@ -246,23 +246,3 @@ def _uncertain(
     if camera.intrinsics is not None:
         return [Finding.of(FindingKind.PLACE_UNCERTAIN, "rejects", "images", **size)]
     return [Finding.of(FindingKind.PLACE_UNCERTAIN, "rejects", "intrinsics", **size, focal_std=focal_std)]
-
-
-def _spread(found: Registration) -> float:
-    """Return the share of the image's area that the standard deviations of its points span."""
-    sides = 4 * np.sqrt(np.linalg.eigvalsh(np.cov(found.x_px.T)))
-    return float(sides.prod() / (found.pose.camera.width * found.pose.camera.height))
-
-
-def _by_faults(solution: Solution, mounted: MountedCamera, hand_eye: Calibration) -> Float[ndarray, "6 6"]:
-    """Return the covariance that faults of the capture's own calibration, such as a slip, add to a further camera.
-
-    The part of its covariance beside images and robot moves everything that varies with it.
-    """
-    size = np.sqrt(np.diag(hand_eye.covariance))
-    more = (hand_eye.covariance - solution.covariance[:7, :7]) / np.outer(size, size)
-    values, vectors = np.linalg.eigh(more)
-    root = size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-    derivative = solution.derivative(mounted.parent_from_camera)
-    follows = derivative @ np.linalg.solve(solution.covariance[:7, :7], solution.covariance[:7]).T
-    return follows @ root @ root.T @ follows.T

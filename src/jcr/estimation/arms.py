@@ -5,11 +5,12 @@ from dataclasses import replace
 from typing import Literal, get_args
 
 import numpy as np
-from numpy import pi
+from jaxtyping import Float
+from numpy import ndarray, pi
 from scipy.spatial.transform import Rotation
 
 from jcr.errors import InputError
-from jcr.estimation.kinematics import Arm, from_dh
+from jcr.estimation.kinematics import Arm
 from jcr.geometry import Transform, transform
 
 Limits = Sequence[tuple[float, float]]
@@ -18,27 +19,50 @@ TWICE = (-2 * pi, 2 * pi)
 """A full rotation either way."""
 
 
-def _shifted(x: float, y: float, z: float) -> Transform:
-    return transform(np.eye(3), np.array([x, y, z]))
+def _arm(
+    name: str,
+    origins: Float[ndarray, "n 6"] | str,
+    limits: Limits,
+    rest: Sequence[float],
+    last_from_gripper: Transform | None = None,
+) -> Arm:
+    """Return an arm whose joints rotate about z, from the frame of each joint in that of the joint before it.
+
+    Each row is x, y, z (m), roll, pitch, yaw (degrees), as the `origin` of a URDF. A further row is the gripper's frame,
+    unless `last_from_gripper` is given.
+    """
+    rows = np.array(origins.split() if isinstance(origins, str) else origins, float).reshape(-1, 6)
+    frames = transform(Rotation.from_euler("xyz", rows[:, 3:], degrees=True).as_matrix(), rows[:, :3])
+    return Arm(
+        name=name,
+        parent_from_joint=frames[: len(limits)],
+        axes=np.tile([0.0, 0.0, 1.0], (len(limits), 1)),
+        last_from_gripper=frames[-1] if last_from_gripper is None else last_from_gripper,
+        limits=np.array(limits, float),
+        rest=np.array(rest, float),
+    )
 
 
-def _dh(a: Numbers, d: Numbers, alpha_deg: Numbers) -> list[tuple[float, float, float, float]]:
-    """Return rows of `from_dh`, without offsets of the joints' zeros."""
-    columns = zip(a, d, np.radians(alpha_deg), strict=True)
-    return [(float(a), float(d), float(alpha), 0.0) for a, d, alpha in columns]
+def _dh(a: Numbers, d: Numbers, alpha_deg: Numbers) -> Float[ndarray, "n 6"]:
+    """Return rows of `_arm` from a, d and α of each link, the base first; a standard table has zeros there.
+
+    Of a modified table (Craig) d is one row later than a and α.
+    """
+    none = np.zeros(len(a))
+    return np.stack([a, none, d, alpha_deg, none, none], axis=1)
 
 
 def _ur(name: str, d1: float, a2: float, a3: float, d4: float, d5: float, d6: float) -> Arm:
-    """Return an arm of the Universal Robots e-Series, by standard parameters.
+    """Return an arm of the Universal Robots e-Series, by standard Denavit-Hartenberg parameters.
 
     Source: Universal Robots, "DH Parameters for calculations of kinematics and dynamics"; the same numbers are in
     ur_description/config/*/default_kinematics.yaml of ros-industrial/universal_robot. The base is that of the
     controller, rotated by 180° about z from base_link of ROS; the gripper is tool0. Limits: joint_limits.yaml.
     """
-    rows = _dh((0, a2, a3, 0, 0, 0), (d1, 0, 0, d4, d5, d6), (90, 0, 0, 90, -90, 0))
+    rows = _dh((0, 0, a2, a3, 0, 0, 0), (0, d1, 0, 0, d4, d5, d6), (0, 90, 0, 0, 90, -90, 0))
     # At zero the arm reaches along -x of the controller's base; the table is at +x.
     rest = (pi, -1.6, 1.9, -1.9, -pi / 2, 0.0)
-    return from_dh(name, rows, [TWICE, TWICE, (-pi, pi), TWICE, TWICE, TWICE], rest, modified=False)
+    return _arm(name, rows, [TWICE, TWICE, (-pi, pi), TWICE, TWICE, TWICE], rest)
 
 
 def _franka(name: str, limits: Limits) -> Arm:
@@ -47,11 +71,9 @@ def _franka(name: str, limits: Limits) -> Arm:
     Source: Franka Control Interface documentation, "Robot and interface specifications"; robots/fer/kinematics.yaml
     and robots/fr3/joint_limits.yaml of frankaemika/franka_description.
     """
-    a, d = (0, 0, 0, 0.0825, -0.0825, 0, 0.088), (0.333, 0, 0.316, 0, 0.384, 0, 0)
-    rows = _dh(a, d, (0, -90, 90, 90, -90, 90, 90))
-    rest = (0.0, -pi / 4, 0.0, -3 * pi / 4, 0.0, pi / 2, pi / 4)
-    flange = _shifted(0.0, 0.0, 0.107)
-    return from_dh(name, rows, limits, rest, modified=True, last_from_gripper=flange)
+    a, d = (0, 0, 0, 0.0825, -0.0825, 0, 0.088, 0), (0, 0.333, 0, 0.316, 0, 0.384, 0, 0.107)
+    rows = _dh(a, d, (0, -90, 90, 90, -90, 90, 90, 0))
+    return _arm(name, rows, limits, (0.0, -pi / 4, 0.0, -3 * pi / 4, 0.0, pi / 2, pi / 4))
 
 
 def _iiwa(name: str, base: float, upper: float, forearm: float) -> Arm:
@@ -60,9 +82,9 @@ def _iiwa(name: str, base: float, upper: float, forearm: float) -> Arm:
     Source: KUKA, "LBR iiwa: Specification" (lengths and limits); iiwa_description/urdf/iiwa7.xacro and iiwa14.xacro of
     IFL-CAMP/iiwa_stack (signs and the 126 mm from wrist to flange).
     """
-    rows = _dh([0] * 7, (base, 0, upper, 0, forearm, 0, 0.126), (-90, 90, 90, -90, -90, 90, 0))
+    d, alpha = (0, base, 0, upper, 0, forearm, 0, 0.126), (0, -90, 90, 90, -90, -90, 90, 0)
     limits = [(-limit, limit) for limit in np.radians([170, 120, 170, 120, 170, 120, 175])]
-    return from_dh(name, rows, limits, (0.0, 0.4, 0.0, -1.6, 0.0, 1.1, 0.0), modified=False)
+    return _arm(name, _dh([0] * 8, d, alpha), limits, (0.0, 0.4, 0.0, -1.6, 0.0, 1.1, 0.0))
 
 
 # Source of the xArms: xarm_description/config/kinematics/default/*.yaml and urdf/*/*.urdf.xacro of
@@ -73,7 +95,8 @@ XARM6 = """
 0.0535 -0.2845 0 0 0 0
 0.0775 0.3425 0 -90 0 0
 0 0 0 90 0 0
-0.076 0.097 0 -90 0 0"""
+0.076 0.097 0 -90 0 0
+0 0 0 0 0 0"""
 XARM7 = """
 0 0 0.267 0 0 0
 0 0 0 -90 0 0
@@ -81,7 +104,8 @@ XARM7 = """
 0.0525 0 0 90 0 0
 0.0775 -0.3425 0 90 0 0
 0 0 0 90 0 0
-0.076 0.097 0 -90 0 0"""
+0.076 0.097 0 -90 0 0
+0 0 0 0 0 0"""
 
 
 Z1 = """
@@ -90,7 +114,8 @@ Z1 = """
 -0.35 0 0 0 0 0
 0.218 0 0.057 0 0 0
 0.07 0 0 0 0 0
-0.0492 0 0 0 0 0"""
+0.0492 0 0 0 0 0
+0.051 0 0 0 0 0"""
 
 
 def _z1() -> Arm:
@@ -100,7 +125,7 @@ def _z1() -> Arm:
     """
     degrees = ((-150, 150), (0, 170), (-165, 0), (-87, 87), (-77, 77), (-160, 160))
     limits = [(float(np.radians(low)), float(np.radians(high))) for low, high in degrees]
-    arm = _from_origins("z1", Z1, _shifted(0.051, 0.0, 0.0), limits, (0.0, 1.6, -1.2, 0.9, 0.0, 0.0))
+    arm = _arm("z1", Z1, limits, (0.0, 1.6, -1.2, 0.9, 0.0, 0.0))
     return replace(arm, axes=np.eye(3)[[2, 1, 1, 1, 2, 0]], forward=np.array([1.0, 0.0, 0.0]))
 
 
@@ -119,26 +144,7 @@ def _so101() -> Arm:
     """
     tip = transform(np.diag([-1.0, 1.0, -1.0]), np.array([-0.0079, -0.000218121, -0.0981274]))
     ends = ((-1.91986, 1.91986), (-1.74533, 1.74533), (-1.69, 1.69), (-1.65806, 1.65806), (-2.74385, 2.84121))
-    return _from_origins("so101", SO101, tip, ends, (0.0, -0.8, 0.5, 1.25, 0.0))
-
-
-def _from_origins(
-    name: str, origins: str, last_from_gripper: Transform, limits: Limits, rest: Sequence[float]
-) -> Arm:
-    """Return an arm whose joints rotate about z, from the `origin` of each joint of its URDF.
-
-    Each row is x, y, z (m), roll, pitch, yaw (degrees).
-    """
-    rows = np.array(origins.split(), float).reshape(-1, 6)
-    rotation = Rotation.from_euler("xyz", rows[:, 3:], degrees=True).as_matrix()
-    return Arm(
-        name=name,
-        parent_from_joint=transform(rotation, rows[:, :3]),
-        axes=np.tile([0.0, 0.0, 1.0], (len(rows), 1)),
-        last_from_gripper=last_from_gripper,
-        limits=np.array(limits),
-        rest=np.array(rest),
-    )
+    return _arm("so101", SO101, ends, (0.0, -0.8, 0.5, 1.25, 0.0), tip)
 
 
 RobotName = Literal[
@@ -161,8 +167,8 @@ _ARMS: dict[RobotName, Callable[[], Arm]] = {
     "fr3": lambda: _franka("fr3", _FR3),
     "iiwa7": lambda: _iiwa("iiwa7", 0.34, 0.4, 0.4),
     "iiwa14": lambda: _iiwa("iiwa14", 0.36, 0.42, 0.4),
-    "xarm6": lambda: _from_origins("xarm6", XARM6, np.eye(4), _XARM6, (0.0, -0.3, -0.9, 0.0, 1.2, 0.0)),
-    "xarm7": lambda: _from_origins("xarm7", XARM7, np.eye(4), _XARM7, (0.0, -0.3, 0.0, 0.9, 0.0, 1.2, 0.0)),
+    "xarm6": lambda: _arm("xarm6", XARM6, _XARM6, (0.0, -0.3, -0.9, 0.0, 1.2, 0.0)),
+    "xarm7": lambda: _arm("xarm7", XARM7, _XARM7, (0.0, -0.3, 0.0, 0.9, 0.0, 1.2, 0.0)),
     "z1": _z1,
     "so101": _so101,
 }

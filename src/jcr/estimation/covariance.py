@@ -5,7 +5,6 @@ covariance. The covariance is therefore scaled until its 99 % ellipsoid holds 99
 standard deviations off is the worst fault.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -22,9 +21,7 @@ from jcr.estimation.robot_noise import (
     Information,
     LinearSolution,
     LogSizes,
-    Weighed,
     over_sizes,
-    score,
     solve_equations,
 )
 from jcr.records import Budget, RobotNoise
@@ -38,48 +35,31 @@ Square = Float[ndarray, "p p"]
 Stack = Float[ndarray, "*k p p"]
 
 
-Posterior = tuple[Float[ndarray, " p"], Square, Budget]
-"""Step of the unknowns averaged over the sizes of the errors, their covariance, and its causes."""
-
-
 def posterior(
-    equations: Equations, log_sizes: LogSizes, information: Information, region: Region
-) -> Posterior:
-    """Return the unknowns averaged over the sizes about their mode, for other poses of the region."""
-    found = over_sizes(equations, log_sizes, information)
-    return _averaged(equations, log_sizes, found, lambda one, at: _elsewhere(equations, one, at, region))
+    equations: Equations,
+    mode: LogSizes,
+    information: Information,
+    region: Region,
+    expected: bool = False,
+) -> tuple[Float[ndarray, " p"], Square, Budget]:
+    """Return the step of the unknowns averaged over the sizes about their mode, their covariance, and its causes.
 
-
-def expected_posterior(equations: Equations, noise: RobotNoise, region: Region) -> Posterior:
-    """Return the posterior to expect for a robot with this noise; the residuals of `equations` are 0.
-
-    In the density of the sizes the squares of residuals are replaced by their expectations, tr(P V) for the covariance
-    V of the noise.
+    The covariance is for other poses of the region. `expected`: the residuals of the equations are 0, and their squares
+    are replaced by their expectations, tr(P V) for the covariance V of the noise at the mode.
     """
-    mode = equations.log_sizes_of(noise)
     root = cholesky(equations.covariance(mode))
 
     def density(solution: LinearSolution) -> Each:
+        if not expected:
+            return solution.log_posterior
         whitened, fitted = _whitened_and_fitted(solution, root)
         return solution.log_posterior - ((whitened**2).sum((-1, -2)) - (fitted**2).sum((-1, -2))) / 2
 
-    found = over_sizes(equations, mode, score(equations, mode)[2], density)
-    return _averaged(equations, mode, found, lambda _, sizes: _expected_elsewhere(equations, sizes, region))
+    def elsewhere(solution: LinearSolution, sizes: LogSizes) -> Stack:
+        part = equations.variances(sizes)[..., 2, None, None] * equations.systematic
+        return region.spread(_blocks_of_poses(part) if expected else _second_moment(solution, part))
 
-
-def expected_covariance_at(equations: Equations, noise: RobotNoise, region: Region) -> Square:
-    """Return the expected covariance where the sizes are known exactly, for comparisons."""
-    mode = equations.log_sizes_of(noise)
-    return solve_equations(equations, mode).covariance + _expected_elsewhere(equations, mode, region)
-
-
-def _averaged(
-    equations: Equations,
-    mode: Float[ndarray, " c"],
-    found: Weighed,
-    elsewhere: Callable[[LinearSolution, LogSizes], Stack],
-) -> Posterior:
-    """Return the mixture of the solutions `found` with their weights, each widened by `elsewhere`."""
+    found = over_sizes(equations, mode, information, density)
     groups = [(share, one.step, one.covariance + elsewhere(one, sizes)) for share, sizes, one in found]
     weight, steps, each = (np.concatenate(part) for part in zip(*groups, strict=True))
     step = weight @ steps
@@ -91,22 +71,22 @@ def _averaged(
     return step, covariance, _budget(equations, mode, at_mode, covariance)
 
 
-def _elsewhere(equations: Equations, solution: LinearSolution, log_sizes: LogSizes, region: Region) -> Stack:
-    """Return the covariance that systematic errors add because the result holds for the region, not for its poses."""
-    part = equations.variances(log_sizes)[..., 2, None, None] * equations.systematic
+def expected_covariance_at(equations: Equations, noise: RobotNoise, region: Region) -> Square:
+    """Return the expected covariance where the sizes are known exactly, for comparisons."""
+    mode = equations.log_sizes_of(noise)
+    part = equations.variances(mode)[2] * equations.systematic
+    return solve_equations(equations, mode).covariance + region.spread(_blocks_of_poses(part))
+
+
+def _second_moment(solution: LinearSolution, part: Float[ndarray, "*k s s"]) -> Float[ndarray, "*k m 6 6"]:
+    """Return the second moment of each pose's systematic errors, of prior covariance `part`, given the residuals."""
     expected = (part @ solution.weighed_left[..., None])[..., 0]
     own = _blocks_of_poses(part)
     for sign, root in zip((-1, 1), _whitened_and_fitted(solution, part), strict=True):
         columns = np.moveaxis(root.reshape(*root.shape[:-1], -1, 6), -2, -3)
         own = own + sign * np.swapaxes(columns, -1, -2) @ columns
     expected = expected.reshape(*expected.shape[:-1], -1, 6)
-    return region.spread(own + expected[..., :, None] * expected[..., None, :])
-
-
-def _expected_elsewhere(equations: Equations, log_sizes: LogSizes, region: Region) -> Stack:
-    """Return `_elsewhere` before there are residuals, with systematic errors as large as expected."""
-    size = equations.variances(log_sizes)[..., 2, None, None, None]
-    return region.spread(size * _blocks_of_poses(equations.systematic))
+    return own + expected[..., :, None] * expected[..., None, :]
 
 
 def _whitened_and_fitted(
@@ -183,14 +163,17 @@ def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covari
     to_whole = _between(sum(parts[1:], parts[0]), whole)
     random, systematic, intrinsics, _ = (to_whole @ part @ to_whole.T for part in parts)
     images = whole - random - systematic - intrinsics
-    parts = [_positive((part + part.T) / 2) for part in (random, systematic, intrinsics, images)]
+    parts = [positive_part((part + part.T) / 2) for part in (random, systematic, intrinsics, images)]
     names = "robot_random", "robot_systematic", "intrinsics", "images"
     return Budget(**dict(zip(names, parts, strict=True)), faults=np.zeros((7, 7)))
 
 
-def _positive(part: Square) -> Square:
-    """Return a symmetric part of a covariance without the negative rounding that degenerate motions leave."""
-    std = np.sqrt(np.maximum(np.diag(part), 0.0))
+def positive_part(part: Square, whole: Square | None = None) -> Square:
+    """Return a symmetric part of a covariance without the negative rounding that degenerate motions leave.
+
+    Lengths are counted in the standard deviations of the `whole`; None: of the part.
+    """
+    std = np.sqrt(np.maximum(np.diag(part if whole is None else whole), 0.0))
     values, vectors = np.linalg.eigh(part / np.outer(*[np.where(std > 0, std, np.inf)] * 2))
     return (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(std, std)
 

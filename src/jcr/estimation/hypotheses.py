@@ -5,22 +5,32 @@ effect inside and absorb part of it. The confirmation estimates the sizes again 
 tests over them (Seber and Lee, Linear Regression Analysis, 2003, chapter 4).
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from jcr.camera import parameter_names
 from jcr.distributions import f as f_distribution
 from jcr.estimation.elimination import cholesky, over
 from jcr.estimation.image_equations import ImageEvidence, image_evidence
-from jcr.estimation.intrinsics_prior import CameraPrior
 from jcr.estimation.kinematics import Arm, Joints, error_jacobian
 from jcr.estimation.pose_equations import PoseEquations, pose_by_pose, pose_equations, reported_poses
-from jcr.estimation.problem import OF_IMAGE, PRISM, UNKNOWNS, Problem, Start, State, pose_problem, with_free
+from jcr.estimation.problem import (
+    OF_IMAGE,
+    PRISM,
+    UNKNOWNS,
+    Start,
+    State,
+    pose_problem,
+    rows_of,
+    spanned,
+    with_free,
+)
 from jcr.estimation.robot_noise import (
     Equations,
     LogSizes,
@@ -99,11 +109,8 @@ class Test:
 def rank(equations: Equations, log_sizes: LogSizes, every: Sequence[Float[ndarray, "s _"]]) -> list[float]:
     """Return the gain of the score test for each set of columns A: gᵀS⁻¹g, g = Aᵀ V⁻¹(r + Jθ), S = Aᵀ P A."""
     solution = solve_equations(equations, log_sizes)
-    projection, gains = solution.projection, list[float]()
-    for columns in every:
-        pull = columns.T @ solution.weighed_left
-        gains.append(float(pull @ np.linalg.lstsq(columns.T @ projection @ columns, pull, rcond=1e-9)[0]))
-    return gains
+    projection, left = solution.projection, solution.weighed_left
+    return [float(left @ a @ np.linalg.lstsq(a.T @ projection @ a, a.T @ left, rcond=1e-9)[0]) for a in every]
 
 
 def best_tests(equations: Equations, log_sizes: LogSizes, rows: Sequence[Row]) -> list[Test]:
@@ -111,18 +118,17 @@ def best_tests(equations: Equations, log_sizes: LogSizes, rows: Sequence[Row]) -
 
     The probability of a kind is multiplied by the number of its rows, the places that were searched.
     """
-    if not rows:
-        return []
     # The penalty d · log(s) of Schwarz (1978).
     penalty = [np.log(len(equations.residual)) * row.columns.shape[1] for row in rows]
     gain = np.subtract(rank(equations, log_sizes, [row.columns for row in rows]), penalty)
     best: dict[FindingKind, int] = {}
     for k in np.argsort(-gain).tolist():
         best.setdefault(rows[k].kind, k)
-    chosen = list(best.values())[:CONFIRMED_AT_MOST]
-    places = {kind: sum(row.kind is kind for row in rows) for kind in best}
-    tests = (confirm(equations, rows[k], places[rows[k].kind]) for k in chosen)
-    return sorted(tests, key=lambda test: test.log_p)
+    places = Counter(row.kind for row in rows)
+    chosen = list(best.items())[:CONFIRMED_AT_MOST]
+    return sorted(
+        (confirm(equations, rows[k], places[kind]) for kind, k in chosen), key=lambda one: one.log_p
+    )
 
 
 def confirm(equations: Equations, row: Row, places: int = 1, freedom: float | None = None) -> Test:
@@ -255,23 +261,21 @@ def joint_offsets(poses: PoseEquations, arm: Arm, joints: Joints) -> JointOffset
     return JointOffsets(offset, size * np.sqrt(np.maximum(1 - size**2 * known, 0.0)), size)
 
 
-WEAK = 0.3, 0.3, 0.2, 0.2
-"""Standard deviations that only keep finite what the images cannot see: focal lengths relative, centre per width."""
-WEAK_DISTORTION, WEAK_PRISM, WEAK_OF_IMAGE = 1.0, 0.3, (0.05, 0.3, 0.1, 0.1)
-"""Standard deviations of the distortion, of a thin prism, and of the nuisances of each image."""
 OfImage = Literal["focal", "shear", "x", "y"]
-"""Nuisance of each image, in the order of the rows of `Problem.nuisance_directions`."""
+"""Parameter of each image, in the order of the rows of `Problem.directions`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Alternatives:
     """Equations of every column that may be freed, with the adjusted unknowns eliminated.
 
-    The columns are the parameters of one camera in `units`, then the nuisances of its images.
+    The columns are the parameters of one camera in `units`, then those of its images and the prism.
     """
 
     hessian: Float[ndarray, "e e"]
     right: Float[ndarray, " e"]
+    total: Float[ndarray, " e"]
+    """Displacement of the columns by what is free beside the prior of the camera."""
     place_by_column: Float[ndarray, "6 e"]
     """Derivative of the camera's pose by each column."""
     images: int
@@ -299,10 +303,10 @@ class Alternatives:
         """Return the combinations that are these parameters of the camera."""
         return np.eye(self.columns)[:, [self.names.index(name) for name in names]]
 
-    def of_images(self, nuisance: OfImage, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
-        """Return the combinations that move a nuisance of each image by its share."""
+    def of_images(self, parameter: OfImage, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
+        """Return the combinations that move a parameter of each image by its share."""
         out = np.zeros((self.columns, shares.shape[1]))
-        first = len(self.names) + get_args(OfImage).index(nuisance) * self.images
+        first = len(self.names) + get_args(OfImage).index(parameter) * self.images
         out[first : first + self.images] = shares
         return out
 
@@ -326,32 +330,50 @@ def first_x(state: State) -> Transform:
 
 def alternatives(
     solution: Solution,
-    prior: CameraPrior,
     camera: int = 0,
     place: Callable[[State], Transform] = first_x,
     model_error_std: float | None = None,
 ) -> Alternatives:
-    """Return the columns and equations of one camera about a solution.
+    """Return the columns and equations of one camera about a solution; what was freed of it is among the columns.
 
-    `prior` is the prior of its intrinsics; directions that were freed beside it are among the columns. `place`
-    returns the pose of the camera on its parent. `model_error_std` is the size of the remaining distortion of the
-    cameras' models, in widths of the image; None: as estimated.
+    `place` returns the pose of the camera on its parent. `model_error_std` is the size of the remaining distortion of
+    the cameras' models, in widths of the image; None: as estimated.
     """
-    problem, own = solution.problem, len(prior.std)
-    assert problem.observations is not None
-    mine = np.flatnonzero(problem.observations.camera == camera)
-    wider = _with_all_free(solution, prior, camera, mine, model_error_std)
+    problem, images = solution.problem, solution.images
+    state, observations = images.state, problem.observations
+    assert observations is not None
+    mine = np.flatnonzero(observations.camera == camera)
+    rows, units, weak = rows_of(problem, camera, mine, problem.n_images)
+    # The columns take the place of what was freed of this camera.
+    own = len(problem.directions.T) - len(problem.freed_std)
+    before, steps = problem.directions[:, own:], state.camera_steps[own : problem.columns.cameras.stop]
+    others, each = ~before[rows].any(0), np.zeros((len(before), len(rows)))
+    each[rows] = np.diag(units)
+    total, names = before[rows] @ steps / units, parameter_names(problem.cameras[camera].intrinsics)
+    first = own + int(others.sum())
+    sizes = state.model_error_std
+    wider = image_evidence(
+        with_free(
+            problem,
+            freed=np.concatenate([before[:, others], each], axis=1),
+            freed_std=np.r_[problem.freed_std[others], weak],
+        ),
+        replace(
+            state,
+            camera_steps=np.r_[
+                state.camera_steps[:own], steps[others], total, state.camera_steps[own + len(steps) :]
+            ],
+            model_error_std=sizes if model_error_std is None else np.full_like(sizes, model_error_std),
+        ),
+    )
     # The arms are at the most likely state, the images where the evidence is.
-    at, likely = wider.state, solution.most_likely
-    equations = pose_equations(
-        wider.problem, replace(at, x=likely.x, scale=likely.scale, z=likely.z), wider
-    ).equations
+    at, likely, begin = wider.state, solution.most_likely, problem.arm_unknowns
+    at = replace(at, x=likely.x, scale=likely.scale, z=likely.z)
+    equations = pose_equations(wider.problem, at, wider).equations
     found = solve_equations(equations, solution.log_sizes)
     hessian = equations.jacobian.T @ found.weighed + equations.prior_information
     right = -(found.weighed.T @ equations.residual + equations.prior_gradient)
-    begin, columns = problem.arm_unknowns, wider.problem.columns
-    of_camera, of_images = columns.intrinsics[camera], columns.nuisance
-    rest = begin + np.r_[of_camera.start + own : of_camera.stop, of_images]
+    rest = begin + first + np.arange(len(rows))
     kept = np.setdiff1d(np.arange(len(hessian)), rest)
     coupling = hessian[np.ix_(kept, rest)]
     by_column = over(cholesky(hessian[np.ix_(kept, kept)]), coupling)
@@ -361,92 +383,35 @@ def alternatives(
     by_kept = np.zeros((6, len(hessian)))
     by_kept[:, :begin] = derivative[:, :begin]
     by_kept[:, len(hessian) - after :] = derivative[:, derivative.shape[1] - after :]
-    # Dispersion of the weighted residuals, at least that of their sums over cells of the images, which are clusters in
-    # the sense of Liang and Zeger (Biometrika 73, 1986).
-    images, weight = solution.images, solution.images.weight
-    pull = weight[:, None] * images.view.residual_px
-    taken = 3 * len(images.state.points_in_world) + 6 * len(problem.seen.rows)
-    expected = 2 * weight.sum() * max(1 - taken / (2 * len(weight)), 0.1)
-    start = problem.intrinsics(images.state)[camera]
-    now, rig = solution.state, problem.observations.rig[mine]
+    now, rig, image = solution.state, observations.rig[mine], observations.image
     # An image without points is as far away as the others.
-    depth, image = wider.view.depth, problem.observations.image
+    depth = wider.view.depth
     distance = np.array([np.median(depth[image == k]) if (image == k).any() else np.nan for k in mine])
     return Alternatives(
         hessian=hessian[np.ix_(rest, rest)] - coupling.T @ by_column,
         right=right[rest] - by_column.T @ right[kept],
+        total=total,
         place_by_column=-by_kept[:, kept] @ by_column,
         images=len(mine),
         freedom=max(len(equations.residual) - begin, 1),
-        dispersion=max(float((pull**2).sum()), problem.layout.squares_of_cells(pull)) / expected,
-        names=parameter_names(start),
-        units=parameter_units(start)[0],
+        dispersion=_dispersion(images),
+        names=names,
+        units=units[: len(names)],
         distance=np.where(np.isfinite(distance), distance, np.nanmedian(distance)),
         down_in_camera=-(now.z[0] @ now.world_from_rig[rig] @ now.rig_from_camera[camera])[:, 2, :3],
     )
 
 
-def nuisances_of(images: Int[ndarray, " m"], count: int) -> Int[ndarray, " r"]:
-    """Return the rows of these images among the nuisances of `count` images, and of what all share."""
-    return np.r_[(count * np.arange(OF_IMAGE)[:, None] + images).ravel(), OF_IMAGE * count + np.arange(PRISM)]
+def _dispersion(images: ImageEvidence) -> float:
+    """Return the dispersion of the weighted residuals, at least that of their sums over cells of the images.
 
-
-def _with_all_free(
-    solution: Solution,
-    prior: CameraPrior,
-    camera: int,
-    images: Int[ndarray, " m"],
-    model_error_std: float | None,
-) -> ImageEvidence:
-    """Return the evidence of the images where every parameter of a camera and of its images is free."""
-    problem, state, own = solution.problem, solution.images.state, len(prior.std)
-    start = problem.intrinsics(state)[camera]
-    units, weak = parameter_units(start)
-    wider = replace(
-        prior,
-        directions=np.column_stack([prior.directions, np.diag(units)]),
-        std=np.r_[prior.std, weak],
-    )
-    rows = nuisances_of(images, problem.n_images)
-    all_free = with_free(
-        problem,
-        cameras=with_camera(problem, wider, camera).cameras,
-        nuisance_directions=np.eye(len(problem.nuisance_directions))[:, rows],
-        nuisance_std=_weak_nuisances(len(images)),
-    )
-    steps, columns = state.camera_steps, problem.columns
-    mine = columns.intrinsics[camera]
-    wider_steps = np.r_[
-        steps[: mine.start + own],
-        beyond_prior(solution, prior, camera) / units,
-        steps[mine.stop : columns.nuisance.start],
-        problem.nuisances(state)[rows],
-        steps[columns.nuisance.stop :],
-    ]
-    sizes = state.model_error_std
-    sizes = sizes if model_error_std is None else np.full_like(sizes, model_error_std)
-    return image_evidence(all_free, replace(state, camera_steps=wider_steps, model_error_std=sizes))
-
-
-def with_camera(problem: Problem, prior: CameraPrior, camera: int = 0) -> Problem:
-    """Return the problem with another prior of a camera's intrinsics."""
-    cameras = problem.cameras
-    prior = replace(prior, mount_free=cameras[camera].mount_free)
-    return replace(problem, cameras=(*cameras[:camera], prior, *cameras[camera + 1 :]))
-
-
-def beyond_prior(solution: Solution, prior: CameraPrior, camera: int = 0) -> Float[ndarray, " q"]:
-    """Return the displacement of a camera's parameters along directions that were freed beside its prior."""
-    problem, own = solution.problem, len(prior.std)
-    steps = solution.images.state.camera_steps[problem.columns.intrinsics[camera]]
-    return problem.cameras[camera].directions[:, own:] @ steps[own:]
-
-
-def parameter_units(camera: Intrinsics) -> tuple[Float[ndarray, " q"], Float[ndarray, " q"]]:
-    """Return the units of the parameters, focal lengths and widths for the centre, and weak priors' std in these."""
-    more = len(parameter_names(camera)) - 4
-    units = np.r_[camera.fx, camera.fy, camera.width, camera.width, np.ones(more)]
-    return units, np.r_[WEAK, np.full(more, WEAK_DISTORTION)]
+    Cells are clusters in the sense of Liang and Zeger (Biometrika 73, 1986).
+    """
+    problem, weight = images.problem, images.weight
+    pull = weight[:, None] * images.view.residual_px
+    taken = 3 * len(images.state.points_in_world) + 6 * len(problem.seen.rows)
+    expected = 2 * weight.sum() * max(1 - taken / (2 * len(weight)), 0.1)
+    return max(float((pull**2).sum()), problem.layout.squares_of_cells(pull)) / expected
 
 
 def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
@@ -461,48 +426,6 @@ def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
 def differences(count: int) -> Float[ndarray, "n d"]:
     """Return an orthonormal basis of the zero-sum vectors of length n, shape (n, n - 1)."""
     return np.linalg.svd(np.eye(count) - 1 / count)[0][:, : count - 1]
-
-
-def freed(
-    problem: Problem,
-    combinations: Float[ndarray, "e p"],
-    images: Int[ndarray, " m"],
-    n_images: int,
-    camera: int = 0,
-) -> Problem:
-    """Return the problem with combinations of the columns of one camera's `Alternatives` free, too.
-
-    Parameters of the camera and of its `images`, of `n_images`, are freed each by themselves.
-    """
-    own = problem.cameras[camera]
-    q = len(parameter_names(own.intrinsics))
-    of_camera, of_images = spanned(combinations[:q]), spanned(combinations[q:])
-    units, weak = parameter_units(own.intrinsics)
-    wider = replace(
-        own,
-        directions=np.column_stack([own.directions, units[:, None] * of_camera]),
-        std=np.r_[own.std, _std(of_camera, weak)],
-    )
-    directions = np.zeros((OF_IMAGE * n_images + PRISM, of_images.shape[1]))
-    directions[nuisances_of(images, n_images)] = of_images
-    std = _std(of_images, _weak_nuisances(len(images)))
-    return replace(with_camera(problem, wider, camera), nuisance_directions=directions, nuisance_std=std)
-
-
-def _weak_nuisances(images: int) -> Float[ndarray, " r"]:
-    """Return standard deviations of nuisances that only keep unobservable ones finite."""
-    return np.r_[np.repeat(WEAK_OF_IMAGE, images), np.full(PRISM, WEAK_PRISM)]
-
-
-def _std(combinations: Float[ndarray, "n p"], of_each: Float[ndarray, " n"]) -> Float[ndarray, " p"]:
-    """Return the standard deviations of combinations of parameters with these standard deviations."""
-    return 1 / np.sqrt(((combinations / of_each[:, None]) ** 2).sum(0))
-
-
-def spanned(combinations: Float[ndarray, "e p"]) -> Float[ndarray, "e r"]:
-    """Return an orthonormal basis of the space of the combinations."""
-    u, size, _ = np.linalg.svd(combinations, full_matrices=False)
-    return u[:, size > 1e-9 * size.max(initial=1e-300)]
 
 
 def test_combinations(

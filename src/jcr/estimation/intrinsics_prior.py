@@ -1,16 +1,16 @@
 """Prior distribution of a camera's intrinsics, and of the error that its model leaves beside them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy import ndarray
 from numpy.polynomial.legendre import legvander2d
 
 from jcr.camera import by_parameters, parameter_names, unproject
 from jcr.geometry import Transform
-from jcr.records import Intrinsics, ModelError
+from jcr.records import COVARIANCE_ORDER, Intrinsics, JointCovariance, ModelError
 
 MEASURED = {
     "f": 5e-3,
@@ -119,8 +119,8 @@ def decentring(camera: Intrinsics, x: Transform) -> Float[ndarray, "r 2"]:
     return out
 
 
-DEGREE = 5
-"""Total degree of the polynomials."""
+DEGREE, POLYNOMIALS = 5, 42
+"""Total degree of the polynomials, and their number."""
 TYPICAL = 1e-4
 """Middle of the weak prior of the size of each polynomial, in widths of the image."""
 UPDATES, SETTLED = 100, 1e-3
@@ -130,28 +130,16 @@ WORTH = 2.0
 
 
 def displacements(
-    cameras: Sequence[CameraPrior],
-    counts: Sequence[int],
-    x_px: Float[ndarray, "k 2"],
-    camera: Int[ndarray, " k"],
+    camera: Intrinsics, directions: Float[ndarray, "q c"], x_px: Float[ndarray, "k 2"]
 ) -> Float[ndarray, "k 2 e"]:
-    """Return the displacement of each observation by each of the `counts` polynomials of each camera.
+    """Return the displacement of each observation by each polynomial, of one image width.
 
-    The unit of a polynomial is the width of the image. Displacements that the intrinsics can express are taken out.
+    Displacements that the intrinsics can express along `directions` are taken out.
     """
-    blocks = [np.zeros((len(camera), 2, 0))]
-    for c, (one, count) in enumerate(zip(cameras, counts, strict=True)):
-        if count == 0:
-            continue
-        rows = np.flatnonzero(camera == c)
-        by_prior = by_parameters(one.intrinsics, unproject(one.intrinsics, x_px[rows])) @ one.directions
-        block = np.zeros((len(camera), 2, count))
-        polynomials = _polynomials(x_px[rows], one.intrinsics)
-        basis = np.linalg.qr(by_prior.reshape(2 * len(rows), -1))[0]
-        flat = polynomials.reshape(2 * len(rows), -1)
-        block[rows] = (flat - basis @ (basis.T @ flat)).reshape(polynomials.shape)
-        blocks.append(block)
-    return np.concatenate(blocks, axis=2)
+    by_prior = by_parameters(camera, unproject(camera, x_px)) @ directions
+    basis = np.linalg.qr(by_prior.reshape(2 * len(x_px), -1))[0]
+    flat = _polynomials(x_px, camera).reshape(2 * len(x_px), -1)
+    return (flat - basis @ (basis.T @ flat)).reshape(len(x_px), 2, -1)
 
 
 def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], std: float) -> float:
@@ -175,13 +163,15 @@ def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], 
     return float(np.sqrt(variance))
 
 
-def expressed(camera: CameraPrior, x_px: Float[ndarray, "k 2"]) -> Float[ndarray, "q e"]:
-    """Return the part of each polynomial over these pixels that the camera's parameters express."""
-    intrinsics = camera.intrinsics
-    by_prior = by_parameters(intrinsics, unproject(intrinsics, x_px)) @ camera.directions
-    rows, polynomials = 2 * len(x_px), _polynomials(x_px, intrinsics)
-    fit = np.linalg.lstsq(by_prior.reshape(rows, -1), polynomials.reshape(rows, -1), rcond=None)[0]
-    return camera.directions @ fit
+def expressed(
+    camera: Intrinsics, directions: Float[ndarray, "q c"], x_px: Float[ndarray, "k 2"]
+) -> Float[ndarray, "q e"]:
+    """Return the part of each polynomial over these pixels that the camera's parameters express along `directions`."""
+    by_prior = by_parameters(camera, unproject(camera, x_px)) @ directions
+    rows, polynomials = 2 * len(x_px), _polynomials(x_px, camera)
+    return (
+        directions @ np.linalg.lstsq(by_prior.reshape(rows, -1), polynomials.reshape(rows, -1), rcond=None)[0]
+    )
 
 
 def second_moment_px2(
@@ -197,11 +187,6 @@ def second_moment_px2(
     return (by @ moment @ np.swapaxes(by, 1, 2)).reshape(*x_px.shape, 2)
 
 
-def polynomials_of(camera: CameraPrior) -> int:
-    """Return the number of displacements of a camera; 0 where its intrinsics are exact."""
-    return (DEGREE + 1) * (DEGREE + 2) if len(camera.std) else 0
-
-
 def _polynomials(x_px: Float[ndarray, "k 2"], camera: Intrinsics) -> Float[ndarray, "k 2 e"]:
     """Return the displacements (px) of x, then of y, by products of Legendre polynomials, one image width each."""
     u, v = ((2 * x_px - [camera.width - 1, camera.height - 1]) / max(camera.width, camera.height)).T
@@ -209,3 +194,14 @@ def _polynomials(x_px: Float[ndarray, "k 2"], camera: Intrinsics) -> Float[ndarr
     i, j = np.nonzero(np.add.outer(np.arange(DEGREE + 1), np.arange(DEGREE + 1)) <= DEGREE)
     kept = every[:, i, j]
     return np.kron(camera.width * np.eye(2), kept[:, None]).reshape(len(kept), 2, -1)
+
+
+def joint_covariance(
+    covariance: Float[ndarray, "7 7"],
+    cross: Float[ndarray, "7 q"],
+    of_camera: Float[ndarray, "q q"],
+    camera: Intrinsics,
+) -> JointCovariance:
+    """Return the covariance of transform and scale together with that of the intrinsics, from its blocks."""
+    together = np.block([[covariance, cross], [cross.T, of_camera]])
+    return JointCovariance(covariance=together, order=(*COVARIANCE_ORDER, *parameter_names(camera)))

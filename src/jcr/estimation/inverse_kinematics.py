@@ -33,17 +33,18 @@ from jcr.geometry import (
     skew,
     transform,
 )
+from jcr.least_squares import minimise
 
 STARTS = 12
 STEPS = 30
-LAST = 8
-"""Number of last steps in which a redundant arm no longer moves towards its rest posture."""
+MOST = 30
+"""Largest number of poses from which an unknown tool is estimated."""
 FITS = (1e-4, 1e-3)
 """Largest misfit (m, rad) of a pose that the arm reaches."""
 REFUSED = (0.01, np.radians(1.0))
 """Misfit, as a share of the reach and in rad, from which poses are not of this arm."""
-TO_REST = 0.5
-"""Share of the way to its rest posture that a redundant arm goes in one step."""
+TO_REST = 3e-4
+"""Weight (m/rad) of the distance from the rest posture: an angle that the pose determines changes by 1e-6 rad."""
 MISFIT_WEIGHT, REST_WEIGHT = 1e10, 0.05
 """Weights of the squared misfit (m²) and the squared distance from rest (rad²), beside squared change between poses."""
 TOOL_STD = (0.15, 1.0)
@@ -85,51 +86,34 @@ def inverse_kinematics(
     for ahead, yaw in TOOLS:
         start = transform(rotation_exp(np.array([0.0, 0.0, yaw])), np.array([0.0, 0.0, ahead]))
         first = _posture(arm, base_from_gripper, start, rng)
-        joints, found = _with_tool(arm, base_from_gripper, first.joints, start)
-        tried.append(_posture(arm, base_from_gripper, found, rng, joints))
+        found = _with_tool(arm, base_from_gripper, first.joints, start)
+        tried.append(_posture(arm, base_from_gripper, found, rng))
         if tried[-1].fits:
             break
     return min(tried, key=lambda one: float(((one.misfit * (1.0, ARM)) ** 2).sum()))
 
 
-def reach_toward(
-    arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"], start: Joints, steps: int = STEPS
-) -> Joints:
+def reach_toward(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"], start: Joints) -> Joints:
     """Return joint angles (n,dof) within the limits that bring the gripper as near each pose as it gets from `start`.
 
-    Damped least squares, the damping after Sugihara ("Solvability-unconcerned inverse kinematics by the
-    Levenberg-Marquardt method", IEEE Trans. Robotics 27, 2011), all poses at once. The free motion of a redundant arm
-    goes towards its rest posture (gradient projection, Liegeois 1977).
+    All poses are solved at once. The free motion of a redundant arm goes towards its rest posture.
     """
     low, high = arm.limits.T
-    joints = np.clip(start, low, high)
-    for k in range(steps):
+
+    def linearised(joints: Joints) -> tuple[Float[ndarray, "n r 1"], Float[ndarray, "n r 1 dof"]]:
         error, jacobian = _error(arm, joints, base_from_gripper)
-        free = np.zeros_like(joints)
-        if arm.dof > 6 and k < steps - LAST:
-            free = TO_REST * (arm.rest - joints)
-        step = _damped_step(error, jacobian, free)
-        # A joint at its limit that would move beyond it takes no part in this step.
-        stuck = ((joints <= low) & (step < 0)) | ((joints >= high) & (step > 0))
-        rows = stuck.any(1)
-        if rows.any():
-            moving = ~stuck[rows]
-            step[rows] = moving * _damped_step(
-                error[rows], jacobian[rows] * moving[:, None], free[rows] * moving
-            )
-        step /= np.abs(step).max(1, keepdims=True).clip(1.0)
-        joints = np.clip(joints + step, low, high)
-    return joints
+        residual = np.concatenate([-error, TO_REST * (joints - arm.rest)], axis=1)
+        rest = np.broadcast_to(TO_REST * np.eye(arm.dof), (len(joints), arm.dof, arm.dof))
+        jacobian = np.concatenate([jacobian, rest], axis=1)
+        # A joint at its limit that would move beyond it takes no part in the step.
+        gradient = (residual[:, None] @ jacobian)[:, 0]
+        stuck = ((joints <= low) & (gradient > 0)) | ((joints >= high) & (gradient < 0))
+        return residual[..., None], (jacobian * ~stuck[:, None])[:, :, None]
 
+    def moved(joints: Joints, step: Joints) -> Joints:
+        return np.clip(joints + step / np.abs(step).max(1, keepdims=True).clip(1.0), low, high)
 
-def _damped_step(
-    error: Float[ndarray, "n 6"], jacobian: Float[ndarray, "n 6 dof"], free: Joints
-) -> Float[ndarray, "n dof"]:
-    """Return the sum of `free` and the smallest damped change that removes the remaining error."""
-    damping = 0.5 * (error**2).sum(1) + 1e-9
-    square = jacobian @ np.swapaxes(jacobian, 1, 2) + damping[:, None, None] * np.eye(6)
-    left = error[..., None] - jacobian @ free[..., None]
-    return free + (np.swapaxes(jacobian, 1, 2) @ np.linalg.solve(square, left))[..., 0]
+    return minimise(linearised, np.clip(start, low, high), moved, tolerance=1e-9, iterations=STEPS).unknowns
 
 
 def _error(
@@ -147,7 +131,6 @@ def _posture(
     base_from_tool: Float[ndarray, "n 4 4"],
     flange_from_tool: Transform,
     rng: np.random.Generator,
-    known: Joints | None = None,
 ) -> Posture:
     """Return the best path through the solutions from many initial estimates, for a known tool."""
     base_from_gripper = base_from_tool @ inverse(flange_from_tool)
@@ -155,8 +138,6 @@ def _posture(
     half = np.minimum(np.diff(arm.limits)[:, 0] / 2, np.pi)
     starts = arm.limits.mean(1) + half * rng.uniform(-1, 1, (len(base_from_tool), STARTS, arm.dof))
     starts[:, 0] = arm.rest
-    if known is not None:
-        starts = np.concatenate([known[:, None], starts], axis=1)
     n, s, dof = starts.shape
     found = reach_toward(arm, np.repeat(base_from_gripper, s, 0), starts.reshape(-1, dof)).reshape(n, s, dof)
     misfit = _misfit(arm, found.reshape(-1, dof), np.repeat(base_from_tool, s, 0), flange_from_tool)
@@ -201,32 +182,38 @@ def _change(
 
 def _with_tool(
     arm: Arm, base_from_tool: Float[ndarray, "n 4 4"], joints: Joints, flange_from_tool: Transform
-) -> tuple[Joints, Transform]:
-    """Return joint angles and one tool by Gauss-Newton, with the angles of each pose eliminated."""
-    weight = 1e-6 / np.repeat(np.square(TOOL_STD), 3)
-    for _ in range(STEPS):
-        error, jacobian = _error(arm, joints, base_from_tool @ inverse(flange_from_tool))
-        rotation = base_from_tool[:, :3, :3] @ flange_from_tool[:3, :3].T
-        by_tool = np.zeros((len(joints), 6, 6))
-        # A twist of the tool, in flange axes, moves the required gripper pose back by this.
+) -> Transform:
+    """Return one tool that lets the arm reach all poses, estimated with their joint angles from initial values."""
+    some = np.unique(np.linspace(0, len(joints) - 1, min(len(joints), MOST)).astype(int))
+    poses, n, dof = base_from_tool[some], len(some), arm.dof
+    weight = 1e-3 / np.repeat(TOOL_STD, 3)
+
+    def linearised(
+        at: tuple[Joints, Transform],
+    ) -> tuple[Float[ndarray, "r 1"], Float[ndarray, "r 1 p"]]:
+        joints, tool = at
+        error, by_joints = _error(arm, joints, poses @ inverse(tool))
+        rotation = poses[:, :3, :3] @ tool[:3, :3].T
+        jacobian = np.zeros((6 * n + 6, n * dof + 6))
+        for k in range(n):
+            jacobian[6 * k : 6 * k + 6, dof * k : dof * k + dof] = by_joints[k]
+        # A step of the tool, in flange axes, moves the required gripper pose back by this.
+        by_tool = np.zeros((n, 6, 6))
         by_tool[:, :3, :3] = rotation
-        by_tool[:, :3, 3:] = rotation @ skew(flange_from_tool[:3, 3])
+        by_tool[:, :3, 3:] = rotation @ skew(tool[:3, 3])
         by_tool[:, 3:, 3:] = ARM * rotation
-        transposed = np.swapaxes(jacobian, 1, 2)
-        damping = 0.5 * (error**2).sum(1) + 1e-9
-        own = np.linalg.inv(jacobian @ transposed + damping[:, None, None] * np.eye(6))
-        # Projector of what the joints cannot explain: I - J (JᵀJ + μ)⁻¹ Jᵀ = μ (JJᵀ + μ)⁻¹.
-        left = damping[:, None, None] * own
-        moved = np.concatenate([flange_from_tool[:3, 3], rotation_log(flange_from_tool[:3, :3])])
-        normal = (np.swapaxes(by_tool, 1, 2) @ left @ by_tool).sum(0) + np.diag(weight)
-        wish = (np.swapaxes(by_tool, 1, 2) @ left @ error[..., None]).sum(0)[:, 0] - weight * moved
-        twist = np.linalg.solve(normal, wish)
-        twist /= max(1.0, np.abs(twist / (0.1, 0.1, 0.1, 0.5, 0.5, 0.5)).max())
-        step = (transposed @ own @ (error - (by_tool @ twist))[..., None])[..., 0]
-        step /= np.abs(step).max(1, keepdims=True).clip(1.0)
-        joints = np.clip(joints + step, *arm.limits.T)
-        flange_from_tool = retract(flange_from_tool, twist)
-    return joints, flange_from_tool
+        jacobian[: 6 * n, -6:] = by_tool.reshape(6 * n, 6)
+        jacobian[6 * n :, -6:] = np.diag(weight)
+        off = np.concatenate([tool[:3, 3], rotation_log(tool[:3, :3])])
+        return np.concatenate([-error.ravel(), weight * off])[:, None], jacobian[:, None]
+
+    def moved(at: tuple[Joints, Transform], step: Float[ndarray, " p"]) -> tuple[Joints, Transform]:
+        step = step / max(1.0, float(np.abs(step).max()))
+        return np.clip(at[0] + step[:-6].reshape(n, dof), *arm.limits.T), retract(at[1], step[-6:])
+
+    return minimise(
+        linearised, (joints[some], flange_from_tool), moved, tolerance=1e-9, iterations=STEPS
+    ).unknowns[1]
 
 
 def posed(arm: Arm, joints: Joints | None, base_from_gripper: Poses) -> tuple[Arm, Joints]:

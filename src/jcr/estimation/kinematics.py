@@ -16,7 +16,6 @@ joint) or the gripper (that of the last joint) are not identifiable: they add to
 which the estimator leaves free anyway.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -57,36 +56,6 @@ class Arm:
         """Longest way from the second joint's axis to the gripper along the links, in metres."""
         links = [*self.parent_from_joint[2:, :3, 3], self.last_from_gripper[:3, 3]]
         return float(np.linalg.norm(links, axis=1).sum())
-
-
-def from_dh(
-    name: str,
-    rows: Sequence[tuple[float, float, float, float]],
-    limits: Sequence[tuple[float, float]],
-    rest: Sequence[float],
-    *,
-    modified: bool,
-    last_from_gripper: Transform | None = None,
-) -> Arm:
-    """Return an arm from rows (a, d, α, θ₀) in m and rad, of standard (distal) or modified (Craig) parameters.
-
-    Standard: R_z(q+θ₀) T_z(d) T_x(a) R_x(α). Modified: R_x(α) T_x(a) R_z(q+θ₀) T_z(d), α and a being those of the link
-    before.
-    """
-    frame, frames = np.eye(4), []
-    for a, d, alpha, theta in rows:
-        about_x = transform(rotation_exp(np.array([alpha, 0.0, 0.0])), np.array([a, 0.0, 0.0]))
-        about_z = transform(rotation_exp(np.array([0.0, 0.0, theta])), np.array([0.0, 0.0, d]))
-        frames.append(frame @ about_x if modified else frame)
-        frame = about_z if modified else about_z @ about_x
-    return Arm(
-        name=name,
-        parent_from_joint=np.stack(frames),
-        axes=np.tile([0.0, 0.0, 1.0], (len(rows), 1)),
-        last_from_gripper=frame if last_from_gripper is None else frame @ last_from_gripper,
-        limits=np.array(limits, float),
-        rest=np.array(rest, float),
-    )
 
 
 def with_tool(arm: Arm, flange_from_tool: Transform) -> Arm:

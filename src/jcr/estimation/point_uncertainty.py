@@ -14,7 +14,6 @@ from jcr.camera import (
     NORMALIZED,
     by_parameters,
     by_point,
-    parameter_names,
     parameters,
     unproject,
     with_thin_prism,
@@ -28,9 +27,7 @@ from jcr.estimation.projection import derivatives
 from jcr.estimation.solve import Solution
 from jcr.geometry import apply, by_similarity, retract, skew
 from jcr.records import (
-    COVARIANCE_ORDER,
     Intrinsics,
-    JointCovariance,
     RobotNoise,
     SceneUncertainty,
     Seen,
@@ -165,17 +162,6 @@ def with_given_intrinsics(
         seen=bounds_at(x, pair, camera, x_px, distance_m),
         differs_mm=1e3 * float(np.linalg.norm(apart)),
     )
-
-
-def joint_covariance(
-    covariance: Float[ndarray, "7 7"],
-    cross: Float[ndarray, "7 q"],
-    of_camera: Float[ndarray, "q q"],
-    camera: Intrinsics,
-) -> JointCovariance:
-    """Return the covariance of transform and scale together with that of the intrinsics, from its blocks."""
-    together = np.block([[covariance, cross], [cross.T, of_camera]])
-    return JointCovariance(covariance=together, order=(*COVARIANCE_ORDER, *parameter_names(camera)))
 
 
 def within_95(covariance: Float[ndarray, "n n"]) -> float:

@@ -199,21 +199,20 @@ def paper_residuals(
     return float(translation), float(np.linalg.norm(gap[:, :3, :3], axis=(1, 2)).mean())
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class PoseEquations:
-    """Equations of all reported poses about a state, and the mixed model of those that are used."""
+    """Equations of the reported poses about a state, and the mixed model of those that are used."""
 
-    residual: Float[ndarray, "n 6"]
-    """Steps from the reported to the predicted gripper poses, at the mean of the rigs."""
-    jacobian: Float[ndarray, "s p"]
-    shared: Float[ndarray, "s s"] | None
-    """Covariance of the residuals by the rigs; None where the rigs are exact."""
-    systematic: Float[ndarray, "s s"]
-    """Covariance of the systematic residuals where the size of systematic errors is 1 rad."""
+    every: Equations
+    """Equations of all poses; residuals are steps from the reported to the predicted ones, at the mean of the rigs."""
     region: Region
     """Effective transform of the used poses."""
     used: Bool[ndarray, " n"]
-    equations: Equations
+
+    @cached_property
+    def equations(self) -> Equations:
+        """Equations of the used poses."""
+        return self.every if self.used.all() else self.every.of_poses(np.flatnonzero(self.used))
 
 
 def reported_poses(
@@ -269,31 +268,23 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
     fit = np.zeros((by_unknown.shape[1], 6 * n))
     fit[:, rows] = region.fit
     everywhere = replace(region, by_unknown=by_unknown, fit=fit)
-    systematic = everywhere.left(np.asarray(block_diag(*(arm.error_covariance for arm in problem.arms))))
-    among = np.ix_(rows, rows)
+    systematic = np.asarray(block_diag(*(arm.error_covariance for arm in problem.arms)))
     confirmed = (
         np.zeros((6 * len(arm.rigs), 0)) if arm.confirmed_errors is None else arm.confirmed_errors
         for arm in problem.arms
     )
-    columns = np.asarray(block_diag(*confirmed))[rows]
-    return PoseEquations(
-        residual=residual,
+    columns = np.asarray(block_diag(*confirmed))
+    every = Equations(
+        residual=residual.ravel(),
         jacobian=jacobian,
-        shared=shared,
-        systematic=systematic,
-        region=region,
-        used=used,
-        equations=Equations(
-            residual=residual.ravel()[rows],
-            jacobian=jacobian[rows],
-            prior_information=information,
-            prior_gradient=gradient,
-            known=None if shared is None else shared[among],
-            systematic=systematic[among],
-            given=problem.robot_noise_floor,
-            confirmed=region.left(columns @ columns.T) if columns.size else None,
-        ),
+        prior_information=information,
+        prior_gradient=gradient,
+        known=shared,
+        systematic=everywhere.left(systematic),
+        given=problem.robot_noise_floor,
+        confirmed=everywhere.left(columns @ columns.T) if columns.size else None,
     )
+    return PoseEquations(every, region, used)
 
 
 class Fit(NamedTuple):

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.camera import guessed_intrinsics, parameters, project, unproject, with_parameters
@@ -19,14 +19,12 @@ from jcr.estimation.intrinsics_prior import CameraPrior, camera_about
 from jcr.estimation.pixel_noise import PixelNoise
 from jcr.estimation.point_uncertainty import seen_points
 from jcr.estimation.pose_equations import pose_equations, pose_residuals
-from jcr.estimation.problem import ROTATION, TRANSLATION, pose_problem, scale_prior, wrist_arm
+from jcr.estimation.problem import ROTATION, TRANSLATION, pose_problem, scale_prior, wrist_arm, wrist_problem
 from jcr.estimation.robot_noise import GIVEN_SHARE, TYPICAL
-from jcr.estimation.solve import Solution, expected_solution
-from jcr.estimation.wrist import uncertainty_of, wrist_problem
+from jcr.estimation.solve import Solution, uncertainty_of, with_covariance
 from jcr.geometry import (
     Poses,
     Transform,
-    apply,
     by_similarity,
     inverse,
     motion_length,
@@ -174,7 +172,7 @@ def predict_covariance(
         priors=() if assumptions.scale_std is None else (scale_prior(1.0, assumptions.scale_std),),
     )
     if averaged:
-        return expected_solution(problem, state, None, noise).covariance[:7, :7]
+        return with_covariance(problem, state, None, expected=noise).covariance[:7, :7]
     poses = pose_equations(problem, state, None)
     return expected_covariance_at(poses.equations, noise, poses.region)[:7, :7]
 
@@ -209,17 +207,18 @@ def _predicted_solution(
     )
     images = image_evidence(problem, state)
     images.information[np.diag_indices(len(images.information))] += UNCONNECTED
-    return expected_solution(problem, state, images, noise)
+    return with_covariance(problem, state, images, expected=noise)
 
 
 def _observed_points(cameras: Poses, intrinsics: Intrinsics, distance_m: float) -> Tracks:
-    """Return points where the rays of a grid in each image meet the scene, and their observations."""
+    """Return points where the rays of a grid in each image meet the scene, and their observations.
+
+    An image shows a point that is inside it where a matcher finds it: from about where its source camera is.
+    """
+    size = np.array([intrinsics.width, intrinsics.height])
     rows = max(2, round(COLUMNS * intrinsics.height / intrinsics.width))
-    u, v = np.meshgrid(
-        (np.arange(COLUMNS) + 0.5) / COLUMNS * intrinsics.width,
-        (np.arange(rows) + 0.5) / rows * intrinsics.height,
-    )
-    rays = unproject(intrinsics, np.stack([u.ravel(), v.ravel()], axis=1))
+    grid = np.stack(np.meshgrid(np.arange(COLUMNS) + 0.5, np.arange(rows) + 0.5), axis=-1).reshape(-1, 2)
+    rays = unproject(intrinsics, grid / [COLUMNS, rows] * size)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     # The surface is across the mean optical axis; rays along it end at twice its distance. The relief is a pattern of
     # the rays, alike in all images.
@@ -235,33 +234,18 @@ def _observed_points(cameras: Poses, intrinsics: Intrinsics, distance_m: float) 
     source = np.repeat(np.arange(len(cameras)), len(rays))
     chosen = np.linspace(0, len(points) - 1, min(len(points), MOST_POINTS)).round().astype(int)
     points, source = points[chosen], source[chosen]
-    image, point = np.nonzero(_visible(cameras, intrinsics, points, source))
-    x_px = np.empty((len(image), 2))
-    for i, pose in enumerate(cameras):
-        mine = image == i
-        x_px[mine] = project(intrinsics, apply(inverse(pose), points[point[mine]]))
-    return Tracks(image=image, x_px=x_px, point=point, points_in_recon=points)
-
-
-def _visible(
-    cameras: Poses, intrinsics: Intrinsics, points: Float[ndarray, "p 3"], source: Int[ndarray, " p"]
-) -> Bool[ndarray, "n p"]:
-    """Return the images in which a matcher finds each point: inside, and from about where its source camera is."""
-    visible = np.zeros((len(cameras), len(points)), bool)
-    to_source = cameras[source, :3, 3] - points
-    source_distance = np.linalg.norm(to_source, axis=1)
-    angle, ratio = SAME_FEATURE
-    for i, pose in enumerate(cameras):
-        x_px = project(intrinsics, x_in_camera := apply(inverse(pose), points))
-        inside = ((x_px > 0) & (x_px < [intrinsics.width, intrinsics.height])).all(1) & (
-            x_in_camera[:, 2] > 0
-        )
-        to_camera = pose[:3, 3] - points
-        distance = np.linalg.norm(to_camera, axis=1)
-        alike = (to_source * to_camera).sum(1) > np.cos(angle) * source_distance * distance
-        near = (distance < ratio * source_distance) & (source_distance < ratio * distance)
-        visible[i] = (inside & alike & near) | (source == i)
-    return visible
+    to_camera = centre[:, None] - points
+    x_in_camera = -to_camera @ cameras[:, :3, :3]
+    x_px = project(intrinsics, x_in_camera)
+    distance = np.linalg.norm(to_camera, axis=2)
+    of_source = source, np.arange(len(points))
+    cosine = (to_camera * to_camera[of_source]).sum(2) / (distance * distance[of_source])
+    apart = np.abs(np.log(distance / distance[of_source]))
+    visible = ((x_px > 0) & (x_px < size)).all(2) & (x_in_camera[..., 2] > 0)
+    visible &= (cosine > np.cos(SAME_FEATURE[0])) & (apart < np.log(SAME_FEATURE[1]))
+    visible[of_source] = True
+    image, point = np.nonzero(visible)
+    return Tracks(image=image, x_px=x_px[image, point], point=point, points_in_recon=points)
 
 
 CANDIDATES = 600
@@ -345,7 +329,13 @@ def candidate_poses(
         far = distance[like] * rng.uniform(0.7, 1.3, n)
         aim = scene + rng.uniform(-0.04, 0.04, (n, 3))
         position = aim + far[:, None] * away
-        rotation = _facing(tilt @ camera[like, :3, :3], aim - position)
+        rotation = tilt @ camera[like, :3, :3]
+        # The shortest rotation that takes the z axis onto the line of sight.
+        to_aim = (aim - position) / far[:, None]
+        cross = np.cross(rotation[:, :, 2], to_aim)
+        sine = np.linalg.norm(cross, axis=1, keepdims=True)
+        angle = np.arctan2(sine, (rotation[:, :, 2] * to_aim).sum(1, keepdims=True))
+        rotation = rotation_exp(cross / np.maximum(sine, 1e-12) * angle) @ rotation
         roll = rotation_exp(rng.uniform(-np.pi / 3, np.pi / 3, n)[:, None] * [0.0, 0.0, 1.0])
         gripper = transform(rotation @ roll, position) @ inverse(x)
         inside = ((gripper[:, :3, 3] >= reach[0]) & (gripper[:, :3, 3] <= reach[1])).all(1)
@@ -392,12 +382,3 @@ def assumed_camera(base_from_gripper: Poses) -> Transform:
             best, least = axis, miss
     across = np.roll(best, 1)
     return transform(np.stack([across, np.cross(best, across), best], axis=1), np.zeros(3))
-
-
-def _facing(rotation: Float[ndarray, "n 3 3"], toward: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3 3"]:
-    """Return the rotations after the shortest rotation that takes their z axis onto a direction."""
-    z, goal = rotation[:, :, 2], toward / np.linalg.norm(toward, axis=1, keepdims=True)
-    cross = np.cross(z, goal)
-    sine = np.linalg.norm(cross, axis=1, keepdims=True)
-    angle = np.arctan2(sine, (z * goal).sum(1, keepdims=True))
-    return rotation_exp(cross / np.maximum(sine, 1e-12) * angle) @ rotation

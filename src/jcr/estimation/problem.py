@@ -8,23 +8,26 @@ X is base_from_camera, Z is gripper_from_world, and the equation is that of grip
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, NamedTuple
+from itertools import pairwise
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
+from scipy.linalg import block_diag
 
 from jcr.camera import parameters, unproject, with_parameters
 from jcr.distributions import chi2
-from jcr.estimation.boards import BoardShapes
+from jcr.estimation.boards import BoardShapes, shapes_of
 from jcr.estimation.elimination import Sightings
-from jcr.estimation.intrinsics_prior import TYPICAL, CameraPrior, displacements, polynomials_of
+from jcr.estimation.intrinsics_prior import POLYNOMIALS, TYPICAL, CameraPrior, displacements
 from jcr.estimation.pixel_noise import Layout, PixelNoise
 from jcr.estimation.robot_noise import smooth_errors
 from jcr.geometry import (
     Poses,
     Transform,
     retract,
+    scale_translation,
     skew,
     step_between,
 )
@@ -73,32 +76,10 @@ class Observations:
         )
 
 
-def sorted_by_point(observations: Observations, points: int) -> Observations:
-    """Return the observations sorted by point and rig, without points that fewer than two show.
-
-    The first of several observations of one point in one image is kept; the points are counted again.
-    """
-    rig = observations.rig[observations.image]
-    order = np.lexsort((observations.image, rig, observations.point))
-    point, image = observations.point[order], observations.image[order]
-    order = order[np.r_[True, (np.diff(point) != 0) | (np.diff(image) != 0)][: len(order)]]
-    count = np.bincount(observations.point[order], minlength=points)
-    order = order[count[observations.point[order]] >= 2]
-    kept, point = np.unique(observations.point[order], return_inverse=True)
-    return replace(
-        observations,
-        image=observations.image[order],
-        x_px=observations.x_px[order],
-        point=point,
-        std_px=observations.std_px[order],
-        point_rows=kept,
-    )
-
-
 CELLS = 8
 """Cells across the width of an image, within which features share errors."""
 OF_IMAGE, PRISM = 4, 4
-"""Number of nuisance parameters of each image, and of those that all images share.
+"""Number of parameters of each image, and of those that all images share.
 
 An image has the logarithm of its focal length over its camera's; a shear from top to bottom in focal lengths (rolling
 shutter); offsets in x and y, in widths. All images share s1 to s4 of OpenCV's thin prism."""
@@ -146,8 +127,8 @@ class RigGaussian(NamedTuple):
 class Columns:
     """Columns of the equations of images; six columns for each rig follow from `first_rig` on."""
 
-    intrinsics: tuple[slice, ...]
-    nuisance: slice
+    cameras: slice
+    """Steps along `Problem.directions`."""
     model_error: tuple[slice, ...]
     boards: slice
     mounts: tuple[slice | None, ...]
@@ -188,9 +169,9 @@ class Problem:
     observations: Observations | None = None
     """Sorted by point and rig, every point with at least two; None: the poses of the rigs are in `known_rigs`."""
     boards: BoardShapes | None = None
-    nuisance_directions: Float[ndarray, "r e"] = field(default_factory=lambda: np.zeros((PRISM, 0)))
-    """Directions in which images differ from their cameras; r = 4 n_images + 4, parameter by parameter."""
-    nuisance_std: Float[ndarray, " e"] = field(default_factory=lambda: np.zeros(0))
+    freed: Float[ndarray, "r e"] = field(default_factory=lambda: np.zeros((0, 0)))
+    """Directions that are free beside the priors of the cameras; rows are those of `directions`."""
+    freed_std: Float[ndarray, " e"] = field(default_factory=lambda: np.zeros(0))
     known_rigs: RigGaussian | None = None
     priors: tuple[LinearPrior, ...] = ()
     robot_noise_floor: tuple[float, float] | None = None
@@ -201,24 +182,40 @@ class Problem:
     @cached_property
     def columns(self) -> Columns:
         """Columns of the equations of images."""
-        begin = 0
+        boards = 0 if self.boards is None else len(self.boards.shape_std)
+        mounts = [6 * camera.mount_free for camera in self.cameras]
+        counts = [self.directions.shape[1], *self.model_error_counts, boards, *mounts]
+        ends = np.cumsum(counts).tolist()
+        cameras, *each = (slice(end - count, end) for count, end in zip(counts, ends, strict=True))
+        own, shape, mounted = each[: len(mounts)], each[len(mounts)], each[len(mounts) + 1 :]
+        poses = tuple(one if one.stop > one.start else None for one in mounted)
+        return Columns(cameras, tuple(own), shape, poses, ends[-1], ends[-1] + 6 * self.n_rigs)
 
-        def following(count: int) -> slice:
-            nonlocal begin
-            begin += count
-            return slice(begin - count, begin)
+    @cached_property
+    def parameters_of(self) -> tuple[slice, ...]:
+        """Rows of `directions` that are the parameters of each camera."""
+        ends = np.cumsum([len(camera.directions) for camera in self.cameras]).tolist()
+        return tuple(slice(a, b) for a, b in pairwise([0, *ends]))
 
-        intrinsics = tuple(following(len(camera.std)) for camera in self.cameras)
-        nuisance = following(len(self.nuisance_std))
-        model_error = tuple(following(count) for count in self.model_error_counts)
-        boards = following(0 if self.boards is None else len(self.boards.shape_std))
-        mounts = tuple(following(6) if camera.mount_free else None for camera in self.cameras)
-        return Columns(intrinsics, nuisance, model_error, boards, mounts, begin, begin + 6 * self.n_rigs)
+    @cached_property
+    def directions(self) -> Float[ndarray, "r l"]:
+        """Directions in which cameras and images may differ from the middle of their priors.
+
+        Rows are the parameters of each camera, the OF_IMAGE parameters of all images one after the other, and the prism.
+        """
+        own = np.asarray(block_diag(*(camera.directions for camera in self.cameras)))
+        own = np.pad(own, ((0, OF_IMAGE * self.n_images + PRISM), (0, 0)))
+        return np.concatenate([own, self.freed], axis=1) if self.freed.size else own
+
+    @cached_property
+    def images_differ(self) -> bool:
+        """Whether images may differ from their cameras."""
+        return bool(self.directions[-OF_IMAGE * self.n_images - PRISM :].any())
 
     @cached_property
     def model_error_counts(self) -> list[int]:
-        """Number of displacements of each camera: none of a camera with too few observations."""
-        counts = [polynomials_of(camera) for camera in self.cameras]
+        """Number of displacements of each camera: none of an exact one or of one with too few observations."""
+        counts = [POLYNOMIALS * bool(self.directions[own].any()) for own in self.parameters_of]
         seen = np.bincount(self.layout.camera, minlength=len(counts)) if self.observations else counts
         return [count if n > count else 0 for n, count in zip(seen, counts, strict=True)]
 
@@ -273,9 +270,13 @@ class Problem:
     def displacements(self) -> Float[ndarray, "k 2 e"]:
         """Displacement of each observation by the remaining distortion of its camera's model, px."""
         assert self.observations is not None
-        return displacements(
-            self.cameras, self.model_error_counts, self.observations.x_px, self.layout.camera
-        )
+        each = zip(self.cameras, self.parameters_of, self.model_error_counts, self.camera_rows, strict=True)
+        x_px, columns = self.observations.x_px, [np.zeros((len(self.observations.x_px), 2, 0))]
+        for camera, own, count, rows in each:
+            columns.append(np.zeros((len(x_px), 2, count)))
+            if count:
+                columns[-1][rows] = displacements(camera.intrinsics, self.directions[own], x_px[rows])
+        return np.concatenate(columns, axis=2)
 
     @cached_property
     def camera_rows(self) -> list[Int[ndarray, "..."]]:
@@ -326,19 +327,19 @@ class Problem:
         each = [np.full(c.stop - c.start, size)
                 for c, size in zip(self.columns.model_error, state.model_error_std, strict=True)]  # fmt: skip
         boards = np.zeros(0) if self.boards is None else self.boards.shape_std
-        return np.concatenate([*(camera.std for camera in self.cameras), self.nuisance_std, *each, boards])
+        return np.concatenate([*(camera.std for camera in self.cameras), self.freed_std, *each, boards])
+
+    def displacement(self, state: State) -> Float[ndarray, " r"]:
+        """Return the displacement of cameras and images from the middle of their priors, as `directions` count it."""
+        return self.directions @ state.camera_steps[self.columns.cameras]
 
     def intrinsics(self, state: State) -> tuple[Intrinsics, ...]:
         """Return the estimated intrinsics of each camera."""
-        steps = (state.camera_steps[columns] for columns in self.columns.intrinsics)
+        off = self.displacement(state)
         return tuple(
-            with_parameters(one.intrinsics, parameters(one.intrinsics) + one.directions @ step)
-            for one, step in zip(self.cameras, steps, strict=True)
+            with_parameters(one.intrinsics, parameters(one.intrinsics) + off[own])
+            for one, own in zip(self.cameras, self.parameters_of, strict=True)
         )
-
-    def nuisances(self, state: State) -> Float[ndarray, " r"]:
-        """Return the nuisance parameters, in the order of the rows of `nuisance_directions`."""
-        return self.nuisance_directions @ state.camera_steps[self.columns.nuisance]
 
     def coordinates(self, state: State) -> Float[ndarray, " p"]:
         """Return the unknowns that linear priors measure: translation of X and log scale, m; steps of the cameras."""
@@ -352,16 +353,28 @@ class Problem:
 def with_observations(problem: Problem, state: State, observations: Observations) -> tuple[Problem, State]:
     """Return the problem with the observations of all points that two or more show, and its initial state.
 
-    The cameras start at the middle of their priors.
+    Observations are sorted by point and rig. The first of several of one point in one image is kept; the points are
+    counted again. The cameras start at the middle of their priors.
     """
-    observations = sorted_by_point(observations, len(state.points_in_world))
-    kept = observations.point_rows
-    assert kept is not None
-    boards = None if problem.boards is None else problem.boards.of_points(kept)
-    if not len(problem.nuisance_std):
-        rows = OF_IMAGE * len(observations.rig) + PRISM
-        problem = replace(problem, nuisance_directions=np.zeros((rows, 0)))
-    problem = replace(problem, observations=observations, boards=boards)
+    rig = observations.rig[observations.image]
+    order = np.lexsort((observations.image, rig, observations.point))
+    point, image = observations.point[order], observations.image[order]
+    order = order[np.r_[True, (np.diff(point) != 0) | (np.diff(image) != 0)][: len(order)]]
+    count = np.bincount(observations.point[order], minlength=len(state.points_in_world))
+    order = order[count[observations.point[order]] >= 2]
+    kept, point = np.unique(observations.point[order], return_inverse=True)
+    problem = replace(
+        problem,
+        boards=None if problem.boards is None else problem.boards.of_points(kept),
+        observations=replace(
+            observations,
+            image=observations.image[order],
+            x_px=observations.x_px[order],
+            point=point,
+            std_px=observations.std_px[order],
+            point_rows=kept,
+        ),
+    )
     state = replace(
         state,
         points_in_world=state.points_in_world[kept],
@@ -371,18 +384,76 @@ def with_observations(problem: Problem, state: State, observations: Observations
     return problem, state
 
 
+WEAK = 0.3, 0.3, 0.2, 0.2
+"""Standard deviations that only keep finite what the images cannot see: focal lengths relative, centre per width."""
+WEAK_DISTORTION, WEAK_PRISM, WEAK_OF_IMAGE = 1.0, 0.3, (0.05, 0.3, 0.1, 0.1)
+"""Standard deviations of the distortion, of a thin prism, and of the parameters of each image."""
+
+
+def rows_of(
+    problem: Problem, camera: int, images: Int[ndarray, " m"], n_images: int
+) -> tuple[Int[ndarray, " e"], Float[ndarray, " e"], Float[ndarray, " e"]]:
+    """Return the rows of `Problem.directions` of a camera, its images and the prism, their units and weak priors.
+
+    The units are focal lengths and widths for the centre; the standard deviations are in these.
+    """
+    intrinsics, own, end = (
+        problem.cameras[camera].intrinsics,
+        problem.parameters_of[camera],
+        problem.parameters_of[-1].stop,
+    )
+    more, m = own.stop - own.start - 4, len(images)
+    of_images = (n_images * np.arange(OF_IMAGE)[:, None] + images).ravel()
+    rows = np.r_[own, end + of_images, end + OF_IMAGE * n_images + np.arange(PRISM)]
+    units = np.ones(len(rows))
+    units[:4] = intrinsics.fx, intrinsics.fy, intrinsics.width, intrinsics.width
+    of_each = np.repeat(WEAK_OF_IMAGE, m)
+    return rows, units, np.r_[WEAK, np.full(more, WEAK_DISTORTION), of_each, np.full(PRISM, WEAK_PRISM)]
+
+
+def freed(
+    problem: Problem,
+    combinations: Float[ndarray, "e p"],
+    images: Int[ndarray, " m"],
+    n_images: int,
+    camera: int = 0,
+) -> Problem:
+    """Return the problem with combinations of the columns of one camera's `Alternatives` free, too.
+
+    Parameters of the camera and of its `images`, of `n_images`, are freed each by themselves.
+    """
+    rows, units, weak = rows_of(problem, camera, images, n_images)
+    q = len(problem.cameras[camera].directions)
+    free = np.asarray(block_diag(spanned(combinations[:q]), spanned(combinations[q:])))
+    directions = np.zeros((problem.parameters_of[-1].stop + OF_IMAGE * n_images + PRISM, free.shape[1]))
+    directions[rows] = units[:, None] * free
+    before = problem.freed if problem.freed.size else directions[:, :0]
+    return replace(
+        problem,
+        freed=np.concatenate([before, directions], axis=1),
+        freed_std=np.r_[problem.freed_std, 1 / np.sqrt(((free / weak[:, None]) ** 2).sum(0))],
+    )
+
+
+def spanned(combinations: Float[ndarray, "e p"]) -> Float[ndarray, "e r"]:
+    """Return an orthonormal basis of the space of the combinations."""
+    u, size, _ = np.linalg.svd(combinations, full_matrices=False)
+    return u[:, size > 1e-9 * size.max(initial=1e-300)]
+
+
 OF_OBSERVATIONS = ("model_error_counts", "layout", "seen", "rows", "displacements", "camera_rows", "prism")
 """Cached properties of a problem that depend on its observations."""
 
 
-def with_free(problem: Problem, **changes: object) -> Problem:
-    """Return the problem with other free directions of the cameras (`cameras`, `nuisance_directions`, `nuisance_std`).
+def with_free(problem: Problem, **changes: Any) -> Problem:
+    """Return the problem with other priors or other free directions of the cameras (`freed`, `freed_std`).
 
     What depends on the observations is kept, and with it the displacements of the remaining distortion, although the
     cameras may express other ones.
     """
-    other = replace(problem, **changes)  # type: ignore[arg-type]
-    other.__dict__.update({name: getattr(problem, name) for name in OF_OBSERVATIONS})
+    other = replace(problem, **changes)
+    if problem.observations is not None:
+        other.__dict__.update({name: getattr(problem, name) for name in OF_OBSERVATIONS})
     return other
 
 
@@ -391,12 +462,14 @@ def transferred(problem: Problem, state: State, other: Problem) -> State:
 
     The cameras stay as they are, as far as the directions of the other problem can express that.
     """
-    along = np.zeros(other.columns.boards.stop)
     before, after = problem.columns, other.columns
-    for now, camera, columns in zip(problem.intrinsics(state), other.cameras, after.intrinsics, strict=True):
-        off = parameters(now) - parameters(camera.intrinsics)
-        along[columns] = _along(camera.directions, camera.std, off)
-    along[after.nuisance] = _along(other.nuisance_directions, other.nuisance_std, problem.nuisances(state))
+    off, along = problem.displacement(state), np.zeros(after.boards.stop)
+    middles = zip(problem.cameras, other.cameras, other.parameters_of, strict=True)
+    for old, new, own in middles:
+        off[own] += parameters(old.intrinsics) - parameters(new.intrinsics)
+    # Of several steps that lead there the most likely ones.
+    std = other.prior_std(state)[after.cameras]
+    along[after.cameras] = std * (np.linalg.pinv(other.directions * std) @ off)
     for old, new in zip(before.model_error, after.model_error, strict=True):
         if old.stop - old.start == new.stop - new.start:
             along[new] = state.camera_steps[old]
@@ -405,13 +478,6 @@ def transferred(problem: Problem, state: State, other: Problem) -> State:
     assert old is not None and new is not None and old.point_rows is not None and new.point_rows is not None
     points = state.points_in_world[np.searchsorted(old.point_rows, new.point_rows)]
     return replace(state, camera_steps=along, points_in_world=points)
-
-
-def _along(
-    directions: Float[ndarray, "q c"], std: Float[ndarray, " c"], off: Float[ndarray, " q"]
-) -> Float[ndarray, " c"]:
-    """Return the most likely steps along directions that come nearest to a displacement."""
-    return std * (np.linalg.pinv(directions * std) @ off)
 
 
 def image_step(problem: Problem, state: State, step: Float[ndarray, " d"]) -> State:
@@ -519,6 +585,44 @@ def pose_problem(
         robot_noise_floor=noise_floor,
     )
     return problem, State(x=x[None], scale=scale, z=z[None], world_from_rig=recon_from_camera)
+
+
+def wrist_problem(
+    arm: ReportedPoses,
+    start: Start,
+    recon_from_camera: Poses,
+    camera: CameraPrior,
+    tracks: Tracks,
+    *,
+    noise: tuple[float, float] | None = None,
+    combinations: Float[ndarray, "e p"] | None = None,
+) -> tuple[Problem, State]:
+    """Return the problem of images and reported poses together, and its initial state; the world is in metres.
+
+    `arm` moves rig i at image i. `noise` is a lower bound on the random errors of the poses (m, rad), and
+    `combinations` of the columns of hypotheses.Alternatives are free.
+    """
+    x, scale, z = start
+    points_in_world = scale * tracks.points_in_recon.astype(float)
+    twice = np.bincount(tracks.point, minlength=len(points_in_world)) >= 2
+    boards, world_from_board = shapes_of(tracks.boards, points_in_world, twice, len(arm.rigs))
+    problem = Problem(
+        arms=(arm,),
+        n_rigs=len(arm.rigs) + len(world_from_board),
+        cameras=(camera,),
+        boards=boards,
+        robot_noise_floor=noise,
+    )
+    state = State(
+        x=x[None],
+        scale=1.0,
+        z=z[None],
+        world_from_rig=np.concatenate([scale_translation(recon_from_camera, scale), world_from_board]),
+        points_in_world=points_in_world,
+    )
+    if combinations is not None:
+        problem = freed(problem, combinations, arm.rigs, len(arm.rigs))
+    return with_observations(problem, state, Observations.of_one_camera(tracks, len(arm.rigs)))
 
 
 def image_problem(

@@ -61,16 +61,16 @@ def view_of(problem: Problem, state: State) -> ProjectedObservations:
         centre[rows] = camera.cx, camera.cy
         from_centre[rows] = project(camera, in_camera[rows]) - centre[rows]
     projected, own_map = centre + from_centre, None
-    if len(problem.nuisance_std):
-        parameters = problem.nuisances(state)
-        of_images = parameters[:-PRISM].reshape(OF_IMAGE, -1)[:, observations.image]
+    if problem.images_differ:
+        off = problem.displacement(state)[problem.parameters_of[-1].stop :]
+        of_images = off[:-PRISM].reshape(OF_IMAGE, -1)[:, observations.image]
         per_height = _of_camera(problem, [camera.fx / camera.height for camera in cameras])
         width = _of_camera(problem, [camera.width for camera in cameras])
         own_map = np.stack([np.exp(of_images[0]), of_images[1] * per_height], axis=1)
         projected = centre + _mapped(own_map, from_centre[..., None])[..., 0] + (width * of_images[2:]).T
-        projected += problem.prism @ parameters[-PRISM:]
-    first, last = problem.columns.nuisance.stop, problem.columns.boards.start
-    projected += problem.displacements @ state.camera_steps[first:last]
+        projected += problem.prism @ off[-PRISM:]
+    columns = problem.columns
+    projected += problem.displacements @ state.camera_steps[columns.cameras.stop : columns.boards.start]
     return ProjectedObservations(
         cameras=cameras,
         from_rig=from_rig,
@@ -89,8 +89,8 @@ def derivatives(
     columns, root = problem.columns, np.sqrt(weight)[:, None, None]
     by_rig = root * _by_rig(problem, state, view)
     shared = np.zeros((len(weight), 2, columns.first_rig))
-    np.multiply(_by_cameras(problem, state, view), root, out=shared[:, :, : columns.nuisance.stop])
-    np.multiply(problem.displacements, root, out=shared[:, :, columns.nuisance.stop : columns.boards.start])
+    np.multiply(_by_cameras(problem, state, view), root, out=shared[:, :, columns.cameras])
+    np.multiply(problem.displacements, root, out=shared[:, :, columns.cameras.stop : columns.boards.start])
     for own, rows in zip(columns.mounts, problem.camera_rows, strict=True):
         if own is not None:
             rotated = by_rig[rows] @ skew(view.from_camera[rows])
@@ -153,37 +153,38 @@ def _by_rig(problem: Problem, state: State, view: ProjectedObservations) -> Floa
 
 
 def _by_cameras(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, "k 2 l"]:
-    """Return the derivative of every observation by the intrinsics and the other camera parameters."""
-    first, last = problem.columns.nuisance.start, problem.columns.nuisance.stop
-    out = np.zeros((len(view.in_camera), 2, last))
-    by_intrinsics, by_nuisance = out[:, :, :first], out[:, :, first:]
-    each = list(
-        zip(view.cameras, problem.cameras, problem.columns.intrinsics, problem.camera_rows, strict=True)
-    )
-    for camera, prior, columns, rows in each:
-        by_intrinsics[rows, :, columns] = by_parameters(camera, view.in_camera[rows]) @ prior.directions
-    if view.own_map is None:
+    """Return the derivative of every observation by the steps of cameras and images."""
+    directions, own_map = problem.directions, view.own_map
+    out = np.zeros((len(view.in_camera), 2, directions.shape[1]))
+    for camera, own, rows in zip(view.cameras, problem.parameters_of, problem.camera_rows, strict=True):
+        columns = np.flatnonzero(directions[own].any(0))
+        along = directions[own, columns]
+        by_camera = by_parameters(camera, view.in_camera[rows]) @ along
+        if own_map is not None:
+            by_camera = _mapped(own_map[rows], by_camera - along[CENTRE]) + along[CENTRE]
+            # The shear is counted in focal lengths, and grows with it.
+            by_camera[:, 0] += (own_map[rows, 1] * view.from_centre_px[rows, 1] / camera.fx)[:, None] * along[
+                0
+            ]
+        out[np.ix_(rows, np.arange(2), columns)] = by_camera
+    if own_map is None:
         return out
-    by_centre = np.zeros_like(by_intrinsics)
-    for _, prior, columns, rows in each:
-        by_centre[rows, :, columns] = prior.directions[CENTRE]
-    by_intrinsics[:] = _mapped(view.own_map, by_intrinsics - by_centre) + by_centre
-    for camera, prior, columns, rows in each:
-        # The shear is counted in focal lengths, and grows with it.
-        sheared = view.own_map[rows, 1] * view.from_centre_px[rows, 1] / camera.fx
-        by_intrinsics[rows, 0, columns] += sheared[:, None] * prior.directions[0]
     assert problem.observations is not None
-    about, directions, image = view.from_centre_px, problem.nuisance_directions, problem.observations.image
-    focal, sheared, *offset = directions[:-PRISM].reshape(OF_IMAGE, -1, directions.shape[1])
+    first, image = problem.parameters_of[-1].stop, problem.observations.image
+    # Parameters of images are freed by themselves.
+    columns = np.flatnonzero(directions[first:].any(0))
+    columns = slice(columns[0], columns[-1] + 1)
+    about, of_images, by_image = view.from_centre_px, directions[first:, columns], out[:, :, columns]
+    focal, sheared, *offset = of_images[:-PRISM].reshape(OF_IMAGE, -1, of_images.shape[1])
     shear_px = _of_camera(problem, [camera.fx / camera.height for camera in view.cameras]) * about[:, 1]
     width = _of_camera(problem, [camera.width for camera in view.cameras])
     # One block at a time: of hundreds of images each has hundreds of megabytes.
-    np.multiply((view.own_map[:, :1] * about)[..., None], focal[image][:, None], out=by_nuisance)
-    by_nuisance[:, 0] += shear_px[:, None] * sheared[image]
+    by_image += (own_map[:, :1] * about)[..., None] * focal[image][:, None]
+    by_image[:, 0] += shear_px[:, None] * sheared[image]
     for axis, one in enumerate(offset):
-        by_nuisance[:, axis] += width[:, None] * one[image]
-    if directions[-PRISM:].any():
-        by_nuisance += problem.prism @ directions[-PRISM:]
+        by_image[:, axis] += width[:, None] * one[image]
+    if of_images[-PRISM:].any():
+        by_image += problem.prism @ of_images[-PRISM:]
     return out
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -115,12 +116,18 @@ class Equations:
         return np.array(self.given or NOISE_FLOOR)
 
     @cached_property
-    def prior(self) -> tuple[Float[ndarray, " c"], Float[ndarray, " c"]]:
-        """Mean and standard deviation of the weak priors of the log sizes."""
+    def prior(self) -> tuple[Float[ndarray, "r c"], Float[ndarray, " r"], Float[ndarray, " c"]]:
+        """Weak prior of the log sizes x: A and b of its residuals A x − b, and the standard deviations of x.
+
+        The last residual is that of the ratio of the random errors.
+        """
         typical, count = np.r_[TYPICAL, TYPICAL_WALKS], 3 + len(self.walks)
         if self.given is not None:
             typical[:2] = GIVEN_SHARE * self.least
-        return np.log(typical[:count]), np.r_[FACTOR_STD, np.full(3, WALK_FACTOR_STD)][:count]
+        std = np.r_[FACTOR_STD, np.full(3, WALK_FACTOR_STD)][:count]
+        rows = np.concatenate([np.diag(1 / std), np.eye(1, count) - np.eye(1, count, 1)])
+        rows[-1] /= RATIO_STD
+        return rows, np.r_[np.log(typical[:count]) / std, np.log(REACH) / RATIO_STD], std
 
     @cached_property
     def of_position(self) -> Float[ndarray, " s"]:
@@ -130,17 +137,18 @@ class Equations:
     def of_poses(self, poses: Int[ndarray, " k"]) -> "Equations":
         """Return the equations of some of the poses."""
         rows = (6 * poses[:, None] + np.arange(6)).ravel()
-        known, confirmed = (
-            None if part is None else part[np.ix_(rows, rows)] for part in (self.known, self.confirmed)
-        )
+
+        def part(of: Covariance | None) -> Any:
+            return None if of is None else of[np.ix_(rows, rows)]
+
         return replace(
             self,
             residual=self.residual[rows],
             jacobian=self.jacobian[rows],
-            systematic=self.systematic[np.ix_(rows, rows)],
-            known=known,
-            walks=tuple(walk[np.ix_(rows, rows)] for walk in self.walks),
-            confirmed=confirmed,
+            systematic=part(self.systematic),
+            known=part(self.known),
+            walks=tuple(map(part, self.walks)),
+            confirmed=part(self.confirmed),
         )
 
     def variances(self, log_sizes: LogSizes) -> Float[ndarray, "*k c"]:
@@ -184,20 +192,6 @@ class Equations:
             if part is not None:
                 covariance += part
         return covariance
-
-    def log_prior(self, log_sizes: LogSizes) -> Each:
-        """Return the log density of the weak priors of the sizes, up to a constant."""
-        mean, std = self.prior
-        ratio = (log_sizes[..., 0] - log_sizes[..., 1] - np.log(REACH)) / RATIO_STD
-        return -((((log_sizes - mean) / std) ** 2).sum(-1) + ratio**2) / 2
-
-    def log_prior_slope(self, log_sizes: LogSizes) -> tuple[LogSizes, Information]:
-        """Return the gradient and the negative Hessian of `log_prior`."""
-        mean, std = self.prior
-        apart = np.zeros(len(std))
-        apart[:2] = 1 / RATIO_STD, -1 / RATIO_STD
-        ratio = (log_sizes[0] - log_sizes[1] - np.log(REACH)) / RATIO_STD
-        return (mean - log_sizes) / std**2 - ratio * apart, np.diag(std**-2.0) + np.outer(apart, apart)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,9 +247,10 @@ def solve_equations(equations: Equations, log_sizes: LogSizes) -> LinearSolution
     step = -over(information_root, gradient)
     squares = (residual**2).sum((-1, -2)) + (gradient * step).sum((-1, -2))
     determinants = log_root_determinant(root) + log_root_determinant(information_root)
-    weighed = upper(root, whitened)
+    weighed, (of_prior, middle, _) = upper(root, whitened), equations.prior
+    against = ((log_sizes @ of_prior.T - middle) ** 2).sum(-1)
     return LinearSolution(
-        log_posterior=-determinants - squares / 2 + equations.log_prior(log_sizes),
+        log_posterior=-determinants - (squares + against) / 2,
         step=step[..., 0],
         root=root,
         information_root=information_root,
@@ -293,7 +288,7 @@ def most_likely(
         some = equations.of_poses(np.linspace(0, poses - 1, TOO_MANY).astype(int))
         at, information = most_likely(some, start, settled)
         return at, poses / TOO_MANY * information
-    at = equations.prior[0] if start is None else start
+    at = equations.prior[1][:-1] * equations.prior[2] if start is None else start
     value, gradient, information = score(equations, at)
     curvature = information
     for _ in range(40):
@@ -324,7 +319,7 @@ def log_evidence(equations: Equations, at_mode: LinearSolution, information: Inf
     """
     gradient = equations.prior_gradient
     against_prior = gradient @ np.linalg.lstsq(equations.prior_information, gradient, rcond=None)[0]
-    volumes = np.linalg.slogdet(information)[1] / 2 + np.log(equations.prior[1]).sum()
+    volumes = np.linalg.slogdet(information)[1] / 2 + np.log(equations.prior[2]).sum()
     return float(at_mode.log_posterior - against_prior / 2 - volumes)
 
 
@@ -375,9 +370,9 @@ def score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, I
     squares = np.r_[masks @ left**2, [left @ part @ left for part in parts]]
     traces = np.r_[masks @ np.diagonal(projection), [np.trace(one) for one in by]]
     growth = np.exp(2 * log_sizes)
-    gradient, information = equations.log_prior_slope(log_sizes)
+    of_prior, middle, _ = equations.prior
     return (
         float(solution.log_posterior),
-        gradient + growth * (squares - traces),
-        information + 2 * np.outer(growth, growth) * pairs,
+        growth * (squares - traces) - of_prior.T @ (of_prior @ log_sizes - middle),
+        of_prior.T @ of_prior + 2 * np.outer(growth, growth) * pairs,
     )

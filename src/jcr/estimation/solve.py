@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.estimation.covariance import expected_posterior, posterior
+from jcr.estimation.covariance import posterior
 from jcr.estimation.elimination import cholesky, inverse_of, lower, over
 from jcr.estimation.image_equations import (
     SIZES_SETTLED,
@@ -29,6 +29,7 @@ from jcr.estimation.image_equations import (
     with_model_error_of,
     with_pixel_noise,
 )
+from jcr.estimation.intrinsics_prior import FIXED, CameraPrior, camera_with_prior, expressed, joint_covariance
 from jcr.estimation.pose_equations import (
     PoseEquations,
     pose_by_pose,
@@ -41,12 +42,17 @@ from jcr.estimation.problem import (
     SCALE,
     LinearPrior,
     Problem,
+    ReportedPoses,
+    Start,
     State,
     full_step,
     image_step,
     similarities_of_rigs,
     step_to,
+    transferred,
     with_free,
+    wrist_arm,
+    wrist_problem,
 )
 from jcr.estimation.projection import view_of
 from jcr.estimation.robot_noise import (
@@ -57,11 +63,12 @@ from jcr.estimation.robot_noise import (
     left_out,
     log_evidence,
     most_likely,
+    score,
     solve_equations,
 )
-from jcr.geometry import Transform, step_between
+from jcr.geometry import Poses, Transform, apply, fit_similarity, step_between
 from jcr.least_squares import one_blas_thread
-from jcr.records import Budget, RobotNoise
+from jcr.records import Budget, Intrinsics, ModelError, RobotNoise, Tracks, Uncertainty
 
 START_NOISE = (1e-3, float(np.radians(0.2)))
 """Random errors of gripper poses before the first estimate (m, rad)."""
@@ -137,20 +144,20 @@ class Solution:
     @cached_property
     def leave_one_out(self) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 6"]]:
         """Each pose's residual from a solution without it (m, rad; base axes), and its whole covariance."""
-        poses, noise, solution = self.poses, self.noise, self.at_mode
-        random = noise.translation, noise.rotation
-        found, covariance = np.empty_like(poses.residual), np.empty((len(poses.used), 6, 6))
-        found[poses.used], covariance[poses.used] = left_out(solution, random)
-        if poses.used.all():
+        used, every, noise, solution = self.poses.used, self.poses.every, self.noise, self.at_mode
+        random, n = (noise.translation, noise.rotation), len(used)
+        found, covariance = every.residual.reshape(n, 6).copy(), np.empty((n, 6, 6))
+        found[used], covariance[used] = left_out(solution, random)
+        if used.all():
             return found, covariance
         # Errors of an unused pose as the errors of the others show them (best linear unbiased prediction).
-        alike = noise.systematic**2 * poses.systematic + (0.0 if poses.shared is None else poses.shared)
-        rows, jacobian = np.repeat(poses.used, 6), poses.jacobian.reshape(len(poses.used), 6, -1)
-        for i in np.flatnonzero(~poses.used):
+        alike = noise.systematic**2 * every.systematic + (0.0 if every.known is None else every.known)
+        rows = np.repeat(used, 6)
+        for i in np.flatnonzero(~used):
             mine = slice(6 * i, 6 * i + 6)
             gain = alike[mine, rows] @ solution.weight
-            by = jacobian[i] - gain @ self.equations.jacobian
-            found[i] = poses.residual[i] - gain @ self.equations.residual
+            by = every.jacobian[mine] - gain @ self.equations.jacobian
+            found[i] -= gain @ self.equations.residual
             own = alike[mine, mine] - gain @ alike[mine, rows].T + np.diag(np.repeat(np.square(random), 3))
             covariance[i] = own + by @ solution.covariance @ by.T
         return found, covariance
@@ -162,8 +169,8 @@ class Solution:
 
     def intrinsics_covariance(self, camera: int) -> Float[ndarray, "q q"]:
         """Return the covariance of the parameters of a camera, in the order of camera.parameters."""
-        own = self.camera_unknowns(self.problem.columns.intrinsics[camera])
-        directions = self.problem.cameras[camera].directions
+        own = self.camera_unknowns(self.problem.columns.cameras)
+        directions = self.problem.directions[self.problem.parameters_of[camera]]
         return directions @ self.covariance[own, own] @ directions.T
 
     def transform(self, of: Callable[[State], Transform]) -> tuple[Transform, Float[ndarray, "6 6"]]:
@@ -199,21 +206,87 @@ def solve(
     uncertainty. `start_noise` is the initial size of the random errors of the poses (m, rad).
     """
     if problem.observations is None:
-        return _with_covariance(problem, start, None, averaged)
+        return with_covariance(problem, start, None, averaged)
     if start.pixel_noise is None:
         state = with_pixel_noise(problem, start, view_of(problem, start))
         noise = np.repeat(problem.robot_noise_floor or start_noise, 3)
         white = np.tile(noise, sum(len(arm.rigs) for arm in problem.arms))
         start = adjusted_images(problem, state, [_rig_information(problem, state, np.diag(white))])[0]
     state, images, settled, rounds, last_step = _rounds(problem, start)
-    found = _with_covariance(problem, state, images, averaged)
+    found = with_covariance(problem, state, images, averaged)
     return replace(found, settled=settled, iterations=rounds, last_step=last_step)
+
+
+def adjust_wrist(  # noqa: PLR0913 (each is a fact about the capture)
+    arm: ReportedPoses | Poses,
+    start: Start,
+    recon_from_camera: Poses,
+    camera: CameraPrior | Intrinsics,
+    tracks: Tracks,
+    *,
+    noise: tuple[float, float] | None = None,
+    combinations: Float[ndarray, "e p"] | None = None,
+    near: Solution | None = None,
+    start_noise: tuple[float, float] = START_NOISE,
+) -> Solution:
+    """Adjust images and reported poses together, from a result of a fit to poses.
+
+    The arguments are those of `wrist_problem`; the systematic errors of poses without an arm are smooth over the poses,
+    and intrinsics without a prior are exact. `start_noise` is the initial size of the random errors of the poses
+    (m, rad). `near` is a solution of the same poses and of the same points or more, from which the adjustment starts.
+    """
+    arm = arm if isinstance(arm, ReportedPoses) else wrist_arm(arm)
+    if isinstance(camera, Intrinsics):
+        camera = camera_with_prior(camera, FIXED)
+    problem, state = wrist_problem(
+        arm, start, recon_from_camera, camera, tracks, noise=noise, combinations=combinations
+    )
+    if near is not None:
+        state = transferred(near.problem, near.state, problem)
+    return solve(problem, state, start_noise=start_noise)
+
+
+def uncertainty_of(found: Solution) -> Uncertainty:
+    """Return the uncertainty of the first arm's transform, of the scale, and of the first camera's intrinsics."""
+    problem, observations, model_error = found.problem, found.problem.observations, None
+    known, directions = problem.intrinsics(found.state)[0], problem.directions[problem.parameters_of[0]]
+    own, cameras = problem.columns.model_error[0], found.camera_unknowns(problem.columns.cameras)
+    if own.stop > own.start:
+        assert observations is not None
+        unknowns = found.camera_unknowns(own)
+        x_px, middle = observations.x_px[problem.camera_rows[0]], problem.cameras[0].intrinsics
+        model_error = ModelError(
+            likeliest=found.state.camera_steps[own],
+            covariance=found.covariance[unknowns, unknowns],
+            expressed=expressed(middle, directions, x_px),
+        )
+    covariance, cross = found.covariance[:7, :7], found.covariance[:7, cameras] @ directions.T
+    joint = joint_covariance(covariance, cross, found.intrinsics_covariance(0), known)
+    return Uncertainty(covariance=covariance, budget=found.budget, joint=joint, model_error=model_error)
+
+
+def recon_frame(solution: Solution, tracks: Tracks) -> tuple[float, Transform]:
+    """Return scale (metres per unit) and base_from_recon of the reconstruction whose tracks were adjusted.
+
+    A similarity is fitted to its points and the adjusted ones, points that disagree having less weight.
+    """
+    state, observations = solution.state, solution.problem.observations
+    assert observations is not None and observations.point_rows is not None
+    points = apply(state.z[0], state.scale * state.points_in_world)
+    recon = tracks.points_in_recon[observations.point_rows].astype(np.float64)
+    weight = np.ones(len(points))
+    base_from_recon, scale = fit_similarity(points, recon, weight)
+    for _ in range(5):
+        gap = np.linalg.norm(apply(base_from_recon, scale * recon) - points, axis=1)
+        weight = 1 / (1 + (gap / max(float(np.median(gap)), 1e-9)) ** 2)
+        base_from_recon, scale = fit_similarity(points, recon, weight)
+    return float(scale), base_from_recon
 
 
 def with_priors(solution: Solution, priors: Sequence[LinearPrior]) -> Solution:
     """Return the solution with other linear priors; the evidence of the images stays as it is."""
     problem = with_free(solution.problem, priors=tuple(priors))
-    return _with_covariance(problem, solution.most_likely, solution.evidence, True)
+    return with_covariance(problem, solution.most_likely, solution.evidence, True)
 
 
 def size_of_boards(solution: Solution) -> tuple[float, Float[ndarray, " p"]]:
@@ -224,27 +297,6 @@ def size_of_boards(solution: Solution) -> tuple[float, Float[ndarray, " p"]]:
     by_unknown[SCALE] = by_unknown[problem.arm_unknowns + np.searchsorted(problem.free, column)] = 1.0
     size = np.log(solution.state.scale * problem.boards.unit) + solution.state.camera_steps[column]
     return float(size), by_unknown
-
-
-def expected_solution(
-    problem: Problem, state: State, images: ImageEvidence | None, noise: RobotNoise
-) -> Solution:
-    """Return the solution to expect of a problem without residuals, the robot's errors having these sizes."""
-    poses = pose_equations(problem, state, images)
-    _, covariance, budget = expected_posterior(poses.equations, noise, poses.region)
-    log_sizes = poses.equations.log_sizes_of(noise)
-    state = replace(state, robot_log_sizes=log_sizes)
-    return Solution(
-        problem=problem,
-        state=state,
-        covariance=covariance,
-        budget=budget,
-        most_likely=state,
-        poses=poses,
-        at_mode=solve_equations(poses.equations, log_sizes),
-        size_information=np.eye(len(log_sizes)),
-        evidence=images,
-    )
 
 
 def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool, int, float]:
@@ -328,18 +380,31 @@ def _accelerated(
     return ends[-1] - beyond * (most / far if far > most else 1.0)
 
 
-def _with_covariance(
-    problem: Problem, state: State, images: ImageEvidence | None, averaged: bool
+def with_covariance(
+    problem: Problem,
+    state: State,
+    images: ImageEvidence | None,
+    averaged: bool = True,
+    expected: RobotNoise | None = None,
 ) -> Solution:
-    """Return the solution with the evidence of the images, from a state that is near."""
-    state = _most_likely_arms(problem, state, images, ARMS_SETTLED if averaged else NEARLY_SETTLED)
+    """Return the solution with the evidence of the images, from a state that is near.
+
+    `expected` is the noise of the robot in a problem without residuals, whose solution is predicted.
+    """
+    if expected is None:
+        state = _most_likely_arms(problem, state, images, ARMS_SETTLED if averaged else NEARLY_SETTLED)
     poses = pose_equations(problem, state, images)
-    log_sizes, information = most_likely(poses.equations, state.robot_log_sizes)
+    equations, region = poses.equations, poses.region
+    if expected is None:
+        log_sizes, information = most_likely(equations, state.robot_log_sizes)
+    else:
+        log_sizes = equations.log_sizes_of(expected)
+        information = score(equations, log_sizes)[2]
     state = likeliest = replace(state, robot_log_sizes=log_sizes)
-    at_mode = solve_equations(poses.equations, log_sizes)
+    at_mode = solve_equations(equations, log_sizes)
     covariance, budget = at_mode.covariance, None
     if averaged:
-        step, covariance, budget = posterior(poses.equations, log_sizes, information, poses.region)
+        step, covariance, budget = posterior(equations, log_sizes, information, region, expected is not None)
         state = full_step(problem, state, step)
     return Solution(
         problem=problem,

@@ -12,10 +12,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.geometry import rotation_exp, skew
+from jcr.least_squares import minimise
 
-STEPS = 8
-SETTLED = 1e-5
-"""rad; of a step, a hundredth of the standard deviation of the surest reading."""
+ROUNDS, ENOUGH = 2, 1e-4
+"""Estimates of the size of the errors, and relative change of a cost that ends the steps between."""
 LEAST_SIGMA_PX = 0.3
 """Least standard deviation of a match; no detector is better over a whole image."""
 LARGEST_SIGMA_PX = 3.0
@@ -142,31 +142,29 @@ def _least_squares_motion(
     ray_j: Float[ndarray, "m 2"],
     focal_px: float,
 ) -> TwoViewMotion | None:
-    """Refine a motion by Gauss-Newton over five numbers under a Cauchy loss."""
+    """Refine a motion over five numbers under a Cauchy loss, whose scale is estimated in turn."""
     if len(ray_i) < 8:
         return None
-    damping, sigma, information = 1e-3, LEAST_SIGMA_PX, np.eye(5)
-    residual = sampson_px(rotation, direction, ray_i, ray_j, focal_px)
-    for _ in range(STEPS):
+    at, sigma, normal = (rotation, direction), LEAST_SIGMA_PX, np.eye(5)
+    for _ in range(ROUNDS):
+        residual = sampson_px(*at, ray_i, ray_j, focal_px)
         sigma = max(1.48 * float(np.median(np.abs(residual))), LEAST_SIGMA_PX)
-        weight = 1 / (1 + (residual / (2 * sigma)) ** 2)
-        jacobian = _by_step(rotation, direction, ray_i, ray_j, focal_px)
-        information = jacobian.T @ (weight[:, None] * jacobian)
-        gradient = jacobian.T @ (weight * residual)
-        step = -np.linalg.solve(information + damping * np.diag(np.diag(information) + 1e-9), gradient)
-        moved = _retracted(rotation, direction, step)
-        tried = sampson_px(*moved, ray_i, ray_j, focal_px)
-        cost, before = (np.log1p((of / (2 * sigma)) ** 2).sum() for of in (tried, residual))
-        if cost > before:
-            damping *= 10
-            continue
-        (rotation, direction), residual, damping = moved, tried, damping / 10
-        if np.abs(step).max() < SETTLED:
-            break
+        scaled = focal_px / (2 * sigma)
+        found = minimise(
+            lambda at, scaled=scaled: (
+                sampson_px(*at, ray_i, ray_j, scaled)[:, None],
+                _by_step(*at, ray_i, ray_j, scaled)[:, None],
+            ),
+            at,
+            lambda at, step: _retracted(*at, step),
+            "cauchy",
+            tolerance=ENOUGH,
+        )
+        at, normal = found.unknowns, found.normal
     # Matches of one detector share errors with their neighbours: no more than a hundred count as independent.
     independent = min(len(ray_i), 100) / len(ray_i)
-    covariance = sigma**2 * np.linalg.inv(independent * information + 1e-6 * np.eye(5))
-    return TwoViewMotion(rotation, direction, covariance, sigma)
+    covariance = np.linalg.inv(4 * independent * normal + 1e-6 / sigma**2 * np.eye(5))
+    return TwoViewMotion(*at, covariance, sigma)
 
 
 def _retracted(

@@ -155,7 +155,7 @@ def joints_at(
         now = joints[-1:]
         flange_from_tool = (inverse(forward_kinematics(arm, now)) @ base_from_gripper[-1:])[0]
         flange = (goal @ inverse(flange_from_tool))[None]
-        found = reach_toward(arm, flange, now, steps=60)
+        found = reach_toward(arm, flange, now)
         off = inverse(forward_kinematics(arm, found)) @ flange
         if np.linalg.norm(off[0, :3, 3]) < FITS[0] and float(rotation_angle(off[0, :3, :3])) < FITS[1]:
             return found[0]

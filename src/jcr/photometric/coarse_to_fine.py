@@ -8,7 +8,17 @@ from numpy import ndarray
 from scipy.linalg import null_space
 
 from jcr.geometry import nearest_to_lines, retract, step_axes
-from jcr.photometric.residuals import Cameras, Level, Points, energy, equations, on_rays, strongest
+from jcr.least_squares import damped_gauss_newton
+from jcr.photometric.residuals import (
+    Cameras,
+    Level,
+    PhotometricEquations,
+    Points,
+    energy,
+    equations,
+    on_rays,
+    strongest,
+)
 
 DEPTHS = 40
 """Tried along a ray, evenly spaced in inverse depth."""
@@ -20,6 +30,8 @@ AGREED = 0.5
 """Cost of a point beyond which its depth is not used."""
 IMAGES_AT_FULL = 10
 """Most images that each get all points; with more each has fewer, as each point is seen more often."""
+STEPS, ENOUGH = 8, 3e-4
+"""Most damped steps of a round, and the relative change of the cost that ends them: a step costs more than it gains."""
 SETTLED = 0.995
 """A round that leaves more of the cost than this was the last."""
 
@@ -97,32 +109,26 @@ def align_photometrically(
 def _after_descent(
     level: Level, cameras: Cameras, points: Points, sigma: float, directions: Float[ndarray, "p q"]
 ) -> tuple[Cameras, Points]:
-    """Take a few steps of Levenberg and Marquardt; the cameras move together where there are 7 parameters.
+    """Take a few damped steps of cameras and depths; the cameras move together where there are 7 parameters."""
 
-    Not least_squares.py: thousands of depths are eliminated, and steps cost so much more than the energy that a
-    thousandth of it is not worth another one.
-    """
-    damping, best = 1e-3, energy(level, cameras, points, sigma)
-    for _ in range(6):
-        system = equations(level, cameras, points, sigma, tied=len(directions) == 7)
+    def step(
+        at: tuple[Cameras, Points], system: PhotometricEquations, damping: float
+    ) -> tuple[Cameras, Points]:
         normal = directions.T @ system.normal @ directions
-        gradient = directions.T @ system.gradient.sum(0)
-        for _ in range(5):
-            damped = normal + np.diag(damping * np.diag(normal) + 1e-9)
-            step = -directions @ np.linalg.solve(damped, gradient)
-            depth = points.depth * np.exp(np.clip(system.depth_step(step), -0.05, 0.05))
-            tried = after_step(cameras, step), replace(points, depth=depth)
-            cost = energy(level, *tried, sigma)
-            if cost < best:
-                break
-            damping *= 6
-        else:
-            break
-        settled = best - cost < 3e-4 * best
-        (cameras, points), best, damping = tried, cost, damping / 6
-        if settled:
-            break
-    return cameras, points
+        normal += np.diag(damping * np.diag(normal) + 1e-9)
+        along = -directions @ np.linalg.solve(normal, directions.T @ system.gradient.sum(0))
+        depth = at[1].depth * np.exp(np.clip(system.depth_step(along), -0.05, 0.05))
+        return after_step(at[0], along), replace(at[1], depth=depth)
+
+    return damped_gauss_newton(
+        lambda at: equations(level, *at, sigma, tied=len(directions) == 7),
+        step,
+        lambda at: energy(level, *at, sigma),
+        (cameras, points),
+        enough=lambda best: ENOUGH * best,
+        damping=1e-3,
+        iterations=STEPS,
+    )[0]
 
 
 def after_step(cameras: Cameras, step: Float[ndarray, " p"]) -> Cameras:

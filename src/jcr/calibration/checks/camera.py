@@ -22,15 +22,12 @@ from jcr.estimation.hypotheses import (
     Row,
     ScoreTest,
     alternatives,
-    beyond_prior,
     differences,
     first_x,
-    nuisances_of,
-    spanned,
     test_combinations,
 )
 from jcr.estimation.intrinsics_prior import TYPICAL, CameraPrior
-from jcr.estimation.problem import OF_IMAGE, PRISM, Problem, State
+from jcr.estimation.problem import OF_IMAGE, PRISM, Problem, State, spanned
 from jcr.estimation.solve import Solution
 from jcr.findings import Concerns, Finding, FindingKind, joined
 from jcr.geometry import step_between
@@ -151,7 +148,7 @@ class CameraAdjustment:
 
     def equations_with(self, model_error_std: float | None) -> Alternatives:
         """Return these equations for a size of the camera-model error; None: as estimated."""
-        return alternatives(self.adjusted, self.prior, self.camera, self.place, model_error_std)
+        return alternatives(self.adjusted, self.camera, self.place, model_error_std)
 
     @property
     def intrinsics(self) -> Intrinsics:
@@ -204,12 +201,7 @@ class CameraAdjustment:
 
     def estimates(self, one: CameraEffect) -> Float[ndarray, " p"]:
         """Return the estimates of the combinations of an effect that is free."""
-        problem, state = self.adjusted.problem, self.adjusted.images.state
-        assert problem.observations is not None
-        images = np.flatnonzero(problem.observations.camera == self.camera)
-        of_camera = beyond_prior(self.adjusted, self.prior, self.camera) / self.equations.units
-        total = np.r_[of_camera, problem.nuisances(state)[nuisances_of(images, problem.n_images)]]
-        return np.linalg.lstsq(one.both, total, rcond=None)[0][one.beside.shape[1] :]
+        return np.linalg.lstsq(one.both, self.equations.total, rcond=None)[0][one.beside.shape[1] :]
 
 
 def rows_of_arm(problem: Problem, arm: int) -> slice:
