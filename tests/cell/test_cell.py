@@ -235,7 +235,8 @@ def test_a_slip_and_late_poses_of_a_further_camera_are_named_with_their_size(fau
     camera = CellCamera(
         name="a", mount="gripper", images=tuple(f"{k}.png" for k in range(12)), image_size=(9, 9)
     )
-    views = CameraViews.of(camera, [(Registration(pose=pose, **rays), 100) for pose in poses])
+    used = {k: Registration(pose=pose, **rays) for k, pose in enumerate(poses)}
+    views = CameraViews(camera=camera, points=[100] * 12, used=used, reasons={})
     _, found = fit_views(views, reported, 1e-4)
     assert [one.kind for one in found] == ([] if kind is None else [kind])
     if kind is FindingKind.SLIP:

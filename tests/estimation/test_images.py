@@ -14,7 +14,7 @@ from jcr.estimation.problem import (
     PRISM,
     Problem,
     State,
-    image_step,
+    stepped,
     with_observations,
 )
 from jcr.estimation.projection import derivatives, view_of
@@ -60,7 +60,7 @@ def test_derivatives_are_those_of_the_residuals():
     begun = np.zeros(problem.columns.count)
     std = problem.prior_std(state)
     begun[: len(std)] = 0.02 * std * rng.normal(size=len(std))
-    state = image_step(problem, state, begun)
+    state = stepped(problem, state, None, begun)
     view = view_of(problem, state)
     found = derivatives(problem, state, view, np.ones(len(view.residual_px)))
     rig = problem.observations.rig[problem.observations.image]
@@ -68,7 +68,7 @@ def test_derivatives_are_those_of_the_residuals():
     for column in range(len(begun)):
         step = np.zeros(len(begun))
         step[column] = 1e-6
-        ahead, behind = (view_of(problem, image_step(problem, state, sign * step)) for sign in (1, -1))
+        ahead, behind = (view_of(problem, stepped(problem, state, None, sign * step)) for sign in (1, -1))
         numeric = (ahead.residual_px - behind.residual_px) / 2e-6
         if column < first:
             analytic = found.shared[:, :, column]

@@ -20,8 +20,7 @@ from jcr.estimation.intrinsics_prior import (
 )
 from jcr.estimation.pixel_noise import PixelNoise
 from jcr.estimation.problem import Observations, image_problem
-from jcr.estimation.solve import Solution
-from jcr.estimation.solve import adjust_wrist, recon_frame
+from jcr.estimation.solve import Solution, adjust_wrist, recon_frame
 from jcr.records import Intrinsics, Tracks
 from simulation.problems import INTRINSICS, HandEyeProblem, error, hand_eye_problem, observed
 

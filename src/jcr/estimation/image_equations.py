@@ -17,7 +17,7 @@ from numpy import ndarray
 from jcr.estimation.elimination import Normal, cholesky, inverse_of, over, with_fixed_points, without_points
 from jcr.estimation.intrinsics_prior import size_of
 from jcr.estimation.pixel_noise import pixel_noise, refined_noise
-from jcr.estimation.problem import Problem, State, image_step, similarities, similarities_of_rigs
+from jcr.estimation.problem import Problem, State, similarities, similarities_of_rigs, stepped
 from jcr.estimation.projection import (
     ProjectedObservations,
     by_points,
@@ -152,7 +152,7 @@ def adjusted_images(
         scaled = scale[:, None] * normal.hessian * scale + 1e-12 * np.eye(len(scale))
         along = scale * over(cholesky(scaled), (scale * normal.right)[:, None])[:, 0]
         points = normal.stepped(now[0].points_in_world, along)
-        tried = replace(image_step(problem, now[0], along), points_in_world=points)
+        tried = replace(stepped(problem, now[0], None, along), points_in_world=points)
         return tried, view_of(problem, tried)
 
     found, _, damping, _ = damped_gauss_newton(

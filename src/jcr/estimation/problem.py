@@ -480,37 +480,39 @@ def transferred(problem: Problem, state: State, other: Problem) -> State:
     return replace(state, camera_steps=along, points_in_world=points)
 
 
-def image_step(problem: Problem, state: State, step: Float[ndarray, " d"]) -> State:
-    """Return the state after a step of the columns of the images; arms and points stay."""
-    columns = problem.columns
-    mounts = state.rig_from_camera.copy()
-    for c, own in enumerate(columns.mounts):
-        if own is not None:
-            mounts[c] = retract(mounts[c], step[own])
-    return replace(
-        state,
-        world_from_rig=retract(state.world_from_rig, step[columns.first_rig :].reshape(-1, 6)),
-        rig_from_camera=mounts,
-        camera_steps=state.camera_steps + step[: columns.boards.stop],
-    )
+def stepped(
+    problem: Problem,
+    state: State,
+    arms: Float[ndarray, " u"] | None = None,
+    columns: Float[ndarray, " d"] | None = None,
+) -> State:
+    """Return the state after a step of the arms' unknowns and one of the columns of the images; points stay.
+
+    `arms` holds X, log scale and Z of the first arm, then X and Z of further arms.
+    """
+    if columns is not None:
+        of, mounts = problem.columns, state.rig_from_camera.copy()
+        for c, own in enumerate(of.mounts):
+            if own is not None:
+                mounts[c] = retract(mounts[c], columns[own])
+        state = replace(
+            state,
+            world_from_rig=retract(state.world_from_rig, columns[of.first_rig :].reshape(-1, 6)),
+            rig_from_camera=mounts,
+            camera_steps=state.camera_steps + columns[: of.boards.stop],
+        )
+    if arms is None:
+        return state
+    own = np.stack([arms[columns_of_arm(arm)] for arm in range(len(state.x))])
+    scale = float(state.scale * np.exp(arms[6]))
+    return replace(state, x=retract(state.x, own[:, :6]), scale=scale, z=retract(state.z, own[:, 6:]))
 
 
 def full_step(problem: Problem, state: State, step: Float[ndarray, " p"]) -> State:
-    """Return the state after a step of all parameters.
-
-    `step` holds X, log scale and Z of the first arm, X and Z of further arms, then the intrinsics and other camera
-    parameters that are estimated.
-    """
-    own = np.stack([step[columns_of_arm(arm)] for arm in range(len(state.x))])
-    of_images = np.zeros(problem.columns.count)
-    of_images[problem.free] = step[problem.arm_unknowns :]
-    moved = image_step(problem, state, of_images) if of_images.any() else state
-    return replace(
-        moved,
-        x=retract(state.x, own[:, :6]),
-        scale=float(state.scale * np.exp(step[6])),
-        z=retract(state.z, own[:, 6:]),
-    )
+    """Return the state after a step of the unknowns of the mixed model."""
+    columns, arms = np.zeros(problem.columns.count), problem.arm_unknowns
+    columns[problem.free] = step[arms:]
+    return stepped(problem, state, step[:arms], columns if columns.any() else None)
 
 
 def step_to(

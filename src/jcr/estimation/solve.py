@@ -46,9 +46,9 @@ from jcr.estimation.problem import (
     Start,
     State,
     full_step,
-    image_step,
     similarities_of_rigs,
     step_to,
+    stepped,
     transferred,
     with_free,
     wrist_arm,
@@ -307,7 +307,7 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
     """
     state, log_sizes, last_step = start, start.robot_log_sizes, np.inf
     ends, steps = list[ndarray](), list[ndarray]()
-    robots, fixed = problem.arm_unknowns, np.zeros(len(problem.free))
+    robots = problem.arm_unknowns
     for count in range(1, ROUNDS + 1):
         before, view = state.pixel_noise, view_of(problem, state)
         state = with_pixel_noise(problem, state, view)
@@ -325,9 +325,8 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
         if change < SIZES_SETTLED and last_step < STEP_SETTLED:
             return state, images, True, count, last_step
         share = share_within_limits(arms)
-        moved = image_step(problem, state, share * columns)
+        moved = stepped(problem, state, share * arms, share * columns)
         moved = replace(moved, points_in_world=normal.stepped(state.points_in_world, share * columns))
-        moved = full_step(problem, moved, np.r_[share * arms, fixed])
         # The cost has the weights and sizes of errors at the start of the step.
         root = cholesky(replace(equations, known=None).covariance(log_sizes))
         cost, moved_cost = (
@@ -426,10 +425,9 @@ def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | No
         equations = pose_equations(problem, state, images).equations
         sizes, _ = most_likely(equations, state.robot_log_sizes, SIZES_SETTLED / 3)
         solution = solve_equations(equations, sizes)
-        step = np.zeros(problem.unknowns)
-        step[:arms] = share_within_limits(solution.step[:arms]) * solution.step[:arms]
-        state = replace(full_step(problem, state, step), robot_log_sizes=sizes)
-        if float(((solution.information_root.T @ step) ** 2).sum()) < settled:
+        step = share_within_limits(solution.step[:arms]) * solution.step[:arms]
+        state = replace(stepped(problem, state, step), robot_log_sizes=sizes)
+        if float(((step @ solution.information_root[:arms]) ** 2).sum()) < settled:
             break
     return state
 
@@ -464,11 +462,10 @@ def _state_at(problem: Problem, start: State, like: State, coordinates: Float[nd
     """Return the state with these coordinates; the other sizes of errors are those of `like`."""
     ends = np.cumsum([problem.arm_unknowns, problem.columns.count, start.points_in_world.size])
     arms, columns, points, sizes = np.split(coordinates, ends)
-    state = replace(
-        image_step(problem, start, columns),
+    return replace(
+        stepped(problem, start, arms, columns),
         points_in_world=start.points_in_world + points.reshape(-1, 3),
         model_error_std=np.exp(sizes),
         pixel_noise=like.pixel_noise,
         robot_log_sizes=like.robot_log_sizes,
     )
-    return full_step(problem, state, np.r_[arms, np.zeros(len(problem.free))])
