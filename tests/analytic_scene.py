@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+import scenes
 from jcr.camera import rays
 from jcr.records import Intrinsics, PointCloud
 
@@ -74,16 +75,9 @@ def cloud(points: int = 60_000, cameras: int = 10, noise: float = 0.0, seed: int
     x_in_base, label, image = map(np.concatenate, zip(*parts, strict=True))
     chosen = draw.choice(len(image), min(points, len(image)), replace=False)
     x_in_base = x_in_base[chosen]
-    return PointCloud(
-        points_in_base=x_in_base,
-        color=(255 * true_color(x_in_base)).astype(np.uint8),
-        confidence=np.ones(len(chosen)),
-        margin=np.zeros(len(chosen)),
-        label=label[chosen],
-        image=image[chosen],
-        camera_centers_in_base=centers,
-        label_names=LABELS,
-    )
+    color = (255 * true_color(x_in_base)).astype(np.uint8)
+    seen = {"label": label[chosen], "image": image[chosen], "camera_centers_in_base": centers}
+    return scenes.cloud_of(x_in_base, color=color, label_names=LABELS, **seen)
 
 
 def looking_at_table(cameras: int) -> Float[ndarray, "m 4 4"]:

@@ -38,7 +38,6 @@ from jcr.records import (
     Attempt,
     Capture,
     Intrinsics,
-    PointCloud,
     Pointmaps,
     Tracks,
 )
@@ -48,7 +47,7 @@ from jcr.scene.cloud import read_cloud, write_cloud
 from jcr.scene.map_file import load_map
 from jcr.scene.options import MapOptions
 from jcr.segments.segments import _read_names
-from scenes import pairs_of, reconstruction_of
+from scenes import cloud_of, pairs_of, reconstruction_of
 from simulation.problems import hand_eye_problem
 from simulation.ros_bag import write_bag
 
@@ -232,17 +231,8 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
     depth, colors = draw.uniform(0.5, 1.0, shape).astype(np.float32), np.zeros((*shape, 3), np.uint8)
     dense = pointmaps_of(depth, *layers, colors, cameras, capture.intrinsics)
     write_depth(folder / "depth.npz", replace(reconstruction, pointmaps=dense), "y")
-    ones = np.ones(200)
-    cloud = PointCloud(
-        points_in_base=draw.random((200, 3)),
-        color=np.zeros((200, 3), np.uint8),
-        confidence=ones,
-        margin=ones,
-        label=ones.astype(int),
-        image=np.zeros(200, int),
-        camera_centers_in_base=inverse(cameras)[:, :3, 3],
-        label_names=("none", "cup"),
-    )
+    labels = {"label": np.ones(200, int), "label_names": ("none", "cup")}
+    cloud = cloud_of(draw.random((200, 3)), camera_centers_in_base=inverse(cameras)[:, :3, 3], **labels)
     write_cloud(folder / "cloud.ply", cloud)
     write_cloud(folder / "points.ply", cloud)
     (folder / "points.csv").write_text("x,y,z\n0.1,0.2,0.3\n")

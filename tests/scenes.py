@@ -11,7 +11,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from jcr.geometry import apply, fit_similarity, inverse, transform
-from jcr.records import Capture, PosePairs, Reconstruction, Tracks
+from jcr.records import Capture, PointCloud, PosePairs, Reconstruction, Tracks
 from simulation.problems import INTRINSICS
 
 Change = Callable[[ndarray], ndarray]
@@ -44,6 +44,14 @@ def reconstruction_of(recon_from_camera: Float[ndarray, "n 4 4"], **facts: Any) 
     """Return a reconstruction with these cameras and no tracks, of every image of a capture."""
     usual = {"image_index": np.arange(len(recon_from_camera)), "intrinsics": INTRINSICS, "tracks": NO_TRACKS}
     return Reconstruction(recon_from_camera=recon_from_camera, **(usual | {"backend": "colmap"} | facts))
+
+
+def cloud_of(points_in_base: Float[ndarray, "n 3"], **facts: Any) -> PointCloud:
+    """Return a cloud of black points without labels, as sure as all others, of one image from above."""
+    nothing, zeros = np.zeros(len(points_in_base)), np.zeros(len(points_in_base), int)
+    usual = {"color": np.zeros(points_in_base.shape, np.uint8), "confidence": nothing + 1, "margin": nothing}
+    usual |= {"label": zeros, "image": zeros, "camera_centers_in_base": np.array([[0.0, 0.0, 1.0]])}
+    return PointCloud(points_in_base=points_in_base, **(usual | facts))
 
 
 def reference_of(folder: Path) -> Float[ndarray, "4 4"]:

@@ -11,6 +11,7 @@ import pytest
 from jaxtyping import Float
 from numpy import ndarray
 
+import scenes
 from jcr.calibration.record import Calibration
 from jcr.cli.use import sizes_lines
 from jcr.errors import InputError
@@ -82,16 +83,8 @@ def cloud_of(
     """The surfaces, given in the table's frame, as images from above saw them."""
     x = np.concatenate(surfaces)
     x = apply(base_from_table, x + rng.normal(0, noise, x.shape))
-    n = len(x)
-    return PointCloud(
-        points_in_base=x,
-        color=np.zeros((n, 3), np.uint8),
-        confidence=np.ones(n),
-        margin=np.zeros(n),
-        label=np.zeros(n, int),
-        image=rng.integers(IMAGES, size=n),
-        camera_centers_in_base=apply(base_from_table, EYES),
-    )
+    centers = apply(base_from_table, EYES)
+    return scenes.cloud_of(x, image=rng.integers(IMAGES, size=len(x)), camera_centers_in_base=centers)
 
 
 def sizes_of(cloud: PointCloud) -> list[ndarray]:
