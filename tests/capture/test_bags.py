@@ -12,11 +12,9 @@ import capture_writers as writers
 import jcr
 from jcr.capture.images import encode_png, read_depth_images, read_image
 from jcr.capture.options import ReadOptions
-from jcr.capture.pose_track import NEVER, PoseTrack
 from jcr.capture.recording import Recording, best_frames, capture_of_recording
 from jcr.capture.ros import image_of, read_ros_depth
 from jcr.files import write_bytes
-from jcr.geometry import rotation_exp, transform
 from jcr.progress import silent
 from jcr.records import Capture
 from simulation.problems import hand_eye_problem
@@ -186,21 +184,6 @@ def test_files_that_are_no_bags_are_one_line(fault: str, tmp_path: Path, mcap: P
     with pytest.raises(jcr.InputError, match=r"scan\.mcap: not a readable bag") as caught:
         jcr.read_capture(file, FRAMES, into=tmp_path / "frames")
     assert "\n" not in str(caught.value)
-
-
-def test_interpolation_is_exact_on_a_screw_and_refuses_what_lies_outside():
-    """A steady rotate with a steady advance along x is its own interpolation."""
-    start = 1_700_000_000_000_000_001
-    time_s = np.arange(5.0)
-    rotation = rotation_exp(np.outer(time_s, [0.1, 0.3, -0.2]))
-    track = PoseTrack(
-        start + (1e9 * time_s).astype(np.int64), transform(rotation, np.outer(time_s, [1.0, 0, 0]))
-    )
-    at, gap = track.at(start + np.array([1_500_000_000, 3_000_000_000, -1, 4_000_000_001]))
-    assert np.allclose(at[0, :3, 3], [1.5, 0, 0]) and np.allclose(
-        at[0, :3, :3], rotation_exp(np.array([0.15, 0.45, -0.3]))
-    )
-    assert gap.tolist() == [10**9, 0, NEVER, NEVER]
 
 
 def test_the_best_frames_are_still_sharp_and_spread():

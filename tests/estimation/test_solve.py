@@ -7,10 +7,10 @@ from scipy.stats import chi2
 import jcr
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.estimation.closed_form import closed_form
-from jcr.estimation.pose_equations import PRIOR_STD, pose_residuals, residuals_by_camera
+from jcr.estimation.pose_equations import PRIOR_STD, pose_residuals
 from jcr.estimation.robot_noise import Equations, left_out, smooth_errors, solve_equations
 from jcr.findings import FindingKind
-from jcr.geometry import inverse, retract, rotation_exp, scale_translation, transform
+from jcr.geometry import inverse, rotation_exp, scale_translation, transform
 from simulation.problems import HandEyeProblem, error, hand_eye_problem
 
 NOISE = (5e-4, np.radians(0.1))
@@ -127,30 +127,6 @@ def test_a_robot_noise_that_the_poses_contradict_is_not_believed():
         assert any("more than the given robot noise" in warning for warning in solved.warnings)
     # Binomial: 47.5 ± 1.5; none where the given noise is believed.
     assert inside >= 42
-
-
-def test_the_equations_jacobians_match_finite_differences():
-    problem = hand_eye_problem(np.random.default_rng(10), 4, robot_noise=NOISE)
-    camera, gripper = problem.recon_from_camera, problem.base_from_gripper
-    x, scale = problem.gripper_from_camera, problem.scale
-    z = problem.true_base_from_gripper[0] @ x @ inverse(scale_translation(camera[0], scale))
-
-    def by_unknowns(step):
-        unknowns = retract(x, step[:6]), scale * np.exp(step[6]), retract(z, step[7:])
-        return pose_residuals(*unknowns, gripper, camera)[0]
-
-    def by_cameras(step):
-        return pose_residuals(x, scale, z, gripper, retract(camera, step))[0]
-
-    jacobian, of_camera = (
-        pose_residuals(x, scale, z, gripper, camera)[1],
-        residuals_by_camera(x, scale, z, camera),
-    )
-    for analytic, function in ((jacobian, by_unknowns), (of_camera, by_cameras)):
-        for k, step in enumerate(1e-6 * np.eye(analytic.shape[2])):
-            numeric = (function(step) - function(-step)) / 2e-6
-            # The logarithm's derivative is one but for the size of the residuals.
-            assert np.allclose(analytic[:, :, k], numeric, atol=5e-3)
 
 
 def test_leave_one_out_error_is_that_of_a_fit_without_the_image():

@@ -137,35 +137,6 @@ def test_what_keeps_its_pixel_while_the_gripper_moves_is_hidden():
     assert not still_cells(moving, few, (640, 480), few).any()
 
 
-def rotations(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Relative rotations of gripper and camera of all pairs, and X's."""
-    problem, pairs = problem_and_pairs(seed)
-    gripper = motions(problem.base_from_gripper)
-    return (
-        np.stack([gripper[pair.key][:3, :3] for pair in pairs]),
-        np.stack([pair.readings[0].rotation for pair in pairs]),
-        problem.gripper_from_camera[:3, :3],
-    )
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_wrong_pairs_are_found_out(seed: int):
-    """Half of the pairs rotated by the angle of the gripper about an axis of chance, which the angle does not show."""
-    rng = np.random.default_rng(seed)
-    gripper, camera, x = rotations(seed)
-    camera = rotation_exp(rng.normal(scale=2e-3, size=(len(camera), 3))) @ camera
-    wrong = rng.permutation(len(camera))[: len(camera) // 2]
-    axis = rng.normal(size=(len(wrong), 3))
-    axis /= np.linalg.norm(axis, axis=1)[:, None]
-    camera[wrong] = rotation_exp(axis * np.asarray(rotation_angle(gripper[wrong]))[:, None])
-    found = rotation_of_x(gripper, camera, np.full(len(gripper), 0.02))
-    assert found is not None
-    assert rotation_angle(found.rotation.T @ x) < 5e-3
-    right = np.setdiff1d(np.arange(len(camera)), wrong)
-    assert found.agreeing[right].mean() > 0.9
-    assert found.agreeing[wrong].mean() < 0.25
-
-
 def test_one_axis_fixes_nothing():
     x = rotation_exp(np.array([0.3, -0.2, 1.0]))
     gripper = rotation_exp(np.linspace(0.2, 1.5, 10)[:, None] * np.array([0.0, 0.0, 1.0]))
