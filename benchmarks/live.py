@@ -175,7 +175,7 @@ def run_of(cell: Cell, way: str) -> Run:
                 break
         live.close()
     found = state.hand_eye
-    assert found is not None and state.now is not None and found.uncertainty.seen is not None
+    assert found is not None and state.reached is not None and found.uncertainty.seen is not None
     # The truth is the effective transform about the postures of the capture.
     draw, each = np.random.default_rng([cell.seed, 80]), -(-EFFECTIVE_POSES // len(visited))
     around = np.concatenate([about_posture(arm, posture, each, draw) for posture in visited])
@@ -185,7 +185,7 @@ def run_of(cell: Cell, way: str) -> Run:
     deg = float(np.degrees(rotation_angle(x[:3, :3].T @ effective[:3, :3])))
     is_true = mm <= REQUIRE[0] and deg <= REQUIRE[1]
     claim = ("true" if is_true else "false") if state.requirement_met else "none"
-    numbers = [f"{value:.2f}" for value in (state.now.translation_mm, state.now.rotation_deg, mm, deg)]
+    numbers = [f"{value:.2f}" for value in (*state.reached, mm, deg)]
     cells = [f"{cell.seed}, {arm.name}", way, f"{len(visited)}", *numbers, claim, f"{seconds:.1f}"]
     return Run(way, len(visited), state.requirement_met, is_true, cells)
 

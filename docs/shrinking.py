@@ -41,10 +41,8 @@ def states() -> list[tuple[str, float, float]]:
         live = jcr.LiveCalibration(Path(folder) / "live", intrinsics=intrinsics)
         for frame in content["frames"]:
             image = np.asarray(Image.open(CAPTURE / frame["image"]).convert("RGB"))
-            now = live.add(image, np.array(frame["base_from_gripper"])).now
-            found.append(
-                (frame["image"], *((now.translation_mm, now.rotation_deg) if now else (math.nan, math.nan)))
-            )
+            reached = live.add(image, np.array(frame["base_from_gripper"])).reached
+            found.append((frame["image"], *(reached or (math.nan, math.nan))))
     return found
 
 

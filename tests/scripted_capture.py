@@ -18,7 +18,7 @@ from jcr.findings import Finding, FindingKind
 from jcr.geometry import rotation_exp, transform
 from jcr.live.cameras import Camera, Frame
 from jcr.live.folder import LiveFolder
-from jcr.live.progress import Accuracy, Progress
+from jcr.live.progress import Progress
 from jcr.live.robot import RobotState
 from jcr.live.session import Answer, LiveSession, SessionOptions
 from jcr.records import Requirement
@@ -28,8 +28,8 @@ RATE = 10
 """Images a second of a video."""
 
 
-def a_hand_eye(met: bool) -> Calibration:
-    """Return an accepted calibration that meets its requirement, or does not."""
+def a_hand_eye(met: bool, reached_mm: float = 1.0) -> Calibration:
+    """Return an accepted calibration that reaches an accuracy and meets its requirement, or does not."""
     rng = np.random.default_rng(0)
     poses = transform(rotation_exp(0.5 * rng.normal(size=(10, 3))), 0.2 * rng.normal(size=(10, 3)))
     found = solve_hand_eye(poses, poses @ transform(np.eye(3), np.array([0.05, 0.0, 0.1])))
@@ -38,7 +38,7 @@ def a_hand_eye(met: bool) -> Calibration:
         rotation_deg=REQUIRED[1],
         asked=True,
         distance_mm=500.0,
-        reached_mm=1.0 if met else 3.0,
+        reached_mm=reached_mm if met else max(reached_mm, 1.1 * REQUIRED[0]),
         reached_deg=0.1,
     )
     return replace(found, requirement=required)
@@ -64,10 +64,9 @@ class Scripted:
             fault, self.fault = self.fault, None
             raise fault
         images = tuple(self.live.names)
-        history = tuple(
-            Accuracy(images=k, translation_mm=10.0 / k, rotation_deg=1.0 / k, accepted=True)
-            for k in range(3, len(images) + 1)
-        )
+        count, hand_eye = len(images), None
+        if count >= 3:
+            hand_eye = a_hand_eye(count >= self.accurate_from, 10.0 / count)
         findings = ()
         if self.contradicted in images:
             findings = (
@@ -85,8 +84,7 @@ class Scripted:
             added=images[-1] if images else None,
             registered=images,
             findings=findings,
-            hand_eye=a_hand_eye(len(images) >= self.accurate_from) if history else None,
-            history=history,
+            hand_eye=hand_eye,
             points_in_base=np.random.default_rng(0).normal(size=(50, 3)),
         )
         return self.progress

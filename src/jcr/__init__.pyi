@@ -26,7 +26,6 @@ from .geometry import Similarity as Similarity
 from .live.calibration import LiveCalibration as LiveCalibration
 from .live.cameras import Camera as Camera
 from .live.cameras import Frame as Frame
-from .live.progress import Accuracy as Accuracy
 from .live.progress import Progress as Progress
 from .live.robot import RobotState as RobotState
 from .live.server import Listen as Listen

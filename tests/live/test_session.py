@@ -104,10 +104,16 @@ def test_take_and_retake_read_where_the_gripper_is(tmp_path: Path, tabletop: Pat
 def test_a_connection_that_fails_during_retake_does_not_end_the_capture(tmp_path: Path, tabletop: Path):
     taken = Stepped(tmp_path / "c", tabletop)
 
-    def lost() -> RobotState:
-        raise jcr.InputError("--poses ur:192.168.0.2:30003: silent for 5 s")
+    is_lost = iter(
+        [False, True, True, False]
+    )  # after the first image, at both commands, after the last image
 
-    taken.session._gripper = lost
+    def read() -> RobotState:
+        if next(is_lost):
+            raise jcr.InputError("--poses ur:192.168.0.2:30003: silent for 5 s")
+        return RobotState(0.0, taken.poses[taken.at])
+
+    taken.session._gripper = read
     heard = taken.run([0, ("retake",), ("take",), 1])
     reasons = [answer["reason"] for answer, _ in heard if "reason" in answer]
     assert len(reasons) == 2 and all("silent for 5 s" in reason for reason in reasons)
@@ -135,7 +141,8 @@ def test_an_arm_that_moves_while_the_image_is_taken_is_named(tmp_path: Path, tab
     taken = Stepped(tmp_path / "c", tabletop)
     moved = taken.poses[0].copy()
     moved[0, 3] += 1e-3
-    answer = taken.session.take(RobotState(0.0, taken.poses[0]), current=lambda: RobotState(0.0, moved))
+    taken.session._gripper = lambda: RobotState(0.0, moved)
+    answer = taken.session.take(RobotState(0.0, taken.poses[0]))
     assert "moved" in answer["reason"] and not (tmp_path / "c" / "capture.json").exists()
 
 

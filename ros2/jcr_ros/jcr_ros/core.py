@@ -173,7 +173,7 @@ class Calibrator:
             return False, str(error)
         if self.session is None or not self.is_running:
             return False, "not started, or finished: call ~/start"
-        answer = self.session.take(state, current=self.gripper_now)
+        answer = self.session.take(state)
         return (True, f"kept {answer['image']}") if answer["accepted"] else (False, str(answer["reason"]))
 
     def undo(self) -> tuple[bool, str]:

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 from jcr.calibration.case import Case
 from jcr.calibration.checks.capture import SAME
 from jcr.calibration.options import CalibrateOptions, check_options
-from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate_case
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
@@ -26,7 +25,7 @@ from jcr.findings import Finding, FindingKind, strongest_first
 from jcr.least_squares import one_blas_thread
 from jcr.live.folder import Channels, LiveFolder
 from jcr.live.next_pose import Reach, propose
-from jcr.live.progress import Accuracy, Progress
+from jcr.live.progress import Progress
 from jcr.options import checked_options
 from jcr.records import Capture, Intrinsics, Tracks
 from jcr.records.capture_json import IntrinsicsEntry
@@ -86,7 +85,6 @@ class LiveCalibration:
         self._map: LiveMap | None = None
         self._mapped: tuple[str, ...] = ()
         self._blurred: dict[str, Finding] = {}
-        self._history: tuple[Accuracy, ...] = ()
         self._refused: list[Float[ndarray, "4 4"]] = []
         self._propose: Callable[[], dict[str, Any]] = dict
         """Function that returns the next pose, by the last calibration and the gripper poses refused since."""
@@ -180,7 +178,7 @@ class LiveCalibration:
     def _calibrated(self, capture: Capture | None, added: str | None) -> Progress:
         """Return the state of the mapped images, calibrated where enough of them registered."""
         names, self._propose = self._mapped, dict
-        state = Progress(images=names, added=added, history=self._history)
+        state = Progress(images=names, added=added)
         if capture is None or self._map is None:
             return state
         made = self._map.reconstruction()
@@ -214,21 +212,17 @@ class LiveCalibration:
                 kind = FindingKind.NO_RECONSTRUCTION
                 few = Finding.of(kind, "rejects", "reconstruction", text=why, remedy=then)
             return replace(state, findings=strongest_first([*findings, few]))
-        hand_eye, required = case.hand_eye, case.hand_eye.requirement
-        assert required is not None
-        reached = Accuracy(
-            images=len(names),
-            translation_mm=float(required.reached_mm),
-            rotation_deg=float(required.reached_deg),
-            accepted=hand_eye.converged,
-        )
-        # Entries of more images belong to other images.
-        self._history = (*(one for one in self._history if one.images < len(names)), reached)
+        hand_eye = case.hand_eye
+        for one in hand_eye.images if hand_eye.is_sound else ():
+            metres = 1e-3 * (one.translation_residual_mm or 0.0)
+            radians = float(np.radians(one.rotation_residual_deg or 0.0))
+            if not one.used and (metres > SAME[0] or radians > SAME[1]):
+                kind = FindingKind.POSE_CONTRADICTS_IMAGE
+                findings.append(Finding.of(kind, "warns", "poses", one.image, value=metres, rotation=radians))
         return replace(
             state,
             hand_eye=hand_eye,
-            findings=strongest_first([*findings, *_contradicting(hand_eye), *hand_eye.findings]),
-            history=self._history,
+            findings=strongest_first([*findings, *hand_eye.findings]),
             points_in_base=_points(case),
         )
 
@@ -246,18 +240,6 @@ def _longest(tracks: Tracks, most: int) -> Tracks:
     chosen = tracks.on_board
     chosen[order[np.cumsum(count[order]) <= most]] = True
     return tracks.only(chosen[tracks.point])
-
-
-def _contradicting(hand_eye: Calibration) -> list[Finding]:
-    """Return a finding for each image whose gripper pose a sound calibration rejects."""
-    found = list[Finding]()
-    for one in hand_eye.images if hand_eye.is_sound else ():
-        metres = 1e-3 * (one.translation_residual_mm or 0.0)
-        radians = float(np.radians(one.rotation_residual_deg or 0.0))
-        if not one.used and (metres > SAME[0] or radians > SAME[1]):
-            kind = FindingKind.POSE_CONTRADICTS_IMAGE
-            found.append(Finding.of(kind, "warns", "poses", one.image, value=metres, rotation=radians))
-    return found
 
 
 def _points(case: Case) -> Float[ndarray, "p 3"]:

@@ -144,15 +144,19 @@ def _verdict(state: SessionState) -> list[str]:
         return ["good", "Requirement met, press Finish", *lines]
     if wrong:
         return ["fair", *lines]
-    return ["", f"{count} images", accuracy_line(progress), *([FIRST_ADVICE] if progress.now is None else [])]
+    return [
+        "",
+        f"{count} images",
+        accuracy_line(progress),
+        *([FIRST_ADVICE] if progress.reached is None else []),
+    ]
 
 
 def _tiles(state: SessionState, required: tuple[float, float]) -> list[Tile]:
     """Return the accuracies beside what is required, at the end those of all images, and the registered images."""
     if not state.images:
         return []
-    tiles, now = list[Tile](), state.progress.now
-    reached = () if now is None else (now.translation_mm, now.rotation_deg)
+    tiles, reached = list[Tile](), state.progress.reached or ()
     if state.result is not None and (found := state.result.calibration.requirement) is not None:
         reached = found.reached_mm, found.reached_deg
     names = ("Point uncertainty", " mm"), ("Direction", "°")

@@ -34,19 +34,6 @@ class Notation:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Accuracy:
-    """Accuracy of the calibration with the first images."""
-
-    images: int
-    """Number of images."""
-    translation_mm: float
-    """95 % of the errors are smaller; `Requirement.at` names the point."""
-    rotation_deg: float
-    """95 % of the errors are smaller."""
-    accepted: bool
-
-
-@dataclass(frozen=True, kw_only=True)
 class Progress:
     """State of a calibration that grows by an image at a time."""
 
@@ -60,8 +47,6 @@ class Progress:
     """Findings about single images and about the calibration, strongest first."""
     hand_eye: Calibration | None = None
     """Calibration; None while fewer than three images are registered."""
-    history: tuple[Accuracy, ...] = ()
-    """Accuracy after each image that gave a calibration."""
     next_pose: NextPose | None = None
     """Gripper pose that improves the calibration most; None below two images."""
     next_joints: Float[ndarray, " dof"] | None = None
@@ -70,9 +55,10 @@ class Progress:
     """Reconstructed points of the scene (m); None without a calibration."""
 
     @property
-    def now(self) -> Accuracy | None:
-        """Accuracy of the calibration; None where there is none with these images."""
-        return self.history[-1] if self.hand_eye is not None and self.history else None
+    def reached(self) -> tuple[float, float] | None:
+        """Bounds of 95 % of the errors (mm, degrees) of the point that `Requirement.at` names; None without any."""
+        required = None if self.hand_eye is None else self.hand_eye.requirement
+        return None if required is None else (float(required.reached_mm), float(required.reached_deg))
 
     @property
     def leave_one_out(self) -> LeaveOneOut | None:
@@ -105,14 +91,14 @@ class Progress:
 
     def as_json(self) -> dict[str, Any]:
         """Return the state for a program, as values of JSON."""
-        pose, now, error = self.next_pose, self.now, self.leave_one_out
+        pose, error = self.next_pose, self.leave_one_out
+        mm, deg = self.reached or (None, None)
         return {
             "images": list(self.images),
             "registered": list(self.registered),
-            "translation_95_mm": None if now is None else now.translation_mm,
-            "rotation_95_deg": None if now is None else now.rotation_deg,
+            "translation_95_mm": mm,
+            "rotation_95_deg": deg,
             "verdict": None if self.hand_eye is None else self.hand_eye.verdict,
-            "history": [vars(one) for one in self.history],
             "findings": [
                 {"kind": one.kind.value, "severity": one.severity, "images": list(one.images)}
                 | {"text": text(one), "remedy": remedy(one)}
@@ -180,9 +166,9 @@ def next_lines(state: Progress, notation: Notation) -> list[str]:
 def accuracy_line(state: Progress) -> str:
     """Return the number of registered images, and the accuracy beside what is required."""
     images = f"{len(state.registered)} of {len(state.images)} images registered"
-    if state.now is None or state.hand_eye is None:
+    if state.reached is None or state.hand_eye is None:
         return f"{images}: no calibration yet"
-    mm, deg = significant(state.now.translation_mm), significant(state.now.rotation_deg)
+    mm, deg = map(significant, state.reached)
     line = f"{images}: ± {mm} mm and {deg}° (95 % of errors of a point at the working distance)"
     line += "" if state.hand_eye.is_sound else ", rejected"
     if (required := state.hand_eye.requirement) is not None:

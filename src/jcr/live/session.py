@@ -94,7 +94,7 @@ class LiveSession:
     """Capture that is taken with a camera, image by image, and calibrated meanwhile.
 
     `tell` receives each answer and each state of the calibration, with the lines that a person reads. `gripper` reads
-    the present state of the arm for an image on command; None where poses are typed or posted.
+    the present state of the arm, for an image on command and after each image; None where poses are typed or posted.
     """
 
     def __init__(
@@ -168,22 +168,19 @@ class LiveSession:
         while not self.state.is_over:
             state = next_rest(states, last, limit)
             # The connection is closed meanwhile: states that wait would be old.
-            answer = self.take(state, current=lambda: next(states()))
+            answer = self.take(state)
             last, limit = state.base_from_gripper, MOVED_ON if answer["accepted"] else TRY_AGAIN
 
-    def take(
-        self, state: RobotState, current: Callable[[], RobotState] | None = None, waits: bool = False
-    ) -> Answer:
+    def take(self, state: RobotState, waits: bool = False) -> Answer:
         """Take an image where the arm rests, let its calibration follow, and return whether it is kept.
 
-        `current` reads the arm once more after the image. With `waits` the answer has the calibration with that image
-        and the next pose, seconds later.
+        With `waits` the answer has the calibration with that image and the next pose, seconds later.
         """
         with self._lock:
             if self.state.is_over:
                 return {"accepted": False, "reason": "the capture has ended", "done": True}
             try:
-                frame = self._frame(state, current)
+                frame = self._frame(state.base_from_gripper)
                 name = self.folder.add(
                     frame.image, state.base_from_gripper, state.joints, frame.time_s, frame.depth_mm
                 )
@@ -231,7 +228,7 @@ class LiveSession:
                     self._refuse("refused: give the pose at which the gripper rests; the image is taken then")
                 elif action in ("take", "retake") and self._gripper is not None:
                     try:
-                        self.take(self._gripper(), current=self._gripper)
+                        self.take(self._gripper())
                     except InputError as error:
                         self._refuse(f"refused: {error}")
 
@@ -246,11 +243,11 @@ class LiveSession:
         self._show(self.state.event, is_refusal=self.state.is_refusal, is_over=True, is_done=True)
         return self.state.result
 
-    def _frame(self, state: RobotState, current: Callable[[], RobotState] | None) -> Frame:
+    def _frame(self, base_from_gripper: Float[ndarray, "4 4"]) -> Frame:
         """Return a frame at rest; raise InputError with the reason why none is kept."""
-        images, pose = self.folder.images, state.base_from_gripper
+        images = self.folder.images
         for one in images:
-            if not is_farther(one.base_from_gripper, pose, SAME_PLACE):
+            if not is_farther(one.base_from_gripper, base_from_gripper, SAME_PLACE):
                 raise InputError(f"the gripper is where {one.image} was taken; move to another pose")
         kept = [self.folder.summary(one.image) for one in images]
         try:
@@ -263,13 +260,11 @@ class LiveSession:
             raise
         if isinstance(found, str):
             raise InputError(found)
-        if current is None:
-            return found
         try:
-            now = current().base_from_gripper
+            now = base_from_gripper if self._gripper is None else self._gripper().base_from_gripper
         except (InputError, StopIteration) as error:
             raise InputError(f"the pose cannot be read after the image: {error}") from None
-        if is_farther(pose, now, REST):
+        if is_farther(base_from_gripper, now, REST):
             raise InputError("the arm moved while the image was taken; let it rest")
         return found
 
