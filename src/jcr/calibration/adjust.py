@@ -3,7 +3,6 @@
 Where images are not adjusted, the covariance of the fit to poses includes the errors of given intrinsics.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -11,13 +10,17 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.case import Case
-from jcr.calibration.hand_eye import image_verdicts, judged
+from jcr.calibration.hand_eye import image_verdicts, judged, leave_one_out
 from jcr.calibration.record import Calibration
 from jcr.camera import by_parameters, by_point, parameter_names
-from jcr.estimation.closed_form import initial_estimate
 from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.intrinsics_prior import CameraPrior, decentring, joint_covariance
-from jcr.estimation.pose_equations import paper_residuals, predicted_gripper_poses
+from jcr.estimation.pose_equations import (
+    paper_residuals,
+    pose_by_pose,
+    predicted_gripper_poses,
+    reported_poses,
+)
 from jcr.estimation.problem import LinearPrior, pose_problem, wrist_arm
 from jcr.estimation.projection import view_of
 from jcr.estimation.solve import START_NOISE, Solution, adjust_wrist, recon_frame, solve, uncertainty_of
@@ -32,7 +35,7 @@ from jcr.geometry import (
     step_between,
     transform,
 )
-from jcr.records import Intrinsics, LeaveOneOut, PaperResiduals, Tracks, Uncertainty
+from jcr.records import LeaveOneOut, PaperResiduals, Tracks
 
 FEWEST = 6
 """Fewest observations of an image from which the motion of its camera with the intrinsics is computed."""
@@ -58,21 +61,17 @@ def with_adjusted_images(case: Case) -> Case:
     case = replace(case, adjusted=found)
     if not case.hand_eye.observability.observable:
         return case
-    refined = judged(refined_by(case, found)).with_findings(*_not_settled(found))
+    refined = judged(refined_by(case, found))
+    if not found.settled:
+        # The rounds ended before sizes and steps settled.
+        severity = "warns" if found.last_step > SETTLED_ENOUGH else "informs"
+        size = {"value": found.last_step, "rounds": float(found.iterations)}
+        unsettled = Finding.of(FindingKind.NOT_SETTLED, severity, "reconstruction", **size)
+        refined = refined.with_findings(unsettled)
     nearer, than = refined.held_out, case.hand_eye.held_out
     if case.tracks.from_pointmaps and (nearer is None or than is None or nearer.length_m >= than.length_m):
         return case
     return replace(case, hand_eye=refined, fit=case.pose_fit)
-
-
-def _not_settled(found: Solution) -> Iterator[Finding]:
-    """Yield a finding where the rounds of the adjustment ended before sizes and steps settled."""
-    if not found.settled:
-        severity = "warns" if found.last_step > SETTLED_ENOUGH else "informs"
-        details = {"rounds": float(found.iterations)}
-        yield Finding.of(
-            FindingKind.NOT_SETTLED, severity, "reconstruction", value=found.last_step, **details
-        )
 
 
 def adjust_case(
@@ -84,10 +83,13 @@ def adjust_case(
 ) -> Solution:
     """Adjust the used images and gripper poses of a case, from its fit to poses or from its adjustment.
 
-    `prior` takes the place of the case's camera; the rest is that of ReportedPoses and adjust_wrist.
+    `prior` takes the place of the case's camera; the rest is that of ReportedPoses and adjust_wrist. The first errors of
+    the gripper poses are those that the fit leaves: images that are first adjusted to poses that contradict them take
+    ten times the steps.
     """
     fit = case.pose_fit
     arm = wrist_arm(case.base_from_gripper[case.used], case.systematic)
+    metres, radians = fit.robot_noise.together
     return adjust_wrist(
         replace(arm, carries=case.carries, confirmed_errors=confirmed_errors),
         (fit.gripper_from_camera, fit.scale, fit.base_from_recon.rigid),
@@ -97,63 +99,32 @@ def adjust_case(
         noise=case.options.robot_noise_m_rad,
         combinations=combinations,
         near=case.adjusted,
-        start_noise=_start_noise(fit),
+        start_noise=(max(START_NOISE[0], metres), max(START_NOISE[1], radians)),
     )
 
 
-def _start_noise(fit: Calibration) -> tuple[float, float]:
-    """Return the errors of gripper poses per axis (m, rad) that the fit to camera poses leaves, random and systematic.
-
-    Images that are first adjusted to poses that contradict them take ten times the steps.
-    """
-    metres, radians = fit.robot_noise.together
-    return max(START_NOISE[0], metres), max(START_NOISE[1], radians)
-
-
-def with_decentring(uncertainty: Uncertainty, camera: Intrinsics, x: Float[ndarray, "4 4"]) -> Uncertainty:
-    """Return an uncertainty with that of a thin prism that nobody measured and no image shows.
-
-    It moves the transform `x` and the intrinsics together, and places no point elsewhere. Cameras of other models than
-    the pinhole have their own coefficients.
-    """
-    if camera.model != "pinhole":
-        return uncertainty
-    steps = decentring(camera, x)
-    return uncertainty.with_error(steps @ steps.T, "intrinsics")
-
-
-def with_prior_of_intrinsics(hand_eye: Calibration, camera: CameraPrior) -> Calibration:
-    """Return a calibration from a network's cameras with the prior uncertainty of the intrinsics.
-
-    The focal length does not move these cameras. A wrong principal point rotates all of them, so that the transform and
-    the principal point together place points where they are.
-    """
-    root, names = camera.directions * camera.std, parameter_names(camera.intrinsics)
-    x, by_camera = hand_eye.gripper_from_camera, np.zeros((7, len(root)))
-    by_camera[3:6, names.index("cx")] = x[:3, 1] / camera.intrinsics.fx
-    by_camera[3:6, names.index("cy")] = -x[:3, 0] / camera.intrinsics.fy
-    rotated = by_camera @ root
-    uncertainty = hand_eye.uncertainty.with_error(rotated @ rotated.T, "intrinsics")
-    joint = joint_covariance(uncertainty.covariance, rotated @ root.T, root @ root.T, camera.intrinsics)
-    return hand_eye.with_uncertainty(replace(uncertainty, joint=joint))
-
-
 def _considered(case: Case) -> Case:
-    """Return the case with the errors of its intrinsics, which a fit to poses cannot estimate, as uncertainty."""
+    """Return the case with the errors of its intrinsics, which a fit to poses cannot estimate, as uncertainty.
+
+    The focal length does not move a network's cameras. A wrong principal point rotates all of them, so that the
+    transform and the principal point together place points where they are.
+    """
+    hand_eye, camera, x = case.hand_eye, case.camera, case.hand_eye.gripper_from_camera
     if case.reconstruction.predicted_focal is not None:
-        known = with_prior_of_intrinsics(case.hand_eye, case.camera)
-        return replace(case, hand_eye=judged(known))
+        root, names = camera.directions * camera.std, parameter_names(camera.intrinsics)
+        by_camera = np.zeros((7, len(root)))
+        by_camera[3:6, names.index("cx")] = x[:3, 1] / camera.intrinsics.fx
+        by_camera[3:6, names.index("cy")] = -x[:3, 0] / camera.intrinsics.fy
+        moved = by_camera @ root
+        uncertainty = hand_eye.uncertainty.with_error(moved @ moved.T, "intrinsics")
+        joint = joint_covariance(uncertainty.covariance, moved @ root.T, root @ root.T, camera.intrinsics)
+        return replace(case, hand_eye=judged(hand_eye.with_uncertainty(replace(uncertainty, joint=joint))))
     made_with_them = case.reconstruction.evidence is None and not case.tracks.from_pointmaps
-    if case.capture.intrinsics is None or not made_with_them or not case.hand_eye.converged:
+    if case.capture.intrinsics is None or not made_with_them or not hand_eye.converged:
         return case
+    gripper, cameras = case.base_from_gripper[case.used], case.recon_from_camera[case.used]
     considered = with_intrinsics_considered(
-        case.hand_eye,
-        case.base_from_gripper[case.used],
-        case.recon_from_camera[case.used],
-        case.tracks,
-        case.camera,
-        case.priors,
-        case.systematic,
+        hand_eye, gripper, cameras, case.tracks, camera, case.priors, case.systematic
     )
     return replace(case, hand_eye=judged(considered))
 
@@ -171,45 +142,33 @@ def with_intrinsics_considered(
 
     This is the consider covariance of Schmidt, Φ that of the intrinsics (Tapley, Schutz and Born, "Statistical Orbit
     Determination", 2004, chapter 6), for a calibration from camera poses alone, which cannot estimate them.
-    All arguments are of the used images. The sensitivity S follows from solutions with the cameras that one standard
+    All arguments are of the used images. The sensitivity S is that of the fit to the cameras that one standard
     deviation of each parameter would give: cameras that keep the pixels of `tracks` in place.
     """
-    seen = [np.flatnonzero(tracks.image == row) for row in range(len(recon_from_camera))]
-    if min(map(len, seen)) < FEWEST:
-        return hand_eye
-    each = zip(recon_from_camera, seen, strict=True)
-    moved = np.array([_camera_with_other_intrinsics(one, tracks, rows, camera) for one, rows in each])
-
-    def solved(recon_from_camera: Float[ndarray, "m 4 4"]) -> tuple[Float[ndarray, "4 4"], float]:
-        problem, state = pose_problem(
-            base_from_gripper,
-            recon_from_camera,
-            initial_estimate(base_from_gripper, recon_from_camera),
-            error_covariance=systematic,
-            noise_floor=hand_eye.robot_noise.given,
-            priors=priors,
-        )
-        found = solve(problem, state, averaged=False).state
-        return found.x[0], found.scale
-
-    x, scale = solved(recon_from_camera)
-    shifts = np.zeros((7, len(camera.std)))
-    for k in range(len(camera.std)):
-        x_k, scale_k = solved(moved[:, k])
-        shifts[:, k] = np.append(step_between(x, x_k), np.log(scale_k / scale))
+    moved = np.zeros((len(recon_from_camera), 6, len(camera.std)))
+    for row, pose in enumerate(recon_from_camera):
+        if len(seen := np.flatnonzero(tracks.image == row)) < FEWEST:
+            return hand_eye
+        x_in_camera = apply(inverse(pose), tracks.points_in_recon[tracks.point[seen]].astype(float))
+        by_x = by_point(camera.intrinsics, x_in_camera)
+        by_pose = np.concatenate([by_x, -by_x @ skew(x_in_camera)], axis=2).reshape(-1, 6)
+        by_intrinsics = by_parameters(camera.intrinsics, x_in_camera) @ (camera.directions * camera.std)
+        steps = -np.linalg.lstsq(by_pose, by_intrinsics.reshape(len(by_pose), -1), rcond=None)[0].T
+        again = pose @ inverse(transform(rotation_exp(steps[:, 3:]), steps[:, :3]))
+        moved[row] = step_between(pose, again).T
+    start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon.rigid
+    problem, state = pose_problem(
+        base_from_gripper,
+        recon_from_camera,
+        start,
+        error_covariance=systematic,
+        noise_floor=hand_eye.robot_noise.given,
+        priors=priors,
+    )
+    found = solve(problem, state, averaged=False)
+    by_camera = reported_poses(problem, found.state)[2]
+    shifts = -(found.at_mode.gain @ pose_by_pose(by_camera, moved.reshape(6 * len(moved), -1)))[:7]
     return hand_eye.with_uncertainty(hand_eye.uncertainty.with_error(shifts @ shifts.T, "intrinsics"))
-
-
-def _camera_with_other_intrinsics(
-    recon_from_camera: Float[ndarray, "4 4"], tracks: Tracks, rows: ndarray, camera: CameraPrior
-) -> Float[ndarray, "c 4 4"]:
-    """Return the camera poses that fit the image's points after one standard deviation more of each parameter."""
-    x_in_camera = apply(inverse(recon_from_camera), tracks.points_in_recon[tracks.point[rows]].astype(float))
-    by_x = by_point(camera.intrinsics, x_in_camera)
-    by_pose = np.concatenate([by_x, -by_x @ skew(x_in_camera)], axis=2).reshape(-1, 6)
-    by_intrinsics = by_parameters(camera.intrinsics, x_in_camera) @ (camera.directions * camera.std)
-    steps = -np.linalg.lstsq(by_pose, by_intrinsics.reshape(len(by_pose), -1), rcond=None)[0].T
-    return recon_from_camera @ inverse(transform(rotation_exp(steps[:, 3:]), steps[:, :3]))
 
 
 def refined_by(case: Case, found: Solution) -> Calibration:
@@ -217,8 +176,11 @@ def refined_by(case: Case, found: Solution) -> Calibration:
     fit, used, x = case.pose_fit, case.used, found.state.x[0]
     scale, base_from_recon = recon_frame(found, case.tracks)
     uncertainty, intrinsics = uncertainty_of(found), found.problem.intrinsics(found.state)[0]
-    if case.capture.intrinsics is None:
-        uncertainty = with_decentring(uncertainty, intrinsics, x)
+    if case.capture.intrinsics is None and intrinsics.model == "pinhole":
+        # A thin prism that nobody measured and no image shows moves transform and intrinsics together, and places no
+        # point elsewhere. Cameras of other models have their own coefficients.
+        steps = decentring(intrinsics, x)
+        uncertainty = uncertainty.with_error(steps @ steps.T, "intrinsics")
     gripper, camera = case.base_from_gripper, case.recon_from_camera
     # Rejected poses are measured against where their cameras show them.
     predicted = base_from_recon @ scale_translation(camera, scale) @ inverse(x)
@@ -245,22 +207,12 @@ def refined_by(case: Case, found: Solution) -> Calibration:
 
 def _leave_one_out(found: Solution) -> LeaveOneOut | None:
     """Return the mean error of gripper poses that are predicted by an adjustment without their image."""
-    left_out = found.leave_one_out[0]
-    m = len(left_out)
-    if m < 4:
-        return None
-    metres, radians = np.linalg.norm(left_out.reshape(m, 2, 3), axis=2).mean(0)
+    left_out, likely = found.leave_one_out[0], found.most_likely
     # The images as they would be with every gripper, and the rig on it, displaced by its own leave-one-out residual.
-    likely, images = found.most_likely, found.images
-    x, z = likely.x[0], likely.z[0]
-    own, rigs = found.problem.arms[0].rigs, likely.world_from_rig.copy()
+    x, z, own, rigs = likely.x[0], likely.z[0], found.problem.arms[0].rigs, likely.world_from_rig.copy()
     gripper = predicted_gripper_poses(x, likely.scale, z, rigs[own])
     in_metres = inverse(z) @ retract(gripper, -left_out) @ x
     rigs[own] = scale_translation(in_metres, 1 / likely.scale)
-    moved = view_of(found.problem, replace(images.state, world_from_rig=rigs))
-    return LeaveOneOut(
-        1e3 * float(metres),
-        float(np.degrees(radians)),
-        float(np.median(median_reprojection_px(found.problem, moved))),
-        "each image's gripper pose predicted by the others",
-    )
+    moved = view_of(found.problem, replace(found.images.state, world_from_rig=rigs))
+    reprojection_px = float(np.median(median_reprojection_px(found.problem, moved)))
+    return leave_one_out(left_out, "each image's gripper pose predicted by the others", reprojection_px)

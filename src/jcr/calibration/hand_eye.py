@@ -157,7 +157,7 @@ def _with_residuals(
         images=image_verdicts(names, used, reasons, metres, radians),
         residuals=PaperResiduals(*paper_residuals(gripper, camera, x, scale, used)),
         robot_noise=fit.noise,
-        held_out=_leave_one_out(fit, fit.problem.used),
+        held_out=leave_one_out(fit.leave_one_out[0][fit.problem.used], "each image predicted by the others"),
         findings=seen.findings,
     )
 
@@ -297,14 +297,14 @@ def _reasons(
     )
 
 
-def _leave_one_out(fit: Solution, used: Bool[ndarray, " n"]) -> LeaveOneOut | None:
-    """Return the error of each used image's prediction by a fit to the others; None where too few are left to fit."""
-    if used.sum() < 4:
+def leave_one_out(
+    residual: Float[ndarray, "u 6"], how: str, reprojection_px: float | None = None
+) -> LeaveOneOut | None:
+    """Return the mean size of the leave-one-out residuals of the used images; None where too few are left to fit."""
+    if len(residual) < 4:
         return None
-    metres, radians = np.linalg.norm(fit.leave_one_out[0][used].reshape(-1, 2, 3), axis=2).mean(0)
-    return LeaveOneOut(
-        1e3 * float(metres), float(np.degrees(radians)), None, "each image predicted by the others"
-    )
+    metres, radians = np.linalg.norm(residual.reshape(-1, 2, 3), axis=2).mean(0)
+    return LeaveOneOut(1e3 * float(metres), float(np.degrees(radians)), reprojection_px, how)
 
 
 def _checked_pairs(base_from_gripper: ArrayLike, recon_from_camera: ArrayLike) -> tuple[Poses, Poses]:
