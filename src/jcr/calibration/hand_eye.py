@@ -13,7 +13,7 @@ from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.hypotheses import drift_covariance
 from jcr.estimation.inverse_kinematics import posed
-from jcr.estimation.kinematics import Arm, Joints
+from jcr.estimation.kinematics import Arm
 from jcr.estimation.observability import observability
 from jcr.estimation.pose_equations import paper_residuals, pose_residuals
 from jcr.estimation.problem import LinearPrior, offset_prior, scale_prior
@@ -21,6 +21,7 @@ from jcr.estimation.robot_noise import arm_errors, smooth_errors
 from jcr.estimation.robust import robust_fit
 from jcr.estimation.solve import Solution
 from jcr.findings import Finding, FindingKind, strongest_first
+from jcr.findings.table import MISFIT
 from jcr.geometry import Poses, require_rigid
 from jcr.least_squares import one_blas_thread
 from jcr.records import ImageVerdict, LeaveOneOut, PaperResiduals, RobotNoise, Uncertainty
@@ -82,8 +83,23 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
     Raises InputError for shapes, values or counts that cannot be poses, and for poses or angles that do not fit the
     robot. Degenerate motion raises nothing; it is in the result (`observability`, `converged`).
     """
-    gripper, camera = _checked_pairs(base_from_gripper, recon_from_camera)
-    priors, n = _checked_priors(offset, scale, scale_std), len(gripper)
+    gripper, camera = (
+        _checked(base_from_gripper, "base_from_gripper"),
+        _checked(recon_from_camera, "recon_from_camera"),
+    )
+    if (n := len(gripper)) != len(camera):
+        raise InputError(
+            f"recon_from_camera: {len(camera)} camera poses for {n} gripper poses; give one per image"
+        )
+    if n < 2:
+        raise InputError(f"base_from_gripper: {n} pose; a hand-eye calibration needs three or more")
+    priors = () if offset is None else (offset_prior(*offset),)
+    if scale is not None:
+        if not (np.isfinite([scale, scale_std]).all() and scale > 0 and scale_std > 0):
+            raise InputError(
+                f"scale: {scale} ± {scale_std} must be two positive numbers (m per unit, relative)"
+            )
+        priors = (*priors, scale_prior(scale, scale_std))
     if robot_noise is not None and not (np.isfinite(robot_noise).all() and min(robot_noise) > 0):
         raise InputError(f"robot_noise: {robot_noise} must be two positive numbers (m, rad)")
     if camera_covariance is not None and camera_covariance.shape != (6 * n, 6 * n):
@@ -91,8 +107,7 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
             f"camera_covariance: shape {camera_covariance.shape}; {n} poses need {(6 * n, 6 * n)}"
         )
     if systematic is None:
-        arm, angles = _checked_arm(robot, joints, n)
-        systematic = smooth_errors(gripper) if arm is None else arm_errors(*posed(arm, angles, gripper))
+        systematic = _systematic(gripper, robot, joints)
     fit, distinct = _fit_distinct(gripper, camera, robot_noise, priors, camera_covariance, systematic)
     if in_sequence and camera_covariance is None:
         assert fit.problem.used is not None
@@ -100,18 +115,8 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
         drift = drift_covariance(gripper, camera, start, used, systematic, robot_noise)
         if drift is not None:
             fit, distinct = _fit_distinct(gripper, camera, robot_noise, priors, drift, systematic)
-    named = [f"pose {k}" for k in range(len(gripper))] if names is None else names
+    named = [f"pose {k}" for k in range(n)] if names is None else names
     return judged(_with_residuals(gripper, camera, fit, distinct, named))
-
-
-def _checked_priors(offset: Offset | None, scale: float | None, scale_std: float) -> tuple[LinearPrior, ...]:
-    """Return the priors of the camera's offset and of the scale; raise InputError for numbers that are none."""
-    priors = () if offset is None else (offset_prior(*offset),)
-    if scale is None:
-        return priors
-    if not (np.isfinite([scale, scale_std]).all() and scale > 0 and scale_std > 0):
-        raise InputError(f"scale: {scale} ± {scale_std} must be two positive numbers (m per unit, relative)")
-    return (*priors, scale_prior(scale, scale_std))
 
 
 def _fit_distinct(
@@ -144,10 +149,15 @@ def _with_residuals(
     assert fit.problem.used is not None
     x, scale, z = fit.state.x[0], fit.state.scale, fit.state.z[0]
     used = fit.problem.used[distinct]
-    seen = observability(gripper[used], x, camera[used], fit.problem.priors)
     residual, _ = pose_residuals(x, scale, z, gripper, camera)
     metres, radians = np.linalg.norm(residual.reshape(-1, 2, 3), axis=2).T
-    reasons = _reasons(used, metres, radians, fit.noise)
+    noise_m, noise_rad = fit.noise.together
+    typical = f"(their noise: {1e3 * noise_m:.1f} mm, {np.degrees(noise_rad):.2f}°)"
+    reasons = [
+        f"its gripper pose is {1e3 * m:.1f} mm and {np.degrees(rad):.2f}° from where the other images put it {typical}"
+        for m, rad in zip(metres, radians, strict=True)
+    ]
+    left_out = fit.leave_one_out[0][fit.problem.used]
     return Calibration(
         on_gripper=x,
         scale=scale,
@@ -157,8 +167,8 @@ def _with_residuals(
         images=image_verdicts(names, used, reasons, metres, radians),
         residuals=PaperResiduals(*paper_residuals(gripper, camera, x, scale, used)),
         robot_noise=fit.noise,
-        held_out=leave_one_out(fit.leave_one_out[0][fit.problem.used], "each image predicted by the others"),
-        findings=seen.findings,
+        held_out=leave_one_out(left_out, "each image predicted by the others"),
+        findings=observability(gripper[used], x, camera[used], fit.problem.priors).findings,
     )
 
 
@@ -171,53 +181,35 @@ def image_verdicts(
     reprojection_px: Float[ndarray, " n"] | None = None,
 ) -> tuple[ImageVerdict, ...]:
     """Return the use of each registered image, its residuals (m, rad) and its median reprojection error (px or NaN)."""
-    pixels = np.full(len(names), np.nan) if reprojection_px is None else reprojection_px
-    columns = (
-        names,
-        used.tolist(),
-        reasons,
-        (1e3 * metres).tolist(),
-        np.degrees(radians).tolist(),
-        pixels.tolist(),
-    )
+    px = np.full(len(names), np.nan) if reprojection_px is None else reprojection_px
     return tuple(
         ImageVerdict(
             image=name,
-            used=is_used,
-            reason=reason,
-            translation_residual_mm=mm,
-            rotation_residual_deg=deg,
-            reprojection_px=None if np.isnan(px) else px,
+            used=bool(used[k]),
+            reason=None if used[k] else reasons[k],
+            translation_residual_mm=1e3 * float(metres[k]),
+            rotation_residual_deg=float(np.degrees(radians[k])),
+            reprojection_px=None if np.isnan(px[k]) else float(px[k]),
         )
-        for name, is_used, reason, mm, deg, px in zip(*columns, strict=True)
+        for k, name in enumerate(names)
     )
 
 
-JUDGED = frozenset(
-    {
-        FindingKind.FEW_AGREE,
-        FindingKind.POSES_CONTRADICT_IMAGES,
-        FindingKind.UNCERTAIN,
-        FindingKind.NOISE_ABOVE_GIVEN,
-        FindingKind.LEAVE_ONE_OUT,
-        FindingKind.FEW_IMAGES,
-    }
-)
+JUDGED = frozenset({*MISFIT, FindingKind.FEW_IMAGES})
 """Kinds of findings that the numbers of a calibration decide by themselves."""
 
 
 def judged(hand_eye: Calibration) -> Calibration:
     """Return the calibration with findings of the kinds JUDGED by its present numbers, after those of other kinds."""
-    uncertain = tuple(_of_uncertainty(hand_eye))
+    rejecting = list(_rejecting(hand_eye))
     # A weakly observed direction explains an uncertainty that rejects, and is therefore named first.
-    weak = "rejects" if uncertain else "warns"
+    weak = "rejects" if any(one.kind is FindingKind.UNCERTAIN for one in rejecting) else "warns"
     others = [
         replace(finding, severity=weak) if "nearly" in finding.details else finding
         for finding in hand_eye.findings
         if finding.kind not in JUDGED
     ]
-    findings = (*others, *_of_agreement(hand_eye), *uncertain, *_of_residuals(hand_eye))
-    return replace(hand_eye, findings=strongest_first(findings))
+    return replace(hand_eye, findings=strongest_first((*others, *rejecting, *_warning(hand_eye))))
 
 
 def poses_agree(noise: RobotNoise) -> bool:
@@ -226,75 +218,47 @@ def poses_agree(noise: RobotNoise) -> bool:
     return metres <= MAX_NOISE[0] and bool(radians <= MAX_NOISE[1])
 
 
-def _of_agreement(hand_eye: Calibration) -> Iterator[Finding]:
-    """Yield findings that too few images agree, or that poses contradict the images."""
-    used, n = float(hand_eye.inliers.sum()), len(hand_eye.inliers)
+def _rejecting(hand_eye: Calibration) -> Iterator[Finding]:
+    """Yield findings that few images agree, that poses contradict images, and that the result is too uncertain."""
+    used, n = int(hand_eye.inliers.sum()), len(hand_eye.inliers)
     if used < max(3, MIN_SHARE_USED * n) and n > 2:
-        yield Finding.of(FindingKind.FEW_AGREE, "rejects", "reconstruction", value=used, images=float(n))
+        counts = {"value": float(used), "images": float(n)}
+        yield Finding.of(FindingKind.FEW_AGREE, "rejects", "reconstruction", **counts)
     if not poses_agree(hand_eye.robot_noise):
         metres, radians = hand_eye.robot_noise.together
         kind = FindingKind.POSES_CONTRADICT_IMAGES
         yield Finding.of(kind, "rejects", "reconstruction", value=metres, rotation=radians)
-
-
-def _of_uncertainty(hand_eye: Calibration) -> Iterator[Finding]:
-    """Yield a finding for each part of the result that is too uncertain."""
     if not hand_eye.observability.observable:
         return
-    std = np.sqrt(np.diag(hand_eye.covariance))
+    std = hand_eye.uncertainty.std
     # With few images, half of the uncertainty may come from the poorly known robot pose noise.
-    unknown = hand_eye.robot_noise.given is None and int(hand_eye.inliers.sum()) < FEW
+    unknown = {"noise_unknown": 1.0} if hand_eye.robot_noise.given is None and used < FEW else {}
     parts = {"translation": std[:3].max(), "rotation": std[3:6].max(), "scale": std[6]}
     for (part, value), limit in zip(parts.items(), MAX_STD, strict=True):
         if value > limit:
-            of_noise = {"noise_unknown": 1.0} if unknown else {}
-            yield Finding.of(
-                FindingKind.UNCERTAIN, "rejects", "images", value=float(value), part=part, **of_noise
-            )
+            size = {"value": float(value), **unknown}
+            yield Finding.of(FindingKind.UNCERTAIN, "rejects", "images", part=part, **size)
 
 
-def _of_residuals(hand_eye: Calibration) -> Iterator[Finding]:
+def _warning(hand_eye: Calibration) -> Iterator[Finding]:
     """Yield findings that do not reject: noise above the given one, leave-one-out error, few images."""
-    noise = hand_eye.robot_noise
-    metres, radians = _disagreement(hand_eye)
+    noise, images = hand_eye.robot_noise, [one for one in hand_eye.images if one.used]
+    residual = np.array([(one.translation_residual_mm, one.rotation_residual_deg) for one in images], float)
+    # The rms residual per axis, corrected for the 13 fitted unknowns.
+    fitted = 6 * len(images) / max(6 * len(images) - 13, 1)
+    mm, deg = np.sqrt(fitted * (residual.reshape(-1, 2) ** 2).mean(0) / 3).tolist()
+    metres, radians = 1e-3 * mm, float(np.radians(deg))
     if noise.given is not None and (
         metres > SURPRISE * noise.given[0] or radians > SURPRISE * noise.given[1]
     ):
         details = {"rotation": radians, "given": noise.given[0], "given_rotation": noise.given[1]}
         yield Finding.of(FindingKind.NOISE_ABOVE_GIVEN, "warns", "none", value=metres, **details)
     if (held_out := hand_eye.held_out) is not None:
-        leave_one_out_m, typical = 1e-3 * held_out.translation_mm, float(np.sqrt(3)) * noise.together[0]
-        if leave_one_out_m > max(3 * typical, WELL_ABOVE):
-            yield Finding.of(
-                FindingKind.LEAVE_ONE_OUT, "warns", "images", value=leave_one_out_m, residual=typical
-            )
+        left_out_m, typical = 1e-3 * held_out.translation_mm, float(np.sqrt(3)) * noise.together[0]
+        if left_out_m > max(3 * typical, WELL_ABOVE):
+            yield Finding.of(FindingKind.LEAVE_ONE_OUT, "warns", "images", value=left_out_m, residual=typical)
     if len(hand_eye.inliers) < FEW:
         yield Finding.of(FindingKind.FEW_IMAGES, "warns", "images", value=float(len(hand_eye.inliers)))
-
-
-def _disagreement(hand_eye: Calibration) -> tuple[float, float]:
-    """Return the rms residual of the used images per axis (m, rad), corrected for the 13 fitted unknowns."""
-    used = [
-        (image.translation_residual_mm, image.rotation_residual_deg)
-        for image in hand_eye.images
-        if image.used
-    ]
-    fitted = 6 * len(used) / max(6 * len(used) - 13, 1)
-    mm, deg = np.sqrt(fitted * (np.array(used, float).reshape(-1, 2) ** 2).mean(0) / 3)
-    return 1e-3 * float(mm), float(np.radians(deg))
-
-
-def _reasons(
-    used: Bool[ndarray, " n"], metres: Float[ndarray, " n"], radians: Float[ndarray, " n"], noise: RobotNoise
-) -> tuple[str | None, ...]:
-    typical = f"(their noise: {1e3 * noise.together[0]:.1f} mm, {np.degrees(noise.together[1]):.2f}°)"
-    put = "from where the other images put it"
-    return tuple(
-        None
-        if is_used
-        else f"its gripper pose is {1e3 * m:.1f} mm and {np.degrees(rad):.2f}° {put} {typical}"
-        for is_used, m, rad in zip(used, metres, radians, strict=True)
-    )
 
 
 def leave_one_out(
@@ -307,38 +271,19 @@ def leave_one_out(
     return LeaveOneOut(1e3 * float(metres), float(np.degrees(radians)), reprojection_px, how)
 
 
-def _checked_pairs(base_from_gripper: ArrayLike, recon_from_camera: ArrayLike) -> tuple[Poses, Poses]:
-    """Return two stacks of rigid poses of equal number; raise InputError for others."""
-    gripper = _checked(base_from_gripper, "base_from_gripper")
-    camera = _checked(recon_from_camera, "recon_from_camera")
-    n = len(gripper)
-    if len(camera) != n:
-        raise InputError(
-            f"recon_from_camera: {len(camera)} camera poses for {n} gripper poses; give one per image"
-        )
-    if n < 2:
-        raise InputError(f"base_from_gripper: {n} pose; a hand-eye calibration needs three or more")
-    return gripper, camera
-
-
-def _checked_arm(
-    robot: str | Arm | None, joints: ArrayLike | None, count: int
-) -> tuple[Arm | None, Joints | None]:
+def _systematic(gripper: Poses, robot: str | Arm | None, joints: ArrayLike | None) -> Float[ndarray, "r r"]:
+    """Return the covariance of the systematic errors at 1 rad; raise InputError where arm, angles and poses misfit."""
     if robot is None:
         if joints is not None:
             raise InputError("joints: which robot? name it (robot=), or leave the joint angles out")
-        return None, None
+        return smooth_errors(gripper)
     arm = arm_named(robot) if isinstance(robot, str) else robot
-    if joints is None:
-        return arm, None
-    angles = _numbers(joints, "joints", "(n,dof) in rad")
-    if angles.shape != (count, arm.dof):
-        raise InputError(
-            f"joints: shape {angles.shape}; {count} poses of a {arm.name} need {(count, arm.dof)}"
-        )
-    if not np.isfinite(angles).all():
+    angles = None if joints is None else _numbers(joints, "joints", "(n,dof) in rad")
+    if angles is not None and angles.shape != (wanted := (len(gripper), arm.dof)):
+        raise InputError(f"joints: shape {angles.shape}; {wanted[0]} poses of a {arm.name} need {wanted}")
+    if angles is not None and not np.isfinite(angles).all():
         raise InputError("joints: NaN or infinite; give the angle of every joint at every image")
-    return arm, angles
+    return arm_errors(*posed(arm, angles, gripper))
 
 
 def _numbers(values: ArrayLike, name: str, shape: str) -> Float[ndarray, "..."]:
