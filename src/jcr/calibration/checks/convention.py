@@ -35,52 +35,25 @@ ROUGHLY = 2.0
 """Factor to which a closed form shows the misfit of a reading."""
 MIN_SHARE = 0.8
 """Smallest share of the images that agree under a reading."""
-INVERSES = "their inverses (gripper_from_base was given)"
-WXYZ = "quaternions w, x, y, z that were taken as x, y, z, w"
-XYZW = "quaternions x, y, z, w that were taken as w, x, y, z"
-TRANSPOSED = "transposed rotations"
 MIRRORED = "mirrored ones (the images are mirrored, or the base's axes are left-handed)"
 BY_NUMBER = "those of the images in order of their names as numbers (1, 2, … 10)"
 BY_TEXT = "those of the images in order of their names as text (1, 10, 11, … 2)"
-OPTIONS = {
-    BY_NUMBER: "add a column image with the images' names",
-    BY_TEXT: "add a column image with the images' names",
-    MIRRORED: "switch off the driver's mirroring or flip the images back, or correct the sign of one axis of the poses",
-    INVERSES: "add --pose-inverted",
-    WXYZ: "in a table add --pose-convention quat-wxyz",
-    XYZW: "in a table add --pose-convention quat-xyzw",
-    TRANSPOSED: "in a table of matrices add --pose-convention franka",
-}
-"""Remedy of each reading."""
+AT_SOURCE = "correct them at their source"
 EULER_ORDERS = (
     *("xyz", "ZYX", "zyx", "XYZ", "ZYZ", "zyz", "xzy", "yxz", "yzx", "zxy", "XZY", "YXZ", "YZX", "ZXY"),
     *("xyx", "xzx", "yxy", "yzy", "zxz", "XYX", "XZX", "YXY", "YZY", "ZXZ"),
 )
 """SciPy's names, lower case about fixed axes, upper case about moving ones; the usual ones first."""
-
-
-def _euler_mistakes() -> list[tuple[str, str]]:
-    """Return pairs of the order that angles were taken in and the intended one, usual mistakes first.
-
-    Angles about fixed axes are angles about moving axes in reverse order, so that each mistake has two names.
-    """
-    rank = {order: k for k, order in enumerate(EULER_ORDERS)}
-    found: dict[frozenset[tuple[str, str]], tuple[str, str]] = {}
-    for mistake in sorted(permutations(EULER_ORDERS, 2), key=lambda pair: rank[pair[0]] + rank[pair[1]]):
-        taken, meant = mistake
-        other = taken[::-1].swapcase(), meant[::-1].swapcase()
-        found.setdefault(frozenset({mistake, other}), mistake)
-    return list(found.values())
-
-
-EULER_MISTAKES = _euler_mistakes()
+_Candidate = tuple[str, str, Float[ndarray, "k 4 4"], Int[ndarray, " k"]]
+"""Name of a reading, its remedy, its gripper poses, and the rows of the cameras that they belong to."""
 
 
 @dataclass(frozen=True)
 class PoseConvention:
-    """Convention or order of the poses, and its misfit."""
+    """Convention or order of the poses, its remedy, and its misfit."""
 
     name: str
+    remedy: str
     translation_mm: float
     """Errors per axis that the fit leaves, random and systematic."""
     rotation_deg: float
@@ -92,33 +65,21 @@ class PoseConvention:
         """Size of the noise, a degree counted as 5 mm."""
         return self.translation_mm + 5 * self.rotation_deg
 
-    @classmethod
-    def of(cls, name: str, solved: Calibration) -> "PoseConvention":
-        """Return a reading with the misfit of its calibration."""
-        metres, radians = solved.robot_noise.together
-        return cls(name, 1e3 * metres, float(np.degrees(radians)), int(solved.inliers.sum()))
-
-
-_Candidate = tuple[str, Float[ndarray, "k 4 4"], Int[ndarray, " k"]]
-"""Name of a reading, its gripper poses, and the rows of the cameras that they belong to."""
-
 
 def check_convention(case: Case) -> Case:
     """Report the convention by which the gripper poses fit, where these are rejected with and without the images.
 
     Degenerate motions fit another convention by chance, and are reported first. A board may be the cause instead.
     """
+    fit, capture = case.pose_fit, case.capture
     by_board = any(one.kind is FindingKind.BOARD_SIZE for one in case.hand_eye.findings)
-    if case.hand_eye.converged or case.pose_fit.converged or by_board:
+    if case.hand_eye.converged or fit.converged or by_board:
         return case
-    rows, capture = case.reconstruction.image_index, case.capture
     by_name = paired_by_name(capture.images, capture.base_from_gripper)
-    by_name = {by_number: poses[rows] for by_number, poses in by_name.items()}
+    by_name = {by_number: poses[case.reconstruction.image_index] for by_number, poses in by_name.items()}
     # Of other readings neither noise nor cues are known, nor are their camera poses weighed.
-    alone = not case.priors and case.reconstruction.evidence is None
-    fit = case.pose_fit
-    solved = fit if alone and fit.robot_noise.given is None else None
-    found = better_reading(case.base_from_gripper, case.recon_from_camera, by_name, solved)
+    alone = not case.priors and case.reconstruction.evidence is None and fit.robot_noise.given is None
+    found = better_reading(case.base_from_gripper, case.recon_from_camera, by_name, fit if alone else None)
     if found is None:
         return case
     observable = case.hand_eye.observability.observable
@@ -139,24 +100,25 @@ def better_reading(
     n = len(base_from_gripper)
     given, *others = _candidates(base_from_gripper)
     for by_number, poses in (by_name or {}).items():
-        others.append((BY_NUMBER if by_number else BY_TEXT, poses, np.arange(n)))
-    as_given = _solved(given, recon_from_camera) if solved is None else PoseConvention.of(given[0], solved)
+        column = "add a column image with the images' names"
+        others.append((BY_NUMBER if by_number else BY_TEXT, column, poses, np.arange(n)))
+    as_given = _solved(given, recon_from_camera, solved)
     if as_given.misfit < FITS and as_given.used >= MIN_SHARE * n:
         return None
-    camera_angle = _angles(recon_from_camera)
-    gaps = np.array([_incongruence(candidate, camera_angle) for candidate in others])
-    order = np.argsort(np.round(gaps / SAME_ANGLE), kind="stable")[:SOLVED]
-    worth = [others[k] for k in order if gaps[k] < 2 * gaps.min() + SAME_ANGLE]
-    rough = np.array([_rough_error(candidate, recon_from_camera) for candidate in worth])
+    camera_angle, gaps = _angles(recon_from_camera), []
+    for _, _, gripper, image in others:
+        gap = np.abs(_angles(gripper) - camera_angle[np.ix_(image, image)])
+        gaps.append(np.quantile(gap[np.triu_indices(len(gap), 1)], 0.6))
+    order = np.argsort(np.round(np.divide(gaps, SAME_ANGLE)), kind="stable")[:SOLVED]
+    worth = [others[k] for k in order if gaps[k] < 2 * min(gaps) + SAME_ANGLE]
+    rough = [_rough_error(candidate, recon_from_camera) for candidate in worth]
     # Of a reading that may be named: shuffled poses fit no reading, and each would be solved in vain.
     enough = 1e-3 * ROUGHLY / BETTER * as_given.misfit
-    least = float(rough.min())
-    if not least <= min(enough, _rough_error(given, recon_from_camera) / ROUGHLY):
+    if not min(rough) <= min(enough, _rough_error(given, recon_from_camera) / ROUGHLY):
         return None
+    near = min(ROUGHLY * min(rough), enough)
     readings = [
-        _solved(candidate, recon_from_camera)
-        for candidate, error in zip(worth, rough, strict=True)
-        if error <= min(ROUGHLY * least, enough)
+        _solved(one, recon_from_camera) for one, error in zip(worth, rough, strict=True) if error <= near
     ]
     least = min(reading.misfit for reading in readings)
     best = next(reading for reading in readings if reading.misfit < 1.05 * least + 0.01)
@@ -168,21 +130,23 @@ def convention_finding(
     found: tuple[PoseConvention, PoseConvention], severity: Severity = "rejects"
 ) -> Finding:
     """Return the finding that the poses fit under another reading, with the remedy."""
-    best, given = (
+    fits, given = (
         f"{reading.translation_mm:.1f} mm and {reading.rotation_deg:.2f}° per axis over {reading.used} images"
         for reading in found
     )
-    remedy = OPTIONS.get(found[0].name, "correct them at their source")
-    details = {"reading": found[0].name, "fits": best, "given": given, "remedy": remedy}
+    details = {"reading": found[0].name, "fits": fits, "given": given, "remedy": found[0].remedy}
     finding = Finding.of(FindingKind.POSE_CONVENTION, severity, "poses", value=1e-3 * found[0].translation_mm)
     return replace(finding, details=details)
 
 
-def _solved(candidate: _Candidate, recon_from_camera: Poses) -> PoseConvention:
-    name, base_from_gripper, image = candidate
-    return PoseConvention.of(
-        name, solve_hand_eye(base_from_gripper, recon_from_camera[image], in_sequence=False)
-    )
+def _solved(
+    candidate: _Candidate, recon_from_camera: Poses, solved: Calibration | None = None
+) -> PoseConvention:
+    """Return a reading with the misfit of its calibration."""
+    name, remedy, base_from_gripper, image = candidate
+    fit = solved or solve_hand_eye(base_from_gripper, recon_from_camera[image], in_sequence=False)
+    metres, radians = fit.robot_noise.together
+    return PoseConvention(name, remedy, 1e3 * metres, float(np.degrees(radians)), int(fit.inliers.sum()))
 
 
 def _rough_error(candidate: _Candidate, recon_from_camera: Poses) -> float:
@@ -190,17 +154,10 @@ def _rough_error(candidate: _Candidate, recon_from_camera: Poses) -> float:
 
     It is infinite where the scale is negative, as of mirrored poses.
     """
-    _, base_from_gripper, image = candidate
+    _, _, base_from_gripper, image = candidate
     camera = recon_from_camera[image]
     agree, error = least_trimmed(base_from_gripper, camera)
     return error if closed_form(base_from_gripper, camera, agree.astype(float))[1] > 0 else np.inf
-
-
-def _incongruence(candidate: _Candidate, camera_angle: Float[ndarray, "n n"]) -> float:
-    """Return the typical difference (rad) between the angles of gripper and camera motions."""
-    _, base_from_gripper, image = candidate
-    gap = np.abs(_angles(base_from_gripper) - camera_angle[np.ix_(image, image)])
-    return float(np.quantile(gap[np.triu_indices(len(gap), 1)], 0.6))
 
 
 def _angles(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n n"]:
@@ -210,44 +167,47 @@ def _angles(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n n"]:
 
 
 def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
-    """Yield the poses as given, then with one mistake each."""
+    """Yield the poses as given, then with one mistake each, usual mistakes first."""
     n = len(base_from_gripper)
     every = np.arange(n)
-    yield ("they are given", base_from_gripper, every)
-    yield (INVERSES, inverse(base_from_gripper), every)
+    yield ("they are given", "", base_from_gripper, every)
+    inverses = "their inverses (gripper_from_base was given)"
+    yield (inverses, "add --pose-inverted", inverse(base_from_gripper), every)
     mirror = np.diag([1.0, -1.0, 1.0, 1.0])
-    yield (MIRRORED, mirror @ base_from_gripper @ mirror, every)
-    yield ("listed in reverse order of the images", base_from_gripper[::-1], every)
+    flip = "switch off the driver's mirroring or flip the images back, or correct the sign of one axis of the poses"
+    yield (MIRRORED, flip, mirror @ base_from_gripper @ mirror, every)
+    yield ("listed in reverse order of the images", AT_SOURCE, base_from_gripper[::-1], every)
     for shift in range(1, min(2, n - 5) + 1):
         later, earlier = slice(shift, None), slice(n - shift)
         ahead = f"{shift} ahead of the images (image k has pose k + {shift})"
         behind = f"{shift} behind the images (image k has pose k − {shift})"
-        yield (ahead, base_from_gripper[later], every[earlier])
-        yield (behind, base_from_gripper[earlier], every[later])
+        yield (ahead, AT_SOURCE, base_from_gripper[later], every[earlier])
+        yield (behind, AT_SOURCE, base_from_gripper[earlier], every[later])
     rotation = Rotation.from_matrix(base_from_gripper[:, :3, :3])
 
-    def with_rotation(name: str, read: Rotation) -> _Candidate:
-        return (name, transform(read.as_matrix(), base_from_gripper[:, :3, 3]), every)
+    def with_rotation(name: str, read: Rotation, remedy: str = AT_SOURCE) -> _Candidate:
+        return (name, remedy, transform(read.as_matrix(), base_from_gripper[:, :3, 3]), every)
 
     x, y, z, w = rotation.as_quat().T
-    yield with_rotation(WXYZ, Rotation.from_quat(np.stack([y, z, w, x], 1)))
-    yield with_rotation(XYZW, Rotation.from_quat(np.stack([w, x, y, z], 1)))
-    in_radians = "in radians that were taken as degrees"
-    yield with_rotation(
-        f"rotation vectors {in_radians}", Rotation.from_rotvec(np.degrees(rotation.as_rotvec()))
-    )
-    yield with_rotation(TRANSPOSED, rotation.inv())
-    angles = {order: _euler(rotation, order) for order in EULER_ORDERS}
+    option = "in a table add --pose-convention quat-"
+    for meant, taken, read in (("wxyz", "xyzw", [y, z, w, x]), ("xyzw", "wxyz", [w, x, y, z])):
+        name = f"quaternions {', '.join(meant)} that were taken as {', '.join(taken)}"
+        yield with_rotation(name, Rotation.from_quat(np.stack(read, 1)), option + meant)
+    in_radians, vectors = "in radians that were taken as degrees", np.degrees(rotation.as_rotvec())
+    yield with_rotation(f"rotation vectors {in_radians}", Rotation.from_rotvec(vectors))
+    of_matrices = "in a table of matrices add --pose-convention franka"
+    yield with_rotation("transposed rotations", rotation.inv(), of_matrices)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # gimbal lock
+        angles = {order: rotation.as_euler(order) for order in EULER_ORDERS}
     for order in EULER_ORDERS:
         read = Rotation.from_euler(order, np.degrees(angles[order]))
         yield with_rotation(f"Euler angles ({order}) {in_radians}", read)
-    for taken, meant in EULER_MISTAKES:
-        read = Rotation.from_euler(meant, angles[taken])
-        yield with_rotation(f"Euler angles {meant} that were taken as {taken}", read)
-
-
-def _euler(rotation: Rotation, order: str) -> Float[ndarray, "*batch 3"]:
-    """Return Euler angles (rad), without the warning of SciPy at gimbal lock."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return rotation.as_euler(order)
+    # Angles about fixed axes are angles about moving axes in reverse order, so that each mistake has two names.
+    named = set[tuple[str, str]]()
+    for pair in sorted(permutations(EULER_ORDERS, 2), key=lambda pair: sum(map(EULER_ORDERS.index, pair))):
+        taken, meant = pair
+        if pair not in named:
+            named |= {pair, (taken[::-1].swapcase(), meant[::-1].swapcase())}
+            read = Rotation.from_euler(meant, angles[taken])
+            yield with_rotation(f"Euler angles {meant} that were taken as {taken}", read)
