@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from analytic_scene import FOCAL_PX, HEIGHT, WIDTH, cast_depth, looking_at_table
-from jcr.calibration.checks.depth import depth_check
+from jcr.calibration.checks.lengths import depth_check
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration, validated
 from jcr.calibration.words import details

@@ -10,21 +10,22 @@ from itertools import combinations
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.calibration.adjust import refined_by
 from jcr.calibration.case import Case
 from jcr.calibration.checks.boards import board_faults
-from jcr.calibration.checks.depth import depth_check
 from jcr.calibration.cues import CONTRADICTED, length_cue
 from jcr.calibration.hand_eye import judged
 from jcr.calibration.record import Calibration
+from jcr.capture.images import read_depth_images
 from jcr.estimation.intrinsics_prior import MEASURED, camera_with_prior
 from jcr.estimation.problem import SCALE, LinearPrior
 from jcr.estimation.solve import Solution, size_of_boards, with_priors
 from jcr.findings import Finding, FindingKind
-from jcr.records import LengthCheck, LengthName, ScaleCheck
+from jcr.geometry import apply, inverse
+from jcr.records import Capture, DepthCheck, LengthCheck, LengthName, Reconstruction, ScaleCheck
 from jcr.rounding import significant
 
 DEPTH_STD, NETWORK_STD = 0.02, 0.05
@@ -46,6 +47,14 @@ WORTH = 10.0
 
 OF_NETWORK = 1.64
 """Standard deviations between a network's focal length and the given one; a tenth of the networks is farther off."""
+MIN_IMAGES, MIN_FEATURES = 3, 60
+"""Fewest images and features at which depth is compared."""
+OUTSIDE = 0.3
+"""Relative difference from the common one beyond which a depth is that of another surface."""
+BINS = 8
+"""Bins of distance in which the noise of depth is measured."""
+NORMAL = 1.4826
+"""Standard deviations of a normal error in its median absolute deviation."""
 
 
 @dataclass(frozen=True)
@@ -60,18 +69,21 @@ class Length:
 def check_lengths(case: Case) -> Case:
     """Estimate the scale with all known lengths, or report two that contradict each other."""
     hand_eye, lengths = _measured(case)
-    converged, robot = hand_eye.converged, Length("robot", 0.0, float(np.sqrt(hand_eye.covariance[6, 6])))
-    pair = contradiction([robot, *lengths]) if lengths and converged else None
+    converged, robot = hand_eye.converged, Length("robot", 0.0, float(hand_eye.uncertainty.std[6]))
+
+    def sigmas(pair: tuple[Length, Length]) -> float:
+        return abs(pair[0].off - pair[1].off) / float(np.hypot(pair[0].std, pair[1].std))
+
+    pair = max(combinations([robot, *lengths], 2), key=sigmas, default=None) if converged else None
+    if pair is not None and (sigmas(pair) <= SIGMAS or abs(pair[0].off - pair[1].off) <= LEAST):
+        pair = None
     of_images = converged and case.adjusted is not None and hand_eye.source == "images"
     weighed = [
         one
         for one in lengths
-        if of_images
-        and pair is None
-        and one.std < WORTH * robot.std
-        and abs(one.off) < AGREES * float(np.hypot(one.std, robot.std))
+        if of_images and pair is None and one.std < WORTH * robot.std and sigmas((one, robot)) < AGREES
     ]
-    checks = (
+    checks = [
         LengthCheck(
             name=name,
             robot_longer_percent=100 * float(np.expm1(one.off)),
@@ -80,14 +92,19 @@ def check_lengths(case: Case) -> Case:
         )
         for one in lengths
         if (name := one.name) != "robot"
-    )
+    ]
     hand_eye = replace(hand_eye, lengths=tuple(checks))
     compared = any(one.name != "network" for one in lengths) or bool(case.priors)
     alone = not compared and case.reconstruction.metric_std is None
     findings = (Finding.of(FindingKind.SCALE_FROM_ROBOT, "informs"),) * alone
     if pair is not None:
-        return case.after((finding_of(*pair, hand_eye), *findings), hand_eye)
-    fault = _fault(hand_eye, lengths)
+        return case.after((_contradiction(*pair, hand_eye), *findings), hand_eye)
+    # The difference of the most exact length from the robot, beyond their uncertainties, counts as uncertainty.
+    best, fault = min(lengths, key=lambda one: one.std, default=robot), np.zeros((7, 7))
+    beyond = best.off**2 - best.std**2 - robot.std**2
+    if best.std < EXACT and beyond > 0:
+        shift = _shift(float(np.sqrt(beyond)), hand_eye)
+        fault = np.outer(shift, shift)
     if weighed:
         return case.after(findings, *_fused(case, hand_eye, weighed, fault))
     if converged and fault.any():
@@ -98,24 +115,23 @@ def check_lengths(case: Case) -> Case:
 def _measured(case: Case) -> tuple[Calibration, list[Length]]:
     """Return the calibration with the measurements of lengths, and the lengths."""
     hand_eye, found = case.hand_eye, list[Length]()
-    boards, adjusted = case.reconstruction.tracks.boards, case.adjusted
+    boards, adjusted, variance = case.reconstruction.tracks.boards, case.adjusted, hand_eye.covariance[6, 6]
+    size_std = None if boards is None or hand_eye.source == "poses" else boards.size_std
     if (
         adjusted is not None
         and adjusted.problem.boards is not None
-        and boards is not None
-        and boards.size_std is not None
-        and hand_eye.source == "images"
+        and size_std is not None
         and not board_faults(case)
     ):
         off, by_unknown = size_of_boards(adjusted)
         together = float(by_unknown @ adjusted.covariance @ by_unknown)
         of_images = max(together - float(adjusted.covariance[SCALE, SCALE].item()), 0.0)
-        found.append(Length("board", off, float(np.hypot(np.sqrt(of_images), boards.size_std))))
+        found.append(Length("board", off, float(np.hypot(np.sqrt(of_images), size_std))))
     if case.options.known_length is not None and not case.priors:
         scale, std = length_cue(case.capture, case.reconstruction, case.options.known_length)
         found.append(Length("known length", float(np.log(hand_eye.scale / scale)), std))
     if hand_eye.converged and (depth := depth_check(case.capture, case.reconstruction, hand_eye)) is not None:
-        of_depth = max((depth.std_percent / 100) ** 2 - hand_eye.covariance[6, 6], 0.0)
+        of_depth = max((depth.std_percent / 100) ** 2 - variance, 0.0)
         std = float(np.hypot(DEPTH_STD, np.sqrt(of_depth)))
         found.append(Length("depth camera", -float(np.log1p(depth.off_percent / 100)), std))
         hand_eye = replace(hand_eye, depth_check=depth)
@@ -123,46 +139,29 @@ def _measured(case: Case) -> tuple[Calibration, list[Length]]:
     if case.reconstruction.is_metric and case.reconstruction.metric_std is None:
         # A network's length of 1 is `scale` metres by the robot.
         found.append(Length("network", float(np.log(hand_eye.scale)), NETWORK_STD))
-        hand_eye = replace(hand_eye, scale_check=_network_check(hand_eye))
+        std_percent = 100 * float(np.sqrt(variance)) / hand_eye.scale
+        check = ScaleCheck(100 * (1 / hand_eye.scale - 1), std_percent)
+        hand_eye = replace(hand_eye, scale_check=check)
     return hand_eye, found
 
 
-def _network_check(hand_eye: Calibration) -> ScaleCheck:
-    std_percent = 100 * float(np.sqrt(hand_eye.covariance[6, 6])) / hand_eye.scale
-    return ScaleCheck(100 * (1 / hand_eye.scale - 1), std_percent)
-
-
-def contradiction(lengths: list[Length]) -> tuple[Length, Length] | None:
-    """Return the two lengths that contradict each other most surely; None where none do."""
-
-    def sigmas(pair: tuple[Length, Length]) -> float:
-        return abs(pair[0].off - pair[1].off) / float(np.hypot(pair[0].std, pair[1].std))
-
-    worst = max(combinations(lengths, 2), key=sigmas)
-    return worst if sigmas(worst) > SIGMAS and abs(worst[0].off - worst[1].off) > LEAST else None
-
-
-def finding_of(one: Length, other: Length, hand_eye: Calibration) -> Finding:
+def _contradiction(one: Length, other: Length, hand_eye: Calibration) -> Finding:
     """Return the finding that two lengths contradict each other; the robot is the first where it is one of them."""
-    off, std = other.off - one.off, float(np.hypot(one.std, other.std))
-    of_robot = one.name == "robot"
-    if of_robot and other.name == "network":
-        check = _network_check(hand_eye)
-        value, std = check.off_percent / 100, check.std_percent / 100
-        return Finding.of(FindingKind.NETWORK_SCALE, "warns", "poses", value=value, std=std)
-    exact = max(one.std, other.std) < EXACT and abs(off) >= CONTRADICTED[1]
-    found = Finding.of(
-        FindingKind.BOARD_SIZE if of_robot and other.name == "board" else FindingKind.SCALES,
-        "rejects" if exact and of_robot else "warns",
-        "poses",
+    off, std, of_robot = other.off - one.off, float(np.hypot(one.std, other.std)), one.name == "robot"
+    if of_robot and other.name == "network" and (check := hand_eye.scale_check) is not None:
+        size = {"value": check.off_percent / 100, "std": check.std_percent / 100}
+        return Finding.of(FindingKind.NETWORK_SCALE, "warns", "poses", **size)
+    exact = of_robot and max(one.std, other.std) < EXACT and abs(off) >= CONTRADICTED[1]
+    found = Finding(
+        kind=FindingKind.BOARD_SIZE if of_robot and other.name == "board" else FindingKind.SCALES,
+        severity="rejects" if exact else "warns",
+        concerns="poses",
         value=float(np.expm1(off)),
         std=std,
-        one=one.name,
-        other=other.name,
+        details={"one": one.name, "other": other.name},
     )
-    if not of_robot or other.std >= EXACT:
-        return found
-    return replace(found, shift=tuple(_shift(off, hand_eye).tolist()))
+    is_shifted = of_robot and other.std < EXACT
+    return replace(found, shift=tuple(_shift(off, hand_eye).tolist())) if is_shifted else found
 
 
 def _shift(off: float, hand_eye: Calibration) -> Float[ndarray, "7"]:
@@ -170,32 +169,21 @@ def _shift(off: float, hand_eye: Calibration) -> Float[ndarray, "7"]:
     return -off * np.r_[hand_eye.gripper_from_camera[:3, 3], np.zeros(3), 1.0]
 
 
-def _fault(hand_eye: Calibration, lengths: list[Length]) -> Float[ndarray, "7 7"]:
-    """Return the covariance of the difference of the most exact length from the robot beyond their uncertainties."""
-    best = min(lengths, key=lambda one: one.std, default=Length("robot", 0.0, EXACT))
-    beyond = best.off**2 - best.std**2 - float(hand_eye.covariance[6, 6])
-    if best.std >= EXACT or beyond <= 0:
-        return np.zeros((7, 7))
-    shift = _shift(float(np.sqrt(beyond)), hand_eye)
-    return np.outer(shift, shift)
-
-
 def _fused(
     case: Case, hand_eye: Calibration, lengths: list[Length], fault: Float[ndarray, "7 7"]
 ) -> tuple[Calibration, Solution]:
     """Return calibration and adjustment with the lengths as priors of the scale."""
-    assert case.adjusted is not None
-    log_scale, boards = float(np.log(case.adjusted.most_likely.scale)), case.reconstruction.tracks.boards
-    by_scale = np.eye(case.adjusted.problem.unknowns)[SCALE.start]
-    known = []
+    adjusted, boards, known = case.adjusted, case.reconstruction.tracks.boards, list[LinearPrior]()
+    assert adjusted is not None
     for one in lengths:
+        row, std = np.eye(adjusted.problem.unknowns)[SCALE.start], one.std
+        value = float(np.log(adjusted.most_likely.scale)) - one.off
         if one.name == "board" and boards is not None and boards.size_std is not None:
-            size, by_unknown = size_of_boards(case.adjusted)
-            value = float(by_unknown @ case.adjusted.problem.coordinates(case.adjusted.state)) - size
-            known.append(LinearPrior(by_unknown, value, float(np.hypot(boards.size_std, ROBOT_STD))))
-        else:
-            known.append(LinearPrior(by_scale, log_scale - one.off, float(np.hypot(one.std, ROBOT_STD))))
-    adjusted = with_priors(case.adjusted, known)
+            size, row = size_of_boards(adjusted)
+            value = float(row @ adjusted.problem.coordinates(adjusted.state)) - size
+            std = boards.size_std
+        known.append(LinearPrior(row, value, float(np.hypot(std, ROBOT_STD))))
+    adjusted = with_priors(adjusted, known)
     refined = refined_by(case, adjusted)
     refined = refined.with_uncertainty(refined.uncertainty.with_error(fault))
     for one in hand_eye.findings:
@@ -229,3 +217,73 @@ def check_predicted_focal(case: Case) -> Case:
     moved = tuple((by_focal.directions @ by_focal.std).tolist())
     found = Finding.of(FindingKind.INTRINSICS, "warns", "intrinsics", **details)
     return case.after((replace(found, shift=(0.0,) * 7, intrinsics_shift=moved),))
+
+
+def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: Calibration) -> DepthCheck | None:
+    """Return scale and noise of the depth images by the robot; None where too few features have a depth.
+
+    Raises InputError where a depth image cannot be read.
+    """
+    if capture.depths is None:
+        return None
+    measured, predicted, image = _depths(capture, reconstruction, hand_eye.scale)
+    off = np.log(measured / predicted)
+    rows, count = np.unique(image, return_counts=True)
+    rows = rows[count >= MIN_FEATURES // 6]
+    if len(rows) < MIN_IMAGES or len(off) < MIN_FEATURES:
+        return None
+    # An image's features share what its pose is off by, so images are counted and not features.
+    medians = np.array([np.median(off[image == row]) for row in rows])
+    common = float(np.median(medians))
+    spread = NORMAL * float(np.median(np.abs(medians - common)))
+    std = np.hypot(1.2533 * spread / np.sqrt(len(rows)), hand_eye.uncertainty.std[6])
+    same = np.abs(off - common) < OUTSIDE
+    depth = predicted[same]
+    noise_m, noise_per_m = _noise(depth, measured[same] / np.exp(common) - depth)
+    near, far = np.percentile(depth, [5, 95])
+    return DepthCheck(
+        off_percent=100 * float(np.expm1(common)),
+        std_percent=100 * float(std),
+        noise_m=noise_m,
+        noise_per_m=noise_per_m,
+        distances_m=(float(near), float(far)),
+        images=len(rows),
+        features=int(same.sum()),
+    )
+
+
+def _depths(
+    capture: Capture, reconstruction: Reconstruction, scale: float
+) -> tuple[Float[ndarray, " k"], Float[ndarray, " k"], Int[ndarray, " k"]]:
+    """Return measured depths (m), depths by the robot, and images of all features that have both."""
+    tracks, depths = reconstruction.tracks, list(capture.depths or [])
+    parts = [np.zeros((3, 0))]
+    for k, row in enumerate(reconstruction.image_index):
+        if row >= len(depths) or (name := depths[row]) is None:
+            continue
+        depth = read_depth_images(capture.folder / name, capture.image_size)
+        seen = np.flatnonzero(tracks.image == k)
+        u, v = np.rint(tracks.x_px[seen]).astype(int).T
+        inside = (u >= 1) & (v >= 1) & (u < depth.shape[1] - 1) & (v < depth.shape[0] - 1)
+        seen, u, v = seen[inside], u[inside], v[inside]
+        around = np.stack([depth[v + dv, u + du] for dv in (-1, 0, 1) for du in (-1, 0, 1)])
+        camera_from_recon = inverse(reconstruction.recon_from_camera[k])
+        z = apply(camera_from_recon, tracks.points_in_recon[tracks.point[seen]])[:, 2]
+        # At the edge of a thing, colour and depth are of different ones.
+        whole = (around > 0).all(0) & (np.ptp(around, axis=0) < 0.03 * around[4]) & (z > 0)
+        parts.append(np.stack([around[4][whole], scale * z[whole], np.full(whole.sum(), k)]))
+    measured, predicted, image = np.concatenate(parts, axis=1)
+    return measured, predicted, image.astype(int)
+
+
+def _noise(depth: Float[ndarray, " k"], residual: Float[ndarray, " k"]) -> tuple[float, float]:
+    """Return a (m) and b (1/m) of sigma² = a² + (b z²)² by the spread of the residuals in bins of distance."""
+    from scipy.optimize import nnls  # few captures have a depth camera, and it takes 0.1 s
+
+    bins = np.array_split(np.argsort(depth), BINS)
+    z = np.array([np.median(depth[rows]) for rows in bins])
+    variance = np.array([(NORMAL * np.median(np.abs(residual[rows]))) ** 2 for rows in bins])
+    # Relative, for a variance that is estimated is as uncertain as it is large.
+    design = np.stack([np.ones(BINS), z**4], 1) / variance[:, None].clip(1e-12)
+    (constant, growing), _ = nnls(design, np.ones(BINS))
+    return float(np.sqrt(constant)), float(np.sqrt(growing))
