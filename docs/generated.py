@@ -384,12 +384,15 @@ def _blanked(template: str) -> str:
     return template
 
 
+UNITS = {"{mm": "m", "{deg": "rad", "{percent": "share of 1", "{value": "as in the message"}
+"""Units of `value` by the field of the message that states it."""
+
+
 def _about_kind(row: KindRow) -> Iterator[str]:
     if isinstance(row.message, str) and row.message != "{text}":
         yield f"> {_blanked(row.message)}\n"
-    yield from (
-        f"- **{name}**: {text}." for name, text in (("Means", row.means), ("`value`", row.evidence)) if text
-    )
+    unit = next((unit for field, unit in UNITS.items() if field in row.message), "")
+    yield from (f"- **{name}**: {text}." for name, text in (("Means", row.means), ("`value`", unit)) if text)
     advice = row.help or (row.remedy if isinstance(row.remedy, str) else "")
     if advice:
         yield f"- **Remedy**: {_blanked(advice)}."

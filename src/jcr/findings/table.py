@@ -106,8 +106,6 @@ class KindRow:
     """Kinds that follow from this one where it rejects a calibration; empty for a kind that is no cause."""
     means: str = ""
     """Meaning, for the documentation, where the message does not state it."""
-    evidence: str = ""
-    """Meaning and unit of `value`, for the documentation."""
     help: str = ""
     """Remedy for the documentation, where `remedy` does not state it."""
 
@@ -128,145 +126,120 @@ class FindingKind(StrEnum):
     UNOBSERVABLE = "unobservable motion", KindRow("motion",
         "{nearly:nearly unobservable|unobservable} from these motions: {direction}", "{concerns:motion={move}|}",
         means="the motions do not determine a direction of translation, rotation or scale",
-        evidence="excitation of that direction, 0 to 0.06",
         help="other motions; `details.motion` says what these are like")
     FEW_IMAGES = "few images", KindRow("motion", "with {value:.0f} images a wrong one cannot be identified",
-        "take 8 or more", evidence="images")
+        "take 8 or more")
     FEW_AGREE = "few images agree", KindRow("motion",
         "only {value:.0f} of {images:.0f} images agree on one calibration",
-        "check that images and poses are paired, and how the poses are written (jcr docs captures)",
-        evidence="images that agree")
+        "check that images and poses are paired, and how the poses are written (jcr docs captures)")
     POSES_CONTRADICT_IMAGES = "gripper poses contradict the images", KindRow("motion",
         "gripper poses and images disagree by {mm:.0f} mm and {rotation_deg:.1f}° per axis",
-        "check the pairing, and how the poses are written (jcr docs captures)", evidence="m per axis")
+        "check the pairing, and how the poses are written (jcr docs captures)")
     POSE_CONVENTION = "pose convention", KindRow("motion",
-        "the poses fit when read as {reading}: {fits}, instead of {given}", "{remedy}",
-        explains=MISFIT, evidence="m per axis, when read so",
+        "the poses fit when read as {reading}: {fits}, instead of {given}", "{remedy}", explains=MISFIT,
         help="the option in `remedy`, or correct them at their source")
     NOISE_ABOVE_GIVEN = "noise above the given one", KindRow("motion",
         "gripper poses and images disagree by {mm:.2g} mm and {rotation_deg:.2g}° per axis, more than the given "
-        "robot noise ({given_mm:.2g} mm, {given_rotation_deg:.2g}°): the larger is used",
-        evidence="m per axis")
+        "robot noise ({given_mm:.2g} mm, {given_rotation_deg:.2g}°): the larger is used")
     UNCERTAIN = "too uncertain", KindRow("motion",
         "the {part} is known to ±{part:translation={mm:.0f} mm|rotation={deg:!.1f}°|scale={percent:.0f} %} only",
         "add images, rotated by 20° or more about different axes{noise_unknown:, or give the robot's repeatability "
         "(--robot-noise MM DEG)|}",
-        means="translation, rotation or scale (`details.part`) is less certain than 20 mm, 3° or 5 %",
-        evidence="1σ: m, rad, share")
+        means="translation, rotation or scale (`details.part`) is less certain than 20 mm, 3° or 5 %")
     LEAVE_ONE_OUT = "leave-one-out error", KindRow("motion",
         "the leave-one-out error ({mm:.1f} mm) is well above the fit's residual ({residual_mm:.1f} mm): "
-        "too few images for this motion", "add some", evidence="m")
+        "too few images for this motion", "add some")
     NOT_EXACT_ENOUGH = "requirement not met", KindRow("motion", f"{SHORT}: {REACHED}",
         "{concerns:images=add {more_images:.0f} more at the poses of next_poses|robot=most of it comes from systematic "
         "robot errors: name the arm (--robot) or add its joint angles|none=a dozen more images would not be enough; "
         "move closer to the scene, or use a better camera or robot}",
         means="not as exact as `--require` asks, which rejects, or as grasping needs, which warns",
-        evidence="m, 95 % of errors are smaller", help="the images in `next_poses`; or the arm's name")
+        help="the images in `next_poses`; or the arm's name")
     FOCUS_BY_DISTANCE = "focal length changes with distance", KindRow("camera",
         "the focal length {value:grows|shrinks} by {percent:!.1f} ± {std_percent:~} % from the nearest "
-        "view to the farthest", "lock the focus, or --focus varies", explains=MISFIT,
-        evidence="share, from the nearest view to the farthest; the chance `p`")
+        "view to the farthest", "lock the focus, or --focus varies", explains=MISFIT)
     FOCUS_BY_IMAGE = "focal length differs between images", KindRow("camera",
         "the focal length differs between images by {percent:~} % (rms, each ± {std_percent:~} %)",
-        "lock the focus and take the images again, or --focus varies", explains=MISFIT, evidence="share, rms")
+        "lock the focus and take the images again, or --focus varies", explains=MISFIT)
     ZOOM = "focal length changed once", KindRow("camera",
         "the focal length changes by {percent:+.1f} ± {std_percent:~} % after {images[0]}: the "
-        "zoom or focus was moved", "calibrate the images before or after it, or --focus varies",
-        explains=MISFIT, evidence="share; the chance `p`")
+        "zoom or focus was moved", "calibrate the images before or after it, or --focus varies", explains=MISFIT)
     ROLLING_SHUTTER = "images sheared alike", KindRow("camera",
         "the images are sheared by {value:.1f} ± {std:~} px from top to bottom, as by the rolling "
-        "shutter of a moving camera", "take the images at rest", explains=MISFIT,
-        evidence="px from top to bottom; the chance `p`")
+        "shutter of a moving camera", "take the images at rest", explains=MISFIT)
     ROLLING_SHUTTER_BY_IMAGE = "images sheared each by itself", KindRow("camera",
         "each image is sheared by itself, {value:.1f} px from top to bottom (rms), as by the "
-        "rolling shutter of a moving camera", "take the images at rest", explains=MISFIT,
-        evidence="px from top to bottom, rms")
+        "rolling shutter of a moving camera", "take the images at rest", explains=MISFIT)
     THIN_PRISM = "thin prism", KindRow("camera",
         "the images show a thin-prism distortion of up to {value:.1f} ± {std:~} px: the sensor is "
         "tilted, or the optics are decentred",
-        "use the transform with the estimated intrinsics, which have the coefficients s1 to s4",
-        explains=MISFIT,
-        evidence="px, where it is largest; the chance `p`")
+        "use the transform with the estimated intrinsics, which have the coefficients s1 to s4", explains=MISFIT)
     CENTRE_SAGS = "principal point moves with gravity", KindRow("camera",
         "the principal point moves with gravity, by {value:.1f} ± {std:~} px when it lies in the image"
         ": the optics are image-stabilised or loose",
-        "switch image stabilisation off, or fix the optics", explains=MISFIT,
-        evidence="px, when gravity lies in the image; the chance `p`")
+        "switch image stabilisation off, or fix the optics", explains=MISFIT)
     INTRINSICS = "intrinsics contradict the images", KindRow("camera", "the {source} show {shown}",
         "{estimated:use the transform with the intrinsics of this calibration|calibrate the intrinsics again at this "
-        "resolution, or give no intrinsics (null) to have them estimated}",
-        explains=MISFIT,
+        "resolution, or give no intrinsics (null) to have them estimated}", explains=MISFIT,
         help="calibrate them again at this resolution, or give none (null) to have them estimated",
-        means="the given intrinsics are not those of the images; parameters in `details`",
-        evidence="the chance `p`")
+        means="the given intrinsics are not those of the images; parameters in `details`")
     SLIP = "camera moved on the gripper", KindRow("order",
         "the camera seems to have moved on the gripper by {mm:.1f} mm and {rotation_deg:.2f}° after {images[0]}",
-        ONE_PART + "the camera still sits as then", explains=MISFIT, evidence="m; the chance `p`")
+        ONE_PART + "the camera still sits as then", explains=MISFIT)
     DRIFT = "camera drifts on the gripper", KindRow("order",
         "the camera seems to drift on the gripper by {mm:.1f} mm and {rotation_deg:.2f}° from the first image to "
-        "the last", "tighten its mount, let it warm up, and take the images again",
-        explains=MISFIT, evidence="m; the chance `p`")
+        "the last", "tighten its mount, let it warm up, and take the images again", explains=MISFIT)
     BASE_MOVED = "robot base moved against the scene", KindRow("order",
         "the robot's base and the scene moved against each other by {mm:.1f} mm and {rotation_deg:.2f}° after "
-        "{images[0]}", ONE_PART + "base and scene still stand as then", explains=MISFIT,
-        evidence="m; the chance `p`")
+        "{images[0]}", ONE_PART + "base and scene still stand as then", explains=MISFIT)
     DELAY = "gripper poses early or late", KindRow("order",
         "the gripper poses look as if read {value:!.3f} ± {std:~} of the time from one image to the next too "
         "{value:late|early}", "stop the arm at each image, or read pose and image by the same clock",
-        explains=MISFIT, evidence="intervals between images; the chance `p`")
+        explains=MISFIT)
     WRONG_MOUNT = "wrong mount", KindRow("robot",
         "the images fit a camera that the gripper carries, not a fixed one",
         "write mount gripper for {camera}", explains=MISFIT)
     ROBOT_UNUSED = "robot not used", KindRow("robot", "the capture's robot is not used: {text}",
         help="correct its name, URDF or joint angles")
     JOINT_OFFSETS = "joint offsets", KindRow("robot", "robot: {shown}",
-        means="`joints` are off; each in `details`", evidence="rad, the largest",
+        means="`joints` are off; each in `details`",
         help="master the joints")
     LENGTHS = "robot lengths differ by direction", KindRow("strain",
         "along {axis} the robot's positions are {percent:!.1f} ± {std_percent:~} % too {value:long|short} "
         "beside those across it",
-        "check that axis (a lift, a rail, a gantry): its gear ratio, its unit", explains=MISFIT,
-        evidence="share, positive: too long; the chance `p`")
+        "check that axis (a lift, a rail, a gantry): its gear ratio, its unit", explains=MISFIT)
     BASE_LEANS = "robot base leans with reach", KindRow("strain",
         "the robot's base leans {value:towards|away from} the gripper by {deg:!.1f} ± {std_deg:~}° per "
-        "metre of reach, which its poses do not say", "bolt the stand to the floor, or brace it",
-        explains=MISFIT,
-        evidence="rad per m, positive: towards the gripper; the chance `p`")
+        "metre of reach, which its poses do not say", "bolt the stand to the floor, or brace it", explains=MISFIT)
     TOOL_SAGS = "tool sags", KindRow("strain",
         "the gripper rotates by {deg:!.2f} ± {std_deg:~}° where it is level, as a tool does that sags "
         "under its weight",
-        "stiffen its mount, and check the zero of the wrist's joints, which looks like it", explains=MISFIT,
-        evidence="rad, where it is level; the chance `p`")
+        "stiffen its mount, and check the zero of the wrist's joints, which looks like it", explains=MISFIT)
     BOARD_SIZE = "board size contradicts the robot", KindRow("lengths",
         "by the robot's motion the {marker:marker|board} is {percent:!.1f} ± {std_percent:~} % {value:larger|smaller} "
         "than given",
-        "measure its squares, and check that the gripper poses are in metres", explains=MISFIT,
-        evidence="share, positive: larger")
+        "measure its squares, and check that the gripper poses are in metres", explains=MISFIT)
     SCALES = "lengths contradict each other", KindRow("lengths",
         "{one} and {other} contradict each other by {percent:!.1f} ± {std_percent:~} %",
-        "measure both again",
-        explains=MISFIT,
+        "measure both again", explains=MISFIT,
         means="two of what the scale is known from (`details.one`, `details.other`: robot, board, known "
-        "length, depth camera, network) differ by more than they may",
-        evidence="share, positive: the second is longer")
+        "length, depth camera, network) differ by more than they may")
     BOARD_SIDE = "side of a board", KindRow("lengths",
         "by the robot's positions the sides of {board} are {mm:.2f} ± {std_mm:.2f} mm",
-        "measure one, and give it in --board: the scale is then known twice", evidence="m")
+        "measure one, and give it in --board: the scale is then known twice")
     BOARD_MOVED = "board at several places", KindRow("lengths",
         "in {images} {board} is at another place than in the other images: it was moved, or there are two",
         "its corners there count little or not at all; keep one board of a kind, and keep it still")
     BOARD_STRETCHED = "board stretched", KindRow("lengths",
         "{board} is {percent:!.1f} % longer along one side than along the other: it was not printed at its size",
-        "print it without scaling (jcr board) and measure both sides; its size is not used for the scale",
-        evidence="share")
+        "print it without scaling (jcr board) and measure both sides; its size is not used for the scale")
     BOARD_NOT_FOUND = "board not found", KindRow("lengths",
         "no two images show {board}: features alone are used{proposed:, but they seem to show $}",
         "check its kind and its numbers of squares or corners (jcr docs markers)",
         means="no two images show what `--board` names; `details.proposed` is what they seem to show")
     NETWORK_SCALE = "a network's metre contradicts the robot", KindRow("lengths",
         "the network's own lengths are {percent:!.3g} ± {std_percent:~} % too {value:long|short} compared with the "
-        "robot's", "check the unit of the gripper poses", means="by far more than networks err",
-        evidence="share, positive: too long")
+        "robot's", "check the unit of the gripper poses", means="by far more than networks err")
     SCALE_ASSUMED = "scale assumed", KindRow("lengths",
         "the scale is unobservable from these motions: it is taken as 1, from the marker's size",
         help="other motions")
@@ -277,7 +250,7 @@ class FindingKind(StrEnum):
         "EXIF orientation {value:.0f}: the images are {rotated}, as viewers show them, and "
         "gripper_from_camera and the intrinsics are of the camera that would see them so",
         "for a driver that gives the sensor's own images remove the tag (exiftool -Orientation= FILES) and "
-        "calibrate again", evidence="the orientation, 2 to 8")
+        "calibrate again")
     BOARD_IN_VIEW = "board in view", KindRow("reconstruction", "a calibration board is in view",
         "try --board {board} with its SIDE in metres, or for tags of a ChArUco board "
         "charuco:COLUMNSxROWS:SIDE:MARKER:DICTIONARY (jcr docs markers)")
@@ -287,16 +260,15 @@ class FindingKind(StrEnum):
         means="no back end found camera poses", help="in its words")
     NOT_SETTLED = "adjustment not settled", KindRow("reconstruction",
         "the adjustment has not settled: its last round moved the result by {value:.2g} standard deviations",
-        "add images of textured, still things", evidence="the last step, in standard deviations")
+        "add images of textured, still things")
     OWN_REJECTED = "the capture's own camera is rejected", KindRow("cell",
         "the {camera} camera's own calibration is rejected", help="correct that first")
     FEW_POINTS_SHARED = "few points shared with the scene", KindRow("cell",
         "{images[0]} shares {value:.0f} points with the mapped scene, too few",
-        "it must see the same scene, unchanged, from a direction not too different",
-        evidence="points, of the best image")
+        "it must see the same scene, unchanged, from a direction not too different")
     FEW_LOCALISED = "few images localised", KindRow("cell",
         "{value:.0f} of its images share enough of the mapped scene; {needed:.0f} are needed",
-        "add images of the mapped scene", evidence="images")
+        "add images of the mapped scene")
     NO_COMMON_POSE = "no image taken with one that is used", KindRow("cell",
         "none of its images was taken with an image that is used", help="more images")
     ONE_GRIPPER_POSE = "camera seen at one gripper pose", KindRow("cell",
@@ -307,67 +279,62 @@ class FindingKind(StrEnum):
         "a second camera on arm {arm}: one each is supported")
     NOT_FIXED = "camera not fixed", KindRow("cell",
         "{images[0]} and {images[1]} were taken from places {mm:.0f} mm and {rotation_deg:.1f}° apart: it is not "
-        "fixed", "of a camera on the gripper write mount gripper, of several cameras give each its own name",
-        evidence="m")
+        "fixed", "of a camera on the gripper write mount gripper, of several cameras give each its own name")
     NOT_RIGID = "camera not rigid on the gripper", KindRow("cell",
         "its place beside the {camera} camera differs by up to {mm:.0f} mm between images: the two are not "
-        "rigid, or the images are not of the frames that they stand for", evidence="m",
+        "rigid, or the images are not of the frames that they stand for",
         help="tighten the mounts; check the frames")
     FAR_FROM_GRIPPER = "camera far from the gripper", KindRow("cell",
         "it is {value:.2f} m from the gripper's frame",
-        "check that it is on the gripper, and that the images are of the frames that they stand for",
-        evidence="m")
+        "check that it is on the gripper, and that the images are of the frames that they stand for")
     IMAGE_MISSES = "image contradicts the camera's place", KindRow("cell",
         "{images[0]} misses the place that fits its images together by {value:.0f} px (median): {mount:base=it is not "
         "fixed|gripper=it is not rigid on the gripper}, the scene changed, or the intrinsics are wrong",
-        evidence="px, median",
         help="tighten the mount, or leave the image out")
     PLACE_UNCERTAIN = "camera's place too uncertain", KindRow("cell",
         "its place is known to ±{mm:.0f} mm and {rotation_deg:.1f}° only{focal_std_percent:, for its images do not show "
         "its intrinsics (focal length ± $ %)}",
         "{concerns:intrinsics=give them, or images with more of the scene, at other depths|images=let it see more of "
         "the mapped scene, or add images to the wrist camera's capture}",
-        means="a further camera is known worse than to 20 mm and 3°", evidence="m, 1σ of the worst axis",
+        means="a further camera is known worse than to 20 mm and 3°",
         help="intrinsics, or more images")
     AT_ANOTHER_CAMERA = "camera stands where another was", KindRow("cell",
         "it stands where the {camera} camera was at {images[0]}: if its image is one of that camera, it is "
         "not fixed", help="check that the image is its own")
     POINTS_CROWDED = "points crowded", KindRow("cell", "its points lie in {percent:.0f} % of the image",
-        "more of the scene in view would help", evidence="share of the image")
+        "more of the scene in view would help")
     STATIC_IMAGES = "images show no motion", KindRow("images",
         "all images show the same view but for noise, while the gripper moves by {mm:.0f} mm and rotates "
         "by {rotation_deg:.0f}°",
         "check that the camera is on the gripper and its stream is live, and take each image at its own pose",
-        explains=(*MISFIT, *TOO_FEW), evidence="m, the gripper's motion")
+        explains=(*MISFIT, *TOO_FEW))
     BLURRED = "images blurred", KindRow("images", "{images} {images:is|are} blurred (edges {value:.0f} px wide)",
         "take them again at rest, in focus and with more light", explains=(*MISFIT, *TOO_FEW),
         means="the strongest edges of these `images` climb over more than 1/80 of the long side; rejects "
-        "where a quarter of all are and the calibration is rejected", evidence="px, how wide the edges are")
+        "where a quarter of all are and the calibration is rejected")
     REPETITIVE = "repetitive scene", KindRow("images",
         "the scene repeats itself: {percent:.0f} % of the features look like others of the same image, so that images "
         "may be matched in the wrong places",
         "put different, textured objects on the table", explains=(*MISFIT, *TOO_FEW),
-        means="regular tiles or patterns; rejects where the calibration is rejected", evidence="share of the features")
+        means="regular tiles or patterns; rejects where the calibration is rejected")
     FEW_USED = "few images used", KindRow("reconstruction",
         "only {value:.0f} of {of:.0f} images are used, and their motions alone are degenerate, those of "
         "all are not", "let the views overlap more and show more texture, or use a board (jcr docs markers)",
-        explains=(*MISFIT, *TOO_FEW), evidence="images")
+        explains=(*MISFIT, *TOO_FEW))
     PIECES = "reconstruction in pieces", KindRow("reconstruction",
         "the reconstruction is in pieces: {value:.0f} of {of:.0f} images, such as {images[0]}, agree with their gripper "
         "poses among themselves and contradict the other images",
         "avoid patterns that repeat, as of a board alone, or name the board (--board); let the views overlap more",
-        explains=MISFIT, evidence="images of the further pieces")
-    POSES_SWAPPED = "gripper poses exchanged", KindRow("single",
-        "{images} have each other's gripper poses", "correct the pairing of images and poses",
         explains=MISFIT)
+    POSES_SWAPPED = "gripper poses exchanged", KindRow("single",
+        "{images} have each other's gripper poses", "correct the pairing of images and poses", explains=MISFIT)
     POSE_CONTRADICTS_IMAGE = "gripper pose contradicts its image", KindRow("single",
         "the gripper pose of {images[0]} is {mm:.0f} mm and {rotation_deg:.1f}° from where its image shows the "
-        "gripper", "correct that pose, or drop the image", evidence="m")
+        "gripper", "correct that pose, or drop the image")
     NOT_REGISTERED = "image not registered", KindRow("single",
         "{images} {images:is|are} not registered: {value:.0f} other images match, too little of each",
         "take such a view again, nearer to a pose that registered, with textured things in view",
-        means="while a capture is taken (`jcr capture`): its camera is not in the reconstruction",
-        evidence="other images that match it")
+        means="while a capture is taken (`jcr capture`): its camera is not in the reconstruction")
     # fmt: on
 
 
