@@ -11,7 +11,13 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from jcr.calibration.record import AnyCalibration, FailedCalibration, read_content, validated
+from jcr.calibration.record import (
+    AnyCalibration,
+    Calibration,
+    FailedCalibration,
+    read_content,
+    validated,
+)
 from jcr.distributions import chi2
 from jcr.errors import InputError, first_fault
 from jcr.geometry import require_rigid, step_between
@@ -75,16 +81,21 @@ def compare(calibration: Comparable, other: Comparable) -> Difference:
     a 4×4 gripper_from_camera. Raises InputError where one of them has no transform of a camera on the gripper,
     RejectedError where nothing was found.
     """
-    return difference(_stated(calibration), _stated(other))
+    ours, others = (_stated(one, "the calibration") for one in (calibration, other))
+    return difference(ours, others)
 
 
-def _stated(one: Comparable) -> StatedTransform:
-    """Return transform and covariance of what `compare` takes."""
+def _stated(one: Comparable, name: str) -> StatedTransform:
+    """Return the transform of what `compare` takes with its covariance; raise InputError without a transform."""
     if isinstance(one, str | Path):
         return read_hand_eye(Path(one))
     record = getattr(one, "calibration", one)
-    if isinstance(record, AnyCalibration):
-        return _of_calibration(record, "the calibration")
+    if isinstance(record, FailedCalibration):
+        raise InputError(f"{name}: has no {record.mount}_from_camera; that calibration failed")
+    if isinstance(record, Calibration):
+        budget = record.uncertainty.budget
+        parts = {} if budget is None else {cause: part[:6, :6] for cause, part in vars(budget).items()}
+        return StatedTransform(record.gripper_from_camera, record.covariance[:6, :6], parts, record.doubt)
     matrix = np.asarray(one, float)
     if matrix.shape != (4, 4):
         raise InputError(f"a transform of shape {matrix.shape}; give a 4×4 gripper_from_camera")
@@ -104,7 +115,7 @@ def read_hand_eye(path: Path) -> StatedTransform:
         raise InputError(f"{path}: no calibration.json or reference.json there; name a run folder or a file")
     content = read_content(file)
     if "format" in content:
-        return _of_calibration(validated(content, file), str(file))
+        return _stated(validated(content, file), str(file))
     try:
         found = _Reference.model_validate_json(json.dumps(content))
     except ValidationError as error:
@@ -117,46 +128,32 @@ def read_hand_eye(path: Path) -> StatedTransform:
     return StatedTransform(found.gripper_from_camera, np.diag(std**2))
 
 
-def _of_calibration(calibration: AnyCalibration, name: str) -> StatedTransform:
-    """Return the transform of a calibration with its covariance and the parts of it; raise InputError without one."""
-    if isinstance(calibration, FailedCalibration):
-        raise InputError(f"{name}: has no {calibration.mount}_from_camera; that calibration failed")
-    budget = calibration.uncertainty.budget
-    parts = {} if budget is None else {cause: part[:6, :6] for cause, part in vars(budget).items()}
-    covariance = calibration.covariance[:6, :6]
-    return StatedTransform(calibration.gripper_from_camera, covariance, parts, calibration.doubt)
-
-
 def difference(ours: StatedTransform, other: StatedTransform) -> Difference:
     """Return the difference of one calibration from another, compared with the covariances that they state.
 
     A cause of covariance Pₖ explains ΔᵀV⁻¹PₖV⁻¹Δ of ΔᵀV⁻¹Δ, V = ΣPₖ: the squared size of its best linear prediction.
     """
     step = step_between(ours.gripper_from_camera, other.gripper_from_camera)
-    parts: dict[str, Float[ndarray, "6 6"]] = {}
-    together = np.zeros((6, 6))
+    parts, together = dict[str, Float[ndarray, "6 6"]](), np.zeros((6, 6))
     for known in (ours, other):
-        if known.covariance is None:
-            continue
-        together += known.covariance
-        rest = known.covariance - sum(known.parts.values(), np.zeros((6, 6)))
-        for name, part in (known.parts | {OTHER: rest}).items():
-            parts[name] = parts.get(name, np.zeros((6, 6))) + part
+        if known.covariance is not None:
+            together += known.covariance
+            rest = known.covariance - sum(known.parts.values(), np.zeros((6, 6)))
+            for name, part in (known.parts | {OTHER: rest}).items():
+                parts[name] = parts.get(name, np.zeros((6, 6))) + part
     if not np.diag(together).all():  # neither states any, or both are said to be exact
         return Difference(translation_m=step[:3], rotation_vector=step[3:])
     std = np.sqrt(np.diag(together))
     weighed = np.linalg.solve(together / np.outer(std, std), step / std) / std
     squared = float(step @ weighed)
     shares = {name: float(weighed @ part @ weighed) / squared for name, part in parts.items() if squared}
+    if abs(shares.get(OTHER, 1.0)) <= NOTHING:
+        del shares[OTHER]
     return Difference(
         translation_m=step[:3],
         rotation_vector=step[3:],
         sigmas=np.abs(step) / std,
         chi2=squared,
         p_value=float(chi2.sf(squared, 6)),
-        explained_by={
-            name: share
-            for name, share in sorted(shares.items(), key=lambda item: -item[1])
-            if name != OTHER or share > NOTHING
-        },
+        explained_by=dict(sorted(shares.items(), key=lambda item: -item[1])),
     )

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 from scipy.linalg import block_diag
-from scipy.optimize import root_scalar
-from scipy.stats import chi2, ncx2
+from scipy.special import chndtrinc
 
+from jcr.distributions import chi2
 from jcr.estimation.hypotheses import Row, Test, confirm
 from jcr.estimation.pose_equations import pose_equations
 from jcr.estimation.problem import ROTATION, TRANSLATION, Problem, State, columns_of_arm, pose_problem
@@ -29,8 +29,8 @@ POWER = 0.9
 """Probability with which a motion of the size `detectable` is found."""
 NOISIER = 1.5
 """Factor of the errors of the gripper poses from which new images contradict one another."""
-SETTLED = 1e-5
-"""Step (m, rad) that ends the iterations."""
+SETTLED, ITERATIONS = 1e-5, 10
+"""Step (m, rad) that ends the iterations, and their largest number."""
 
 NewPoses = Float[ndarray, "k 4 4"]
 Cause = Literal["camera", "scene", "either"]
@@ -67,65 +67,57 @@ def drift(
     and new gripper poses at 1 rad.
     """
     gripper, camera = (np.concatenate(pair) for pair in zip(old, new[:2], strict=True))
+    first, state = len(old[0]), calibrated.state
     problem, _ = pose_problem(
         gripper,
         camera,
-        (calibrated.state.x[0], calibrated.state.scale, calibrated.state.z[0]),
-        camera_covariance=np.asarray(block_diag(np.zeros((6 * len(old[0]),) * 2), *new[2])),
+        (state.x[0], state.scale, state.z[0]),
+        camera_covariance=np.asarray(block_diag(np.zeros((6 * first, 6 * first)), *new[2])),
         error_covariance=systematic,
         noise_floor=calibrated.noise.given,
     )
-    of_camera = _motion(problem, calibrated, len(old[0]), FindingKind.SLIP)
-    of_scene = _motion(problem, calibrated, len(old[0]), FindingKind.BASE_MOVED)
+    state = State(x=state.x, scale=state.scale, z=state.z, world_from_rig=camera)
+    of_camera, of_scene = (
+        _motion(problem, state, first, kind) for kind in (FindingKind.SLIP, FindingKind.BASE_MOVED)
+    )
     difference = of_camera.log_p - of_scene.log_p
     # Either motion fits one image exactly.
     unclear = len(new[0]) == 1 or abs(difference) < CLEAR
+    now, then = np.array(of_camera.noise.together), np.array(calibrated.noise.together)
     return Drift(
         offset=of_camera.estimate,
         covariance=of_camera.covariance,
         p_value=float(np.exp(of_camera.log_p)),
         cause="either" if unclear else "camera" if difference < 0 else "scene",
         detectable=detectable(of_camera.covariance, alpha),
-        is_noisier=any(
-            now > NOISIER * then
-            for now, then in zip(of_camera.noise.together, calibrated.noise.together, strict=True)
-        ),
+        is_noisier=bool((now > NOISIER * then).any()),
     )
 
 
-def _motion(problem: Problem, calibrated: Solution, first: int, kind: FindingKind) -> Test:
+def _motion(problem: Problem, state: State, first: int, kind: FindingKind) -> Test:
     """Return the test of a motion of X or Z from image `first` on, linear about the motion that it estimates."""
-    assert problem.known_rigs is not None
-    arm, cameras = problem.arms[0], problem.known_rigs.world_from_rig
-    x, scale, z = calibrated.state.x[0], calibrated.state.scale, calibrated.state.z[0]
-    of_x = kind is FindingKind.SLIP
-    columns = columns_of_arm(0)[:6] if of_x else columns_of_arm(0)[6:]
-    motion, test = np.zeros(6), None
-    for _ in range(10):
+    (arm,), (x,), (z,), of_x = problem.arms, state.x, state.z, kind is FindingKind.SLIP
+    columns, motion = columns_of_arm(0)[:6] if of_x else columns_of_arm(0)[6:], np.zeros(6)
+    left = ITERATIONS
+    while True:
         # Reported without the motion, the new gripper poses fit the transforms of the calibration.
-        moved = retract(x if of_x else z, motion)
-        gripper = arm.base_from_gripper.copy()
+        moved, gripper = retract(x if of_x else z, motion), arm.base_from_gripper.copy()
         gripper[first:] = (
             gripper[first:] @ moved @ inverse(x) if of_x else z @ inverse(moved) @ gripper[first:]
         )
         at = replace(problem, arms=(replace(arm, base_from_gripper=gripper),))
-        state = State(x=x[None], scale=scale, z=z[None], world_from_rig=cameras)
         equations = pose_equations(at, state, None).equations
         by_motion = equations.jacobian[:, columns].copy()
         by_motion[: 6 * first] = 0.0
         whole = replace(equations, residual=equations.residual - by_motion @ motion)
         test = confirm(whole, Row(kind=kind, columns=by_motion, place=first), freedom=KNOWN)
-        step, motion = test.estimate - motion, test.estimate
-        if np.abs(step).max() < SETTLED:
-            break
-    assert test is not None
-    return test
+        step, motion, left = test.estimate - motion, test.estimate, left - 1
+        if np.abs(step).max() < SETTLED or left == 0:
+            return test
 
 
 def detectable(covariance: Float[ndarray, "6 6"], alpha: float) -> tuple[float, float]:
     """Return motions (m) and rotations (rad) in the worst direction that a test at `alpha` finds nine times in ten."""
-    least = chi2.isf(alpha, 6)
-    found = root_scalar(lambda squared: float(ncx2.sf(least, 6, squared)) - POWER, bracket=(1e-3, 1e3))
-    length = np.sqrt(found.root)
+    length = np.sqrt(chndtrinc(chi2.isf(alpha, 6), 6, 1 - POWER))
     worst = [np.sqrt(np.linalg.eigvalsh(covariance[part, part])[-1]) for part in (TRANSLATION, ROTATION)]
     return float(length * worst[0]), float(length * worst[1])

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -413,20 +413,6 @@ class FailedCalibration(Outcome):
     Its file has the keys of a Calibration, which are null. What it does not have raises RejectedError.
     """
 
-    scale: None = None
-    uncertainty: None = None
-    residuals: None = None
-    robot_noise: None = None
-    robot_errors: None = None
-    held_out: None = None
-    requirement: None = None
-    with_given_intrinsics: None = None
-    scale_check: None = None
-    depth_check: None = None
-    board: None = None
-    next_poses: tuple[()] = ()
-    lengths: tuple[()] = ()
-
     @computed_field
     @property
     def observability(self) -> Observability:
@@ -440,11 +426,19 @@ class FailedCalibration(Outcome):
         """None: nothing was found."""
         return None
 
-    def __getattr__(self, name: str) -> NoReturn:
-        """Raise RejectedError for an attribute of a calibration, AttributeError for others."""
+    def __getattr__(self, name: str) -> Any:
+        """Return nothing for a field of a calibration; raise RejectedError for other attributes of one."""
+        if name in Calibration.__dataclass_fields__ or name == "robot_errors":
+            return () if name in {"next_poses", "lengths"} else None
         if name.startswith("_") or not hasattr(Calibration, name):
             raise AttributeError(name)
         raise RejectedError(f"no calibration was found: {self.doubt}")
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the content of calibration.json: the keys of a Calibration, whose own are null or empty."""
+        fields = {*Calibration.__dataclass_fields__, "robot_errors"} - self.__dataclass_fields__.keys()
+        empty = {name: [] if name in {"next_poses", "lengths"} else None for name in sorted(fields)}
+        return super().as_json() | empty
 
 
 AnyCalibration = Calibration | FailedCalibration
