@@ -259,9 +259,9 @@ def test_label_images_are_read_where_the_pointmap_looks(tmp_path: Path):
         write_label(tmp_path, name, halves)
     (tmp_path / "labels" / "names.json").write_text(json.dumps({"1": "left\nhand", "300": ""}))
     labels = read_labels(capture, reconstruction)
-    assert labels is not None and labels.labels.shape == (2, 30, 40)
-    assert (labels.labels[:, :, :20] == 1).all() and (labels.labels[:, :, 20:] == 300).all()
-    assert len(labels.names) == 301 and labels.names[1] == "left hand" and labels.names[300] == "300"
+    assert labels is not None and labels[0].shape == (2, 30, 40)
+    assert (labels[0][:, :, :20] == 1).all() and (labels[0][:, :, 20:] == 300).all()
+    assert len(labels[1]) == 301 and labels[1][1] == "left hand" and labels[1][300] == "300"
 
 
 def test_a_pixel_beyond_the_image_has_no_label_and_distortion_is_followed(tmp_path: Path):
@@ -276,14 +276,14 @@ def test_a_pixel_beyond_the_image_has_no_label_and_distortion_is_followed(tmp_pa
         spot[round(y) - 1 : round(y) + 2, round(x) - 1 : round(x) + 2] = 9
         write_label(tmp_path, name, spot)
     labels = read_labels(capture, reconstruction)
-    assert labels is not None and labels.labels[0, 15, 35] == 9
-    assert (labels.labels == 9).sum() <= 2 * 4
+    assert labels is not None and labels[0][0, 15, 35] == 9
+    assert (labels[0] == 9).sum() <= 2 * 4
     pointmaps = replace(reconstruction.dense, intrinsics=replace(PINHOLE, fx=10.0, fy=10.0))
     wide = replace(reconstruction, pointmaps=pointmaps)
     for name in "ab":
         write_label(tmp_path, name, np.full((60, 80), 2, np.uint8))
     labels = read_labels(capture, wide)
-    assert labels is not None and labels.labels[0, 0, 0] == 0 and labels.labels[0, 15, 20] == 2
+    assert labels is not None and labels[0][0, 0, 0] == 0 and labels[0][0, 15, 20] == 2
 
 
 @pytest.mark.parametrize(
@@ -353,14 +353,14 @@ def test_masks_of_different_images_become_objects_by_where_they_lie():
     first = np.stack([mug, everything, ghost])
     second = np.stack([everything, mug[::-1, ::-1]])
     labels = merged([first, second], x_in_base, np.ones((2, 30, 40), bool))
-    assert labels.names == ("none", "segment 1", "segment 2")
-    np.testing.assert_array_equal(labels.labels[0], np.where(mug, 2, 1))
-    np.testing.assert_array_equal(labels.labels[1], np.where(mug, 2, 1)[::-1, ::-1])
+    assert labels[1] == ("none", "segment 1", "segment 2")
+    np.testing.assert_array_equal(labels[0][0], np.where(mug, 2, 1))
+    np.testing.assert_array_equal(labels[0][1], np.where(mug, 2, 1)[::-1, ::-1])
     # The same pixels elsewhere in space are another object, here one that no other image shows.
     moved = x_in_base + np.array([0.0, 1.0])[:, None, None, None]
-    assert merged([first, second], moved, np.ones((2, 30, 40), bool)).labels.max() == 0
+    assert merged([first, second], moved, np.ones((2, 30, 40), bool))[0].max() == 0
     nothing = [np.zeros((0, 30, 40), bool)] * 2
-    assert merged(nothing, x_in_base, np.ones((2, 30, 40), bool)).names == ("none",)
+    assert merged(nothing, x_in_base, np.ones((2, 30, 40), bool))[1] == ("none",)
 
 
 @pytest.fixture(scope="module")
@@ -428,5 +428,5 @@ def test_segment_anything_gives_distinct_masks_of_the_image(
         replace(reconstruction, pointmaps=replace(reconstruction.dense, colors=np.stack([image, image]))),
         hand_eye(),
     )
-    assert labels.labels.max() == len(labels.names) - 1 > 0
-    np.testing.assert_array_equal(labels.labels[0], labels.labels[1])
+    assert labels[0].max() == len(labels[1]) - 1 > 0
+    np.testing.assert_array_equal(labels[0][0], labels[0][1])

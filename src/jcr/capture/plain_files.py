@@ -77,14 +77,13 @@ def read_yaml(file: Path) -> Any:
     """Read the plain data of a YAML file, a list of several documents; InputError when it is none."""
     import yaml
 
-    try:
-        from yaml import CSafeLoader as SafeLoader
-    except ImportError:
-        from yaml import SafeLoader
-
     text = read_text(file, MAX_YAML)
     try:
-        documents = [one for one in yaml.load_all(text, Loader=SafeLoader) if one is not None]
+        documents = [
+            one
+            for one in yaml.load_all(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+            if one is not None
+        ]
         return documents[0] if len(documents) == 1 else documents or None
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         # Besides what is no YAML: dates and characters that are none, thousands of digits or brackets.

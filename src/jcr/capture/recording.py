@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy import ndarray
 from jcr.capture.checks import checked_capture
 from jcr.capture.images import BLURRED, DEPTH, encode_png, sharpness
 from jcr.capture.options import MIN_FRAMES, ReadOptions
+from jcr.capture.ros import read_camera_info
 from jcr.errors import InputError
 from jcr.estimation.pose_equations import ASSUMED_NOISE, expected_covariance
 from jcr.estimation.prediction import choose_poses, pose_information, total_uncertainty
@@ -60,8 +62,8 @@ class Recording:
     """Time between the two poses around each frame; 0 where none is interpolated."""
     images_of_rows: Callable[[Rows], Iterator[Picture]]
     """Images of ascending rows, one by one."""
-    intrinsics_of_size: Callable[[tuple[int, int]], Intrinsics | None]
-    """Intrinsics of images of a size (width, height)."""
+    intrinsics_of_size: Callable[[tuple[int, int]], Intrinsics | None] = lambda _: None
+    """Intrinsics of images of a size (width, height), where the options name no file with them."""
     joints: Float[ndarray, "n j"] | None = None
     """Joint angles (rad) of the arm in `options.urdf`, where they are known."""
     depth_at: Callable[[int], UInt16[ndarray, "h w"] | None] | None = None
@@ -109,6 +111,9 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
         if depth is not None:
             write_bytes(into / f"{DEPTH}/{name}.png", encode_png(depth))
         report("frames", 0.8 + 0.2 * (k + 1) / len(rows))
+    known = recording.intrinsics_of_size
+    if options.camera_info is not None:
+        known = partial(read_camera_info, options.camera_info)
     capture, kept = checked_capture(into, images, recording.base_from_gripper[rows], str(recording.source))
     notes = (f"{len(kept)} of {len(fresh)} frames chosen", *([] if fresh.all() else [f"{stale}left out"]))
     return replace(
@@ -116,7 +121,7 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
         joints=None if recording.joints is None else recording.joints[rows[kept]],
         urdf=None if recording.joints is None else options.urdf,
         depths=tuple(depths[k] for k in kept) if any(depths[k] for k in kept) else None,
-        intrinsics=recording.intrinsics_of_size(capture.image_size),
+        intrinsics=known(capture.image_size),
         notes=(*notes, *remarks, *capture.notes),
     )
 

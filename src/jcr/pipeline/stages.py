@@ -341,7 +341,7 @@ def _map(result: RunResult, progress: Progress) -> RunResult:
         capture, made, hand_eye.depth_check if hand_eye.is_sound else None, hand_eye.scale
     )
     given = image_labels(capture, made, hand_eye, options.segment, progress)
-    labels, names = (None, ("none",)) if given is None else (given.labels, given.names)
+    labels, names = given or (None, ("none",))
     cloud, support = point_cloud(capture, made, hand_eye, labels, options.cloud, names), None
     with suppress(InputError):
         support = fit_support(cloud)

@@ -26,8 +26,10 @@ from jcr.records.json_fields import (
     in_unit,
 )
 
-PER_RADIAN = 180 / np.pi
-"""Degrees in a radian."""
+Metres = Annotated[float, in_unit(1e3)]
+"""Length (m); millimetres in files."""
+Radians = Annotated[float, in_unit(180 / np.pi)]
+"""Angle (rad); degrees in files."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,16 +99,10 @@ class NextPose:
     """Bound on 95 % of the errors of a seen point (mm), as Seen has it."""
     rotation_95_deg: Spread
     """Bound on 95 % of the errors of directions there."""
-    moved_m: Annotated[float, in_unit(1e3), Field(alias="moved_mm")] = 0.0
+    moved_m: Annotated[Metres, Field(alias="moved_mm")] = 0.0
     """Distance of the gripper's origin from its place at `like` (m)."""
-    rotation_rad: Annotated[float, in_unit(PER_RADIAN), Field(alias="rotated_deg")] = 0.0
+    rotation_rad: Annotated[Radians, Field(alias="rotated_deg")] = 0.0
     """Angle of the rotation from that pose (rad)."""
-
-
-Metres = Annotated[float, in_unit(1e3)]
-"""Length (m); millimetres in files."""
-Radians = Annotated[float, in_unit(PER_RADIAN)]
-"""Angle (rad); degrees in files."""
 
 
 @dataclass(frozen=True, kw_only=True)

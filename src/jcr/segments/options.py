@@ -34,11 +34,5 @@ class SegmentOptions:
     tabletop: TabletopOptions = field(default_factory=TabletopOptions)
 
 
-@dataclass(frozen=True)
-class LabelImages:
-    """Labels at the pointmaps' pixels."""
-
-    labels: Int[ndarray, "m h w"]
-    """0 = none."""
-    names: tuple[str, ...]
-    """Name of each label; label 0 is none."""
+LabelImages = tuple[Int[ndarray, "m h w"], tuple[str, ...]]
+"""Labels at the pointmaps' pixels, 0 = none, and the name of each label; label 0 is none."""

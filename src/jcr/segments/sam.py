@@ -170,4 +170,4 @@ def merged(
         if rank[group[row]] > 0:
             labels[k][mask] = rank[group[row]]
     names = ("none", *(f"segment {n}" for n in range(1, int((size > 0).sum()) + 1)))
-    return LabelImages(labels, names)
+    return labels, names

@@ -38,7 +38,7 @@ def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages
             labels[k] = cv2.remap(label, at_px[..., 0], at_px[..., 1], cv2.INTER_NEAREST, borderValue=0)
     count = int(labels.max()) + 1
     names = {k: str(k) for k in range(1, count)} | {0: "none"} | _read_names(folder / "names.json")
-    return LabelImages(labels, tuple(names[k] for k in range(count)))
+    return labels, tuple(names[k] for k in range(count))
 
 
 def _read(path: Path, capture: Capture, image: str) -> UInt16[ndarray, "h w"]:

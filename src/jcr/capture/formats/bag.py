@@ -13,7 +13,7 @@ from numpy import ndarray
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import TfTree, speed
 from jcr.capture.recording import Picture, Recording, capture_of_recording, chosen_name
-from jcr.capture.ros import image_of, intrinsics_of_ros, read_camera_info, read_ros_depth
+from jcr.capture.ros import image_of, intrinsics_of_ros, read_ros_depth
 from jcr.capture.urdf_chain import read_arm
 from jcr.errors import InputError
 from jcr.extras import extra
@@ -64,7 +64,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
             speed=speed(poses_at, stamps),
             gap_ns=gap_ns,
             images_of_rows=lambda rows: bag.pictures(rows, stamps, log_ns),
-            intrinsics_of_size=lambda size: bag.intrinsics(options, size),
+            intrinsics_of_size=bag.intrinsics,
             joints=joints,
             depth_at=(lambda row: bag.depth_near(int(stamps[row]), int(log_ns[row]))) if bag.depth else None,
         )
@@ -141,10 +141,8 @@ class _Bag:
         apart, topic, message = min(near, key=lambda one: one[0], default=(SAME_MOMENT_NS + 1, "", None))
         return read_ros_depth(message, f"{self.path}: {topic}") if apart <= SAME_MOMENT_NS else None
 
-    def intrinsics(self, options: ReadOptions, size: tuple[int, int]) -> Intrinsics | None:
-        """Return the intrinsics of --camera-info or CameraInfo; of rectified images P. ROS 1 writes K, D, P."""
-        if options.camera_info is not None:
-            return read_camera_info(options.camera_info, size)
+    def intrinsics(self, size: tuple[int, int]) -> Intrinsics | None:
+        """Return the intrinsics of CameraInfo; of rectified images P."""
         if (info := self.camera_info) is None:
             return None
         where = f"{self.path}: camera_info of {self.topic}"

@@ -16,7 +16,6 @@ from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_json, validated_content
 from jcr.capture.pose_track import PoseTrack, speed
 from jcr.capture.recording import Picture, Recording, capture_of_recording, chosen_name
-from jcr.capture.ros import read_camera_info
 from jcr.capture.urdf_chain import read_arm
 from jcr.errors import InputError
 from jcr.extras import extra
@@ -110,9 +109,6 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
         speed=np.concatenate([speed(PoseTrack(at, poses[part]).at, at) for at, part in pieces]),
         gap_ns=np.zeros(len(state), np.int64),  # a row is one instant
         images_of_rows=lambda wanted: _images(episodes, rows, wanted, camera, info.fps),
-        intrinsics_of_size=lambda size: (
-            None if options.camera_info is None else read_camera_info(options.camera_info, size)
-        ),
         joints=joints,
     )
     return capture_of_recording(recording, into, report)
