@@ -122,6 +122,7 @@ def to_mjcf(
     # All light is the lamps': a head light would move with the camera and wash the shading out.
     root = xml.fromstring(f"""
         <mujoco model="{scene.name}">
+        <compiler balanceinertia="true"/>
         <statistic center="{_text(center)}" extent="0.8"/>
         <visual>
         <global offwidth="{buffer[0]}" offheight="{buffer[1]}"/>
@@ -133,7 +134,7 @@ def to_mjcf(
         </asset>
         <worldbody/>
         </mujoco>""")
-    assets, world = root[2], root[3]
+    assets, world = root[3], root[4]
     # One lamp is a ring of weak ones: MuJoCo's shadows are hard, their sum is soft.
     for angle in 2 * np.pi * np.arange(_LAMPS) / _LAMPS:
         at = scene.light_in_base + 0.12 * np.array([np.cos(angle), np.sin(angle), 0.0])
