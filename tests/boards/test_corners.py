@@ -72,9 +72,11 @@ def test_a_board_that_was_moved_is_used_where_most_images_show_it_and_the_others
     assert boards is not None and boards.elsewhere == (6, 7, 8)
     hand_eye = calibrate_reconstruction(capture, made)
     (named,) = (one for one in hand_eye.findings if one.kind is FindingKind.BOARD_MOVED)
-    assert named.images == ("06.png", "07.png", "08.png") and "it was moved, or there are two" in sentence(
-        named
-    )
+    assert named.images == (
+        "06.png",
+        "07.png",
+        "08.png",
+    ) and "it was moved, the robot holds it, or there are two" in sentence(named)
     assert hand_eye.converged and hand_eye.board is not None
     assert hand_eye.board.images == 6
 

@@ -228,7 +228,8 @@ class FindingKind(StrEnum):
         "by the robot's positions the sides of {board} are {mm:.2f} ± {std_mm:.2f} mm",
         "measure one, and give it in --board: the scale is then known twice")
     BOARD_MOVED = "board at several places", KindRow("lengths",
-        "in {images} {board} is at another place than in the other images: it was moved, or there are two",
+        "in {images} {board} is at another place than in the other images: it was moved, the robot holds it, or "
+        "there are two",
         "its corners there count little or not at all; keep one board of a kind, and keep it still")
     BOARD_STRETCHED = "board stretched", KindRow("lengths",
         "{board} is {percent:!.1f} % longer along one side than along the other: it was not printed at its size",

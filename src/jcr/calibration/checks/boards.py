@@ -25,7 +25,7 @@ def check_boards(case: Case) -> Case:
     if boards is None:
         return case
     findings = list[Finding]()
-    if not boards.bodies:
+    if not boards.bodies and not boards.elsewhere:
         details = {"board": boards.spec} | ({"proposed": boards.proposed} if boards.proposed else {})
         findings.append(
             Finding(
