@@ -17,7 +17,7 @@ import jcr
 from conftest import shrunk_capture
 from jcr.calibration.checks.left_out import left_out_poses
 from jcr.calibration.hand_eye import solve_hand_eye
-from jcr.capture.images import BLURRED_EDGE, edge_width, encode_png, read_image
+from jcr.capture.images import BLURRED_EDGE, edge_width, encode_png, read_image, show_one_view
 from jcr.cli import dispatch
 from jcr.cli.check import read_arguments
 from jcr.findings import FindingKind
@@ -48,6 +48,17 @@ def test_a_camera_at_rest_is_named_before_anything_is_matched(small_capture: Pat
     found = json.loads(said.out)
     assert found["verdict"] == "rejected" and "all images show the same view" in found["warnings"][0]
     assert not said.err
+
+
+def test_a_board_that_the_robot_holds_is_no_stream_that_stands_still(tabletop: Path):
+    first, other = (read_image(tabletop / f"images/{k:02d}.jpg").copy() for k in (0, 6))
+    height, width = first.shape[:2]
+    squares = (np.indices((height, width // 3)) // 16).sum(0) % 2
+    for image in (first, other):
+        image[:, : width // 3] = 255 * squares[..., None]
+    assert not show_one_view(first, other)
+    noisy = np.clip(1.2 * first + RNG.normal(0, 6, first.shape), 0, 255).astype(np.uint8)
+    assert show_one_view(first, noisy)
 
 
 def test_blur_is_measured_by_the_image_itself(tabletop: Path):
